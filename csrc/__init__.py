@@ -1,0 +1,1 @@
+"""Hand-written C that generated code takes in."""

@@ -1,0 +1,1 @@
+"""eomc, the equations-of-motion compiler."""

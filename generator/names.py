@@ -1,0 +1,96 @@
+"""Names that C, C++ and Python can bear, and what to use where they can't."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import sys
+
+_C = """auto break case char const continue default do double else enum extern float for goto if
+inline int long register restrict return short signed sizeof static struct switch typedef union
+unsigned void volatile while asm typeof""".split()
+
+_CPP = """alignas alignof and and_eq bitand bitor bool catch char16_t char32_t class co_await
+co_return co_yield compl concept const_cast consteval constexpr constinit decltype delete
+dynamic_cast explicit export false friend mutable namespace new noexcept not not_eq nullptr
+operator or or_eq private protected public reinterpret_cast requires static_assert static_cast
+template this thread_local throw true try typeid typename using virtual wchar_t xor xor_eq""".split()
+
+# functions and macros of math.h, and macros that compilers define without an underscore
+_MATH = """acos asin atan atan2 ceil cos cosh exp fabs floor fmod frexp ldexp log log10 modf pow
+sin sinh sqrt tan tanh acosh asinh atanh cbrt copysign erf erfc exp2 expm1 fdim fma fmax fmin hypot
+ilogb lgamma llrint llround log1p log2 logb lrint lround nan nearbyint nextafter nexttoward
+remainder remquo rint round scalbln scalbn tgamma trunc sincos fpclassify isfinite isinf isnan
+isnormal signbit isgreater isgreaterequal isless islessequal islessgreater isunordered
+float_t double_t linux unix i386""".split()
+
+_FORMULA = "abs sign heaviside dot min max pi t".split()
+
+_WHY = {
+    **dict.fromkeys(_CPP, "a C++ keyword, and the generated header serves C++ too"),
+    **dict.fromkeys(keyword.kwlist, "a Python keyword"),
+    **dict.fromkeys(_MATH, "taken by the C mathematics library"),
+    **dict.fromkeys(_C, "a C keyword"),
+    **dict.fromkeys(_FORMULA, "taken by the formula language"),
+    "t": "the time",
+}
+
+_BETTER = {
+    "lambda": "lambda_1 or lam",
+    "double": "double_mass or two_m",
+    "t": "time constants tau_1, temperatures T",
+    "sin": "s_theta",
+    "cos": "c_theta",
+    "gamma": "gamma",
+}
+
+GREEK = dict(
+    zip(
+        "αβγδεζηθικλμνξοπρστυφχψωΑΒΓΔΕΖΗΘΙΚΛΜΝΞΟΠΡΣΤΥΦΧΨΩ",
+        [
+            *"alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi".split(),
+            *"omicron pi rho sigma tau upsilon phi chi psi omega".split(),
+            *"Alpha Beta Gamma Delta Epsilon Zeta Eta Theta Iota Kappa Lambda Mu Nu Xi".split(),
+            *"Omicron Pi Rho Sigma Tau Upsilon Phi Chi Psi Omega".split(),
+        ],
+        strict=True,
+    )
+)
+
+
+def plain(name: str) -> str:
+    """`name` made of what C can bear: Greek written out, LaTeX stripped, keywords marked.
+
+    >>> plain("θ₁"), plain(r"\\theta_{1}"), plain("lambda")
+    ('theta_1', 'theta_1', 'lambda_1')
+    """
+    subscripts = str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")
+    text = "".join("_" + c.translate(subscripts) if c in "₀₁₂₃₄₅₆₇₈₉" else c for c in name)
+    text = "".join(GREEK.get(c, c) for c in text)
+    text = re.sub(r"[^0-9A-Za-z]+", "_", text)
+    text = re.sub(r"_+", "_", text).strip("_")
+    if not text or not text[0].isalpha():
+        text = "v_" + text
+    return text + "_1" if text in _WHY else text
+
+
+def fault(name: str) -> str | None:
+    """Why `name` can't be used in a scene, with a remedy; None where it can."""
+    if name in _WHY:
+        return f"'{name}' is {_WHY[name]}: choose another name, such as {_BETTER.get(name, name + '_1')}"
+    if not name.isascii() or not name.isidentifier():
+        return f"'{name}' is not a plain name: use ASCII letters, digits and '_', such as {plain(name)}"
+    if name.startswith("_") or "__" in name or name.endswith("_"):
+        return f"'{name}' has underscores that C keeps for itself: use {plain(name)}"
+    if len(name) > 40:
+        return f"'{name}' has {len(name)} characters: 40 are the most, so that C lines stay readable"
+    return None
+
+
+def module_fault(name: str) -> str | None:
+    """Why a scene can't bear `name`, which becomes a Python module and a prefix in C."""
+    if why := fault(name):
+        return why
+    if name in sys.stdlib_module_names or name in ("numpy", "cffi", "eomc", "sympy", "test"):
+        return f"'{name}' is the name of a Python module, which it would hide: use {name}_scene"
+    return None

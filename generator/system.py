@@ -1,0 +1,357 @@
+"""A mechanical system in SymPy: symbols, ordered definitions, K, P, dissipation and forces.
+
+Made from a checked scene (`from_scene`) or in Python (`System.make`), with symbols or with
+`sympy.physics.mechanics.dynamicsymbols`. Knows nothing of TOML or C.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import sympy
+from sympy import Expr, Symbol
+from sympy.core.function import AppliedUndef
+
+from eomc import formulas, names
+from eomc.formulas import FormulaError
+from eomc.problems import EomcError, Problem, SceneError
+from eomc.scene import Run, Scene
+
+t = Symbol("t", real=True)
+
+
+class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
+    """The total time derivative of its argument, kept as it stands until it is asked for."""
+
+    nargs = 1
+    is_real = True
+
+
+def symbol(name: str) -> Symbol:
+    """The symbol of a name; all of a system's symbols are real."""
+    return Symbol(name, real=True)
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A generalized coordinate `q` and its velocity `qd`; `start` in `unit`, `rate` in unit/s."""
+
+    name: str
+    unit: str = ""
+    start: float = 0.0
+    rate: float = 0.0
+    note: str = ""
+
+    @property
+    def q(self) -> Symbol:
+        """The coordinate's symbol."""
+        return symbol(self.name)
+
+    @property
+    def qd(self) -> Symbol:
+        """The velocity's symbol, `<name>_dot`."""
+        return symbol(f"{self.name}_dot")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that may change at run time."""
+
+    name: str
+    value: float
+    unit: str = ""
+    note: str = ""
+
+    @property
+    def symbol(self) -> Symbol:
+        """The parameter's symbol."""
+        return symbol(self.name)
+
+
+@dataclass(frozen=True)
+class Input:
+    """A quantity given from outside at every step; `signal` is its value by default."""
+
+    name: str
+    unit: str = ""
+    signal: Expr = sympy.S.Zero
+    note: str = ""
+
+    @property
+    def symbol(self) -> Symbol:
+        """The input's symbol."""
+        return symbol(self.name)
+
+
+@dataclass(frozen=True)
+class System:
+    """d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, over named definitions.
+
+    `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
+    `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate. `digest` names what
+    the system was made from; `renamed` says which names C could not bear: (given, used) pairs.
+    """
+
+    name: str
+    coordinates: tuple[Coordinate, ...]
+    kinetic: Expr
+    potential: Expr = sympy.S.Zero
+    dissipation: Expr = sympy.S.Zero
+    forces: tuple[Expr, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    inputs: tuple[Input, ...] = ()
+    definitions: tuple[tuple[Symbol, Expr], ...] = ()
+    run: Run = Run()
+    title: str = ""
+    note: str = ""
+    file: str = ""
+    digest: str = ""
+    renamed: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[Problem, ...] = field(default=(), compare=False)
+
+    @property
+    def q(self) -> tuple[Symbol, ...]:
+        """The coordinates' symbols, in scene order."""
+        return tuple(c.q for c in self.coordinates)
+
+    @property
+    def qd(self) -> tuple[Symbol, ...]:
+        """The velocities' symbols, in scene order."""
+        return tuple(c.qd for c in self.coordinates)
+
+    @property
+    def u(self) -> tuple[Symbol, ...]:
+        """The inputs' symbols, in scene order."""
+        return tuple(i.symbol for i in self.inputs)
+
+    @classmethod
+    def make(
+        cls,
+        name: str,
+        coordinates: Sequence[Any] | Mapping[Any, float | tuple[float, float]],
+        kinetic: Any,
+        potential: Any = 0,
+        *,
+        parameters: Mapping[Any, float] | None = None,
+        dissipation: Any = 0,
+        forces: Mapping[Any, Any] | None = None,
+        inputs: Mapping[Any, Any] | Sequence[Any] = (),
+        definitions: Mapping[Any, Any] | None = None,
+        units: Mapping[Any, str] | None = None,
+        title: str = "",
+        h: float = 0.001,
+        duration: float = 10.0,
+    ) -> System:
+        r"""A system from SymPy expressions.
+
+        coordinates: symbols or dynamicsymbols, or a mapping to their start (or (start, rate)).
+        With plain symbols the velocity of `theta` is the symbol `theta_dot`; with dynamicsymbols
+        it is `theta.diff()`. parameters, inputs (to their default signal) and definitions are
+        mappings from symbols. Names that C can't bear (`\theta`, `lambda`) are replaced, and
+        `renamed` says how. Raises EomcError where something is undeclared.
+
+        >>> from sympy.physics.mechanics import dynamicsymbols
+        >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
+        >>> System.make("pendulum", {theta: 0.5}, m*l**2*theta.diff()**2/2,
+        ...             -m*g*l*sympy.cos(theta), parameters={m: 1, l: 1, g: 9.81}).qd
+        (theta_dot,)
+        """
+        return _Maker(name).make(
+            coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
+            inputs, definitions or {}, units or {}, title, Run(h, duration),
+        )  # fmt: skip
+
+
+# --- from a scene -------------------------------------------------------------------------------
+
+
+def _number(text: str) -> Expr:
+    return sympy.Rational(text) if not text[:2].lower() in ("0x", "0o", "0b") else sympy.Integer(int(text, 0))
+
+
+_ALGEBRA: Mapping[str, Any] = {
+    "number": _number,
+    "pi": sympy.pi,
+    **{n: getattr(sympy, n) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")},
+    **{n: getattr(sympy, n) for n in ("sinh", "cosh", "tanh", "exp", "log", "sqrt", "sign")},
+    "abs": sympy.Abs,
+    "heaviside": lambda x: sympy.Heaviside(x),
+    "min": sympy.Min,
+    "max": sympy.Max,
+    "dot": dot,
+}
+
+_UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
+
+
+def from_scene(scene: Scene) -> System:
+    """The scene's formulas as SymPy expressions, constants folded in. Raises SceneError."""
+    known: dict[str, Expr] = {"t": t}
+    for c in scene.coordinates:
+        known |= {c.name: symbol(c.name), f"{c.name}_dot": symbol(f"{c.name}_dot")}
+    for named in (*scene.parameters, *scene.inputs):
+        known[named.name] = symbol(named.name)
+    problems: list[Problem] = []
+
+    def value(key: str, formula: formulas.Formula) -> Expr:
+        try:
+            found = sympy.sympify(formulas.evaluate(formula, _ALGEBRA, known.__getitem__))
+            if found.has(*_UNDEFINED):
+                raise FormulaError("divides by zero")
+            if found.has(sympy.I):
+                raise FormulaError("has no real value")
+        except (FormulaError, ArithmeticError, ValueError, TypeError) as fault:
+            problems.append(Problem(f"'{formula.text}' {fault}", key, scene.file))
+            return sympy.S.Zero
+        return found
+
+    for constant in scene.constants:
+        known[constant.name] = value(f"constants.{constant.name}", constant.formula)
+    definitions = []
+    for name, formula in scene.definitions:
+        definitions.append((symbol(name), value(f"definitions.{name}", formula)))
+        known[name] = symbol(name)
+    start, rate = scene.start()
+    system = System(
+        name=scene.name,
+        coordinates=tuple(
+            Coordinate(c.name, c.unit, q, qd, c.note)
+            for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
+        ),
+        kinetic=value("energy.kinetic", scene.kinetic),
+        potential=value("energy.potential", scene.potential),
+        dissipation=value("energy.dissipation", scene.dissipation),
+        forces=tuple(
+            value(f"forces.{c.name}", scene.forces[c.name]) if c.name in scene.forces else sympy.S.Zero
+            for c in scene.coordinates
+        ),
+        parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
+        inputs=tuple(
+            Input(i.name, i.unit, value(f"inputs.{i.name}.signal", i.signal), i.note)
+            for i in scene.inputs
+        ),
+        definitions=tuple(definitions),
+        run=scene.run,
+        title=scene.title,
+        note=scene.note,
+        file=scene.file,
+        digest=scene.digest,
+        warnings=scene.warnings,
+    )
+    if problems:
+        raise SceneError(problems)
+    return system
+
+
+# --- from Python --------------------------------------------------------------------------------
+
+
+class _Maker:
+    """Turns a user's symbols, of whatever assumptions and spelling, into ours."""
+
+    def __init__(self, name: str) -> None:
+        if why := names.module_fault(name):
+            raise EomcError(f"System.make: name: {why}")
+        self.name = name
+        self.map: dict[Any, Expr] = {}
+        self.taken: dict[str, Any] = {}
+        self.renamed: list[tuple[str, str]] = []
+
+    def name_of(self, given: Any, role: str) -> str:
+        text = given.func.__name__ if isinstance(given, AppliedUndef) else str(given)
+        used = names.plain(text) if names.fault(text) else text
+        if used in self.taken:
+            raise EomcError(f"System.make: {role} '{text}': the name '{used}' is taken already")
+        if used != text:
+            self.renamed.append((text, used))
+        self.taken[used] = given
+        return used
+
+    def expression(self, given: Any, role: str) -> Expr:
+        try:
+            expr = sympy.sympify(given)
+        except sympy.SympifyError:
+            raise EomcError(f"System.make: {role}: {given!r} is not an expression") from None
+        if isinstance(given, str):
+            raise EomcError(f"System.make: {role}: give a SymPy expression, not the text {given!r}")
+        expr = expr.replace(
+            lambda e: isinstance(e, sympy.Derivative), lambda e: self.map.get(e, e)
+        ).xreplace(self.map)
+        strange = sorted(
+            map(str, expr.atoms(AppliedUndef, sympy.Derivative) - expr.atoms(dot))
+            if expr.has(AppliedUndef, sympy.Derivative)
+            else []
+        ) + sorted(s.name for s in expr.free_symbols if s not in self.known)
+        if strange:
+            raise EomcError(
+                f"System.make: {role}: {', '.join(strange)} not declared: "
+                "name it among coordinates, parameters, inputs or definitions"
+            )
+        if expr.has(*_UNDEFINED, sympy.I):
+            raise EomcError(f"System.make: {role}: {expr} is not a real, finite expression")
+        return expr
+
+    def make(
+        self, coordinates: Any, kinetic: Any, potential: Any, parameters: Mapping[Any, float],
+        dissipation: Any, forces: Mapping[Any, Any], inputs: Any, definitions: Mapping[Any, Any],
+        units: Mapping[Any, str], title: str, run: Run,
+    ) -> System:  # fmt: skip
+        starts = dict(coordinates) if isinstance(coordinates, Mapping) else dict.fromkeys(coordinates, 0.0)
+        if not starts:
+            raise EomcError("System.make: give at least one coordinate")
+        made = []
+        for given, start in starts.items():
+            q0, qd0 = start if isinstance(start, tuple) else (start, 0.0)
+            c = Coordinate(self.name_of(given, "coordinate"), units.get(given, ""), float(q0), float(qd0))
+            self.map[given] = c.q
+            if isinstance(given, AppliedUndef):
+                time = given.args[0]
+                self.map[sympy.Derivative(given, time)] = c.qd
+                self.map[time] = t
+            else:
+                self.map[Symbol(f"{given}_dot", **given.assumptions0)] = c.qd
+            made.append(c)
+        declared = [
+            Parameter(self.declare(p, "parameter"), float(v), units.get(p, ""))
+            for p, v in parameters.items()
+        ]
+        pending = dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(inputs, 0)
+        given_inputs = [(i, self.declare(i, "input")) for i in pending]
+        self.known = {c.q for c in made} | {c.qd for c in made} | {t}
+        self.known |= {symbol(n) for n in self.taken}
+        ordered = []
+        for given, body in definitions.items():
+            expr = self.expression(body, f"definition {given}")
+            defined = symbol(self.declare(given, "definition"))
+            self.known.add(defined)
+            ordered.append((defined, expr))
+        unknown = [str(f) for f in forces if f not in starts]
+        if unknown:
+            raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
+        exprs: Callable[[Any, str], Expr] = self.expression
+        fields: dict[str, Any] = dict(
+            name=self.name,
+            coordinates=tuple(made),
+            kinetic=exprs(kinetic, "kinetic"),
+            potential=exprs(potential, "potential"),
+            dissipation=exprs(dissipation, "dissipation"),
+            forces=tuple(exprs(forces.get(given, 0), f"force on {given}") for given in starts),
+            parameters=tuple(declared),
+            inputs=tuple(
+                Input(used, units.get(given, ""), exprs(pending[given], f"signal of {given}"))
+                for given, used in given_inputs
+            ),
+            definitions=tuple(ordered),
+            run=run,
+            title=title or self.name.replace("_", " ").capitalize(),
+        )
+        digest = hashlib.sha256(sympy.srepr(sorted(fields.items())).encode()).hexdigest()
+        return System(**fields, digest=digest, renamed=tuple(self.renamed))
+
+    def declare(self, given: Any, role: str) -> str:
+        used = self.name_of(given, role)
+        self.map[given] = symbol(used)
+        return used
