@@ -9,11 +9,16 @@ from __future__ import annotations
 
 import ast
 import difflib
+import keyword
 import math
 import operator
+import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+from eomc import names
 
 MAX_LENGTH = 10_000
 MAX_DEPTH = 150
@@ -40,23 +45,53 @@ _OPERATORS: Mapping[type, Callable[..., Any]] = {
     ast.USub: operator.neg,
 }
 
-# what people write instead, and the remedy
+# what people write instead, and the remedy: characters, then functions, then syntax
+_QUOTE = "quotes and primes are not used here: write theta_dot for a velocity, dot(e) for de/dt"
+_ORDER = "comparisons are not used in formulas: write heaviside(a - b), min or max"
+_CHARACTERS: Mapping[str, str] = {
+    **dict.fromkeys("'\"`", _QUOTE),
+    **dict.fromkeys("<>", _ORDER),
+    **dict.fromkeys(
+        "\\\b\f\v\a\r", "LaTeX is not read: write names without backslash (theta), powers as **"
+    ),
+    **dict.fromkeys("[{", "lists and indices are not used: give each quantity a name of its own"),
+    "^": "'^' is not a power here: write '**'",
+    "=": "'=' is not used inside a formula: write only what stands right of it",
+    "°": "angles are in radians: write 90*pi/180",
+    "#": "a comment can't stand inside a formula: put it after the closing quotes",
+    "%": "'%' is not used in formulas: comments stand after the closing quotes, with '#'",
+    **{c: f"'{c}' is not ASCII: write {names.plain(c)}" for c in names.GREEK},
+    "π": "'π' is not ASCII: write pi",
+    **dict.fromkeys("·×⋅∙", "products are written with '*'"),
+    **dict.fromkeys("−–—", "this dash is not a minus sign: write '-'"),
+    **dict.fromkeys("′’‘″“”", _QUOTE),
+    **{c: f"'{c}' is not ASCII: write **{n}" for n, c in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")},
+    "√": "'√' is not ASCII: write sqrt(...)",
+}
+
+_ELSEWHERE: Mapping[str, str] = {
+    **{f"arc{f}": f"a{f}" for f in ("sin", "cos", "tan", "tan2")},
+    **{f.capitalize(): f for f in FUNCTIONS},
+    **{"ln": "log", "fabs": "abs", "sgn": "sign", "sine": "sin", "cosine": "cos"},
+    **{"Heaviside": "heaviside", "step": "heaviside", "tangent": "tan", "Derivative": "dot"},
+    **{"diff": "dot", "derivative": "dot", "ddt": "dot", "arctg": "atan", "tg": "tan"},
+}
+
 _FOREIGN: Mapping[type, str] = {
-    ast.BitXor: "'^' is not a power here: write '**'",
     ast.FloorDiv: "'//' is not used in formulas: write '/'",
-    ast.Mod: "'%' is not used in formulas",
-    ast.Compare: "comparisons are not used in formulas: write heaviside(a - b), min or max",
     ast.IfExp: "'if' is not used in formulas: write heaviside(a - b), min or max",
     ast.BoolOp: "'and' and 'or' are not used in formulas: write heaviside, min or max",
+    ast.Compare: _ORDER,
     ast.Attribute: "'.' is not used in formulas: names are plain, velocities end in _dot",
-    ast.Subscript: "'[...]' is not used in formulas: give each quantity a name of its own",
-    ast.Tuple: "a comma stands outside a function call: a decimal point is written '.'",
     ast.Lambda: "'lambda' is not used in formulas",
 }
 
+_ALLOWED = "numbers, names, + - * / **, parentheses and functions"
+_TOO_DEEP = "the formula is nested too deeply: split it with [definitions]"
+
 
 class FormulaError(ValueError):
-    """What is wrong with a formula, and where: `column` and `width` count characters of its text."""
+    """What is wrong with a formula, and where: `column` and `width` count its characters."""
 
     def __init__(self, message: str, column: int = 0, width: int = 1) -> None:
         super().__init__(message)
@@ -85,143 +120,186 @@ class Formula:
                 if node.func.id in functions:
                     yield node
 
-    def part(self, node: ast.expr) -> Formula:
-        """The sub-formula that `node` is."""
-        return Formula(ast.get_source_segment(self.text, node) or self.text, node)
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The known name that `name` may have been meant for, or the empty string."""
+    known = list(known)
+    same = [k for k in known if k.lower() == name.lower()]
+    return next(iter(same or difflib.get_close_matches(name, known, n=1, cutoff=0.6)), "")
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'm_c'?"` where a known name is close, else the empty string."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
-    return f"; did you mean '{near[0]}'?" if near else ""
+    near = nearest(name, known)
+    return f"; did you mean '{near}'?" if near else ""
 
 
 def parse(text: str) -> Formula:
-    """Check `text` and return its tree. Raises FormulaError with the place of the first fault."""
-    if len(text) > MAX_LENGTH:
+    """Check `text`, blanks around it apart. Raises FormulaError with the place of a fault."""
+    # newlines are layout in a multi-line TOML string, as inside parentheses
+    line = text.replace("\n", " ").replace("\t", " ").strip(" ")
+    if len(line) > MAX_LENGTH:
         raise FormulaError(
-            f"the formula has {len(text)} characters, more than {MAX_LENGTH}: "
+            f"the formula has {len(line)} characters, more than {MAX_LENGTH}: "
             "split it with [definitions]"
         )
-    if not text.strip():
+    if not line:
         raise FormulaError("the formula is empty: write 0 if nothing is meant")
-    shift = len(text) - len(text.lstrip())
-    # newlines are layout in a multi-line TOML string, as inside parentheses
-    line = text.strip().replace("\r", " ").replace("\n", " ").replace("\t", " ")
-    if not line.isascii():
-        at = next(i for i, c in enumerate(line) if not c.isascii())
-        raise FormulaError(
-            f"'{line[at]}' is not ASCII: write Greek letters out (theta), powers as **, "
-            "products as *",
-            at + shift,
-        )
+    for at, c in enumerate(line):
+        if c in _CHARACTERS:
+            raise FormulaError(_CHARACTERS[c], at)
+        if not " " <= c <= "~":
+            raise FormulaError(f"'{c}' is not used in formulas: only {_ALLOWED}", at)
     try:
-        tree = ast.parse(line, mode="eval").body
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python's remarks on odd literals, such as 1or 2
+            tree = ast.parse(line, mode="eval").body
     except SyntaxError as fault:
-        at = max((fault.offset or 1) - 1, 0)
-        raise FormulaError(_explain_syntax(line, fault.msg, at), min(at, len(line)) + shift) from None
+        raise _explain_syntax(line, fault) from None
     except (RecursionError, MemoryError, ValueError):
-        raise FormulaError(
-            "the formula is nested too deeply: split it with [definitions]"
-        ) from None
+        raise FormulaError(_TOO_DEEP) from None
     formula = Formula(line, tree)
-    try:
-        _check(formula, tree, 0)
-    except FormulaError as fault:
-        fault.column += shift
-        raise
+    _check(formula, tree, 0)
     return formula
 
 
-def _explain_syntax(text: str, message: str, at: int) -> str:
-    around = text[max(at - 12, 0) : at + 12]
-    if "'" in text:
-        return "a prime is not a derivative here: write theta_dot for the velocity, dot(e) for de/dt"
-    if "=" in text:
-        return "'=' is not used in formulas: the name stands left of the TOML '='"
-    for i, (a, b) in enumerate(zip(text, text[1:], strict=False)):
-        alone = i == 0 or not (text[i - 1].isalnum() or text[i - 1] in "_.")
-        if a.isdigit() and b.isalpha() and alone and b not in "eE":
-            return f"write products with '*': '{a}*{b}', not '{a}{b}'"
-    return f"not a formula near '{around.strip()}' ({message.split(' (')[0]})"
+# 2m, then m g, then )m
+_PRODUCT = re.compile(
+    r"(?<![\w.])(?!0[xob])(\d[\d.]*)(?![eE][+-]?\d)([A-Za-z_]\w*)|([\w.]+) +([\w.]+)|(\)) *([\w.]+)"
+)
 
 
-def _fault(formula: Formula, node: ast.expr, message: str) -> FormulaError:
+def _explain_syntax(text: str, fault: SyntaxError) -> FormulaError:
+    if "too many nested" in fault.msg:
+        return FormulaError(_TOO_DEEP)
+    for word in re.finditer(r"[A-Za-z_]\w*", text):
+        if keyword.iskeyword(word[0]) and word[0] not in ("if", "else", "and", "or", "not"):
+            why = names.fault(word[0]) or ""
+            return FormulaError(why, word.start(), len(word[0]))
+    product = _PRODUCT.search(text)
+    if product and not {"if", "else", "and", "or", "not", "in", "is"} & set(product.groups()):
+        left, right = (group for group in product.groups() if group)
+        return FormulaError(
+            f"write products with '*': '{left}*{right}', not '{product[0]}'",
+            product.start(),
+            len(product[0]),
+        )
+    at = min(max((fault.offset or 1) - 1, 0), len(text) - 1)
+    around = text[max(at - 12, 0) : at + 12].strip()
+    return FormulaError(f"not a formula near '{around}' ({fault.msg.split(' (')[0]})", at)
+
+
+def _fault(node: ast.expr, message: str) -> FormulaError:
     width = max((node.end_col_offset or 0) - node.col_offset, 1)
     return FormulaError(message, node.col_offset, width)
 
 
-def _check(formula: Formula, node: ast.expr, depth: int) -> None:
+def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> None:
+    """Hold `node` against the whitelist; `power` is the product of the exponents around it."""
     if depth > MAX_DEPTH:
-        raise _fault(
-            formula,
-            node,
-            f"the formula is nested more than {MAX_DEPTH} deep: split it with [definitions]",
+        raise FormulaError(
+            f"the formula is nested more than {MAX_DEPTH} deep, each term of a sum counted: "
+            "split it with [definitions]",
+            node.col_offset,
         )
     match node:
-        case ast.Constant(value=bool()) | ast.Constant(value=complex()):
-            raise _fault(formula, node, f"'{node.value}' is not a real number")
+        case ast.Constant(value=bool() | complex() as value):
+            raise _fault(node, f"'{value}' is not a real number")
         case ast.Constant(value=int() | float() as value):
-            if not _in_range(value):
-                raise _fault(formula, node, f"the number is larger than 1e{MAX_LOG10}")
+            written = re.fullmatch(r"[\d.]+e([+-]?\d+)", _literal_of(formula, node))
+            # 0e999999999 too, whose exact value costs what it says
+            if not _in_range(value) or (written and abs(int(written[1])) > MAX_LOG10):
+                raise _fault(node, f"numbers lie between 1e-{MAX_LOG10} and 1e{MAX_LOG10} in size")
         case ast.Name(id=name):
             if name in FUNCTIONS:
-                raise _fault(formula, node, f"'{name}' is a function: write {name}(...)")
+                raise _fault(node, f"'{name}' is a function: write {name}(...)")
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
-            _check(formula, operand, depth + 1)
-        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-            _check(formula, left, depth + 1)
+            _check(formula, operand, depth + 1, power)
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
             _check(formula, right, depth + 1)
-            if isinstance(op, ast.Pow):
-                _check_power(formula, left, right)
-        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
-            if name not in FUNCTIONS:
-                raise _fault(
-                    formula, node.func, f"'{name}' is not a function{suggest(name, FUNCTIONS)}"
-                    + (f" ({', '.join(sorted(FUNCTIONS))})" if not suggest(name, FUNCTIONS) else "")
-                )
-            least, most = FUNCTIONS[name]
-            if not least <= len(args) <= most:
-                wanted = str(least) if least == most else f"{least} to {most}"
-                plural = "" if wanted == "1" else "s"
-                raise _fault(
-                    formula, node, f"{name}() takes {wanted} argument{plural}, here {len(args)}"
-                )
+            exponent = _number(formula, right)
+            if exponent is not None:
+                power = _bounded(right, exponent, power)
+            _check(formula, left, depth + 1, power)
+            _check_value(formula, node)
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+            _check(formula, left, depth + 1, power)
+            _check(formula, right, depth + 1, power)
+            if isinstance(op, ast.Div) and _number(formula, right) == 0:
+                raise _fault(right, "divides by zero")
+            _check_value(formula, node)
+        case ast.Call(func=ast.Name(id=name) as func, args=args, keywords=[]):
+            _check_call(func, node)
             for arg in args:
-                _check(formula, arg, depth + 1)
-        case _:
-            kinds = [type(node), type(getattr(node, "op", None))]
-            told = next((_FOREIGN[k] for k in kinds if k in _FOREIGN), None)
-            raise _fault(
-                formula,
-                node,
-                told or "only numbers, names, + - * / **, parentheses and functions are used here",
+                _check(formula, arg, depth + 1, power)
+            _check_value(formula, node)
+        case ast.Call(func=ast.Attribute(attr=name) as func) if name in FUNCTIONS:
+            raise _fault(func, f"functions stand by themselves: write {name}(...)")
+        case ast.Call(func=ast.Attribute() | ast.Lambda() as func):
+            raise _fault(func, _FOREIGN[type(func)])
+        case ast.Call(func=func) if not isinstance(func, ast.Name):
+            raise _fault(func, "write products with '*': a parenthesis follows without one")
+        case ast.Tuple(elts=[first, *_]):
+            raise FormulaError(
+                "a comma stands outside a function call: a decimal point is written '.'",
+                formula.text.index(",", first.end_col_offset),
             )
+        case _:
+            kinds = (type(node), type(getattr(node, "op", None)))
+            told = next((_FOREIGN[k] for k in kinds if k in _FOREIGN), None)
+            raise _fault(node, told or f"only {_ALLOWED} are used here")
+
+
+def _check_call(func: ast.Name, call: ast.Call) -> None:
+    name, given = func.id, len(call.args)
+    if name == "pow":
+        raise _fault(func, "'pow' is not used in formulas: write a**b")
+    if name not in FUNCTIONS:
+        near = _ELSEWHERE.get(name)
+        raise _fault(
+            func,
+            f"'{name}' is not a function"
+            + (
+                (f"; did you mean '{near}'?" if near else suggest(name, FUNCTIONS))
+                or f": write {name}*(...) for a product; functions are {', '.join(FUNCTIONS)}"
+            ),
+        )
+    least, most = FUNCTIONS[name]
+    if not least <= given <= most:
+        wanted = str(least) if least == most else f"{least} to {most}"
+        plural = "" if wanted == "1" else "s"
+        raise _fault(call, f"{name}() takes {wanted} argument{plural}, here {given}")
 
 
 def _in_range(value: float) -> bool:
-    return value == 0 or math.log10(abs(value)) < MAX_LOG10 if abs(value) != math.inf else False
+    return value == 0 or (abs(value) < math.inf and abs(math.log10(abs(value))) < MAX_LOG10)
 
 
-def _check_power(formula: Formula, base: ast.expr, exponent: ast.expr) -> None:
-    power = _number(formula, exponent)
-    if power is not None and not abs(power) <= MAX_EXPONENT:
-        raise _fault(formula, exponent, f"an exponent is at most {MAX_EXPONENT} in size")
-    number = _number(formula, base)
-    if number is not None and power is not None and number != 0:
-        if not abs(power * math.log10(abs(number))) < MAX_LOG10:
-            raise _fault(formula, base, f"the power is larger than 1e{MAX_LOG10}")
+def _bounded(node: ast.expr, exponent: float, power: float) -> float:
+    """The product of the exponents, within bounds."""
+    if not abs(exponent) <= MAX_EXPONENT:
+        raise _fault(node, f"an exponent lies between -{MAX_EXPONENT} and {MAX_EXPONENT}")
+    if abs(power * exponent) > MAX_EXPONENT:
+        raise _fault(node, f"the exponents of a power of a power pass {MAX_EXPONENT} together")
+    return power * max(abs(exponent), 1)
+
+
+def _check_value(formula: Formula, node: ast.expr) -> None:
+    value = _number(formula, node)
+    if value is not None and not abs(value) < math.inf:
+        raise _fault(node, "has no real, finite value")
 
 
 def _number(formula: Formula, node: ast.expr) -> float | None:
-    """The value of a subtree without names, None if it has names; inf where it can't be had."""
-    if any(isinstance(n, ast.Name) and n.id not in FUNCTIONS for n in ast.walk(node)):
+    """The value of a subtree, nan where it is not real and finite, None where it has names."""
+    found = (n.id for n in ast.walk(node) if isinstance(n, ast.Name))
+    if any(name not in NUMERIC for name in found):
         return None
     try:
-        value = _walk(formula, node, NUMERIC, {}.__getitem__)
+        value = _walk(formula, node, NUMERIC, NUMERIC.__getitem__)
+        return float(value) if isinstance(value, (int, float)) else math.nan
     except (ArithmeticError, ValueError, TypeError):
-        return math.inf
-    return float(value) if isinstance(value, (int, float)) else math.inf
+        return math.nan
 
 
 def evaluate(formula: Formula, algebra: Mapping[str, Any], lookup: Callable[[str], Any]) -> Any:
@@ -238,8 +316,7 @@ def _walk(
 ) -> Any:
     match node:
         case ast.Constant():
-            text = ast.get_source_segment(formula.text, node) or repr(node.value)
-            return algebra["number"](text.replace("_", ""))
+            return algebra["number"](_literal_of(formula, node))
         case ast.Name(id="pi"):
             return algebra["pi"]
         case ast.Name(id=name):
@@ -255,8 +332,13 @@ def _walk(
     raise AssertionError(f"unchecked node {ast.dump(node)}")
 
 
+def _literal_of(formula: Formula, node: ast.Constant) -> str:
+    """A number as it was written, so that 0.1 may stay exact."""
+    return formula.text[node.col_offset : node.end_col_offset].replace("_", "").lower()
+
+
 def _literal(text: str) -> float:
-    return float(int(text, 0)) if text[:2].lower() in ("0x", "0o", "0b") else float(text)
+    return float(int(text, 0)) if text[:2] in ("0x", "0o", "0b") else float(text)
 
 
 NUMERIC: Mapping[str, Any] = {

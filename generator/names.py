@@ -1,10 +1,14 @@
 """Names that C, C++ and Python can bear, and what to use where they can't."""
 
+# ruff: noqa: SIM905 - a list of words reads better without quotes
+
 from __future__ import annotations
 
 import keyword
 import re
 import sys
+
+MAX_LENGTH = 40
 
 _C = """auto break case char const continue default do double else enum extern float for goto if
 inline int long register restrict return short signed sizeof static struct switch typedef union
@@ -14,7 +18,8 @@ _CPP = """alignas alignof and and_eq bitand bitor bool catch char16_t char32_t c
 co_return co_yield compl concept const_cast consteval constexpr constinit decltype delete
 dynamic_cast explicit export false friend mutable namespace new noexcept not not_eq nullptr
 operator or or_eq private protected public reinterpret_cast requires static_assert static_cast
-template this thread_local throw true try typeid typename using virtual wchar_t xor xor_eq""".split()
+template this thread_local throw true try typeid typename using virtual wchar_t xor
+xor_eq""".split()
 
 # functions and macros of math.h, and macros that compilers define without an underscore
 _MATH = """acos asin atan atan2 ceil cos cosh exp fabs floor fmod frexp ldexp log log10 modf pow
@@ -38,24 +43,18 @@ _WHY = {
 _BETTER = {
     "lambda": "lambda_1 or lam",
     "double": "double_mass or two_m",
-    "t": "time constants tau_1, temperatures T",
+    "t": "tau_1 for a time constant, T for a temperature",
     "sin": "s_theta",
     "cos": "c_theta",
-    "gamma": "gamma",
 }
 
-GREEK = dict(
-    zip(
-        "αβγδεζηθικλμνξοπρστυφχψωΑΒΓΔΕΖΗΘΙΚΛΜΝΞΟΠΡΣΤΥΦΧΨΩ",
-        [
-            *"alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi".split(),
-            *"omicron pi rho sigma tau upsilon phi chi psi omega".split(),
-            *"Alpha Beta Gamma Delta Epsilon Zeta Eta Theta Iota Kappa Lambda Mu Nu Xi".split(),
-            *"Omicron Pi Rho Sigma Tau Upsilon Phi Chi Psi Omega".split(),
-        ],
-        strict=True,
-    )
-)
+_LETTERS = """alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi omicron pi
+rho sigma tau upsilon phi chi psi omega""".split()
+
+GREEK = {
+    **dict(zip("αβγδεζηθικλμνξοπρστυφχψω", _LETTERS, strict=True)),
+    **dict(zip("ΑΒΓΔΕΖΗΘΙΚΛΜΝΞΟΠΡΣΤΥΦΧΨΩ", map(str.capitalize, _LETTERS), strict=True)),
+}
 
 
 def plain(name: str) -> str:
@@ -70,20 +69,21 @@ def plain(name: str) -> str:
     text = re.sub(r"[^0-9A-Za-z]+", "_", text)
     text = re.sub(r"_+", "_", text).strip("_")
     if not text or not text[0].isalpha():
-        text = "v_" + text
+        text = "v_" + text if text else "v"
     return text + "_1" if text in _WHY else text
 
 
 def fault(name: str) -> str | None:
     """Why `name` can't be used in a scene, with a remedy; None where it can."""
     if name in _WHY:
-        return f"'{name}' is {_WHY[name]}: choose another name, such as {_BETTER.get(name, name + '_1')}"
+        better = _BETTER.get(name, f"{name}_1")
+        return f"'{name}' is {_WHY[name]}: choose another name, such as {better}"
     if not name.isascii() or not name.isidentifier():
-        return f"'{name}' is not a plain name: use ASCII letters, digits and '_', such as {plain(name)}"
+        return f"'{name}' is not a plain name: use letters a-z, digits and '_', as in {plain(name)}"
     if name.startswith("_") or "__" in name or name.endswith("_"):
         return f"'{name}' has underscores that C keeps for itself: use {plain(name)}"
-    if len(name) > 40:
-        return f"'{name}' has {len(name)} characters: 40 are the most, so that C lines stay readable"
+    if len(name) > MAX_LENGTH:
+        return f"'{name}' has {len(name)} characters: {MAX_LENGTH} are the most, for readable C"
     return None
 
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+WIDTH = 100  # characters of a source line shown, at most
+MOST = 50  # problems shown, at most
+
 
 class EomcError(Exception):
     """An error that is the user's to mend; its text is meant to be read as it stands."""
@@ -29,14 +32,27 @@ class Problem:
             place += f":{self.line}"
             if self.column >= 0:
                 place += f":{self.column + 1}"
-        head = ": ".join(part for part in (place, self.severity, self.key, self.message) if part)
+        parts = (place, self.severity, self.key, self.message)
+        text = ": ".join(_shown(part) for part in parts if part)
         if not self.source:
-            return head
+            return text
+        # of a long line, the part around the fault
+        start = max(self.column - WIDTH // 2, 0) if len(self.source) > WIDTH else 0
+        shown = _shown(self.source[start : start + WIDTH])
+        before = "…" if start else ""
+        after = "…" if len(self.source) > start + WIDTH else ""
         gutter = f"  {self.line} | "
-        text = head + "\n" + gutter + self.source
+        text += f"\n{gutter}{before}{shown}{after}"
         if self.column >= 0:
-            text += "\n" + " " * (len(gutter) - 2) + "| " + " " * self.column + "^" * self.width
+            left = len(before) + self.column - start
+            width = max(min(self.width, len(before) + len(shown) - left), 1)
+            text += "\n" + " " * (len(gutter) - 2) + "| " + " " * left + "^" * width
         return text
+
+
+def _shown(text: str) -> str:
+    """`text` in one line, as wide on the screen as it is long."""
+    return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
 
 
 class SceneError(EomcError):
@@ -44,4 +60,7 @@ class SceneError(EomcError):
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(sorted(problems, key=lambda p: (p.line, p.column)))
-        super().__init__("\n".join(map(str, self.problems)))
+        told = [str(p) for p in self.problems[:MOST]]
+        if len(self.problems) > MOST:
+            told.append(f"... and {len(self.problems) - MOST} more")
+        super().__init__("\n".join(told))

@@ -8,8 +8,9 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,11 +18,12 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from eomc import formulas, names
-from eomc.formulas import Formula, FormulaError, suggest
+from eomc.formulas import Formula, FormulaError, nearest, suggest
 from eomc.problems import EomcError, Problem, SceneError
 
 METHODS = ("rk4",)
-MAX_BYTES = 4_000_000
+MAX_BYTES = 1_000_000
+MAX_STATEMENT = 500  # lines
 
 # --- the layout of the file -------------------------------------------------------------------
 
@@ -151,23 +153,58 @@ class Scene:
     dissipation: Formula
     forces: Mapping[str, Formula]
     run: Run
+    places: Places = field(repr=False, compare=False)
     warnings: tuple[Problem, ...] = ()
 
-    def start(self, parameters: Mapping[str, float] | None = None) -> tuple[list[float], list[float]]:
-        """q and q_dot at the start, with the given values in place of the parameters' defaults."""
+    def start(
+        self, parameters: Mapping[str, float] | None = None
+    ) -> tuple[list[float], list[float]]:
+        """q and q_dot at the start, with the given values in place of the parameters' defaults.
+
+        Raises EomcError where they have no value, such as 1/l with l = 0.
+        """
         values = {p.name: p.value for p in (*self.parameters, *self.constants)}
         values.update(parameters or {})
-        number = lambda f: formulas.evaluate(f, formulas.NUMERIC, values.__getitem__)  # noqa: E731 - one use, twice
+
+        def number(formula: Formula, key: str) -> float:
+            value, fault = _value(formula, values)
+            if fault:
+                raise EomcError(str(self.problem(key, fault, formula)))
+            return value
+
         return (
-            [float(number(c.start)) for c in self.coordinates],
-            [float(number(c.rate)) for c in self.coordinates],
+            [number(c.start, f"coordinates.{c.name}.start") for c in self.coordinates],
+            [number(c.rate, f"coordinates.{c.name}.rate") for c in self.coordinates],
         )
+
+    def problem(self, key: str, message: str, formula: Formula | None = None) -> Problem:
+        """A problem at a key such as `energy.kinetic`, with its line and its formula marked."""
+        text = formula.text if formula else None
+        return self.places.problem(tuple(key.split(".")), message, text=text)
+
+
+def _value(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
+    """The value of a formula and "", or nan and why it has none."""
+    try:
+        value = formulas.evaluate(formula, formulas.NUMERIC, known.__getitem__)
+        if isinstance(value, (int, float)) and math.isfinite(value):
+            return float(value), ""
+        fault = "has no real, finite value"
+    except ZeroDivisionError:
+        fault = "divides by zero"
+    except OverflowError:
+        fault = "is too large for a double"
+    except (ValueError, TypeError):
+        fault = "has no real value"
+    given = {n.id: known[n.id] for n in formula.names()}
+    where = ", ".join(f"{name} = {value:g}" for name, value in given.items())
+    return math.nan, f"'{formula.text}' {fault}" + (f" at {where}" if where else "")
 
 
 # --- where things stand in the file -------------------------------------------------------------
 
 
-class _Places:
+class Places:
     """Line numbers of keys, found by giving tomllib one statement at a time."""
 
     def __init__(self, text: str, file: str) -> None:
@@ -180,72 +217,97 @@ class _Places:
             if self.lines[start].strip().startswith("#") or not self.lines[start].strip():
                 start += 1
                 continue
-            for end in range(start + 1, len(self.lines) + 1):
-                statement = "\n".join(self.lines[start:end])
-                try:
-                    tree = tomllib.loads(statement)
-                except tomllib.TOMLDecodeError:
-                    continue
-                header = statement.lstrip().startswith("[")
-                for path in _paths(tree):
-                    self._line.setdefault((() if header else prefix) + path, (start, end))
-                if header:
-                    prefix = next(iter(sorted(_paths(tree), key=len, reverse=True)))
-                start = end
-                break
-            else:
-                start += 1
+            end = self._end(start)
+            if end == start:
+                break  # hundreds of lines in one statement: no scene; the rest keeps no places
+            statement = "\n".join(self.lines[start:end])
+            paths = list(_paths(tomllib.loads(statement)))
+            header = statement.lstrip().startswith("[")
+            for path in paths:
+                self._line.setdefault((() if header else prefix) + path, (start, end))
+            if header:
+                prefix = max(paths, key=len)
+            start = end
+
+    def _end(self, start: int) -> int:
+        """The line after the statement that begins at `start`; `start` where none is found."""
+        for end in range(start + 1, min(start + MAX_STATEMENT, len(self.lines)) + 1):
+            try:
+                tomllib.loads("\n".join(self.lines[start:end]))
+            except ValueError:
+                continue
+            return end
+        return start
+
+    def rename(self, given: tuple[str, ...], meant: tuple[str, ...]) -> None:
+        """Let `meant` and what is under it stand where the misspelt `given` stands."""
+        for path, place in list(self._line.items()):
+            if path[: len(given)] == given:
+                self._line.setdefault(meant + path[len(given) :], place)
+
+    def source(self, path: tuple[str, ...]) -> str:
+        """The statement in which a key stands."""
+        start, end = self._line.get(path, (0, 0))
+        return "\n".join(self.lines[start:end])
 
     def problem(
         self,
         path: tuple[str, ...],
         message: str,
         at: FormulaError | ast.expr | None = None,
-        text: str = "",
+        text: str | None = None,
         severity: str = "error",
     ) -> Problem:
-        """A problem at a key, with the fault of its formula `text` marked where it can be found."""
+        """A problem at a key; the fault `at` of its text is marked where it can be found."""
+        if path[-1:] == ("value",) and path not in self._line:
+            path = path[:-1]  # written short, m = 2.0
         key = ".".join(path)
         known = path
         while known and known not in self._line:
             known = known[:-1]
         if not known:
             return Problem(message, key, self.file, severity=severity)
-        start, end = self._line[known]
-        for number in range(start, end):
-            line = self.lines[number]
-            column, width = -1, 1
-            quoted = re.search(f"""(["']){re.escape(text)}\\1""", line) if text else None
-            if quoted is not None:
-                inside = quoted.start() + 1
-                if isinstance(at, FormulaError):
-                    column, width = inside + at.column, at.width
-                elif at is not None:
-                    column = inside + at.col_offset
-                    width = max((at.end_col_offset or 0) - at.col_offset, 1)
-                else:
-                    column, width = inside, max(len(text), 1)
-            elif text:
-                continue
-            elif len(path) > len(known) or len(path) > 1:
-                last = re.search(rf"(?<![\w.]){re.escape(path[-1])}(?!\w)", line)
-                if last is not None:
-                    column, width = last.start(), len(path[-1])
-            return Problem(
-                message, key, self.file, number + 1, column, width, line.rstrip(), severity
-            )
+        source = self.source(known)
+        offset, width = _spot(source, known[-1], at, text)
+        line = self._line[known][0] + source.count("\n", 0, max(offset, 0))
+        column = offset - source.rfind("\n", 0, offset) - 1 if offset >= 0 else -1
         return Problem(
-            message, key, self.file, start + 1, source=self.lines[start].rstrip(), severity=severity
+            message, key, self.file, line + 1, column, width, self.lines[line].rstrip(), severity
         )
 
 
-def _paths(tree: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _spot(
+    source: str, key: str, at: FormulaError | ast.expr | None, text: str | None
+) -> tuple[int, int]:
+    """Where in a statement the fault stands, and how wide it is; -1 where it can't be told."""
+    text = (text or "").strip()
+    column, width = 0, len(text) or 1
+    if isinstance(at, FormulaError):
+        column, width = at.column, at.width
+    elif at is not None:
+        column, width = at.col_offset, (at.end_col_offset or 0) - at.col_offset
+    for written in (str, _escaped) if text else ():
+        # blanks may be line breaks, one for one, so that columns stay
+        body = re.sub(r"\\\s", r"\\s", re.escape(written(text)))
+        quoted = re.search(rf"""(["'])\s*({body})\s*\1""", source)
+        if quoted is not None:
+            return quoted.start(2) + len(written(text[:column])), width
+    named = re.search(rf"(?<!\w){re.escape(key)}(?!\w)", source)
+    return (named.start(), len(key)) if named else (-1, 1)
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _paths(tree: Mapping[str, Any], depth: int = 3) -> Iterator[tuple[str, ...]]:
+    """The keys of a tree as deep as a scene goes: table, name, key."""
     for key, value in tree.items():
         yield (key,)
         if isinstance(value, list):
             value = next((v for v in value if isinstance(v, dict)), None)
-        if isinstance(value, dict):
-            for rest in _paths(value):
+        if isinstance(value, dict) and depth > 1:
+            for rest in _paths(value, depth - 1):
                 yield (key, *rest)
 
 
@@ -260,162 +322,190 @@ def read(file: str | os.PathLike[str]) -> Scene:
     except FileNotFoundError:
         near = suggest(path.name, (p.name for p in path.parent.glob("*.toml")))
         raise EomcError(f"{file}: there is no such file{near}") from None
-    except OSError as fault:
-        raise EomcError(f"{file}: can't be read ({fault.strerror})") from None
+    except (OSError, ValueError) as fault:
+        why = getattr(fault, "strerror", None) or fault
+        raise EomcError(f"{file}: can't be read ({why})") from None
     return parse(data, str(file))
 
 
 def parse(data: bytes | str, file: str = "scene.toml") -> Scene:
     """Check the text of a scene. Raises SceneError with every fault."""
     if isinstance(data, str):
-        data = data.encode()
+        data = data.encode(errors="surrogatepass")
     if len(data) > MAX_BYTES:
         raise EomcError(f"{file}: {len(data)} bytes are more than the {MAX_BYTES} a scene may have")
     try:
         text = data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as fault:
-        line = data[: fault.start].count(b"\n") + 1
-        raise SceneError(
-            [Problem("the file is not UTF-8 text: save it as UTF-8", file=file, line=line)]
-        ) from None
+        raise SceneError([_encoding_problem(data, fault.start, file)]) from None
     if not text.strip():
         raise SceneError(
             [Problem("the file is empty: 'eomc new NAME' writes a scene to start from", file=file)]
         )
     try:
         tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as fault:
+    except ValueError as fault:
         raise SceneError([_toml_problem(fault, text, file)]) from None
     except RecursionError:
         raise SceneError([Problem("the TOML is nested too deeply", file=file)]) from None
-    return _Check(tree, _Places(text, file), hashlib.sha256(data).hexdigest()).scene()
+    return _Check(tree, Places(text, file)).scene(hashlib.sha256(data).hexdigest())
 
 
-def _toml_problem(fault: tomllib.TOMLDecodeError, text: str, file: str) -> Problem:
+def _encoding_problem(data: bytes, at: int, file: str) -> Problem:
+    start = data.rfind(b"\n", 0, at) + 1
+    source = data[start:].split(b"\n")[0].decode("utf-8", "replace").rstrip()
+    column = len(data[start:at].decode())
+    line = data[:start].count(b"\n") + 1
+    return Problem(
+        "the file is not UTF-8 text: save it as UTF-8", "", file, line, column, source=source
+    )
+
+
+def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
+    """tomllib's message, its place, and what is mostly meant by it."""
+    if not isinstance(fault, tomllib.TOMLDecodeError):  # an int beyond Python's 4,300 digits
+        long = re.search(r"\d[\d_]{4000}", text)
+        line = text.count("\n", 0, long.start()) + 1 if long else 0
+        return Problem("a number has thousands of digits", "", file, line)
     lines = text.split("\n")
     found = re.search(r" \(at line (\d+), column (\d+)\)", str(fault))
     line, column = (int(found[1]), int(found[2]) - 1) if found else (len(lines), -1)
     message = re.sub(r" \(at .*\)", "", str(fault))
-    remedy = ""
-    if line <= len(lines):
-        if re.match(r"\s*[^\s\"'=]*[^\x00-\x7f]", lines[line - 1]):
-            remedy = ": bare keys are ASCII, write Greek letters out (theta)"
-        elif "Invalid value" in message:
-            remedy = ": formulas stand in quotes, numbers have digits on both sides of the point"
-        elif "overwrite" in message or "declare" in message:
-            remedy = ": each name and each [table] stands once"
-    return Problem(
-        f"not TOML: {message}{remedy}",
-        file=file,
-        line=line,
-        column=column,
-        source=lines[line - 1].rstrip() if line <= len(lines) else "",
-    )
+    source = lines[line - 1].rstrip()
+    key = re.match(r"\s*([^=\s]+)\s*=", source)
+    width = 1
+    if re.match(r"\s*[^\s\"'=#]*[^\x00-\x7f]", source):
+        remedy = ": bare keys are ASCII, write Greek letters out (theta)"
+    elif "overwrite" in message and key:
+        remedy = f": '{key[1]}' stands here a second time, remove one of the two"
+        column, width = key.start(1), len(key[1])
+    elif "Cannot declare" in message:
+        remedy = ": a [table] stands once, put its entries together"
+        column, width = 0, len(source)
+    else:
+        remedy = next((r for m, r in _TOML_REMEDIES.items() if m in message), "")
+    return Problem(f"not TOML: {message}{remedy}", "", file, line, column, width, source)
 
 
-_TABLES = "coordinates parameters constants inputs definitions energy forces run".split()
+_TOML_REMEDIES = {
+    "Invalid value": ": formulas stand in quotes, numbers have digits on both sides of the point",
+    "Expected newline": ": one entry a line, comments begin with '#', decimals are written 9.81",
+    "Illegal character '\\n'": ": is a closing quote missing in this line?",
+    "Unescaped '\\'": ": LaTeX is not read, write names without backslash (theta)",
+    "Unclosed inline table": ": entries in { ... } are separated by commas and stand on one line",
+}
 
-# the kinds of thing a formula can hang on
+# the kinds of thing a formula can hang on; what hangs on something faulty is in doubt
 _TIME, _INPUT, _POSITION, _VELOCITY = "the time", "inputs", "coordinates", "velocities"
+_DOUBT = "something faulty"
+
+_NOTHING: frozenset[str] = frozenset()
 
 
-@dataclass
 class _Check:
     """Everything that is checked in one scene, faults collected on the way."""
 
-    tree: dict[str, Any]
-    places: _Places
-    digest: str
-    problems: list[Problem] = field(default_factory=list)
-    missing: set[tuple[str, ...]] = field(default_factory=set)
+    def __init__(self, tree: dict[str, Any], places: Places) -> None:
+        self.places = places
+        self.problems: list[Problem] = []
+        self.used: set[str] = set()
+        self.mended: set[tuple[str, ...]] = set()
+        self.kinds: dict[str, frozenset[str]] = {}  # of every name that may be used so far
+        self.doc = self._layout(tree)
+        self.tables = self._names()
+        self.definitions: dict[str, Formula] = {}
 
-    def scene(self) -> Scene:
-        self.document = self._layout()
-        doc = self.document
-        # formulas of definitions and forces, by name, that are free of faults so far
-        self._names()
-        self.constants = self._quantities("constants", doc.constants)
-        self.parameters = self._quantities("parameters", doc.parameters)
-        self.kinds: dict[str, frozenset[str]] = {
-            **dict.fromkeys((*doc.constants, *doc.parameters), frozenset()),
+    def scene(self, digest: str) -> Scene:
+        """The checked scene. Raises SceneError with every fault."""
+        doc = self.doc
+        self.kinds |= {
+            **dict.fromkeys((*doc.constants, *doc.parameters), _NOTHING),
             **dict.fromkeys(doc.inputs, frozenset({_INPUT})),
             **dict.fromkeys(doc.coordinates, frozenset({_POSITION})),
             **{f"{c}_dot": frozenset({_VELOCITY}) for c in doc.coordinates},
             "t": frozenset({_TIME}),
         }
-        self.used: set[str] = set()
-        coordinates = self._coordinates()
-        definitions = self._definitions()
+        known: dict[str, float] = {}
+        constants = self._quantities("constants", known)
+        parameters = self._quantities("parameters", known)
+        coordinates = self._coordinates(known)
+        self._definitions()
         inputs = self._inputs()
-        zero = formulas.parse("0")
-        energies = {}
-        for key in ("kinetic", "potential", "dissipation"):
-            formula = self._formula(("energy", key), getattr(doc.energy, key))
-            if formula:
-                self._energy_kinds(key, formula)
-            energies[key] = formula or zero
-        forces = {
-            c: self._formula(("forces", c), value) or zero
-            for c, value in doc.forces.items()
-            if c in doc.coordinates or self._not_a_coordinate(c)
-        }
+        energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
+        forces = self._forces()
         self._unused()
-        name = doc.name
-        self._raise()
-        scene = Scene(
-            name=name,
-            title=doc.title or name.replace("_", " ").capitalize(),
+        if any(p.severity == "error" for p in self.problems):
+            raise SceneError(self.problems)
+        return Scene(
+            name=doc.name,
+            title=doc.title or doc.name.replace("_", " ").capitalize(),
             note=doc.note,
             file=self.places.file,
-            digest=self.digest,
+            digest=digest,
             coordinates=tuple(coordinates),
-            parameters=tuple(self.parameters),
-            constants=tuple(self.constants),
+            parameters=tuple(parameters),
+            constants=tuple(constants),
             inputs=tuple(inputs),
-            definitions=tuple(definitions.items()),
+            definitions=tuple(self.definitions.items()),
             **energies,
             forces=forces,
             run=Run(doc.run.h, doc.run.duration, doc.run.method),
+            places=self.places,
             warnings=tuple(self.problems),
         )
-        self._start(scene)
-        self._raise()
-        return scene
-
-    def _raise(self) -> None:
-        if any(p.severity == "error" for p in self.problems):
-            raise SceneError(self.problems)
 
     def say(
         self,
         path: tuple[str, ...],
         message: str,
         at: FormulaError | ast.expr | None = None,
-        text: str = "",
+        text: str | None = None,
         severity: str = "error",
     ) -> None:
+        """Note a problem; `at` is its place in the formula `text`."""
         self.problems.append(self.places.problem(path, message, at, text, severity))
 
-    # layout
+    # layout and names
 
-    def _layout(self) -> _Document:
-        """The document; faulty entries are told, taken out, and the rest is checked on."""
+    def _layout(self, tree: dict[str, Any]) -> _Document:
+        """The document; faulty entries are told, taken out or mended, and the rest checked on."""
         for _ in range(100):
             try:
-                return _Document.model_validate(self.tree)
+                return _Document.model_validate(tree)
             except pydantic.ValidationError as fault:
-                told = set()
-                for error in fault.errors():
-                    path = _clean(error["loc"])
-                    if path not in told:
-                        told.add(path)
-                        self.missing |= {path, (*path, "kinetic")}
-                        self.say(path, _say_layout(error, path, self.tree))
-                        _mend(self.tree, path, error["type"])
+                errors = fault.errors()
+            # misspelt keys first: what is missing may only be misspelt
+            errors.sort(key=lambda error: error["type"] != "extra_forbidden")
+            told: set[tuple[str, ...]] = set()
+            for error in errors:
+                path = _path(error)
+                if path in told or (error["type"] == "missing" and _has(tree, path)):
+                    continue
+                told.add(path)
+                self.say(path, _say_layout(error, path))
+                if error["type"] == "extra_forbidden":
+                    self._misspelt(tree, path)
+                else:
+                    self.mended.add(path)
+                    _mend(tree, path)
+            if ("coordinates",) in self.mended:
+                break  # everything else hangs on them
         raise SceneError(self.problems)
 
-    def _names(self) -> None:
-        doc = self.document
+    def _misspelt(self, tree: dict[str, Any], path: tuple[str, ...]) -> None:
+        """Take an unknown key for the one that was meant, or out."""
+        table = _at(tree, path[:-1])
+        value = table.pop(path[-1])
+        meant = _meant(path)
+        if meant and meant not in table:
+            table[meant] = value
+            self.places.rename(path, (*path[:-1], meant))
+        elif isinstance(value, dict):
+            self.kinds |= dict.fromkeys(value, frozenset({_DOUBT}))
+
+    def _names(self) -> dict[str, str]:
+        """Every declared name and its table."""
+        doc = self.doc
         if why := names.module_fault(doc.name):
             self.say(("name",), why, text=doc.name)
         seen: dict[str, str] = {}
@@ -424,19 +514,36 @@ class _Check:
                 if why := names.fault(name):
                     self.say((table, name), why)
                 elif name in seen:
-                    self.say((table, name), f"'{name}' stands in [{seen[name]}] already")
+                    self.say(
+                        (table, name),
+                        f"'{name}' stands in [{seen[name]}] already: rename one of the two",
+                    )
                 seen.setdefault(name, table)
         for name in doc.coordinates:
-            if f"{name}_dot" in seen:
+            velocity = f"{name}_dot"
+            if velocity in seen:
                 self.say(
-                    (seen[f"{name}_dot"], f"{name}_dot"),
-                    f"'{name}_dot' is the velocity of coordinate '{name}': choose another name",
+                    (seen[velocity], velocity),
+                    f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
                 )
+        upper: dict[str, str] = {}
+        for name in doc.coordinates:
+            if (other := upper.setdefault(name.upper(), name)) != name:
+                self.say(
+                    ("coordinates", name),
+                    f"'{other}' and '{name}' differ only in case, and C's name for their places "
+                    f"in q is {doc.name.upper()}_{name.upper()}: rename one of the two",
+                )
+        return seen
 
     # formulas
 
     def _parse(self, path: tuple[str, ...], value: float | str) -> Formula | None:
         text = value if isinstance(value, str) else repr(value)
+        if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
+            # "\theta" is a tab and 'heta', "\nu" a line break and 'u'
+            self.say(path, "LaTeX is not read: write names without backslash (theta)")
+            return None
         try:
             return formulas.parse(text)
         except FormulaError as fault:
@@ -444,150 +551,155 @@ class _Check:
             return None
 
     def _formula(
-        self, path: tuple[str, ...], value: float | str, kinds: Mapping[str, frozenset[str]] | None = None
+        self,
+        path: tuple[str, ...],
+        value: float | str,
+        allowed: Collection[str] | None = None,
+        rule: str = "",
     ) -> Formula | None:
-        """Parse a formula and check its names; None where it has a fault, which is told."""
+        """Parse a formula and check its names; None where it has a fault, which is told.
+
+        `rule` says in words which names are `allowed`, where not all are.
+        """
         formula = self._parse(path, value)
-        if formula is None:
-            return None
-        known = self.kinds if kinds is None else kinds
-        good = True
+        return formula if formula and self._checked(path, formula, allowed, rule) else None
+
+    def _checked(
+        self,
+        path: tuple[str, ...],
+        formula: Formula,
+        allowed: Collection[str] | None = None,
+        rule: str = "",
+    ) -> bool:
+        before = len(self.problems)
         for node in formula.names():
             self.used.add(node.id)
-            if node.id not in known:
-                good = False
-                self.say(path, self._unknown(node.id, known), node, str(value))
-        if good:
-            good = self._dots(path, formula, str(value))
-        return formula if good else None
+            if node.id not in (self.kinds if allowed is None else allowed):
+                self.say(path, self._refused(node.id, rule), node, formula.text)
+        if len(self.problems) == before:
+            for call in formula.calls("dot"):
+                if why := rule or self._no_rate(call.args[0]):
+                    self.say(path, f"dot(...) can't be used here: {why}", call, formula.text)
+        return len(self.problems) == before
 
-    def _unknown(self, name: str, known: Iterable[str]) -> str:
-        if name in self.kinds:
-            return f"'{name}' can't be used here: only {', '.join(known) or 'numbers and pi'}"
-        if near := suggest(name, known):
-            return f"'{name}' is not declared{near}"
+    def _refused(self, name: str, rule: str) -> str:
+        """Why `name` can't be used."""
+        if rule and (name in self.tables or name in self.kinds):
+            return f"'{name}' can't be used here: {rule}"
+        if name in self.tables:
+            return f"'{name}' is defined further down: move its line above this one"
+        start = f"'{name}' is not declared"
         if name.endswith(("_ddot", "_dot_dot")):
-            return f"'{name}' is not declared: accelerations can't stand in a formula, they are what is solved for"
-        if name.endswith("_dot") and name[:-4] in self.kinds:
-            return (
-                f"'{name}' is not declared: only coordinates have velocities, "
-                f"write dot({name[:-4]}) for the derivative of a definition"
-            )
+            return f"{start}: accelerations are what is solved for, no formula can use them"
+        owner = name.removesuffix("_dot")
+        match self.tables.get(owner) if owner != name else None:
+            case "definitions":
+                return f"{start}: write dot({owner}) for the rate of a definition"
+            case "inputs":
+                return f"{start}: nobody knows the rate of an input; add it as a further input"
+            case "parameters" | "constants" as table:
+                return f"{start}: '{owner}' stands in [{table}], so it doesn't move"
+        if near := suggest(name, self.kinds):
+            return start + near
         if name in ("e", "E"):
-            return f"'{name}' is not declared: write exp(1), or declare it in [constants]"
-        return f"'{name}' is not declared: add it to [parameters], [constants], [inputs] or [definitions]"
+            return f"{start}: write exp(1), or declare it in [constants]"
+        return f"{start}: add it to [parameters], [constants], [inputs] or [definitions]"
 
-    def kinds_of(self, formula: Formula) -> frozenset[str]:
-        """What the value of the formula hangs on; dot(e) brings velocities where e moves."""
-        found: set[str] = set()
-        for node in formula.names():
-            found |= self.kinds.get(node.id, frozenset())
-        for call in formula.calls("dot"):
-            if _POSITION in self.kinds_of(formula.part(call.args[0])):
-                found.add(_VELOCITY)
-        return frozenset(found)
+    def _no_rate(self, inside: ast.expr) -> str:
+        """Why dot(inside) can't be had, or the empty string."""
+        kinds = self.kinds_of(inside)
+        if _INPUT in kinds:
+            return "it holds inputs, whose rate nobody knows; add the rate as a further input"
+        if _VELOCITY in kinds:
+            return "it holds velocities, and their rates are what is solved for"
+        return ""
 
-    def _dots(self, path: tuple[str, ...], formula: Formula, text: str) -> bool:
-        good = True
-        for call in formula.calls("dot"):
-            inside = formula.part(call.args[0])
-            kinds = set(self.kinds_of(inside))
-            if inside.tree is not formula.tree and any(True for _ in inside.calls("dot")):
-                kinds.add(_VELOCITY)
-            why = ""
-            if _VELOCITY in kinds:
-                why = "velocities, so its rate would hold accelerations, which are what is solved for"
-            elif _INPUT in kinds:
-                why = "inputs, whose rate nobody knows"
-            if why:
-                good = False
-                self.say(path, f"dot(...) of something that depends on {why}", call, text)
-        return good
+    def kinds_of(self, node: ast.AST) -> frozenset[str]:
+        """What the value hangs on; dot(e) brings velocities where e moves."""
+        if isinstance(node, ast.Name):
+            return self.kinds.get(node.id, _NOTHING)
+        kinds = _NOTHING.union(*map(self.kinds_of, ast.iter_child_nodes(node)))
+        dot = (
+            isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "dot"
+        )
+        return kinds | {_VELOCITY} if dot and _POSITION in kinds else kinds
 
-    def _quantities(self, table: str, entries: Mapping[str, _Quantity]) -> list[Quantity]:
-        """Constants may use earlier constants; parameters any constant."""
-        known: dict[str, float] = {}
-        if table == "parameters":
-            known = {c.name: c.value for c in self.constants}
+    def _where(self, formula: Formula, kind: str) -> ast.expr:
+        """The first part of the formula that brings in `kind`."""
+        parts: list[ast.expr] = [*formula.calls("dot"), *formula.names()]
+        found = [part for part in parts if kind in self.kinds_of(part)]
+        return min(found, key=lambda part: part.col_offset, default=formula.tree)
+
+    # tables
+
+    def _quantities(self, table: str, known: dict[str, float]) -> list[Quantity]:
+        """Constants may use constants above them; parameters any constant. Adds to `known`."""
+        allowed, rule = {
+            "constants": (known, "a constant is made of numbers and of constants above it"),
+            "parameters": (
+                list(known),
+                "a parameter's value is made of numbers and constants; "
+                "what hangs on other parameters is a definition",
+            ),
+        }[table]
         out = []
-        self.kinds, self.used = dict.fromkeys(known, frozenset()), getattr(self, "used", set())
-        for name, entry in entries.items():
-            path = (table, name) if (table, name, "value") not in self.places._line else (table, name, "value")
-            formula = self._formula(path, entry.value, dict.fromkeys(known, frozenset()))
-            if formula is None:
-                known.setdefault(name, 1.0)
-                continue
-            value = self._value(path, formula, known, entry.value)
-            if table == "constants":
-                known[name] = value
-            out.append(Quantity(name, entry.unit, value, entry.note, formula))
+        for name, entry in getattr(self.doc, table).items():
+            path = (table, name, "value")
+            formula = self._formula(path, entry.value, allowed, rule)
+            known[name] = self._number(path, formula, known)
+            if formula:
+                out.append(Quantity(name, entry.unit, known[name], entry.note, formula))
         return out
 
-    def _value(
-        self, path: tuple[str, ...], formula: Formula, known: Mapping[str, float], text: float | str
+    def _number(
+        self, path: tuple[str, ...], formula: Formula | None, known: Mapping[str, float]
     ) -> float:
-        try:
-            value = formulas.evaluate(formula, formulas.NUMERIC, known.__getitem__)
-            if isinstance(value, (int, float)) and math.isfinite(value):
-                return float(value)
-            fault = "is not a real, finite number"
-        except ZeroDivisionError:
-            fault = "divides by zero"
-        except (ArithmeticError, ValueError, TypeError, KeyError) as error:
-            fault = f"can't be evaluated ({error})"
-        self.say(path, f"the value of '{formula.text}' {fault}", text=str(text))
-        return 1.0
+        """The formula's value; nan where it has none, which is told."""
+        if formula is None or any(math.isnan(known[n.id]) for n in formula.names()):
+            return math.nan  # told already
+        value, fault = _value(formula, known)
+        if fault:
+            self.say(path, fault, text=formula.text)
+        return value
 
-    def _coordinates(self) -> list[Coordinate]:
-        plain = {q.name: frozenset[str]() for q in (*self.constants, *self.parameters)}
+    def _coordinates(self, known: Mapping[str, float]) -> list[Coordinate]:
+        def formula(path: tuple[str, ...], value: float | str) -> Formula | None:
+            rule = f"a {path[-1]} is made of numbers, constants and parameters"
+            found = self._formula(path, value, known, rule)
+            self._number(path, found, known)
+            return found
+
         out = []
-        for name, entry in self.document.coordinates.items():
-            start = self._formula(("coordinates", name, "start"), entry.start, plain)
-            rate = self._formula(("coordinates", name, "rate"), entry.rate, plain)
+        for name, entry in self.doc.coordinates.items():
+            start = formula(("coordinates", name, "start"), entry.start)
+            rate = formula(("coordinates", name, "rate"), entry.rate)
             if start and rate:
                 out.append(Coordinate(name, entry.unit, start, rate, entry.note))
         return out
 
-    def _start(self, scene: Scene) -> None:
-        values = {q.name: q.value for q in (*scene.constants, *scene.parameters)}
-        for c in scene.coordinates:
-            self._value(("coordinates", c.name, "start"), c.start, values, c.start.text)
-            self._value(("coordinates", c.name, "rate"), c.rate, values, c.rate.text)
-
-    def _definitions(self) -> dict[str, Formula]:
-        entries = self.document.definitions
-        for name in self._circular(entries):
-            self.kinds.setdefault(name, frozenset())
-        out: dict[str, Formula] = {}
-        later = list(entries)
-        for name, value in entries.items():
-            later.remove(name)
+    def _definitions(self) -> None:
+        parsed = {n: self._parse(("definitions", n), v) for n, v in self.doc.definitions.items()}
+        sound = {name: formula for name, formula in parsed.items() if formula}
+        circular = self._circular(sound)
+        self.kinds |= dict.fromkeys(circular, frozenset({_DOUBT}))
+        for name in parsed:
+            formula = sound.get(name)
             path = ("definitions", name)
-            if name in self.kinds:  # circular, told already
-                continue
-            forward = [n for n in self._used_names(value) if n in later and n not in self.kinds]
-            for used in forward:
-                self.say(
-                    path,
-                    f"'{used}' is defined further down: move its line above this one",
-                    text=str(value),
-                )
-                self.used.add(used)
-            formula = None if forward else self._formula(path, value)
-            self.kinds[name] = self.kinds_of(formula) if formula else frozenset()
-            if formula:
-                out[name] = formula
-        return out
+            if formula is None or name in circular or path in self.mended:
+                self.kinds[name] = frozenset({_DOUBT})
+            elif self._checked(path, formula):
+                self.definitions[name] = formula
+                self.kinds[name] = self.kinds_of(formula.tree)
+            else:
+                self.kinds[name] = frozenset({_DOUBT})
 
-    def _used_names(self, value: float | str) -> list[str]:
-        try:
-            return [n.id for n in formulas.parse(str(value)).names()]
-        except FormulaError:
-            return []
-
-    def _circular(self, entries: Mapping[str, float | str]) -> list[str]:
-        graph = {n: [u for u in self._used_names(v) if u in entries] for n, v in entries.items()}
-        lost: list[str] = []
+    def _circular(self, definitions: Mapping[str, Formula]) -> set[str]:
+        """The names that hang on themselves, each ring told once."""
+        graph = {
+            name: [n.id for n in formula.names() if n.id in definitions]
+            for name, formula in definitions.items()
+        }
+        lost: set[str] = set()
         while True:
             try:
                 TopologicalSorter(graph).prepare()
@@ -597,172 +709,229 @@ class _Check:
                 self.say(
                     ("definitions", ring[0]),
                     f"circular definition: {' -> '.join(ring)}; one of them must stand on its own",
-                    text=str(entries[ring[0]]),
+                    next(n for n in definitions[ring[0]].names() if n.id == ring[1]),
+                    definitions[ring[0]].text,
                 )
-                self.used.update(ring)
-                lost += ring
-                for name in ring:
-                    graph[name] = []
+                lost.update(ring)
+                graph |= {name: [] for name in ring}
 
     def _inputs(self) -> list[Input]:
-        known = {n: k for n, k in self.kinds.items() if _INPUT not in k}
+        allowed = [name for name, kinds in self.kinds.items() if _INPUT not in kinds]
+        rule = "a signal can't hang on inputs"
         out = []
-        for name, entry in self.document.inputs.items():
-            signal = self._formula(("inputs", name, "signal"), entry.signal, known)
+        for name, entry in self.doc.inputs.items():
+            signal = self._formula(("inputs", name, "signal"), entry.signal, allowed, rule)
             if signal:
                 out.append(Input(name, entry.unit, signal, entry.note))
         return out
 
-    def _energy_kinds(self, key: str, formula: Formula) -> None:
-        path, text = ("energy", key), str(getattr(self.document.energy, key))
-        kinds = self.kinds_of(formula)
+    def _energy(self, key: str) -> Formula:
+        path = ("energy", key)
+        formula = self._formula(path, getattr(self.doc.energy, key))
+        if formula is None:
+            return formulas.parse("0")
+        kinds = self.kinds_of(formula.tree)
+        sure = _DOUBT not in kinds and not {path, ("energy",)} & self.mended
+        fault = partial(self.say, path, text=formula.text)
         if _INPUT in kinds:
-            self.say(
-                path, "an energy can't depend on inputs: let them act through [forces]", text=text
+            fault(
+                "an energy can't depend on inputs: let them act through [forces]",
+                self._where(formula, _INPUT),
             )
         if key == "potential" and _VELOCITY in kinds:
-            self.say(
-                path,
+            fault(
                 "the potential energy can't depend on velocities: parts linear in them "
-                "(magnetic, gyroscopic) belong in 'kinetic', friction in 'dissipation'",
-                text=text,
+                "(magnetic, gyroscopic) belong in 'kinetic' with the sign changed, "
+                "friction in 'dissipation'",
+                self._where(formula, _VELOCITY),
             )
-        if key == "kinetic" and _VELOCITY not in kinds and path not in self.missing:
-            self.say(
-                path,
+        if key == "kinetic" and _VELOCITY not in kinds and sure:
+            velocities = " or ".join(f"{c}_dot" for c in self.doc.coordinates)
+            fault(
                 "the kinetic energy has no velocities, so nothing has inertia: "
-                f"use {', '.join(f'{c}_dot' for c in self.document.coordinates)} or dot(...)",
-                text=text,
+                f"use {velocities}, or dot(...) of a definition",
             )
-        self._smooth(path, formula, text)
+        if key == "dissipation" and _VELOCITY not in kinds and sure and any(formula.names()):
+            fault(
+                "the dissipation has no velocities, so it gives no force -dR/dq_dot: "
+                "viscous friction is b*x_dot**2/2",
+            )
+        self._smooth(path, formula)
+        return formula
 
-    def _smooth(self, path: tuple[str, ...], formula: Formula, text: str) -> None:
+    def _smooth(self, path: tuple[str, ...], formula: Formula) -> None:
         """Energies are differentiated, so nothing in them may jump."""
-        defined = {n: str(v) for n, v in self.document.definitions.items()}
-        queue: list[tuple[tuple[str, ...], Formula, str]] = [(path, formula, text)]
+        queue = [(path, formula)]
         seen: set[str] = set()
         while queue:
-            where, f, shown = queue.pop()
+            where, f = queue.pop()
             for call in f.calls("sign", "heaviside"):
-                if {_POSITION, _VELOCITY} & self.kinds_of(f.part(call)):
-                    function = call.func.id if isinstance(call.func, ast.Name) else ""
+                if {_POSITION, _VELOCITY} & self.kinds_of(call):
+                    function = ast.unparse(call.func)
                     self.say(
                         where,
-                        f"{function}(...) jumps, so energy.{path[-1]} that uses it has no derivative: "
-                        "use abs, min or max (max(x, 0)**2 for a stop), a smooth tanh(x/width), "
-                        "or give the force itself in [forces]",
+                        f"{function}(...) jumps, and {'.'.join(path)} that uses it is "
+                        "differentiated: use abs, min or max (max(x, 0)**2 for a stop), a smooth "
+                        "tanh(x/width), or give the force itself in [forces]",
                         call,
-                        shown,
+                        f.text,
                     )
             for node in f.names():
-                if node.id in defined and node.id not in seen:
+                if node.id in self.definitions and node.id not in seen:
                     seen.add(node.id)
-                    inner = self._quiet(defined[node.id])
-                    if inner is not None:
-                        queue.append((("definitions", node.id), inner, defined[node.id]))
+                    queue.append((("definitions", node.id), self.definitions[node.id]))
 
-    def _quiet(self, text: str) -> Formula | None:
-        try:
-            return formulas.parse(text)
-        except FormulaError:
-            return None
-
-    def _not_a_coordinate(self, name: str) -> bool:
-        known = list(self.document.coordinates)
-        self.say(
-            ("forces", name),
-            f"'{name}' is not a coordinate"
-            + (suggest(name, known) or f": a force acts along {' or '.join(known)}"),
-        )
-        return False
+    def _forces(self) -> dict[str, Formula]:
+        out = {}
+        known = list(self.doc.coordinates)
+        for name, value in self.doc.forces.items():
+            formula = self._formula(("forces", name), value)
+            if name not in known:
+                remedy = suggest(name, known) or f": a force acts along {' or '.join(known)}"
+                self.say(("forces", name), f"'{name}' is not a coordinate{remedy}")
+            elif formula:
+                out[name] = formula
+        return out
 
     def _unused(self) -> None:
-        doc = self.document
         if any(p.severity == "error" for p in self.problems):
             return  # a name may be unused only because its formula was refused
-        for table in ("parameters", "constants", "inputs", "definitions"):
-            for name in getattr(doc, table):
-                if name not in self.used:
-                    self.say(
-                        (table, name),
-                        f"'{name}' is not used by any formula: remove it, or use it",
-                        severity="warning",
-                    )
+        for name, table in self.tables.items():
+            if table != "coordinates" and name not in self.used:
+                self.say(
+                    (table, name),
+                    f"'{name}' is not used by any formula: remove it, or use it",
+                    severity="warning",
+                )
 
 
-def _clean(location: tuple[Any, ...]) -> tuple[str, ...]:
-    """pydantic's place without the branches of a union."""
-    inner = {"float", "str", "constrained-str", "int"}
-    return tuple(str(p) for p in location if str(p) not in inner and "[" not in str(p))
+# --- the layout's faults in words -----------------------------------------------------------------
 
 
-def _say_layout(error: Mapping[str, Any], path: tuple[str, ...], tree: Mapping[str, Any]) -> str:
-    kind, given = str(error["type"]), error.get("input")
-    last = path[-1] if path else ""
-    if path == ("eomc",):
-        if kind == "missing":
-            return "the scene does not say its format: begin it with 'eomc = 1'"
-        return f"format {given!r} is not known to this version, which reads format 1"
+_MODELS: Mapping[str, type[_Table]] = {
+    "coordinates": _Coordinate,
+    "parameters": _Quantity,
+    "constants": _Quantity,
+    "inputs": _Input,
+    "energy": _Energy,
+    "run": _Run,
+}
+
+# what people write instead of our keys
+_ALIASES = {
+    "dt": "h", "step": "h", "time": "duration", "tend": "duration", "t_end": "duration",
+    "initial": "start", "init": "start", "velocity": "rate", "units": "unit", "val": "value",
+    "variables": "coordinates", "params": "parameters", "T": "kinetic", "K": "kinetic",
+    "V": "potential", "U": "potential", "P": "potential", "R": "dissipation",
+}  # fmt: skip
+
+
+def _at(tree: Any, path: tuple[str, ...]) -> dict[str, Any]:
+    """The table at `path`; an empty one where there is none."""
+    for part in path:
+        tree = tree.get(part) if isinstance(tree, dict) else None
+    return tree if isinstance(tree, dict) else {}
+
+
+def _has(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
+    return path[-1] in _at(tree, path[:-1])
+
+
+def _path(error: Mapping[str, Any]) -> tuple[str, ...]:
+    """pydantic's place without the branch of a union."""
+    path = tuple(map(str, error["loc"]))
+    branch = path[-1] in ("float", "str") and error["type"] in _OF_BRANCHES
+    return path[:-1] if branch else path
+
+
+_OF_BRANCHES = ("float_type", "string_type", "finite_number")
+
+
+def _keys(path: tuple[str, ...]) -> list[str]:
+    """The keys that may stand beside the last of `path`."""
+    model = _MODELS[path[0]] if len(path) > 1 else _Document
+    return list(model.model_fields)
+
+
+def _meant(path: tuple[str, ...]) -> str:
+    """The key that the last of `path` may have been meant for, or the empty string."""
+    known, alias = _keys(path), _ALIASES.get(path[-1], "")
+    return alias if alias in known else nearest(path[-1], known)
+
+
+def _toml(value: object) -> str:
+    """A value as TOML writes it, shortened."""
+    if isinstance(value, bool):
+        text = str(value).lower()
+    elif isinstance(value, dict):
+        text = "a table"
+    else:
+        text = repr(value) if isinstance(value, (str, list, float, int)) else str(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _say_layout(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
+    kind, given, last = str(error["type"]), error.get("input"), path[-1]
+    here = _toml(given)
     if kind == "missing":
-        wanted = {
-            ("name",): "name = \"...\": it names the module and begins every C symbol",
-            ("coordinates",): "[coordinates], such as x = { unit = \"m\", start = 0.0 }",
-            ("energy",): "[energy] with kinetic = \"...\" and potential = \"...\"",
-            ("energy", "kinetic"): "kinetic = \"...\" in [energy]",
-        }.get(path, f"'{last}'" + (f" in [{'.'.join(path[:-1])}]" if path[:-1] else ""))
-        return f"missing: add {wanted}"
+        return "missing: " + _MISSING.get(path, f"add {last} = ...")
     if kind == "extra_forbidden":
-        models: dict[tuple[str, ...], list[str]] = {
-            (): list(_Document.model_fields),
-            ("energy",): list(_Energy.model_fields),
-            ("run",): list(_Run.model_fields),
-        }
-        tables = {
-            "coordinates": _Coordinate,
-            "parameters": _Quantity,
-            "constants": _Quantity,
-            "inputs": _Input,
-        }
-        table = tables.get(path[0])
-        known = models.get(path[:-1]) or (list(table.model_fields) if table else [])
-        near = suggest(last, known)
-        return f"unknown key '{last}'{near}" + ("" if near else f": known are {', '.join(known)}")
+        near = _meant(path)
+        remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(_keys(path))}"
+        return f"unknown {'table' if isinstance(given, dict) else 'key'} '{last}'{remedy}"
+    if path == ("eomc",):
+        return f"format {here} is not known to this version, which reads eomc = 1"
     if kind == "too_short":
-        return "no coordinates: declare at least one, such as x = { unit = \"m\", start = 0.0 }"
-    if kind == "literal_error" and path == ("run", "method"):
-        return f"unknown method {given!r}: known are {', '.join(METHODS)}"
+        return 'none is declared: add at least one, such as x = { unit = "m", start = 0.0 }'
+    if path == ("run", "method"):
+        return f"unknown method {here}: known are {', '.join(METHODS)}"
     if kind == "greater_than":
-        return f"must be greater than zero, here {given!r}"
+        return f"must be greater than zero, here {here}"
     if kind == "finite_number":
-        return f"must be a finite number, here {given!r}"
+        return f"must be a finite number, here {here}"
     if kind in ("dict_type", "model_type", "model_attributes_type"):
-        if path in {(t,) for t in _TABLES}:
+        if len(path) == 1:
             return f"'{last}' is a table: write [{last}] and its entries below"
-        return f"'{last}' is a table: write {last} = {{ unit = \"m\", ... }}, here {given!r}"
+        key = {"coordinates": "start", "inputs": "signal"}.get(path[0], "value")
+        value = here if isinstance(given, (int, float, str)) else "..."
+        return f"'{last}' is a table: write {last} = {{ {key} = {value} }}"
     if path[0] == "run":
-        return f"must be a number, here {given!r}"
-    if kind.startswith("string") and len(path) and last in ("unit", "note", "name", "title"):
-        return f"must be text in quotes, here {given!r}"
-    return f"must be a number or a formula in quotes, here {given!r}"
+        return f"must be a number, here {here}"
+    if last in ("unit", "note", "name", "title"):
+        return f"must be text in quotes, here {here}"
+    return f"must be a number or a formula in quotes, here {here}"
 
 
-def _mend(tree: dict[str, Any], path: tuple[str, ...], kind: str) -> None:
-    """Take a faulty entry out, or put a harmless one in, so that the rest can be checked."""
-    harmless: dict[tuple[str, ...], Any] = {
-        ("eomc",): 1,
-        ("name",): "scene",
-        ("coordinates",): {"x": {}},
-        ("energy",): {"kinetic": "0"},
-        ("energy", "kinetic"): "0",
-    }
-    node: Any = tree
-    for part in path[:-1]:
-        node = node[part] if isinstance(node, dict) and isinstance(node.get(part), dict) else {}
-    if path in harmless:
-        node[path[-1]] = harmless[path]
-    elif kind == "missing":
-        node[path[-1]] = 1.0
-    elif path and path[-1] in node:
-        del node[path[-1]]
-    elif len(path) > 1:
-        _mend(tree, path[:-1], kind)
+_MISSING: Mapping[tuple[str, ...], str] = {
+    ("eomc",): "begin the scene with eomc = 1, its format",
+    ("name",): 'add name = "...", which names the module and begins every C symbol',
+    ("coordinates",): 'add [coordinates] with entries such as x = { unit = "m", start = 0.0 }',
+    ("energy",): 'add [energy] with kinetic = "..." and potential = "..."',
+    ("energy", "kinetic"): 'add kinetic = "..."',
+}
+
+
+def _mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
+    """Put something harmless in a faulty entry's place, so that the rest can be checked."""
+    table, last = _at(tree, path[:-1]), path[-1]
+    given = table.get(last)
+    if isinstance(given, list) and given and all(isinstance(g, dict) for g in given):
+        table[last] = {key: value for g in given for key, value in g.items()}  # [[parameters]]
+    elif path in _HARMLESS:
+        table[last] = _HARMLESS[path]
+    elif len(path) == 2 and path[0] in ("definitions", "forces"):
+        table[last] = "0"
+    elif len(path) == 2 and path[0] in ("coordinates", "inputs"):
+        table[last] = {}
+    elif last == "value":
+        _at(tree, path[:1])[path[1]] = 1.0
+    else:
+        table.pop(last, None)
+
+
+_HARMLESS: Mapping[tuple[str, ...], Any] = {
+    ("eomc",): 1,
+    ("name",): "scene",
+    ("energy",): {"kinetic": "0"},
+    ("energy", "kinetic"): "0",
+}

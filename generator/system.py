@@ -204,7 +204,7 @@ def from_scene(scene: Scene) -> System:
             if found.has(sympy.I):
                 raise FormulaError("has no real value")
         except (FormulaError, ArithmeticError, ValueError, TypeError) as fault:
-            problems.append(Problem(f"'{formula.text}' {fault}", key, scene.file))
+            problems.append(scene.problem(key, f"'{formula.text}' {fault}", formula))
             return sympy.S.Zero
         return found
 

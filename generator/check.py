@@ -1,0 +1,571 @@
+"""A compiled module held against the reference, and against what mechanics says of any scene.
+
+Two kinds of row. A value of the module is compared with the independent `reference`, in units of
+rounding. A property (symmetry, order of convergence, power balance) is tested on the module
+alone, whatever the reference says.
+
+A unit of rounding is eps times the size of what was added up on the way. That size is not
+the result, which may cancel to nothing: it is |f| + sum_i |x_i df/dx_i|, what one rounding of
+each of the inputs x does to f, and beside it the size that the laws of motion give to the sums
+that f is made of: sqrt(D_ii D_jj) for D_ij, D qd times a rate for forces, K and P for energies.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sympy
+
+from eomc.reference import Reference, Vector, derive
+from eomc.system import System
+
+EPS = 2.0**-52
+
+# Correct builds differ by some units, by some tens in long expressions. A wrong sign makes 1e15,
+# and 1e5 where the term is a ten thousand millionth of the whole.
+LIMIT = 1e4
+SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
+ORDER_LIMIT = 3.6  # the next lower order is 3
+CLOSING_LIMIT = 3.0  # a wrong power does not close at all: order 0
+CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
+
+NUDGE = 1e-6  # relative change of an input from which its influence is estimated
+RUN_STEPS = 100
+GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
+STRETCHES = (1.0, 4.0, 0.25, 16.0, 1 / 16)  # of the scene's h, where its errors can't be measured
+
+VALUES = {
+    "D": "D",
+    "C": "C",
+    "g": "g",
+    "bias": "bias",
+    "tau": "tau",
+    "kinetic_energy": "kinetic",
+    "potential_energy": "potential",
+    "energy": "energy",
+    "jacobi": "jacobi",
+    "power": "power",
+}  # the module's name for what the reference calls ...
+
+
+@dataclass(frozen=True)
+class Row:
+    """One thing that was tested: how far it was off, in what unit, and how far it may be."""
+
+    name: str
+    error: float
+    limit: float
+    passed: bool
+    unit: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """The outcome of `check`. `states` were used, `rejected` ones had no regular D."""
+
+    scene: str
+    rows: tuple[Row, ...]
+    states: int
+    rejected: int
+
+    @property
+    def passed(self) -> bool:
+        """Whether every row has passed."""
+        return all(row.passed for row in self.rows)
+
+    def table(self) -> str:
+        """The rows as text, for a terminal."""
+        from rich.box import SIMPLE_HEAD
+        from rich.console import Console
+        from rich.table import Table
+
+        used = f"{self.states} random states" + f", {self.rejected} rejected" * bool(self.rejected)
+        table = Table(box=SIMPLE_HEAD, title=f"{self.scene}: {used}", title_justify="left")
+        for heading, justify in (("", "left"), ("", "left"), ("found", "right"), ("limit", "right")):
+            table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+        table.add_column("in")
+        for row in self.rows:
+            mark = "ok" if row.passed else "FAILED"
+            table.add_row(mark, row.name, f"{row.error:.3g}", f"{row.limit:g}", row.unit)
+        text = io.StringIO()
+        Console(file=text, width=100).print(table)
+        return "\n".join(line.rstrip() for line in text.getvalue().splitlines()).strip("\n")
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON; numbers that are not finite are None."""
+        rows = [asdict(row) for row in self.rows]
+        for row in rows:
+            row["error"] = row["error"] if math.isfinite(row["error"]) else None
+        return {
+            "scene": self.scene,
+            "passed": self.passed,
+            "states": self.states,
+            "rejected": self.rejected,
+            "rows": rows,
+        }
+
+
+def check(system: System, module: Any, *, seed: int = 0, states: int = 16) -> Report:
+    """Test the compiled `module` of `system` at random states and parameters.
+
+    Always the same states for the same seed. A module that raises fails the row, which
+    shows its words. Raises EomcError where `reference.derive` does.
+    """
+    return _Check(system, module, np.random.default_rng(seed), states).report()
+
+
+# --- states ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class State:
+    """Where to evaluate: q, qd (nq,), t in s, u (nu,) or None for the signals, params or None."""
+
+    q: Vector
+    qd: Vector
+    t: float = 0.0
+    u: Vector | None = None
+    params: Mapping[str, float] | None = None
+
+
+def _ask(module: Any, name: str, s: State) -> Vector:
+    """The module's value of that name."""
+    place = (s.q,) if name in ("D", "g", "potential_energy") else (s.q, s.qd)
+    inputs = {"u": s.u} if name in ("tau", "power", "acceleration") else {}
+    return np.asarray(getattr(module, name)(*place, t=s.t, params=s.params, **inputs), float)
+
+
+def _nudged(s: State, defaults: Mapping[str, float]) -> Iterator[State]:
+    """The state with one input after the other changed by a small part of itself."""
+    for field in ("q", "qd", "u"):
+        values = getattr(s, field)
+        for i in np.flatnonzero(values) if values is not None else ():
+            changed = values.copy()
+            changed[i] *= 1 + NUDGE
+            yield replace(s, **{field: changed})
+    if s.t:
+        yield replace(s, t=s.t * (1 + NUDGE))
+    params = s.params or defaults
+    for name, value in params.items():
+        yield replace(s, params={**params, name: value * (1 + NUDGE)})
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """The reference's values at a state, and the sizes that errors are measured against."""
+
+    state: State
+    value: Mapping[str, Vector]
+    size: Mapping[str, Vector]
+
+
+class _Sampler:
+    """Draws states around the start that are finite and have a regular D."""
+
+    def __init__(self, reference: Reference, random: np.random.Generator) -> None:
+        self.reference, self.random = reference, random
+        self.system = system = reference.system
+        self.defaults = {p.name: p.value for p in system.parameters}
+        self.rejected = 0
+        start = self.start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
+        # how far things go: from the start, from what happens next, else 1 of the unit
+        with np.errstate(all="ignore"):
+            try:
+                _, q, qd = reference.simulate(steps=50)
+            except np.linalg.LinAlgError:
+                q, qd = start.q[None], start.qd[None]
+        far, fast = (np.nan_to_num(np.max(np.abs(x), axis=0), posinf=0) for x in (q, qd))
+        self.angles = np.array([c.unit == "rad" for c in system.coordinates])
+        self.spread = np.where(self.angles, np.pi, np.where(far > 0, far, 1.0))
+        self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
+
+    def states(self, count: int) -> list[_Expected]:
+        """The start, some states with the parameters' defaults, then all at random."""
+        found: list[_Expected] = []
+        nearness = 1.0  # every rejection moves the next draw closer to the start
+        for attempt in range(20 * count):
+            if len(found) == count:
+                break
+            usual = len(found) < count // 4
+            state = self.start if attempt == 0 else self.draw(nearness, usual, len(found) % 2 == 1)
+            with np.errstate(all="ignore"):
+                expected = self.expected(state) if self.regular(state) else None
+            if expected is None:
+                self.rejected += 1
+                nearness *= 0.7
+            else:
+                found.append(expected)
+                nearness = 1.0
+        return found
+
+    def draw(self, nearness: float, usual: bool, given: bool) -> State:
+        """A random state; `usual`: default parameters; `given`: inputs from outside."""
+        random, n, start = self.random, len(self.start.q), self.start
+        centre = np.where(self.angles, nearness < 1, 1) * start.q
+        q = centre + nearness * self.spread * random.uniform(-1, 1, n)
+        qd = start.qd + nearness * self.speed * random.uniform(-1, 1, n)
+        t = random.uniform(0, self.system.run.duration)
+        u = None
+        if given and self.system.inputs:
+            signals = np.abs(self.reference.evaluate("signals", q, qd, t))
+            u = random.normal(size=len(signals)) * np.where(signals > 0, signals, 1)
+        factors = np.exp(random.uniform(-0.5, 0.5, len(self.defaults)))
+        params = {
+            name: value * factor if value else factor - 0.5
+            for (name, value), factor in zip(self.defaults.items(), factors.tolist(), strict=True)
+        }
+        return State(q, qd, t, u, None if usual else params)
+
+    def regular(self, s: State) -> bool:
+        """D finite and far from singular, and positive definite where we chose the parameters."""
+        D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
+        diagonal = np.abs(np.diag(D))
+        if not (np.all(np.isfinite(D)) and np.all(diagonal > 0)):
+            return False
+        eigenvalues = np.linalg.eigvalsh(D / np.sqrt(np.outer(diagonal, diagonal)))
+        least, most = np.min(np.abs(eigenvalues)), np.max(np.abs(eigenvalues))
+        return bool(least * CONDITION_LIMIT > most and (s.params is None or eigenvalues[0] > 0))
+
+    def expected(self, s: State) -> _Expected | None:
+        """The reference's values and their sizes; None where something is not finite."""
+        value: dict[str, Vector] = {}
+        reach: dict[str, Vector] = {}
+        for name, field in VALUES.items():
+            value[name], reach[name] = self.reach(
+                lambda s, field=field: self.reference.evaluate(field, s.q, s.qd, s.t, s.u, s.params), s
+            )
+        D, qd = value["D"], np.abs(s.qd)
+        value["acceleration"] = qdd = np.linalg.solve(D, value["tau"] - value["bias"])
+        if not all(np.all(np.isfinite(x)) for x in value.values()):
+            return None
+        diagonal = np.sqrt(np.diag(reach["D"]))
+        inertia = np.outer(diagonal, diagonal) + reach["D"]
+        rate = np.max(qd / self.spread)  # of change of D, in 1/s
+        force = reach["bias"] + reach["g"] + reach["tau"] + rate * inertia @ qd
+        energy = reach["kinetic_energy"] + reach["potential_energy"]
+        size = {
+            "D": inertia,
+            "C": reach["C"] + rate * inertia,
+            **dict.fromkeys(("g", "bias", "tau"), force),
+            **dict.fromkeys(("kinetic_energy", "potential_energy", "energy", "jacobi"), energy),
+            "power": reach["power"] + force @ qd,
+            "motion": inertia @ np.abs(qdd) + force,
+        }
+        size["acceleration"] = np.abs(np.linalg.inv(D)) @ size["motion"]
+        return _Expected(s, value, size)
+
+    def reach(self, of: Callable[[State], Vector], s: State) -> tuple[Vector, Vector]:
+        """f and |f| + sum_i |x_i df/dx_i|."""
+        value = of(s)
+        size = np.abs(value)
+        for nudged in _nudged(s, self.defaults):
+            size = size + np.nan_to_num(np.abs(of(nudged) - value) / NUDGE)
+        return value, size
+
+
+def _units(found: Any, expected: Any, size: Any) -> float:
+    """The largest difference in units of rounding, nan where something is not a number."""
+    off = np.abs(np.asarray(found, float) - expected)
+    if off.shape != np.shape(expected):
+        raise ValueError(f"shape {np.shape(found)} where {np.shape(expected)} is meant")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.max(np.where(off == 0, 0, off / (EPS * np.asarray(size))), initial=0))
+
+
+# --- rows -----------------------------------------------------------------------------------------
+
+
+class _Check:
+    """All rows of one report."""
+
+    def __init__(
+        self, system: System, module: Any, random: np.random.Generator, states: int
+    ) -> None:
+        self.system, self.module = system, module
+        self.reference = derive(system)
+        self.sampler = _Sampler(self.reference, random)
+        self.expected = self.sampler.states(states)
+        self.rows: list[Row] = []
+
+    def report(self) -> Report:
+        """Compare, then test the properties."""
+        rounding = "units of rounding"
+        self.row("names, defaults, start", 0, "differences", self.faces)
+        if self.expected:
+            for name in (*VALUES, "acceleration"):
+                self.row(name, LIMIT, rounding, lambda name=name: self.value(name))
+            self.row("one step", LIMIT, rounding, self.steps)
+            self.row("run", LIMIT, rounding + ", times steps and growth", self.runs)
+            self.row("run: its energy", LIMIT, rounding, self.run_energy)
+            self.row("D = D^T", LIMIT, rounding, self.symmetry)
+            self.row("D > 0", 0, "least eigenvalue of D, scaled", self.definiteness, least=True)
+            self.row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", self.skewness)
+            self.row("bias = C qd + g", LIMIT, rounding, self.bias)
+            self.row("D qdd + bias = tau", LIMIT, rounding, self.motion)
+            self.smooth_row("order of RK4", ORDER_LIMIT, "order observed", self.order)
+            self.smooth_row(
+                "power balance", CLOSING_LIMIT, "order at which it closes", self.closing
+            )
+        else:
+            self.row("states", 1, "states with a regular D", lambda: 0.0, least=True)
+        return Report(self.system.name, tuple(self.rows), len(self.expected), self.sampler.rejected)
+
+    def row(
+        self, name: str, limit: float, unit: str, measure: Callable[[], float], least: bool = False
+    ) -> None:
+        """Add what `measure` finds: at most the limit, or more than it where it is the least."""
+        try:
+            error = measure()
+        except Exception as fault:  # whatever the module raises is an outcome of the check
+            self.rows.append(Row(name, math.nan, limit, False, f"{type(fault).__name__}: {fault}"))
+            return
+        self.rows.append(Row(name, error, limit, error > limit if least else error <= limit, unit))
+
+    def smooth_row(self, name: str, limit: float, unit: str, measure: Callable[[], float]) -> None:
+        """A row about orders, which is not judged where the scene's functions have corners."""
+        self.row(name, limit, unit, measure, least=True)
+        row = self.rows[-1]
+        if math.isinf(row.error):
+            self.rows[-1] = replace(row, unit=unit + ": exact, no error to measure")
+        elif not row.passed and self.corners and not math.isnan(row.error):
+            note = f"{unit}; not to be expected with {self.corners}"
+            self.rows[-1] = replace(row, passed=True, unit=note)
+
+    @cached_property
+    def corners(self) -> str:
+        """The functions in the scene that jump or bend."""
+        s = self.system
+        exprs = (
+            *(s.kinetic, s.potential, s.dissipation, *s.forces),
+            *(e for _, e in s.definitions),
+            *(i.signal for i in s.inputs),
+        )
+        kinds = (sympy.sign, sympy.Heaviside, sympy.Abs, sympy.Min, sympy.Max)
+        found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
+        return ", ".join(sorted(found))
+
+    def largest(self, of: Callable[[_Expected], float]) -> float:
+        """The largest error over all states; nan wins."""
+        return float(np.max([of(e) for e in self.expected]))
+
+    # against the reference
+
+    def faces(self) -> float:
+        """How many of the module's names, defaults and start values are not the system's."""
+        s, m, start = self.system, self.module, self.sampler.start
+        pairs = [
+            (tuple(m.coordinates), tuple(c.name for c in s.coordinates)),
+            (tuple(m.parameters), tuple(p.name for p in s.parameters)),
+            (tuple(m.inputs), tuple(i.name for i in s.inputs)),
+            (dict(m.defaults), self.sampler.defaults),
+            *((np.asarray(a).tolist(), b.tolist()) for a, b in zip(m.start, (start.q, start.qd), strict=True)),
+        ]
+        return float(sum(theirs != ours for theirs, ours in pairs))
+
+    def value(self, name: str) -> float:
+        """One of VALUES or the acceleration."""
+        return self.largest(
+            lambda e: _units(_ask(self.module, name, e.state), e.value[name], e.size[name])
+        )
+
+    def steps(self) -> float:
+        """One step of the scene's h from a few states."""
+        h = self.system.run.h
+
+        def reference(s: State) -> Vector:
+            return np.array(self.reference.step(s.q, s.qd, h, s.t, s.u, s.params))
+
+        def error(e: _Expected) -> float:
+            s = e.state
+            with np.errstate(all="ignore"):
+                expected, size = self.sampler.reach(reference, s)
+            if not np.all(np.isfinite(expected)):
+                return 0.0
+            found = self.module.step(s.q, s.qd, h=h, t=s.t, u=s.u, params=s.params)
+            return _units(found, expected, size + h * np.array([np.abs(s.qd), e.size["acceleration"]]))
+
+        return float(np.max([error(e) for e in self._few()]))
+
+    def runs(self) -> float:
+        """A short run from the start, and one from a random state with random parameters."""
+        return float(np.max([self._run(e.state) for e in {id(e): e for e in self._few(2)}.values()]))
+
+    def _run(self, s: State) -> float:
+        steps = min(RUN_STEPS, round(self.system.run.duration / self.system.run.h))
+        spread = np.array([self.sampler.spread, self.sampler.speed])
+        run = self._simulate(s, steps=steps)
+        if str(getattr(run.status, "value", run.status)) != "ok":
+            raise RuntimeError(f"the run ended with status {run.status}")
+        with np.errstate(all="ignore"):
+            t, *x = self.reference.simulate(s.q, s.qd, steps=steps, u=s.u, params=s.params)
+            moved = replace(s, q=s.q + NUDGE * spread[0], qd=s.qd - NUDGE * spread[1])
+            _, *y = self.reference.simulate(
+                moved.q, moved.qd, steps=steps, u=s.u, params=s.params
+            )
+            growth = np.max(np.abs(np.subtract(y, x)).transpose(1, 0, 2) / spread, axis=(1, 2)) / NUDGE
+        growth = np.maximum.accumulate(growth)[:, None]
+        honest = growth[:, 0] < GROWTH_LIMIT
+        counts = np.arange(1, len(t) + 1)[:, None]
+        return max(
+            _units(run.t, t, np.abs(t) + self.system.run.h),
+            *(
+                _units(a[honest], b[honest], (counts * (growth * width + np.abs(b)))[honest])
+                for a, b, width in zip((np.asarray(run.q), np.asarray(run.qd)), x, spread, strict=True)
+            ),
+        )
+
+    def _simulate(self, s: State, **how: Any) -> Any:
+        return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
+
+    def run_energy(self) -> float:
+        """The energy that a run reports, at the states that it reports."""
+        run = self._simulate(self._few(2)[-1].state, steps=2)
+        params = self._few(2)[-1].state.params
+        rows = zip(run.t, run.q, run.qd, run.energy, strict=True)
+        known = [
+            (energy, self.sampler.expected(State(np.asarray(q), np.asarray(qd), float(t), None, params)))
+            for t, q, qd, energy in rows
+        ]
+        return float(
+            np.max([_units(found, e.value["energy"], e.size["energy"]) for found, e in known if e])
+        )
+
+    def _few(self, count: int = 4) -> list[_Expected]:
+        """Some of the states: the first ones and the last ones."""
+        half = count // 2
+        return self.expected[:half] + self.expected[half:][-half:]
+
+    # properties of the module alone
+
+    def symmetry(self) -> float:
+        """D = D^T."""
+
+        def error(e: _Expected) -> float:
+            D = _ask(self.module, "D", e.state)
+            return _units(D, D.T, e.size["D"])
+
+        return self.largest(error)
+
+    def definiteness(self) -> float:
+        """The least eigenvalue of D_ij / sqrt(D_ii D_jj) over all states."""
+
+        def least(e: _Expected) -> float:
+            D = _ask(self.module, "D", e.state)
+            diagonal = np.diag(D)
+            if np.any(diagonal <= 0):
+                return float(np.min(diagonal))
+            return float(np.linalg.eigvalsh(D / np.sqrt(np.outer(diagonal, diagonal)))[0])
+
+        return -self.largest(lambda e: -least(e))
+
+    def skewness(self) -> float:
+        """(Ddot - 2C + dD/dt) + its transpose, Ddot and dD/dt by differences of order 8.
+
+        The best of some widths counts: too wide is inexact, too narrow rounds, but no width
+        makes a wrong C right.
+        """
+        stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+
+        def error(e: _Expected) -> float:
+            s = e.state
+            rate = np.max(np.abs(s.qd) / self.sampler.spread) or 1.0
+            C = _ask(self.module, "C", s)
+
+            def along(qd: Vector, width: float) -> Vector:
+                at = (_ask(self.module, "D", replace(s, q=s.q + k * width * qd, t=s.t + k * width))
+                      for n, _ in stencil for k in (n, -n))  # fmt: skip
+                return sum((w * (next(at) - next(at)) for _, w in stencil), 0 * C) / width
+
+            def residual(width: float) -> float:
+                A = along(s.qd, width) + along(0 * s.qd, width) - 2 * C
+                return float(np.max(np.abs(A + A.T) / (rate * e.size["D"] + np.abs(C))))
+
+            return min(residual(part / rate) for part in (0.03, 0.003, 3e-4, 3e-5))
+
+        return self.largest(error)
+
+    def bias(self) -> float:
+        """bias = C qd + g."""
+
+        def error(e: _Expected) -> float:
+            bias, C, g = (_ask(self.module, name, e.state) for name in ("bias", "C", "g"))
+            return _units(C @ e.state.qd + g, bias, e.size["bias"])
+
+        return self.largest(error)
+
+    def motion(self) -> float:
+        """D qdd + bias = tau."""
+
+        def error(e: _Expected) -> float:
+            names = ("D", "acceleration", "bias", "tau")
+            D, qdd, bias, tau = (_ask(self.module, name, e.state) for name in names)
+            return _units(D @ qdd + bias, tau, e.size["motion"])
+
+        return self.largest(error)
+
+    def order(self) -> float:
+        """Of convergence of the state, the median over some states; inf where RK4 is exact."""
+        return float(np.median([self._order(e.state) for e in self._usual()]))
+
+    def _order(self, s: State) -> float:
+        """log2 of the ratio of the differences between runs with h, h/2 and h/4.
+
+        The finest three runs count whose differences are clear of rounding, and small.
+        """
+        spread = np.array([self.sampler.spread, self.sampler.speed])
+        best: list[float] = []
+        small = True
+        for stretch in STRETCHES:
+            ends = []
+            for n in (6, 12, 24, 48, 96, 192):
+                run = self._simulate(s, h=stretch * 96 * self.system.run.h / n, steps=n, every=n)
+                ends.append(np.array([run.q[-1], run.qd[-1]]) / spread)
+            off = np.array([np.max(np.abs(a - b)) for a, b in zip(ends, ends[1:], strict=False)])
+            floor = 1e4 * EPS * (1 + np.max(np.abs(ends[-1])))
+            small = small and bool(off[0] < floor)
+            clear = [float(x) for x in off if floor < x < 1e-2]
+            if len(clear) > len(best):
+                best = clear
+            if len(best) > 3:
+                break
+        return math.log2(best[-2] / best[-1]) if len(best) > 1 else math.inf if small else math.nan
+
+    def closing(self) -> float:
+        """The order at which jacobi(T) - jacobi(0) - integral of power vanishes, at least 0."""
+        orders = [self._closing(e.state) for e in self._usual()]
+        return float(np.min(orders))
+
+    def _closing(self, s: State) -> float:
+        """By RK4 and Simpson's rule with h, h/2 and h/4; inf where it closes to rounding."""
+        for stretch in sorted(STRETCHES):
+            gaps, energy = [], 0.0
+            for n in (32, 64, 128):
+                h = 32 * stretch * self.system.run.h / n
+                run = self._simulate(s, h=h, steps=n)
+                rows = [
+                    replace(s, q=np.asarray(q), qd=np.asarray(qd), t=float(t))
+                    for t, q, qd in zip(run.t, run.q, run.qd, strict=True)
+                ]
+                power = np.array([_ask(self.module, "power", row) for row in rows])
+                work = h / 3 * (power[0] + power[-1] + 4 * power[1::2].sum() + 2 * power[2:-1:2].sum())
+                ends = [_ask(self.module, "jacobi", rows[i]) for i in (-1, 0)]
+                gaps.append(abs(float(ends[0] - ends[1] - work)))
+                energy = sum(
+                    abs(float(_ask(self.module, name, row)))
+                    for name in ("kinetic_energy", "potential_energy")
+                    for row in (rows[0], rows[-1])
+                ) + h * float(np.abs(power).sum())
+            if not gaps[-1] <= 1e3 * EPS * energy:
+                return max(0.0, math.log2(gaps[1] / gaps[2]))
+        return math.inf
+
+    def _usual(self) -> Sequence[_Expected]:
+        """Some states with the scene's own parameters and away from its start."""
+        own = [e for e in self.expected if e.state.params is None]
+        return own[1:4] or self.expected[:3]

@@ -1,0 +1,301 @@
+"""Euler and Lagrange over a tape: D, C, g, bias, generalized forces and accelerations.
+
+With K, P and R as programs over named positions, the equations of motion
+
+    D(q) qdd + bias(q, qd, t) = tau,    bias = C qd + g,    tau = Q - dR/dqd
+
+follow by sweeps (tape.py). What a scene writes as dot(y) is treated as a velocity w of its own:
+since d(ydot)/dq = d/dt (dy/dq), Lagrange's operator is the same in any coordinates, so
+
+    bias_i = d/dt(dF/dqd_i) - dF/dq_i + dP/dq_i + sum_k d/dt(dF/dw_k) dy_k/dq_i
+
+with K = F(q, qd, w, t) and d/dt taken at qdd = 0: the inertial forces of the points, projected
+by one backward sweep over their positions. That is the operation count of recursive Newton and
+Euler, without the terms that cancel when K is differentiated as a function of q and qd.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import sympy
+from sympy import Expr, S, Symbol
+
+from eomc.problems import EomcError
+from eomc.system import System, dot, t
+from eomc.tape import Stage, Tape, split
+
+Vector = tuple[Expr, ...]
+Rows = tuple[Vector, ...]
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The equations of motion as atoms of a tape; shapes as in the field: D, C (nq, nq).
+
+    kinetic, potential: K and P. jacobi: p.qd - K + P, what is conserved without forces and
+    explicit time; None where it is K + P. power: d(jacobi)/dt; 0 for a conservative system.
+    balance: b in D qdd = b.
+    order: the order in which coordinates are eliminated from D qdd = b; pivots: those of
+    L diag(pivots) L^T, all positive where D is positive definite, each beside the diagonal entry
+    of D that it started as. notes: where unusual terms of K went.
+    """
+
+    system: System
+    tape: Tape
+    D: Rows
+    C: Rows
+    g: Vector
+    bias: Vector
+    tau: Vector
+    signals: Vector
+    kinetic: Expr
+    potential: Expr
+    jacobi: Expr | None
+    power: Expr
+    balance: Vector
+    acceleration: Vector
+    order: tuple[int, ...]
+    pivots: tuple[tuple[Expr, Expr], ...]
+    notes: tuple[str, ...]
+
+
+@dataclass
+class _Energies:
+    """K, P, R and Q on the tape, with the points y_k and their velocities w_k = dot(y_k)."""
+
+    tape: Tape
+    kinetic: Expr
+    potential: Expr
+    dissipation: Expr
+    forces: list[Expr]
+    signals: list[Expr]
+    points: dict[Symbol, Expr]  # w -> y
+
+
+def derive(system: System) -> Equations:
+    """The equations of motion of `system`.
+
+    Raises EomcError where K is not quadratic in the velocities or a coordinate has no inertia.
+    Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral);
+    C from Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
+    """
+    e = _on_tape(system)
+    tape, q, qd = e.tape, system.q, system.qd
+    w = list(e.points)
+    stop = frozenset(w)
+    rates: dict[Symbol, Expr] = {**dict(zip(q, qd, strict=True)), t: S.One}
+
+    # momenta dF/dqd and dF/dw, and their rates at qdd = 0
+    momenta = tape.gradient([(e.kinetic, S.One)], [*qd, *w], stop)
+    p, p_w = momenta[: len(q)], momenta[len(q) :]
+    moving = tape.forward(momenta, rates)
+    p_dot, p_w_dot = moving[: len(q)], moving[len(q) :]
+    friction = tape.gradient([(e.dissipation, S.One)], [*qd, *w], stop)
+    r, r_w = friction[: len(q)], friction[len(q) :]
+
+    def projected(at_points: list[Expr], *energies: tuple[Expr, Expr]) -> list[Expr]:
+        seeds = [*energies, *zip(e.points.values(), at_points, strict=True)]
+        return tape.gradient(seeds, q, stop)
+
+    def add(*terms: Expr) -> Expr:
+        return tape.define(sympy.Add(*terms))
+
+    lagrangian = ((e.kinetic, S.NegativeOne), (e.potential, S.One))
+    bias = [add(a, b) for a, b in zip(p_dot, projected(p_w_dot, *lagrangian), strict=True)]
+    damping = [add(a, b) for a, b in zip(r, projected(r_w), strict=True)]
+    tau = [add(force, -drag) for force, drag in zip(e.forces, damping, strict=True)]
+
+    D = _mass_matrix(system, e, [*p, *p_w], projected)
+
+    at_rest = dict.fromkeys(qd, S.Zero)
+    driven = t in tape.leaves_of([e.kinetic])
+    quadratic = all(x == 0 for x in tape.substitute([e.kinetic, *p, *p_w], at_rest)) and not driven
+    g = tape.gradient([(e.potential, S.One)], q) if quadratic else tape.substitute(bias, at_rest)
+    C = _coriolis(system, tape, bias, quadratic)
+
+    # D qdd = b, the forces projected in one sweep
+    if e.dissipation == 0:
+        b = [add(force, -c) for force, c in zip(e.forces, bias, strict=True)]
+    else:
+        seeds = [add(i, f) for i, f in zip(p_w_dot, r_w, strict=True)]
+        whole = projected(seeds, *lagrangian)
+        b = [
+            add(force, -inertia, -drag, -rest)
+            for force, inertia, drag, rest in zip(e.forces, p_dot, r, whole, strict=True)
+        ]
+    order, acceleration, pivots = solve(tape, D, b)
+
+    euler = dict(zip(qd, qd, strict=True))
+    jacobi = None
+    if not quadratic:
+        (twice,) = tape.forward([e.kinetic], euler)
+        jacobi = add(twice, -e.kinetic, e.potential)
+    explicit = tape.forward([e.kinetic, e.potential], {t: S.One})
+    (lost,) = tape.forward([e.dissipation], euler)
+    works = [tape.define(force * v) for force, v in zip(e.forces, qd, strict=True)]
+    power = add(*works, -lost, explicit[1], -explicit[0])
+
+    return Equations(
+        system=system,
+        tape=tape,
+        D=D,
+        C=C,
+        g=tuple(g),
+        bias=tuple(bias),
+        tau=tuple(tau),
+        signals=tuple(e.signals),
+        kinetic=e.kinetic,
+        potential=e.potential,
+        jacobi=jacobi,
+        power=power,
+        balance=tuple(b),
+        acceleration=acceleration,
+        order=order,
+        pivots=pivots,
+        notes=_notes(tape, e, p, p_w, at_rest, D),
+    )
+
+
+def _on_tape(system: System) -> _Energies:
+    leaves: dict[Symbol, Stage] = {t: Stage.TIME}
+    leaves |= {p.symbol: Stage.PARAMETER for p in system.parameters}
+    leaves |= dict.fromkeys(system.u, Stage.TIME)
+    leaves |= dict.fromkeys(system.q, Stage.POSITION)
+    leaves |= dict.fromkeys(system.qd, Stage.VELOCITY)
+    tape = Tape(leaves)
+    rates: dict[Symbol, Expr] = {**dict(zip(system.q, system.qd, strict=True)), t: S.One}
+    known: dict[Symbol, Expr] = {}
+    points: dict[Symbol, Expr] = {}
+
+    def value(expr: Expr) -> Expr:
+        velocities = {}
+        for moving in sorted(expr.atoms(dot), key=str):
+            position = tape.define(moving.args[0].xreplace(known))
+            (velocity,) = tape.forward([position], rates)
+            inside = moving.args[0]
+            name = f"{inside}_dot" if inside.is_Symbol else f"w{len(points) + 1}"
+            velocity = tape.named(velocity, name)
+            if velocity in tape.rhs and tape.stage[velocity] is Stage.VELOCITY:
+                points.setdefault(velocity, position)
+            velocities[moving] = velocity
+        return tape.define(expr.xreplace(velocities).xreplace(known))
+
+    for symbol, expr in system.definitions:
+        known[symbol] = tape.named(value(expr), symbol.name)
+    forces = system.forces or (S.Zero,) * len(system.coordinates)
+    return _Energies(
+        tape,
+        value(system.kinetic),
+        value(system.potential),
+        value(system.dissipation),
+        [value(force) for force in forces],
+        [value(i.signal) for i in system.inputs],
+        points,
+    )
+
+
+def _mass_matrix(system: System, e: _Energies, momenta: list[Expr], projected: object) -> Rows:
+    """D_ij = d(dF/dqd_i)/dqd_j + sum_k d(dF/dw_k)/dqd_j dy_k/dq_i, a column a sweep."""
+    tape, n = e.tape, len(system.q)
+    whole: list[list[Expr]] = []
+    assert callable(projected)
+    for j, velocity in enumerate(system.qd):
+        column = tape.forward(momenta, {velocity: S.One})
+        at_points = projected(column[n:])
+        whole.append([tape.define(a + b) for a, b in zip(column[:n], at_points, strict=True)])
+    # D is symmetric, and one half of it may cost less than the other
+    halves = [
+        [[whole[side(i, j)][other(i, j)] for j in range(n)] for i in range(n)]
+        for side, other in ((min, max), (max, min))
+    ]
+    D = min(halves, key=lambda half: len(tape.live(entry for row in half for entry in row)))
+    for c, row in zip(system.coordinates, D, strict=True):
+        if all(entry == 0 for entry in row):
+            raise EomcError(
+                f"{system.name}: coordinate '{c.name}' has no inertia: the kinetic energy does not "
+                f"depend on {c.name}_dot, so nothing can be solved for its acceleration; "
+                "give it a mass, or make it an input"
+            )
+    for i, j in product(range(n), repeat=2):
+        if tape.stage_of(D[i][j]) >= Stage.VELOCITY:
+            raise EomcError(
+                f"{system.name}: the kinetic energy is not quadratic in the velocities "
+                f"(d2K/d{system.qd[i]}d{system.qd[j]} still depends on a velocity): "
+                "mechanics in the form D qdd + C qd + g = tau needs K = qd.D(q).qd/2 + a(q).qd + b(q)"
+            )
+    return tuple(map(tuple, D))
+
+
+def _coriolis(system: System, tape: Tape, bias: list[Expr], quadratic: bool) -> Rows:
+    """C = (J(qd) + J(0))/2 with J = d(bias)/dqd.
+
+    The part of bias that is quadratic in qd is sum_jk c_ijk qd_j qd_k with Christoffel's symbols
+    of the first kind, symmetric in j and k, so half its Jacobian is the Christoffel form of C.
+    The linear part (gyroscopic terms, explicit time in D) is J(0) qd and goes in whole.
+    """
+    at_rest = dict.fromkeys(system.qd, S.Zero)
+    columns = []
+    for velocity in system.qd:
+        column = tape.forward(bias, {velocity: S.One})
+        still = [S.Zero] * len(column) if quadratic else tape.substitute(column, at_rest)
+        columns.append(
+            [tape.define((a + b) / 2) for a, b in zip(column, still, strict=True)]
+        )
+    return tuple(tuple(column[i] for column in columns) for i in range(len(columns)))
+
+
+def solve(
+    tape: Tape, D: Rows, b: list[Expr]
+) -> tuple[tuple[int, ...], Vector, tuple[tuple[Expr, Expr], ...]]:
+    """x with D x = b by L diag(d) L^T x = b, unrolled; zeros are neither stored nor computed.
+
+    Source: Golub & Van Loan, *Matrix Computations*, 4th ed., alg. 4.1.2. The next pivot is the
+    one with the fewest entries left beside it (minimum degree), the earliest known among equals.
+    """
+    n = len(b)
+    A = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
+    y = list(b)
+    left, order, pivots = list(range(n)), [], []
+    steps: list[tuple[int, Expr, dict[int, Expr]]] = []
+    while left:
+        k = min(left, key=lambda i: (sum((i, j) in A for j in left), tape.stage_of(A[i, i]), i))
+        left.remove(k)
+        order.append(k)
+        pivot = A[k, k]
+        pivots.append((pivot, D[k][k]))
+        inverse = tape.define(1 / pivot)
+        beside = {i: A[i, k] for i in left if (i, k) in A}
+        factors = {i: tape.define(a * inverse) for i, a in beside.items()}
+        for i, factor in factors.items():
+            y[i] = tape.define(y[i] - factor * y[k])
+            for j, a in beside.items():
+                if j <= i:
+                    A[i, j] = A[j, i] = tape.define(A.get((i, j), S.Zero) - factor * a)
+        steps.append((k, inverse, factors))
+    x: dict[int, Expr] = {}
+    for k, inverse, factors in reversed(steps):
+        rest = [-factor * x[i] for i, factor in factors.items()]
+        x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *map(tape.define, rest)))
+    return tuple(order), tuple(x[i] for i in range(n)), tuple(pivots)
+
+
+def _notes(
+    tape: Tape, e: _Energies, p: list[Expr], p_w: list[Expr], at_rest: dict[Symbol, Expr], D: Rows
+) -> tuple[str, ...]:
+    """Where terms of K went that are not quadratic in the velocities."""
+    notes = []
+    if any(x != 0 for x in tape.substitute([*p, *p_w], at_rest)):
+        notes.append(
+            "The part of K that is linear in the velocities, a(q, t).qd, gives gyroscopic forces: "
+            "its skew matrix is in C, da/dt in g."
+        )
+    if tape.substitute([e.kinetic], at_rest) != [S.Zero]:
+        notes.append("The part K0 of K that is free of velocities acts as -K0 in P: -dK0/dq is in g.")
+    if t in tape.leaves_of([entry for row in D for entry in row]):
+        notes.append("D depends on time: C includes dD/dt, and Ddot - 2 C + dD/dt is skew-symmetric.")
+    return tuple(notes)
+
+
+__all__ = ["Equations", "derive", "split"]

@@ -1,0 +1,300 @@
+"""The independent answer: Euler-Lagrange as a textbook writes it, in SymPy, NumPy and plain Python.
+
+It starts from the `System` and shares nothing else with the compiled way: definitions are
+substituted, everything is differentiated as it stands, evaluated in doubles with `lambdify`,
+solved with NumPy and stepped in a Python loop. Slow, short, and meant to be believed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import sympy
+from numpy.typing import ArrayLike, NDArray
+from sympy import Expr, ImmutableMatrix
+
+from eomc.formulas import suggest
+from eomc.problems import EomcError
+from eomc.system import System, dot, t
+
+Vector = NDArray[np.float64]
+
+SCALARS = ("kinetic", "potential", "energy", "jacobi", "power")
+
+SIMPLIFIED_SIZE = 300  # operations; SymPy takes seconds beyond
+
+
+def derive(system: System) -> Reference:
+    """D qdd + C qd + g = tau from d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, plainly.
+
+    K is split by its degree in qd, K = K2 + a.qd + K0, and p = dK/dqd:
+
+    - D = d2K/dqd2, symmetric, others call it M;
+    - bias = (dp/dq) qd + dp/dt - dK/dq + dP/dq, and g = bias at qd = 0;
+    - C_ij = 1/2 sum_k (dD_ij/dq_k + dD_ik/dq_j - dD_jk/dq_i) qd_k (Christoffel; Spong, Hutchinson,
+      Vidyasagar, Robot Modeling and Control, 2006, eq. 7.60) + (da_i/dq_j - da_j/dq_i) + dD_ij/dt,
+      so that bias = C qd + g, and Ddot - 2C + dD/dt is skew-symmetric;
+    - tau = Q - dR/dqd;
+    - jacobi = p.qd - K + P, which is K + P where K is purely quadratic, and changes at the rate
+      power = tau.qd - dL/dt, L = K - P at fixed q and qd.
+
+    Raises EomcError where K is not quadratic in the velocities, or where a definition can't be
+    differentiated.
+    """
+    expand = _expander(system)
+    q, qd = system.q, ImmutableMatrix(system.qd)
+    K, P, R = (expand(e) for e in (system.kinetic, system.potential, system.dissipation))
+    rest = dict.fromkeys(system.qd, sympy.S.Zero)
+
+    def gradient(e: Expr, xs: Sequence[sympy.Symbol]) -> ImmutableMatrix:
+        return ImmutableMatrix([sympy.diff(e, x) for x in xs])
+
+    p = gradient(K, system.qd)
+    D = ImmutableMatrix(p.jacobian(qd)).applyfunc(lambda e: _free_of(e, system.qd))
+    a = p.xreplace(rest)
+    n = range(len(q))
+
+    def coriolis(i: int, j: int) -> Expr:
+        christoffel = [
+            (D[i, j].diff(q[k]) + D[i, k].diff(q[j]) - D[j, k].diff(q[i])) * qd[k] / 2 for k in n
+        ]
+        return sum(christoffel, a[i].diff(q[j]) - a[j].diff(q[i]) + D[i, j].diff(t))
+
+    bias = p.jacobian(q) * qd + p.diff(t) - gradient(K, q) + gradient(P, q)
+    forces = system.forces or (sympy.S.Zero,) * len(q)
+    tau = ImmutableMatrix([expand(e) for e in forces]) - gradient(R, system.qd)
+    return Reference(
+        system=system,
+        D=D,
+        C=ImmutableMatrix(len(q), len(q), coriolis),
+        g=bias.xreplace(rest),
+        bias=bias,
+        tau=tau,
+        kinetic=K,
+        potential=P,
+        energy=K + P,
+        jacobi=p.dot(qd) - K + P,
+        power=tau.dot(qd) - sympy.diff(K - P, t),
+        signals=ImmutableMatrix(len(system.u), 1, [expand(i.signal) for i in system.inputs]),
+    )
+
+
+def _expander(system: System) -> Callable[[Expr], Expr]:
+    """A function that puts definitions in and carries every dot(...) out."""
+    known: dict[Expr, Expr] = {}
+
+    def rate(e: Expr) -> Expr:
+        """de/dt = sum de/dq qd + de/dt."""
+        strange = e.free_symbols & {*system.qd, *system.u}
+        if strange:
+            raise EomcError(f"dot({e}): {', '.join(sorted(map(str, strange)))} has no known rate")
+        parts = (sympy.diff(e, x) * v for x, v in zip(system.q, system.qd, strict=True))
+        return sum(parts, sympy.diff(e, t))
+
+    def expand(e: Expr) -> Expr:
+        return sympy.sympify(e).xreplace(known).replace(dot, rate)
+
+    for name, body in system.definitions:
+        known[name] = expand(body)
+    return expand
+
+
+def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
+    """`e`, an entry of D, in a form without velocities. Raises EomcError where there is none."""
+    for attempt in (lambda x: x, sympy.expand, sympy.simplify):
+        e = attempt(e)
+        if not e.has(*velocities):
+            return e
+    raise EomcError(
+        "the kinetic energy is not quadratic in the velocities: the mass matrix d2K/dqd2 has "
+        f"the entry {e}. Friction belongs in 'dissipation' or [forces]"
+    )
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The equations of `system` as expressions over q, qd, t, u and the parameters.
+
+    D, C: (nq, nq); g, bias, tau: (nq, 1); signals: (nu, 1), the inputs by default.
+    """
+
+    system: System
+    D: ImmutableMatrix
+    C: ImmutableMatrix
+    g: ImmutableMatrix
+    bias: ImmutableMatrix
+    tau: ImmutableMatrix
+    kinetic: Expr
+    potential: Expr
+    energy: Expr
+    jacobi: Expr
+    power: Expr
+    signals: ImmutableMatrix
+    _functions: dict[str, Callable[..., Any]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def evaluate(
+        self,
+        name: str,
+        q: ArrayLike,
+        qd: ArrayLike | None = None,
+        t: float = 0.0,
+        u: ArrayLike | None = None,
+        params: Mapping[str, float] | None = None,
+    ) -> Any:
+        """The value of the field `name`: a float, an (nq,) or (nu,) vector or an (nq, nq) matrix.
+
+        q, qd: (nq,), m or rad per coordinate and their rates, qd None at rest; u: (nu,), None for
+        the scene's signals; params: values in place of defaults. nan where a formula has no
+        real value. Raises EomcError where params names no parameter.
+        """
+        q = np.asarray(q, float)
+        qd = np.zeros_like(q) if qd is None else np.asarray(qd, float)
+        return self._value(name, q, qd, t, u, self._values(params))
+
+    def acceleration(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        t: float = 0.0,
+        u: ArrayLike | None = None,
+        params: Mapping[str, float] | None = None,
+    ) -> Vector:
+        """Solve D qdd = tau - bias: (nq,). Raises numpy.linalg.LinAlgError where D is singular."""
+        q, qd = np.asarray(q, float), np.asarray(qd, float)
+        return self._acceleration(q, qd, t, u, self._values(params))
+
+    def step(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        u: ArrayLike | None = None,
+        params: Mapping[str, float] | None = None,
+    ) -> tuple[Vector, Vector]:
+        """One step of the classical Runge-Kutta method of order 4: q and qd at t + h.
+
+        u None: the scene's signals at every stage; u given: held over the step.
+        """
+        q, qd = np.asarray(q, float), np.asarray(qd, float)
+        return self._step(q, qd, h, t, u, self._values(params))
+
+    def simulate(
+        self,
+        q0: ArrayLike | None = None,
+        qd0: ArrayLike | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        every: int = 1,
+        u: ArrayLike | None = None,
+        params: Mapping[str, float] | None = None,
+    ) -> tuple[Vector, Vector, Vector]:
+        """Run from the start: t (n,) and q, qd (n, nq), rows every `every` steps and the last."""
+        start = self.system.coordinates
+        q = np.array([c.start for c in start] if q0 is None else q0, float)
+        qd = np.array([c.rate for c in start] if qd0 is None else qd0, float)
+        h = self.system.run.h if h is None else h
+        steps = round(self.system.run.duration / h) if steps is None else steps
+        values = self._values(params)
+        rows = [(0.0, q, qd)]
+        for n in range(steps):
+            q, qd = self._step(q, qd, h, n * h, u, values)
+            if (n + 1) % every == 0 or n + 1 == steps:
+                rows.append(((n + 1) * h, q, qd))
+        times, qs, qds = zip(*rows, strict=True)
+        return np.array(times), np.array(qs), np.array(qds)
+
+    def simplified(self) -> Reference:
+        """The same in shorter forms, for people to read; entries of over 300 operations stay."""
+        D, C, g, tau = (getattr(self, name).applyfunc(_shorter) for name in ("D", "C", "g", "tau"))
+        K, P, jacobi, power = map(_shorter, (self.kinetic, self.potential, self.jacobi, self.power))
+        return replace(
+            self, D=D, C=C, g=g, bias=C * ImmutableMatrix(self.system.qd) + g, tau=tau,
+            kinetic=K, potential=P, energy=K + P, jacobi=jacobi, power=power,
+        )  # fmt: skip
+
+    def _values(self, params: Mapping[str, float] | None) -> tuple[float, ...]:
+        """Parameters in the system's order."""
+        values = {p.name: p.value for p in self.system.parameters}
+        for name in params or {}:
+            if name not in values:
+                raise EomcError(f"'{name}' is not a parameter{suggest(name, values)}")
+        return tuple((values | dict(params or {})).values())
+
+    def _value(
+        self, name: str, q: Vector, qd: Vector, t: float, u: ArrayLike | None,
+        values: tuple[float, ...],
+    ) -> Any:  # fmt: skip
+        if name == "signals" or not self.system.inputs:
+            u = np.zeros(len(self.system.inputs))
+        elif u is None:
+            u = self._value("signals", q, qd, t, None, values)
+        expr = getattr(self, name)
+        shape = () if name in SCALARS else expr.shape if name in ("D", "C") else (expr.rows,)
+        try:
+            found = self._function(name)(*q.tolist(), *qd.tolist(), t, *np.asarray(u), *values)
+        except (ArithmeticError, ValueError):
+            return np.full(shape, math.nan)[()]
+        return np.array(found, float).reshape(shape)[()]
+
+    def _function(self, name: str) -> Callable[..., Any]:
+        if name not in self._functions:
+            system, expr = self.system, getattr(self, name)
+            symbols = (*system.q, *system.qd, t, *system.u, *(p.symbol for p in system.parameters))
+            entries = [expr] if name in SCALARS else expr.flat()
+            self._functions[name] = sympy.lambdify(
+                symbols, entries, modules=[_JUMPS, "math"], cse=True
+            )
+        return self._functions[name]
+
+    def _acceleration(
+        self, q: Vector, qd: Vector, t: float, u: ArrayLike | None, values: tuple[float, ...]
+    ) -> Vector:
+        D, bias, tau = (self._value(name, q, qd, t, u, values) for name in ("D", "bias", "tau"))
+        return np.asarray(np.linalg.solve(D, tau - bias))
+
+    def _step(
+        self, q: Vector, qd: Vector, h: float, t: float, u: ArrayLike | None,
+        values: tuple[float, ...],
+    ) -> tuple[Vector, Vector]:  # fmt: skip
+        v1, a1 = qd, self._acceleration(q, qd, t, u, values)
+        v2 = qd + h / 2 * a1
+        a2 = self._acceleration(q + h / 2 * v1, v2, t + h / 2, u, values)
+        v3 = qd + h / 2 * a2
+        a3 = self._acceleration(q + h / 2 * v2, v3, t + h / 2, u, values)
+        v4 = qd + h * a3
+        a4 = self._acceleration(q + h * v3, v4, t + h, u, values)
+        return (
+            q + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4),
+            qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4),
+        )
+
+
+def _sign(x: float) -> float:
+    return float((x > 0) - (x < 0))
+
+
+def _heaviside(x: float, at_zero: float = 0.5) -> float:
+    return at_zero if x == 0 else float(x > 0)
+
+
+def _dirac_delta(x: float, order: int = 0) -> float:
+    return math.inf if x == 0 else 0.0
+
+
+# what `math` has no name for
+_JUMPS = {"sign": _sign, "Heaviside": _heaviside, "DiracDelta": _dirac_delta}
+
+
+def _shorter(e: Expr) -> Expr:
+    """The shorter of `e` and its expanded, trigonometrically simplified, factored form."""
+    if e.count_ops() > SIMPLIFIED_SIZE:
+        return e
+    short = sympy.factor_terms(sympy.trigsimp(sympy.expand(e)))
+    return min((e, short), key=lambda form: form.count_ops())
