@@ -50,6 +50,12 @@ class Expander:
             return None
         return [self.built(polynomial) for polynomial in polynomials]
 
+    def short(self, atom: Expr) -> Expr:
+        """The atom multiplied out where that leaves few terms, so that cancellations are seen."""
+        if (out := self.expand([atom])) is not None and len(self.atom(atom)) <= 8:
+            return out[0]
+        return atom
+
     def atom(self, atom: Expr) -> Polynomial:
         factor, symbol = split(atom)
         if symbol is None:

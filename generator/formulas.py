@@ -208,7 +208,7 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
         case ast.Constant(value=int() | float() as value):
             written = re.fullmatch(r"[\d.]+e([+-]?\d+)", _literal_of(formula, node))
             # 0e999999999 too, whose exact value costs what it says
-            if not _in_range(value) or (written and abs(int(written[1])) > MAX_LOG10):
+            if not _in_range(value) or (written and abs(float(written[1])) > MAX_LOG10):
                 raise _fault(node, f"numbers lie between 1e-{MAX_LOG10} and 1e{MAX_LOG10} in size")
         case ast.Name(id=name):
             if name in FUNCTIONS:

@@ -16,6 +16,7 @@ Euler, without the terms that cancel when K is differentiated as a function of q
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -24,7 +25,7 @@ from sympy import Expr, S, Symbol
 
 from eomc.problems import EomcError
 from eomc.system import System, dot, t
-from eomc.tape import Stage, Tape, split
+from eomc.tape import Stage, Tape
 
 Vector = tuple[Expr, ...]
 Rows = tuple[Vector, ...]
@@ -196,11 +197,15 @@ def _on_tape(system: System) -> _Energies:
     )
 
 
-def _mass_matrix(system: System, e: _Energies, momenta: list[Expr], projected: object) -> Rows:
+def _mass_matrix(
+    system: System,
+    e: _Energies,
+    momenta: list[Expr],
+    projected: Callable[[list[Expr]], list[Expr]],
+) -> Rows:
     """D_ij = d(dF/dqd_i)/dqd_j + sum_k d(dF/dw_k)/dqd_j dy_k/dq_i, a column a sweep."""
     tape, n = e.tape, len(system.q)
     whole: list[list[Expr]] = []
-    assert callable(projected)
     for j, velocity in enumerate(system.qd):
         column = tape.forward(momenta, {velocity: S.One})
         at_points = projected(column[n:])
@@ -247,12 +252,13 @@ def _coriolis(system: System, tape: Tape, bias: list[Expr], quadratic: bool) -> 
 
 
 def solve(
-    tape: Tape, D: Rows, b: list[Expr]
+    tape: Tape, D: Rows, b: Sequence[Expr], short: Callable[[Expr], Expr] = lambda atom: atom
 ) -> tuple[tuple[int, ...], Vector, tuple[tuple[Expr, Expr], ...]]:
     """x with D x = b by L diag(d) L^T x = b, unrolled; zeros are neither stored nor computed.
 
     Source: Golub & Van Loan, *Matrix Computations*, 4th ed., alg. 4.1.2. The next pivot is the
     one with the fewest entries left beside it (minimum degree), the earliest known among equals.
+    short: rewrites what elimination makes, so that terms which cancel are gone.
     """
     n = len(b)
     A = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
@@ -269,10 +275,10 @@ def solve(
         beside = {i: A[i, k] for i in left if (i, k) in A}
         factors = {i: tape.define(a * inverse) for i, a in beside.items()}
         for i, factor in factors.items():
-            y[i] = tape.define(y[i] - factor * y[k])
+            y[i] = short(tape.define(y[i] - factor * y[k]))
             for j, a in beside.items():
                 if j <= i:
-                    A[i, j] = A[j, i] = tape.define(A.get((i, j), S.Zero) - factor * a)
+                    A[i, j] = A[j, i] = short(tape.define(A.get((i, j), S.Zero) - factor * a))
         steps.append((k, inverse, factors))
     x: dict[int, Expr] = {}
     for k, inverse, factors in reversed(steps):
@@ -296,6 +302,3 @@ def _notes(
     if t in tape.leaves_of([entry for row in D for entry in row]):
         notes.append("D depends on time: C includes dD/dt, and Ddot - 2 C + dD/dt is skew-symmetric.")
     return tuple(notes)
-
-
-__all__ = ["Equations", "derive", "split"]

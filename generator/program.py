@@ -62,11 +62,12 @@ Value = Sum | Product | Call
 
 @dataclass(frozen=True)
 class Assignment:
-    """name = value, known from `stage` on."""
+    """name = value, known from `stage` on; `named` where the name tells what it is."""
 
     name: str
     value: Value
     stage: Stage
+    named: bool = False
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,10 @@ def build(equations: Equations) -> Program:
         if (short := expander.expand(outputs)) is not None:
             routes["expanded"] = (short, ())
         functions[name] = _cheapest(name, tape, routes)
-    functions["acceleration"] = _cheapest("acceleration", tape, _acceleration_routes(e, expander))
+    labels = [f"{c.name}_ddot" for c in e.system.coordinates]
+    labels += [f"{what}_{e.system.coordinates[k].name}" for k in e.order for what in ("d", "D")]
+    routes = _acceleration_routes(e, expander)
+    functions["acceleration"] = _cheapest("acceleration", tape, routes, labels)
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     return Program(e.system, functions, e.notes, e.order)
@@ -194,13 +198,16 @@ def _acceleration_routes(e: Equations, expander: Expander) -> dict[str, Ends]:
     if both is not None:
         entries = dict(zip(lower, both, strict=False))
         D = tuple(tuple(entries[max(i, j), min(i, j)] for j in range(n)) for i in range(n))
-        _, acceleration, pivots = mechanics.solve(e.tape, D, both[len(lower) :])
-        routes["expanded"] = (acceleration, pivots)
+        for route, short in (("expanded", lambda atom: atom), ("cancelled", expander.short)):
+            _, acceleration, pivots = mechanics.solve(e.tape, D, both[len(lower) :], short)
+            routes[route] = (acceleration, pivots)
     return routes
 
 
-def _cheapest(name: str, tape: Tape, routes: Mapping[str, Ends]) -> Function:
-    made = {route: _lower(name, tape, *ends) for route, ends in routes.items()}
+def _cheapest(
+    name: str, tape: Tape, routes: Mapping[str, Ends], labels: Sequence[str] = ()
+) -> Function:
+    made = {route: _lower(name, tape, *ends, labels) for route, ends in routes.items()}
     weight: Callable[[str], tuple[int, int]] = lambda route: (  # noqa: E731 - a key, used once
         _weight(made[route].cost),
         len(made[route].early),
@@ -218,7 +225,11 @@ def _weight(cost: Cost) -> int:
 
 
 def _lower(
-    name: str, tape: Tape, outputs: Sequence[Expr], checks: Sequence[tuple[Expr, Expr]]
+    name: str,
+    tape: Tape,
+    outputs: Sequence[Expr],
+    checks: Sequence[tuple[Expr, Expr]],
+    labels: Sequence[str],
 ) -> Function:
     ends = [*outputs, *(atom for pair in checks for atom in pair)]
     work = _Work(tape)
@@ -227,6 +238,9 @@ def _lower(
     operands = [work.operand(atom) for atom in ends]
     work.tidy(operands)
     assignments = work.assignments(operands)
+    for o, label in zip(operands, labels, strict=False):
+        if o.coefficient == 1 and o.name in work.values:
+            work.hints.setdefault(o.name, label)
     early = tuple(a for a in assignments if a.stage <= Stage.PARAMETER)
     body = tuple(a for a in assignments if a.stage > Stage.PARAMETER)
     pairs = operands[len(outputs) :]
@@ -342,6 +356,7 @@ class _Work:
         self._factor(ends, Stage.NUMBER)
         self._drop(ends)
         self._absorb(ends)
+        self._hoist(ends)
         self._share_products()
         self._share_sums()
         self._drop(ends)
@@ -391,7 +406,7 @@ class _Work:
                 terms = []
                 for weight, term in value.terms:
                     inner = self.values.get(term)
-                    single = isinstance(inner, Product) and uses[term] == 1
+                    single = uses[term] == 1 and term not in self.hints
                     if isinstance(inner, Product) and single and abs(weight) != 1:
                         sign = S.NegativeOne if weight.is_negative else S.One
                         self._put(term, Product(inner.coefficient * abs(weight), inner.factors))
@@ -650,6 +665,7 @@ def _renamed(function: Function, hints: Mapping[str, str]) -> Function:
         if a.name in hints:
             give(a.name, hints[a.name])
     count = 0
+    plain: set[str] = set()  # names that say nothing
     for a in everything:
         if a.name in assigned:
             continue
@@ -657,21 +673,47 @@ def _renamed(function: Function, hints: Mapping[str, str]) -> Function:
         if isinstance(a.value, Call) and len(a.value.args) == 1:
             arg = a.value.args[0]
             inner = assigned.get(arg.name, arg.name)
-            if arg.coefficient == 1 and not inner.startswith("_"):
+            if arg.coefficient == 1 and inner not in plain:
                 wish = {"reciprocal": f"inv_{inner}"}.get(a.value.function, f"{a.value.function}_{inner}")
+            elif len(parts := _leaves(function, arg)) > 1:
+                wish = f"{a.value.function}_{'_'.join(parts)}"
         if not wish:
             count += 1
             wish = f"w{count}"
+            plain.add(wish)
         give(a.name, wish)
 
+    told = {name for name, used in assigned.items() if used.rstrip("_") not in plain}
+    marked = replace(
+        function,
+        early=tuple(replace(a, named=a.name in told) for a in function.early),
+        body=tuple(replace(a, named=a.name in told) for a in function.body),
+    )
+    return rename(marked, assigned)
+
+
+def _leaves(function: Function, arg: Operand) -> tuple[str, ...]:
+    """The names in a sum of two or three, for sin_q1_q2; nothing where the argument is more."""
+    for a in (*function.early, *function.body):
+        if a.name == arg.name and isinstance(a.value, Sum) and len(a.value.terms) <= 3:
+            names = names_of(a.value)
+            return () if any(n.startswith("_") for n in names) else names
+    return ()
+
+
+def rename(function: Function, new: Mapping[str, str]) -> Function:
+    """The function with other names for some of its values."""
+
     def real(name: str) -> str:
-        return assigned.get(name, name)
+        return new.get(name, name)
 
     def operand(o: Operand) -> Operand:
         return replace(o, name=real(o.name)) if o.name else o
 
     def renamed(items: Iterable[Assignment]) -> tuple[Assignment, ...]:
-        return tuple(Assignment(real(a.name), _renamed_value(a.value, real), a.stage) for a in items)
+        return tuple(
+            replace(a, name=real(a.name), value=_renamed_value(a.value, real)) for a in items
+        )
 
     return replace(
         function,

@@ -1,0 +1,70 @@
+"""The cases with trusted answers in data/cases.json, as scenes."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eomc import names, scene, system
+
+DATA = Path(__file__).parent / "data" / "cases.json"
+SCENES = Path(__file__).parent.parent / "scenes"
+
+
+@cache
+def cases() -> dict[str, dict[str, Any]]:
+    """The cases by name; the file's own \"contract\" says what their keys mean."""
+    return {case["name"]: case for case in json.loads(DATA.read_text())["cases"]}
+
+
+def scene_text(name: str) -> str:
+    """A case as the text of a scene; parameters that C can't bear get names that it can."""
+    case = cases()[name]
+    if case["constraints"]:
+        raise ValueError(f"{name} has constraints, which scenes can't say")
+    renamed = {p: names.plain(p) if names.fault(p) else p for p in case["parameters"]}
+
+    def formula(text: str) -> str:
+        return json.dumps(re.sub(r"\b[A-Za-z]\w*", lambda m: renamed.get(m[0], m[0]), text))
+
+    starts = zip(case["coordinates"], case["q0"], case["qd0"], strict=True)
+    return "\n".join(
+        [
+            "eomc = 1",
+            f"name = {json.dumps(re.sub('[^a-z0-9]+', '_', name.lower()))}",
+            "[coordinates]",
+            *(f'{q} = {{ start = "{q0}", rate = "{qd0}" }}' for q, q0, qd0 in starts),
+            "[parameters]",
+            *(f"{renamed[p]} = {float(value)!r}" for p, value in case["parameters"].items()),
+            "[energy]",
+            f"kinetic = {formula(case['K'])}",
+            f"potential = {formula(case['P'])}",
+            "[forces]",
+            *(f"{q} = {formula(force)}" for q, force in case["generalized_forces"].items()),
+            "[run]",
+            f"h = {case['rk4_measured'][0]['h']!r}",
+            f"duration = {float(case['t_end'])!r}",
+        ]
+    )
+
+
+@cache
+def case_system(name: str) -> system.System:
+    """A case as a System, with the coarsest measured step size and t_end as its run."""
+    return system.from_scene(scene.parse(scene_text(name), f"{name}.toml"))
+
+
+@cache
+def scene_system(name: str) -> system.System:
+    """The System of scenes/<name>.toml."""
+    return system.from_scene(scene.read(SCENES / f"{name}.toml"))
+
+
+def error_of(name: str, q: Any) -> float:
+    """max_i |q_i - q_ref_i| at t_end."""
+    return float(np.max(np.abs(np.asarray(q) - np.array(cases()[name]["q_ref"], float))))
