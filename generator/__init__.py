@@ -1,3 +1,110 @@
-"""eomc, the equations-of-motion compiler."""
+"""eomc, the equations-of-motion compiler: from energies to fast, checked C.
+
+    scene.toml -> Scene -> System -> Equations -> Program -> Sources -> Module
+
+`load` goes the whole way; `sources` stops at the text. Each arrow is a function of one module:
+scene.read, system.from_scene, mechanics.derive, program.build, render.render, compile.build.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from eomc.problems import EomcError, SceneError
+
+if TYPE_CHECKING:
+    from eomc.compile import Built
+    from eomc.render import Sources
+    from eomc.system import System
 
 __version__ = "0.1.0"
+__all__ = ["EomcError", "SceneError", "System", "build", "load", "read", "sources"]
+
+ScenePath = str | os.PathLike[str]
+
+
+def __getattr__(name: str) -> Any:
+    """System, imported when it is asked for: SymPy takes half a second."""
+    if name == "System":
+        from eomc.system import System
+
+        return System
+    raise AttributeError(f"module 'eomc' has no attribute {name!r}")
+
+
+def read(scene: ScenePath) -> System:
+    """The checked scene as a SymPy system. Raises SceneError with every fault."""
+    from eomc import scene as scenes
+    from eomc.system import from_scene
+
+    return from_scene(scenes.read(scene))
+
+
+def sources(system: System, extension: str = "_extension") -> Sources:
+    """The generated files of a system, as text."""
+    from eomc import mechanics, program, render
+
+    return render.render(program.build(mechanics.derive(system)), extension)
+
+
+def build(
+    scene: ScenePath | System,
+    root: ScenePath = "build",
+    *,
+    on_system: Callable[[System], None] | None = None,
+) -> Built:
+    """The compiled module of a scene file or a System, in `root`/<name>/.
+
+    Nothing is derived or compiled where nothing has changed. on_system is called with the system
+    if it has to be derived. Raises SceneError for a faulty scene, EomcError for what else fails.
+    """
+    from eomc import compile as compiler
+
+    if not isinstance(scene, (str, os.PathLike)):
+        made, name, digest = scene, scene.name, scene.digest
+    else:
+        made = None
+        name, digest = _name_and_digest(Path(scene))
+    wanted = compiler.key(digest)
+    if name and compiler.found(Path(root) / name, wanted):
+        return compiler.Built(name, Path(root) / name, False)
+    if made is None:
+        made = read(scene)
+    if on_system is not None:
+        on_system(made)
+
+    def texts(extension: str) -> tuple[Any, str, str]:
+        out = sources(made, extension)
+        return out.files, out.binding, out.cdef
+
+    return compiler.build(made.name, wanted, texts, Path(root))
+
+
+def load(scene: ScenePath | System, root: ScenePath = "build") -> ModuleType:
+    """The compiled module of a scene, built where it is not there yet, imported.
+
+    >>> cartpole = load("scenes/cartpole.toml")     # doctest: +SKIP
+    >>> cartpole.simulate(duration=1.0).q[-1]       # doctest: +SKIP
+    """
+    from eomc import compile as compiler
+
+    return compiler.load(build(scene, root))
+
+
+def _name_and_digest(path: Path) -> tuple[str, str]:
+    """What a scene is called and the digest of its text, without checking it; no SymPy."""
+    import hashlib
+    import tomllib
+
+    try:
+        data = path.read_bytes()
+        name = tomllib.loads(data.decode()).get("name", "")
+    except (OSError, ValueError):
+        return "", ""  # the reader tells what is wrong
+    return name if isinstance(name, str) and name.isidentifier() else "", hashlib.sha256(
+        data
+    ).hexdigest()

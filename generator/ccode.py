@@ -65,7 +65,9 @@ def number(value: Expr, real: Real = DOUBLE) -> str:
         nearest = float(value)
         text = _decimal(nearest)
         if sympy.Rational(text) != value and max(abs(value.p), value.q) < 2**24:
-            return f"({_decimal(float(value.p))}{real.suffix}/{_decimal(float(value.q))}{real.suffix})"
+            return (
+                f"({_decimal(float(value.p))}{real.suffix}/{_decimal(float(value.q))}{real.suffix})"
+            )
         return text + real.suffix
     return _decimal(float(value.evalf(25))) + real.suffix
 
@@ -167,8 +169,8 @@ class Body:
     early: tuple[Block, ...]
     blocks: tuple[Block, ...]
     results: tuple[str, ...]
-    early_checks: tuple[str, ...]
-    checks: tuple[str, ...]
+    early_failures: tuple[str, ...]  # conditions under which D can't be inverted
+    failures: tuple[str, ...]
     kept: tuple[str, ...]  # what goes into the struct, where there is one
     sincos: bool
 
@@ -215,7 +217,7 @@ def body(
     early = {a.name for a in function.early}
     is_early = [c[0].name in early or c[0].name in where or not c[0].name for c in function.checks]
     checks = [(e, pair) for e, pair in zip(is_early, function.checks, strict=True)]
-    early_checks = tuple(_check(printer, pair, tolerance) for e, pair in checks if e)
+    early_failures = tuple(_fails(printer, pair, tolerance) for e, pair in checks if e)
     if keep is not None:
         printer.where |= {name: keep(name) for name in kept}
 
@@ -238,21 +240,24 @@ def body(
         early=(Block("parameters alone", tuple(early_lines)),) if early_lines else (),
         blocks=tuple(Block(_STAGE_COMMENTS[s], tuple(text)) for s, text in lines.items() if text),
         results=tuple(printer.operand(o) for o in function.outputs),
-        early_checks=early_checks,
-        checks=tuple(_check(printer, pair, tolerance) for e, pair in checks if not e),
+        early_failures=early_failures,
+        failures=tuple(_fails(printer, pair, tolerance) for e, pair in checks if not e),
         kept=tuple(kept),
         sincos=real is DOUBLE and any("_sincos(" in x for text in lines.values() for x in text),
     )
 
 
-def _check(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) -> str:
-    """A pivot must be positive, and not what rounding leaves of a diagonal entry."""
+def _fails(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) -> str:
+    """Whether a pivot is not positive, or no more than what rounding leaves of a diagonal entry.
+
+    Not a number passes: the state behind it is reported as not finite.
+    """
     pivot, diagonal = pair
     text = printer.operand(pivot, 2)
     if pivot == diagonal:
-        return f"{text} > 0"
+        return f"{text} <= 0"
     limit = _decimal(float(f"{tolerance:.1e}")) + printer.real.suffix
-    return f"{text} > {limit}*{printer.operand(diagonal, 4)}"
+    return f"{text} <= {limit}*{printer.operand(diagonal, 4)}"
 
 
 def _sincos(printer: Printer, angle: Operand, names: Mapping[str, str]) -> list[str]:
@@ -309,18 +314,18 @@ def _numbered(function: Function, inline: frozenset[str]) -> dict[str, str]:
 
 def indent(lines: Iterable[str], width: int = 4) -> str:
     """Lines of one block, indented; long ones broken after operators."""
-    return "\n".join(" " * width + line for text in lines for line in _broken(text, 96 - width))
+    return "\n".join(" " * width + line for text in lines for line in broken(text, 100 - width))
 
 
-def _broken(text: str, width: int) -> Sequence[str]:
-    """A statement over several lines, broken where a sum goes on; deeper lines are indented."""
+def broken(text: str, width: int = 100) -> Sequence[str]:
+    """A statement or a prototype over several lines, each at most `width` long where it can be."""
     lines = []
     while len(text) > width:
-        at = max(text.rfind(" + ", 0, width), text.rfind(" - ", 0, width), text.rfind(" && ", 0, width))
-        if at <= 8:
-            at = text.rfind("*", 0, width)
-            if at <= 8:
-                break
+        marks = (", ", " + ", " - ", " || ", "*")
+        at = next((k for m in marks if (k := text.rfind(m, 12, width)) > 0), 0)
+        if not at:
+            break
+        at += 1 if text[at] == "," else 0
         lines.append(text[:at])
         text = "    " + text[at:].lstrip()
     return [*lines, text]

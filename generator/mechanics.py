@@ -245,9 +245,7 @@ def _coriolis(system: System, tape: Tape, bias: list[Expr], quadratic: bool) -> 
     for velocity in system.qd:
         column = tape.forward(bias, {velocity: S.One})
         still = [S.Zero] * len(column) if quadratic else tape.substitute(column, at_rest)
-        columns.append(
-            [tape.define((a + b) / 2) for a, b in zip(column, still, strict=True)]
-        )
+        columns.append([tape.define((a + b) / 2) for a, b in zip(column, still, strict=True)])
     return tuple(tuple(column[i] for column in columns) for i in range(len(columns)))
 
 
@@ -298,7 +296,11 @@ def _notes(
             "its skew matrix is in C, da/dt in g."
         )
     if tape.substitute([e.kinetic], at_rest) != [S.Zero]:
-        notes.append("The part K0 of K that is free of velocities acts as -K0 in P: -dK0/dq is in g.")
+        notes.append(
+            "The part K0 of K that is free of velocities acts as -K0 in P: -dK0/dq is in g."
+        )
     if t in tape.leaves_of([entry for row in D for entry in row]):
-        notes.append("D depends on time: C includes dD/dt, and Ddot - 2 C + dD/dt is skew-symmetric.")
+        notes.append(
+            "D depends on time: C includes dD/dt, and Ddot - 2 C + dD/dt is skew-symmetric."
+        )
     return tuple(notes)

@@ -7,6 +7,7 @@ equations are had by more than one route, the one with the fewest operations is 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -274,9 +275,7 @@ class _Work:
         rhs = self.tape.rhs[symbol]
         if rhs.is_Add:
             constant = Sum((), sum((a for a in rhs.args if a.is_number), S.Zero)).constant
-            terms = tuple(
-                (o.coefficient, o.name) for o in map(self.operand, rhs.args) if o.name
-            )
+            terms = tuple((o.coefficient, o.name) for o in map(self.operand, rhs.args) if o.name)
             self._put(symbol.name, Sum(terms, constant))
         elif rhs.is_Mul or rhs.is_Pow:
             self._put(symbol.name, self._product(rhs, symbol.name))
@@ -394,7 +393,10 @@ class _Work:
                 coefficient, factors = value.coefficient, []
                 for factor in value.factors:
                     inner = self.values.get(factor)
-                    ripe = self.stages[factor] > Stage.PARAMETER or self.stages[name] <= Stage.PARAMETER
+                    ripe = (
+                        self.stages[factor] > Stage.PARAMETER
+                        or self.stages[name] <= Stage.PARAMETER
+                    )
                     single = uses[factor] == 1 and factor not in self.hints
                     if isinstance(inner, Product) and single and ripe:
                         coefficient *= inner.coefficient
@@ -427,7 +429,12 @@ class _Work:
                 inner = self.values.get(term)
                 if isinstance(inner, Product) and uses[term] == 1 and term not in self.hints:
                     inside[term] = inner
-            counts = Counter(f for p in inside.values() for f in dict.fromkeys(p.factors) if self.stages[f] >= least)
+            counts = Counter(
+                f
+                for p in inside.values()
+                for f in dict.fromkeys(p.factors)
+                if self.stages[f] >= least
+            )
             best = max(counts, key=lambda f: (counts[f], -self.stages[f], f), default=None)
             if best is None or counts[best] < 2:
                 continue
@@ -622,7 +629,9 @@ def _renamed_value(value: Value, real: Callable[[str], str]) -> Value:
         return Sum(tuple((w, real(n)) for w, n in value.terms), value.constant)
     if isinstance(value, Product):
         return Product(value.coefficient, tuple(real(n) for n in value.factors))
-    return Call(value.function, tuple(replace(a, name=real(a.name)) if a.name else a for a in value.args))
+    return Call(
+        value.function, tuple(replace(a, name=real(a.name)) if a.name else a for a in value.args)
+    )
 
 
 def _cost(body: Sequence[Assignment], outputs: Sequence[Operand]) -> Cost:
@@ -674,7 +683,9 @@ def _renamed(function: Function, hints: Mapping[str, str]) -> Function:
             arg = a.value.args[0]
             inner = assigned.get(arg.name, arg.name)
             if arg.coefficient == 1 and inner not in plain:
-                wish = {"reciprocal": f"inv_{inner}"}.get(a.value.function, f"{a.value.function}_{inner}")
+                wish = {"reciprocal": f"inv_{inner}"}.get(
+                    a.value.function, f"{a.value.function}_{inner}"
+                )
             elif len(parts := _leaves(function, arg)) > 1:
                 wish = f"{a.value.function}_{'_'.join(parts)}"
         if not wish:
@@ -721,6 +732,49 @@ def rename(function: Function, new: Mapping[str, str]) -> Function:
         body=renamed(function.body),
         outputs=tuple(map(operand, function.outputs)),
         checks=tuple((operand(a), operand(b)) for a, b in function.checks),
+    )
+
+
+# --- evaluation in Python -----------------------------------------------------------------------
+
+_PYTHON: Mapping[str, Callable[..., float]] = {
+    **{n: getattr(math, n) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")},
+    **{n: getattr(math, n) for n in ("sinh", "cosh", "tanh", "exp", "log", "sqrt", "pow")},
+    "abs": abs,
+    "sign": lambda x: float((x > 0) - (x < 0)),
+    "heaviside": lambda x: 0.5 + 0.5 * ((x > 0) - (x < 0)),
+    "min": min,
+    "max": max,
+    "reciprocal": lambda x: 1 / x,
+}
+
+
+def evaluate(function: Function, values: Mapping[str, float]) -> tuple[list[float], bool]:
+    """The results of a function, and whether every pivot is positive; all in Python floats.
+
+    values: coordinates, velocities, parameters, inputs and t by name. Raises ArithmeticError or
+    ValueError where a result is not a finite number.
+    """
+    known = dict(values)
+
+    def operand(o: Operand) -> float:
+        return float(o.coefficient) * (known[o.name] if o.name else 1.0)
+
+    for a in (*function.early, *function.body):
+        v = a.value
+        if isinstance(v, Sum):
+            known[a.name] = float(v.constant) + sum(float(w) * known[n] for w, n in v.terms)
+        elif isinstance(v, Product):
+            known[a.name] = float(v.coefficient) * math.prod(known[n] for n in v.factors)
+        else:
+            known[a.name] = _PYTHON[v.function](*map(operand, v.args))
+    results = [operand(o) for o in function.outputs]
+    if not all(map(math.isfinite, results)):
+        raise ValueError(f"{function.name} is not finite")
+    tolerance = 8 * 2.0**-52 * max(1, len(function.checks))
+    return results, all(
+        operand(pivot) > (0 if pivot == diagonal else tolerance * operand(diagonal))
+        for pivot, diagonal in function.checks
     )
 
 

@@ -169,7 +169,11 @@ class System:
 
 
 def _number(text: str) -> Expr:
-    return sympy.Rational(text) if not text[:2].lower() in ("0x", "0o", "0b") else sympy.Integer(int(text, 0))
+    return (
+        sympy.Rational(text)
+        if not text[:2].lower() in ("0x", "0o", "0b")
+        else sympy.Integer(int(text, 0))
+    )
 
 
 _ALGEBRA: Mapping[str, Any] = {
@@ -225,7 +229,9 @@ def from_scene(scene: Scene) -> System:
         potential=value("energy.potential", scene.potential),
         dissipation=value("energy.dissipation", scene.dissipation),
         forces=tuple(
-            value(f"forces.{c.name}", scene.forces[c.name]) if c.name in scene.forces else sympy.S.Zero
+            value(f"forces.{c.name}", scene.forces[c.name])
+            if c.name in scene.forces
+            else sympy.S.Zero
             for c in scene.coordinates
         ),
         parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
@@ -299,13 +305,19 @@ class _Maker:
         dissipation: Any, forces: Mapping[Any, Any], inputs: Any, definitions: Mapping[Any, Any],
         units: Mapping[Any, str], title: str, run: Run,
     ) -> System:  # fmt: skip
-        starts = dict(coordinates) if isinstance(coordinates, Mapping) else dict.fromkeys(coordinates, 0.0)
+        starts = (
+            dict(coordinates)
+            if isinstance(coordinates, Mapping)
+            else dict.fromkeys(coordinates, 0.0)
+        )
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
         made = []
         for given, start in starts.items():
             q0, qd0 = start if isinstance(start, tuple) else (start, 0.0)
-            c = Coordinate(self.name_of(given, "coordinate"), units.get(given, ""), float(q0), float(qd0))
+            c = Coordinate(
+                self.name_of(given, "coordinate"), units.get(given, ""), float(q0), float(qd0)
+            )
             self.map[given] = c.q
             if isinstance(given, AppliedUndef):
                 time = given.args[0]

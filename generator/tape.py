@@ -233,7 +233,9 @@ class Tape:
         """The leaves that `atoms` hang on."""
         atoms = list(atoms)
         names = self.live(atoms)
-        seen = {s for atom in atoms for s in atom.free_symbols}.union(*(self.parts[n] for n in names))
+        seen = {s for atom in atoms for s in atom.free_symbols}.union(
+            *(self.parts[n] for n in names)
+        )
         return seen & self.leaves.keys()
 
     def partial(self, symbol: Symbol, part: Symbol) -> Expr:
@@ -249,14 +251,18 @@ class Tape:
         tangent: dict[Symbol, Expr] = dict(seeds)
         for symbol in self.live(outputs):
             terms = [
-                self._product([*Mul.make_args(self.partial(symbol, part)), *Mul.make_args(tangent[part])])
+                self._product(
+                    [*Mul.make_args(self.partial(symbol, part)), *Mul.make_args(tangent[part])]
+                )
                 for part in self.parts[symbol]
                 if part in tangent
             ]
             if terms and (sum_ := self._sum(terms)) != 0:
                 tangent[symbol] = sum_
         return [
-            self._product([factor, *Mul.make_args(tangent[symbol])]) if symbol in tangent else S.Zero
+            self._product([factor, *Mul.make_args(tangent[symbol])])
+            if symbol in tangent
+            else S.Zero
             for factor, symbol in map(split, outputs)
         ]
 

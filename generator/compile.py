@@ -1,0 +1,273 @@
+"""Sources to a compiled, importable module: cffi, the C compiler, the cache.
+
+A module lies in `build/<name>/`. Its extension carries a digest in its name, and `__init__.py`,
+which says which extension is its own, is moved into place last: whatever interrupts a build, what
+was there before stays whole. A file lock keeps builds of one scene apart.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+
+from eomc import __version__
+from eomc.problems import EomcError
+
+# no -ffast-math: it breaks the reduction of angles and the checks for singular D
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize")
+STANDARD = "-std=gnu99"  # c99 would forbid the contraction to FMA
+MANIFEST = "build.json"
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C compiler: the command, and what identifies it."""
+
+    command: tuple[str, ...]
+    identity: str
+
+
+@dataclass(frozen=True)
+class Built:
+    """A module on disk; `fresh` where it was built just now and not found."""
+
+    name: str
+    folder: Path
+    fresh: bool
+
+
+def find_compiler() -> Compiler:
+    """$CC, cc, gcc, clang or the pip-installable ziglang, in this order. Raises EomcError."""
+    wish = os.environ.get("CC")
+    for candidate in [wish] if wish else ["cc", "gcc", "clang"]:
+        words = shlex.split(candidate)
+        if words and (path := shutil.which(words[0])):
+            return Compiler((path, *words[1:]), _identity(path) + " ".join(words[1:]))
+    if wish:
+        raise EomcError(f"the C compiler CC={wish!r} is not there: correct or unset CC")
+    if importlib.util.find_spec("ziglang") is not None:
+        import ziglang
+
+        return Compiler((sys.executable, "-m", "ziglang", "cc"), f"ziglang {ziglang.__file__}")
+    raise EomcError(
+        "no C compiler found: install gcc or clang (Debian: apt install gcc), "
+        "or 'pip install ziglang', which brings one"
+    )
+
+
+def _identity(path: str) -> str:
+    real = Path(path).resolve()
+    stat = real.stat()
+    return f"{real} {stat.st_size} {stat.st_mtime_ns}"
+
+
+def flags() -> tuple[str, ...]:
+    """The optimisation flags: $EOMC_CFLAGS where it is set, FLAGS otherwise."""
+    given = os.environ.get("EOMC_CFLAGS")
+    if given is not None:
+        return tuple(shlex.split(given))
+    wide = ("-mprefer-vector-width=512",) if "avx512f" in _processor() else ()
+    return (*FLAGS, *wide)
+
+
+@lru_cache(maxsize=1)
+def _processor() -> str:
+    """What -march=native hangs on."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        kept = {line for line in lines if line.startswith(("model name", "flags", "Features"))}
+        return platform.machine() + " " + " ".join(sorted(kept))
+    except OSError:
+        return platform.machine() + " " + platform.processor()
+
+
+@lru_cache(maxsize=1)
+def _generator_digest() -> str:
+    """What the generator is: its version and the text of all its parts."""
+    here = Path(__file__).parent
+    folders = [here]
+    for part in ("templates", "csrc"):
+        spec = importlib.util.find_spec(f"eomc.{part}")
+        assert spec is not None and spec.origin is not None
+        folders.append(Path(spec.origin).parent)
+    total = hashlib.sha256(__version__.encode())
+    for folder in folders:
+        for file in sorted(folder.iterdir()):
+            if file.suffix in (".py", ".jinja", ".h"):
+                total.update(file.name.encode() + file.read_bytes())
+    return total.hexdigest()
+
+
+def key(scene_digest: str, options: str = "") -> str:
+    """The digest of all that a build hangs on: scene, generator, flags, compiler, processor."""
+    compiler = find_compiler()
+    parts = (
+        scene_digest, options, _generator_digest(), compiler.identity, STANDARD, *flags(),
+        _processor(), sys.version, str(sysconfig.get_config_var("EXT_SUFFIX")),
+    )  # fmt: skip
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def found(folder: Path, wanted: str) -> bool:
+    """Whether `folder` holds a whole build of this key."""
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        return manifest["key"] == wanted and all(
+            (folder / name).stat().st_size == size for name, size in manifest["files"].items()
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+
+
+def build(
+    name: str,
+    wanted: str,
+    sources: Callable[[str], tuple[Mapping[str, str], str, str]],
+    root: Path,
+) -> Built:
+    """The module of one scene under `root`, built where it isn't there yet.
+
+    wanted: the key. sources: given the name of the extension, the texts of the files by name, the
+    binding's C and its cdef; called only where something is to be built.
+    Raises EomcError where the compiler fails, with its own words, or the folder can't be written.
+    """
+    folder = root / name
+    if found(folder, wanted):
+        return Built(name, folder, False)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _locked(root / f".{name}.lock"):
+            if found(folder, wanted):  # by another process, meanwhile
+                return Built(name, folder, False)
+            with tempfile.TemporaryDirectory(dir=root, prefix=f".{name}.") as beside:
+                _build(name, wanted, sources, folder, Path(beside))
+    except OSError as fault:
+        raise EomcError(
+            f"{fault.filename or folder}: can't be written ({fault.strerror}): "
+            "choose another place with --build DIR"
+        ) from None
+    return Built(name, folder, True)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with path.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _build(
+    name: str,
+    wanted: str,
+    sources: Callable[[str], tuple[Mapping[str, str], str, str]],
+    folder: Path,
+    beside: Path,
+) -> None:
+    extension = f"_{name}_{wanted[:12]}"
+    texts, binding, cdef = sources(extension)
+    for file, text in texts.items():
+        (beside / file).write_text(text, encoding="utf-8")
+    library = extension + str(sysconfig.get_config_var("EXT_SUFFIX"))
+    _compile(name, extension, binding, cdef, beside, library)
+    kept = [library, *texts]
+    manifest = {
+        "key": wanted,
+        "name": name,
+        "eomc": __version__,
+        "compiler": " ".join(find_compiler().command),
+        "flags": " ".join((STANDARD, *flags())),
+        "files": {file: (beside / file).stat().st_size for file in kept},
+    }
+    (beside / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
+    # the face last: until it is there, the old one is whole; the manifest after it
+    for file in [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST]:
+        os.replace(beside / file, folder / file)
+    for path in stale:
+        path.unlink(missing_ok=True)
+
+
+def _compile(
+    name: str, extension: str, binding: str, cdef: str, folder: Path, library: str
+) -> None:
+    import cffi
+
+    ffi = cffi.FFI()
+    ffi.cdef(cdef)
+    ffi.set_source(extension, binding, compiler_verbose=0)
+    ffi.emit_c_code(str(folder / "binding.c"))
+    compiler = find_compiler()
+    include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
+    common = [*compiler.command, STANDARD, "-fPIC", "-fvisibility=hidden"]
+    jobs = [
+        [*common, *flags(), "-c", f"{name}.c", "-o", "scene.o"],
+        # the wrapper's speed is that of the calls in it
+        [*common, "-O1", *include, "-c", "binding.c", "-o", "binding.o"],
+    ]
+    running = [(job, _start(job, folder)) for job in jobs]
+    for job, process in running:
+        _finish(name, job, process)
+    link = [*compiler.command, "-shared", "scene.o", "binding.o", "-lm", "-o", library]
+    if sys.platform == "darwin":
+        link.insert(1, "-undefined")
+        link.insert(2, "dynamic_lookup")
+    _finish(name, link, _start(link, folder))
+
+
+def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
+    try:
+        return subprocess.Popen(
+            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+    except OSError as fault:
+        raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
+
+
+def _finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) -> None:
+    try:
+        words, _ = process.communicate()
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    if process.returncode:
+        raise EomcError(
+            f"{name}: the C compiler failed (status {process.returncode}):\n"
+            f"  {shlex.join(command)}\n{words.rstrip()}"
+        )
+
+
+def load(built: Built) -> ModuleType:
+    """Import a built module, whatever else bears its name; the same build gives the same module."""
+    manifest = json.loads((built.folder / MANIFEST).read_text(encoding="utf-8"))
+    alias = f"_eomc_{built.name}_{manifest['key'][:12]}"
+    if alias in sys.modules:
+        return sys.modules[alias]
+    spec = importlib.util.spec_from_file_location(
+        alias, built.folder / "__init__.py", submodule_search_locations=[str(built.folder)]
+    )
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[alias] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[alias]
+        raise
+    return module

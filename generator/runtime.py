@@ -1,0 +1,559 @@
+"""What every compiled scene offers in Python: arrays in, arrays out, the loop in C.
+
+This file is copied beside each compiled extension, so that a built scene needs NumPy and cffi
+only. Shapes: q, qd (nq,) or (n, nq); then results have a leading n as well. Angles in rad,
+everything in SI units. Wrong shapes, unknown names and numbers that are not finite raise
+ValueError with the name of the argument.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[Any]
+Parameters = Mapping[str, float] | Sequence[float] | Array | None
+Inputs = ArrayLike | Callable[[float, Array, Array], ArrayLike] | None
+
+STATUS = ("ok", "singular", "not finite")
+_SAID = {
+    "singular": "D is not positive definite there, so no acceleration exists",
+    "not finite": "the state would no longer be finite: the step may be too long, "
+    "or the motion runs into a singularity",
+    "interrupted": "interrupted",
+}
+_CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
+
+
+class MotionError(ArithmeticError):
+    """There is no finite acceleration at a state; `status` says why: singular or not finite."""
+
+    def __init__(self, message: str, status: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a simulation; `run` holds what was done until then."""
+
+    def __init__(self, run: Run) -> None:
+        super().__init__(run.message)
+        self.run = run
+
+
+class Run:
+    """A trajectory: t (n,), q (n, nq), qd (n, nq), status.
+
+    status: "ok", "singular", "not finite" or "interrupted"; a run that is not ok ends with its
+    last good state, and `message` says where and why. energy (n,): K + P, computed when it is
+    asked for; `steps` were done, of size h.
+    """
+
+    def __init__(
+        self, model: Model, t: Array, q: Array, qd: Array, h: float, steps: int, status: str,
+        params: Array,
+    ) -> None:  # fmt: skip
+        self.t, self.q, self.qd = t, q, qd
+        self.h, self.steps, self.status = h, steps, status
+        self._model, self._params = model, params
+        self._energy: Array | None = None
+
+    @property
+    def energy(self) -> Array:
+        """K + P along the run, (n,), J."""
+        if self._energy is None:
+            self._energy = self._rows("energy")
+        return self._energy
+
+    @property
+    def jacobi(self) -> Array:
+        """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic."""
+        return self._rows("jacobi")
+
+    def _rows(self, name: str) -> Array:
+        function = getattr(self._model, name)
+        values = [
+            np.atleast_1d(function(q, qd, t=float(self.t[k]), params=self._params))
+            for k, q, qd in self._model._by_time(name, self.t, self.q, self.qd)
+        ]
+        return np.concatenate(values)
+
+    @property
+    def x(self) -> Array:
+        """The states [q; qd], (n, 2 nq)."""
+        return np.hstack([self.q, self.qd])
+
+    @property
+    def message(self) -> str:
+        """What happened, in a sentence."""
+        if self.status == "ok":
+            return f"{self.steps} steps of {self.h:g} s"
+        return (
+            f"stopped at t = {self.t[-1]:.9g} after {self.steps} steps of {self.h:g} s, "
+            f"q = {np.array2string(self.q[-1], precision=6)}, "
+            f"qd = {np.array2string(self.qd[-1], precision=6)}: {_SAID[self.status]}"
+        )
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __repr__(self) -> str:
+        return f"<Run of {self._model.name}: {self.message}>"
+
+
+class Params:
+    """A scene's parameters, by name: `p = Params(m_c=3.0); p.m_c = 4.0`. Made by the module."""
+
+    _names: tuple[str, ...] = ()
+    _defaults: tuple[float, ...] = ()
+    _dtype = "float64"
+    __slots__ = ("values",)
+
+    def __init__(self, **values: float) -> None:
+        object.__setattr__(self, "values", np.array(self._defaults, self._dtype))
+        for name, value in values.items():
+            setattr(self, name, value)
+
+    def _index(self, name: str) -> int:
+        try:
+            return self._names.index(name)
+        except ValueError:
+            raise ValueError(_unknown("params", name, self._names)) from None
+
+    def __getattr__(self, name: str) -> float:
+        if name.startswith("_") or name == "values" or name not in self._names:
+            raise AttributeError(_unknown("params", name, self._names))
+        return float(self.values[self._names.index(name)])
+
+    def __setattr__(self, name: str, value: float) -> None:
+        number = float(value)
+        if not np.isfinite(number):
+            raise ValueError(f"params: {name} = {value} is not a finite number")
+        self.values[self._index(name)] = number
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __repr__(self) -> str:
+        inside = ", ".join(f"{n}={v:g}" for n, v in zip(self._names, self.values, strict=True))
+        return f"Params({inside})"
+
+
+class Model:
+    """The functions of one compiled scene; the package hands them on under their own names."""
+
+    def __init__(
+        self, extension: Any, *, name: str, title: str, dtype: str,
+        coordinates: Mapping[str, str], parameters: Mapping[str, float],
+        inputs: Mapping[str, str], units: Mapping[str, str],
+        start: tuple[Sequence[float], Sequence[float]], h: float, duration: float, timed: Sequence[str], digest: str,
+    ) -> None:  # fmt: skip
+        self._ffi, self._lib = extension.ffi, extension.lib
+        self._ctype = {"float64": "double[]", "float32": "float[]"}[dtype]
+        self.name, self.title, self.digest = name, title, digest
+        self.dtype = np.dtype(dtype)
+        self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
+        self.parameters = tuple(parameters)
+        self.defaults = dict(parameters)
+        self.units = dict(units)
+        self.nq, self.nu = len(self.coordinates), len(self.inputs)
+        self.h, self.duration = h, duration
+        self._start = tuple(np.array(x, self.dtype) for x in start)
+        self._p0 = np.array(list(parameters.values()), self.dtype)
+        self._timed = frozenset(timed)
+        self._told = False
+        names = {
+            "_names": self.parameters,
+            "_defaults": tuple(parameters.values()),
+            "_dtype": dtype,
+        }
+        self.Params = type("Params", (Params,), {**names, "__slots__": ()})
+
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """(q, qd) where the scene starts."""
+        q, qd = self._start
+        return q.copy(), qd.copy()
+
+    # --- arguments -----------------------------------------------------------------------------
+
+    def _pointer(self, array: Array | None) -> Any:
+        if array is None:
+            return self._ffi.NULL
+        return self._ffi.from_buffer(self._ctype, array)
+
+    def _array(self, value: ArrayLike, name: str, width: int) -> Array:
+        try:
+            array = np.ascontiguousarray(value, self.dtype)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
+        if array.ndim not in (1, 2) or array.shape[-1] != width:
+            raise ValueError(
+                f"{name}: shape {np.shape(value)}, expected ({width},) or (n, {width}): "
+                f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
+        return array
+
+    def _state(self, q: ArrayLike, qd: ArrayLike | None) -> tuple[Array, Array | None]:
+        q = self._array(q, "q", self.nq)
+        if qd is None:
+            return q, None
+        qd = self._array(qd, "qd", self.nq)
+        if q.shape != qd.shape:
+            raise ValueError(f"qd: shape {qd.shape} beside q of shape {q.shape}: they go in pairs")
+        return q, qd
+
+    def _parameters(self, params: Any) -> Array:
+        if params is None:
+            return self._p0
+        if isinstance(params, Params):
+            if params._names != self.parameters:
+                raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
+            values: Array = params.values
+            return values
+        if isinstance(params, Mapping):
+            return np.asarray(self.Params(**params).values)
+        array = np.ascontiguousarray(params, self.dtype)
+        if array.shape != self._p0.shape or not np.isfinite(array).all():
+            raise ValueError(
+                f"params: expected a dict, Params or {len(self._p0)} finite numbers in the order "
+                f"{', '.join(self.parameters)}"
+            )
+        return array
+
+    def _inputs(self, u: Any) -> Array | None:
+        if u is None:
+            return None
+        if not self.nu:
+            raise ValueError("u: this scene has no inputs")
+        if self.nu == 1 and np.ndim(u) == 0:
+            u = [u]
+        array = self._array(u, "u", self.nu)
+        if array.ndim != 1:
+            raise ValueError(f"u: shape {array.shape}, expected ({self.nu},): one value an input")
+        return array
+
+    def _out(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
+        if out is None:
+            return np.empty(shape, self.dtype)
+        good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.c_contiguous
+        if not good or out.shape != shape or not out.flags.writeable:
+            raise ValueError(
+                f"{name}: expected a writeable, C-contiguous array of {self.dtype}, shape {shape}"
+            )
+        array: Array = out
+        return array
+
+    def _time(self, t: float) -> float:
+        if not np.isfinite(t):
+            raise ValueError(f"t: {t} is not a finite number")
+        return float(t)
+
+    # --- functions of a state --------------------------------------------------------------------
+
+    def _evaluate(
+        self, name: str, shape: tuple[int, ...], q: ArrayLike, qd: ArrayLike | None, t: float,
+        u: Any, params: Any, out: Any,
+    ) -> Any:  # fmt: skip
+        q, qd = self._state(q, qd)
+        rows = q.shape[:-1]
+        result = self._out(out, rows + shape)
+        function = getattr(self._lib, name, None)
+        if function is None:
+            result[...] = 0
+        else:
+            function(
+                rows[0] if rows else 1,
+                self._pointer(result), self._pointer(q), self._pointer(qd), self._time(t),
+                self._pointer(self._inputs(u)), self._pointer(self._parameters(params)),
+            )  # fmt: skip
+        return result if result.ndim else result[()]
+
+    def _by_time(
+        self, name: str, t: Array, q: Array, qd: Array
+    ) -> Iterator[tuple[int, Array, Array]]:
+        """Rows that can be evaluated in one call: all of them, unless time matters."""
+        if name not in self._timed:
+            yield 0, q, qd
+        else:
+            for k in range(len(t)):
+                yield k, q[k : k + 1], qd[k : k + 1]
+
+    def D(self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
+        """D(q): mass matrix, (nq, nq), symmetric positive definite. Others call it M."""
+        return self._evaluate("D", (self.nq, self.nq), q, None, t, None, params, out)
+
+    def C(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """C(q, qd): Coriolis matrix, (nq, nq), in Christoffel form: Ddot - 2 C is skew-symmetric."""
+        return self._evaluate("C", (self.nq, self.nq), q, qd, t, None, params, out)
+
+    def g(self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
+        """g(q) = dP/dq, (nq,): generalized forces of the potential energy."""
+        return self._evaluate("g", (self.nq,), q, None, t, None, params, out)
+
+    def bias(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """C(q, qd) qd + g(q), (nq,), without forming C."""
+        return self._evaluate("bias", (self.nq,), q, qd, t, None, params, out)
+
+    def tau(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
+        params: Parameters = None, out: Any = None,
+    ) -> Any:  # fmt: skip
+        """tau = Q - dR/dqd, (nq,): what inputs, friction and other forces do. u None: the signals."""
+        return self._evaluate("tau", (self.nq,), q, qd, t, u, params, out)
+
+    def kinetic_energy(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """K(q, qd), J."""
+        return self._evaluate("kinetic_energy", (), q, qd, t, None, params, out)
+
+    def potential_energy(
+        self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None
+    ) -> Any:
+        """P(q), J."""
+        return self._evaluate("potential_energy", (), q, None, t, None, params, out)
+
+    def energy(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """K + P, J."""
+        return self._evaluate("energy", (), q, qd, t, None, params, out)
+
+    def jacobi(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """qd.dK/dqd - K + P, J: the energy where K is quadratic in qd, else what takes its place."""
+        name = "jacobi" if hasattr(self._lib, "jacobi") else "energy"
+        return self._evaluate(name, (), q, qd, t, None, params, out)
+
+    def power(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
+        params: Parameters = None, out: Any = None,
+    ) -> Any:  # fmt: skip
+        """d(jacobi)/dt, W: what inputs, friction and driven supports put in. u None: the signals."""
+        return self._evaluate("power", (), q, qd, t, u, params, out)
+
+    def signal(self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None) -> Any:
+        """The scene's own inputs at a state and time, (nu,)."""
+        return self._evaluate("signal", (self.nu,), q, qd, t, None, params, None)
+
+    def acceleration(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
+        params: Parameters = None, out: Any = None,
+    ) -> Array:  # fmt: skip
+        """Qdd from D qdd + C qd + g = tau, (nq,). u None: the scene's signals.
+
+        Raises MotionError where D is singular or a result is not finite.
+        """
+        q, qd = self._state(q, qd)
+        assert qd is not None
+        result = self._out(out, q.shape)
+        made = result if out is None else np.empty(q.shape, self.dtype)
+        status = self._ffi.new("int *")
+        rows = q.shape[0] if q.ndim == 2 else 1
+        done = self._lib.acceleration(
+            rows, self._pointer(made), self._pointer(q), self._pointer(qd), self._time(t),
+            self._pointer(self._inputs(u)), self._pointer(self._parameters(params)), status,
+        )  # fmt: skip
+        if status[0]:
+            at = (q, qd) if q.ndim == 1 else (q[done], qd[done])
+            where = f"q = {np.array2string(at[0])}, qd = {np.array2string(at[1])}"
+            said = STATUS[status[0]]
+            what = _SAID[said] if said == "singular" else "the acceleration is not finite there"
+            raise MotionError(f"at {where}: {what}", said)
+        if made is not result:
+            result[...] = made
+        return result
+
+    def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
+        """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
+        x = np.asarray(x, self.dtype)
+        if x.shape != (2 * self.nq,):
+            raise ValueError(f"x: shape {x.shape}, expected ({2 * self.nq},): q, then qd")
+        out = np.empty(2 * self.nq, self.dtype)
+        out[: self.nq] = x[self.nq :]
+        out[self.nq :] = self.acceleration(x[: self.nq], x[self.nq :], t, u, params)
+        return out
+
+    # --- motion ------------------------------------------------------------------------------------
+
+    def step(
+        self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
+        params: Parameters = None, out: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """(q, qd) one Runge-Kutta step of size h later; u is held over the step.
+
+        u None: the scene's signals, followed through the step. Raises MotionError where the step
+        can't be made; `out` is untouched then.
+        """
+        q, qd = self._state(q, qd)
+        assert qd is not None
+        if q.ndim != 1:
+            raise ValueError(f"q: shape {q.shape}, expected ({self.nq},)")
+        q, qd = q.copy(), qd.copy()
+        status = self._ffi.new("int *")
+        self._lib.rk4_run(
+            self._pointer(q), self._pointer(qd), self._time(t), self._size(h), 0, 1,
+            self._pointer(self._inputs(u)), 0, 0, self._ffi.NULL, self._ffi.NULL,
+            self._pointer(self._parameters(params)), status,
+        )  # fmt: skip
+        if status[0]:
+            said = STATUS[status[0]]
+            where = f"t = {t:.9g}, q = {np.array2string(q)}, qd = {np.array2string(qd)}"
+            raise MotionError(f"no step from {where}: {_SAID[said]}", said)
+        if out is None:
+            return q, qd
+        into = self._out(out[0], q.shape), self._out(out[1], q.shape)
+        into[0][...], into[1][...] = q, qd
+        return into
+
+    def _size(self, h: float | None) -> float:
+        h = self.h if h is None else float(h)
+        if not (np.isfinite(h) and h != 0):
+            raise ValueError(f"h: {h} is not a step size: give a finite number of seconds")
+        return h
+
+    def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
+        if steps is not None:
+            if duration is not None:
+                raise ValueError("steps: give steps or duration, not both")
+            if steps != int(steps) or steps < 0:
+                raise ValueError(f"steps: {steps} is not a number of steps")
+            return int(steps)
+        duration = self.duration if duration is None else float(duration)
+        if not (np.isfinite(duration) and duration >= 0):
+            raise ValueError(f"duration: {duration} is not a time in s")
+        # the first multiple of h that is not before the duration, rounding aside
+        return int(np.ceil(duration / abs(h) * (1 - 1e-12)))
+
+    def simulate(
+        self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
+        duration: float | None = None, steps: int | None = None, every: int = 1,
+        u: Inputs = None, params: Parameters = None, method: str = "rk4", *, t0: float = 0.0,
+        out: tuple[Array, Array] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Run:  # fmt: skip
+        """A trajectory by fixed steps of size h, the loop in C and the GIL released.
+
+        q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration.
+        every: a row is kept of every so many steps, and the first and last state always.
+        u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; or
+        a function u(t, q, qd) called before each step, which is some hundred times slower.
+        out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
+        A run that can't go on keeps what it has, warns, and says in `status` and `message` where
+        and why. Ctrl-C raises Interrupted, which holds the run so far.
+        """
+        if method != "rk4":
+            raise ValueError(f"method: {method!r} is not in this module: rk4 is")
+        q, qd = self.start
+        if q0 is not None:
+            q = self._array(q0, "q0", self.nq).copy()
+        if qd0 is not None:
+            qd = self._array(qd0, "qd0", self.nq).copy()
+        if q.shape != (self.nq,) or qd.shape != (self.nq,):
+            raise ValueError(f"q0, qd0: expected one state, ({self.nq},)")
+        h = self._size(h)
+        t0 = self._time(t0)
+        steps = self._steps(h, duration, steps)
+        if every != int(every) or every < 1:
+            raise ValueError(f"every: {every} is not a positive number of steps")
+        every = int(every)
+        p = self._parameters(params).copy()
+        law, held, stride = self._table(u, steps)
+        rows = 1 + steps // every + (steps % every > 0)
+        try:
+            given = out or (None, None)
+            q_rows = self._out(given[0], (rows, self.nq), "out[0]")
+            qd_rows = self._out(given[1], (rows, self.nq), "out[1]")
+        except MemoryError:
+            raise MemoryError(
+                f"{rows} rows of {2 * self.nq} numbers don't fit in memory: keep fewer with every="
+            ) from None
+        q_rows[0], qd_rows[0] = q, qd
+        status = self._ffi.new("int *")
+        at_q, at_qd, at_p = self._pointer(q), self._pointer(qd), self._pointer(p)
+        at_u = self._pointer(held)
+        rows_q, rows_qd = self._pointer(q_rows), self._pointer(qd_rows)
+        done, said = 0, "ok"
+        chunk = 1 if law else min(steps, max(1, 4096 // self.nq))
+        run = self._lib.rk4_run
+        try:
+            while done < steps:
+                if law:
+                    held = self._inputs(law(t0 + done * h, q.copy(), qd.copy()))
+                    at_u = self._pointer(held)
+                begun = perf_counter()
+                row = (1 + done // every) * self.nq
+                count = min(chunk, steps - done)
+                made = run(
+                    at_q, at_qd, t0, h, done, count, at_u + done * stride if stride else at_u,
+                    stride, every, rows_q + row, rows_qd + row, at_p, status,
+                )  # fmt: skip
+                done += made
+                if status[0]:
+                    said = STATUS[status[0]]
+                    break
+                if progress is not None:
+                    progress(done, steps)
+                if not law:
+                    spent = perf_counter() - begun
+                    chunk = int(count * min(16.0, max(0.25, _CHUNK_SECONDS / (spent + 1e-9)))) + 1
+        except KeyboardInterrupt:
+            said = "interrupted"
+        kept = 1 + done // every
+        if done % every:
+            q_rows[kept], qd_rows[kept] = q, qd
+            kept += 1
+        t = t0 + h * np.minimum(np.arange(kept) * every, done)
+        result = Run(self, t, q_rows[:kept], qd_rows[:kept], h, done, said, p)
+        if said == "interrupted":
+            raise Interrupted(result) from None
+        if said != "ok":
+            warnings.warn(f"{self.name}: {result.message}", RuntimeWarning, stacklevel=2)
+        return result
+
+    def _table(self, u: Any, steps: int) -> tuple[Callable[..., Any] | None, Array | None, int]:
+        """(function, held values, values from one step to the next)."""
+        if u is None:
+            return None, None, 0
+        if not self.nu:
+            raise ValueError("u: this scene has no inputs")
+        if callable(u):
+            if not self._told:
+                self._told = True
+                warnings.warn(
+                    f"{self.name}: u is a Python function, called before each step: some hundred "
+                    "times slower than a table (steps, nu) or the scene's own signal",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
+            return u, None, 0
+        if self.nu == 1 and np.ndim(u) <= 1:
+            u = np.reshape(u, (-1, 1)) if np.size(u) > 1 else np.reshape(u, 1)
+        array = self._array(u, "u", self.nu)
+        if array.ndim == 1:
+            return None, array, 0
+        if len(array) != steps:
+            raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a step")
+        return None, array, self.nu
+
+
+def _unknown(argument: str, name: str, known: Sequence[str]) -> str:
+    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}"
