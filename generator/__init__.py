@@ -73,6 +73,7 @@ def build(
     if name and compiler.found(Path(root) / name, wanted):
         return compiler.Built(name, Path(root) / name, False)
     if made is None:
+        assert isinstance(scene, (str, os.PathLike))
         made = read(scene)
     if on_system is not None:
         on_system(made)

@@ -87,7 +87,7 @@ class Printer:
         self.inline: dict[str, tuple[str, int]] = {}
 
     def name(self, name: str, binding: int = 4) -> str:
-        """A name as it is written, in parentheses where its expression binds less than `binding`."""
+        """A name as it is written, in parentheses where it binds less than `binding`."""
         if name in self.inline:
             text, strength = self.inline[name]
             return text if strength >= binding else f"({text})"

@@ -24,7 +24,7 @@ MOST_IN_ALL = 160  # of the outputs of one function
 _ZERO, _ONE = Fraction(0), Fraction(1)
 
 
-class TooLarge(Exception):
+class TooLargeError(Exception):
     """The polynomial has more terms than the limit: not worth multiplying out."""
 
 
@@ -44,7 +44,7 @@ class Expander:
         """
         try:
             polynomials = [self.atom(output) for output in outputs]
-        except TooLarge:
+        except TooLargeError:
             return None
         if sum(map(len, polynomials)) > MOST_IN_ALL:
             return None
@@ -57,21 +57,23 @@ class Expander:
         return atom
 
     def atom(self, atom: Expr) -> Polynomial:
+        """The polynomial of what `Tape.define` returned."""
         factor, symbol = split(atom)
         if symbol is None:
             return {(): factor} if factor != 0 else {}
         return {m: factor * c for m, c in self.symbol(symbol).items()}
 
     def symbol(self, symbol: Symbol) -> Polynomial:
+        """The polynomial of a name. Raises TooLargeError."""
         if symbol not in self.known:
             live = self.tape.live([symbol])
             if not self.large.isdisjoint(live):
-                raise TooLarge
+                raise TooLargeError
             for name in live:  # in order, so that nothing recurses deeply
                 if name not in self.known:
                     try:
                         self.known[name] = self._reduced(self._of(name))
-                    except TooLarge:
+                    except TooLargeError:
                         self.large.add(name)
                         raise
             self.known.setdefault(symbol, self._whole(symbol))
@@ -111,7 +113,7 @@ class Expander:
         inner = self.symbol(base)
         power = Fraction(int(exponent.p), int(exponent.q)) if exponent.is_Rational else None
         if power is None:
-            raise TooLarge
+            raise TooLargeError
         if len(inner) == 1 and power.denominator == 1:
             ((monomial, coefficient),) = inner.items()
             return {tuple((n, e * power) for n, e in monomial): coefficient**exponent}
@@ -120,7 +122,7 @@ class Expander:
 
     def _times(self, one: Polynomial, other: Polynomial) -> Polynomial:
         if len(one) * len(other) > 8 * MOST_TERMS:
-            raise TooLarge
+            raise TooLargeError
         out: Polynomial = {}
         for m1, c1 in one.items():
             for m2, c2 in other.items():
@@ -142,7 +144,7 @@ class Expander:
                 pair = (name, twin.name) if sine else (twin.name, name)
                 polynomial = _with_square(_without_square(polynomial, *pair), *pair)
         if len(polynomial) > MOST_TERMS:
-            raise TooLarge
+            raise TooLargeError
         return polynomial
 
     # --- back on the tape ------------------------------------------------------------------------
@@ -160,8 +162,7 @@ class Expander:
         return self.tape.stage[self.symbols[name]]
 
     def _expr(self, powers: Iterable[tuple[str, Fraction]]) -> Expr:
-        rational = lambda e: Rational(e.numerator, e.denominator)  # noqa: E731 - used here alone
-        return Mul(*(Pow(self.symbols[n], rational(e)) for n, e in powers))
+        return Mul(*(Pow(self.symbols[n], Rational(e.numerator, e.denominator)) for n, e in powers))
 
     def _factored(self, terms: Mapping[Monomial, Expr]) -> Expr:
         counts = Counter(n for m in terms for n, e in m if e >= 1 and e.denominator == 1)

@@ -206,7 +206,7 @@ def _mass_matrix(
     """D_ij = d(dF/dqd_i)/dqd_j + sum_k d(dF/dw_k)/dqd_j dy_k/dq_i, a column a sweep."""
     tape, n = e.tape, len(system.q)
     whole: list[list[Expr]] = []
-    for j, velocity in enumerate(system.qd):
+    for velocity in system.qd:
         column = tape.forward(momenta, {velocity: S.One})
         at_points = projected(column[n:])
         whole.append([tape.define(a + b) for a, b in zip(column[:n], at_points, strict=True)])
@@ -216,19 +216,20 @@ def _mass_matrix(
         for side, other in ((min, max), (max, min))
     ]
     D = min(halves, key=lambda half: len(tape.live(entry for row in half for entry in row)))
+    place = f"{system.file or system.name}: energy.kinetic"
     for c, row in zip(system.coordinates, D, strict=True):
         if all(entry == 0 for entry in row):
             raise EomcError(
-                f"{system.name}: coordinate '{c.name}' has no inertia: the kinetic energy does not "
+                f"{place}: coordinate '{c.name}' has no inertia: the kinetic energy does not "
                 f"depend on {c.name}_dot, so nothing can be solved for its acceleration; "
                 "give it a mass, or make it an input"
             )
     for i, j in product(range(n), repeat=2):
         if tape.stage_of(D[i][j]) >= Stage.VELOCITY:
             raise EomcError(
-                f"{system.name}: the kinetic energy is not quadratic in the velocities "
+                f"{place}: the kinetic energy is not quadratic in the velocities "
                 f"(d2K/d{system.qd[i]}d{system.qd[j]} still depends on a velocity): "
-                "mechanics in the form D qdd + C qd + g = tau needs K = qd.D(q).qd/2 + a(q).qd + b(q)"
+                "D qdd + C qd + g = tau needs K = qd.D(q).qd/2 + a(q).qd + b(q)"
             )
     return tuple(map(tuple, D))
 

@@ -155,10 +155,9 @@ def names_of(value: Value) -> tuple[str, ...]:
 def build(equations: Equations) -> Program:
     """The program of the equations: each function by its cheapest route."""
     e, tape = equations, equations.tape
-    flat = lambda rows: [entry for row in rows for entry in row]  # noqa: E731 - shorter than a def
     wanted: dict[str, list[Expr]] = {
-        "D": flat(e.D),
-        "C": flat(e.C),
+        "D": [entry for row in e.D for entry in row],
+        "C": [entry for row in e.C for entry in row],
         "g": list(e.g),
         "bias": list(e.bias),
         "tau": list(e.tau),
@@ -175,7 +174,7 @@ def build(equations: Equations) -> Program:
     expander = Expander(tape)
     functions: dict[str, Function] = {}
     for name, outputs in wanted.items():
-        routes = {"program": (outputs, ())}
+        routes: dict[str, Ends] = {"program": (outputs, ())}
         if (short := expander.expand(outputs)) is not None:
             routes["expanded"] = (short, ())
         functions[name] = _cheapest(name, tape, routes)
@@ -390,7 +389,8 @@ class _Work:
         uses = self._uses(ends)
         for name, value in list(self.values.items()):
             if isinstance(value, Product):
-                coefficient, factors = value.coefficient, []
+                coefficient: Expr = value.coefficient
+                factors: list[str] = []
                 for factor in value.factors:
                     inner = self.values.get(factor)
                     ripe = (
@@ -654,7 +654,7 @@ def _cost(body: Sequence[Assignment], outputs: Sequence[Operand]) -> Cost:
     return Cost(adds, muls, divs, len(angles), calls)
 
 
-# --- names ------------------------------------------------------------------------------------------
+# --- names ----------------------------------------------------------------------------------------
 
 
 def _renamed(function: Function, hints: Mapping[str, str]) -> Function:

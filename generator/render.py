@@ -132,14 +132,9 @@ class _Context:
         taken = {
             f"{self.PREFIX}_{w}" for w in ("H", "NQ", "NU", "OK", "SINGULAR", "NOT_FINITE", "STAMP")
         }
-        self.enum = {
-            n: e
-            for n, e in zip(
-                [*(c.name for c in s.coordinates), *(i.name for i in s.inputs)],
-                _unique([f"{self.PREFIX}_{x.name}" for x in (*s.coordinates, *s.inputs)], taken),
-                strict=True,
-            )
-        }
+        indexed = [*(c.name for c in s.coordinates), *(i.name for i in s.inputs)]
+        wishes = [f"{self.PREFIX}_{name}" for name in indexed]
+        self.enum = dict(zip(indexed, _unique(wishes, taken), strict=True))
         self.needs_p = bool(s.parameters)
         acceleration = program["acceleration"]
         signal = program.functions.get("signal")
@@ -195,9 +190,9 @@ class _Context:
                 for i in s.inputs
             ],
             "parameters": [
-                {"name": p.name, "unit": p.unit, "note": p.note, "comment": _comment(p.unit, p.note),
-                 "value": self.literal(p.value), "number": repr(p.value),
-                 "named": f"/* {p.name} */"}
+                {"name": p.name, "unit": p.unit, "note": p.note,
+                 "comment": _comment(p.unit, p.note), "value": self.literal(p.value),
+                 "number": repr(p.value), "named": f"/* {p.name} */"}
                 for p in s.parameters
             ],
             "q0": [self.literal(c.start) for c in s.coordinates],
@@ -552,18 +547,21 @@ class _Context:
         s = self.system
         NQ = f"{self.PREFIX}_NQ"
         t, u = "t" if self.driven else "", "u" if s.inputs else ""
-        units = {x.name: x.unit for x in (*s.coordinates, *s.parameters, *s.inputs) if x.unit}
+        units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
+        units |= {i.name: i.unit for i in s.inputs}
         return {
             "title_literal": repr(s.title),
             "coordinate_units": repr({c.name: c.unit for c in s.coordinates}),
             "parameter_values": repr({p.name: p.value for p in s.parameters}),
             "input_units": repr({i.name: i.unit for i in s.inputs}),
-            "units": repr(units),
-            "timed": repr(tuple(n for n in ("energy", "jacobi") if n in self.program and self.takes_t(n))),
-            "face_functions": sorted(
-                "D C g bias tau kinetic_energy potential_energy energy jacobi power signal "
-                "acceleration rhs step simulate".split()
+            "units": repr({name: unit for name, unit in units.items() if unit}),
+            "timed": repr(
+                tuple(n for n in ("energy", "jacobi") if n in self.program and self.takes_t(n))
             ),
+            "face_functions": [
+                "C", "D", "acceleration", "bias", "energy", "g", "jacobi", "kinetic_energy",
+                "potential_energy", "power", "rhs", "signal", "simulate", "step", "tau",
+            ],
             "acceleration_binding": f"{self.prefix}_acceleration("
             + self.arguments(f"out + {NQ}*k", f"q + {NQ}*k", f"qd + {NQ}*k", t, u, self.p_cast)
             + ")",

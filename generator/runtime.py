@@ -95,8 +95,7 @@ class Run:
             return f"{self.steps} steps of {self.h:g} s"
         return (
             f"stopped at t = {self.t[-1]:.9g} after {self.steps} steps of {self.h:g} s, "
-            f"q = {np.array2string(self.q[-1], precision=6)}, "
-            f"qd = {np.array2string(self.qd[-1], precision=6)}: {_SAID[self.status]}"
+            f"{_state_text(self.q[-1], self.qd[-1])}: {_SAID[self.status]}"
         )
 
     def __len__(self) -> int:
@@ -113,6 +112,7 @@ class Params:
     _defaults: tuple[float, ...] = ()
     _dtype = "float64"
     __slots__ = ("values",)
+    values: Array
 
     def __init__(self, **values: float) -> None:
         object.__setattr__(self, "values", np.array(self._defaults, self._dtype))
@@ -151,7 +151,8 @@ class Model:
         self, extension: Any, *, name: str, title: str, dtype: str,
         coordinates: Mapping[str, str], parameters: Mapping[str, float],
         inputs: Mapping[str, str], units: Mapping[str, str],
-        start: tuple[Sequence[float], Sequence[float]], h: float, duration: float, timed: Sequence[str], digest: str,
+        start: tuple[Sequence[float], Sequence[float]], h: float, duration: float,
+        timed: Sequence[str], digest: str,
     ) -> None:  # fmt: skip
         self._ffi, self._lib = extension.ffi, extension.lib
         self._ctype = {"float64": "double[]", "float32": "float[]"}[dtype]
@@ -201,14 +202,11 @@ class Model:
             raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
         return array
 
-    def _state(self, q: ArrayLike, qd: ArrayLike | None) -> tuple[Array, Array | None]:
-        q = self._array(q, "q", self.nq)
-        if qd is None:
-            return q, None
-        qd = self._array(qd, "qd", self.nq)
-        if q.shape != qd.shape:
-            raise ValueError(f"qd: shape {qd.shape} beside q of shape {q.shape}: they go in pairs")
-        return q, qd
+    def _state(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
+        at, moving = self._array(q, "q", self.nq), self._array(qd, "qd", self.nq)
+        if at.shape != moving.shape:
+            raise ValueError(f"qd: shape {moving.shape} beside q of shape {at.shape}")
+        return at, moving
 
     def _parameters(self, params: Any) -> Array:
         if params is None:
@@ -216,8 +214,7 @@ class Model:
         if isinstance(params, Params):
             if params._names != self.parameters:
                 raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
-            values: Array = params.values
-            return values
+            return params.values
         if isinstance(params, Mapping):
             return np.asarray(self.Params(**params).values)
         array = np.ascontiguousarray(params, self.dtype)
@@ -262,8 +259,11 @@ class Model:
         self, name: str, shape: tuple[int, ...], q: ArrayLike, qd: ArrayLike | None, t: float,
         u: Any, params: Any, out: Any,
     ) -> Any:  # fmt: skip
-        q, qd = self._state(q, qd)
-        rows = q.shape[:-1]
+        if qd is None:
+            at, moving = self._array(q, "q", self.nq), None
+        else:
+            at, moving = self._state(q, qd)
+        rows = at.shape[:-1]
         result = self._out(out, rows + shape)
         function = getattr(self._lib, name, None)
         if function is None:
@@ -271,7 +271,7 @@ class Model:
         else:
             function(
                 rows[0] if rows else 1,
-                self._pointer(result), self._pointer(q), self._pointer(qd), self._time(t),
+                self._pointer(result), self._pointer(at), self._pointer(moving), self._time(t),
                 self._pointer(self._inputs(u)), self._pointer(self._parameters(params)),
             )  # fmt: skip
         return result if result.ndim else result[()]
@@ -294,7 +294,7 @@ class Model:
         self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
-        """C(q, qd): Coriolis matrix, (nq, nq), in Christoffel form: Ddot - 2 C is skew-symmetric."""
+        """C(q, qd): Coriolis matrix, (nq, nq), Christoffel form: Ddot - 2 C is skew-symmetric."""
         return self._evaluate("C", (self.nq, self.nq), q, qd, t, None, params, out)
 
     def g(self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
@@ -312,7 +312,7 @@ class Model:
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Any:  # fmt: skip
-        """tau = Q - dR/dqd, (nq,): what inputs, friction and other forces do. u None: the signals."""
+        """tau = Q - dR/dqd, (nq,): of inputs, friction and other forces. u None: the signals."""
         return self._evaluate("tau", (self.nq,), q, qd, t, u, params, out)
 
     def kinetic_energy(
@@ -339,7 +339,7 @@ class Model:
         self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
-        """qd.dK/dqd - K + P, J: the energy where K is quadratic in qd, else what takes its place."""
+        """qd.dK/dqd - K + P, J: K + P where K is quadratic in qd, else what takes its place."""
         name = "jacobi" if hasattr(self._lib, "jacobi") else "energy"
         return self._evaluate(name, (), q, qd, t, None, params, out)
 
@@ -347,7 +347,7 @@ class Model:
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
     ) -> Any:  # fmt: skip
-        """d(jacobi)/dt, W: what inputs, friction and driven supports put in. u None: the signals."""
+        """d(jacobi)/dt, W: by inputs, friction and driven supports. u None: the signals."""
         return self._evaluate("power", (), q, qd, t, u, params, out)
 
     def signal(self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None) -> Any:
@@ -362,19 +362,17 @@ class Model:
 
         Raises MotionError where D is singular or a result is not finite.
         """
-        q, qd = self._state(q, qd)
-        assert qd is not None
-        result = self._out(out, q.shape)
-        made = result if out is None else np.empty(q.shape, self.dtype)
+        at, moving = self._state(q, qd)
+        result = self._out(out, at.shape)
+        made = result if out is None else np.empty(at.shape, self.dtype)
         status = self._ffi.new("int *")
-        rows = q.shape[0] if q.ndim == 2 else 1
         done = self._lib.acceleration(
-            rows, self._pointer(made), self._pointer(q), self._pointer(qd), self._time(t),
+            at.shape[0] if at.ndim == 2 else 1,
+            self._pointer(made), self._pointer(at), self._pointer(moving), self._time(t),
             self._pointer(self._inputs(u)), self._pointer(self._parameters(params)), status,
         )  # fmt: skip
         if status[0]:
-            at = (q, qd) if q.ndim == 1 else (q[done], qd[done])
-            where = f"q = {np.array2string(at[0])}, qd = {np.array2string(at[1])}"
+            where = _state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
             said = STATUS[status[0]]
             what = _SAID[said] if said == "singular" else "the acceleration is not finite there"
             raise MotionError(f"at {where}: {what}", said)
@@ -384,15 +382,15 @@ class Model:
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
-        x = np.asarray(x, self.dtype)
-        if x.shape != (2 * self.nq,):
-            raise ValueError(f"x: shape {x.shape}, expected ({2 * self.nq},): q, then qd")
-        out = np.empty(2 * self.nq, self.dtype)
-        out[: self.nq] = x[self.nq :]
-        out[self.nq :] = self.acceleration(x[: self.nq], x[self.nq :], t, u, params)
+        n, state = self.nq, np.asarray(x, self.dtype)
+        if state.shape != (2 * n,):
+            raise ValueError(f"x: shape {state.shape}, expected ({2 * n},): q, then qd")
+        out = np.empty(2 * n, self.dtype)
+        out[:n] = state[n:]
+        out[n:] = self.acceleration(state[:n], state[n:], t, u, params)
         return out
 
-    # --- motion ------------------------------------------------------------------------------------
+    # --- motion ----------------------------------------------------------------------------------
 
     def step(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
@@ -403,25 +401,25 @@ class Model:
         u None: the scene's signals, followed through the step. Raises MotionError where the step
         can't be made; `out` is untouched then.
         """
-        q, qd = self._state(q, qd)
-        assert qd is not None
-        if q.ndim != 1:
-            raise ValueError(f"q: shape {q.shape}, expected ({self.nq},)")
-        q, qd = q.copy(), qd.copy()
+        at, moving = self._state(q, qd)
+        if at.ndim != 1:
+            raise ValueError(f"q: shape {at.shape}, expected ({self.nq},)")
+        at, moving = at.copy(), moving.copy()
         status = self._ffi.new("int *")
         self._lib.rk4_run(
-            self._pointer(q), self._pointer(qd), self._time(t), self._size(h), 0, 1,
+            self._pointer(at), self._pointer(moving), self._time(t), self._size(h), 0, 1,
             self._pointer(self._inputs(u)), 0, 0, self._ffi.NULL, self._ffi.NULL,
             self._pointer(self._parameters(params)), status,
         )  # fmt: skip
         if status[0]:
             said = STATUS[status[0]]
-            where = f"t = {t:.9g}, q = {np.array2string(q)}, qd = {np.array2string(qd)}"
-            raise MotionError(f"no step from {where}: {_SAID[said]}", said)
+            raise MotionError(
+                f"no step from t = {t:.9g}, {_state_text(at, moving)}: {_SAID[said]}", said
+            )
         if out is None:
-            return q, qd
-        into = self._out(out[0], q.shape), self._out(out[1], q.shape)
-        into[0][...], into[1][...] = q, qd
+            return at, moving
+        into = self._out(out[0], at.shape), self._out(out[1], at.shape)
+        into[0][...], into[1][...] = at, moving
         return into
 
     def _size(self, h: float | None) -> float:
@@ -553,6 +551,13 @@ class Model:
         if len(array) != steps:
             raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a step")
         return None, array, self.nu
+
+
+def _state_text(q: Array, qd: Array) -> str:
+    def text(x: Array) -> str:
+        return np.array2string(x, precision=6, threshold=12)
+
+    return f"q = {text(q)}, qd = {text(qd)}"
 
 
 def _unknown(argument: str, name: str, known: Sequence[str]) -> str:

@@ -7,8 +7,8 @@ Made from a checked scene (`from_scene`) or in Python (`System.make`), with symb
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import sympy
@@ -104,7 +104,7 @@ class System:
     parameters: tuple[Parameter, ...] = ()
     inputs: tuple[Input, ...] = ()
     definitions: tuple[tuple[Symbol, Expr], ...] = ()
-    run: Run = Run()
+    run: Run = field(default_factory=Run)
     title: str = ""
     note: str = ""
     file: str = ""
@@ -121,6 +121,11 @@ class System:
     def qd(self) -> tuple[Symbol, ...]:
         """The velocities' symbols, in scene order."""
         return tuple(c.qd for c in self.coordinates)
+
+    def at(self, parameters: Mapping[str, float]) -> System:
+        """The system with other values for some of its parameters."""
+        changed = tuple(replace(p, value=parameters.get(p.name, p.value)) for p in self.parameters)
+        return replace(self, parameters=changed)
 
     @property
     def u(self) -> tuple[Symbol, ...]:
@@ -171,7 +176,7 @@ class System:
 def _number(text: str) -> Expr:
     return (
         sympy.Rational(text)
-        if not text[:2].lower() in ("0x", "0o", "0b")
+        if text[:2].lower() not in ("0x", "0o", "0b")
         else sympy.Integer(int(text, 0))
     )
 
@@ -196,8 +201,8 @@ def from_scene(scene: Scene) -> System:
     known: dict[str, Expr] = {"t": t}
     for c in scene.coordinates:
         known |= {c.name: symbol(c.name), f"{c.name}_dot": symbol(f"{c.name}_dot")}
-    for named in (*scene.parameters, *scene.inputs):
-        known[named.name] = symbol(named.name)
+    names_given = [*(p.name for p in scene.parameters), *(i.name for i in scene.inputs)]
+    known |= {name: symbol(name) for name in names_given}
     problems: list[Problem] = []
 
     def value(key: str, formula: formulas.Formula) -> Expr:
@@ -343,25 +348,25 @@ class _Maker:
         unknown = [str(f) for f in forces if f not in starts]
         if unknown:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
-        exprs: Callable[[Any, str], Expr] = self.expression
-        fields: dict[str, Any] = dict(
-            name=self.name,
-            coordinates=tuple(made),
-            kinetic=exprs(kinetic, "kinetic"),
-            potential=exprs(potential, "potential"),
-            dissipation=exprs(dissipation, "dissipation"),
-            forces=tuple(exprs(forces.get(given, 0), f"force on {given}") for given in starts),
-            parameters=tuple(declared),
-            inputs=tuple(
-                Input(used, units.get(given, ""), exprs(pending[given], f"signal of {given}"))
+        expression = self.expression
+        made_of: dict[str, Any] = {
+            "name": self.name,
+            "coordinates": tuple(made),
+            "kinetic": expression(kinetic, "kinetic"),
+            "potential": expression(potential, "potential"),
+            "dissipation": expression(dissipation, "dissipation"),
+            "forces": tuple(expression(forces.get(c, 0), f"force on {c}") for c in starts),
+            "parameters": tuple(declared),
+            "inputs": tuple(
+                Input(used, units.get(given, ""), expression(pending[given], f"signal of {given}"))
                 for given, used in given_inputs
             ),
-            definitions=tuple(ordered),
-            run=run,
-            title=title or self.name.replace("_", " ").capitalize(),
-        )
-        digest = hashlib.sha256(sympy.srepr(sorted(fields.items())).encode()).hexdigest()
-        return System(**fields, digest=digest, renamed=tuple(self.renamed))
+            "definitions": tuple(ordered),
+            "run": run,
+            "title": title or self.name.replace("_", " ").capitalize(),
+        }
+        digest = hashlib.sha256(sympy.srepr(sorted(made_of.items())).encode()).hexdigest()
+        return System(**made_of, digest=digest, renamed=tuple(self.renamed))
 
     def declare(self, given: Any, role: str) -> str:
         used = self.name_of(given, role)

@@ -1,0 +1,55 @@
+# make demo    set up, build and check the cart-pole scenes, run one, draw it
+# make test    set up, run the quick tests
+# make test-all, make lint, make golden, make clean
+
+PYTHON ?= python3
+BIN := .venv/bin
+DEMO := scenes/cartpole.toml scenes/cartpole_driven.toml scenes/cartpole_tutorial.toml
+# what a test run writes, it writes under build/
+export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
+
+.PHONY: demo test test-all lint golden clean
+
+demo: .venv/demo
+	@$(BIN)/eomc build $(DEMO)
+	@$(BIN)/eomc check --quiet $(DEMO)
+	@echo "checked against the pure-Python reference: 3 scenes agree"
+	@echo
+	@$(BIN)/eomc run scenes/cartpole.toml --plot build/cartpole.png --out build/cartpole.csv
+	@echo
+	@echo "the picture:         build/cartpole.png"
+	@echo "the numbers:         build/cartpole.csv"
+	@echo "the C to embed:      build/cartpole/cartpole.h, build/cartpole/cartpole.c"
+	@echo "the Python module:   PYTHONPATH=build $(BIN)/python -c 'import cartpole; print(cartpole.simulate())'"
+	@echo "the command:         $(BIN)/eomc --help"
+
+test: .venv/dev
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+test-all: .venv/dev
+	$(BIN)/python -m pytest -n 2
+
+lint: .venv/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@mkdir -p build/types && ln -sfn $(CURDIR)/generator build/types/eomc
+	MYPYPATH=build/types $(BIN)/mypy -p eomc --cache-dir build/mypy
+
+golden: .venv/dev
+	$(BIN)/python tests/test_golden.py --accept
+	$(BIN)/python tests/test_bad_scenes.py
+
+clean:
+	rm -rf build
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade pip
+
+.venv/demo: pyproject.toml .venv/bin/python
+	$(BIN)/python -m pip install --quiet --editable ".[plot]"
+	@touch $@
+
+.venv/dev: pyproject.toml .venv/bin/python
+	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	@touch $@ .venv/demo

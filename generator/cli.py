@@ -1,0 +1,499 @@
+"""The command: eomc new, build, check, run, show, list.
+
+Exit status: 0, 1 where a check failed or a run could not go on, 2 for bad input. What takes time
+to import (SymPy, pydantic, rich) is imported where it is needed: `eomc build` with nothing to do
+is over in a tenth of a second.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+import eomc
+from eomc.problems import EomcError, SceneError
+
+if TYPE_CHECKING:
+    from eomc.runtime import Run
+    from eomc.system import System
+
+_SCENE = click.argument("scene", type=click.Path(path_type=Path))
+_SCENES = click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path))
+_BUILD = click.option(
+    "--build", "root", default="build", show_default=True, type=click.Path(path_type=Path),
+    help="Where built modules lie.",
+)  # fmt: skip
+_QUIET = click.option("--quiet", "-q", is_flag=True, help="Print errors only.")
+_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+
+class _Group(click.Group):
+    """Errors that are the user's to mend are printed as they are, with status 2."""
+
+    def invoke(self, context: click.Context) -> Any:
+        try:
+            return super().invoke(context)
+        except SceneError as fault:
+            count = sum(p.severity == "error" for p in fault.problems)
+            click.echo(str(fault), err=True)
+            _fail(f"eomc: {count} error{'s' if count != 1 else ''}, nothing was built or changed")
+        except EomcError as fault:
+            _fail(f"eomc: {fault}")
+        except KeyboardInterrupt:
+            click.echo("eomc: interrupted", err=True)
+            sys.exit(130)
+
+
+def _fail(message: str) -> NoReturn:
+    click.echo(message, err=True)
+    sys.exit(2)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(eomc.__version__, prog_name="eomc")
+def main() -> None:
+    """The equations-of-motion compiler: from energies to fast, checked C.
+
+    \b
+    eomc new pendulum              write a scene to start from
+    eomc run pendulum.toml         derive, compile and simulate it
+    eomc check pendulum.toml       hold it against the independent reference
+    """
+
+
+@main.command()
+@click.argument("name")
+def new(name: str) -> None:
+    """Write a scene to start from: scenes/NAME.toml, or NAME.toml where there is no scenes/.
+
+    \b
+    eomc new crane
+    """
+    from eomc import names
+    from eomc.render import environment
+
+    if why := names.module_fault(name):
+        raise EomcError(why)
+    folder = Path("scenes") if Path("scenes").is_dir() else Path()
+    path = folder / f"{name}.toml"
+    text = (
+        environment()
+        .get_template("scene.toml.jinja")
+        .render(name=name, title=name.replace("_", " ").capitalize())
+    )
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise EomcError(f"{path}: is there already, and stays as it is") from None
+    except OSError as fault:
+        raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
+    click.echo(f"wrote {path}; try: eomc run {path}")
+
+
+@main.command()
+@_SCENES
+@_BUILD
+@_QUIET
+@_JSON
+def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> None:
+    """Derive, generate and compile: a package and embeddable C in build/NAME/.
+
+    \b
+    eomc build scenes/cartpole.toml
+    PYTHONPATH=build python -c "import cartpole; print(cartpole.simulate())"
+    cd build/cartpole && cc -std=c99 -O2 main.c cartpole.c -lm && ./a.out
+    """
+    told = []
+    with _progress("building", quiet or as_json) as progress:
+        for k, scene in enumerate(scenes):
+            begun = time.perf_counter()
+            built = eomc.build(scene, root, on_system=_warn)
+            spent = time.perf_counter() - begun
+            progress(k + 1, len(scenes))
+            told.append(
+                {"scene": str(scene), "name": built.name, "folder": str(built.folder),
+                 "fresh": built.fresh, "seconds": round(spent, 3)}
+            )  # fmt: skip
+            if not quiet and not as_json:
+                done = f"built in {spent:.1f} s" if built.fresh else "is up to date"
+                click.echo(f"{built.folder}/: {done}")
+    if as_json:
+        click.echo(json.dumps(told, indent=1))
+
+
+@main.command()
+@_SCENES
+@_BUILD
+@click.option("--seed", default=0, show_default=True, help="Of the random states.")
+@_QUIET
+@_JSON
+def check(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: bool) -> None:
+    """Compare the compiled module with the pure-Python reference, and test what must hold.
+
+    \b
+    eomc check scenes/*.toml
+    """
+    from eomc.check import check as checked
+
+    reports = []
+    with _progress("checking", quiet or as_json) as progress:
+        for k, scene in enumerate(scenes):
+            system = eomc.read(scene)
+            _warn(system)
+            report = checked(system, eomc.load(scene, root), seed=seed)
+            progress(k + 1, len(scenes))
+            reports.append(report)
+            if not as_json and not (quiet and report.passed):
+                click.echo(report.table())
+                click.echo()
+    failed = [r.scene for r in reports if not r.passed]
+    if as_json:
+        click.echo(json.dumps([r.as_dict() for r in reports], indent=1))
+    elif failed:
+        click.echo(f"FAILED: {', '.join(failed)}")
+    elif not quiet:
+        click.echo(f"all {len(reports)} passed" if len(reports) > 1 else "passed")
+    sys.exit(1 if failed else 0)
+
+
+@main.command()
+@_SCENE
+@_BUILD
+@click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE", help="A parameter.")
+@click.option("--start", multiple=True, metavar="NAME=VALUE", help="A coordinate, or its velocity.")
+@click.option("--h", "h", type=float, help="Step size in s, instead of the scene's.")
+@click.option("--duration", type=float, help="In s, instead of the scene's.")
+@click.option("--every", type=click.IntRange(1), default=1, help="Keep every so many steps.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
+)
+@click.option("--plot", type=click.Path(path_type=Path), help="Draw them: FILE.png, .svg or .pdf.")
+@_QUIET
+@_JSON
+def run(
+    scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str], h: float | None,
+    duration: float | None, every: int, out: Path | None, plot: Path | None, quiet: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Simulate a scene; print the end, the error and the speed.
+
+    \b
+    eomc run scenes/cartpole.toml --plot cartpole.png
+    eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
+    """
+    from eomc.runtime import Interrupted
+
+    _known_suffix(out, (".csv", ".npz"), "--out")
+    _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
+    with _status(f"building {scene.stem}", quiet or as_json):
+        module = eomc.load(scene, root)
+    values, q0, qd0 = _overrides(scene, module, parameters, start)
+    options: dict[str, Any] = {"h": h, "duration": duration, "params": values}
+    try:
+        with _progress("running", quiet or as_json) as progress:
+            begun = time.perf_counter()
+            done = _simulated(module, q0, qd0, every=every, progress=progress, **options)
+            seconds = time.perf_counter() - begun
+    except Interrupted as stop:
+        click.echo(f"eomc: {stop.run.message}", err=True)
+        sys.exit(130)
+    except (ValueError, MemoryError) as fault:
+        raise EomcError(str(fault)) from None
+    error = None
+    if done.status == "ok" and 0 < seconds < 2 and done.steps:
+        halved = _simulated(
+            module, q0, qd0, h=done.h / 2, steps=2 * done.steps, every=2 * done.steps, params=values
+        )
+        if halved.status == "ok":
+            error = _end_error(done, halved)
+    if out:
+        _write(out, module, done)
+    if plot:
+        from eomc import plot as plots
+
+        plots.draw(eomc.read(scene).at(values), done.t, done.q, done.qd, done.energy, plot)
+    summary = _summary(module, done, seconds, error, plot=plot, out=out)
+    if as_json:
+        click.echo(json.dumps(summary, indent=1))
+    elif not quiet:
+        _print_summary(module, done, summary)
+    if done.status != "ok":
+        click.echo(f"eomc: {done.message}", err=True)
+        sys.exit(1)
+
+
+@main.command()
+@_SCENE
+@click.option("--latex", "form", flag_value="latex", help="LaTeX.")
+@click.option(
+    "--python", "form", flag_value="python", help="Python source that makes the matrices."
+)
+@click.option("--cost", "form", flag_value="cost", help="Operations of each generated function.")
+def show(scene: Path, form: str | None) -> None:
+    """Print D, C, g and the rest, as text for a terminal.
+
+    \b
+    eomc show scenes/cartpole.toml
+    eomc show scenes/cartpole.toml --latex
+    """
+    from eomc import show as shown
+
+    system = eomc.read(scene)
+    _warn(system)
+    with _status("deriving", False):
+        text = shown.cost(system) if form == "cost" else shown.equations(system, form or "text")
+    click.echo(text)
+
+
+@main.command("list")
+@click.argument("folders", nargs=-1, type=click.Path(path_type=Path))
+@_BUILD
+@_JSON
+def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
+    """List the scenes in scenes/, or in the given folders, and whether they are built.
+
+    \b
+    eomc list
+    """
+    import tomllib
+
+    rows = []
+    default = Path("scenes") if Path("scenes").is_dir() else Path()
+    for folder in folders or [default]:
+        if not folder.is_dir():
+            raise EomcError(f"{folder}: is not a folder")
+        for path in sorted(folder.glob("*.toml")):
+            try:
+                text = tomllib.loads(path.read_text(encoding="utf-8"))
+            except (OSError, ValueError):
+                continue
+            if "eomc" not in text or not isinstance(text.get("name"), str):
+                continue
+            built = (root / text["name"] / "build.json").is_file()
+            rows.append(
+                {"scene": str(path), "name": text["name"], "title": str(text.get("title", "")),
+                 "coordinates": list(text.get("coordinates", {})),
+                 "inputs": list(text.get("inputs", {})), "built": built}
+            )  # fmt: skip
+    if as_json:
+        click.echo(json.dumps(rows, indent=1))
+        return
+    if not rows:
+        click.echo("no scenes here: 'eomc new NAME' writes one")
+    wide = max((len(row["scene"]) for row in rows), default=0)
+    titles = max((len(row["title"]) for row in rows), default=0)
+    for row in rows:
+        moved = f"({', '.join(row['inputs'])})" if row["inputs"] else ""
+        built = "built" if row["built"] else "     "
+        click.echo(
+            f"{row['scene']:{wide}}  {row['title']:{titles}}  "
+            f"{built}  {', '.join(row['coordinates'])} {moved}".rstrip()
+        )
+
+
+# --- pieces ---------------------------------------------------------------------------------------
+
+
+def _warn(system: System) -> None:
+    for problem in system.warnings:
+        click.echo(str(problem), err=True)
+
+
+def _known_suffix(path: Path | None, known: Sequence[str], option: str) -> None:
+    if path is not None and path.suffix not in known:
+        raise EomcError(f"{option} {path}: give a name that ends in {' or '.join(known)}")
+
+
+def _overrides(
+    scene: Path, module: Any, parameters: Sequence[str], start: Sequence[str]
+) -> tuple[dict[str, float], Any, Any]:
+    """Parameters and start from NAME=VALUE pairs; a value may be a formula such as pi/3."""
+    from eomc.formulas import suggest
+
+    values: dict[str, float] = {}
+    for name, value in _pairs(parameters, "--set", module.defaults):
+        if name not in module.defaults:
+            raise EomcError(f"--set: '{name}' is not a parameter{suggest(name, module.defaults)}")
+        values[name] = value
+    q0, qd0 = module.start
+    if values:  # the start may be a formula in the parameters
+        from eomc import scene as scenes
+
+        q0[:], qd0[:] = scenes.read(scene).start(values)
+    states = {name: (q0, k) for k, name in enumerate(module.coordinates)}
+    states |= {f"{name}_dot": (qd0, k) for k, name in enumerate(module.coordinates)}
+    for name, value in _pairs(start, "--start", {**module.defaults, **values}):
+        if name not in states:
+            raise EomcError(
+                f"--start: '{name}' is not a coordinate or velocity{suggest(name, states)}"
+            )
+        array, k = states[name]
+        array[k] = value
+    return values, q0, qd0
+
+
+def _pairs(
+    given: Sequence[str], option: str, known: Mapping[str, float]
+) -> Iterator[tuple[str, float]]:
+    import math
+
+    from eomc import formulas
+
+    for pair in given:
+        name, equals, text = pair.partition("=")
+        if not equals:
+            raise EomcError(f"{option} {pair}: write {option} NAME=VALUE")
+        try:
+            value = float(
+                formulas.evaluate(formulas.parse(text), formulas.NUMERIC, known.__getitem__)
+            )
+        except KeyError as fault:
+            raise EomcError(f"{option} {pair}: {fault} is not a number or parameter") from None
+        except (ValueError, ArithmeticError, TypeError) as fault:
+            raise EomcError(f"{option} {pair}: {fault}") from None
+        if not math.isfinite(value):
+            raise EomcError(f"{option} {pair}: not a finite number")
+        yield name.strip(), value
+
+
+def _simulated(module: Any, q0: Any, qd0: Any, **options: Any) -> Run:
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # told by the caller
+        done: Run = module.simulate(q0, qd0, **options)
+        return done
+
+
+def _end_error(done: Run, halved: Run) -> dict[str, float]:
+    """The error of the last state, from the same run at half the step (order 4: 16/15)."""
+    import numpy as np
+
+    q = float(np.max(np.abs(done.q[-1] - halved.q[-1]))) * 16 / 15
+    qd = float(np.max(np.abs(done.qd[-1] - halved.qd[-1]))) * 16 / 15
+    return {"q": q, "qd": qd}
+
+
+def _summary(
+    module: Any, done: Run, seconds: float, error: Mapping[str, float] | None, **files: Path | None
+) -> dict[str, Any]:
+    import numpy as np
+
+    energy = done.jacobi
+    return {
+        "scene": module._model.name,
+        "status": done.status,
+        "message": done.message,
+        "method": "rk4",
+        "h": done.h,
+        "steps": done.steps,
+        "t": float(done.t[-1]),
+        "q": dict(zip(module.coordinates, map(float, done.q[-1]), strict=True)),
+        "qd": dict(zip(module.coordinates, map(float, done.qd[-1]), strict=True)),
+        "energy": {
+            "start": float(energy[0]),
+            "end": float(energy[-1]),
+            "largest_change": float(np.max(np.abs(energy - energy[0]))),
+        },
+        "error_estimate": error,
+        "seconds": seconds,
+        "steps_per_second": done.steps / seconds if seconds else None,
+        "files": [str(path) for path in files.values() if path],
+    }
+
+
+def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
+    click.echo(
+        f"{module.title}: {done.steps} steps of rk4, h = {done.h:g} s, to t = {done.t[-1]:g} s"
+    )
+    wide = max(map(len, module.coordinates))
+    for name, q, qd in zip(module.coordinates, done.q[-1], done.qd[-1], strict=True):
+        unit = module.units.get(name, "")
+        rate = f"{unit}/s" if unit else ""
+        click.echo(f"  {name:{wide}} {q: .9g} {unit}   {name}_dot {qd: .9g} {rate}".rstrip())
+    change = summary["energy"]["largest_change"]
+    click.echo(f"  energy {summary['energy']['end']:.9g} J, changed by at most {change:.2g} J")
+    if error := summary["error_estimate"]:
+        click.echo(
+            f"  error at the end about {error['q']:.1g} in q, {error['qd']:.1g} in qd "
+            "(from the same run at h/2)"
+        )
+    speed = summary["steps_per_second"] or 0.0
+    click.echo(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
+    for file in summary["files"]:
+        click.echo(f"  wrote {file}")
+
+
+def _write(path: Path, module: Any, done: Run) -> None:
+    """The rows as CSV (17 digits, so that they read back as they were) or as NPZ arrays."""
+    import numpy as np
+
+    names = [*module.coordinates, *(f"{c}_dot" for c in module.coordinates)]
+    try:
+        if path.suffix == ".npz":
+            np.savez(
+                path, t=done.t, q=done.q, qd=done.qd, energy=done.energy,
+                coordinates=np.array(module.coordinates),
+            )  # fmt: skip
+            return
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["t", *names, "energy"])
+            writer.writerows(
+                [repr(float(x)) for x in row]
+                for row in np.column_stack([done.t, done.q, done.qd, done.energy])
+            )
+    except OSError as fault:
+        raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
+
+
+def _watched(silent: bool) -> bool:
+    return not silent and sys.stderr.isatty()
+
+
+@contextmanager
+def _progress(what: str, silent: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar for what takes longer than a second, where a person is watching."""
+    if not _watched(silent):
+        yield lambda done, total: None
+        return
+    begun = time.monotonic()
+    bar: list[Any] = []
+
+    def update(done: int, total: int) -> None:
+        if not bar and time.monotonic() - begun > 1 and done < total:
+            from rich.console import Console
+            from rich.progress import Progress
+
+            progress = Progress(console=Console(stderr=True), transient=True)
+            progress.start()
+            bar.extend([progress, progress.add_task(what, total=total)])
+        if bar:
+            bar[0].update(bar[1], completed=done)
+
+    try:
+        yield update
+    finally:
+        if bar:
+            bar[0].stop()
+
+
+@contextmanager
+def _status(what: str, silent: bool) -> Iterator[None]:
+    """A line that says what is going on, where a person is watching."""
+    if not _watched(silent):
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(f"{what} ..."):
+        yield

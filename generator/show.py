@@ -1,0 +1,101 @@
+"""Equations and costs as text: for a terminal, for LaTeX, for Python."""
+
+from __future__ import annotations
+
+import sympy
+from sympy import Expr
+
+from eomc import mechanics, program, reference
+from eomc.system import System, t
+
+_MATRICES = ("D", "C", "g", "tau")
+_SCALARS = ("kinetic", "potential", "jacobi", "power")
+_MEANING = {
+    "D": "mass matrix",
+    "C": "Coriolis matrix, Christoffel form",
+    "g": "potential forces",
+    "tau": "generalized forces",
+    "kinetic": "kinetic energy",
+    "potential": "potential energy",
+    "jacobi": "Jacobi integral, conserved in place of K + P",
+    "power": "power into the system",
+}
+_SYMBOL = {"kinetic": "K", "potential": "P", "jacobi": "h", "power": "power", "tau": "tau"}
+
+
+def equations(system: System, form: str = "text") -> str:
+    """D, C, g and what else there is of D qdd + C qd + g = tau.
+
+    form: "text" (Unicode), "latex" or "python". The equations are the reference's, simplified:
+    written out, as a textbook has them.
+    """
+    plain = reference.derive(system)
+    found = plain.simplified()
+    values = {name: getattr(found, name) for name in (*_MATRICES, *_SCALARS)}
+    if sympy.expand(plain.jacobi - plain.energy) == 0:
+        del values["jacobi"]
+    values = {
+        name: value
+        for name, value in values.items()
+        if name in ("D", "C", "g", "kinetic", "potential") or not _nothing(value)
+    }
+    return {"text": _text, "latex": _latex, "python": _python}[form](system, values)
+
+
+def _nothing(value: Expr | sympy.MatrixBase) -> bool:
+    return all(e == 0 for e in value) if isinstance(value, sympy.MatrixBase) else value == 0
+
+
+def _text(system: System, values: dict[str, Expr]) -> str:
+    names = {c.qd: sympy.Symbol(_dotted(c.name)) for c in system.coordinates}
+    order = ", ".join(c.name for c in system.coordinates)
+    parts = [f"{system.title}: D q̈ + C q̇ + g = {'τ' if 'tau' in values else '0'},  q = ({order})"]
+    for name, value in values.items():
+        shown = sympy.pretty(value.xreplace(names), use_unicode=True, wrap_line=False)
+        head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}:"
+        parts.append(head + "\n" + "\n".join("    " + line for line in shown.splitlines()))
+    return "\n\n".join(parts)
+
+
+def _dotted(name: str) -> str:
+    """theta2 -> thetadot2, which SymPy prints as a dotted theta with a subscript 2."""
+    base = name.split("_")[0].rstrip("0123456789") or name
+    return f"{base}dot{name[len(base) :]}"
+
+
+def _latex(system: System, values: dict[str, Expr]) -> str:
+    names = {s: rf"\dot{{{sympy.latex(q)}}}" for s, q in zip(system.qd, system.q, strict=True)}
+    symbols = {"tau": r"\tau", "kinetic": "K", "potential": "P", "jacobi": "h", "power": r"\dot h"}
+    lines = [
+        rf"  {symbols.get(name, name)} &= {sympy.latex(value, symbol_names=names)} \\"
+        for name, value in values.items()
+    ]
+    return "\n".join([r"\begin{align*}", *lines, r"\end{align*}"])
+
+
+def _python(system: System, values: dict[str, Expr]) -> str:
+    symbols = [*system.q, *system.qd, *system.u, *(p.symbol for p in system.parameters), t]
+    names = ", ".join(s.name for s in symbols)
+    lines = [
+        f'"""{system.title}: D qdd + C qd + g = tau, as SymPy matrices."""',
+        "",
+        "from sympy import *",
+        "",
+        f'{names} = symbols("{names}", real=True)',
+    ]
+    for name, value in values.items():
+        text = f"Matrix({value.tolist()})" if isinstance(value, sympy.MatrixBase) else str(value)
+        lines.append(f"{name + '_' if name in {s.name for s in symbols} else name} = {text}")
+    return "\n".join(lines)
+
+
+def cost(system: System) -> str:
+    """The operations of each generated function, and those of the routes not taken."""
+    made = program.build(mechanics.derive(system))
+    lines = [f"{system.title}: operations of one call, those on parameters alone left out", ""]
+    wide = max(map(len, made.functions))
+    for name, function in made.functions.items():
+        others = [f"{r} {c.flops}" for r, c in function.routes if r != function.route]
+        beside = f"  ({function.route}; {', '.join(others)})" if others else ""
+        lines.append(f"{name:{wide}}  {function.cost.flops:5d} flops: {function.cost}{beside}")
+    return "\n".join(lines)

@@ -1,0 +1,127 @@
+"""What several test files share: scenes compiled once, scenes from text, the C compilers here."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import eomc
+from cases import SCENES
+from eomc import scene, system
+
+ROOT = Path(__file__).parent.parent
+MODULES = ROOT / "build" / "tests" / "modules"  # kept from one run of the tests to the next
+
+# Every function of the formula language, an explicit time, friction, a part of K without
+# velocities, an input that hangs on the state, and names that C and Python would like to keep.
+EVERYTHING = """
+eomc = 1
+name = "everything"
+title = "Every function of the formula language"
+[coordinates]
+x     = { unit = "m", start = 0.3, rate = 0.2, note = "a note with */ in it and an é" }
+theta = { unit = "rad", start = 0.4, rate = -0.1 }
+q     = { start = 0.5, rate = 0.3 }
+[parameters]
+m      = 1.5
+g      = 9.81
+I      = 0.7
+E      = 0.2
+S      = 0.3
+N      = 0.25
+beta   = 0.4
+gamma  = 0.15
+zeta   = 0.05
+values = 0.6
+h      = 0.35
+y0     = 0.45
+index  = 0.55
+[constants]
+third = "1/3"
+[inputs]
+u    = { unit = "N", signal = "sin(2*t) + x/10" }
+push = { unit = "N" }
+[definitions]
+px = "x*cos(theta) + tanh(q)*S + E*cos(3*t)"
+py = "x*sin(theta) + N*sinh(q/4)*cosh(q/5)"
+a  = "atan(q) + asin(q/4) + acos(q/5) + atan2(q + 2, x + 3)"
+b  = "exp(-q**2) + log(2 + q**2) + sqrt(1 + x**2) + tan(q/7) + third"
+[energy]
+kinetic     = "m*(dot(px)**2 + dot(py)**2)/2 + I*theta_dot**2/2 + beta*q_dot**2*(2 + sin(theta))/2 + values*(theta_dot + h*x)**2/2 + y0*t*q_dot/10"
+potential   = "m*g*py + gamma*a**2 + index*b + zeta*x**4 + (1 + x**2)**1.5/20"
+dissipation = "zeta*theta_dot**2/2 + gamma*dot(py)**2/2"
+[forces]
+x     = "u - zeta*x_dot*abs(x_dot)"
+theta = "-gamma*sign(theta_dot)/10 + push*heaviside(x) + pi/100"
+q     = "min(x, theta, 0.3)/5 - max(q_dot, 0.1)/7"
+[run]
+h        = 0.01
+duration = 2.0
+"""
+
+
+@cache
+def _loaded(name: str) -> ModuleType:
+    return eomc.load(SCENES / f"{name}.toml", MODULES)
+
+
+@cache
+def _from_text(text: str) -> ModuleType:
+    return eomc.load(system.from_scene(scene.parse(text, "test.toml")), MODULES)
+
+
+class Modules:
+    """Compiled scenes, each built once in a session and found again by the next."""
+
+    def __call__(self, name: str) -> ModuleType:
+        """The module of scenes/<name>.toml."""
+        return _loaded(name)
+
+    def of_text(self, text: str) -> ModuleType:
+        """The module of a scene given as text."""
+        return _from_text(text)
+
+
+@pytest.fixture(scope="session")
+def modules() -> Modules:
+    return Modules()
+
+
+@pytest.fixture(scope="session")
+def cartpole(modules: Modules) -> ModuleType:
+    """No inputs, no time, no friction."""
+    return modules("cartpole")
+
+
+@pytest.fixture(scope="session")
+def driven(modules: Modules) -> ModuleType:
+    """One input, with a signal that hangs on the time."""
+    return modules("cartpole_driven")
+
+
+@pytest.fixture(scope="session")
+def everything(modules: Modules) -> ModuleType:
+    """All that a scene can say."""
+    return modules.of_text(EVERYTHING)
+
+
+@pytest.fixture
+def no_warnings() -> Iterator[None]:
+    """A warning is a failure."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def needs(compiler: str) -> str:
+    """The path of a compiler; where it isn't there, the test is skipped and says so."""
+    path = shutil.which(compiler)
+    if path is None:
+        pytest.skip(f"{compiler} is not installed")
+    return path
