@@ -18,6 +18,7 @@ from eomc.problems import EomcError, SceneError
 
 if TYPE_CHECKING:
     from eomc.compile import Built
+    from eomc.problems import Problem
     from eomc.render import Sources
     from eomc.system import System
 
@@ -55,12 +56,12 @@ def build(
     scene: ScenePath | System,
     root: ScenePath = "build",
     *,
-    on_system: Callable[[System], None] | None = None,
+    warn: Callable[[Problem], None] | None = None,
 ) -> Built:
     """The compiled module of a scene file or a System, in `root`/<name>/.
 
-    Nothing is derived or compiled where nothing has changed. on_system is called with the system
-    if it has to be derived. Raises SceneError for a faulty scene, EomcError for what else fails.
+    Nothing is derived or compiled where nothing has changed. warn is called with each warning.
+    Raises SceneError for a faulty scene, EomcError for what else fails.
     """
     from eomc import compile as compiler
 
@@ -75,17 +76,25 @@ def build(
     if made is None:
         assert isinstance(scene, (str, os.PathLike))
         made = read(scene)
-    if on_system is not None:
-        on_system(made)
 
-    def texts(extension: str) -> tuple[Any, str, str]:
-        out = sources(made, extension)
-        return out.files, out.binding, out.cdef
+    def texts(extension: str) -> Sources:
+        from eomc import mechanics, program, render
+
+        derived = program.build(mechanics.derive(made))
+        for problem in (*made.warnings, *program.inertia(derived)):
+            if warn is not None:
+                warn(problem)
+        return render.render(derived, extension)
 
     return compiler.build(made.name, wanted, texts, Path(root))
 
 
-def load(scene: ScenePath | System, root: ScenePath = "build") -> ModuleType:
+def load(
+    scene: ScenePath | System,
+    root: ScenePath = "build",
+    *,
+    warn: Callable[[Problem], None] | None = None,
+) -> ModuleType:
     """The compiled module of a scene, built where it is not there yet, imported.
 
     >>> cartpole = load("scenes/cartpole.toml")     # doctest: +SKIP
@@ -93,7 +102,7 @@ def load(scene: ScenePath | System, root: ScenePath = "build") -> ModuleType:
     """
     from eomc import compile as compiler
 
-    return compiler.load(build(scene, root))
+    return compiler.load(build(scene, root, warn=warn))
 
 
 def _name_and_digest(path: Path) -> tuple[str, str]:

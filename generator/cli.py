@@ -22,8 +22,8 @@ import eomc
 from eomc.problems import EomcError, SceneError
 
 if TYPE_CHECKING:
+    from eomc.problems import Problem
     from eomc.runtime import Run
-    from eomc.system import System
 
 _SCENE = click.argument("scene", type=click.Path(path_type=Path))
 _SCENES = click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -116,7 +116,7 @@ def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> Non
     with _progress("building", quiet or as_json) as progress:
         for k, scene in enumerate(scenes):
             begun = time.perf_counter()
-            built = eomc.build(scene, root, on_system=_warn)
+            built = eomc.build(scene, root, warn=_warn)
             spent = time.perf_counter() - begun
             progress(k + 1, len(scenes))
             told.append(
@@ -148,8 +148,7 @@ def check(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: b
     with _progress("checking", quiet or as_json) as progress:
         for k, scene in enumerate(scenes):
             system = eomc.read(scene)
-            _warn(system)
-            report = checked(system, eomc.load(scene, root), seed=seed)
+            report = checked(system, eomc.load(scene, root, warn=_warn), seed=seed)
             progress(k + 1, len(scenes))
             reports.append(report)
             if not as_json and not (quiet and report.passed):
@@ -195,7 +194,7 @@ def run(
     _known_suffix(out, (".csv", ".npz"), "--out")
     _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
     with _status(f"building {scene.stem}", quiet or as_json):
-        module = eomc.load(scene, root)
+        module = eomc.load(scene, root, warn=_warn)
     values, q0, qd0 = _overrides(scene, module, parameters, start)
     options: dict[str, Any] = {"h": h, "duration": duration, "params": values}
     try:
@@ -248,7 +247,8 @@ def show(scene: Path, form: str | None) -> None:
     from eomc import show as shown
 
     system = eomc.read(scene)
-    _warn(system)
+    for problem in system.warnings:
+        _warn(problem)
     with _status("deriving", False):
         text = shown.cost(system) if form == "cost" else shown.equations(system, form or "text")
     click.echo(text)
@@ -303,9 +303,8 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
 # --- pieces ---------------------------------------------------------------------------------------
 
 
-def _warn(system: System) -> None:
-    for problem in system.warnings:
-        click.echo(str(problem), err=True)
+def _warn(problem: Problem) -> None:
+    click.echo(str(problem), err=True)
 
 
 def _known_suffix(path: Path | None, known: Sequence[str], option: str) -> None:
@@ -497,3 +496,7 @@ def _status(what: str, silent: bool) -> Iterator[None]:
 
     with Console(stderr=True).status(f"{what} ..."):
         yield
+
+
+if __name__ == "__main__":
+    main()

@@ -19,15 +19,19 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from eomc import __version__
 from eomc.problems import EomcError
+
+if TYPE_CHECKING:
+    from eomc.render import Sources
 
 # no -ffast-math: it breaks the reduction of angles and the checks for singular D
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize")
@@ -138,13 +142,13 @@ def found(folder: Path, wanted: str) -> bool:
 def build(
     name: str,
     wanted: str,
-    sources: Callable[[str], tuple[Mapping[str, str], str, str]],
+    sources: Callable[[str], Sources],
     root: Path,
 ) -> Built:
     """The module of one scene under `root`, built where it isn't there yet.
 
-    wanted: the key. sources: given the name of the extension, the texts of the files by name, the
-    binding's C and its cdef; called only where something is to be built.
+    wanted: the key. sources: makes the files, given the name of the extension; called only where
+    something is to be built.
     Raises EomcError where the compiler fails, with its own words, or the folder can't be written.
     """
     folder = root / name
@@ -175,17 +179,17 @@ def _locked(path: Path) -> Iterator[None]:
 def _build(
     name: str,
     wanted: str,
-    sources: Callable[[str], tuple[Mapping[str, str], str, str]],
+    sources: Callable[[str], Sources],
     folder: Path,
     beside: Path,
 ) -> None:
     extension = f"_{name}_{wanted[:12]}"
-    texts, binding, cdef = sources(extension)
-    for file, text in texts.items():
+    made = sources(extension)
+    for file, text in made.files.items():
         (beside / file).write_text(text, encoding="utf-8")
     library = extension + str(sysconfig.get_config_var("EXT_SUFFIX"))
-    _compile(name, extension, binding, cdef, beside, library)
-    kept = [library, *texts]
+    _compile(made, extension, beside, library)
+    kept = [library, *made.files]
     manifest = {
         "key": wanted,
         "name": name,
@@ -203,14 +207,13 @@ def _build(
         path.unlink(missing_ok=True)
 
 
-def _compile(
-    name: str, extension: str, binding: str, cdef: str, folder: Path, library: str
-) -> None:
+def _compile(made: Sources, extension: str, folder: Path, library: str) -> None:
     import cffi
 
+    name = made.name
     ffi = cffi.FFI()
-    ffi.cdef(cdef)
-    ffi.set_source(extension, binding, compiler_verbose=0)
+    ffi.cdef(made.cdef)
+    ffi.set_source(extension, made.binding, compiler_verbose=0)
     ffi.emit_c_code(str(folder / "binding.c"))
     compiler = find_compiler()
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]

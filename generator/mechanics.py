@@ -173,7 +173,14 @@ def _on_tape(system: System) -> _Energies:
     def value(expr: Expr) -> Expr:
         velocities = {}
         for moving in sorted(expr.atoms(dot), key=str):
-            position = tape.define(moving.args[0].xreplace(known))
+            position = tape.define(_position(system, moving).xreplace(known))
+            held = tape.leaves_of([position]) & {*system.qd, *system.u}
+            if held:
+                raise EomcError(
+                    f"{system.file or system.name}: {moving} is the rate of something that "
+                    f"depends on {', '.join(sorted(map(str, held)))}: only t, coordinates and "
+                    "parameters have known rates"
+                )
             (velocity,) = tape.forward([position], rates)
             inside = moving.args[0]
             name = f"{inside}_dot" if inside.is_Symbol else f"w{len(points) + 1}"
@@ -195,6 +202,16 @@ def _on_tape(system: System) -> _Energies:
         [value(i.signal) for i in system.inputs],
         points,
     )
+
+
+def _position(system: System, moving: dot) -> Expr:
+    (inside,) = moving.args
+    if inside.has(dot):
+        raise EomcError(
+            f"{system.file or system.name}: {moving} would hold accelerations, which are what is "
+            "solved for"
+        )
+    return inside
 
 
 def _mass_matrix(

@@ -1,7 +1,5 @@
 """Names that C, C++ and Python can bear, and what to use where they can't."""
 
-# ruff: noqa: SIM905 - a list of words reads better without quotes
-
 from __future__ import annotations
 
 import keyword

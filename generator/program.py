@@ -20,6 +20,7 @@ from sympy import Expr, S, Symbol
 from eomc import mechanics
 from eomc.expand import Expander
 from eomc.mechanics import Equations
+from eomc.problems import EomcError, Problem
 from eomc.system import System, t
 from eomc.tape import Stage, Tape, split
 
@@ -776,6 +777,59 @@ def evaluate(function: Function, values: Mapping[str, float]) -> tuple[list[floa
         operand(pivot) > (0 if pivot == diagonal else tolerance * operand(diagonal))
         for pivot, diagonal in function.checks
     )
+
+
+def inertia(program: Program) -> list[Problem]:
+    """A warning where D is not positive definite at the start.
+
+    Raises EomcError where it is so at states around the start as well: no motion can be computed.
+    """
+    s = program.system
+    weak = _without_inertia(program, 0)
+    if weak is None:
+        return []
+    key = "energy.kinetic"
+    if all(_without_inertia(program, k) is not None for k in range(1, 6)):
+        raise EomcError(
+            f"{s.file or s.name}: {key}: D is not positive definite: '{weak}' has no inertia of its "
+            "own. Give it a mass, or leave out a coordinate that others determine"
+        )
+    message = (
+        f"D is not positive definite at the start, '{weak}' has no inertia there: "
+        "start elsewhere, or choose coordinates that are regular there"
+    )
+    return [Problem(message, key, s.file, severity="warning")]
+
+
+def nearby(system: System, k: int) -> dict[str, float]:
+    """Values by name of the k-th of some states around the start (0: the start itself)."""
+    out = {p.name: p.value for p in system.parameters} | {TIME: 0.0}
+    for i, c in enumerate(system.coordinates):
+        # steps in directions that have nothing to do with one another, short as they are printed
+        out[c.name] = (
+            float(f"{c.start + 0.37 * k * math.sin(1.0 + i + 2.3 * k):.6g}") if k else c.start
+        )
+        rate = c.rate + 0.53 * k * math.cos(0.7 + i + 1.9 * k)
+        out[f"{c.name}_dot"] = float(f"{rate:.6g}") if k else c.rate
+    return out
+
+
+def _without_inertia(program: Program, k: int) -> str | None:
+    """The coordinate at which elimination in D finds no positive pivot, None where there is none."""
+    names = [c.name for c in program.system.coordinates]
+    n = len(names)
+    try:
+        flat, _ = evaluate(program["D"], nearby(program.system, k))
+    except (ArithmeticError, ValueError):
+        return names[0]
+    A = [flat[n * i : n * i + n] for i in range(n)]
+    for i in range(n):
+        if not A[i][i] > 8 * n * 2.0**-52 * flat[n * i + i]:
+            return names[i]
+        for j in range(i + 1, n):
+            factor = A[j][i] / A[i][i]
+            A[j] = [a - factor * b for a, b in zip(A[j], A[i], strict=True)]
+    return None
 
 
 TIME = t.name

@@ -16,7 +16,7 @@ import jinja2
 
 from eomc import __version__, ccode
 from eomc.ccode import DOUBLE, Body, Real, indent
-from eomc.program import TIME, Function, Program, evaluate, rename
+from eomc.program import TIME, Function, Program, evaluate, nearby, rename
 from eomc.system import System
 
 # names that the templates use inside functions; a user's name that is one of them gets a "_"
@@ -485,19 +485,8 @@ class _Context:
         s = self.system
         states = []
         for k in range(6):
-            # the start, then beside it in directions that have nothing to do with one another
-            q = [
-                c.start + 0.37 * k * math.sin(1.0 + i + 2.3 * k)
-                for i, c in enumerate(s.coordinates)
-            ]
-            qd = [
-                c.rate + 0.53 * k * math.cos(0.7 + i + 1.9 * k) for i, c in enumerate(s.coordinates)
-            ]
-            # as they are printed
-            q, qd = ([float(f"{x:.6g}") for x in xs] for xs in (q, qd))
-            known = {p.name: p.value for p in s.parameters} | {TIME: 0.0}
-            known |= {c.name: x for c, x in zip(s.coordinates, q, strict=True)}
-            known |= {f"{c.name}_dot": x for c, x in zip(s.coordinates, qd, strict=True)}
+            known = nearby(s, k)
+            x = [known[name.name] for name in (*s.q, *s.qd)]
             try:
                 if "signal" in self.program:
                     u, _ = evaluate(self.program["signal"], known)
@@ -508,7 +497,7 @@ class _Context:
             if values[2][1] and max(map(abs, values[2][0])) < 1e8:
                 states.append(
                     {
-                        "x": [self.literal(x) for x in (*q, *qd)],
+                        "x": [self.literal(value) for value in x],
                         "expected": [self.literal(x) for v, _ in values for x in v],
                     }
                 )

@@ -526,14 +526,6 @@ class _Check:
                     (seen[velocity], velocity),
                     f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
                 )
-        upper: dict[str, str] = {}
-        for name in doc.coordinates:
-            if (other := upper.setdefault(name.upper(), name)) != name:
-                self.say(
-                    ("coordinates", name),
-                    f"'{other}' and '{name}' differ only in case, and C's name for their places "
-                    f"in q is {doc.name.upper()}_{name.upper()}: rename one of the two",
-                )
         return seen
 
     # formulas
