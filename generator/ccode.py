@@ -10,7 +10,7 @@ from itertools import count
 import sympy
 from sympy import Expr
 
-from eomc.program import Call, Function, Operand, Product, Sum, Value, names_of, rename
+from eomc.assignments import Call, Function, Operand, Product, Sum, Value, names_of, rename
 from eomc.tape import Stage
 
 MOST_INLINE = 5  # operations; longer expressions get a name of their own

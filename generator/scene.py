@@ -8,87 +8,21 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import pydantic
 
-from eomc import formulas, names
-from eomc.formulas import Formula, FormulaError, nearest, suggest
+from eomc import formulas, layout, names
+from eomc.formulas import Formula, FormulaError, suggest
+from eomc.places import Places
 from eomc.problems import EomcError, Problem, SceneError
 
-METHODS = ("rk4",)
 MAX_BYTES = 1_000_000
-MAX_STATEMENT = 500  # lines
-
-# --- the layout of the file -------------------------------------------------------------------
-
-_Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
-_Value = _Number | pydantic.StrictStr
-_Positive = Annotated[float, pydantic.Field(strict=True, gt=0, allow_inf_nan=False)]
-
-
-class _Table(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
-
-
-class _Coordinate(_Table):
-    unit: pydantic.StrictStr = ""
-    start: _Value = 0.0
-    rate: _Value = 0.0
-    note: pydantic.StrictStr = ""
-
-
-class _Quantity(_Table):
-    value: _Value
-    unit: pydantic.StrictStr = ""
-    note: pydantic.StrictStr = ""
-
-
-class _Input(_Table):
-    unit: pydantic.StrictStr = ""
-    signal: _Value = 0.0
-    note: pydantic.StrictStr = ""
-
-
-class _Energy(_Table):
-    kinetic: _Value
-    potential: _Value = 0.0
-    dissipation: _Value = 0.0
-
-
-class _Run(_Table):
-    h: _Positive = 0.001
-    duration: _Positive = 10.0
-    method: Literal[METHODS] = "rk4"  # type: ignore[valid-type]
-
-
-def _spelled_out(value: object) -> object:
-    """`m = 2.0` says the same as `m = { value = 2.0 }`."""
-    return value if isinstance(value, dict) else {"value": value}
-
-
-_Short = Annotated[_Quantity, pydantic.BeforeValidator(_spelled_out)]
-
-
-class _Document(_Table):
-    eomc: Literal[1]
-    name: pydantic.StrictStr
-    title: pydantic.StrictStr = ""
-    note: pydantic.StrictStr = ""
-    coordinates: dict[str, _Coordinate] = pydantic.Field(min_length=1)
-    parameters: dict[str, _Short] = {}
-    constants: dict[str, _Short] = {}
-    inputs: dict[str, _Input] = {}
-    definitions: dict[str, _Value] = {}
-    energy: _Energy
-    forces: dict[str, _Value] = {}
-    run: _Run = _Run()
-
 
 # --- what a checked scene is ------------------------------------------------------------------
 
@@ -199,116 +133,6 @@ def _value(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
     given = {n.id: known[n.id] for n in formula.names()}
     where = ", ".join(f"{name} = {value:g}" for name, value in given.items())
     return math.nan, f"'{formula.text}' {fault}" + (f" at {where}" if where else "")
-
-
-# --- where things stand in the file -------------------------------------------------------------
-
-
-class Places:
-    """Line numbers of keys, found by giving tomllib one statement at a time."""
-
-    def __init__(self, text: str, file: str) -> None:
-        self.lines = text.split("\n")
-        self.file = file
-        self._line: dict[tuple[str, ...], tuple[int, int]] = {}
-        prefix: tuple[str, ...] = ()
-        start = 0
-        while start < len(self.lines):
-            if self.lines[start].strip().startswith("#") or not self.lines[start].strip():
-                start += 1
-                continue
-            end = self._end(start)
-            if end == start:
-                break  # hundreds of lines in one statement: no scene; the rest keeps no places
-            statement = "\n".join(self.lines[start:end])
-            paths = list(_paths(tomllib.loads(statement)))
-            header = statement.lstrip().startswith("[")
-            for path in paths:
-                self._line.setdefault((() if header else prefix) + path, (start, end))
-            if header:
-                prefix = max(paths, key=len)
-            start = end
-
-    def _end(self, start: int) -> int:
-        """The line after the statement that begins at `start`; `start` where none is found."""
-        for end in range(start + 1, min(start + MAX_STATEMENT, len(self.lines)) + 1):
-            try:
-                tomllib.loads("\n".join(self.lines[start:end]))
-            except ValueError:
-                continue
-            return end
-        return start
-
-    def rename(self, given: tuple[str, ...], meant: tuple[str, ...]) -> None:
-        """Let `meant` and what is under it stand where the misspelt `given` stands."""
-        for path, place in list(self._line.items()):
-            if path[: len(given)] == given:
-                self._line.setdefault(meant + path[len(given) :], place)
-
-    def source(self, path: tuple[str, ...]) -> str:
-        """The statement in which a key stands."""
-        start, end = self._line.get(path, (0, 0))
-        return "\n".join(self.lines[start:end])
-
-    def problem(
-        self,
-        path: tuple[str, ...],
-        message: str,
-        at: FormulaError | ast.expr | None = None,
-        text: str | None = None,
-        severity: str = "error",
-    ) -> Problem:
-        """A problem at a key; the fault `at` of its text is marked where it can be found."""
-        if path[-1:] == ("value",) and path not in self._line:
-            path = path[:-1]  # written short, m = 2.0
-        key = ".".join(path)
-        known = path
-        while known and known not in self._line:
-            known = known[:-1]
-        if not known:
-            return Problem(message, key, self.file, severity=severity)
-        source = self.source(known)
-        offset, width = _spot(source, known[-1], at, text)
-        line = self._line[known][0] + source.count("\n", 0, max(offset, 0))
-        column = offset - source.rfind("\n", 0, offset) - 1 if offset >= 0 else -1
-        return Problem(
-            message, key, self.file, line + 1, column, width, self.lines[line].rstrip(), severity
-        )
-
-
-def _spot(
-    source: str, key: str, at: FormulaError | ast.expr | None, text: str | None
-) -> tuple[int, int]:
-    """Where in a statement the fault stands, and how wide it is; -1 where it can't be told."""
-    text = (text or "").strip()
-    column, width = 0, len(text) or 1
-    if isinstance(at, FormulaError):
-        column, width = at.column, at.width
-    elif at is not None:
-        column, width = at.col_offset, (at.end_col_offset or 0) - at.col_offset
-    for written in (str, _escaped) if text else ():
-        # blanks may be line breaks, one for one, so that columns stay
-        body = re.sub(r"\\\s", r"\\s", re.escape(written(text)))
-        quoted = re.search(rf"""(["'])\s*({body})\s*\1""", source)
-        if quoted is not None:
-            return quoted.start(2) + len(written(text[:column])), width
-    named = re.search(rf"(?<!\w){re.escape(key)}(?!\w)", source)
-    return (named.start(), len(key)) if named else (-1, 1)
-
-
-def _escaped(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"')
-
-
-def _paths(tree: Mapping[str, Any], depth: int = 3) -> Iterator[tuple[str, ...]]:
-    """The keys of a tree as deep as a scene goes: table, name, key."""
-    for key, value in tree.items():
-        yield (key,)
-        if isinstance(value, list):
-            value = next((v for v in value if isinstance(v, dict)), None)
-        if isinstance(value, dict) and depth > 1:
-            for rest in _paths(value, depth - 1):
-                yield (key, *rest)
 
 
 # --- reading --------------------------------------------------------------------------------------
@@ -467,36 +291,36 @@ class _Check:
 
     # layout and names
 
-    def _layout(self, tree: dict[str, Any]) -> _Document:
+    def _layout(self, tree: dict[str, Any]) -> layout.Document:
         """The document; faulty entries are told, taken out or mended, and the rest checked on."""
         for _ in range(100):
             try:
-                return _Document.model_validate(tree)
+                return layout.Document.model_validate(tree)
             except pydantic.ValidationError as fault:
                 errors = fault.errors()
             # misspelt keys first: what is missing may only be misspelt
             errors.sort(key=lambda error: error["type"] != "extra_forbidden")
             told: set[tuple[str, ...]] = set()
             for error in errors:
-                path = _path(error)
-                if path in told or (error["type"] == "missing" and _has(tree, path)):
+                path = layout.place(error)
+                if path in told or (error["type"] == "missing" and layout.has(tree, path)):
                     continue
                 told.add(path)
-                self.say(path, _say_layout(error, path))
+                self.say(path, layout.say(error, path))
                 if error["type"] == "extra_forbidden":
                     self._misspelt(tree, path)
                 else:
                     self.mended.add(path)
-                    _mend(tree, path)
+                    layout.mend(tree, path)
             if ("coordinates",) in self.mended:
                 break  # everything else hangs on them
         raise SceneError(self.problems)
 
     def _misspelt(self, tree: dict[str, Any], path: tuple[str, ...]) -> None:
         """Take an unknown key for the one that was meant, or out."""
-        table = _at(tree, path[:-1])
+        table = layout.table_at(tree, path[:-1])
         value = table.pop(path[-1])
-        meant = _meant(path)
+        meant = layout.meant(path)
         if meant and meant not in table:
             table[meant] = value
             self.places.rename(path, (*path[:-1], meant))
@@ -795,135 +619,3 @@ class _Check:
                     f"'{name}' is not used by any formula: remove it, or use it",
                     severity="warning",
                 )
-
-
-# --- the layout's faults in words -----------------------------------------------------------------
-
-
-_MODELS: Mapping[str, type[_Table]] = {
-    "coordinates": _Coordinate,
-    "parameters": _Quantity,
-    "constants": _Quantity,
-    "inputs": _Input,
-    "energy": _Energy,
-    "run": _Run,
-}
-
-# what people write instead of our keys
-_ALIASES = {
-    "dt": "h", "step": "h", "time": "duration", "tend": "duration", "t_end": "duration",
-    "initial": "start", "init": "start", "velocity": "rate", "units": "unit", "val": "value",
-    "variables": "coordinates", "params": "parameters", "T": "kinetic", "K": "kinetic",
-    "V": "potential", "U": "potential", "P": "potential", "R": "dissipation",
-}  # fmt: skip
-
-
-def _at(tree: Any, path: tuple[str, ...]) -> dict[str, Any]:
-    """The table at `path`; an empty one where there is none."""
-    for part in path:
-        tree = tree.get(part) if isinstance(tree, dict) else None
-    return tree if isinstance(tree, dict) else {}
-
-
-def _has(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
-    return path[-1] in _at(tree, path[:-1])
-
-
-def _path(error: Mapping[str, Any]) -> tuple[str, ...]:
-    """pydantic's place without the branch of a union."""
-    path = tuple(map(str, error["loc"]))
-    branch = path[-1] in ("float", "str") and error["type"] in _OF_BRANCHES
-    return path[:-1] if branch else path
-
-
-_OF_BRANCHES = ("float_type", "string_type", "finite_number")
-
-
-def _keys(path: tuple[str, ...]) -> list[str]:
-    """The keys that may stand beside the last of `path`."""
-    model = _MODELS[path[0]] if len(path) > 1 else _Document
-    return list(model.model_fields)
-
-
-def _meant(path: tuple[str, ...]) -> str:
-    """The key that the last of `path` may have been meant for, or the empty string."""
-    known, alias = _keys(path), _ALIASES.get(path[-1], "")
-    return alias if alias in known else nearest(path[-1], known)
-
-
-def _toml(value: object) -> str:
-    """A value as TOML writes it, shortened."""
-    if isinstance(value, bool):
-        text = str(value).lower()
-    elif isinstance(value, dict):
-        text = "a table"
-    else:
-        text = repr(value) if isinstance(value, (str, list, float, int)) else str(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
-def _say_layout(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
-    kind, given, last = str(error["type"]), error.get("input"), path[-1]
-    here = _toml(given)
-    if kind == "missing":
-        return "missing: " + _MISSING.get(path, f"add {last} = ...")
-    if kind == "extra_forbidden":
-        near = _meant(path)
-        remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(_keys(path))}"
-        return f"unknown {'table' if isinstance(given, dict) else 'key'} '{last}'{remedy}"
-    if path == ("eomc",):
-        return f"format {here} is not known to this version, which reads eomc = 1"
-    if kind == "too_short":
-        return 'none is declared: add at least one, such as x = { unit = "m", start = 0.0 }'
-    if path == ("run", "method"):
-        return f"unknown method {here}: known are {', '.join(METHODS)}"
-    if kind == "greater_than":
-        return f"must be greater than zero, here {here}"
-    if kind == "finite_number":
-        return f"must be a finite number, here {here}"
-    if kind in ("dict_type", "model_type", "model_attributes_type"):
-        if len(path) == 1:
-            return f"'{last}' is a table: write [{last}] and its entries below"
-        key = {"coordinates": "start", "inputs": "signal"}.get(path[0], "value")
-        value = here if isinstance(given, (int, float, str)) else "..."
-        return f"'{last}' is a table: write {last} = {{ {key} = {value} }}"
-    if path[0] == "run":
-        return f"must be a number, here {here}"
-    if last in ("unit", "note", "name", "title"):
-        return f"must be text in quotes, here {here}"
-    return f"must be a number or a formula in quotes, here {here}"
-
-
-_MISSING: Mapping[tuple[str, ...], str] = {
-    ("eomc",): "begin the scene with eomc = 1, its format",
-    ("name",): 'add name = "...", which names the module and begins every C symbol',
-    ("coordinates",): 'add [coordinates] with entries such as x = { unit = "m", start = 0.0 }',
-    ("energy",): 'add [energy] with kinetic = "..." and potential = "..."',
-    ("energy", "kinetic"): 'add kinetic = "..."',
-}
-
-
-def _mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
-    """Put something harmless in a faulty entry's place, so that the rest can be checked."""
-    table, last = _at(tree, path[:-1]), path[-1]
-    given = table.get(last)
-    if isinstance(given, list) and given and all(isinstance(g, dict) for g in given):
-        table[last] = {key: value for g in given for key, value in g.items()}  # [[parameters]]
-    elif path in _HARMLESS:
-        table[last] = _HARMLESS[path]
-    elif len(path) == 2 and path[0] in ("definitions", "forces"):
-        table[last] = "0"
-    elif len(path) == 2 and path[0] in ("coordinates", "inputs"):
-        table[last] = {}
-    elif last == "value":
-        _at(tree, path[:1])[path[1]] = 1.0
-    else:
-        table.pop(last, None)
-
-
-_HARMLESS: Mapping[tuple[str, ...], Any] = {
-    ("eomc",): 1,
-    ("name",): "scene",
-    ("energy",): {"kinetic": "0"},
-    ("energy", "kinetic"): "0",
-}

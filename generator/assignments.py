@@ -1,0 +1,199 @@
+"""Assignments: the small language that programs are written in, and its evaluation in Python.
+
+A function is a list of sums, products and calls over names; what hangs on parameters alone comes
+first. Knows nothing of mechanics or C.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from sympy import Expr, S
+
+from eomc.tape import Stage
+
+
+@dataclass(frozen=True)
+class Sum:
+    """sum of coefficient times name, plus a constant."""
+
+    terms: tuple[tuple[Expr, str], ...]
+    constant: Expr = S.Zero
+
+
+@dataclass(frozen=True)
+class Product:
+    """coefficient times a product of names, repeated for whole powers."""
+
+    coefficient: Expr
+    factors: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Call:
+    """A function of atoms: "reciprocal", "sqrt", "pow" or one of the scene's functions."""
+
+    function: str
+    args: tuple[Operand, ...]
+
+
+@dataclass(frozen=True)
+class Operand:
+    """A number times a name; the name is empty for a number alone."""
+
+    coefficient: Expr
+    name: str = ""
+
+
+Value = Sum | Product | Call
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """name = value, known from `stage` on; `named` where the name tells what it is."""
+
+    name: str
+    value: Value
+    stage: Stage
+    named: bool = False
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Operations of one call, those that depend on parameters alone left out."""
+
+    adds: int = 0
+    multiplications: int = 0
+    divisions: int = 0
+    sincos: int = 0
+    calls: int = 0  # square roots and other functions of the mathematics library
+
+    @property
+    def flops(self) -> int:
+        """Additions, multiplications and divisions."""
+        return self.adds + self.multiplications + self.divisions
+
+    def __str__(self) -> str:
+        parts = [
+            (self.adds, "addition"),
+            (self.multiplications, "multiplication"),
+            (self.divisions, "division"),
+            (self.sincos, "sincos"),
+            (self.calls, "other call"),
+        ]
+        told = [f"{n} {what}{'s' if n > 1 and what != 'sincos' else ''}" for n, what in parts if n]
+        return ", ".join(told) or "no arithmetic"
+
+
+@dataclass(frozen=True)
+class Function:
+    """One function of the generated code.
+
+    `early` hangs on parameters alone, `body` on the rest; `outputs` are the results, row-major
+    where they are a matrix. `checks` are (pivot, diagonal) pairs that must be positive.
+    """
+
+    name: str
+    early: tuple[Assignment, ...]
+    body: tuple[Assignment, ...]
+    outputs: tuple[Operand, ...]
+    checks: tuple[tuple[Operand, Operand], ...]
+    cost: Cost
+    route: str
+    routes: tuple[tuple[str, Cost], ...]
+
+    @property
+    def uses(self) -> frozenset[str]:
+        """Every name that the function reads."""
+        made = {a.name for a in (*self.early, *self.body)}
+        read = {n for a in (*self.early, *self.body) for n in names_of(a.value)}
+        ends = [*self.outputs, *(o for pair in self.checks for o in pair)]
+        return frozenset(read | {o.name for o in ends if o.name}) - made
+
+
+def names_of(value: Value) -> tuple[str, ...]:
+    """The names on a right-hand side, repeated as often as they stand there."""
+    if isinstance(value, Sum):
+        return tuple(n for _, n in value.terms)
+    if isinstance(value, Product):
+        return value.factors
+    return tuple(a.name for a in value.args if a.name)
+
+
+def rename(function: Function, new: Mapping[str, str]) -> Function:
+    """The function with other names for some of its values."""
+
+    def real(name: str) -> str:
+        return new.get(name, name)
+
+    def operand(o: Operand) -> Operand:
+        return replace(o, name=real(o.name)) if o.name else o
+
+    def renamed(items: Iterable[Assignment]) -> tuple[Assignment, ...]:
+        return tuple(
+            replace(a, name=real(a.name), value=renamed_value(a.value, real)) for a in items
+        )
+
+    return replace(
+        function,
+        early=renamed(function.early),
+        body=renamed(function.body),
+        outputs=tuple(map(operand, function.outputs)),
+        checks=tuple((operand(a), operand(b)) for a, b in function.checks),
+    )
+
+
+def renamed_value(value: Value, real: Callable[[str], str]) -> Value:
+    """A right-hand side with other names."""
+    if isinstance(value, Sum):
+        return Sum(tuple((w, real(n)) for w, n in value.terms), value.constant)
+    if isinstance(value, Product):
+        return Product(value.coefficient, tuple(real(n) for n in value.factors))
+    return Call(
+        value.function, tuple(replace(a, name=real(a.name)) if a.name else a for a in value.args)
+    )
+
+
+# --- evaluation in Python -----------------------------------------------------------------------
+
+_PYTHON: Mapping[str, Callable[..., float]] = {
+    **{n: getattr(math, n) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")},
+    **{n: getattr(math, n) for n in ("sinh", "cosh", "tanh", "exp", "log", "sqrt", "pow")},
+    "abs": abs,
+    "sign": lambda x: float((x > 0) - (x < 0)),
+    "heaviside": lambda x: 0.5 + 0.5 * ((x > 0) - (x < 0)),
+    "min": min,
+    "max": max,
+    "reciprocal": lambda x: 1 / x,
+}
+
+
+def evaluate(function: Function, values: Mapping[str, float]) -> tuple[list[float], bool]:
+    """The results of a function, and whether every pivot is positive; all in Python floats.
+
+    values: coordinates, velocities, parameters, inputs and t by name. Raises ArithmeticError or
+    ValueError where a result is not a finite number.
+    """
+    known = dict(values)
+
+    def operand(o: Operand) -> float:
+        return float(o.coefficient) * (known[o.name] if o.name else 1.0)
+
+    for a in (*function.early, *function.body):
+        v = a.value
+        if isinstance(v, Sum):
+            known[a.name] = float(v.constant) + sum(float(w) * known[n] for w, n in v.terms)
+        elif isinstance(v, Product):
+            known[a.name] = float(v.coefficient) * math.prod(known[n] for n in v.factors)
+        else:
+            known[a.name] = _PYTHON[v.function](*map(operand, v.args))
+    results = [operand(o) for o in function.outputs]
+    if not all(map(math.isfinite, results)):
+        raise ValueError(f"{function.name} is not finite")
+    tolerance = 8 * 2.0**-52 * max(1, len(function.checks))
+    return results, all(
+        operand(pivot) > (0 if pivot == diagonal else tolerance * operand(diagonal))
+        for pivot, diagonal in function.checks
+    )

@@ -1,0 +1,560 @@
+"""What the templates are given: prototypes, bodies and calls as finished text.
+
+A prototype has only what its function needs: t where time matters, u where inputs do, p where
+there are parameters. Every such choice is made here, none in a template.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+from eomc import __version__, ccode
+from eomc.assignments import Function, evaluate, rename
+from eomc.ccode import DOUBLE, Body, Real, indent
+from eomc.program import TIME, Program, nearby
+from eomc.system import System
+
+# names that the templates use inside functions; a user's name that is one of them gets a "_"
+_OURS = frozenset(
+    "q qd qdd t t0 u p c a h r v D C g K P bias tau power energy now k n good status first steps "
+    "every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6".split()
+)
+LARGE = 1000  # operations from which an acceleration is called, not inlined four times
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What is known of a function before it is looked at: results, arguments, meaning."""
+
+    out: str
+    shape: str  # "", "n" or "n*n"
+    qd: bool
+    u: bool
+    doc: str
+
+
+_KINDS: Mapping[str, _Kind] = {
+    "D": _Kind("D", "n*n", False, False, "D(q): mass matrix, nq x nq, symmetric."),
+    "C": _Kind("C", "n*n", True, False, "C(q, qd): Coriolis matrix, nq x nq, Christoffel form."),
+    "g": _Kind("g", "n", False, False, "g(q): dP/dq, the forces of the potential energy."),
+    "bias": _Kind("bias", "n", True, False, "bias = C(q, qd) qd + g(q), without forming C."),
+    "tau": _Kind("tau", "n", True, True, "tau = Q - dR/dqd: inputs, friction and other forces."),
+    "kinetic_energy": _Kind("", "", True, False, "K(q, qd), J."),
+    "potential_energy": _Kind("", "", False, False, "P(q), J."),
+    "energy": _Kind("", "", True, False, "K + P, J."),
+    "jacobi": _Kind(
+        "", "", True, False, "qd.dK/dqd - K + P, J: what is conserved here in place of K + P."
+    ),
+    "power": _Kind(
+        "",
+        "",
+        True,
+        True,
+        "Power into the system, W: d(energy)/dt, or d(jacobi)/dt if there is one.",
+    ),
+    "signal": _Kind("u", "m", True, False, "u: the scene's own signals for the inputs."),
+}
+
+
+def resource(package: str, name: str) -> str:
+    """The text of a template or of hand-written C."""
+    return (files(f"eomc.{package}") / name).read_text(encoding="utf-8")
+
+
+class Context:
+    """The variables of the templates."""
+
+    def __init__(self, program: Program, real: Real) -> None:
+        self.program = program
+        self.system: System = program.system
+        self.real = real
+        self.prefix = self.system.name
+        self.PREFIX = self.prefix.upper()
+        self.sincos = False  # found out while bodies are printed
+        s = self.system
+        taken = {
+            f"{self.PREFIX}_{w}" for w in ("H", "NQ", "NU", "OK", "SINGULAR", "NOT_FINITE", "STAMP")
+        }
+        indexed = [*(c.name for c in s.coordinates), *(i.name for i in s.inputs)]
+        wishes = [f"{self.PREFIX}_{name}" for name in indexed]
+        self.enum = dict(zip(indexed, _unique(wishes, taken), strict=True))
+        self.needs_p = bool(s.parameters)
+        acceleration = program["acceleration"]
+        signal = program.functions.get("signal")
+        self.signal_state = signal is not None and bool(
+            signal.uses & {x.name for x in (*s.q, *s.qd)}
+        )
+        self.signal_t = signal is not None and TIME in signal.uses
+        self.driven = TIME in acceleration.uses or self.signal_t
+
+    # pieces of argument lists, each with its comma before it
+
+    def _arguments(self, *parts: str) -> str:
+        return ", ".join(p for p in parts if p)
+
+    @property
+    def _p_arg(self) -> str:
+        return f"const {self.prefix}_params *p" if self.needs_p else ""
+
+    @property
+    def _p_call(self) -> str:
+        return "p" if self.needs_p else ""
+
+    def _takes_t(self, name: str) -> bool:
+        """Whether a function's result depends on time, by itself or by the signals."""
+        takes_u = name in _KINDS and _KINDS[name].u and self.system.inputs
+        return TIME in self.program[name].uses or bool(takes_u and self.signal_t)
+
+    def values(self) -> dict[str, Any]:
+        """Every variable of every template."""
+        s, real = self.system, self.real
+        functions = [self._function(name) for name in _KINDS if name in self.program]
+        dynamics = self._dynamics()
+        n = len(s.coordinates)
+        return {
+            "title": s.title,
+            "prefix": self.prefix,
+            "PREFIX": self.PREFIX,
+            "real": real.name,
+            "dtype": real.dtype,
+            "lit": lambda text: text + real.suffix,
+            "stamp": self._stamp(),
+            "handshake": f"0x{s.digest[:8]}u",
+            "digest": s.digest,
+            "notes": self.program.notes,
+            "description": self._description(),
+            "coordinates": [
+                {"name": c.name, "enum": self.enum[c.name], "unit": c.unit, "note": c.note,
+                 "comment": _comment(c.unit, c.note)}
+                for c in s.coordinates
+            ],
+            "inputs": [
+                {"name": i.name, "enum": self.enum[i.name], "unit": i.unit, "note": i.note,
+                 "comment": _comment(i.unit, i.note)}
+                for i in s.inputs
+            ],
+            "parameters": [
+                {"name": p.name, "unit": p.unit, "note": p.note,
+                 "comment": _comment(p.unit, p.note), "value": self._literal(p.value),
+                 "number": repr(p.value), "named": f"/* {p.name} */"}
+                for p in s.parameters
+            ],
+            "q0": [self._literal(c.start) for c in s.coordinates],
+            "qd0": [self._literal(c.rate) for c in s.coordinates],
+            "start": [c.start for c in s.coordinates],
+            "rates_at_start": [c.rate for c in s.coordinates],
+            "n": n,
+            "m": len(s.inputs),
+            "functions": functions,
+            "names": [c.name for c in s.coordinates],
+            "order": [s.coordinates[k].name for k in self.program.order],
+            "run": s.run,
+            "indent": indent,
+            "broken": lambda text: "\n".join(ccode.broken(text)),
+            "has_t": self.driven,
+            "has_u": bool(s.inputs),
+            "has_p": self.needs_p,
+            "takes_t": {f["name"]: f["takes_t"] for f in functions},
+            "pieces": self._pieces(functions, dynamics),
+            **dynamics,
+            **self._example(),
+            **self._selftest(),
+            **self._face(),
+        }  # fmt: skip
+
+    def _literal(self, value: float) -> str:
+        text = repr(value)
+        return (
+            text if "." in text or "e" in text or "n" in text else text + ".0"
+        ) + self.real.suffix
+
+    def _stamp(self) -> str:
+        s = self.system
+        source = s.file.replace("\\", "/").rsplit("/", 1)[-1]
+        made = (
+            f"from {source} (sha256 {s.digest[:16]}): eomc build {source}"
+            if source
+            else (f"from a system made in Python (sha256 {s.digest[:16]})")
+        )
+        return f"Generated by eomc {__version__} {made}"
+
+    def _description(self) -> list[str]:
+        s = self.system
+        lines = textwrap.wrap(" ".join(s.note.split()), 92) if s.note else []
+        if lines:
+            lines.append("")
+        if s.renamed:
+            renamed = ", ".join(f"{given} is {used}" for given, used in s.renamed)
+            lines += [*textwrap.wrap(f"Names that C can't bear: {renamed}.", 92), ""]
+        return [line.replace("*/", "* /") for line in lines]
+
+    # --- evaluation functions ------------------------------------------------------------------
+
+    def _where(self, function: Function, p: str = "p") -> dict[str, str]:
+        """How names from outside are written: p->m_c for parameters, theta_ where theta is ours."""
+        s = self.system
+        out = {x.name: f"{p}->{x.name}" for x in s.parameters}
+        mine = [*(x.name for x in s.q), *(x.name for x in s.qd), *(i.name for i in s.inputs)]
+        return out | {n: _local(n) for n in mine}
+
+    def _body(self, function: Function, **options: Any) -> Body:
+        clash = {a.name: a.name + "_" for a in (*function.early, *function.body) if a.name in _OURS}
+        made = ccode.body(
+            rename(function, clash), self.prefix, self._where(function), self.real, **options
+        )
+        self.sincos |= made.sincos
+        return made
+
+    def _loads(self, function: Function, in_struct: bool = False) -> list[str]:
+        """Locals for the coordinates, velocities and inputs that are used."""
+        s, real = self.system, self.real.name
+        read = [(c.q.name, c.name, "q") for c in s.coordinates]
+        read += [(c.qd.name, c.name, "qd") for c in s.coordinates]
+        read += [(i.name, i.name, "u") for i in s.inputs]
+        return [
+            f"const {real} {_local(name)} = "
+            + (f"{array}->{of};" if in_struct and array != "u" else f"{array}[{self.enum[of]}];")
+            for name, of, array in read
+            if name in function.uses
+        ]
+
+    def _function(self, name: str) -> dict[str, Any]:
+        """One evaluation function: prototype, documentation, body."""
+        kind, function, s = _KINDS[name], self.program[name], self.system
+        real, NQ, NU = self.real.name, f"{self.PREFIX}_NQ", f"{self.PREFIX}_NU"
+        size = {"n*n": f"{NQ}*{NQ}", "n": NQ, "m": NU}.get(kind.shape, "")
+        takes_u = kind.u and bool(s.inputs)
+        takes_q = name != "signal" or self.signal_state
+        takes_t = self._takes_t(name)
+        arguments = self._arguments(
+            f"{real} {kind.out}[{size}]" if size else "",
+            f"{real} t" if takes_t and name == "signal" else "",
+            f"const {real} q[{NQ}]" if takes_q else "",
+            f"const {real} qd[{NQ}]" if takes_q and kind.qd else "",
+            f"{real} t" if takes_t and name != "signal" else "",
+            f"const {real} *u" if takes_u else "",
+            self._p_arg,
+        )
+        body = self._body(function)
+        used = function.uses
+        unused = []
+        reads_u = takes_u and bool(used & {i.name for i in s.inputs})
+        passes = reads_u and self.signal_state  # to the signals
+        read_q = bool(used & {x.name for x in s.q})
+        read_qd = bool(used & {x.name for x in s.qd})
+        if takes_q and not read_q and not passes:
+            unused.append("q")
+        if takes_q and kind.qd and not read_qd and not passes:
+            unused.append("qd")
+        if self.needs_p and not used & {p.name for p in s.parameters}:
+            if not reads_u:
+                unused.append("p")
+        if takes_u and not reads_u:
+            unused.append("u")
+        if takes_t and TIME not in used and not reads_u:
+            unused.append("t")
+        results = (
+            [f"{kind.out}[{i}] = {r};" for i, r in enumerate(body.results)]
+            if size
+            else [f"return {body.results[0]};"]
+        )
+        doc = [kind.doc]
+        if takes_u:
+            doc.append("u: the inputs; NULL for the scene's signals.")
+        doc.append(f"{_sentence(function)}")
+        return {
+            "name": name,
+            "doc": doc,
+            "prototype": f"{'void' if size else real} {self.prefix}_{name}({arguments})",
+            "takes_u": takes_u,
+            "reads_u": reads_u,
+            "takes_t": takes_t,
+            "takes_q": takes_q,
+            "takes_qd": takes_q and kind.qd,
+            "shape": kind.shape,
+            "size": size,
+            "width": {"n*n": len(s.q) ** 2, "n": len(s.q), "m": len(s.u)}.get(kind.shape, 1),
+            "unused": unused,
+            "loads": self._loads(function),
+            "blocks": [*body.early, *body.blocks],
+            "results": results,
+            "signal_call": self._signal_call("now", "q", "qd"),
+            "binding_call": self._binding_call(name, kind, size, takes_q, takes_t, takes_u),
+        }
+
+    def _binding_call(
+        self, name: str, kind: _Kind, size: str, takes_q: bool, takes_t: bool, takes_u: bool
+    ) -> str:
+        """The call for row k of many."""
+        NQ, signal = f"{self.PREFIX}_NQ", name == "signal"
+        at = f"q + {NQ}*k" if takes_q else ""
+        arguments = self._arguments(
+            f"out + {size}*k" if size else "",
+            "t" if takes_t and signal else "",
+            at,
+            at.replace("q", "qd", 1) if kind.qd else "",
+            "t" if takes_t and not signal else "",
+            "u" if takes_u else "",
+            self._p_cast,
+        )
+        return f"{'' if size else 'out[k] = '}{self.prefix}_{name}({arguments});"
+
+    @property
+    def _p_cast(self) -> str:
+        return f"(const {self.prefix}_params *)p" if self.needs_p else ""
+
+    def _signal_call(self, out: str, q: str, qd: str) -> str:
+        if "signal" not in self.program:
+            return ""
+        arguments = self._arguments(
+            out, "t" if self.signal_t else "", *((q, qd) if self.signal_state else ()), self._p_call
+        )
+        return f"{self.prefix}_signal({arguments});"
+
+    # --- accelerations and steppers ------------------------------------------------------------
+
+    def _dynamics(self) -> dict[str, Any]:
+        s, function, real = self.system, self.program["acceleration"], self.real.name
+        body = self._body(
+            function, keep=lambda name: f"c->{name}", parameters=[p.name for p in s.parameters]
+        )
+        takes_c = bool(body.kept)
+        own = {p.name for p in s.parameters}
+        takes_p = self.needs_p and "signal" in self.program
+        uses_t = TIME in function.uses
+        c_arg = f"const {self.prefix}_prepared *c" if takes_c else ""
+        vector = f"const {self.prefix}_vector *"
+        u_arg = f"const {real} *u" if s.inputs else ""
+        p_arg = self._p_arg if takes_p else ""
+        t_arg = f"{real} t" if self.driven else ""
+        u_held = "u" if s.inputs else ""
+        c_call = "c" if takes_c else ""
+        p_held = "p" if takes_p else ""
+        has_prepare = bool(body.kept or body.early_failures)
+        inline = "inline " if function.cost.flops <= LARGE else ""
+        unread = [
+            argument
+            for argument, names in (("q", s.q), ("qd", s.qd), ("u", s.u))
+            if names and not function.uses & {x.name for x in names}
+        ]
+        NQ = f"{self.PREFIX}_NQ"
+        outer = self._arguments(u_arg, self._p_arg)
+        x = f"{real} q[{NQ}], {real} qd[{NQ}]"
+        rows = f"long every, {real} *q_rows, {real} *qd_rows"
+        t0_arg = f"{real} t0" if self.driven else ""
+        u_run = f"{u_arg}, long u_stride" if s.inputs else ""
+
+        def rates_call(time: str) -> str:
+            if s.inputs:
+                return _after(time if self.driven else "", u_held, c_call, p_held)
+            return _after(time if uses_t else "", c_call)
+
+        return {
+            "prepared_members": body.kept,
+            "prepare_early": [line for block in body.early for line in block.lines],
+            "prepare_sets": [f"c->{n} = {'p->' if n in own else ''}{n};" for n in body.kept],
+            "prepare_result": _none_of(body.early_failures),
+            "has_prepare": has_prepare,
+            "prepare_arguments": self._arguments(
+                f"{self.prefix}_prepared *c" if takes_c else "", self._p_arg
+            ),
+            "prepare_call": self._arguments("&prepared" if takes_c else "", self._p_call),
+            "p_unused": self.needs_p and not has_prepare and not takes_p,
+            "takes_c": takes_c,
+            "solve_arguments": self._arguments(
+                f"{self.prefix}_vector *a", f"{vector}q", f"{vector}qd",
+                f"{real} t" if uses_t else "", u_arg, c_arg,
+            ),
+            "solve_call": _after("t" if uses_t else "", u_held, c_call),
+            "solve_now": _after("t" if uses_t else "", "now", c_call),
+            "solve_unused": unread,
+            "solve_loads": self._loads(function, in_struct=True),
+            "solve_blocks": body.blocks,
+            "solve_results": [
+                f"a->{c.name} = {r};" for c, r in zip(s.coordinates, body.results, strict=True)
+            ],
+            "solve_result": _none_of(body.failures),
+            "cost": _sentence(function),
+            "inline": inline,
+            "rates": f"{self.prefix}_{'rates' if s.inputs else 'solve'}",
+            "rates_call": rates_call,
+            "rates_prototype": f"static {inline}int {self.prefix}_rates("
+            + self._arguments(
+                f"{self.prefix}_vector *a", f"{vector}q", f"{vector}qd", t_arg, u_arg, c_arg, p_arg
+            ) + ")",
+            "rk4_prototype": f"static {inline}{self.prefix}_status {self.prefix}_rk4("
+            + self._arguments(
+                f"{self.prefix}_vector *q", f"{self.prefix}_vector *qd", t_arg, f"{real} h",
+                u_arg, c_arg, p_arg,
+            ) + ")",
+            "call_no_t": _after(u_held, c_call, p_held),
+            "t_call": _after("t" if self.driven else ""),
+            "p_call": _after(self._p_call),
+            "signal_state": self.signal_state,
+            "signal_now": self._signal_call("now", "at", "moving"),
+            "acceleration_prototype": f"{self.prefix}_status {self.prefix}_acceleration("
+            + self._arguments(
+                f"{real} qdd[{NQ}]", f"const {real} q[{NQ}]", f"const {real} qd[{NQ}]", t_arg, outer
+            ) + ")",
+            "step_prototype": f"{self.prefix}_status {self.prefix}_rk4_step("
+            + self._arguments(x, t_arg, f"{real} h", outer) + ")",
+            "run_prototype": f"long {self.prefix}_rk4_run("
+            + self._arguments(
+                x, t0_arg, f"{real} h", "long first", "long steps", u_run, rows, self._p_arg,
+                f"{self.prefix}_status *status",
+            ) + ")",
+            "enums": [self.enum[c.name] for c in s.coordinates],
+        }  # fmt: skip
+
+    def _example(self) -> dict[str, Any]:
+        """What main.c needs: the scene's own run, some two hundred rows of it."""
+        run, s = self.system.run, self.system
+        steps = max(1, math.ceil(run.duration / run.h * (1 - 1e-12)))
+        timed = self._takes_t("energy")
+        call = f"{self.prefix}_energy(" + "{}" + _after(self._p_call) + ")"
+        names = [c.name for c in s.coordinates]
+        return {
+            "h": self._literal(run.h),
+            "steps": steps,
+            "main_every": max(1, steps // 200),
+            "columns": ["t", *names, *(f"{n}_dot" for n in names), "energy"],
+            "energy_call": call.format("q, qd, t" if timed else "q, qd"),
+            "energy_call_end": call.format(
+                f"q, qd, ({self.real.name})steps*h" if timed else "q, qd"
+            ),
+        }
+
+    def _selftest(self) -> dict[str, Any]:
+        """States near the start and what the program gives there, computed in Python."""
+        s = self.system
+        states = []
+        for k in range(6):
+            known = nearby(s, k)
+            x = [known[name.name] for name in (*s.q, *s.qd)]
+            try:
+                if "signal" in self.program:
+                    u, _ = evaluate(self.program["signal"], known)
+                    known |= {i.name: x for i, x in zip(s.inputs, u, strict=True)}
+                values = [evaluate(self.program[f], known) for f in ("D", "bias", "acceleration")]
+            except (ArithmeticError, ValueError):
+                continue
+            if values[2][1] and max(map(abs, values[2][0])) < 1e8:
+                states.append(
+                    {
+                        "x": [self._literal(value) for value in x],
+                        "expected": [self._literal(x) for v, _ in values for x in v],
+                    }
+                )
+        state = self._arguments("q", "qd")
+
+        def call(name: str) -> str:
+            kind = _KINDS[name]
+            arguments = self._arguments(
+                name, "q", "qd" if kind.qd else "", self._zero if self._takes_t(name) else "",
+                "NULL" if kind.u and s.inputs else "", "&" + self.prefix + "_defaults"
+                if self.needs_p else "",
+            )  # fmt: skip
+            return f"{self.prefix}_{name}({arguments});"
+
+        return {
+            "states": states[:3],
+            "tolerance": 1e-9 if self.real is DOUBLE else 1e-3,
+            "calls": {
+                "D": call("D"),
+                "bias": call("bias"),
+                "tau": call("tau") if "tau" in self.program else "",
+                "acceleration": f"{self.prefix}_acceleration("
+                + self._arguments(
+                    "qdd", state, self._zero if self.driven else "",
+                    "NULL" if s.inputs else "", f"&{self.prefix}_defaults" if self.needs_p else "",
+                ) + ")",
+            },
+        }  # fmt: skip
+
+    @property
+    def _zero(self) -> str:
+        return "0.0" + self.real.suffix
+
+    def _face(self) -> dict[str, Any]:
+        """What the Python package needs."""
+        s = self.system
+        NQ = f"{self.PREFIX}_NQ"
+        t, u = "t" if self.driven else "", "u" if s.inputs else ""
+        units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
+        units |= {i.name: i.unit for i in s.inputs}
+        return {
+            "title_literal": repr(s.title),
+            "coordinate_units": repr({c.name: c.unit for c in s.coordinates}),
+            "parameter_values": repr({p.name: p.value for p in s.parameters}),
+            "input_units": repr({i.name: i.unit for i in s.inputs}),
+            "units": repr({name: unit for name, unit in units.items() if unit}),
+            "timed": repr(
+                tuple(n for n in ("energy", "jacobi") if n in self.program and self._takes_t(n))
+            ),
+            "face_functions": [
+                "C", "D", "acceleration", "bias", "energy", "g", "jacobi", "kinetic_energy",
+                "potential_energy", "power", "rhs", "signal", "simulate", "step", "tau",
+            ],
+            "acceleration_binding": f"{self.prefix}_acceleration("
+            + self._arguments(f"out + {NQ}*k", f"q + {NQ}*k", f"qd + {NQ}*k", t, u, self._p_cast)
+            + ")",
+            "run_binding": f"{self.prefix}_rk4_run("
+            + self._arguments(
+                "q", "qd", "t0" if t else "", "h", "first", "steps", u and "u, u_stride",
+                "every", "q_rows", "qd_rows", self._p_cast, "&found",
+            ) + ")",
+        }  # fmt: skip
+
+    def _pieces(
+        self, functions: Sequence[Mapping[str, Any]], dynamics: Mapping[str, Any]
+    ) -> list[str]:
+        """The hand-written C that this scene needs, under its own prefix."""
+        if not self.sincos:
+            return []
+        text = resource("csrc", "sincos.h")
+        text = text.replace("#include <math.h>\n", "")
+        return [
+            text.replace("eomc_", f"{self.prefix}_").replace("EOMC_", f"{self.PREFIX}_").strip()
+        ]
+
+
+def _after(*parts: str) -> str:
+    """What follows in an argument list, each part with its comma."""
+    return "".join(f", {part}" for part in parts if part)
+
+
+def _none_of(conditions: Sequence[str]) -> str:
+    return f"!({' || '.join(conditions)})" if conditions else "1"
+
+
+def _local(name: str) -> str:
+    return name + "_" if name in _OURS else name
+
+
+def _unique(wishes: Iterable[str], taken: set[str]) -> list[str]:
+    """Upper-case enumerators, in the author's own case where that would clash."""
+    out = []
+    wishes = list(wishes)
+    uppers = [w.upper() for w in wishes]
+    for wish, upper in zip(wishes, uppers, strict=True):
+        used = upper if uppers.count(upper) == 1 else wish
+        while used in taken:
+            used += "_"
+        taken.add(used)
+        out.append(used)
+    return out
+
+
+def _comment(unit: str, note: str) -> str:
+    text = ", ".join(t for t in (unit, " ".join(note.split())) if t)
+    return f"/* {text.replace('*/', '* /')} */" if text else ""
+
+
+def _sentence(function: Function) -> str:
+    cost = str(function.cost)
+    return cost[0].upper() + cost[1:] + "."
