@@ -189,8 +189,6 @@ def run(
     eomc run scenes/cartpole.toml --plot cartpole.png
     eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
     """
-    from eomc.runtime import Interrupted
-
     _known_suffix(out, (".csv", ".npz"), "--out")
     _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
     with _status(f"building {scene.stem}", quiet or as_json):
@@ -202,9 +200,8 @@ def run(
             begun = time.perf_counter()
             done = _simulated(module, q0, qd0, every=every, progress=progress, **options)
             seconds = time.perf_counter() - begun
-    except Interrupted as stop:
-        click.echo(f"eomc: {stop.run.message}", err=True)
-        sys.exit(130)
+    except module.Interrupted as stop:  # what was done is kept
+        done, seconds = stop.run, time.perf_counter() - begun
     except (ValueError, MemoryError) as fault:
         raise EomcError(str(fault)) from None
     error = None
@@ -227,7 +224,7 @@ def run(
         _print_summary(module, done, summary)
     if done.status != "ok":
         click.echo(f"eomc: {done.message}", err=True)
-        sys.exit(1)
+        sys.exit(130 if done.status == "interrupted" else 1)
 
 
 @main.command()

@@ -10,6 +10,7 @@ import pydantic
 from eomc.formulas import nearest
 
 METHODS = ("rk4",)
+REALS = ("double", "float")
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
 _Value = _Number | pydantic.StrictStr
@@ -51,6 +52,7 @@ class _Run(_Table):
     h: _Positive = 0.001
     duration: _Positive = 10.0
     method: Literal[METHODS] = "rk4"  # type: ignore[valid-type]
+    real: Literal[REALS] = "double"  # type: ignore[valid-type]
 
 
 def _spelled_out(value: object) -> object:
@@ -159,6 +161,8 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
         return 'none is declared: add at least one, such as x = { unit = "m", start = 0.0 }'
     if path == ("run", "method"):
         return f"unknown method {here}: known are {', '.join(METHODS)}"
+    if path == ("run", "real"):
+        return f"unknown type {here}: known are {', '.join(REALS)}"
     if kind == "greater_than":
         return f"must be greater than zero, here {here}"
     if kind == "finite_number":

@@ -11,7 +11,7 @@ from importlib.resources import files
 
 import jinja2
 
-from eomc.ccode import DOUBLE, Real
+from eomc.ccode import REALS
 from eomc.context import Context, resource
 from eomc.program import Program
 
@@ -42,12 +42,12 @@ def environment() -> jinja2.Environment:
     )
 
 
-def render(program: Program, extension: str, real: Real = DOUBLE) -> Sources:
+def render(program: Program, extension: str) -> Sources:
     """The generated files of a program, its Python face importing `extension`.
 
     Same program, same text.
     """
-    context = {**Context(program, real).values(), "extension": extension}
+    context = {**Context(program, REALS[program.system.run.real]).values(), "extension": extension}
     jinja = environment()
     name = program.system.name
 

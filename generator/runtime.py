@@ -8,6 +8,7 @@ ValueError with the name of the argument.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from time import perf_counter
@@ -476,8 +477,10 @@ class Model:
         p = self._parameters(params).copy()
         law, held, stride = self._table(u, steps)
         rows = 1 + steps // every + (steps % every > 0)
+        given = out or (None, None)
         try:
-            given = out or (None, None)
+            if out is None and rows * 2 * self.nq * self.dtype.itemsize > _memory():
+                raise MemoryError
             q_rows = self._out(given[0], (rows, self.nq), "out[0]")
             qd_rows = self._out(given[1], (rows, self.nq), "out[1]")
         except MemoryError:
@@ -551,6 +554,14 @@ class Model:
         if len(array) != steps:
             raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a step")
         return None, array, self.nu
+
+
+def _memory() -> float:
+    """The bytes of memory that the machine has; a larger array may be handed out all the same."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return float("inf")
 
 
 def _state_text(q: Array, qd: Array) -> str:

@@ -61,11 +61,15 @@ class Input:
 
 @dataclass(frozen=True)
 class Run:
-    """How the scene is run unless the caller says otherwise: step size h and duration in s."""
+    """How the scene is run unless the caller says otherwise: step size h and duration in s.
+
+    real: the C type that everything is computed in.
+    """
 
     h: float = 0.001
     duration: float = 10.0
     method: str = "rk4"
+    real: str = "double"
 
 
 @dataclass(frozen=True)
@@ -273,7 +277,7 @@ class _Check:
             definitions=tuple(self.definitions.items()),
             **energies,
             forces=forces,
-            run=Run(doc.run.h, doc.run.duration, doc.run.method),
+            run=Run(doc.run.h, doc.run.duration, doc.run.method, doc.run.real),
             places=self.places,
             warnings=tuple(self.problems),
         )

@@ -149,6 +149,7 @@ class System:
         title: str = "",
         h: float = 0.001,
         duration: float = 10.0,
+        real: str = "double",
     ) -> System:
         r"""A system from SymPy expressions.
 
@@ -166,7 +167,7 @@ class System:
         """
         return _Maker(name).make(
             coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
-            inputs, definitions or {}, units or {}, title, Run(h, duration),
+            inputs, definitions or {}, units or {}, title, Run(h, duration, real=real),
         )  # fmt: skip
 
 
