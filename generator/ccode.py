@@ -187,12 +187,13 @@ def body(
     real: Real = DOUBLE,
     keep: Callable[[str], str] | None = None,
     parameters: Sequence[str] = (),
+    lane: bool = False,
 ) -> Body:
     """The statements of a function.
 
     where: how each name from outside is written (`m_c` -> `p->m_c`).
     keep: how the rest reads what parameters decide, where that lives in a struct; `parameters`
-    are kept there too where the rest reads them.
+    are kept there too where the rest reads them. lane: without branches, for a loop over many.
     """
     stages = {a.name: a.stage for a in (*function.early, *function.body)}
     late_checks = [c for c in function.checks if stages.get(c[0].name, 0) > Stage.PARAMETER]
@@ -229,7 +230,7 @@ def body(
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             if names := angles.pop(a.value.args, None):
-                lines[a.stage] += _sincos(printer, a.value.args[0], names)
+                lines[a.stage] += _sincos(printer, a.value.args[0], names, lane)
             continue
         text, strength = printer.value(a.value)
         if a.name in inline:
@@ -243,7 +244,7 @@ def body(
         early_failures=early_failures,
         failures=tuple(_fails(printer, pair, tolerance) for e, pair in checks if not e),
         kept=tuple(kept),
-        sincos=real is DOUBLE and any("_sincos(" in x for text in lines.values() for x in text),
+        sincos=real is DOUBLE and any("_sincos" in x for text in lines.values() for x in text),
     )
 
 
@@ -260,7 +261,7 @@ def _fails(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) ->
     return f"{text} <= {limit}*{printer.operand(diagonal, 4)}"
 
 
-def _sincos(printer: Printer, angle: Operand, names: Mapping[str, str]) -> list[str]:
+def _sincos(printer: Printer, angle: Operand, names: Mapping[str, str], lane: bool) -> list[str]:
     real = printer.real
     argument = printer.operand(angle)
     if real is not DOUBLE:
@@ -270,7 +271,9 @@ def _sincos(printer: Printer, angle: Operand, names: Mapping[str, str]) -> list[
     other = names.get("cos") or names["sin"].replace("sin", "cos") + "_"
     return [
         f"{real.name} {one}, {other};",
-        f"{printer.prefix}_sincos({argument}, &{one}, &{other});",
+        f"{printer.prefix}_sincos_lane({argument}, &{one}, &{other}, trouble);"
+        if lane
+        else f"{printer.prefix}_sincos({argument}, &{one}, &{other});",
     ]
 
 

@@ -22,7 +22,8 @@ from eomc.system import System
 # names that the templates use inside functions; a user's name that is one of them gets a "_"
 _OURS = frozenset(
     "q qd qdd t t0 u p c a h r v D C g K P bias tau power energy now k n good status first steps "
-    "every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6".split()
+    "every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 trouble held at moving "
+    "prepared".split()
 )
 LARGE = 1000  # operations from which an acceleration is called, not inlined four times
 
@@ -159,6 +160,7 @@ class Context:
             "has_t": self.driven,
             "has_u": bool(s.inputs),
             "has_p": self.needs_p,
+            "batch": s.run.batch,
             "takes_t": {f["name"]: f["takes_t"] for f in functions},
             "pieces": self._pieces(functions, dynamics),
             **dynamics,
@@ -202,24 +204,33 @@ class Context:
         mine = [*(x.name for x in s.q), *(x.name for x in s.qd), *(i.name for i in s.inputs)]
         return out | {n: _local(n) for n in mine}
 
-    def _body(self, function: Function, **options: Any) -> Body:
+    def _body(
+        self, function: Function, where: Mapping[str, str] | None = None, **options: Any
+    ) -> Body:
         clash = {a.name: a.name + "_" for a in (*function.early, *function.body) if a.name in _OURS}
         made = ccode.body(
-            rename(function, clash), self.prefix, self._where(function), self.real, **options
+            rename(function, clash),
+            self.prefix,
+            self._where(function) | dict(where or {}),
+            self.real,
+            **options,
         )
         self.sincos |= made.sincos
         return made
 
-    def _loads(self, function: Function, in_struct: bool = False) -> list[str]:
-        """Locals for the coordinates, velocities and inputs that are used."""
+    def _loads(self, function: Function, state: str = "[]", inputs: str = "[]") -> list[str]:
+        """Locals for the coordinates, velocities and inputs that are used.
+
+        state, inputs: "[]" where they stand in arrays, "->" where in structs.
+        """
         s, real = self.system, self.real.name
-        read = [(c.q.name, c.name, "q") for c in s.coordinates]
-        read += [(c.qd.name, c.name, "qd") for c in s.coordinates]
-        read += [(i.name, i.name, "u") for i in s.inputs]
+        read = [(c.q.name, c.name, "q", state) for c in s.coordinates]
+        read += [(c.qd.name, c.name, "qd", state) for c in s.coordinates]
+        read += [(i.name, i.name, "u", inputs) for i in s.inputs]
         return [
             f"const {real} {_local(name)} = "
-            + (f"{array}->{of};" if in_struct and array != "u" else f"{array}[{self.enum[of]}];")
-            for name, of, array in read
+            + (f"{array}->{of};" if how == "->" else f"{array}[{self.enum[of]}];")
+            for name, of, array, how in read
             if name in function.uses
         ]
 
@@ -319,45 +330,31 @@ class Context:
     # --- accelerations and steppers ------------------------------------------------------------
 
     def _dynamics(self) -> dict[str, Any]:
+        """What belongs to accelerations and steppers."""
         s, function, real = self.system, self.program["acceleration"], self.real.name
-        body = self._body(
-            function, keep=lambda name: f"c->{name}", parameters=[p.name for p in s.parameters]
-        )
-        takes_c = bool(body.kept)
-        own = {p.name for p in s.parameters}
-        takes_p = self.needs_p and "signal" in self.program
-        uses_t = TIME in function.uses
-        c_arg = f"const {self.prefix}_prepared *c" if takes_c else ""
-        vector = f"const {self.prefix}_vector *"
-        u_arg = f"const {real} *u" if s.inputs else ""
-        p_arg = self._p_arg if takes_p else ""
-        t_arg = f"{real} t" if self.driven else ""
-        u_held = "u" if s.inputs else ""
-        c_call = "c" if takes_c else ""
-        p_held = "p" if takes_p else ""
-        has_prepare = bool(body.kept or body.early_failures)
-        inline = "inline " if function.cost.flops <= LARGE else ""
-        unread = [
-            argument
-            for argument, names in (("q", s.q), ("qd", s.qd), ("u", s.u))
-            if names and not function.uses & {x.name for x in names}
-        ]
+        body = self._body(function, keep=_in_prepared, parameters=[p.name for p in s.parameters])
+        early = [line for block in body.early for line in block.lines]
+        own = [p.name for p in s.parameters]
+        kept = list(body.kept)
+        if s.run.batch and "signal" in self.program:  # lanes read nothing else
+            kept = [n for n in own if n in kept or n in self.program["signal"].uses] + [
+                n for n in kept if n not in own
+            ]
+        takes_c, takes_p = bool(kept), self.needs_p and "signal" in self.program
+        t, u = "t" if self.driven else "", "u" if s.inputs else ""
+        c, p = "c" if takes_c else "", "p" if takes_p else ""
+        has_prepare = bool(kept or body.early_failures)
+        scalar = self._mode(function, body, takes_c, takes_p)
         NQ = f"{self.PREFIX}_NQ"
+        t_arg, u_arg = f"{real} t" if t else "", f"const {real} *u" if u else ""
         outer = self._arguments(u_arg, self._p_arg)
         x = f"{real} q[{NQ}], {real} qd[{NQ}]"
         rows = f"long every, {real} *q_rows, {real} *qd_rows"
-        t0_arg = f"{real} t0" if self.driven else ""
-        u_run = f"{u_arg}, long u_stride" if s.inputs else ""
-
-        def rates_call(time: str) -> str:
-            if s.inputs:
-                return _after(time if self.driven else "", u_held, c_call, p_held)
-            return _after(time if uses_t else "", c_call)
-
+        t0_arg = f"{real} t0" if t else ""
         return {
-            "prepared_members": body.kept,
-            "prepare_early": [line for block in body.early for line in block.lines],
-            "prepare_sets": [f"c->{n} = {'p->' if n in own else ''}{n};" for n in body.kept],
+            "prepared_members": kept,
+            "prepare_early": early,
+            "prepare_sets": [f"c->{n} = {'p->' if n in own else ''}{n};" for n in kept],
             "prepare_result": _none_of(body.early_failures),
             "has_prepare": has_prepare,
             "prepare_arguments": self._arguments(
@@ -366,37 +363,13 @@ class Context:
             "prepare_call": self._arguments("&prepared" if takes_c else "", self._p_call),
             "p_unused": self.needs_p and not has_prepare and not takes_p,
             "takes_c": takes_c,
-            "solve_arguments": self._arguments(
-                f"{self.prefix}_vector *a", f"{vector}q", f"{vector}qd",
-                f"{real} t" if uses_t else "", u_arg, c_arg,
-            ),
-            "solve_call": _after("t" if uses_t else "", u_held, c_call),
-            "solve_now": _after("t" if uses_t else "", "now", c_call),
-            "solve_unused": unread,
-            "solve_loads": self._loads(function, in_struct=True),
-            "solve_blocks": body.blocks,
-            "solve_results": [
-                f"a->{c.name} = {r};" for c, r in zip(s.coordinates, body.results, strict=True)
-            ],
-            "solve_result": _none_of(body.failures),
             "cost": _sentence(function),
-            "inline": inline,
-            "rates": f"{self.prefix}_{'rates' if s.inputs else 'solve'}",
-            "rates_call": rates_call,
-            "rates_prototype": f"static {inline}int {self.prefix}_rates("
-            + self._arguments(
-                f"{self.prefix}_vector *a", f"{vector}q", f"{vector}qd", t_arg, u_arg, c_arg, p_arg
-            ) + ")",
-            "rk4_prototype": f"static {inline}{self.prefix}_status {self.prefix}_rk4("
-            + self._arguments(
-                f"{self.prefix}_vector *q", f"{self.prefix}_vector *qd", t_arg, f"{real} h",
-                u_arg, c_arg, p_arg,
-            ) + ")",
-            "call_no_t": _after(u_held, c_call, p_held),
-            "t_call": _after("t" if self.driven else ""),
+            "scalar": scalar,
+            "lane": self._lane(function, takes_c) if s.run.batch else None,
+            "rates_now": f"{self.prefix}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
+            "rk4_call": _after(t, "h", u, c, p),
+            "t_call": _after(t),
             "p_call": _after(self._p_call),
-            "signal_state": self.signal_state,
-            "signal_now": self._signal_call("now", "at", "moving"),
             "acceleration_prototype": f"{self.prefix}_status {self.prefix}_acceleration("
             + self._arguments(
                 f"{real} qdd[{NQ}]", f"const {real} q[{NQ}]", f"const {real} qd[{NQ}]", t_arg, outer
@@ -405,11 +378,179 @@ class Context:
             + self._arguments(x, t_arg, f"{real} h", outer) + ")",
             "run_prototype": f"long {self.prefix}_rk4_run("
             + self._arguments(
-                x, t0_arg, f"{real} h", "long first", "long steps", u_run, rows, self._p_arg,
+                x, t0_arg, f"{real} h", "long first", "long steps",
+                u_arg and f"{u_arg}, long u_stride", rows, self._p_arg,
                 f"{self.prefix}_status *status",
+            ) + ")",
+            "batch_prototype": f"void {self.prefix}_rk4_batch("
+            + self._arguments(
+                "long count", f"{real} *q", f"{real} *qd", t0_arg, f"{real} h", "long first",
+                "long steps", u_arg and f"{u_arg}, long u_instance, long u_step",
+                f"{rows}, long row_count", self._p_arg and f"{self._p_arg}, long p_instance",
+                "long *done", "int *status",
+            ) + ")",
+            "tile": self._tile(len(kept)),
+            "input_names": [i.name for i in s.inputs],
+            "sincos": self.sincos,
+            "prepare_first": self._arguments("&prepared" if takes_c else "", self._p_call),
+            "prepare_lane": self._arguments(
+                "&prepared" if takes_c else "", "p + k*p_instance" if self.needs_p else ""
+            ),
+            "retry_call": _after(
+                t, "h", u and "u ? u + (base + i)*u_instance + n*u_step : 0",
+                "&c" if takes_c else "", "p + (base + i)*p_instance" if takes_p else "",
+            ),
+            "batch_binding": f"{self.prefix}_rk4_batch("
+            + self._arguments(
+                "count", "q", "qd", t and "t0", "h", "first", "steps",
+                u and "u, u_instance, u_step", "every", "q_rows", "qd_rows", "row_count",
+                f"{self._p_cast}, p_instance" if self.needs_p else "", "done", "status",
             ) + ")",
             "enums": [self.enum[c.name] for c in s.coordinates],
         }  # fmt: skip
+
+    def _mode(self, function: Function, body: Body, takes_c: bool, takes_p: bool) -> dict[str, Any]:
+        """solve, rates and rk4 for one trajectory: they return whether D was positive definite."""
+        s, real, P = self.system, self.real.name, self.prefix
+        timed, u = TIME in function.uses, bool(s.inputs)
+        inline = "inline " if function.cost.flops <= LARGE else ""
+        vector = f"const {P}_vector *"
+        t_arg = f"{real} t" if self.driven else ""
+        u_arg = f"const {real} *u" if u else ""
+        c_arg = f"const {P}_prepared *c" if takes_c else ""
+        p_arg = self._p_arg if takes_p else ""
+        c, p = "c" if takes_c else "", "p" if takes_p else ""
+        state = f"{vector}q, {vector}qd"
+
+        def rates(time: str) -> str:
+            if u:
+                return _after(time if self.driven else "", "u", c, p)
+            return _after(time if timed else "", c)
+
+        return {
+            "head": f"static {inline}int",
+            "inline": f"static {inline}",
+            "solve": "solve",
+            "rates": "rates" if u else "solve",
+            "rk4": "rk4",
+            "solve_arguments": self._arguments(
+                f"{P}_vector *a", state, f"{real} t" if timed else "", u_arg, c_arg
+            ),
+            "solve_u": _after("t" if timed else "", "u", c),
+            "solve_now": _after("t" if timed else "", "now", c),
+            "rates_arguments": self._arguments(f"{P}_vector *a", state, t_arg, u_arg, c_arg, p_arg),
+            "rk4_arguments": self._arguments(
+                f"{P}_vector *r, {P}_vector *v, {state}", t_arg, f"{real} h", u_arg, c_arg, p_arg
+            ),
+            "unused": self._unread(function),
+            "loads": self._loads(function, "->", "[]"),
+            "blocks": body.blocks,
+            "results": [
+                f"a->{c.name} = {r};" for c, r in zip(s.coordinates, body.results, strict=True)
+            ],
+            "end": [f"return {_none_of(body.failures)};"],
+            "signal_is_array": self.signal_state,
+            "signal_call": self._signal_call("now", "at", "moving"),
+            "call": rates,
+            "first": "int good = ",
+            "and": "good &= ",
+            "last": "return good;",
+            "own_signal": None,
+        }
+
+    def _lane(self, function: Function, takes_c: bool) -> dict[str, Any]:
+        """The same for one of many: no branches; what goes wrong is noted in *trouble."""
+        s, real, P = self.system, self.real.name, self.prefix
+        body = self._body(
+            function, keep=_in_prepared, parameters=[p.name for p in s.parameters], lane=True
+        )
+        mode = self._mode(function, body, takes_c, False)
+        trouble, u_arg = f"{real} *trouble", f"const {P}_inputs *u" if s.inputs else ""
+        c, inline = "c" if takes_c else "", f"{self.PREFIX}_LANE"
+        vector = f"const {P}_vector *"
+        state = f"{vector}q, {vector}qd"
+        timed = TIME in function.uses
+        c_arg = f"const {P}_prepared *c" if takes_c else ""
+        t_arg = f"{real} t" if self.driven else ""
+        one = f"1.0{self.real.suffix}"
+
+        def rates(time: str) -> str:
+            if s.inputs:
+                return _after(time if self.driven else "", "u", "held", c, "trouble")
+            return _after(time if timed else "", c, "trouble")
+
+        signal = None
+        if "signal" in self.program:
+            given = self.program["signal"]
+            where = {p.name: f"c->{p.name}" for p in s.parameters}
+            made = self._body(given, where=where, lane=True)
+            signal = {
+                "arguments": self._arguments(
+                    f"{P}_inputs *u", f"{real} t" if self.signal_t else "",
+                    state if self.signal_state else "", c_arg if where else "", trouble,
+                ),
+                "unused": [
+                    name
+                    for name, used in (
+                        ("c", not where or (takes_c and given.uses & set(where))),
+                        ("trouble", made.sincos),
+                    )
+                    if not used
+                ],
+                "loads": self._loads(given, "->", "->") if self.signal_state else [],
+                "blocks": [*made.early, *made.blocks],
+                "results": [
+                    f"u->{i.name} = {r};" for i, r in zip(s.inputs, made.results, strict=True)
+                ],
+                "call": self._arguments(
+                    "&now", "t" if self.signal_t else "", "q, qd" if self.signal_state else "",
+                    c if where else "", "trouble",
+                ),
+            }  # fmt: skip
+        return mode | {
+            "head": f"{inline} void",
+            "inline": inline + " ",
+            "solve": "solve_lane",
+            "rates": "rates_lane" if s.inputs else "solve_lane",
+            "rk4": "rk4_lane",
+            "solve_arguments": self._arguments(
+                f"{P}_vector *a", state, f"{real} t" if timed else "", u_arg, c_arg, trouble
+            ),
+            "solve_u": _after("t" if timed else "", "held ? u : &now", c, "trouble"),
+            "rates_arguments": self._arguments(
+                f"{P}_vector *a", state, t_arg, u_arg, "int held", c_arg, trouble
+            ),
+            "rk4_arguments": self._arguments(
+                f"{P}_vector *r, {P}_vector *v, {state}", t_arg, f"{real} h",
+                u_arg and f"{u_arg}, int held", c_arg, trouble,
+            ),
+            "rk4_call": _after(
+                "t" if self.driven else "", "h", "&u, held" if s.inputs else "",
+                "&c" if takes_c else "", "&trouble",
+            ),
+            "unused": [*mode["unused"], *([] if body.failures or body.sincos else ["trouble"])],
+            "loads": self._loads(function, "->", "->"),
+            "end": [f"*trouble = {x} ? {one} : *trouble;" for x in body.failures],
+            "call": rates,
+            "first": "",
+            "and": "",
+            "last": "",
+            "own_signal": signal,
+        }  # fmt: skip
+
+    def _tile(self, kept: int) -> int:
+        """Instances side by side: 64, fewer where their states would not stay in the L1 cache."""
+        bytes_each = 8 * (2 * len(self.system.q) + len(self.system.u) + kept + 2)
+        return max(8, min(64, 1 << (16_384 // bytes_each).bit_length() - 1))
+
+    def _unread(self, function: Function) -> list[str]:
+        """Arguments that the body of a function does not read."""
+        s = self.system
+        return [
+            argument
+            for argument, names in (("q", s.q), ("qd", s.qd), ("u", s.u))
+            if names and not function.uses & {x.name for x in names}
+        ]
 
     def _example(self) -> dict[str, Any]:
         """What main.c needs: the scene's own run, some two hundred rows of it."""
@@ -498,7 +639,9 @@ class Context:
             ),
             "face_functions": [
                 "C", "D", "acceleration", "bias", "energy", "g", "jacobi", "kinetic_energy",
-                "potential_energy", "power", "rhs", "signal", "simulate", "step", "tau",
+                "potential_energy", "power", "rhs", "signal", "simulate",
+                *(["simulate_batch"] if s.run.batch else []), "step",
+                *(["step_batch"] if s.run.batch else []), "tau",
             ],
             "acceleration_binding": f"{self.prefix}_acceleration("
             + self._arguments(f"out + {NQ}*k", f"q + {NQ}*k", f"qd + {NQ}*k", t, u, self._p_cast)
@@ -526,6 +669,10 @@ class Context:
 def _after(*parts: str) -> str:
     """What follows in an argument list, each part with its comma."""
     return "".join(f", {part}" for part in parts if part)
+
+
+def _in_prepared(name: str) -> str:
+    return f"c->{name}"
 
 
 def _none_of(conditions: Sequence[str]) -> str:

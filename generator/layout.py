@@ -53,6 +53,7 @@ class _Run(_Table):
     duration: _Positive = 10.0
     method: Literal[METHODS] = "rk4"  # type: ignore[valid-type]
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
+    batch: pydantic.StrictBool = False
 
 
 def _spelled_out(value: object) -> object:
@@ -173,6 +174,8 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
         key = {"coordinates": "start", "inputs": "signal"}.get(path[0], "value")
         value = here if isinstance(given, (int, float, str)) else "..."
         return f"'{last}' is a table: write {last} = {{ {key} = {value} }}"
+    if path == ("run", "batch"):
+        return f"must be true or false, here {here}"
     if path[0] == "run":
         return f"must be a number, here {here}"
     if last in ("unit", "note", "name", "title"):

@@ -50,6 +50,7 @@ def render(program: Program, extension: str) -> Sources:
     context = {**Context(program, REALS[program.system.run.real]).values(), "extension": extension}
     jinja = environment()
     name = program.system.name
+    parts = ["runtime.py", *(["batch.py"] if program.system.run.batch else [])]
 
     def text(template: str) -> str:
         return jinja.get_template(template + ".jinja").render(context)
@@ -62,7 +63,7 @@ def render(program: Program, extension: str) -> Sources:
             "main.c": text("main.c"),
             "selftest.c": text("selftest.c"),
             "__init__.py": text("face.py"),
-            "_runtime.py": (files("eomc") / "runtime.py").read_text(encoding="utf-8"),
+            **{part: (files("eomc") / part).read_text(encoding="utf-8") for part in parts},
         },
         binding=text("binding.c"),
         cdef=text("binding.cdef"),

@@ -42,7 +42,7 @@ class MotionError(ArithmeticError):
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C during a simulation; `run` holds what was done until then."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Any) -> None:
         super().__init__(run.message)
         self.run = run
 

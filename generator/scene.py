@@ -63,13 +63,15 @@ class Input:
 class Run:
     """How the scene is run unless the caller says otherwise: step size h and duration in s.
 
-    real: the C type that everything is computed in.
+    real: the C type that everything is computed in. batch: whether many trajectories at once are
+    wanted.
     """
 
     h: float = 0.001
     duration: float = 10.0
     method: str = "rk4"
     real: str = "double"
+    batch: bool = False
 
 
 @dataclass(frozen=True)
@@ -277,7 +279,7 @@ class _Check:
             definitions=tuple(self.definitions.items()),
             **energies,
             forces=forces,
-            run=Run(doc.run.h, doc.run.duration, doc.run.method, doc.run.real),
+            run=Run(doc.run.h, doc.run.duration, doc.run.method, doc.run.real, doc.run.batch),
             places=self.places,
             warnings=tuple(self.problems),
         )

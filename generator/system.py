@@ -150,6 +150,7 @@ class System:
         h: float = 0.001,
         duration: float = 10.0,
         real: str = "double",
+        batch: bool = False,
     ) -> System:
         r"""A system from SymPy expressions.
 
@@ -167,7 +168,7 @@ class System:
         """
         return _Maker(name).make(
             coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
-            inputs, definitions or {}, units or {}, title, Run(h, duration, real=real),
+            inputs, definitions or {}, units or {}, title, Run(h, duration, real=real, batch=batch),
         )  # fmt: skip
 
 

@@ -1,0 +1,311 @@
+"""Many trajectories of one scene at once: what a scene with `batch = true` adds in Python.
+
+Copied beside the compiled extension like runtime.py, where the scene asks for it. Instances run
+side by side in vector registers and in threads; no result depends on either.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .runtime import STATUS, Array, Interrupted, Model, Params
+
+_GROUP = 64  # instances in a tile, or a multiple of those in one
+_WORTH = 20_000  # steps in all from which threads pay
+_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
+
+
+class BatchRun:
+    """Trajectories: t (n,), q and qd (batch, n, nq), status and steps (batch,).
+
+    status: "ok", "singular", "not finite" or "interrupted", one an instance; the rows behind the
+    last good one of an instance that could not go on are nan. steps: how many each has made.
+    """
+
+    def __init__(
+        self, t: Array, q: Array, qd: Array, h: float, steps: Array, status: Array, wanted: int
+    ) -> None:
+        self.t, self.q, self.qd = t, q, qd
+        self.h, self.steps, self.status = h, steps, status
+        self.wanted = wanted
+
+    @property
+    def message(self) -> str:
+        """What happened, in a sentence."""
+        names, counts = np.unique(self.status, return_counts=True)
+        told = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
+        done = int(self.steps.sum())
+        return (
+            f"{len(self.status)} instances, {done} of {self.wanted} steps of {self.h:g} s: {told}"
+        )
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    def __repr__(self) -> str:
+        return f"<BatchRun: {self.message}>"
+
+
+class BatchModel(Model):
+    """A model whose extension steps many instances at once."""
+
+    def simulate_batch(
+        self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
+        duration: float | None = None, steps: int | None = None, every: int = 1,
+        params: Any = None, u: ArrayLike | None = None, threads: int | None = None,
+        method: str = "rk4", *, t0: float = 0.0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> BatchRun:  # fmt: skip
+        """Trajectories of many instances by fixed steps; see `simulate` for what is not here.
+
+        q0, qd0: (batch, nq), or (nq,) for all alike. params: a dict of numbers or (batch,)
+        arrays, Params, or an array (batch, np). u: None, the scene's signals; (nu,) or
+        (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step.
+        threads: as many as there are processors where None. An instance that can't go on has its
+        own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
+        """
+        if method != "rk4":
+            raise ValueError(f"method: {method!r} is not in this module: rk4 is")
+        h, t0 = self._size(h), self._time(t0)
+        steps = self._steps(h, duration, steps)
+        if every != int(every) or every < 1:
+            raise ValueError(f"every: {every} is not a positive number of steps")
+        q, qd, table, held, count = self._instances(q0, qd0, params, u, steps)
+        rows = 1 + steps // every + (steps % every > 0)
+        try:
+            q_rows = np.empty((count, rows, self.nq), self.dtype)
+            qd_rows = np.empty_like(q_rows)
+        except MemoryError:
+            raise MemoryError(
+                f"{count} times {rows} rows of {2 * self.nq} numbers don't fit in memory: "
+                "keep fewer with every="
+            ) from None
+        q_rows[:, 0], qd_rows[:, 0] = q, qd
+        work = _Work(self, q, qd, h, t0, steps, int(every), held, table, q_rows, qd_rows)
+        whole = work.run(threads, progress)
+        status = np.array([*STATUS, "interrupted"])[work.status]
+        kept = 1 + work.done // every + (work.done % every > 0)
+        if steps % every:
+            q_rows[:, -1], qd_rows[:, -1] = q, qd
+        for k in np.flatnonzero(work.done < steps):
+            # the last good state stands where the next row would have
+            last = kept[k] - 1
+            q_rows[k, last], qd_rows[k, last] = q[k], qd[k]
+            q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
+        if not whole:
+            status[(work.status == 0) & (work.done < steps)] = "interrupted"
+        t = t0 + h * np.minimum(np.arange(rows) * every, steps)
+        run = BatchRun(t, q_rows, qd_rows, h, work.done, status, count * steps)
+        if not whole:
+            raise Interrupted(run)
+        return run
+
+    def step_batch(
+        self, q: Array, qd: Array, h: float | None = None, t: float = 0.0,
+        u: ArrayLike | None = None, params: Any = None,
+        out: tuple[Array, Array] | None = None, threads: int | None = None,
+    ) -> Array:  # fmt: skip
+        """One step of many instances, q and qd (batch, nq) in place, or from them into `out`.
+
+        Returns the status of each, (batch,) integers: 0 where the step was made; elsewhere
+        STATUS tells, and the state is as it was. u, params: as in `simulate_batch`.
+        """
+        if out is not None:
+            into = (
+                self._out(out[0], np.shape(q), "out[0]"),
+                self._out(out[1], np.shape(qd), "out[1]"),
+            )
+            into[0][...], into[1][...] = q, qd
+            q, qd = into
+        for name, x in (("q", q), ("qd", qd)):
+            self._out(x, (len(x), self.nq), name)
+        if len(q) != len(qd):
+            raise ValueError(f"qd: {len(qd)} instances where q has {len(q)}")
+        h, t = self._size(h), self._time(t)
+        table, held = self._parameter_rows(params), self._input_rows(u, 1)
+        for name, given in (("params", table), ("u", held)):
+            if given is not None and len(given) not in (1, len(q)):
+                raise ValueError(f"{name}: {len(given)} instances where q has {len(q)}")
+        work = _Work(self, q, qd, h, t, 1, 0, held, table, None, None)
+        work.run(threads, None)
+        return work.status
+
+    def _instances(
+        self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int
+    ) -> tuple[Array, Array, Array, Array | None, int]:
+        """(q, qd, parameters, inputs, batch), one row an instance; a single one serves for all."""
+        start = self.start
+        q = self._array(start[0] if q0 is None else q0, "q0", self.nq)
+        qd = self._array(start[1] if qd0 is None else qd0, "qd0", self.nq)
+        table = self._parameter_rows(params)
+        held = self._input_rows(u, steps)
+        sizes = {
+            "q0": 1 if q.ndim == 1 else len(q),
+            "qd0": 1 if qd.ndim == 1 else len(qd),
+            "params": len(table),
+            "u": 1 if held is None else len(held),
+        }
+        count = max(sizes.values())
+        for name, size in sizes.items():
+            if size not in (1, count):
+                raise ValueError(f"{name}: {size} instances where others have {count}")
+        q, qd = (np.array(np.broadcast_to(x, (count, self.nq)), order="C") for x in (q, qd))
+        return q, qd, table, held, count
+
+    def _parameter_rows(self, params: Any) -> Array:
+        if params is None or isinstance(params, Params):
+            return self._parameters(params)[None]
+        if not isinstance(params, Mapping):
+            array = np.ascontiguousarray(params, self.dtype)
+            if array.ndim == 2 and array.shape[1] == len(self.parameters):
+                if not np.isfinite(array).all():
+                    raise ValueError("params: not all numbers are finite")
+                return array
+            return self._parameters(params)[None]
+        sizes = {name: np.size(value) for name, value in params.items() if np.ndim(value)}
+        count = max(sizes.values(), default=1)
+        table = np.tile(self._p0, (count, 1))
+        for name, value in params.items():
+            column = np.asarray(value, self.dtype)
+            if name not in self.parameters:
+                self._parameters({name: 0.0})  # raises, with the names there are
+            if column.ndim > 1 or (column.ndim and len(column) != count):
+                raise ValueError(f"params: {name} has shape {column.shape}, expected ({count},)")
+            if not np.isfinite(column).all():
+                raise ValueError(f"params: {name} is not finite everywhere")
+            table[:, self.parameters.index(name)] = column
+        return table
+
+    def _input_rows(self, u: Any, steps: int) -> Array | None:
+        """(batch or 1, steps or 1, nu)."""
+        if u is None:
+            return None
+        if not self.nu:
+            raise ValueError("u: this scene has no inputs")
+        if callable(u):
+            raise ValueError("u: a Python function can't be called for many at once: give a table")
+        array = np.ascontiguousarray(u, self.dtype)
+        if array.ndim < 2:
+            array = array.reshape(1, 1, -1)
+        elif array.ndim == 2:
+            array = array[:, None, :]
+        if array.ndim != 3 or array.shape[2] != self.nu or array.shape[1] not in (1, steps):
+            raise ValueError(
+                f"u: shape {np.shape(u)}, expected ({self.nu},), (batch, {self.nu}) or "
+                f"(batch, {steps}, {self.nu})"
+            )
+        if not np.isfinite(array).all():
+            raise ValueError("u: not all numbers are finite")
+        return np.ascontiguousarray(array)
+
+
+class _Work:
+    """One batch on its way: groups of instances, each taken through all its steps in pieces."""
+
+    def __init__(
+        self, model: BatchModel, q: Array, qd: Array, h: float, t0: float, steps: int, every: int,
+        held: Array | None, table: Array, q_rows: Array | None, qd_rows: Array | None,
+    ) -> None:  # fmt: skip
+        self.model, self.q, self.qd = model, q, qd
+        self.h, self.t0, self.steps, self.every = h, t0, steps, every
+        self.held, self.table = held, table
+        self.q_rows, self.qd_rows = q_rows, qd_rows
+        count = len(q)
+        self.done = np.zeros(count, np.dtype("l"))
+        self.status = np.zeros(count, np.dtype("i"))
+        self.stop = threading.Event()
+        self.moved = 0
+
+    def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
+        """All of it; False where Ctrl-C came in between."""
+        count = len(self.q)
+        if threads is None:
+            threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        if threads < 1:
+            raise ValueError(f"threads: {threads} is not a positive number")
+        if count * self.steps < _WORTH:
+            threads = 1
+        tiles = -(-count // _GROUP)
+        size = _GROUP * max(1, min(16, tiles // (4 * threads)))
+        groups = [(at, min(size, count - at)) for at in range(0, count, size)]
+        total = count * self.steps
+        if threads == 1 or len(groups) == 1:
+            try:
+                for group in groups:
+                    self._group(*group, lambda: progress and progress(self.moved, total))
+            except KeyboardInterrupt:
+                return False
+            return True
+        pool = _pool(threads)
+        waiting: set[Future[None]] = {pool.submit(self._group, *group) for group in groups}
+        try:
+            while waiting:
+                ended, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_COMPLETED)
+                for future in ended:
+                    future.result()
+                if progress is not None:
+                    progress(self.moved, total)
+        except BaseException as fault:
+            self.stop.set()
+            for future in waiting:
+                future.cancel()
+            wait(waiting)
+            if isinstance(fault, KeyboardInterrupt):
+                return False
+            raise
+        return True
+
+    def _group(self, at: int, count: int, told: Callable[[], object] = lambda: None) -> None:
+        """Instances at, ..., at + count - 1 through all steps, a piece of some time at once."""
+        model, n = self.model, self.model.nq
+        pointer = model._pointer
+        null = model._ffi.NULL
+        end = at + count
+        q, qd = pointer(self.q[at:end]), pointer(self.qd[at:end])
+        done = model._ffi.from_buffer("long[]", self.done[at:end])
+        status = model._ffi.from_buffer("int[]", self.status[at:end])
+        each = len(self.table) > 1
+        table = pointer(self.table[at:end] if each else self.table)
+        u, u_instance, u_step = null, 0, 0
+        if self.held is not None:
+            _, many, width = self.held.shape
+            u = pointer(self.held[at:end] if len(self.held) > 1 else self.held)
+            u_instance = many * width if len(self.held) > 1 else 0
+            u_step = width if many > 1 else 0
+        q_rows = qd_rows = null
+        rows = 0
+        if self.q_rows is not None and self.qd_rows is not None:
+            rows = self.q_rows.shape[1]
+            q_rows, qd_rows = pointer(self.q_rows[at:end]), pointer(self.qd_rows[at:end])
+        first, chunk = 0, max(1, 2048 // max(1, count // 16) // n)
+        while first < self.steps and not self.stop.is_set():
+            many = min(chunk, self.steps - first)
+            begun = perf_counter()
+            model._lib.rk4_batch(
+                count, q, qd, self.t0, self.h, first, many, u + first * u_step if u_step else u,
+                u_instance, u_step, self.every, q_rows, qd_rows, rows, table,
+                1 if each else 0, done, status,
+            )  # fmt: skip
+            spent = perf_counter() - begun
+            first += many
+            self.moved += many * count  # a figure for the bar; threads may lose one another's
+            chunk = int(many * min(16.0, max(0.25, _SECONDS / (spent + 1e-9)))) + 1
+            told()
+
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads are kept for the next batch: starting them takes longer than a short one."""
+    if threads not in _pools:
+        _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="eomc")
+    return _pools[threads]
