@@ -1,0 +1,181 @@
+"""Many at once: what a scene with batch = true promises."""
+
+from __future__ import annotations
+
+import _thread
+import re
+import threading
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import eomc
+
+SCENES = Path(__file__).parent.parent / "scenes"
+STEPS = 60
+
+
+def module(name: str, **run: str) -> ModuleType:
+    """A scene with batch = true, built under build/ and kept there from test to test."""
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    options = "".join(f"{k} = {v}\n" for k, v in {"batch": "true", **run}.items())
+    text = re.sub(r"^name\s*=.*", f'name = "many_{name}"', text, flags=re.M)
+    text = text.replace("[run]\n", "[run]\n" + options)
+    path = Path("build/tests") / f"many_{name}_{'_'.join(run)}.toml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return eomc.load(path, path.parent / "modules")
+
+
+def starts(m: ModuleType, count: int) -> tuple[Any, Any]:
+    """`count` states around the scene's start."""
+    random = np.random.default_rng(1)
+    return tuple(x + 0.2 * random.standard_normal((count, len(x))) for x in m.start)  # type: ignore[return-value]
+
+
+NAMES = ["cartpole", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_instance_moves_as_it_would_alone(name: str) -> None:
+    m = module(name)
+    q0, qd0 = starts(m, 130)
+    runs = m.simulate_batch(q0, qd0, steps=STEPS, every=7)
+    for k in (0, 63, 64, 129):
+        alone = m.simulate(q0[k], qd0[k], steps=STEPS, every=7)
+        assert np.array_equal(runs.t, alone.t)
+        # the same operations, contracted to FMA in other places
+        scale = 1 + np.max(np.abs(alone.q))
+        assert np.max(np.abs(runs.q[k] - alone.q)) < 1e-13 * scale
+        assert np.max(np.abs(runs.qd[k] - alone.qd)) < 1e-11 * (1 + np.max(np.abs(alone.qd)))
+    assert set(runs.status) == {"ok"} and set(runs.steps) == {STEPS}
+
+
+def test_place_and_threads_change_no_bit() -> None:
+    m = module("cartpole_driven")
+    q0, qd0 = starts(m, 1000)
+    one = m.simulate_batch(q0, qd0, steps=STEPS, threads=1)
+    many = m.simulate_batch(q0, qd0, steps=STEPS, threads=3)
+    assert np.array_equal(one.q, many.q) and np.array_equal(one.qd, many.qd)
+    part = m.simulate_batch(q0[501:540], qd0[501:540], steps=STEPS)
+    assert np.array_equal(part.q, one.q[501:540])
+    turned = m.simulate_batch(q0[::-1], qd0[::-1], steps=STEPS)
+    assert np.array_equal(turned.q, one.q[::-1])
+
+
+def test_parameters_and_inputs_of_its_own() -> None:
+    m = module("cartpole_driven")
+    q0, qd0 = starts(m, 70)
+    masses = np.linspace(0.5, 4.0, 70)
+    table = np.random.default_rng(2).standard_normal((70, STEPS, 1))
+    runs = m.simulate_batch(q0, qd0, steps=STEPS, params={"m_c": masses, "l": 1.5}, u=table)
+    k = 69
+    alone = m.simulate(q0[k], qd0[k], steps=STEPS, params={"m_c": masses[k], "l": 1.5}, u=table[k])
+    assert np.max(np.abs(runs.q[k] - alone.q)) < 1e-12
+    constant = m.simulate_batch(q0, qd0, steps=STEPS, u=[3.0])
+    alone = m.simulate(q0[k], qd0[k], steps=STEPS, u=[3.0])
+    assert np.max(np.abs(constant.q[k] - alone.q)) < 1e-12
+
+
+def test_a_bad_instance_leaves_the_others_alone() -> None:
+    m = module("kepler_orbit")
+    q0, qd0 = np.tile(m.start[0], (100, 1)), np.tile(m.start[1], (100, 1))
+    good = m.simulate_batch(q0, qd0, steps=STEPS, every=7)
+    q0[41] = 0.0  # at the centre, where the force is infinite
+    runs = m.simulate_batch(q0, qd0, steps=STEPS, every=7)
+    assert runs.status[41] == "not finite" and runs.steps[41] == 0
+    assert np.array_equal(runs.q[41, 0], q0[41]) and np.isnan(runs.q[41, 1:]).all()
+    others = np.arange(100) != 41
+    assert set(runs.status[others]) == {"ok"}
+    assert np.array_equal(runs.q[others], good.q[others])
+
+
+def test_an_instance_that_fails_on_the_way_keeps_its_last_state() -> None:
+    m = module("mass_spring")
+    k = np.full(9, m.defaults["k"])
+    k[4] *= 1e6  # far beyond the stability limit: it grows until it overflows
+    with pytest.warns(RuntimeWarning, match="not finite|no longer be finite"):
+        alone = m.simulate(steps=400, every=5, params={"k": k[4]})
+    runs = m.simulate_batch(steps=400, every=5, params={"k": k})
+    assert 5 < alone.steps < 400 and runs.status[4] == alone.status == "not finite"
+    assert runs.steps[4] == alone.steps
+    rows = len(alone.t)
+    assert np.allclose(runs.q[4, :rows], alone.q, rtol=1e-9)
+    assert np.isnan(runs.q[4, rows:]).all() and np.isfinite(runs.q[5]).all()
+
+
+def test_wide_angles_are_reduced_as_in_a_single_run() -> None:
+    m = module("cartpole")
+    q0 = np.array([[0.0, 3e6], [0.0, 1.0]])
+    runs = m.simulate_batch(q0, steps=5)
+    assert np.array_equal(runs.q[0], m.simulate(q0[0], steps=5).q)
+
+
+def test_step_batch_in_place_and_into_out() -> None:
+    m = module("cartpole")
+    q0, qd0 = starts(m, 80)
+    q, qd = q0.copy(), qd0.copy()
+    for _ in range(3):
+        assert not m.step_batch(q, qd, h=0.01).any()
+    runs = m.simulate_batch(q0, qd0, h=0.01, steps=3)
+    assert np.array_equal(q, runs.q[:, -1]) and np.array_equal(qd, runs.qd[:, -1])
+    out = np.empty_like(q0), np.empty_like(qd0)
+    m.step_batch(q0, qd0, h=0.01, out=out)
+    assert np.array_equal(out[0], runs.q[:, 1])
+
+
+def test_ctrl_c_stops_within_a_second_and_keeps_what_was_done() -> None:
+    m = module("kepler_orbit")
+    q0, qd0 = np.tile(m.start[0], (300, 1)), np.tile(m.start[1], (300, 1))
+    threading.Timer(0.3, _thread.interrupt_main).start()
+    begun = time.perf_counter()
+    with pytest.raises(m.Interrupted) as stop:
+        m.simulate_batch(q0, qd0, steps=10**9, every=10**8)
+    assert time.perf_counter() - begun < 1.3
+    assert stop.value.run.steps.sum() > 0 and "interrupted" in stop.value.run.message
+
+
+def test_progress_reaches_the_end() -> None:
+    m = module("cartpole")
+    seen: list[tuple[int, int]] = []
+    q0, qd0 = starts(m, 64)
+    m.simulate_batch(q0, qd0, steps=STEPS, progress=lambda done, total: seen.append((done, total)))
+    assert seen[-1] == (64 * STEPS, 64 * STEPS)
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"params": {"mass": [1.0, 2.0]}}, "params: 'mass'"),
+        ({"params": {"m_c": [1.0, float("nan")]}}, "params: m_c"),
+        ({"u": [1.0]}, "u: this scene has no inputs"),
+        ({"q0": np.zeros((2, 3))}, "q0"),
+        ({"q0": np.zeros((3, 2)), "params": {"m_c": [1.0, 2.0]}}, "params: 2 instances"),
+        ({"every": 0}, "every"),
+        ({"threads": 0}, "threads"),
+        ({"method": "euler"}, "method"),
+    ],
+)
+def test_wrong_arguments_are_named(given: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(named)):
+        module("cartpole").simulate_batch(steps=2, **given)
+
+
+def test_only_scenes_that_ask_have_it() -> None:
+    plain = eomc.sources(eomc.read(SCENES / "cartpole.toml"))
+    assert "batch" not in plain.files["cartpole.c"] and "batch.py" not in plain.files
+
+
+def test_single_precision() -> None:
+    m = module("double_pendulum", real='"float"')
+    assert m.dtype == np.float32
+    q0, qd0 = starts(m, 10)
+    runs = m.simulate_batch(q0, qd0, steps=STEPS)
+    assert runs.q.dtype == np.float32
+    exact = module("double_pendulum").simulate_batch(q0, qd0, steps=STEPS)
+    error = np.max(np.abs(runs.q - exact.q))
+    assert 1e-9 < error < 1e-4  # that of single precision, no more and no less
