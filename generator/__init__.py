@@ -45,11 +45,20 @@ def read(scene: ScenePath) -> System:
     return from_scene(scenes.read(scene))
 
 
-def sources(system: System, extension: str = "_extension") -> Sources:
-    """The generated files of a system, as text."""
+def sources(
+    system: System,
+    extension: str = "_extension",
+    *,
+    warn: Callable[[Problem], None] | None = None,
+) -> Sources:
+    """The generated files of a system, as text. warn is called with each warning."""
     from eomc import mechanics, program, render
 
-    return render.render(program.build(mechanics.derive(system)), extension)
+    derived = program.build(mechanics.derive(system))
+    for problem in (*system.warnings, *program.inertia(derived)):
+        if warn is not None:
+            warn(problem)
+    return render.render(derived, extension)
 
 
 def build(
@@ -78,13 +87,7 @@ def build(
         made = read(scene)
 
     def texts(extension: str) -> Sources:
-        from eomc import mechanics, program, render
-
-        derived = program.build(mechanics.derive(made))
-        for problem in (*made.warnings, *program.inertia(derived)):
-            if warn is not None:
-                warn(problem)
-        return render.render(derived, extension)
+        return sources(made, extension, warn=warn)
 
     return compiler.build(made.name, wanted, texts, Path(root))
 

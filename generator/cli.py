@@ -384,7 +384,7 @@ def _summary(
 ) -> dict[str, Any]:
     import numpy as np
 
-    energy = done.jacobi
+    energy, jacobi = done.energy, done.jacobi
     return {
         "scene": module._model.name,
         "status": done.status,
@@ -400,6 +400,9 @@ def _summary(
             "end": float(energy[-1]),
             "largest_change": float(np.max(np.abs(energy - energy[0]))),
         },
+        "jacobi_change": None
+        if np.array_equal(energy, jacobi)
+        else float(np.max(np.abs(jacobi - jacobi[0]))),
         "error_estimate": error,
         "seconds": seconds,
         "steps_per_second": done.steps / seconds if seconds else None,
@@ -416,13 +419,17 @@ def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
         unit = module.units.get(name, "")
         rate = f"{unit}/s" if unit else ""
         click.echo(f"  {name:{wide}} {q: .9g} {unit}   {name}_dot {qd: .9g} {rate}".rstrip())
-    change = summary["energy"]["largest_change"]
-    click.echo(f"  energy {summary['energy']['end']:.9g} J, changed by at most {change:.2g} J")
+    change, jacobi = summary["energy"]["largest_change"], summary["jacobi_change"]
+    beside = "" if jacobi is None else f"; Jacobi's integral by {jacobi:.2g} J"
+    end = summary["energy"]["end"]
+    click.echo(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J{beside}")
     if error := summary["error_estimate"]:
         click.echo(
             f"  error at the end about {error['q']:.1g} in q, {error['qd']:.1g} in qd "
             "(from the same run at h/2)"
         )
+        if error["q"] > 0.1 * max(1.0, *map(abs, summary["q"].values())):
+            click.echo("  this motion is not resolved: take a smaller --h, or a shorter --duration")
     speed = summary["steps_per_second"] or 0.0
     click.echo(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
     for file in summary["files"]:

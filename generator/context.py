@@ -127,7 +127,7 @@ class Context:
             "stamp": self._stamp(),
             "handshake": f"0x{s.digest[:8]}u",
             "digest": s.digest,
-            "notes": self.program.notes,
+            "notes": [line for note in self.program.notes for line in textwrap.wrap(note, 92)],
             "description": self._description(),
             "coordinates": [
                 {"name": c.name, "enum": self.enum[c.name], "unit": c.unit, "note": c.note,

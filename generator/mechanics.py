@@ -23,7 +23,7 @@ from itertools import product
 import sympy
 from sympy import Expr, S, Symbol
 
-from eomc.problems import EomcError
+from eomc.problems import EomcError, SceneError
 from eomc.system import System, dot, t
 from eomc.tape import Stage, Tape
 
@@ -78,7 +78,7 @@ class _Energies:
 def derive(system: System) -> Equations:
     """The equations of motion of `system`.
 
-    Raises EomcError where K is not quadratic in the velocities or a coordinate has no inertia.
+    Raises SceneError where K is not quadratic in the velocities or a coordinate has no inertia.
     Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral);
     C from Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
     """
@@ -233,21 +233,22 @@ def _mass_matrix(
         for side, other in ((min, max), (max, min))
     ]
     D = min(halves, key=lambda half: len(tape.live(entry for row in half for entry in row)))
-    place = f"{system.file or system.name}: energy.kinetic"
     for c, row in zip(system.coordinates, D, strict=True):
         if all(entry == 0 for entry in row):
-            raise EomcError(
-                f"{place}: coordinate '{c.name}' has no inertia: the kinetic energy does not "
-                f"depend on {c.name}_dot, so nothing can be solved for its acceleration; "
+            message = (
+                f"coordinate '{c.name}' has no inertia: the kinetic energy does not depend on "
+                f"{c.name}_dot, so nothing can be solved for its acceleration; "
                 "give it a mass, or make it an input"
             )
+            raise SceneError([system.problem("energy.kinetic", message)])
     for i, j in product(range(n), repeat=2):
         if tape.stage_of(D[i][j]) >= Stage.VELOCITY:
-            raise EomcError(
-                f"{place}: the kinetic energy is not quadratic in the velocities "
+            message = (
+                "the kinetic energy is not quadratic in the velocities "
                 f"(d2K/d{system.qd[i]}d{system.qd[j]} still depends on a velocity): "
                 "D qdd + C qd + g = tau needs K = qd.D(q).qd/2 + a(q).qd + b(q)"
             )
+            raise SceneError([system.problem("energy.kinetic", message)])
     return tuple(map(tuple, D))
 
 

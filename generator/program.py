@@ -13,7 +13,7 @@ from eomc.assignments import Cost, Function, evaluate
 from eomc.expand import Expander
 from eomc.lowering import lower
 from eomc.mechanics import Equations
-from eomc.problems import EomcError, Problem
+from eomc.problems import Problem, SceneError
 from eomc.system import System, t
 from eomc.tape import Tape
 
@@ -111,23 +111,23 @@ def _weight(cost: Cost) -> int:
 def inertia(program: Program) -> list[Problem]:
     """A warning where D is not positive definite at the start.
 
-    Raises EomcError where it is so at states around the start as well: no motion can be computed.
+    Raises SceneError where it is so at states around the start as well: no motion can be computed.
     """
     s = program.system
     weak = _without_inertia(program, 0)
     if weak is None:
         return []
-    key = "energy.kinetic"
     if all(_without_inertia(program, k) is not None for k in range(1, 6)):
-        raise EomcError(
-            f"{s.file or s.name}: {key}: D is not positive definite: '{weak}' has no inertia of "
-            "its own. Give it a mass, or leave out a coordinate that others determine"
+        message = (
+            f"D is not positive definite: '{weak}' has no inertia of its own. Give it a mass, "
+            "or leave out a coordinate that others determine"
         )
+        raise SceneError([s.problem("energy.kinetic", message)])
     message = (
         f"D is not positive definite at the start, '{weak}' has no inertia there: "
         "start elsewhere, or choose coordinates that are regular there"
     )
-    return [Problem(message, key, s.file, severity="warning")]
+    return [s.problem("energy.kinetic", message, "warning")]
 
 
 def nearby(system: System, k: int) -> dict[str, float]:

@@ -112,11 +112,11 @@ class Params:
     _names: tuple[str, ...] = ()
     _defaults: tuple[float, ...] = ()
     _dtype = "float64"
-    __slots__ = ("values",)
-    values: Array
+    __slots__ = ("_array",)  # a parameter's name begins with a letter
+    _array: Array
 
     def __init__(self, **values: float) -> None:
-        object.__setattr__(self, "values", np.array(self._defaults, self._dtype))
+        object.__setattr__(self, "_array", np.array(self._defaults, self._dtype))
         for name, value in values.items():
             setattr(self, name, value)
 
@@ -127,21 +127,21 @@ class Params:
             raise ValueError(_unknown("params", name, self._names)) from None
 
     def __getattr__(self, name: str) -> float:
-        if name.startswith("_") or name == "values" or name not in self._names:
+        if name not in self._names:
             raise AttributeError(_unknown("params", name, self._names))
-        return float(self.values[self._names.index(name)])
+        return float(self._array[self._names.index(name)])
 
     def __setattr__(self, name: str, value: float) -> None:
         number = float(value)
         if not np.isfinite(number):
             raise ValueError(f"params: {name} = {value} is not a finite number")
-        self.values[self._index(name)] = number
+        self._array[self._index(name)] = number
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
 
     def __repr__(self) -> str:
-        inside = ", ".join(f"{n}={v:g}" for n, v in zip(self._names, self.values, strict=True))
+        inside = ", ".join(f"{n}={v:g}" for n, v in zip(self._names, self._array, strict=True))
         return f"Params({inside})"
 
 
@@ -215,9 +215,9 @@ class Model:
         if isinstance(params, Params):
             if params._names != self.parameters:
                 raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
-            return params.values
+            return params._array
         if isinstance(params, Mapping):
-            return np.asarray(self.Params(**params).values)
+            return np.asarray(self.Params(**params)._array)
         array = np.ascontiguousarray(params, self.dtype)
         if array.shape != self._p0.shape or not np.isfinite(array).all():
             raise ValueError(

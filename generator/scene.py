@@ -117,10 +117,16 @@ class Scene:
             [number(c.rate, f"coordinates.{c.name}.rate") for c in self.coordinates],
         )
 
-    def problem(self, key: str, message: str, formula: Formula | None = None) -> Problem:
+    def problem(
+        self,
+        key: str,
+        message: str,
+        formula: Formula | None = None,
+        severity: str = "error",
+    ) -> Problem:
         """A problem at a key such as `energy.kinetic`, with its line and its formula marked."""
         text = formula.text if formula else None
-        return self.places.problem(tuple(key.split(".")), message, text=text)
+        return self.places.problem(tuple(key.split(".")), message, text=text, severity=severity)
 
 
 def _value(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
@@ -150,7 +156,8 @@ def read(file: str | os.PathLike[str]) -> Scene:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        near = suggest(path.name, (p.name for p in path.parent.glob("*.toml")))
+        others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
+        near = suggest(path.name, others)
         raise EomcError(f"{file}: there is no such file{near}") from None
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
@@ -399,8 +406,9 @@ class _Check:
             if node.id not in (self.kinds if allowed is None else allowed):
                 self.say(path, self._refused(node.id, rule), node, formula.text)
         if len(self.problems) == before:
+            still = allowed is not None and not {*self.doc.coordinates} & {*allowed}
             for call in formula.calls("dot"):
-                if why := rule or self._no_rate(call.args[0]):
+                if why := rule if still else self._no_rate(call.args[0]):
                     self.say(path, f"dot(...) can't be used here: {why}", call, formula.text)
         return len(self.problems) == before
 
@@ -588,7 +596,7 @@ class _Check:
         while queue:
             where, f = queue.pop()
             for call in f.calls("sign", "heaviside"):
-                if {_POSITION, _VELOCITY} & self.kinds_of(call):
+                if {_TIME, _POSITION, _VELOCITY} & self.kinds_of(call):
                     function = ast.unparse(call.func)
                     self.say(
                         where,

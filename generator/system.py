@@ -7,7 +7,7 @@ Made from a checked scene (`from_scene`) or in Python (`System.make`), with symb
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -111,6 +111,7 @@ class System:
     digest: str = ""
     renamed: tuple[tuple[str, str], ...] = ()
     warnings: tuple[Problem, ...] = field(default=(), compare=False)
+    place: Callable[..., Problem] | None = field(default=None, compare=False, repr=False)
 
     @property
     def q(self) -> tuple[Symbol, ...]:
@@ -121,6 +122,12 @@ class System:
     def qd(self) -> tuple[Symbol, ...]:
         """The velocities' symbols, in scene order."""
         return tuple(c.qd for c in self.coordinates)
+
+    def problem(self, key: str, message: str, severity: str = "error") -> Problem:
+        """A problem at a key such as `energy.kinetic`, with its line where there is a scene."""
+        if self.place is None:
+            return Problem(message, key, f"System {self.name}", severity=severity)
+        return self.place(key, message, severity=severity)
 
     def at(self, parameters: Mapping[str, float]) -> System:
         """The system with other values for some of its parameters."""
@@ -253,6 +260,7 @@ def from_scene(scene: Scene) -> System:
         file=scene.file,
         digest=scene.digest,
         warnings=scene.warnings,
+        place=scene.problem,
     )
     if problems:
         raise SceneError(problems)
