@@ -61,7 +61,7 @@ class BatchModel(Model):
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
         params: Any = None, u: ArrayLike | None = None, threads: int | None = None,
-        method: str = "rk4", *, t0: float = 0.0,
+        method: str | None = None, *, t0: float = 0.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> BatchRun:  # fmt: skip
         """Trajectories of many instances by fixed steps; see `simulate` for what is not here.
@@ -72,8 +72,7 @@ class BatchModel(Model):
         threads: as many as there are processors where None. An instance that can't go on has its
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
         """
-        if method != "rk4":
-            raise ValueError(f"method: {method!r} is not in this module: rk4 is")
+        step = self._stepper(method, "batch")
         h, t0 = self._size(h), self._time(t0)
         steps = self._steps(h, duration, steps)
         if every != int(every) or every < 1:
@@ -89,7 +88,7 @@ class BatchModel(Model):
                 "keep fewer with every="
             ) from None
         q_rows[:, 0], qd_rows[:, 0] = q, qd
-        work = _Work(self, q, qd, h, t0, steps, int(every), held, table, q_rows, qd_rows)
+        work = _Work(self, step, q, qd, h, t0, steps, int(every), held, table, q_rows, qd_rows)
         whole = work.run(threads, progress)
         status = np.array([*STATUS, "interrupted"])[work.status]
         kept = 1 + work.done // every + (work.done % every > 0)
@@ -112,12 +111,14 @@ class BatchModel(Model):
         self, q: Array, qd: Array, h: float | None = None, t: float = 0.0,
         u: ArrayLike | None = None, params: Any = None,
         out: tuple[Array, Array] | None = None, threads: int | None = None,
+        method: str | None = None,
     ) -> Array:  # fmt: skip
         """One step of many instances, q and qd (batch, nq) in place, or from them into `out`.
 
         Returns the status of each, (batch,) integers: 0 where the step was made; elsewhere
         STATUS tells, and the state is as it was. u, params: as in `simulate_batch`.
         """
+        step = self._stepper(method, "batch")
         if out is not None:
             into = (
                 self._out(out[0], np.shape(q), "out[0]"),
@@ -134,7 +135,7 @@ class BatchModel(Model):
         for name, given in (("params", table), ("u", held)):
             if given is not None and len(given) not in (1, len(q)):
                 raise ValueError(f"{name}: {len(given)} instances where q has {len(q)}")
-        work = _Work(self, q, qd, h, t, 1, 0, held, table, None, None)
+        work = _Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
         work.run(threads, None)
         return work.status
 
@@ -211,10 +212,10 @@ class _Work:
     """One batch on its way: groups of instances, each taken through all its steps in pieces."""
 
     def __init__(
-        self, model: BatchModel, q: Array, qd: Array, h: float, t0: float, steps: int, every: int,
-        held: Array | None, table: Array, q_rows: Array | None, qd_rows: Array | None,
+        self, model: BatchModel, step: Any, q: Array, qd: Array, h: float, t0: float,
+        steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None, qd_rows: Array | None,
     ) -> None:  # fmt: skip
-        self.model, self.q, self.qd = model, q, qd
+        self.model, self.step, self.q, self.qd = model, step, q, qd
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
         self.held, self.table = held, table
         self.q_rows, self.qd_rows = q_rows, qd_rows
@@ -289,7 +290,7 @@ class _Work:
         while first < self.steps and not self.stop.is_set():
             many = min(chunk, self.steps - first)
             begun = perf_counter()
-            model._lib.rk4_batch(
+            self.step(
                 count, q, qd, self.t0, self.h, first, many, u + first * u_step if u_step else u,
                 u_instance, u_step, self.every, q_rows, qd_rows, rows, table,
                 1 if each else 0, done, status,

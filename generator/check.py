@@ -17,12 +17,14 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import sympy
 
 from eomc.reference import Reference, Vector, derive
+from eomc.steppers import METHODS
 from eomc.system import System
 
 EPS = 2.0**-52
@@ -31,7 +33,7 @@ EPS = 2.0**-52
 # sign makes 1e15, and still 1e5 in a term that is a ten thousand millionth of the whole.
 LIMIT = 1e3
 SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
-ORDER_LIMIT = 3.5  # between 4 and the next lower order
+ORDER_MARGIN = 0.5  # below the order of a method: half way to the next lower one
 CLOSING_LIMIT = 2.0  # of 4; a wrong power does not close at all: order 0
 CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
 
@@ -308,6 +310,7 @@ class _Check:
         self.system, self.module = system, module
         self.dtype = np.dtype(getattr(module, "dtype", "float64"))
         self.eps = float(np.finfo(self.dtype).eps)
+        self.methods: tuple[str, ...] = getattr(module, "methods", ("rk4",))
         self.reference = derive(system)
         self.sampler = _Sampler(self.reference, random)
         self.expected = self.sampler.states(states)
@@ -329,7 +332,15 @@ class _Check:
             self.row("D qdd + bias = tau", LIMIT, rounding, self.motion)
             if self.dtype == np.float64:  # single precision leaves differences too few digits
                 self.row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", self.skewness)
-                self.smooth_row("order of RK4", ORDER_LIMIT, "order observed", self.order)
+                for method in self.methods:
+                    least = METHODS[method].order - ORDER_MARGIN
+                    find = partial(self.order, method)
+                    self.smooth_row(f"order of {method}", least, "order observed", find)
+                for method in self.methods[1:]:
+                    unit = "of the first method's own error"
+                    self.row(
+                        f"{method} beside {self.methods[0]}", 2, unit, partial(self.beside, method)
+                    )
                 self.smooth_row(
                     "power balance", CLOSING_LIMIT, "order at which it closes", self.closing
                 )
@@ -536,15 +547,32 @@ class _Check:
 
         return self.largest(error)
 
-    def order(self) -> float:
-        """Of convergence of the state, the median over some states; inf where RK4 is exact."""
-        return _median(self._order(e.state) for e in self._usual())
+    def beside(self, method: str) -> float:
+        """How far another method ends from the first, over what halving h changes in that one."""
 
-    def _order(self, s: State) -> float:
+        def ratio(s: State) -> float:
+            span = 24 * self.system.run.h
+            one, two = (
+                _rows(self._simulate(s, h=span / n, steps=n, every=n), s)[-1] for n in (24, 48)
+            )
+            other = _rows(self._simulate(s, h=span / 48, steps=48, every=48, method=method), s)[-1]
+            floor = LIMIT * self.eps * (1 + np.abs(np.array([two.q, two.qd])))
+            change = np.abs(np.array([two.q, two.qd]) - np.array([one.q, one.qd]))
+            off = np.abs(np.array([two.q, two.qd]) - np.array([other.q, other.qd]))
+            return float(np.max(off) / np.max(change + floor))
+
+        return _median(ratio(e.state) for e in self._usual())
+
+    def order(self, method: str) -> float:
+        """Of convergence of the state, the median over some states; inf where it is exact."""
+        return _median(self._order(e.state, method) for e in self._usual())
+
+    def _order(self, s: State, method: str) -> float:
         """log2 of the ratio of the differences between runs with h, h/2 and h/4.
 
         h is moved by factors of 4 from the scene's until differences are small and clear of
-        rounding; the finest of these count.
+        rounding. The largest of successive orders counts: rounding spoils the finest, and the
+        coarsest are not small yet, but no step makes a wrong coefficient right.
         """
         spread = np.array([self.sampler.spread, self.sampler.speed])
         best: list[float] = []
@@ -552,7 +580,7 @@ class _Check:
         for _ in range(8):
             ends = []
             for n in (6, 12, 24, 48, 96):
-                end = _rows(self._simulate(s, h=span / n, steps=n, every=n), s)[-1]
+                end = _rows(self._simulate(s, h=span / n, steps=n, every=n, method=method), s)[-1]
                 ends.append(np.array([end.q, end.qd]) / spread)
             off = np.max(np.abs(np.diff(ends, axis=0)), axis=(1, 2))
             floor = 1e4 * EPS * (1 + np.max(np.abs(ends[-1])))
@@ -562,7 +590,9 @@ class _Check:
             if len(best) > 2:
                 break
             span *= 4 if off[-1] < 1e-8 else 1 / 4
-        return math.log2(best[-2] / best[-1]) if len(best) > 1 else math.inf if exact else math.nan
+        if len(best) > 1:
+            return max(math.log2(a / b) for a, b in pairwise(best))
+        return math.inf if exact else math.nan
 
     def closing(self) -> float:
         """The order at which jacobi(T) - jacobi(0) - integral of power vanishes; inf: it is 0."""

@@ -171,6 +171,7 @@ def check(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: b
 @click.option("--start", multiple=True, metavar="NAME=VALUE", help="A coordinate, or its velocity.")
 @click.option("--h", "h", type=float, help="Step size in s, instead of the scene's.")
 @click.option("--duration", type=float, help="In s, instead of the scene's.")
+@click.option("--method", help="A stepper that the scene asks for; its first where not given.")
 @click.option("--every", type=click.IntRange(1), default=1, help="Keep every so many steps.")
 @click.option(
     "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
@@ -180,8 +181,8 @@ def check(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: b
 @_JSON
 def run(
     scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str], h: float | None,
-    duration: float | None, every: int, out: Path | None, plot: Path | None, quiet: bool,
-    as_json: bool,
+    duration: float | None, method: str | None, every: int, out: Path | None,
+    plot: Path | None, quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Simulate a scene; print the end, the error and the speed.
 
@@ -189,12 +190,14 @@ def run(
     eomc run scenes/cartpole.toml --plot cartpole.png
     eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
     """
+    from eomc.steppers import METHODS
+
     _known_suffix(out, (".csv", ".npz"), "--out")
     _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
     with _status(f"building {scene.stem}", quiet or as_json):
         module = eomc.load(scene, root, warn=_warn)
     values, q0, qd0 = _overrides(scene, module, parameters, start)
-    options: dict[str, Any] = {"h": h, "duration": duration, "params": values}
+    options: dict[str, Any] = {"h": h, "duration": duration, "params": values, "method": method}
     try:
         with _progress("running", quiet or as_json) as progress:
             begun = time.perf_counter()
@@ -207,17 +210,24 @@ def run(
     error = None
     if done.status == "ok" and 0 < seconds < 2 and done.steps:
         halved = _simulated(
-            module, q0, qd0, h=done.h / 2, steps=2 * done.steps, every=2 * done.steps, params=values
+            module,
+            q0,
+            qd0,
+            h=done.h / 2,
+            steps=2 * done.steps,
+            every=2 * done.steps,
+            params=values,
+            method=method,
         )
         if halved.status == "ok":
-            error = _end_error(done, halved)
+            error = _end_error(done, halved, METHODS[method or module.methods[0]].order)
     if out:
         _write(out, module, done)
     if plot:
         from eomc import plot as plots
 
         plots.draw(eomc.read(scene).at(values), done.t, done.q, done.qd, done.energy, plot)
-    summary = _summary(module, done, seconds, error, plot=plot, out=out)
+    summary = _summary(module, method, done, seconds, error, plot=plot, out=out)
     if as_json:
         click.echo(json.dumps(summary, indent=1))
     elif not quiet:
@@ -370,17 +380,23 @@ def _simulated(module: Any, q0: Any, qd0: Any, **options: Any) -> Run:
         return done
 
 
-def _end_error(done: Run, halved: Run) -> dict[str, float]:
-    """The error of the last state, from the same run at half the step (order 4: 16/15)."""
+def _end_error(done: Run, halved: Run, order: int) -> dict[str, float]:
+    """The error of the last state, from the same run at half the step."""
     import numpy as np
 
-    q = float(np.max(np.abs(done.q[-1] - halved.q[-1]))) * 16 / 15
-    qd = float(np.max(np.abs(done.qd[-1] - halved.qd[-1]))) * 16 / 15
+    share = 2**order / (2**order - 1)
+    q = float(np.max(np.abs(done.q[-1] - halved.q[-1]))) * share
+    qd = float(np.max(np.abs(done.qd[-1] - halved.qd[-1]))) * share
     return {"q": q, "qd": qd}
 
 
 def _summary(
-    module: Any, done: Run, seconds: float, error: Mapping[str, float] | None, **files: Path | None
+    module: Any,
+    method: str | None,
+    done: Run,
+    seconds: float,
+    error: Mapping[str, float] | None,
+    **files: Path | None,
 ) -> dict[str, Any]:
     import numpy as np
 
@@ -389,7 +405,7 @@ def _summary(
         "scene": module._model.name,
         "status": done.status,
         "message": done.message,
-        "method": "rk4",
+        "method": method or module.methods[0],
         "h": done.h,
         "steps": done.steps,
         "t": float(done.t[-1]),
@@ -412,7 +428,8 @@ def _summary(
 
 def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
     click.echo(
-        f"{module.title}: {done.steps} steps of rk4, h = {done.h:g} s, to t = {done.t[-1]:g} s"
+        f"{module.title}: {done.steps} steps of {summary['method']}, h = {done.h:g} s, "
+        f"to t = {done.t[-1]:g} s"
     )
     wide = max(map(len, module.coordinates))
     for name, q, qd in zip(module.coordinates, done.q[-1], done.qd[-1], strict=True):

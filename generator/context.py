@@ -10,13 +10,17 @@ import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from importlib.resources import files
 from typing import Any
+
+from sympy import Rational
 
 from eomc import __version__, ccode
 from eomc.assignments import Function, evaluate, rename
 from eomc.ccode import DOUBLE, Body, Real, indent
 from eomc.program import TIME, Program, nearby
+from eomc.steppers import METHODS, RK4, Row
 from eomc.system import System
 
 # names that the templates use inside functions; a user's name that is one of them gets a "_"
@@ -367,22 +371,26 @@ class Context:
             "scalar": scalar,
             "lane": self._lane(function, takes_c) if s.run.batch else None,
             "rates_now": f"{self.prefix}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
-            "rk4_call": _after(t, "h", u, c, p),
+            "stepper_call": _after(t, "h", u, c, p),
+            "methods": [
+                _method(name, [c.name for c in s.coordinates], self.real) for name in s.run.methods
+            ],
+            "method_names": repr(s.run.methods),
             "t_call": _after(t),
             "p_call": _after(self._p_call),
             "acceleration_prototype": f"{self.prefix}_status {self.prefix}_acceleration("
             + self._arguments(
                 f"{real} qdd[{NQ}]", f"const {real} q[{NQ}]", f"const {real} qd[{NQ}]", t_arg, outer
             ) + ")",
-            "step_prototype": f"{self.prefix}_status {self.prefix}_rk4_step("
+            "step_prototype": lambda name: f"{self.prefix}_status {self.prefix}_{name}_step("
             + self._arguments(x, t_arg, f"{real} h", outer) + ")",
-            "run_prototype": f"long {self.prefix}_rk4_run("
+            "run_prototype": lambda name: f"long {self.prefix}_{name}_run("
             + self._arguments(
                 x, t0_arg, f"{real} h", "long first", "long steps",
                 u_arg and f"{u_arg}, long u_stride", rows, self._p_arg,
                 f"{self.prefix}_status *status",
             ) + ")",
-            "batch_prototype": f"void {self.prefix}_rk4_batch("
+            "batch_prototype": lambda name: f"void {self.prefix}_{name}_batch("
             + self._arguments(
                 "long count", f"{real} *q", f"{real} *qd", t0_arg, f"{real} h", "long first",
                 "long steps", u_arg and f"{u_arg}, long u_instance, long u_step",
@@ -400,7 +408,7 @@ class Context:
                 t, "h", u and "u ? u + (base + i)*u_instance + n*u_step : 0",
                 "&c" if takes_c else "", "p + (base + i)*p_instance" if takes_p else "",
             ),
-            "batch_binding": f"{self.prefix}_rk4_batch("
+            "batch_binding": lambda name: f"{self.prefix}_{name}_batch("
             + self._arguments(
                 "count", "q", "qd", t and "t0", "h", "first", "steps",
                 u and "u, u_instance, u_step", "every", "q_rows", "qd_rows", "row_count",
@@ -410,7 +418,7 @@ class Context:
         }  # fmt: skip
 
     def _mode(self, function: Function, body: Body, takes_c: bool, takes_p: bool) -> dict[str, Any]:
-        """solve, rates and rk4 for one trajectory: they return whether D was positive definite."""
+        """solve, rates and steppers for one trajectory: they return whether D was regular."""
         s, real, P = self.system, self.real.name, self.prefix
         timed, u = TIME in function.uses, bool(s.inputs)
         inline = "inline " if function.cost.flops <= LARGE else ""
@@ -432,14 +440,14 @@ class Context:
             "inline": f"static {inline}",
             "solve": "solve",
             "rates": "rates" if u else "solve",
-            "rk4": "rk4",
+            "suffix": "",
             "solve_arguments": self._arguments(
                 f"{P}_vector *a", state, f"{real} t" if timed else "", u_arg, c_arg
             ),
             "solve_u": _after("t" if timed else "", "u", c),
             "solve_now": _after("t" if timed else "", "now", c),
             "rates_arguments": self._arguments(f"{P}_vector *a", state, t_arg, u_arg, c_arg, p_arg),
-            "rk4_arguments": self._arguments(
+            "stepper_arguments": self._arguments(
                 f"{P}_vector *r, {P}_vector *v, {state}", t_arg, f"{real} h", u_arg, c_arg, p_arg
             ),
             "unused": self._unread(function),
@@ -512,7 +520,7 @@ class Context:
             "inline": inline + " ",
             "solve": "solve_lane",
             "rates": "rates_lane" if s.inputs else "solve_lane",
-            "rk4": "rk4_lane",
+            "suffix": "_lane",
             "solve_arguments": self._arguments(
                 f"{P}_vector *a", state, f"{real} t" if timed else "", u_arg, c_arg, trouble
             ),
@@ -520,11 +528,11 @@ class Context:
             "rates_arguments": self._arguments(
                 f"{P}_vector *a", state, t_arg, u_arg, "int held", c_arg, trouble
             ),
-            "rk4_arguments": self._arguments(
+            "stepper_arguments": self._arguments(
                 f"{P}_vector *r, {P}_vector *v, {state}", t_arg, f"{real} h",
                 u_arg and f"{u_arg}, int held", c_arg, trouble,
             ),
-            "rk4_call": _after(
+            "stepper_call": _after(
                 "t" if self.driven else "", "h", "&u, held" if s.inputs else "",
                 "&c" if takes_c else "", "&trouble",
             ),
@@ -646,7 +654,7 @@ class Context:
             "acceleration_binding": f"{self.prefix}_acceleration("
             + self._arguments(f"out + {NQ}*k", f"q + {NQ}*k", f"qd + {NQ}*k", t, u, self._p_cast)
             + ")",
-            "run_binding": f"{self.prefix}_rk4_run("
+            "run_binding": lambda name: f"{self.prefix}_{name}_run("
             + self._arguments(
                 "q", "qd", "t0" if t else "", "h", "first", "steps", u and "u, u_stride",
                 "every", "q_rows", "qd_rows", self._p_cast, "&found",
@@ -669,6 +677,46 @@ class Context:
 def _after(*parts: str) -> str:
     """What follows in an argument list, each part with its comma."""
     return "".join(f", {part}" for part in parts if part)
+
+
+def _method(name: str, coordinates: Sequence[str], real: Real) -> dict[str, Any]:
+    """A stepper as its template wants it; RK4 has one of its own, written out by hand."""
+    m = METHODS[name]
+
+    def number(x: Fraction) -> str:
+        return ccode.number(Rational(x.numerator, x.denominator), real)
+
+    def total(row: Row, of: str) -> str:
+        terms = [(x, k + 1) for k, x in enumerate(row) if x]
+        text = " + ".join(f"{number(x)}*a{k}.{of}" for x, k in terms).replace("+ -", "- ")
+        return text or number(Fraction(0))
+
+    def lines(c: Fraction, positions: Row, velocities: Row) -> list[str]:
+        step = "h" if c == 1 else f"{number(c)}*h"
+        return [
+            line
+            for x in coordinates
+            for line in (
+                f"r->{x} = q->{x} + ({step}*qd->{x} + hh*({total(positions, x)}));",
+                f"v->{x} = qd->{x} + h*({total(velocities, x)});",
+            )
+        ]
+
+    stages = [] if m is RK4 else list(zip(m.c, m.a_squared, m.a, strict=True))[1:]
+    return {
+        "name": m.name,
+        "title": m.title,
+        "order": m.order,
+        "source": m.source,
+        "stages": m.stages,
+        "limits": m.limits,
+        "template": "rk4.c.jinja" if m is RK4 else "explicit.c.jinja",
+        "body": [
+            {"lines": lines(c, *rows), "time": "t + h" if c == 1 else f"t + {number(c)}*h"}
+            for c, *rows in stages
+        ],
+        "end": lines(Fraction(1), m.b_a, m.b),
+    }
 
 
 def _in_prepared(name: str) -> str:

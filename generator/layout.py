@@ -9,7 +9,7 @@ import pydantic
 
 from eomc.formulas import nearest
 
-METHODS = ("rk4",)
+METHODS = ("rk4", "dp8")
 REALS = ("double", "float")
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
@@ -48,10 +48,23 @@ class _Energy(_Table):
     dissipation: _Value = 0.0
 
 
+def _listed(value: object) -> object:
+    """`method = "rk4"` says the same as `method = ["rk4"]`; the first is what runs use."""
+    if isinstance(value, list) and value:
+        return tuple(dict.fromkeys(map(str, value)))
+    return (value,)
+
+
+_Methods = Annotated[
+    tuple[Literal[METHODS], ...],  # type: ignore[valid-type]
+    pydantic.BeforeValidator(_listed),
+]
+
+
 class _Run(_Table):
     h: _Positive = 0.001
     duration: _Positive = 10.0
-    method: Literal[METHODS] = "rk4"  # type: ignore[valid-type]
+    method: _Methods = ("rk4",)
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
 
@@ -160,7 +173,7 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
         return f"format {here} is not known to this version, which reads eomc = 1"
     if kind == "too_short":
         return 'none is declared: add at least one, such as x = { unit = "m", start = 0.0 }'
-    if path == ("run", "method"):
+    if path[:2] == ("run", "method"):
         return f"unknown method {here}: known are {', '.join(METHODS)}"
     if path == ("run", "real"):
         return f"unknown type {here}: known are {', '.join(REALS)}"

@@ -153,7 +153,7 @@ class Model:
         coordinates: Mapping[str, str], parameters: Mapping[str, float],
         inputs: Mapping[str, str], units: Mapping[str, str],
         start: tuple[Sequence[float], Sequence[float]], h: float, duration: float,
-        timed: Sequence[str], digest: str,
+        timed: Sequence[str], methods: Sequence[str], digest: str,
     ) -> None:  # fmt: skip
         self._ffi, self._lib = extension.ffi, extension.lib
         self._ctype = {"float64": "double[]", "float32": "float[]"}[dtype]
@@ -168,6 +168,7 @@ class Model:
         self._start = tuple(np.array(x, self.dtype) for x in start)
         self._p0 = np.array(list(parameters.values()), self.dtype)
         self._timed = frozenset(timed)
+        self.methods = tuple(methods)
         self._told = False
         names = {
             "_names": self.parameters,
@@ -395,9 +396,10 @@ class Model:
 
     def step(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
-        params: Parameters = None, out: tuple[Array, Array] | None = None,
+        params: Parameters = None, method: str | None = None,
+        out: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """(q, qd) one Runge-Kutta step of size h later; u is held over the step.
+        """(q, qd) one step of size h later; u is held over the step.
 
         u None: the scene's signals, followed through the step. Raises MotionError where the step
         can't be made; `out` is untouched then.
@@ -407,7 +409,7 @@ class Model:
             raise ValueError(f"q: shape {at.shape}, expected ({self.nq},)")
         at, moving = at.copy(), moving.copy()
         status = self._ffi.new("int *")
-        self._lib.rk4_run(
+        self._stepper(method, "run")(
             self._pointer(at), self._pointer(moving), self._time(t), self._size(h), 0, 1,
             self._pointer(self._inputs(u)), 0, 0, self._ffi.NULL, self._ffi.NULL,
             self._pointer(self._parameters(params)), status,
@@ -422,6 +424,15 @@ class Model:
         into = self._out(out[0], at.shape), self._out(out[1], at.shape)
         into[0][...], into[1][...] = at, moving
         return into
+
+    def _stepper(self, method: str | None, what: str) -> Any:
+        """The C function of a method: its run, or its batch."""
+        if method is not None and method not in self.methods:
+            raise ValueError(
+                f"method: {method!r} is not in this module, which has {', '.join(self.methods)}: "
+                "a scene asks for several with a list, [run] method = [...]"
+            )
+        return getattr(self._lib, f"{method or self.methods[0]}_{what}")
 
     def _size(self, h: float | None) -> float:
         h = self.h if h is None else float(h)
@@ -445,7 +456,7 @@ class Model:
     def simulate(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
-        u: Inputs = None, params: Parameters = None, method: str = "rk4", *, t0: float = 0.0,
+        u: Inputs = None, params: Parameters = None, method: str | None = None, *, t0: float = 0.0,
         out: tuple[Array, Array] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Run:  # fmt: skip
@@ -453,14 +464,14 @@ class Model:
 
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration.
         every: a row is kept of every so many steps, and the first and last state always.
+        method: one of `methods`, the first of them where None.
         u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; or
         a function u(t, q, qd) called before each step, which is some hundred times slower.
         out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
-        if method != "rk4":
-            raise ValueError(f"method: {method!r} is not in this module: rk4 is")
+        run = self._stepper(method, "run")
         q, qd = self.start
         if q0 is not None:
             q = self._array(q0, "q0", self.nq).copy()
@@ -494,7 +505,6 @@ class Model:
         rows_q, rows_qd = self._pointer(q_rows), self._pointer(qd_rows)
         done, said = 0, "ok"
         chunk = 1 if law else min(steps, max(1, 4096 // self.nq))
-        run = self._lib.rk4_run
         try:
             while done < steps:
                 if law:

@@ -63,13 +63,13 @@ class Input:
 class Run:
     """How the scene is run unless the caller says otherwise: step size h and duration in s.
 
-    real: the C type that everything is computed in. batch: whether many trajectories at once are
-    wanted.
+    methods: the steppers wanted, the one that runs use first. real: the C type that everything
+    is computed in. batch: whether many trajectories at once are wanted.
     """
 
     h: float = 0.001
     duration: float = 10.0
-    method: str = "rk4"
+    methods: tuple[str, ...] = ("rk4",)
     real: str = "double"
     batch: bool = False
 

@@ -156,6 +156,7 @@ class System:
         title: str = "",
         h: float = 0.001,
         duration: float = 10.0,
+        methods: Sequence[str] = ("rk4",),
         real: str = "double",
         batch: bool = False,
     ) -> System:
@@ -175,7 +176,8 @@ class System:
         """
         return _Maker(name).make(
             coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
-            inputs, definitions or {}, units or {}, title, Run(h, duration, real=real, batch=batch),
+            inputs, definitions or {}, units or {}, title,
+            Run(h, duration, tuple(methods), real, batch),
         )  # fmt: skip
 
 

@@ -1,0 +1,153 @@
+"""Explicit Runge-Kutta methods: coefficients as exact fractions, and what is known of each.
+
+For q'' = a(q, qd, t) a stage needs accelerations only: with A c = the rows' sums,
+
+    Q_i = q + c_i h qd + h^2 sum_k (A A)_ik a_k        r = q  + h qd + h^2 sum_k (b A)_k a_k
+    V_i = qd + h sum_k A_ik a_k                        v = qd + h sum_k b_k a_k
+
+(Hairer, Norsett & Wanner, *Solving Ordinary Differential Equations I*, sec. II.14).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+
+Row = tuple[Fraction, ...]
+
+
+@dataclass(frozen=True)
+class Method:
+    """An explicit method of fixed step: `a` below the diagonal, `b` the weights, c their nodes.
+
+    limits: the largest h omega of an undamped and h lambda of a decaying motion.
+    """
+
+    name: str
+    title: str
+    order: int
+    source: str
+    limits: tuple[float, float]
+    a: tuple[Row, ...]
+    b: Row
+
+    @property
+    def stages(self) -> int:
+        """Accelerations a step."""
+        return len(self.b)
+
+    @property
+    def c(self) -> Row:
+        """The nodes, sum_k a_ik."""
+        return tuple(sum(row, Fraction(0)) for row in self.a)
+
+    @property
+    def a_squared(self) -> tuple[Row, ...]:
+        """A A: what accelerations add to the positions of the stages, over h^2."""
+        return tuple(_times(row, self.a) for row in self.a)
+
+    @property
+    def b_a(self) -> Row:
+        """b A: what they add to the position at the end, over h^2."""
+        return _times(self.b, self.a)
+
+
+def _times(row: Row, a: tuple[Row, ...]) -> Row:
+    """The product of a row and the matrix `a`."""
+    n = len(a)
+    padded = [[*r, *([Fraction(0)] * (n - len(r)))] for r in a]
+    return tuple(sum((x * padded[j][k] for j, x in enumerate(row)), Fraction(0)) for k in range(n))
+
+
+def _sparse(text: str) -> tuple[Row, ...]:
+    """Rows of a triangle from lines `i k value`; what is not given is zero."""
+    given = {(int(i), int(k)): Fraction(x) for i, k, x in map(str.split, text.strip().splitlines())}
+    last = max(i for i, _ in given)
+    return tuple(tuple(given.get((i, k), Fraction(0)) for k in range(i)) for i in range(last + 1))
+
+
+RK4 = Method(
+    name="rk4",
+    title="the classical Runge-Kutta method",
+    order=4,
+    source="Hairer, Norsett & Wanner, Solving ODEs I, table II.1.2",
+    limits=(2.83, 2.79),
+    a=_sparse("1 0 1/2\n2 1 1/2\n3 2 1"),
+    b=(Fraction(1, 6), Fraction(1, 3), Fraction(1, 3), Fraction(1, 6)),
+)
+
+# row 12 holds the weights
+_DP8 = _sparse(
+    """
+    1 0 5.26001519587677318785587544488e-2
+    2 0 1.97250569845378994544595329183e-2
+    2 1 5.91751709536136983633785987549e-2
+    3 0 2.95875854768068491816892993775e-2
+    3 2 8.87627564304205475450678981324e-2
+    4 0 2.41365134159266685502369798665e-1
+    4 2 -8.84549479328286085344864962717e-1
+    4 3 9.24834003261792003115737966543e-1
+    5 0 3.7037037037037037037037037037e-2
+    5 3 1.70828608729473871279604482173e-1
+    5 4 1.25467687566822425016691814123e-1
+    6 0 3.7109375e-2
+    6 3 1.70252211019544039314978060272e-1
+    6 4 6.02165389804559606850219397283e-2
+    6 5 -1.7578125e-2
+    7 0 3.70920001185047927108779319836e-2
+    7 3 1.70383925712239993810214054705e-1
+    7 4 1.07262030446373284651809199168e-1
+    7 5 -1.53194377486244017527936158236e-2
+    7 6 8.27378916381402288758473766002e-3
+    8 0 6.24110958716075717114429577812e-1
+    8 3 -3.36089262944694129406857109825
+    8 4 -8.68219346841726006818189891453e-1
+    8 5 2.75920996994467083049415600797e1
+    8 6 2.01540675504778934086186788979e1
+    8 7 -4.34898841810699588477366255144e1
+    9 0 4.77662536438264365890433908527e-1
+    9 3 -2.48811461997166764192642586468
+    9 4 -5.90290826836842996371446475743e-1
+    9 5 2.12300514481811942347288949897e1
+    9 6 1.52792336328824235832596922938e1
+    9 7 -3.32882109689848629194453265587e1
+    9 8 -2.03312017085086261358222928593e-2
+    10 0 -9.3714243008598732571704021658e-1
+    10 3 5.18637242884406370830023853209
+    10 4 1.09143734899672957818500254654
+    10 5 -8.14978701074692612513997267357
+    10 6 -1.85200656599969598641566180701e1
+    10 7 2.27394870993505042818970056734e1
+    10 8 2.49360555267965238987089396762
+    10 9 -3.0467644718982195003823669022
+    11 0 2.27331014751653820792359768449
+    11 3 -1.05344954667372501984066689879e1
+    11 4 -2.00087205822486249909675718444
+    11 5 -1.79589318631187989172765950534e1
+    11 6 2.79488845294199600508499808837e1
+    11 7 -2.85899827713502369474065508674
+    11 8 -8.87285693353062954433549289258
+    11 9 1.23605671757943030647266201528e1
+    11 10 6.43392746015763530355970484046e-1
+    12 0 5.42937341165687622380535766363e-2
+    12 5 4.45031289275240888144113950566
+    12 6 1.89151789931450038304281599044
+    12 7 -5.8012039600105847814672114227
+    12 8 3.1116436695781989440891606237e-1
+    12 9 -1.52160949662516078556178806805e-1
+    12 10 2.01365400804030348374776537501e-1
+    12 11 4.47106157277725905176885569043e-2
+    """
+)
+DP8 = Method(
+    name="dp8",
+    title="the method of Dormand and Prince of order 8",
+    order=8,
+    source="Hairer, Norsett & Wanner, Solving ODEs I, sec. II.10, the 8th-order weights of DOP853",
+    limits=(5.96, 6.39),
+    a=_DP8[:12],
+    b=_DP8[12],
+)
+
+METHODS: Mapping[str, Method] = {m.name: m for m in (RK4, DP8)}
