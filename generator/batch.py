@@ -213,7 +213,8 @@ class _Work:
 
     def __init__(
         self, model: BatchModel, step: Any, q: Array, qd: Array, h: float, t0: float,
-        steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None, qd_rows: Array | None,
+        steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None,
+        qd_rows: Array | None,
     ) -> None:  # fmt: skip
         self.model, self.step, self.q, self.qd = model, step, q, qd
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
