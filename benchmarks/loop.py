@@ -66,9 +66,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=2000)
     options = parser.parse_args()
-    print(
-        f"{'one RK4 step':20} {'C':>11} {'Python':>11} {'ratio':>8} {'difference':>12} {'error':>12}"
-    )
+    columns = f"{'C':>11} {'Python':>11} {'ratio':>8} {'difference':>12} {'error':>12}"
+    print(f"{'one RK4 step':20} {columns}")
     with tempfile.TemporaryDirectory() as root:
         for scene in options.scenes:
             loop(scene, root, options.rounds, options.steps)
