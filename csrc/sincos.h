@@ -34,9 +34,17 @@
 #define EOMC_FAST_FMA 0
 #endif
 
+/* Inlined for certain: gcc would stop at some ten of them in one loop, and the loop would no longer
+ * be put into vector registers. */
+#ifdef __GNUC__
+#define EOMC_INLINE static inline __attribute__((always_inline))
+#else
+#define EOMC_INLINE static inline
+#endif
+
 /* a b + c: one rounding where the hardware has it, two elsewhere.  It is written out
  * so that the compiler finds nothing left to contract in one build and not in another. */
-static inline double eomc_mul_add(double a, double b, double c)
+EOMC_INLINE double eomc_mul_add(double a, double b, double c)
 {
 #if EOMC_FAST_FMA
     return fma(a, b, c);
@@ -46,7 +54,7 @@ static inline double eomc_mul_add(double a, double b, double c)
 }
 
 /* s = sin x, c = cos x for |x| <= 2^20; anything else gives nonsense. */
-static inline void eomc_sincos_small(double x, double *s, double *c)
+EOMC_INLINE void eomc_sincos_small(double x, double *s, double *c)
 {
     /* Doubles next to 1.5 2^52 are 1 apart, so adding it and taking it off again rounds to the
      * nearest integer; 1.5, not 1, leaves room for negative ones. */

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
-from sympy import Expr, S
+import mpmath
+from sympy import Expr, Rational, S
 
 from eomc.tape import Stage
 
@@ -158,11 +160,14 @@ def renamed_value(value: Value, real: Callable[[str], str]) -> Value:
 
 # --- evaluation in Python -----------------------------------------------------------------------
 
-_PYTHON: Mapping[str, Callable[..., float]] = {
-    **{n: getattr(math, n) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")},
-    **{n: getattr(math, n) for n in ("sinh", "cosh", "tanh", "exp", "log", "sqrt", "pow")},
+_NAMES = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt".split()
+
+_DOUBLES: Mapping[str, Callable[..., Any]] = {
+    **{name: getattr(math, name) for name in _NAMES},
+    "number": float,
+    "pow": math.pow,
     "abs": abs,
-    "sign": lambda x: float((x > 0) - (x < 0)),
+    "sign": lambda x: (x > 0) - (x < 0),
     "heaviside": lambda x: 0.5 + 0.5 * ((x > 0) - (x < 0)),
     "min": min,
     "max": max,
@@ -170,26 +175,46 @@ _PYTHON: Mapping[str, Callable[..., float]] = {
 }
 
 
-def evaluate(function: Function, values: Mapping[str, float]) -> tuple[list[float], bool]:
-    """The results of a function, and whether every pivot is positive; all in Python floats.
+def _many_digits() -> Mapping[str, Callable[..., Any]]:
+    """The same in 40 digits."""
+    mp = mpmath.mp.clone()
+    mp.dps = 40
+    return {
+        **_DOUBLES,
+        **{name: getattr(mp, name) for name in _NAMES},
+        "number": lambda x: mp.mpf(x.p) / x.q if isinstance(x, Rational) else mp.mpf(x.evalf(40)),
+        "pow": mp.power,
+    }
 
-    values: coordinates, velocities, parameters, inputs and t by name. Raises ArithmeticError or
-    ValueError where a result is not a finite number.
+
+def evaluate(
+    function: Function, values: Mapping[str, float], exact: bool = False
+) -> tuple[list[float], bool]:
+    """The results of a function, and whether every pivot is positive.
+
+    values: coordinates, velocities, parameters, inputs and t by name. In Python floats, or in 40
+    digits and then rounded where `exact`. Raises ArithmeticError or ValueError where a result is
+    not a finite, real number.
     """
-    known = dict(values)
+    of = _many_digits() if exact else _DOUBLES
+    number = of["number"]
+    known: dict[str, Any] = dict(values)
 
-    def operand(o: Operand) -> float:
-        return float(o.coefficient) * (known[o.name] if o.name else 1.0)
+    def operand(o: Operand) -> Any:
+        return number(o.coefficient) * known[o.name] if o.name else number(o.coefficient)
 
     for a in (*function.early, *function.body):
         v = a.value
         if isinstance(v, Sum):
-            known[a.name] = float(v.constant) + sum(float(w) * known[n] for w, n in v.terms)
+            known[a.name] = sum((number(w) * known[n] for w, n in v.terms), number(v.constant))
         elif isinstance(v, Product):
-            known[a.name] = float(v.coefficient) * math.prod(known[n] for n in v.factors)
+            known[a.name] = math.prod((known[n] for n in v.factors), start=number(v.coefficient))
         else:
-            known[a.name] = _PYTHON[v.function](*map(operand, v.args))
-    results = [operand(o) for o in function.outputs]
+            known[a.name] = of[v.function](*map(operand, v.args))
+    try:
+        results = [float(operand(o)) for o in function.outputs]
+    except TypeError:  # a complex number
+        raise ValueError(f"{function.name} is not real") from None
     if not all(map(math.isfinite, results)):
         raise ValueError(f"{function.name} is not finite")
     tolerance = 8 * 2.0**-52 * max(1, len(function.checks))

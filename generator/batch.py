@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .runtime import STATUS, Array, Interrupted, Model, Params
+from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number
 
 _GROUP = 64  # instances in a tile, or a multiple of those in one
 _WORTH = 20_000  # steps in all from which threads pay
@@ -73,10 +73,9 @@ class BatchModel(Model):
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
         """
         step = self._stepper(method, "batch")
-        h, t0 = self._size(h), self._time(t0)
+        h, t0 = self._size(h), _number(t0, "t0")
         steps = self._steps(h, duration, steps)
-        if every != int(every) or every < 1:
-            raise ValueError(f"every: {every} is not a positive number of steps")
+        every = _count(every, "every", 1)
         q, qd, table, held, count = self._instances(q0, qd0, params, u, steps)
         rows = 1 + steps // every + (steps % every > 0)
         try:
@@ -88,7 +87,7 @@ class BatchModel(Model):
                 "keep fewer with every="
             ) from None
         q_rows[:, 0], qd_rows[:, 0] = q, qd
-        work = _Work(self, step, q, qd, h, t0, steps, int(every), held, table, q_rows, qd_rows)
+        work = _Work(self, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows)
         whole = work.run(threads, progress)
         status = np.array([*STATUS, "interrupted"])[work.status]
         kept = 1 + work.done // every + (work.done % every > 0)
@@ -120,17 +119,14 @@ class BatchModel(Model):
         """
         step = self._stepper(method, "batch")
         if out is not None:
-            into = (
-                self._out(out[0], np.shape(q), "out[0]"),
-                self._out(out[1], np.shape(qd), "out[1]"),
-            )
+            into = self._pair(out, np.shape(q))
             into[0][...], into[1][...] = q, qd
             q, qd = into
         for name, x in (("q", q), ("qd", qd)):
             self._out(x, (len(x), self.nq), name)
         if len(q) != len(qd):
             raise ValueError(f"qd: {len(qd)} instances where q has {len(q)}")
-        h, t = self._size(h), self._time(t)
+        h, t = self._size(h), _number(t, "t")
         table, held = self._parameter_rows(params), self._input_rows(u, 1)
         for name, given in (("params", table), ("u", held)):
             if given is not None and len(given) not in (1, len(q)):

@@ -216,7 +216,7 @@ def body(
         else:
             early_lines.append(f"const {real.name} {a.name} = {text};")
     early = {a.name for a in function.early}
-    is_early = [c[0].name in early or c[0].name in where or not c[0].name for c in function.checks]
+    is_early = [not c[0].name or c[0].name in {*early, *parameters} for c in function.checks]
     checks = [(e, pair) for e, pair in zip(is_early, function.checks, strict=True)]
     early_failures = tuple(_fails(printer, pair, tolerance) for e, pair in checks if e)
     if keep is not None:

@@ -456,7 +456,9 @@ class _Check:
         off_time = self.units(run.t, t, np.abs(t) + self.system.run.h)
         return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
 
-    def _simulate(self, s: State, **how: Any) -> Any:
+    def _simulate(self, s: State, method: str = "", **how: Any) -> Any:
+        if method and method != self.methods[0]:
+            how["method"] = method
         return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
 
     def run_energy(self) -> float:

@@ -155,11 +155,13 @@ def build(
     if found(folder, wanted):
         return Built(name, folder, False)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        root.mkdir(parents=True, exist_ok=True)
         with _locked(root / f".{name}.lock"):
             if found(folder, wanted):  # by another process, meanwhile
                 return Built(name, folder, False)
-            with tempfile.TemporaryDirectory(dir=root, prefix=f".{name}.") as beside:
+            for left in root.glob(f".{name}.build-*"):  # by a build that was killed
+                shutil.rmtree(left, ignore_errors=True)
+            with tempfile.TemporaryDirectory(dir=root, prefix=f".{name}.build-") as beside:
                 _build(name, wanted, sources, folder, Path(beside))
     except OSError as fault:
         raise EomcError(
@@ -199,6 +201,7 @@ def _build(
         "files": {file: (beside / file).stat().st_size for file in kept},
     }
     (beside / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    folder.mkdir(exist_ok=True)
     stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
     # the face last: until it is there, the old one is whole; the manifest after it
     for file in [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST]:
@@ -224,8 +227,12 @@ def _compile(made: Sources, extension: str, folder: Path, library: str) -> None:
         [*common, "-O1", *include, "-c", "binding.c", "-o", "binding.o"],
     ]
     running = [(job, _start(job, folder)) for job in jobs]
-    for job, process in running:
-        _finish(name, job, process)
+    try:
+        for job, process in running:
+            _finish(name, job, process)
+    finally:
+        for _, process in running:  # none goes on where another failed
+            process.kill()
     link = [*compiler.command, "-shared", "scene.o", "binding.o", "-lm", "-o", library]
     if sys.platform == "darwin":
         link.insert(1, "-undefined")
@@ -243,12 +250,7 @@ def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
 
 
 def _finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) -> None:
-    try:
-        words, _ = process.communicate()
-    except BaseException:
-        process.kill()
-        process.wait()
-        raise
+    words, _ = process.communicate()
     if process.returncode:
         raise EomcError(
             f"{name}: the C compiler failed (status {process.returncode}):\n"

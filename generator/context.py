@@ -129,6 +129,7 @@ class Context:
             "dtype": real.dtype,
             "lit": lambda text: text + real.suffix,
             "stamp": self._stamp(),
+            "stamp_lines": textwrap.wrap(self._stamp(), 92, break_on_hyphens=False),
             "handshake": f"0x{s.digest[:8]}u",
             "digest": s.digest,
             "notes": [line for note in self.program.notes for line in textwrap.wrap(note, 92)],
@@ -369,7 +370,7 @@ class Context:
             "takes_c": takes_c,
             "cost": _sentence(function),
             "scalar": scalar,
-            "lane": self._lane(function, takes_c) if s.run.batch else None,
+            "lane": self._lane(function, kept) if s.run.batch else None,
             "rates_now": f"{self.prefix}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
             "stepper_call": _after(t, "h", u, c, p),
             "methods": [
@@ -407,6 +408,11 @@ class Context:
             "retry_call": _after(
                 t, "h", u and "u ? u + (base + i)*u_instance + n*u_step : 0",
                 "&c" if takes_c else "", "p + (base + i)*p_instance" if takes_p else "",
+            ),
+            "tile_prototype": lambda name: (
+                f"{self.PREFIX}_LANE {real} {self.prefix}_{name}_tile_step("
+                + self._arguments(f"{self.prefix}_tile *s", t_arg, f"{real} h", u and "int held")
+                + ")"
             ),
             "batch_binding": lambda name: f"{self.prefix}_{name}_batch("
             + self._arguments(
@@ -466,12 +472,14 @@ class Context:
             "own_signal": None,
         }
 
-    def _lane(self, function: Function, takes_c: bool) -> dict[str, Any]:
+    def _lane(self, function: Function, kept: Sequence[str]) -> dict[str, Any]:
         """The same for one of many: no branches; what goes wrong is noted in *trouble."""
         s, real, P = self.system, self.real.name, self.prefix
         body = self._body(
             function, keep=_in_prepared, parameters=[p.name for p in s.parameters], lane=True
         )
+        takes_c, held = bool(kept), bool(s.inputs)
+        names = [c.name for c in s.coordinates]
         mode = self._mode(function, body, takes_c, False)
         trouble, u_arg = f"{real} *trouble", f"const {P}_inputs *u" if s.inputs else ""
         c, inline = "c" if takes_c else "", f"{self.PREFIX}_LANE"
@@ -544,7 +552,23 @@ class Context:
             "and": "",
             "last": "",
             "own_signal": signal,
+            "from_tile": [
+                self._gathered("vector", "q", "s->q_", names),
+                self._gathered("vector", "qd", "s->qd_", names),
+                *([self._gathered("inputs", "u", "s->u_", [i.name for i in s.inputs])] * held),
+                *([self._gathered("prepared", "c", "s->c_", kept)] * takes_c),
+            ],
+            "from_tile_again": [
+                self._gathered("vector", "at", "s.q_", names),
+                self._gathered("vector", "moving", "s.qd_", names),
+                *([self._gathered("prepared", "c", "s.c_", kept)] * takes_c),
+            ],
         }  # fmt: skip
+
+    def _gathered(self, what: str, name: str, arrays: str, members: Sequence[str]) -> str:
+        """A struct of one instance, put together from a tile's arrays."""
+        inside = ", ".join(f"{arrays}{member}[i]" for member in members)
+        return f"const {self.prefix}_{what} {name} = {{ {inside} }};"
 
     def _tile(self, kept: int) -> int:
         """Instances side by side: 64, fewer where their states would not stay in the L1 cache."""

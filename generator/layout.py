@@ -129,6 +129,8 @@ def has(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
 def place(error: Mapping[str, Any]) -> tuple[str, ...]:
     """pydantic's place without the branch of a union."""
     path = tuple(map(str, error["loc"]))
+    if path[:2] == ("run", "method"):  # whichever of a list
+        return path[:2]
     branch = path[-1] in ("float", "str") and error["type"] in _OF_BRANCHES
     return path[:-1] if branch else path
 

@@ -25,7 +25,7 @@ Vector = NDArray[np.float64]
 
 SCALARS = ("kinetic", "potential", "energy", "jacobi", "power")
 
-SIMPLIFIED_SIZE = 300  # operations; SymPy takes seconds beyond
+SIMPLIFIED_WORK = 200_000  # squares of operations, added up: a few seconds of SymPy
 
 
 def derive(system: System) -> Reference:
@@ -211,9 +211,19 @@ class Reference:
         return np.array(times), np.array(qs), np.array(qds)
 
     def simplified(self) -> Reference:
-        """The same in shorter forms, for people to read; entries of over 300 operations stay."""
-        D, C, g, tau = (getattr(self, name).applyfunc(_shorter) for name in ("D", "C", "g", "tau"))
-        K, P, jacobi, power = map(_shorter, (self.kinetic, self.potential, self.jacobi, self.power))
+        """The same in shorter forms, for people to read; what would take SymPy long stays."""
+        names = ("D", "C", "g", "tau")
+        entries = {e for name in names for e in getattr(self, name)}
+        entries |= {self.kinetic, self.potential, self.jacobi, self.power}
+        short: dict[Expr, Expr] = {}
+        left = SIMPLIFIED_WORK
+        for e in sorted(entries, key=lambda e: (e.count_ops(), str(e))):
+            left -= e.count_ops() ** 2
+            short[e] = _shorter(e) if left > 0 else e
+        D, C, g, tau = (getattr(self, name).applyfunc(short.__getitem__) for name in names)
+        K, P, jacobi, power = map(
+            short.__getitem__, (self.kinetic, self.potential, self.jacobi, self.power)
+        )
         return replace(
             self, D=D, C=C, g=g, bias=C * ImmutableMatrix(self.system.qd) + g, tau=tau,
             kinetic=K, potential=P, energy=K + P, jacobi=jacobi, power=power,
@@ -294,7 +304,5 @@ _JUMPS = {"sign": _sign, "Heaviside": _heaviside, "DiracDelta": _dirac_delta}
 
 def _shorter(e: Expr) -> Expr:
     """The shorter of `e` and its expanded, trigonometrically simplified, factored form."""
-    if e.count_ops() > SIMPLIFIED_SIZE:
-        return e
     short = sympy.factor_terms(sympy.trigsimp(sympy.expand(e)))
     return min((e, short), key=lambda form: form.count_ops())

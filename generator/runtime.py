@@ -28,6 +28,7 @@ _SAID = {
     "or the motion runs into a singularity",
     "interrupted": "interrupted",
 }
+_OF_POSITION = ("D", "g", "potential_energy")
 _CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
 
 
@@ -115,16 +116,15 @@ class Params:
     __slots__ = ("_array",)  # a parameter's name begins with a letter
     _array: Array
 
-    def __init__(self, **values: float) -> None:
+    def __init__(self, /, **values: float) -> None:
         object.__setattr__(self, "_array", np.array(self._defaults, self._dtype))
         for name, value in values.items():
-            setattr(self, name, value)
+            self._set(name, value)
 
-    def _index(self, name: str) -> int:
-        try:
-            return self._names.index(name)
-        except ValueError:
-            raise ValueError(_unknown("params", name, self._names)) from None
+    def _set(self, name: str, value: float) -> None:
+        if name not in self._names:
+            raise ValueError(_unknown("params", name, self._names))
+        self._array[self._names.index(name)] = _number(value, f"params: {name}")
 
     def __getattr__(self, name: str) -> float:
         if name not in self._names:
@@ -132,10 +132,7 @@ class Params:
         return float(self._array[self._names.index(name)])
 
     def __setattr__(self, name: str, value: float) -> None:
-        number = float(value)
-        if not np.isfinite(number):
-            raise ValueError(f"params: {name} = {value} is not a finite number")
-        self._array[self._index(name)] = number
+        self._set(name, value)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -175,7 +172,7 @@ class Model:
             "_defaults": tuple(parameters.values()),
             "_dtype": dtype,
         }
-        self.Params = type("Params", (Params,), {**names, "__slots__": ()})
+        self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -213,13 +210,20 @@ class Model:
     def _parameters(self, params: Any) -> Array:
         if params is None:
             return self._p0
-        if isinstance(params, Params):
-            if params._names != self.parameters:
-                raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
-            return params._array
+        if isinstance(params, self.Params):
+            values: Array = params._array
+            return values
+        if hasattr(params, "_names"):  # Params of another module
+            raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
         if isinstance(params, Mapping):
-            return np.asarray(self.Params(**params)._array)
-        array = np.ascontiguousarray(params, self.dtype)
+            given = self.Params()
+            for name, value in params.items():
+                given._set(name, value)
+            return np.asarray(given._array)
+        try:
+            array = np.ascontiguousarray(params, self.dtype)
+        except (TypeError, ValueError):
+            array = np.empty(0, self.dtype)
         if array.shape != self._p0.shape or not np.isfinite(array).all():
             raise ValueError(
                 f"params: expected a dict, Params or {len(self._p0)} finite numbers in the order "
@@ -250,10 +254,13 @@ class Model:
         array: Array = out
         return array
 
-    def _time(self, t: float) -> float:
-        if not np.isfinite(t):
-            raise ValueError(f"t: {t} is not a finite number")
-        return float(t)
+    def _pair(self, out: Any, shape: tuple[int, ...]) -> tuple[Array, Array]:
+        """Arrays for positions and velocities: those given, or new ones."""
+        if out is None:
+            return np.empty(shape, self.dtype), np.empty(shape, self.dtype)
+        if not isinstance(out, (tuple, list)) or len(out) != 2:
+            raise ValueError("out: expected a pair of arrays, (q, qd)")
+        return self._out(out[0], shape, "out[0]"), self._out(out[1], shape, "out[1]")
 
     # --- functions of a state --------------------------------------------------------------------
 
@@ -261,20 +268,21 @@ class Model:
         self, name: str, shape: tuple[int, ...], q: ArrayLike, qd: ArrayLike | None, t: float,
         u: Any, params: Any, out: Any,
     ) -> Any:  # fmt: skip
-        if qd is None:
+        if name in _OF_POSITION:
             at, moving = self._array(q, "q", self.nq), None
         else:
-            at, moving = self._state(q, qd)
+            at, moving = self._state(q, qd)  # type: ignore[arg-type]  # None is told there
         rows = at.shape[:-1]
         result = self._out(out, rows + shape)
+        time, held, table = _number(t, "t"), self._inputs(u), self._parameters(params)
         function = getattr(self._lib, name, None)
-        if function is None:
+        if function is None:  # no forces, no power
             result[...] = 0
         else:
             function(
                 rows[0] if rows else 1,
-                self._pointer(result), self._pointer(at), self._pointer(moving), self._time(t),
-                self._pointer(self._inputs(u)), self._pointer(self._parameters(params)),
+                self._pointer(result), self._pointer(at), self._pointer(moving), time,
+                self._pointer(held), self._pointer(table),
             )  # fmt: skip
         return result if result.ndim else result[()]
 
@@ -370,7 +378,7 @@ class Model:
         status = self._ffi.new("int *")
         done = self._lib.acceleration(
             at.shape[0] if at.ndim == 2 else 1,
-            self._pointer(made), self._pointer(at), self._pointer(moving), self._time(t),
+            self._pointer(made), self._pointer(at), self._pointer(moving), _number(t, "t"),
             self._pointer(self._inputs(u)), self._pointer(self._parameters(params)), status,
         )  # fmt: skip
         if status[0]:
@@ -408,20 +416,20 @@ class Model:
         if at.ndim != 1:
             raise ValueError(f"q: shape {at.shape}, expected ({self.nq},)")
         at, moving = at.copy(), moving.copy()
-        status = self._ffi.new("int *")
+        into = None if out is None else self._pair(out, at.shape)
+        status, total = self._ffi.new("int *"), self._ffi.new("long *")
         self._stepper(method, "run")(
-            self._pointer(at), self._pointer(moving), self._time(t), self._size(h), 0, 1,
+            self._pointer(at), self._pointer(moving), _number(t, "t"), self._size(h), 0, 1,
             self._pointer(self._inputs(u)), 0, 0, self._ffi.NULL, self._ffi.NULL,
-            self._pointer(self._parameters(params)), status,
+            self._pointer(self._parameters(params)), status, total,
         )  # fmt: skip
         if status[0]:
             said = STATUS[status[0]]
             raise MotionError(
                 f"no step from t = {t:.9g}, {_state_text(at, moving)}: {_SAID[said]}", said
             )
-        if out is None:
+        if into is None:
             return at, moving
-        into = self._out(out[0], at.shape), self._out(out[1], at.shape)
         into[0][...], into[1][...] = at, moving
         return into
 
@@ -435,23 +443,21 @@ class Model:
         return getattr(self._lib, f"{method or self.methods[0]}_{what}")
 
     def _size(self, h: float | None) -> float:
-        h = self.h if h is None else float(h)
-        if not (np.isfinite(h) and h != 0):
-            raise ValueError(f"h: {h} is not a step size: give a finite number of seconds")
-        return h
+        size = self.h if h is None else _number(h, "h")
+        if size == 0:
+            raise ValueError("h: 0 is not a step size: give a number of seconds")
+        return size
 
     def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
         if steps is not None:
             if duration is not None:
                 raise ValueError("steps: give steps or duration, not both")
-            if steps != int(steps) or steps < 0:
-                raise ValueError(f"steps: {steps} is not a number of steps")
-            return int(steps)
-        duration = self.duration if duration is None else float(duration)
-        if not (np.isfinite(duration) and duration >= 0):
+            return _count(steps, "steps", 0)
+        time = self.duration if duration is None else _number(duration, "duration")
+        if time < 0:
             raise ValueError(f"duration: {duration} is not a time in s")
         # the first multiple of h that is not before the duration, rounding aside
-        return int(np.ceil(duration / abs(h) * (1 - 1e-12)))
+        return int(np.ceil(time / abs(h) * (1 - 1e-12)))
 
     def simulate(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
@@ -480,26 +486,22 @@ class Model:
         if q.shape != (self.nq,) or qd.shape != (self.nq,):
             raise ValueError(f"q0, qd0: expected one state, ({self.nq},)")
         h = self._size(h)
-        t0 = self._time(t0)
+        t0 = _number(t0, "t0")
         steps = self._steps(h, duration, steps)
-        if every != int(every) or every < 1:
-            raise ValueError(f"every: {every} is not a positive number of steps")
-        every = int(every)
+        every = _count(every, "every", 1)
         p = self._parameters(params).copy()
         law, held, stride = self._table(u, steps)
         rows = 1 + steps // every + (steps % every > 0)
-        given = out or (None, None)
         try:
             if out is None and rows * 2 * self.nq * self.dtype.itemsize > _memory():
                 raise MemoryError
-            q_rows = self._out(given[0], (rows, self.nq), "out[0]")
-            qd_rows = self._out(given[1], (rows, self.nq), "out[1]")
+            q_rows, qd_rows = self._pair(out, (rows, self.nq))
         except MemoryError:
             raise MemoryError(
                 f"{rows} rows of {2 * self.nq} numbers don't fit in memory: keep fewer with every="
             ) from None
         q_rows[0], qd_rows[0] = q, qd
-        status = self._ffi.new("int *")
+        status, total = self._ffi.new("int *"), self._ffi.new("long *")
         at_q, at_qd, at_p = self._pointer(q), self._pointer(qd), self._pointer(p)
         at_u = self._pointer(held)
         rows_q, rows_qd = self._pointer(q_rows), self._pointer(qd_rows)
@@ -509,15 +511,17 @@ class Model:
             while done < steps:
                 if law:
                     held = self._inputs(law(t0 + done * h, q.copy(), qd.copy()))
+                    if held is None:
+                        raise ValueError("u: the function returned None, not the inputs")
                     at_u = self._pointer(held)
                 begun = perf_counter()
                 row = (1 + done // every) * self.nq
                 count = min(chunk, steps - done)
-                made = run(
+                run(
                     at_q, at_qd, t0, h, done, count, at_u + done * stride if stride else at_u,
-                    stride, every, rows_q + row, rows_qd + row, at_p, status,
+                    stride, every, rows_q + row, rows_qd + row, at_p, status, total,
                 )  # fmt: skip
-                done += made
+                done = total[0]
                 if status[0]:
                     said = STATUS[status[0]]
                     break
@@ -527,7 +531,7 @@ class Model:
                     spent = perf_counter() - begun
                     chunk = int(count * min(16.0, max(0.25, _CHUNK_SECONDS / (spent + 1e-9)))) + 1
         except KeyboardInterrupt:
-            said = "interrupted"
+            done, said = total[0], "interrupted"
         kept = 1 + done // every
         if done % every:
             q_rows[kept], qd_rows[kept] = q, qd
@@ -556,7 +560,7 @@ class Model:
                     stacklevel=3,
                 )
             return u, None, 0
-        if self.nu == 1 and np.ndim(u) <= 1:
+        if self.nu == 1 and np.ndim(u) <= 1 and np.size(u):
             u = np.reshape(u, (-1, 1)) if np.size(u) > 1 else np.reshape(u, 1)
         array = self._array(u, "u", self.nu)
         if array.ndim == 1:
@@ -564,6 +568,25 @@ class Model:
         if len(array) != steps:
             raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a step")
         return None, array, self.nu
+
+
+def _number(value: Any, name: str) -> float:
+    """A finite number, or a ValueError that names the argument."""
+    try:
+        number = float("x" if isinstance(value, (str, bytes)) else value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: {value!r} is not a number") from None
+    if not np.isfinite(number):
+        raise ValueError(f"{name}: {value!r} is not a finite number")
+    return number
+
+
+def _count(value: Any, name: str, least: int) -> int:
+    """A whole number of steps, or a ValueError that names the argument."""
+    number = _number(value, name)
+    if number != int(number) or number < least:
+        raise ValueError(f"{name}: {value!r} is not a whole number of steps, {least} or more")
+    return int(number)
 
 
 def _memory() -> float:

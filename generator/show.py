@@ -5,8 +5,11 @@ from __future__ import annotations
 import sympy
 from sympy import Expr
 
-from eomc import mechanics, program, reference
+from eomc import ccode, mechanics, program, reference
+from eomc.problems import EomcError
 from eomc.system import System, t
+
+WRITTEN_OUT = 400  # operations of D, C and bias up to which a person may want them written out
 
 _MATRICES = ("D", "C", "g", "tau")
 _SCALARS = ("kinetic", "potential", "jacobi", "power")
@@ -27,8 +30,17 @@ def equations(system: System, form: str = "text") -> str:
     """D, C, g and what else there is of D qdd + C qd + g = tau.
 
     form: "text" (Unicode), "latex" or "python". The equations are the reference's, simplified:
-    written out, as a textbook has them.
+    written out, as a textbook has them. Written out, those of a large system are no use to anyone:
+    as text it is shown as the assignments that compute it, and refused otherwise.
     """
+    made = program.build(mechanics.derive(system))
+    if sum(made[name].cost.flops for name in ("D", "C", "bias")) > WRITTEN_OUT:
+        if form != "text":
+            raise EomcError(
+                f"{system.name}: its equations would fill pages: 'eomc show' without --{form} "
+                "prints them as the assignments that compute them"
+            )
+        return _assignments(made)
     plain = reference.derive(system)
     found = plain.simplified()
     values = {name: getattr(found, name) for name in (*_MATRICES, *_SCALARS)}
@@ -87,6 +99,21 @@ def _python(system: System, values: dict[str, Expr]) -> str:
         text = f"Matrix({value.tolist()})" if isinstance(value, sympy.MatrixBase) else str(value)
         lines.append(f"{name + '_' if name in {s.name for s in symbols} else name} = {text}")
     return "\n".join(lines)
+
+
+def _assignments(made: program.Program) -> str:
+    """D, C, g and tau as short lists of assignments, the form in which they are computed."""
+    names = [c.name for c in made.system.coordinates]
+    parts = [f"{made.system.title}: D qdd + C qd + g = tau, q = ({', '.join(names)})"]
+    for name in (n for n in _MATRICES if n in made):
+        body = ccode.body(made[name], made.system.name, {})
+        lines = [line.removeprefix("const double ").rstrip(";") for line in body.lines]
+        n = len(names)
+        for k, result in enumerate(body.results):
+            place = f"{names[k // n]}, {names[k % n]}" if name in ("D", "C") else names[k]
+            lines.append(f"{name}[{place}] = {result}")
+        parts.append(f"{name}, {_MEANING[name]}:\n" + ccode.indent(lines))
+    return "\n\n".join(parts)
 
 
 def cost(system: System) -> str:

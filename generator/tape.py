@@ -49,6 +49,7 @@ class Tape:
         self._powers: dict[Symbol, dict[Symbol, Expr]] = {}
         self.squares: dict[Symbol, Symbol] = {}  # sin(a) <-> cos(a), where both are there
         self._partial: dict[tuple[Symbol, Symbol], Expr] = {}
+        self._pairs: dict[tuple[Symbol, Symbol], Expr] = {}
 
     # --- definitions ---------------------------------------------------------------------------
 
@@ -149,6 +150,16 @@ class Tape:
         symbol = self._name(product)
         self._powers[symbol] = powers
         return number * symbol
+
+    def times(self, one: Expr, other: Expr) -> Expr:
+        """The product of two atoms."""
+        (a, x), (b, y) = split(one), split(other)
+        if x is None or y is None:
+            return one * other
+        if (x, y) not in self._pairs:
+            self._pairs[x, y] = self._pairs[y, x] = self._product((x, y))
+        product = self._pairs[x, y]
+        return product if a == b == 1 else a * b * product
 
     def _sum(self, atoms: Iterable[Expr]) -> Expr:
         total = self._gather(Add(*atoms))
@@ -251,18 +262,14 @@ class Tape:
         tangent: dict[Symbol, Expr] = dict(seeds)
         for symbol in self.live(outputs):
             terms = [
-                self._product(
-                    [*Mul.make_args(self.partial(symbol, part)), *Mul.make_args(tangent[part])]
-                )
+                self.times(self.partial(symbol, part), tangent[part])
                 for part in self.parts[symbol]
                 if part in tangent
             ]
             if terms and (sum_ := self._sum(terms)) != 0:
                 tangent[symbol] = sum_
         return [
-            self._product([factor, *Mul.make_args(tangent[symbol])])
-            if symbol in tangent
-            else S.Zero
+            factor * tangent[symbol] if symbol in tangent else S.Zero
             for factor, symbol in map(split, outputs)
         ]
 
@@ -280,14 +287,14 @@ class Tape:
         for output, seed in outputs:
             factor, symbol = split(output)
             if symbol is not None and seed != 0:
-                terms.setdefault(symbol, []).append(self._product([factor, *Mul.make_args(seed)]))
+                terms.setdefault(symbol, []).append(factor * seed)
         for symbol in reversed(self.live([o for o, _ in outputs], stop)):
             if symbol in stop or symbol not in terms:
                 continue
-            adjoint = Mul.make_args(self._sum(terms[symbol]))
+            adjoint = self._sum(terms[symbol])
             for part in self.parts[symbol]:
                 slope = self.partial(symbol, part)
-                terms.setdefault(part, []).append(self._product([*Mul.make_args(slope), *adjoint]))
+                terms.setdefault(part, []).append(self.times(slope, adjoint))
         return [self._sum(terms.get(symbol, ())) for symbol in wrt]
 
     def substitute(self, outputs: Sequence[Expr], values: Mapping[Symbol, Expr]) -> list[Expr]:
@@ -306,5 +313,7 @@ def split(atom: Expr) -> tuple[Expr, Symbol | None]:
         return S.One, atom
     if atom.is_number:
         return atom, None
+    if len(atom.args) == 2 and atom.args[1].is_Symbol:
+        return atom.args[0], atom.args[1]
     symbol = next(iter(atom.free_symbols))
     return Mul(*(f for f in atom.args if f is not symbol)), symbol

@@ -51,9 +51,10 @@ push = { unit = "N" }
 px = "x*cos(theta) + tanh(q)*S + E*cos(3*t)"
 py = "x*sin(theta) + N*sinh(q/4)*cosh(q/5)"
 a  = "atan(q) + asin(q/4) + acos(q/5) + atan2(q + 2, x + 3)"
+turning = "(I*theta_dot**2 + beta*q_dot**2*(2 + sin(theta)) + values*(theta_dot + h*x)**2)/2"
 b  = "exp(-q**2) + log(2 + q**2) + sqrt(1 + x**2) + tan(q/7) + third"
 [energy]
-kinetic     = "m*(dot(px)**2 + dot(py)**2)/2 + I*theta_dot**2/2 + beta*q_dot**2*(2 + sin(theta))/2 + values*(theta_dot + h*x)**2/2 + y0*t*q_dot/10"
+kinetic     = "m*(dot(px)**2 + dot(py)**2)/2 + turning + y0*t*q_dot/10"
 potential   = "m*g*py + gamma*a**2 + index*b + zeta*x**4 + (1 + x**2)**1.5/20"
 dissipation = "zeta*theta_dot**2/2 + gamma*dot(py)**2/2"
 [forces]
