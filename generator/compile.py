@@ -233,6 +233,7 @@ def _compile(made: Sources, extension: str, folder: Path, library: str) -> None:
     finally:
         for _, process in running:  # none goes on where another failed
             process.kill()
+            process.wait()
     link = [*compiler.command, "-shared", "scene.o", "binding.o", "-lm", "-o", library]
     if sys.platform == "darwin":
         link.insert(1, "-undefined")
