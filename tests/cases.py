@@ -15,6 +15,25 @@ from eomc import names, scene, system
 DATA = Path(__file__).parent / "data" / "cases.json"
 SCENES = Path(__file__).parent.parent / "scenes"
 
+# the scenes and the cases that have the same physics and the same start
+ALIKE = {
+    "mass_spring": "harmonic_1e6_periods",
+    "cartpole": "cartpole_drop_physicalP",
+    "cartpole_driven": "cartpole_torque_physicalP",
+    "cartpole_tutorial": "cartpole_drop_tutorialP",
+    "simple_pendulum": "pendulum_large_swing",
+    "double_pendulum": "double_pendulum_regular",
+    "acrobot": "acrobot_torque",
+    "furuta_pendulum": "furuta_pendulum",
+    "spring_pendulum": "spring_pendulum_resonant",
+    "kapitza_pendulum": "kapitza_pendulum",
+    "bead_on_hoop": "bead_on_hoop_near_critical",
+    "foucault_pendulum": "foucault_day",
+    "swinging_atwood": "swinging_atwood_mu3",
+    "kepler_orbit": "kepler_e0.9_cartesian",
+    "heavy_top": "lagrange_top_nutation",
+}
+
 
 @cache
 def cases() -> dict[str, dict[str, Any]]:

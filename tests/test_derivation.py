@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cases import scene_system
-from eomc import program, scene, system
+from eomc import check, program, scene, system
 from eomc.assignments import Call, evaluate
 from eomc.mechanics import derive
 from eomc.problems import EomcError, SceneError
@@ -36,19 +36,7 @@ U = symbol("u")  # an input
 NAMES = ("x", "theta", "phi")
 
 # the program's name of a value, and the reference's
-VALUES = {
-    "D": "D",
-    "C": "C",
-    "g": "g",
-    "bias": "bias",
-    "tau": "tau",
-    "kinetic_energy": "kinetic",
-    "potential_energy": "potential",
-    "energy": "energy",
-    "jacobi": "jacobi",
-    "power": "power",
-    "signal": "signals",
-}
+VALUES = {**check.VALUES, "signal": "signals"}
 
 
 # --- random systems ------------------------------------------------------------------------------

@@ -19,27 +19,12 @@ import pytest
 from conftest import ROOT, Modules
 
 import eomc
-from cases import case_system, cases, error_of
+from cases import ALIKE, case_system, cases, error_of
 
 CASES = ROOT / "build" / "tests" / "cases"
 
-# scenes/<name>.toml and the case with the same physics and the same start; see test_reference.py
-SCENES = {
-    "cartpole": "cartpole_drop_physicalP",
-    "cartpole_driven": "cartpole_torque_physicalP",
-    "cartpole_tutorial": "cartpole_drop_tutorialP",
-    "simple_pendulum": "pendulum_large_swing",
-    "double_pendulum": "double_pendulum_regular",
-    "acrobot": "acrobot_torque",
-    "furuta_pendulum": "furuta_pendulum",
-    "spring_pendulum": "spring_pendulum_resonant",
-    "kapitza_pendulum": "kapitza_pendulum",
-    "bead_on_hoop": "bead_on_hoop_near_critical",
-    "foucault_pendulum": "foucault_day",
-    "swinging_atwood": "swinging_atwood_mu3",
-    "kepler_orbit": "kepler_e0.9_cartesian",
-    "heavy_top": "lagrange_top_nutation",
-}
+# mass_spring has tests of its own
+SCENES = {scene: case for scene, case in ALIKE.items() if scene != "mass_spring"}
 MOST_STEPS = 11_000_000  # about half a second
 
 # an error at the start grows by 1.7e11: at every step size listed the motion is lost
