@@ -1,5 +1,6 @@
 # make demo    set up, build and check the cart-pole scenes, run one, draw it
 # make test    set up, run the quick tests
+# make bench   against numba, CasADi, heyoka and a NumPy loop; writes benchmarks/RESULTS.md
 # make test-all, make lint, make golden, make clean
 
 PYTHON ?= python3
@@ -8,7 +9,7 @@ DEMO := scenes/cartpole.toml scenes/cartpole_driven.toml scenes/cartpole_tutoria
 # what a test run writes, it writes under build/
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
 
-.PHONY: demo test test-all lint golden clean
+.PHONY: demo test test-all lint golden bench clean
 
 demo: .venv/demo
 	@$(BIN)/eomc build $(DEMO)
@@ -38,6 +39,15 @@ lint: .venv/dev
 golden: .venv/dev
 	$(BIN)/python tests/test_golden.py --accept
 	$(BIN)/python tests/test_bad_scenes.py
+
+bench: build/bench/done
+	build/bench/bin/python benchmarks/loop.py
+	build/bench/bin/python benchmarks/peers.py
+
+build/bench/done: pyproject.toml benchmarks/requirements.txt
+	$(PYTHON) -m venv build/bench
+	build/bench/bin/python -m pip install --quiet --editable . -r benchmarks/requirements.txt
+	@touch $@
 
 clean:
 	rm -rf build
