@@ -78,7 +78,7 @@ def build(
         made, name, digest = scene, scene.name, scene.digest
     else:
         made = None
-        name, digest = _name_and_digest(Path(scene))
+        name, digest = name_and_digest(Path(scene))
     wanted = compiler.key(digest)
     if name and compiler.found(Path(root) / name, wanted):
         return compiler.Built(name, Path(root) / name, False)
@@ -108,7 +108,7 @@ def load(
     return compiler.load(build(scene, root, warn=warn))
 
 
-def _name_and_digest(path: Path) -> tuple[str, str]:
+def name_and_digest(path: Path) -> tuple[str, str]:
     """What a scene is called and the digest of its text, without checking it; no SymPy."""
     import hashlib
     import tomllib

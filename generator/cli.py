@@ -112,6 +112,13 @@ def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> Non
     PYTHONPATH=build python -c "import cartpole; print(cartpole.simulate())"
     cd build/cartpole && cc -std=c99 -O2 main.c cartpole.c -lm && ./a.out
     """
+    named: dict[str, Path] = {}
+    for scene in scenes:
+        name = eomc.name_and_digest(scene)[0]
+        if name and (other := named.setdefault(name, scene)) != scene:
+            raise EomcError(
+                f"{other} and {scene} are both named '{name}': one would replace the other"
+            )
     told = []
     with _progress("building", quiet or as_json) as progress:
         for k, scene in enumerate(scenes):
@@ -206,7 +213,7 @@ def run(
     except module.Interrupted as stop:  # what was done is kept
         done, seconds = stop.run, time.perf_counter() - begun
     except (ValueError, MemoryError) as fault:
-        raise EomcError(str(fault)) from None
+        raise EomcError(str(fault).replace("every=", "--every")) from None
     error = None
     if done.status == "ok" and 0 < seconds < 2 and done.steps:
         halved = _simulated(
@@ -273,6 +280,8 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
     """
     import tomllib
 
+    from eomc import compile as compiler
+
     rows = []
     default = Path("scenes") if Path("scenes").is_dir() else Path()
     for folder in folders or [default]:
@@ -282,10 +291,11 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
             try:
                 text = tomllib.loads(path.read_text(encoding="utf-8"))
             except (OSError, ValueError):
-                continue
+                text = {"eomc": 0, "name": path.stem, "title": "(can't be read: eomc build tells)"}
             if "eomc" not in text or not isinstance(text.get("name"), str):
                 continue
-            built = (root / text["name"] / "build.json").is_file()
+            name, digest = eomc.name_and_digest(path)
+            built = bool(name) and compiler.found(root / name, compiler.key(digest))
             rows.append(
                 {"scene": str(path), "name": text["name"], "title": str(text.get("title", "")),
                  "coordinates": list(text.get("coordinates", {})),
@@ -300,10 +310,10 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
     titles = max((len(row["title"]) for row in rows), default=0)
     for row in rows:
         moved = f"({', '.join(row['inputs'])})" if row["inputs"] else ""
-        built = "built" if row["built"] else "     "
+        mark = "built" if row["built"] else "     "
         click.echo(
             f"{row['scene']:{wide}}  {row['title']:{titles}}  "
-            f"{built}  {', '.join(row['coordinates'])} {moved}".rstrip()
+            f"{mark}  {', '.join(row['coordinates'])} {moved}".rstrip()
         )
 
 

@@ -25,7 +25,7 @@ from sympy import Expr, S, Symbol
 
 from eomc.problems import EomcError, SceneError
 from eomc.system import System, dot, t
-from eomc.tape import Stage, Tape
+from eomc.tape import RoughError, Stage, Tape
 
 Vector = tuple[Expr, ...]
 Rows = tuple[Vector, ...]
@@ -82,6 +82,17 @@ def derive(system: System) -> Equations:
     Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral);
     C from Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
     """
+    try:
+        return _derived(system)
+    except RoughError:  # P and R are differentiated once, K twice
+        message = (
+            "a second derivative of the kinetic energy jumps: it must be quadratic in the "
+            "velocities and smooth; abs, sign, min, max and roots of velocities are not"
+        )
+        raise SceneError([system.problem("energy.kinetic", message)]) from None
+
+
+def _derived(system: System) -> Equations:
     e = _on_tape(system)
     tape, q, qd = e.tape, system.q, system.qd
     w = list(e.points)

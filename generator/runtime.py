@@ -189,6 +189,8 @@ class Model:
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:
         try:
+            if np.asarray(value).dtype.kind not in "biuf":
+                raise TypeError
             array = np.ascontiguousarray(value, self.dtype)
         except (TypeError, ValueError):
             raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
@@ -274,6 +276,13 @@ class Model:
             at, moving = self._state(q, qd)  # type: ignore[arg-type]  # None is told there
         rows = at.shape[:-1]
         result = self._out(out, rows + shape)
+        if np.ndim(t) and rows:  # a time for each row
+            if np.shape(t) != rows:
+                raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
+            for k, now in enumerate(np.asarray(t)):
+                row_qd = None if moving is None else moving[k]
+                result[k] = self._evaluate(name, shape, at[k], row_qd, now, u, params, None)
+            return result
         time, held, table = _number(t, "t"), self._inputs(u), self._parameters(params)
         function = getattr(self._lib, name, None)
         if function is None:  # no forces, no power

@@ -363,7 +363,35 @@ class _Check:
                     (seen[velocity], velocity),
                     f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
                 )
+        for table in ("coordinates", "parameters", "constants", "inputs"):
+            for name, entry in getattr(doc, table).items():
+                self._unit((table, name), entry.unit)
         return seen
+
+    def _unit(self, path: tuple[str, ...], unit: str) -> None:
+        """Units are texts; those that show that something was meant to be converted are told."""
+        plain = unit.strip().lower()
+        if plain in ("deg", "degree", "degrees", "°", "deg/s", "°/s"):
+            remedy = 'write 30 degrees as "30*pi/180", with unit = "rad"'
+            self.say((*path, "unit"), f"angles are in radians, nothing is converted: {remedy}")
+        elif plain in (
+            "mm",
+            "cm",
+            "km",
+            "g",
+            "gram",
+            "ms",
+            "min",
+            "rpm",
+            "inch",
+            "ft",
+            "lb",
+            "lbs",
+        ):
+            message = (
+                f"'{unit}' is not an SI unit: numbers are taken as they stand, none is converted"
+            )
+            self.say((*path, "unit"), message, severity="warning")
 
     # formulas
 

@@ -19,6 +19,10 @@ from eomc.problems import EomcError
 _ROUGH = (sympy.DiracDelta, sympy.Derivative, sympy.Subs)
 
 
+class RoughError(EomcError):
+    """A derivative of something that jumps is needed."""
+
+
 class Stage(IntEnum):
     """When a value becomes known; a value is as late as the latest that it is made of."""
 
@@ -97,10 +101,7 @@ class Tape:
         found = self._known.get(rhs)
         if found is None:
             if rhs.has(*_ROUGH):
-                raise EomcError(
-                    "a derivative of something that jumps is needed: use abs, min, max or tanh "
-                    "in energies, and give forces that jump in [forces]"
-                )
+                raise RoughError("a derivative of something that jumps is needed")
             found = Symbol(f"_{len(self.rhs):06d}", real=True)
             self._known[rhs] = found
             self._number[found] = len(self.rhs)

@@ -109,3 +109,10 @@ def test_jumps_in_energies_are_refused() -> None:
     system = System.make("a", [x], x_dot**2 / 2, x * sympy.sign(x))
     with pytest.raises(EomcError, match="jumps"):
         eomc.sources(system)
+
+
+@pytest.mark.parametrize("more", [sympy.Abs(x_dot) ** 3, sympy.sqrt(x_dot**2)])
+def test_a_kinetic_energy_that_is_not_quadratic_is_named(more: sympy.Expr) -> None:
+    system = System.make("a", [x], x_dot**2 / 2 + more)
+    with pytest.raises(EomcError, match=r"energy\.kinetic: .* (quadratic|jumps)"):
+        eomc.sources(system)
