@@ -189,7 +189,7 @@ class Model:
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:
         try:
-            if np.asarray(value).dtype.kind not in "biuf":
+            if np.asarray(value).dtype.kind in "USmM":  # text that looks like a number is none
                 raise TypeError
             array = np.ascontiguousarray(value, self.dtype)
         except (TypeError, ValueError):
