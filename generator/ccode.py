@@ -17,7 +17,6 @@ MOST_INLINE = 5  # operations; longer expressions get a name of their own
 
 _FUNCTIONS = {
     "abs": "fabs",
-    "reciprocal": "",
     **{n: n for n in ("tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")},
     **{n: n for n in ("exp", "log", "sqrt", "pow", "sin", "cos")},
     "min": "fmin",

@@ -165,7 +165,6 @@ class Context:
             "has_u": bool(s.inputs),
             "has_p": self.needs_p,
             "batch": s.run.batch,
-            "takes_t": {f["name"]: f["takes_t"] for f in functions},
             "pieces": self._pieces(functions, dynamics),
             **dynamics,
             **self._example(),
@@ -203,10 +202,10 @@ class Context:
 
     # --- evaluation functions ------------------------------------------------------------------
 
-    def _where(self, function: Function, p: str = "p") -> dict[str, str]:
+    def _where(self) -> dict[str, str]:
         """How names from outside are written: p->m_c for parameters, theta_ where theta is ours."""
         s = self.system
-        out = {x.name: f"{p}->{x.name}" for x in s.parameters}
+        out = {x.name: f"p->{x.name}" for x in s.parameters}
         mine = [*(x.name for x in s.q), *(x.name for x in s.qd), *(i.name for i in s.inputs)]
         return out | {n: _local(n) for n in mine}
 
@@ -217,7 +216,7 @@ class Context:
         made = ccode.body(
             rename(function, clash),
             self.prefix,
-            self._where(function) | dict(where or {}),
+            self._where() | dict(where or {}),
             self.real,
             **options,
         )
@@ -290,12 +289,7 @@ class Context:
             "prototype": f"{'void' if size else real} {self.prefix}_{name}({arguments})",
             "takes_u": takes_u,
             "reads_u": reads_u,
-            "takes_t": takes_t,
-            "takes_q": takes_q,
-            "takes_qd": takes_q and kind.qd,
-            "shape": kind.shape,
             "size": size,
-            "width": {"n*n": len(s.q) ** 2, "n": len(s.q), "m": len(s.u)}.get(kind.shape, 1),
             "unused": unused,
             "loads": self._loads(function),
             "blocks": [*body.early, *body.blocks],
