@@ -135,7 +135,7 @@ def rename(function: Function, new: Mapping[str, str]) -> Function:
 
     def renamed(items: Iterable[Assignment]) -> tuple[Assignment, ...]:
         return tuple(
-            replace(a, name=real(a.name), value=renamed_value(a.value, real)) for a in items
+            Assignment(real(a.name), renamed_value(a.value, real), a.stage, a.named) for a in items
         )
 
     return replace(

@@ -146,11 +146,17 @@ class _Work:
 
     def _put(self, name: str, value: Value) -> None:
         old = self.values.get(name)
-        if old is not None and self.known.get(old) == name:
-            del self.known[old]
+        if old is not None:
+            if old == value:
+                return
+            if self.known.get(old) == name:
+                del self.known[old]
         self.values[name] = value
         self.known.setdefault(value, name)
-        self.stages[name] = max((self.stages[n] for n in names_of(value)), default=Stage.NUMBER)
+        self.stages[name] = self._stage(value)
+
+    def _stage(self, value: Value) -> Stage:
+        return max((self.stages[n] for n in names_of(value)), default=Stage.NUMBER)
 
     # putting in order
 
@@ -284,9 +290,9 @@ class _Work:
 
     def _sort(self) -> None:
         """Definitions before their uses, stages anew."""
-        values, self.values = self.values, {}
-        for name in _in_order(values):
-            self._put(name, values[name])
+        self.values = {name: self.values[name] for name in _in_order(self.values)}
+        for name, value in self.values.items():
+            self.stages[name] = self._stage(value)
 
     def _hoist(self, ends: Iterable[Operand]) -> None:
         """What parameters alone decide inside a later sum or product gets a name of its own."""

@@ -16,31 +16,53 @@ Euler, without the terms that cancel when K is differentiated as a function of q
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
+from typing import NoReturn
 
 import sympy
 from sympy import Expr, S, Symbol
 
+from eomc.articulated import MasslessError, accelerations
+from eomc.bodies import Tree, needed
 from eomc.problems import EomcError, SceneError
-from eomc.system import System, dot, t
+from eomc.system import System, dot, symbol, t
 from eomc.tape import RoughError, Stage, Tape
+from eomc.trees import Recursion
 
 Vector = tuple[Expr, ...]
 Rows = tuple[Vector, ...]
+
+ALONG = "_along"  # a direction's entry along a coordinate
+LAGRANGE_DEFINITIONS = 12  # of a tree's world coordinates: beyond, recursion always needs less
+MOST_ROWS = 16  # coordinates from which D is computed column by column, where nothing needs it
+WRITTEN_OUT = 4000  # names on the tape, about, from which C is computed column by column
+
+
+@dataclass(frozen=True)
+class Solution:
+    """qdd by one way of solving D qdd = tau - bias.
+
+    order: the order in which coordinates are eliminated; pivots: those of L diag(pivots) L^T, all
+    positive where D is positive definite, each beside a value of the size of what it came from.
+    """
+
+    acceleration: Vector
+    order: tuple[int, ...]
+    pivots: tuple[tuple[Expr, Expr], ...]
 
 
 @dataclass(frozen=True)
 class Equations:
     """The equations of motion as atoms of a tape; shapes as in the field: D, C (nq, nq).
 
-    kinetic, potential: K and P. jacobi: p.qd - K + P, what is conserved without forces and
-    explicit time; None where it is K + P. power: d(jacobi)/dt; 0 for a conservative system.
-    balance: b in D qdd = b.
-    order: the order in which coordinates are eliminated from D qdd = b; pivots: those of
-    L diag(pivots) L^T, all positive where D is positive definite, each beside the diagonal entry
-    of D that it started as. notes: where unusual terms of K went.
+    D, C: by rows, or where that would be long a single column, D e and C e, for a direction e
+    whose entries are the leaves `along` (then `is_column`). kinetic, potential: K and P.
+    jacobi: p.qd - K + P, what is conserved without forces and explicit time; None where it is
+    K + P. power: d(jacobi)/dt; 0 for a conservative system. balance: b in D qdd = b.
+    solutions: the accelerations, by route; passed_over: routes that were not tried, and why.
+    notes: where unusual terms of K went.
     """
 
     system: System
@@ -56,14 +78,13 @@ class Equations:
     jacobi: Expr | None
     power: Expr
     balance: Vector
-    acceleration: Vector
-    order: tuple[int, ...]
-    pivots: tuple[tuple[Expr, Expr], ...]
+    solutions: Mapping[str, Solution]
+    passed_over: Mapping[str, str]
     notes: tuple[str, ...]
 
 
 @dataclass
-class _Energies:
+class Energies:
     """K, P, R and Q on the tape, with the points y_k and their velocities w_k = dot(y_k)."""
 
     tape: Tape
@@ -75,25 +96,123 @@ class _Energies:
     points: dict[Symbol, Expr]  # w -> y
 
 
-def derive(system: System) -> Equations:
-    """The equations of motion of `system`.
+def derive(system: System) -> dict[str, Equations]:
+    """The equations of motion of `system` by each way that may be worth its while.
 
-    Raises SceneError where K is not quadratic in the velocities or a coordinate has no inertia.
-    Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral);
-    C from Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
+    "program" is Lagrange's way over the program of K and P; "tree" the recursive one, where bodies
+    hang on joints. Raises SceneError where K is not quadratic in the velocities or a coordinate
+    has no inertia. Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's
+    integral); C from Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
     """
+    out: dict[str, Equations] = {}
     try:
-        return _derived(system)
+        if system.tree is None or len(system.definitions) <= LAGRANGE_DEFINITIONS:
+            out["program"] = _by_lagrange(system)
+        if system.tree is not None:
+            out["tree"] = _by_recursion(system, system.tree)
     except RoughError:  # P and R are differentiated once, K twice
         message = (
             "a second derivative of the kinetic energy jumps: it must be quadratic in the "
             "velocities and smooth; abs, sign, min, max and roots of velocities are not"
         )
         raise SceneError([system.problem("energy.kinetic", message)]) from None
+    return out
 
 
-def _derived(system: System) -> Equations:
-    e = _on_tape(system)
+def _by_lagrange(system: System) -> Equations:
+    e = on_tape(system, system.kinetic, system.potential)
+    motion = _lagrange(system, e)
+    _has_inertia(system, motion.D)
+    order, acceleration, pivots = solve(e.tape, motion.D, motion.balance)
+    solutions = {"program": Solution(acceleration, order, pivots)}
+    return _equations(system, e, motion, solutions, {})
+
+
+def _by_recursion(system: System, tree: Tree) -> Equations:
+    """Newton and Euler for the tree, Lagrange for what is beside it."""
+    e = on_tape(system, tree.beside_kinetic, tree.beside_potential)
+    tape, q = e.tape, system.q
+    beside = _lagrange(system, e)
+    recursion = Recursion(tape, tree)
+    at = {link.q: k for k, link in enumerate(tree.links)}
+
+    def placed(by_link: Sequence[Expr]) -> list[Expr]:
+        return [by_link[at[x]] if x in at else S.Zero for x in q]
+
+    bias = placed(recursion.bias())
+    motion = replace(
+        beside,
+        bias=_sums(tape, beside.bias, bias),
+        g=_sums(tape, beside.g, placed(recursion.gravity_forces())),
+        balance=_sums(tape, beside.balance, [-x for x in bias]),
+    )
+    solutions: dict[str, Solution] = {}
+    alone = all(x == 0 for column in beside.D for x in column) and len(at) == len(q)
+    if alone:
+        drive = [beside.balance[q.index(link.q)] for link in tree.links]
+        try:
+            found, pivots = accelerations(recursion, drive)
+        except MasslessError as fault:
+            _no_inertia(system, tree.links[fault.link].q.name)
+        order = tuple(q.index(link.q) for link in reversed(tree.links))
+        solutions["articulated"] = Solution(tuple(found[at[x]] for x in q), order, pivots)
+    passed_over = {}
+    if len(system.definitions) > LAGRANGE_DEFINITIONS:
+        passed_over["program"] = f"{len(system.definitions)} world coordinates to differentiate"
+    elimination = recursion.elimination()
+    long = solutions and elimination > len(tape.live(solutions["articulated"].acceleration))
+    if long and len(q) > MOST_ROWS:
+        D = _column(system, tape, recursion, at)
+    else:
+        rows = recursion.mass_matrix()
+        D = tuple(
+            tuple(
+                tape.total([beside.D[i][j], rows[at[x]][at[y]] if {x, y} <= at.keys() else S.Zero])
+                for j, y in enumerate(q)
+            )
+            for i, x in enumerate(q)
+        )
+        _has_inertia(system, D)
+    if long:
+        passed_over["composite"] = f"{elimination} flops for elimination alone"
+    else:
+        order, acceleration, pivots = solve(tape, D, motion.balance)
+        solutions["composite"] = Solution(acceleration, order, pivots)
+    e.kinetic = tape.total([e.kinetic, recursion.kinetic_energy()])
+    e.potential = tape.total([e.potential, recursion.potential_energy()])
+    return _equations(system, e, replace(motion, D=D), solutions, passed_over)
+
+
+def along(system: System) -> list[Symbol]:
+    """The entries of a direction e, for D e and C e."""
+    return [symbol(f"{c.name}{ALONG}") for c in system.coordinates]
+
+
+def _column(system: System, tape: Tape, recursion: Recursion, at: Mapping[Symbol, int]) -> Rows:
+    """D e for a direction e."""
+    direction = dict(zip(system.q, along(system), strict=True))
+    found = recursion.mass_times([direction[link.q] for link in recursion.links])
+    return (tuple(found[at[x]] for x in system.q),)
+
+
+def _sums(tape: Tape, one: Sequence[Expr], other: Sequence[Expr]) -> Vector:
+    return tuple(tape.total(pair) for pair in zip(one, other, strict=True))
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What Lagrange's equations give: D, bias, its part g at rest, tau and D qdd = balance."""
+
+    D: Rows
+    bias: Vector
+    g: Vector
+    tau: Vector
+    balance: Vector
+    quadratic: bool  # K is so in the velocities, with nothing else and without explicit time
+    notes: tuple[str, ...]
+
+
+def _lagrange(system: System, e: Energies) -> _Motion:
     tape, q, qd = e.tape, system.q, system.qd
     w = list(e.points)
     stop = frozenset(w)
@@ -125,7 +244,6 @@ def _derived(system: System) -> Equations:
     driven = t in tape.leaves_of([e.kinetic])
     quadratic = all(x == 0 for x in tape.substitute([e.kinetic, *p, *p_w], at_rest)) and not driven
     g = tape.gradient([(e.potential, S.One)], q) if quadratic else tape.substitute(bias, at_rest)
-    C = _coriolis(system, tape, bias, quadratic)
 
     # D qdd = b, the forces projected in one sweep
     if e.dissipation == 0:
@@ -137,45 +255,55 @@ def _derived(system: System) -> Equations:
             add(force, -inertia, -drag, -rest)
             for force, inertia, drag, rest in zip(e.forces, p_dot, r, whole, strict=True)
         ]
-    order, acceleration, pivots = solve(tape, D, b)
+    notes = _notes(tape, e, p, p_w, at_rest, D)
+    return _Motion(D, tuple(bias), tuple(g), tuple(tau), tuple(b), quadratic, notes)
+
+
+def _equations(
+    system: System, e: Energies, motion: _Motion, solutions: Mapping[str, Solution],
+    passed_over: Mapping[str, str],
+) -> Equations:  # fmt: skip
+    tape, qd = e.tape, system.qd
+
+    def add(*terms: Expr) -> Expr:
+        return tape.define(sympy.Add(*terms))
 
     euler = dict(zip(qd, qd, strict=True))
     jacobi = None
-    if not quadratic:
+    if not motion.quadratic:
         (twice,) = tape.forward([e.kinetic], euler)
         jacobi = add(twice, -e.kinetic, e.potential)
     explicit = tape.forward([e.kinetic, e.potential], {t: S.One})
     (lost,) = tape.forward([e.dissipation], euler)
     works = [tape.define(force * v) for force, v in zip(e.forces, qd, strict=True)]
     power = add(*works, -lost, explicit[1], -explicit[0])
-
     return Equations(
         system=system,
         tape=tape,
-        D=D,
-        C=C,
-        g=tuple(g),
-        bias=tuple(bias),
-        tau=tuple(tau),
+        D=motion.D,
+        C=_coriolis(system, tape, motion.bias, motion.quadratic),
+        g=motion.g,
+        bias=motion.bias,
+        tau=motion.tau,
         signals=tuple(e.signals),
         kinetic=e.kinetic,
         potential=e.potential,
         jacobi=jacobi,
         power=power,
-        balance=tuple(b),
-        acceleration=acceleration,
-        order=order,
-        pivots=pivots,
-        notes=_notes(tape, e, p, p_w, at_rest, D),
+        balance=motion.balance,
+        solutions=solutions,
+        passed_over=passed_over,
+        notes=motion.notes,
     )
 
 
-def _on_tape(system: System) -> _Energies:
+def on_tape(system: System, kinetic: Expr, potential: Expr) -> Energies:
+    """K and P, with the system's dissipation, forces and signals, and what they are made of."""
     leaves: dict[Symbol, Stage] = {t: Stage.TIME}
     leaves |= {p.symbol: Stage.PARAMETER for p in system.parameters}
     leaves |= dict.fromkeys(system.u, Stage.TIME)
     leaves |= dict.fromkeys(system.q, Stage.POSITION)
-    leaves |= dict.fromkeys(system.qd, Stage.VELOCITY)
+    leaves |= dict.fromkeys((*system.qd, *along(system)), Stage.VELOCITY)
     tape = Tape(leaves)
     rates: dict[Symbol, Expr] = {**dict(zip(system.q, system.qd, strict=True)), t: S.One}
     known: dict[Symbol, Expr] = {}
@@ -201,13 +329,14 @@ def _on_tape(system: System) -> _Energies:
             velocities[moving] = velocity
         return tape.define(expr.xreplace(velocities).xreplace(known))
 
-    for symbol, expr in system.definitions:
-        known[symbol] = tape.named(value(expr), symbol.name)
     forces = system.forces or (S.Zero,) * len(system.coordinates)
-    return _Energies(
+    ends = [kinetic, potential, system.dissipation, *forces, *(i.signal for i in system.inputs)]
+    for defined, expr in needed(system.definitions, ends):
+        known[defined] = tape.named(value(expr), defined.name)
+    return Energies(
         tape,
-        value(system.kinetic),
-        value(system.potential),
+        value(kinetic),
+        value(potential),
         value(system.dissipation),
         [value(force) for force in forces],
         [value(i.signal) for i in system.inputs],
@@ -227,7 +356,7 @@ def _position(system: System, moving: dot) -> Expr:
 
 def _mass_matrix(
     system: System,
-    e: _Energies,
+    e: Energies,
     momenta: list[Expr],
     projected: Callable[[list[Expr]], list[Expr]],
 ) -> Rows:
@@ -244,14 +373,6 @@ def _mass_matrix(
         for side, other in ((min, max), (max, min))
     ]
     D = min(halves, key=lambda half: len(tape.live(entry for row in half for entry in row)))
-    for c, row in zip(system.coordinates, D, strict=True):
-        if all(entry == 0 for entry in row):
-            message = (
-                f"coordinate '{c.name}' has no inertia: the kinetic energy does not depend on "
-                f"{c.name}_dot, so nothing can be solved for its acceleration; "
-                "give it a mass, or make it an input"
-            )
-            raise SceneError([system.problem("energy.kinetic", message)])
     for i, j in product(range(n), repeat=2):
         if tape.stage_of(D[i][j]) >= Stage.VELOCITY:
             message = (
@@ -263,19 +384,38 @@ def _mass_matrix(
     return tuple(map(tuple, D))
 
 
-def _coriolis(system: System, tape: Tape, bias: list[Expr], quadratic: bool) -> Rows:
-    """C = (J(qd) + J(0))/2 with J = d(bias)/dqd.
+def _has_inertia(system: System, D: Sequence[Sequence[Expr]]) -> None:
+    for c, row in zip(system.coordinates, D, strict=True):
+        if all(entry == 0 for entry in row):
+            _no_inertia(system, c.name)
+
+
+def _no_inertia(system: System, name: str) -> NoReturn:
+    message = (
+        f"coordinate '{name}' has no inertia: the kinetic energy does not depend on "
+        f"{name}_dot, so nothing can be solved for its acceleration; "
+        "give it a mass, or make it an input"
+    )
+    raise SceneError([system.problem("energy.kinetic", message)])
+
+
+def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool) -> Rows:
+    """C = (J(qd) + J(0))/2 with J = d(bias)/dqd, or C e where that would be long.
 
     The part of bias that is quadratic in qd is sum_jk c_ijk qd_j qd_k with Christoffel's symbols
     of the first kind, symmetric in j and k, so half its Jacobian is the Christoffel form of C.
     The linear part (gyroscopic terms, explicit time in D) is J(0) qd and goes in whole.
     """
     at_rest = dict.fromkeys(system.qd, S.Zero)
-    columns = []
-    for velocity in system.qd:
-        column = tape.forward(bias, {velocity: S.One})
-        still = [S.Zero] * len(column) if quadratic else tape.substitute(column, at_rest)
-        columns.append([tape.define((a + b) / 2) for a, b in zip(column, still, strict=True)])
+
+    def column(seeds: Mapping[Symbol, Expr]) -> list[Expr]:
+        slope = tape.forward(bias, seeds)
+        still = [S.Zero] * len(slope) if quadratic else tape.substitute(slope, at_rest)
+        return [tape.define((a + b) / 2) for a, b in zip(slope, still, strict=True)]
+
+    if len(bias) * len(tape.live(bias)) > WRITTEN_OUT:
+        return (tuple(column(dict(zip(system.qd, along(system), strict=True)))),)
+    columns = [column({velocity: S.One}) for velocity in system.qd]
     return tuple(tuple(column[i] for column in columns) for i in range(len(columns)))
 
 
@@ -316,7 +456,7 @@ def solve(
 
 
 def _notes(
-    tape: Tape, e: _Energies, p: list[Expr], p_w: list[Expr], at_rest: dict[Symbol, Expr], D: Rows
+    tape: Tape, e: Energies, p: list[Expr], p_w: list[Expr], at_rest: dict[Symbol, Expr], D: Rows
 ) -> tuple[str, ...]:
     """Where terms of K went that are not quadratic in the velocities."""
     notes = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from sympy import Expr
 
@@ -12,7 +12,7 @@ from eomc import mechanics
 from eomc.assignments import Cost, Function, evaluate
 from eomc.expand import Expander
 from eomc.lowering import lower
-from eomc.mechanics import Equations
+from eomc.mechanics import Equations, Solution
 from eomc.problems import Problem, SceneError
 from eomc.system import System, t
 from eomc.tape import Tape
@@ -23,12 +23,17 @@ LOST = 2  # times the rounding of another route: a route that has more is not ta
 
 @dataclass(frozen=True)
 class Program:
-    """Everything that the generated code computes."""
+    """Everything that the generated code computes.
+
+    order: in which the accelerations eliminate coordinates. passed_over: routes to them that were
+    not tried, and why. notes: where unusual terms of K went.
+    """
 
     system: System
     functions: Mapping[str, Function]
     notes: tuple[str, ...]
     order: tuple[int, ...]
+    passed_over: Mapping[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Function:
         return self.functions[name]
@@ -40,18 +45,58 @@ class Program:
 # --- from equations to a program ------------------------------------------------------------------
 
 
-def build(equations: Equations) -> Program:
-    """The program of the equations: each function by its cheapest route."""
-    e, tape = equations, equations.tape
+def build(equations: Mapping[str, Equations]) -> Program:
+    """The program of a system's equations, by route: each function by its cheapest route."""
+    first = next(iter(equations.values()))
+    names = [c.name for c in first.system.coordinates]
+    expanders = {route: Expander(e.tape) for route, e in equations.items() if route == "program"}
+    functions: dict[str, Function] = {}
+    for name in _wanted(first):
+        routes: dict[str, Route] = {}
+        for route, e in equations.items():
+            outputs = _wanted(e)[name]
+            routes[route] = Route(e.tape, outputs)
+            if route in expanders and (short := expanders[route].expand(outputs)) is not None:
+                routes["expanded"] = Route(e.tape, short)
+        functions[name] = _cheapest(name, first.system, routes)
+    routes = {}
+    for route, e in equations.items():
+        for way, solution in e.solutions.items():
+            routes[way] = _solving(e, solution, names)
+        if route in expanders:
+            routes |= _expanded_solutions(e, expanders[route], names)
+    best = functions["acceleration"] = _cheapest("acceleration", first.system, routes)
+    if all(o.coefficient == 0 for o in functions["tau"].outputs):
+        del functions["tau"]
+    last = list(equations.values())[-1]
+    order = routes[best.route].order
+    return Program(first.system, functions, first.notes, order, last.passed_over)
+
+
+@dataclass(frozen=True)
+class Route:
+    """One way to a function: results and (pivot, diagonal) pairs on a tape, and their names."""
+
+    tape: Tape
+    outputs: Sequence[Expr]
+    checks: Sequence[tuple[Expr, Expr]] = ()
+    labels: Sequence[str] = ()
+    order: tuple[int, ...] = ()
+
+
+def _wanted(e: Equations) -> dict[str, list[Expr]]:
+    by_rows = {"D": e.D, "C": e.C}
     wanted: dict[str, list[Expr]] = {
-        "D": [entry for row in e.D for entry in row],
-        "C": [entry for row in e.C for entry in row],
+        **{
+            name if len(rows) == len(e.g) else f"{name}_column": [x for row in rows for x in row]
+            for name, rows in by_rows.items()
+        },
         "g": list(e.g),
         "bias": list(e.bias),
         "tau": list(e.tau),
         "kinetic_energy": [e.kinetic],
         "potential_energy": [e.potential],
-        "energy": [tape.define(e.kinetic + e.potential)],
+        "energy": [e.tape.define(e.kinetic + e.potential)],
     }
     if e.jacobi is not None:
         wanted["jacobi"] = [e.jacobi]
@@ -59,47 +104,36 @@ def build(equations: Equations) -> Program:
         wanted["power"] = [e.power]
     if e.signals:
         wanted["signal"] = list(e.signals)
-    expander = Expander(tape)
-    functions: dict[str, Function] = {}
-    for name, outputs in wanted.items():
-        routes: dict[str, Ends] = {"program": (outputs, ())}
-        if (short := expander.expand(outputs)) is not None:
-            routes["expanded"] = (short, ())
-        functions[name] = _cheapest(name, e.system, tape, routes)
-    labels = [f"{c.name}_ddot" for c in e.system.coordinates]
-    labels += [f"{what}_{e.system.coordinates[k].name}" for k in e.order for what in ("d", "D")]
-    routes = _acceleration_routes(e, expander)
-    functions["acceleration"] = _cheapest("acceleration", e.system, tape, routes, labels)
-    if all(o.coefficient == 0 for o in functions["tau"].outputs):
-        del functions["tau"]
-    return Program(e.system, functions, e.notes, e.order)
+    return wanted
 
 
-Ends = tuple[Sequence[Expr], Sequence[tuple[Expr, Expr]]]
+def _solving(e: Equations, solution: Solution, names: Sequence[str]) -> Route:
+    labels = [f"{name}_ddot" for name in names]
+    labels += [f"{what}_{names[k]}" for k in solution.order for what in ("d", "D")]
+    return Route(e.tape, solution.acceleration, solution.pivots, labels, solution.order)
 
 
-def _acceleration_routes(e: Equations, expander: Expander) -> dict[str, Ends]:
-    routes: dict[str, Ends] = {"program": (e.acceleration, e.pivots)}
+def _expanded_solutions(e: Equations, expander: Expander, names: Sequence[str]) -> dict[str, Route]:
     n = len(e.bias)
     lower = [(i, j) for i in range(n) for j in range(i + 1)]
     both = expander.expand([*(e.D[i][j] for i, j in lower), *e.balance])
-    if both is not None:
-        entries = dict(zip(lower, both, strict=False))
-        D = tuple(tuple(entries[max(i, j), min(i, j)] for j in range(n)) for i in range(n))
-        for route, short in (("expanded", lambda atom: atom), ("cancelled", expander.short)):
-            _, acceleration, pivots = mechanics.solve(e.tape, D, both[len(lower) :], short)
-            routes[route] = (acceleration, pivots)
+    if both is None:
+        return {}
+    entries = dict(zip(lower, both, strict=False))
+    D = tuple(tuple(entries[max(i, j), min(i, j)] for j in range(n)) for i in range(n))
+    routes = {}
+    for route, short in (("expanded", lambda atom: atom), ("cancelled", expander.short)):
+        order, acceleration, pivots = mechanics.solve(e.tape, D, both[len(lower) :], short)
+        routes[route] = _solving(e, Solution(acceleration, order, pivots), names)
     return routes
 
 
-def _cheapest(
-    name: str, system: System, tape: Tape, routes: Mapping[str, Ends], labels: Sequence[str] = ()
-) -> Function:
+def _cheapest(name: str, system: System, routes: Mapping[str, Route]) -> Function:
     """By the route with the fewest operations among those that lose no digits against another."""
-    made = {route: lower(name, tape, *ends, labels) for route, ends in routes.items()}
+    made = {way: lower(name, r.tape, r.outputs, r.checks, r.labels) for way, r in routes.items()}
     by_weight = sorted(made, key=lambda route: (_weight(made[route].cost), len(made[route].early)))
-    best = by_weight[0]
-    if len(made) > 1 and made[best].body != made["program"].body:
+    best, first = by_weight[0], next(iter(made))
+    if len(made) > 1 and made[best].body != made[first].body:
         errors = {route: _rounding(function, system) for route, function in made.items()}
         least = min(errors.values())
         best = next(r for r in by_weight if errors[r] <= LOST * max(least, 2.0**-50))
@@ -110,8 +144,9 @@ def _cheapest(
 def _rounding(function: Function, system: System) -> float:
     """The largest relative error of the results, in doubles, over some states around the start."""
     worst = 0.0
-    for k in range(5):
+    for k in range(5 if len(function.body) < 500 else 2):
         values = nearby(system, k)
+        values |= {f"{c.name}{mechanics.ALONG}": 1.0 / (k + 1) for c in system.coordinates}
         values |= {i.name: 0.7 + 0.1 * n for n, i in enumerate(system.inputs)}
         try:
             found, _ = evaluate(function, values)
@@ -164,17 +199,31 @@ def nearby(system: System, k: int) -> dict[str, float]:
     return out
 
 
+def mass_matrix(program: Program, values: Mapping[str, float]) -> list[list[float]]:
+    """D at the given values by name, in Python floats. Raises as `evaluate` does."""
+    names = [c.name for c in program.system.coordinates]
+    n = len(names)
+    if "D" in program:
+        flat, _ = evaluate(program["D"], values)
+        return [flat[n * i : n * i + n] for i in range(n)]
+    columns = []
+    for name in names:
+        unit = {f"{other}{mechanics.ALONG}": float(other == name) for other in names}
+        columns.append(evaluate(program["D_column"], {**values, **unit})[0])
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
 def _without_inertia(program: Program, k: int) -> str | None:
     """The coordinate without a positive pivot in D at the k-th state; None where D is regular."""
     names = [c.name for c in program.system.coordinates]
     n = len(names)
     try:
-        flat, _ = evaluate(program["D"], nearby(program.system, k))
+        D = mass_matrix(program, nearby(program.system, k))
     except (ArithmeticError, ValueError):
         return names[0]
-    A = [flat[n * i : n * i + n] for i in range(n)]
+    A = [list(row) for row in D]
     for i in range(n):
-        if not A[i][i] > 8 * n * 2.0**-52 * flat[n * i + i]:
+        if not A[i][i] > 8 * n * 2.0**-52 * D[i][i]:
             return names[i]
         for j in range(i + 1, n):
             factor = A[j][i] / A[i][i]

@@ -34,7 +34,8 @@ def equations(system: System, form: str = "text") -> str:
     as text it is shown as the assignments that compute it, and refused otherwise.
     """
     made = program.build(mechanics.derive(system))
-    if sum(made[name].cost.flops for name in ("D", "C", "bias")) > WRITTEN_OUT:
+    shown = [made[name].cost.flops for name in ("D", "C", "bias") if name in made]
+    if len(shown) < 3 or sum(shown) > WRITTEN_OUT:
         if form != "text":
             raise EomcError(
                 f"{system.name}: its equations would fill pages: 'eomc show' without --{form} "
@@ -105,24 +106,42 @@ def _assignments(made: program.Program) -> str:
     """D, C, g and tau as short lists of assignments, the form in which they are computed."""
     names = [c.name for c in made.system.coordinates]
     parts = [f"{made.system.title}: D qdd + C qd + g = tau, q = ({', '.join(names)})"]
-    for name in (n for n in _MATRICES if n in made):
+    for name in (n for whole in _MATRICES for n in (whole, f"{whole}_column") if n in made):
         body = ccode.body(made[name], made.system.name, {})
         lines = [line.removeprefix("const double ").rstrip(";") for line in body.lines]
         n = len(names)
         for k, result in enumerate(body.results):
             place = f"{names[k // n]}, {names[k % n]}" if name in ("D", "C") else names[k]
             lines.append(f"{name}[{place}] = {result}")
-        parts.append(f"{name}, {_MEANING[name]}:\n" + ccode.indent(lines))
+        meaning = _MEANING.get(name) or f"{name[0]} e for a direction e = ({names[0]}_along, ...)"
+        parts.append(f"{name}, {meaning}:\n" + ccode.indent(lines))
     return "\n\n".join(parts)
 
 
+_ROUTES = {
+    "program": "Lagrange over the program of K and P",
+    "expanded": "the same, multiplied out",
+    "cancelled": "multiplied out again during elimination",
+    "tree": "Newton and Euler along the tree",
+    "composite": "Newton and Euler, D of composite bodies, L D L^T",
+    "articulated": "Newton and Euler, articulated bodies",
+}
+
+
 def cost(system: System) -> str:
-    """The operations of each generated function, and those of the routes not taken."""
+    """The operations of each generated function, by each route, and why one was taken."""
     made = program.build(mechanics.derive(system))
     lines = [f"{system.title}: operations of one call, those on parameters alone left out", ""]
     wide = max(map(len, made.functions))
+    told: dict[str, None] = {}
     for name, function in made.functions.items():
         others = [f"{r} {c.flops}" for r, c in function.routes if r != function.route]
+        others += [f"{r} {why}" for r, why in made.passed_over.items() if name == "acceleration"]
         beside = f"  ({function.route}; {', '.join(others)})" if others else ""
         lines.append(f"{name:{wide}}  {function.cost.flops:5d} flops: {function.cost}{beside}")
+        told |= dict.fromkeys(r for r, _ in function.routes)
+    if len(told) > 1:
+        lines += ["", "Of each function the route of least weight is taken that loses no digits:"]
+        lines.append("a division weighs as 8 additions, a sine or other call as 25.")
+        lines += [f"    {route:{max(map(len, told))}}  {_ROUTES[route]}" for route in told]
     return "\n".join(lines)

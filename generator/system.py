@@ -16,23 +16,13 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from eomc import formulas, names
+from eomc.bodies import Builder, Terms, Tree
 from eomc.formulas import FormulaError
 from eomc.problems import EomcError, Problem, SceneError
 from eomc.scene import Run, Scene
+from eomc.symbols import dot, symbol, t
 
-t = Symbol("t", real=True)
-
-
-class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
-    """The total time derivative of its argument, kept as it stands until it is asked for."""
-
-    nargs = 1
-    is_real = True
-
-
-def symbol(name: str) -> Symbol:
-    """The symbol of a name; all of a system's symbols are real."""
-    return Symbol(name, real=True)
+__all__ = ["Coordinate", "Input", "Parameter", "System", "dot", "from_scene", "symbol", "t"]
 
 
 @dataclass(frozen=True)
@@ -91,8 +81,9 @@ class System:
     """d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, over named definitions.
 
     `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
-    `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate. `digest` names what
-    the system was made from; `renamed` says which names C could not bear: (given, used) pairs.
+    `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate. `tree`: the bodies
+    that hang on joints, whose energies are part of K and P. `digest` names what the system was
+    made from; `renamed` says which names C could not bear: (given, used) pairs.
     """
 
     name: str
@@ -104,6 +95,7 @@ class System:
     parameters: tuple[Parameter, ...] = ()
     inputs: tuple[Input, ...] = ()
     definitions: tuple[tuple[Symbol, Expr], ...] = ()
+    tree: Tree | None = None
     run: Run = field(default_factory=Run)
     title: str = ""
     note: str = ""
@@ -230,10 +222,24 @@ def from_scene(scene: Scene) -> System:
 
     for constant in scene.constants:
         known[constant.name] = value(f"constants.{constant.name}", constant.formula)
+    declared = [*known, *(name for name, _ in scene.definitions)]
+    assembly = getattr(scene, "assembly", None)
+    builder = Builder(assembly, value, declared) if assembly else None
     definitions = []
+    if builder:
+        builder.build_tree()
+        definitions += builder.terms.definitions
+        known |= {name.name: name for name, _ in definitions}
     for name, formula in scene.definitions:
         definitions.append((symbol(name), value(f"definitions.{name}", formula)))
         known[name] = symbol(name)
+    if builder:
+        builder.build_rest()
+        builder.add_forces()
+        definitions += builder.terms.later
+    more = builder.terms if builder else Terms()
+    kinetic = value("energy.kinetic", scene.kinetic)
+    potential = value("energy.potential", scene.potential)
     start, rate = scene.start()
     system = System(
         name=scene.name,
@@ -241,15 +247,19 @@ def from_scene(scene: Scene) -> System:
             Coordinate(c.name, c.unit, q, qd, c.note)
             for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
         ),
-        kinetic=value("energy.kinetic", scene.kinetic),
-        potential=value("energy.potential", scene.potential),
-        dissipation=value("energy.dissipation", scene.dissipation),
+        kinetic=kinetic + more.kinetic + more.tree_kinetic,
+        potential=potential + more.potential + more.tree_potential,
+        dissipation=value("energy.dissipation", scene.dissipation) + more.dissipation,
         forces=tuple(
-            value(f"forces.{c.name}", scene.forces[c.name])
-            if c.name in scene.forces
-            else sympy.S.Zero
+            more.forces.get(c.name, sympy.S.Zero)
+            + (
+                value(f"forces.{c.name}", scene.forces[c.name])
+                if c.name in scene.forces
+                else sympy.S.Zero
+            )
             for c in scene.coordinates
         ),
+        tree=more.tree(kinetic, potential),
         parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
         inputs=tuple(
             Input(i.name, i.unit, value(f"inputs.{i.name}.signal", i.signal), i.note)

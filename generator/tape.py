@@ -33,6 +33,10 @@ class Stage(IntEnum):
     VELOCITY = 4
 
 
+Powers = dict[Symbol, Expr]  # {name: exponent}, a product
+_Late = tuple[tuple[Symbol, Expr], ...]  # powers of names known after the parameters
+
+
 class Tape:
     """Definitions in order, each a sum, a product or a function of names before it.
 
@@ -48,12 +52,15 @@ class Tape:
         self.hint: dict[Symbol, str] = {}
         self.parts: dict[Symbol, tuple[Symbol, ...]] = {}  # names in the right-hand side
         self._number: dict[Symbol, int] = {}
-        self._known: dict[Expr, Symbol] = {}
+        self._known: dict[object, Symbol] = {}  # by right-hand side, sums and products by content
         self._solid: set[Symbol] = set()  # names that stay whole inside products
-        self._powers: dict[Symbol, dict[Symbol, Expr]] = {}
+        self._powers: dict[Symbol, Powers] = {}  # of names that are products
+        self._weights: dict[Symbol, dict[Symbol, Expr]] = {}  # of names that are sums
+        self._late: dict[Symbol, tuple[_Late, Expr]] = {}
         self.squares: dict[Symbol, Symbol] = {}  # sin(a) <-> cos(a), where both are there
         self._partial: dict[tuple[Symbol, Symbol], Expr] = {}
         self._pairs: dict[tuple[Symbol, Symbol], Expr] = {}
+        self._atoms: dict[tuple[Expr, Symbol], Expr] = {}
 
     # --- definitions ---------------------------------------------------------------------------
 
@@ -102,20 +109,39 @@ class Tape:
         if found is None:
             if rhs.has(*_ROUGH):
                 raise RoughError("a derivative of something that jumps is needed")
-            found = Symbol(f"_{len(self.rhs):06d}", real=True)
-            self._known[rhs] = found
-            self._number[found] = len(self.rhs)
-            self.rhs[found] = rhs
-            parts = sorted(rhs.free_symbols, key=lambda s: (self._number.get(s, -1), s.name))
-            self.parts[found] = tuple(parts)
-            self.stage[found] = max(self.stage[s] for s in parts)
+            found = self._new(rhs, rhs, rhs.free_symbols)
         return found
 
-    def _powers_of(self, symbol: Symbol) -> Mapping[Symbol, Expr]:
+    def _new(self, key: object, rhs: Expr, parts: Iterable[Symbol]) -> Symbol:
+        found = Symbol(f"_{len(self.rhs):06d}", real=True)
+        self._known[key] = found
+        self._number[found] = len(self.rhs)
+        self.rhs[found] = rhs
+        self.parts[found] = self._ordered(parts)
+        self.stage[found] = max(self.stage[s] for s in self.parts[found])
+        return found
+
+    def _ordered(self, names: Iterable[Symbol]) -> tuple[Symbol, ...]:
+        """Leaves by name, then names as they were made."""
+        return tuple(sorted(names, key=lambda s: (self._number.get(s, -1), s.name)))
+
+    def _powers_of(self, symbol: Symbol) -> Powers:
         """The symbol as a product of powers: its factors where it is one, itself elsewhere."""
         if symbol in self._solid:
             return {symbol: S.One}
         return self._powers.get(symbol) or {symbol: S.One}
+
+    def scaled(self, number: Expr, atom: Expr) -> Expr:
+        """A number times an atom."""
+        factor, symbol = split(atom)
+        factor = number if factor is S.One else number * factor
+        if symbol is None or factor == 0:
+            return factor
+        if factor is S.One:
+            return symbol
+        if (factor, symbol) not in self._atoms:
+            self._atoms[factor, symbol] = Mul._from_args((factor, symbol))
+        return self._atoms[factor, symbol]
 
     def _product(self, factors: Iterable[Expr]) -> Expr:
         number: Expr = S.One
@@ -142,51 +168,119 @@ class Tape:
             whole = self._powers_of(symbol) if exponent.is_Integer else {symbol: S.One}
             for name, power in whole.items():
                 powers[name] = powers.get(name, S.Zero) + power * exponent
+        if number == 0:
+            return S.Zero
+        return self.scaled(number, self._of_powers(powers))
+
+    def _of_powers(self, powers: Powers) -> Expr:
+        """What stands for a product of powers of names."""
         powers = {name: power for name, power in powers.items() if power != 0}
-        product = Mul(*(Pow(name, power) for name, power in powers.items()))
-        if number == 0 or product.is_number:
-            return number * product
-        if product.is_Symbol:
-            return number * product
-        symbol = self._name(product)
-        self._powers[symbol] = powers
-        return number * symbol
+        if not powers:
+            return S.One
+        if len(powers) == 1 and S.One in powers.values():
+            return next(iter(powers))
+        key = ("product", frozenset(powers.items()))
+        if (found := self._known.get(key)) is None:
+            names = self._ordered(powers)
+            rhs = Mul(*(Pow(name, powers[name]) for name in names))
+            found = self._new(key, rhs, names)
+            self._powers[found] = powers
+        return found
 
     def times(self, one: Expr, other: Expr) -> Expr:
         """The product of two atoms."""
         (a, x), (b, y) = split(one), split(other)
-        if x is None or y is None:
-            return one * other
+        if x is None:
+            return self.scaled(a, other)
+        if y is None:
+            return self.scaled(b, one)
         if (x, y) not in self._pairs:
-            self._pairs[x, y] = self._pairs[y, x] = self._product((x, y))
+            powers = dict(self._powers_of(x))
+            for name, power in self._powers_of(y).items():
+                powers[name] = powers[name] + power if name in powers else power
+            self._pairs[x, y] = self._pairs[y, x] = self._of_powers(powers)
         product = self._pairs[x, y]
-        return product if a == b == 1 else a * b * product
+        if a is S.One and b is S.One:
+            return product
+        return self.scaled(a * b, product)
+
+    def total(self, atoms: Iterable[Expr]) -> Expr:
+        """The sum of atoms."""
+        return self._sum(atoms)
 
     def _sum(self, atoms: Iterable[Expr]) -> Expr:
-        total = self._gather(Add(*atoms))
-        if not total.is_Add:
-            return total
-        terms = total.args
-        weights = [split(term)[0] for term in terms]
-        sign = weights[0] if weights[0].is_Rational else S.One
-        if all(w == sign or w == -sign for w in weights) and not any(w.is_number for w in terms):
-            return sign * self._name(Add(*(term / sign for term in terms)))
-        if sign.is_negative:
-            return -self._name(Add(*(-term for term in terms)))
-        return self._name(total)
+        weights: dict[Symbol, Expr] = {}
+        constant: Expr = S.Zero
+        for atom in atoms:
+            factor, symbol = split(atom)
+            if symbol is None:
+                constant += factor
+            elif symbol in weights:
+                weights[symbol] += factor
+            else:
+                weights[symbol] = factor
+        weights = {symbol: weight for symbol, weight in weights.items() if weight != 0}
+        if len(weights) + (constant != 0) < 2:
+            return constant if not weights else self.scaled(*weights.popitem()[::-1])
+        if self._can_gather(weights, constant):
+            terms = [constant, *(self.scaled(w, x) for x, w in weights.items())]
+            total = self._gather(Add(*terms))
+            if not total.is_Add:
+                return total
+            weights = dict(split(term)[::-1] for term in total.args if not term.is_number)
+            constant = total.as_coeff_Add()[0]
+        return self._of_weights(weights, constant)
+
+    def _of_weights(self, weights: dict[Symbol, Expr], constant: Expr = S.Zero) -> Expr:
+        """What stands for a sum of weighted names; most weights in it are positive."""
+        names = self._ordered(weights)
+        last = weights[min(reversed(names), key=lambda name: self.stage[name])]
+        negative = sum(bool(w.is_negative) for w in (constant, *weights.values()))
+        count = len(weights) + (constant != 0)
+        flip = 2 * negative > count or (2 * negative == count and last.is_negative)
+        size = abs(last) if last.is_Rational else S.One
+        if constant != 0 or not all(w in (size, -size) for w in weights.values()):
+            size = S.One
+        sign = -size if flip else size
+        if sign is not S.One:
+            weights = {name: weights[name] / sign for name in names}
+            constant = constant / sign
+        key = ("sum", frozenset(weights.items()), constant)
+        if (found := self._known.get(key)) is None:
+            terms = [self.scaled(weights[name], name) for name in names]
+            rhs = Add._from_args([*([constant] if constant != 0 else []), *terms])
+            found = self._new(key, rhs, names)
+            self._weights[found] = weights
+        return self.scaled(sign, found)
+
+    def _can_gather(self, weights: Mapping[Symbol, Expr], constant: Expr) -> bool:
+        """Whether terms differ in parameters' work alone, or are squares that may add up."""
+        seen: set[_Late] = {()} if constant != 0 else set()
+        for symbol in weights:
+            late = self._split_late(symbol)[0]
+            if late in seen or any(e == 2 and n in self.squares for n, e in late):
+                return True
+            seen.add(late)
+        return False
+
+    def _split_late(self, symbol: Symbol) -> tuple[_Late, Expr]:
+        """The factors that are known after the parameters, and the product of the rest."""
+        if symbol not in self._late:
+            powers = self._powers_of(symbol)
+            early = [n for n in powers if self.stage[n] <= Stage.PARAMETER]
+            late = tuple((n, powers[n]) for n in self._ordered(powers) if n not in early)
+            self._late[symbol] = (late, Mul(*(Pow(n, powers[n]) for n in early)))
+        return self._late[symbol]
 
     def _gather(self, total: Expr) -> Expr:
         """a x + b x = (a + b) x where a, b are parameters' work; a sin2 + a cos2 = a."""
         if not total.is_Add:
             return total
-        groups: dict[tuple[tuple[Symbol, Expr], ...], list[Expr]] = {}
+        groups: dict[_Late, list[Expr]] = {}
         for term in total.args:
             factor, symbol = split(term)
-            powers = self._powers_of(symbol) if symbol is not None else {}
-            early = [n for n in powers if self.stage[n] <= Stage.PARAMETER]
-            late = tuple(sorted(((n, e) for n, e in powers.items() if n not in early), key=str))
-            weight = Mul(factor, *(Pow(n, powers[n]) for n in early))
-            groups.setdefault(late, []).append(weight)
+            late, early = self._split_late(symbol) if symbol is not None else ((), S.One)
+            groups.setdefault(late, []).append(factor * early)
         weights = {
             late: self.define(parts[0])
             if len(parts) == 1
@@ -205,11 +299,13 @@ class Tape:
 
     def _sum_of_parameters(self, atoms: Iterable[Expr]) -> Expr:
         total = Add(*atoms)
-        return self._name(total) if total.is_Add else total
+        if not total.is_Add:
+            return total
+        constant = total.as_coeff_Add()[0]
+        terms = (split(term)[::-1] for term in total.args if not term.is_number)
+        return self._of_weights(dict(terms), constant)
 
-    def _pythagoras(
-        self, weights: dict[tuple[tuple[Symbol, Expr], ...], Expr]
-    ) -> dict[tuple[tuple[Symbol, Expr], ...], Expr]:
+    def _pythagoras(self, weights: dict[_Late, Expr]) -> dict[_Late, Expr]:
         again = True
         while again:
             again = False
@@ -219,7 +315,8 @@ class Tape:
                     if other is None or power != 2 or late not in weights:
                         continue
                     rest = tuple(part for part in late if part[0] != name)
-                    twin = tuple(sorted((*rest, (other, power)), key=str))
+                    powers = dict((*rest, (other, power)))
+                    twin = tuple((n, powers[n]) for n in self._ordered(powers))
                     if twin != late and weights.get(twin) == weight:
                         del weights[late], weights[twin]
                         sum_ = Add(weight, weights.get(rest, S.Zero))
@@ -254,8 +351,20 @@ class Tape:
         """d rhs(symbol)/d part, as `define` returns it."""
         key = (symbol, part)
         if key not in self._partial:
-            rhs = self.rhs[symbol]
-            self._partial[key] = rhs.coeff(part) if rhs.is_Add else self.define(rhs.diff(part))
+            if symbol in self._weights:
+                self._partial[key] = self._weights[symbol][part]
+            elif symbol in self._powers:
+                powers = dict(self._powers[symbol])
+                power = powers[part]
+                powers[part] = power - 1
+                whole: Powers = {}
+                for name, e in powers.items():  # whole powers of products become theirs
+                    inside = self._powers_of(name) if e.is_Integer else {name: S.One}
+                    for n, inner in inside.items():
+                        whole[n] = whole.get(n, S.Zero) + inner * e
+                self._partial[key] = self.scaled(power, self._of_powers(whole))
+            else:
+                self._partial[key] = self.define(self.rhs[symbol].diff(part))
         return self._partial[key]
 
     def forward(self, outputs: Sequence[Expr], seeds: Mapping[Symbol, Expr]) -> list[Expr]:
@@ -270,7 +379,7 @@ class Tape:
             if terms and (sum_ := self._sum(terms)) != 0:
                 tangent[symbol] = sum_
         return [
-            factor * tangent[symbol] if symbol in tangent else S.Zero
+            self.scaled(factor, tangent[symbol]) if symbol in tangent else S.Zero
             for factor, symbol in map(split, outputs)
         ]
 
@@ -288,7 +397,7 @@ class Tape:
         for output, seed in outputs:
             factor, symbol = split(output)
             if symbol is not None and seed != 0:
-                terms.setdefault(symbol, []).append(factor * seed)
+                terms.setdefault(symbol, []).append(self.scaled(factor, seed))
         for symbol in reversed(self.live([o for o, _ in outputs], stop)):
             if symbol in stop or symbol not in terms:
                 continue

@@ -47,7 +47,11 @@ def derived(change: Callable[[Equations], Equations]) -> Breakage:
 
     def breakage(patch: pytest.MonkeyPatch) -> None:
         right = mechanics.derive
-        patch.setattr(mechanics, "derive", lambda system: change(right(system)))
+        patch.setattr(
+            mechanics,
+            "derive",
+            lambda system: {route: change(e) for route, e in right(system).items()},
+        )
 
     return breakage
 
