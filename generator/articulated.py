@@ -15,6 +15,7 @@ from itertools import combinations_with_replacement
 from sympy import Expr, S
 
 from eomc.bodies import Matrix
+from eomc.tape import Stage
 from eomc.trees import AXES, ZERO, Inertia, Recursion, Vector
 
 Rows = list[list[Expr]]
@@ -76,7 +77,8 @@ class _Articulated:
             d = r.add(own, r.armature[k])
             if d == 0:
                 raise MasslessError(k)
-            pivots.append((d, r.add(d, size[k])))
+            known = r.tape.stage_of(d) <= Stage.PARAMETER
+            pivots.append((d, d if known else r.add(d, size[k])))
             inverse[k] = r.define(1 / d)
             columns[k] = (u_m, u_f)
             left[k] = r.add(drive[k], r.minus((m if link.turns else f)[k][a]))
@@ -87,7 +89,7 @@ class _Articulated:
             m[k] = r.plus(m[k], r.scaled(u_m, ratio))
             f[k] = r.plus(f[k], r.scaled(u_f, ratio))
             p = link.parent
-            size[p] = r.add(size[p], self._size_for(p, k, body, size[k]))
+            size[p] = r.add(size[p], self._size(k, body))
             bodies[p] = self._sum(bodies[p], self._carried(k, reduced))
             force, moment = r.inwards(k, f[k]), r.inwards(k, m[k])
             f[p] = r.plus(f[p], force)
@@ -124,18 +126,16 @@ class _Articulated:
         link = self.links[k]
         return link.inertia[link.axis] if link.turns else link.mass
 
-    def _size_for(self, p: int, k: int, body: _Inertia, before: Expr) -> Expr:
-        """For a link p without inertia of its own: the size of what it gets from k, not reduced."""
-        if self._own_size(p) != 0 or self.r.armature[p] != 0:
+    def _size(self, k: int, body: _Inertia) -> Expr:
+        """For a parent without inertia of its own: the size of what k hands on unreduced."""
+        r, p = self.r, self.links[k].parent
+        if self._own_size(p) != 0 or r.armature[p] != 0:
             return S.Zero
-        r = self.r
+        mass = [body.M[i][i] for i in range(3)]
         if not self.links[p].turns:
-            return r.add(before, *(body.M[i][i] for i in range(3)))
+            return r.add(*mass)
         across = r.dot(r.arm[k], r.arm[k])
-        return r.add(
-            before, *(body.J[i][i] for i in range(3)),
-            *(r.times(across, body.M[i][i]) for i in range(3)),
-        )  # fmt: skip
+        return r.add(*(body.J[i][i] for i in range(3)), *(r.times(across, m) for m in mass))
 
     def _rigid(self, x: Inertia) -> _Inertia:
         hx, hy, hz = x.moment
