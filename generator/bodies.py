@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import mpmath
 import sympy
-from sympy import Expr, Rational, S, Symbol
+from sympy import Add, Expr, Rational, S, Symbol
 
 from eomc.assembly import JOINTS, WORLD, Assembly, Body, Damper, Spring
 from eomc.formulas import Formula
@@ -23,7 +23,7 @@ Matrix = tuple[Vector, Vector, Vector]
 Value = Callable[[str, Formula], Expr]  # the expression of a formula that stands at a key
 
 DIGITS = 50  # of numbers that are folded
-TINY = Rational(1, 10**40)
+TINY = 10**40  # what is nearer than one part in that many to a whole number is it
 
 ZERO: Vector = (S.Zero, S.Zero, S.Zero)
 ONE: Matrix = ((S.One, S.Zero, S.Zero), (S.Zero, S.One, S.Zero), (S.Zero, S.Zero, S.One))
@@ -76,8 +76,8 @@ class Terms:
 
     definitions: list[tuple[Symbol, Expr]] = field(default_factory=list)
     later: list[tuple[Symbol, Expr]] = field(default_factory=list)
-    tree_kinetic: Expr = S.Zero
-    tree_potential: Expr = S.Zero
+    tree_kinetic: list[Expr] = field(default_factory=list)  # to be added up
+    tree_potential: list[Expr] = field(default_factory=list)
     kinetic: Expr = S.Zero  # of bodies placed by formulas
     potential: Expr = S.Zero  # theirs and the springs'
     dissipation: Expr = S.Zero
@@ -206,8 +206,8 @@ class Builder:
             arm = plus(place.offset, apply(place.rotation, c))
             about = [a + b for a, b in zip(about, point_inertia(m, arm), strict=True)]
             self._add_mass(place.link, m, moment, about)
-            terms.tree_kinetic += self._kinetic(body.name, mass, inertia, position, place)
-        terms.tree_potential += self._weight(mass, position)
+            terms.tree_kinetic += self._kinetic(mass, inertia, position, place)
+        terms.tree_potential.append(self._weight(mass, position))
 
     def _add_mass(self, k: int, mass: Expr, moment: Vector, inertia: Sequence[Expr]) -> None:
         link = self.terms.links[k]
@@ -220,7 +220,7 @@ class Builder:
     def _collect_masses(self) -> None:
         """Armatures, which have kinetic energy of their own."""
         for link in self.terms.links:
-            self.terms.tree_kinetic += link.armature * link.qd**2 / 2
+            self.terms.tree_kinetic.append(link.armature * link.qd**2 / 2)
 
     def add_forces(self) -> None:
         """Damping, friction and actuators of the joints."""
@@ -275,7 +275,7 @@ class Builder:
             turned = self._entries(body.name, turned, later=True)
         place = _Place(-1, ZERO, ONE, position, turned, angle)
         self.places[body.name] = place
-        terms.kinetic += self._kinetic(body.name, mass, inertia, position, place)
+        terms.kinetic += Add(*self._kinetic(mass, inertia, position, place))
         terms.potential += self._weight(mass, position)
 
     def _spring(self, key: str, spring: Spring) -> None:
@@ -309,21 +309,22 @@ class Builder:
     # --- pieces ----------------------------------------------------------------------------------
 
     def _kinetic(
-        self, name: str, mass: Expr, inertia: Sequence[Expr], position: Vector, place: _Place
-    ) -> Expr:
-        """m/2 |dc/dt|^2 + 1/2 sum_ab J_ab sum_k dR_ka/dt dR_kb/dt with J = tr(I)/2 - I."""
-        energy = mass * sum(dot(x) ** 2 for x in position if x.free_symbols) / 2
+        self, mass: Expr, inertia: Sequence[Expr], position: Vector, place: _Place
+    ) -> list[Expr]:
+        """m/2 |dc/dt|^2 + 1/2 sum_ab J_ab sum_k dR_ka/dt dR_kb/dt with J = tr(I)/2 - I; terms."""
+        energy = [mass * _rate(x) ** 2 / 2 for x in position]
         if self.assembly.plane:
-            return energy + inertia[2] * _rate(place.angle) ** 2 / 2
+            return [*energy, inertia[2] * _rate(place.angle) ** 2 / 2]
         xx, yy, zz, xy, xz, yz = inertia
         second = {
             (0, 0): (yy + zz - xx) / 2, (1, 1): (xx + zz - yy) / 2, (2, 2): (xx + yy - zz) / 2,
             (0, 1): -2 * xy, (0, 2): -2 * xz, (1, 2): -2 * yz,
         }  # fmt: skip
-        for (a, b), J in second.items():
-            if J != 0:
-                energy += J * sum(_rate(row[a]) * _rate(row[b]) for row in place.turned) / 2
-        return energy
+        rates = [[_rate(entry) for entry in row] for row in place.turned]
+        turning = [
+            J * row[a] * row[b] / 2 for (a, b), J in second.items() if J != 0 for row in rates
+        ]
+        return energy + turning
 
     def _weight(self, mass: Expr, position: Vector) -> Expr:
         return -mass * dot_product(self.terms.gravity, position)
@@ -404,13 +405,13 @@ def _motions(body: Body) -> list[tuple[str, Sequence[float], str]]:
 
 
 def numeric_entry(e: Expr) -> Expr:
-    """Numbers as fractions of at most DIGITS digits; what is within TINY of a whole one is it."""
+    """Numbers as fractions of at most DIGITS digits; what is all but whole is whole."""
     if not e.is_number:
         return e
     if not e.is_Rational:
         e = Rational(str(e.evalf(DIGITS + 5)))
-    whole = round(e)
-    if abs(e - whole) < TINY:
+    whole = (2 * e.p + e.q) // (2 * e.q)  # the nearest
+    if abs(e.p - whole * e.q) * TINY < e.q:
         return S(whole)
     if e.q > 10**DIGITS:
         with mpmath.workdps(DIGITS):
@@ -432,7 +433,8 @@ def clean(matrix: Matrix) -> Matrix:
 
 def plus(a: Vector, b: Vector) -> Vector:
     """a + b"""
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+    x, y, z = (p if q is S.Zero else q if p is S.Zero else p + q for p, q in zip(a, b, strict=True))
+    return (x, y, z)
 
 
 def scaled(a: Vector, factor: Expr) -> Vector:
@@ -447,7 +449,10 @@ def dot_product(a: Vector, b: Vector) -> Expr:
 
 def apply(R: Matrix, v: Sequence[Expr]) -> Vector:
     """R v"""
-    x, y, z = (sum((r * e for r, e in zip(row, v, strict=True)), S.Zero) for row in R)
+    x, y, z = (
+        Add(*(e if r is S.One else r * e for r, e in zip(row, v, strict=True) if r is not S.Zero))
+        for row in R
+    )
     return (x, y, z)
 
 

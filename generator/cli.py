@@ -1,4 +1,4 @@
-"""The command: eomc new, build, check, run, show, list.
+"""The command: eomc new, import, build, check, run, show, dof, list.
 
 Exit status: 0, 1 where a check failed or a run could not go on, 2 for bad input. What takes time
 to import (SymPy, pydantic, rich) is imported where it is needed: `eomc build` with nothing to do
@@ -64,6 +64,7 @@ def main() -> None:
 
     \b
     eomc new pendulum              write a scene to start from
+    eomc import robot.urdf         write the scene of a robot file
     eomc run pendulum.toml         derive, compile and simulate it
     eomc check pendulum.toml       hold it against the independent reference
     """
@@ -82,13 +83,23 @@ def new(name: str) -> None:
 
     if why := names.module_fault(name):
         raise EomcError(why)
-    folder = Path("scenes") if Path("scenes").is_dir() else Path()
-    path = folder / f"{name}.toml"
     text = (
         environment()
         .get_template("scene.toml.jinja")
         .render(name=name, title=name.replace("_", " ").capitalize())
     )
+    path = _scene_path(name)
+    _write_new(path, text)
+    click.echo(f"wrote {path}; try: eomc run {path}")
+
+
+def _scene_path(name: str) -> Path:
+    """Where a new scene goes: into scenes/ where there is one."""
+    return (Path("scenes") if Path("scenes").is_dir() else Path()) / f"{name}.toml"
+
+
+def _write_new(path: Path, text: str) -> None:
+    """Write a file that must not be there yet."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -96,7 +107,83 @@ def new(name: str) -> None:
         raise EomcError(f"{path}: is there already, and stays as it is") from None
     except OSError as fault:
         raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
-    click.echo(f"wrote {path}; try: eomc run {path}")
+
+
+@main.command("import")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="The scene; by default as eomc new has it."
+)
+@click.option("--name", help="Of the scene, instead of the robot's.")
+@click.option(
+    "--lock", "locks", multiple=True, metavar="JOINT=VALUE", help="Freeze a joint, at rad or m."
+)
+@click.option("--root", metavar="LINK", default="", help="Keep what this link carries, fix it.")
+@click.option("--tip", metavar="LINK", default="", help="Keep the chain that ends in this link.")
+@click.option(
+    "--base", type=click.Choice(["fixed", "free"]), help="Of the root, instead of the file's."
+)
+@click.option("--no-drives", is_flag=True, help="No input for each joint.")
+@click.option("--include", is_flag=True, help="Open what <include> names, in the file's folder.")
+def import_(
+    file: Path, out: Path | None, name: str | None, locks: Sequence[str], root: str, tip: str,
+    base: str | None, no_drives: bool, include: bool,
+) -> None:  # fmt: skip
+    """Write the scene of a robot file, URDF or MJCF, and say what it leaves out.
+
+    \b
+    eomc import panda.urdf --lock panda_finger_joint1=0.04 --lock panda_finger_joint2=0.04
+    eomc import humanoid.urdf --root torso --tip left_hand
+    """
+    from dataclasses import replace
+
+    from eomc import mjcf, names, robots, urdf, xmlfile
+
+    element = xmlfile.root(file).tag
+    if element == "mujoco":
+        robot = mjcf.read(file, include)
+    elif include:
+        raise EomcError(f"--include is for MJCF files, and {file} is none")
+    else:
+        robot = urdf.read(file)
+    robot = robots.lock(robot, dict(_pairs(locks, "--lock", {})))
+    robot = robots.cut(robot, root, tip)
+    if base:
+        robot = robots.based(robot, free=base == "free")
+    if no_drives:
+        robot = replace(robot, drives=())
+    if name is not None:
+        if why := names.module_fault(name):
+            raise EomcError(f"--name: {why}")
+        robot = replace(robot, name=name)
+    robot = robots.finished(robot)
+    path = out or _scene_path(robot.name)
+    _write_new(path, robots.scene_text(robot))
+    click.echo(
+        f"wrote {path}: bodies {len(robot.bodies)}, coordinates {len(robot.motions)}, "
+        f"inputs {len(robot.drives)}"
+    )
+    if robot.left_out:
+        click.echo("not modelled, or to be looked at:")
+        for words in robot.left_out:
+            click.echo(f"  - {words}")
+    click.echo(f"try: eomc dof {path}; eomc run {path}")
+
+
+@main.command()
+@_SCENE
+@_JSON
+def dof(scene: Path, as_json: bool) -> None:
+    """Count a scene's freedoms, from its bodies and joints, and say which are redundant.
+
+    \b
+    eomc dof scenes/arm.toml
+    """
+    from eomc import mobility
+    from eomc import scene as scenes
+
+    counted = mobility.count(scenes.read(scene))
+    click.echo(json.dumps(counted.as_dict(), indent=1) if as_json else counted.table())
 
 
 @main.command()

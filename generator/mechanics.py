@@ -37,7 +37,7 @@ Rows = tuple[Vector, ...]
 ALONG = "_along"  # a direction's entry along a coordinate
 LAGRANGE_DEFINITIONS = 12  # of a tree's world coordinates: beyond, recursion always needs less
 MOST_ROWS = 16  # coordinates from which D is computed column by column, where nothing needs it
-WRITTEN_OUT = 4000  # names on the tape, about, from which C is computed column by column
+WRITTEN_OUT = 2500  # names on the tape, about, from which C is computed column by column
 
 
 @dataclass(frozen=True)

@@ -247,8 +247,8 @@ def from_scene(scene: Scene) -> System:
             Coordinate(c.name, c.unit, q, qd, c.note)
             for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
         ),
-        kinetic=kinetic + more.kinetic + more.tree_kinetic,
-        potential=potential + more.potential + more.tree_potential,
+        kinetic=sympy.Add(kinetic, more.kinetic, *more.tree_kinetic),
+        potential=sympy.Add(potential, more.potential, *more.tree_potential),
         dissipation=value("energy.dissipation", scene.dissipation) + more.dissipation,
         forces=tuple(
             more.forces.get(c.name, sympy.S.Zero)

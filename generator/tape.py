@@ -135,7 +135,7 @@ class Tape:
         """A number times an atom."""
         factor, symbol = split(atom)
         factor = number if factor is S.One else number * factor
-        if symbol is None or factor == 0:
+        if symbol is None or factor is S.Zero:
             return factor
         if factor is S.One:
             return symbol
@@ -174,7 +174,7 @@ class Tape:
 
     def _of_powers(self, powers: Powers) -> Expr:
         """What stands for a product of powers of names."""
-        powers = {name: power for name, power in powers.items() if power != 0}
+        powers = {name: power for name, power in powers.items() if power is not S.Zero}
         if not powers:
             return S.One
         if len(powers) == 1 and S.One in powers.values():
@@ -219,8 +219,8 @@ class Tape:
                 weights[symbol] += factor
             else:
                 weights[symbol] = factor
-        weights = {symbol: weight for symbol, weight in weights.items() if weight != 0}
-        if len(weights) + (constant != 0) < 2:
+        weights = {symbol: w for symbol, w in weights.items() if w is not S.Zero}
+        if len(weights) + (constant is not S.Zero) < 2:
             return constant if not weights else self.scaled(*weights.popitem()[::-1])
         if self._can_gather(weights, constant):
             terms = [constant, *(self.scaled(w, x) for x, w in weights.items())]
@@ -235,11 +235,11 @@ class Tape:
         """What stands for a sum of weighted names; most weights in it are positive."""
         names = self._ordered(weights)
         last = weights[min(reversed(names), key=lambda name: self.stage[name])]
-        negative = sum(bool(w.is_negative) for w in (constant, *weights.values()))
-        count = len(weights) + (constant != 0)
-        flip = 2 * negative > count or (2 * negative == count and last.is_negative)
+        negative = sum(map(_is_negative, (constant, *weights.values())))
+        count = len(weights) + (constant is not S.Zero)
+        flip = 2 * negative > count or (2 * negative == count and _is_negative(last))
         size = abs(last) if last.is_Rational else S.One
-        if constant != 0 or not all(w in (size, -size) for w in weights.values()):
+        if constant is not S.Zero or not all(w in (size, -size) for w in weights.values()):
             size = S.One
         sign = -size if flip else size
         if sign is not S.One:
@@ -248,14 +248,14 @@ class Tape:
         key = ("sum", frozenset(weights.items()), constant)
         if (found := self._known.get(key)) is None:
             terms = [self.scaled(weights[name], name) for name in names]
-            rhs = Add._from_args([*([constant] if constant != 0 else []), *terms])
+            rhs = Add._from_args([*([constant] if constant is not S.Zero else []), *terms])
             found = self._new(key, rhs, names)
             self._weights[found] = weights
         return self.scaled(sign, found)
 
     def _can_gather(self, weights: Mapping[Symbol, Expr], constant: Expr) -> bool:
         """Whether terms differ in parameters' work alone, or are squares that may add up."""
-        seen: set[_Late] = {()} if constant != 0 else set()
+        seen: set[_Late] = {()} if constant is not S.Zero else set()
         for symbol in weights:
             late = self._split_late(symbol)[0]
             if late in seen or any(e == 2 and n in self.squares for n, e in late):
@@ -427,3 +427,7 @@ def split(atom: Expr) -> tuple[Expr, Symbol | None]:
         return atom.args[0], atom.args[1]
     symbol = next(iter(atom.free_symbols))
     return Mul(*(f for f in atom.args if f is not symbol)), symbol
+
+
+def _is_negative(number: Expr) -> bool:
+    return bool(number.p < 0 if number.is_Rational else number.is_negative)

@@ -89,11 +89,11 @@ class Recursion:
 
     def add(self, *terms: Expr) -> Expr:
         """Their sum."""
-        return self.tape.total([x for x in terms if x != 0])
+        return self.tape.total([x for x in terms if x is not S.Zero])
 
     def times(self, a: Expr, b: Expr) -> Expr:
         """a b"""
-        return S.Zero if a == 0 or b == 0 else self.tape.times(a, b)
+        return S.Zero if a is S.Zero or b is S.Zero else self.tape.times(a, b)
 
     def minus(self, a: Expr) -> Expr:
         """-a"""

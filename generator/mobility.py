@@ -1,0 +1,458 @@
+"""M = d(N - 1 - j) + sum f_i: how many freedoms a scene of bodies and joints has, and which.
+
+The count (Chebychev, Grübler, Kutzbach; e.g. Angeles, *Fundamentals of Robotic Mechanical
+Systems*) is held against ranks: of the poses of all bodies over the coordinates, which shows
+coordinates that move nothing or nothing of their own, and of the mass matrix of the bodies, which
+shows those that move nothing with inertia. Both are taken from plain forward kinematics, of bodies
+placed by formulas from its finite differences, at random states and at the start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eomc import formulas
+from eomc.assembly import JOINTS, WORLD, Assembly, Body, Turn
+from eomc.formulas import Formula
+from eomc.problems import EomcError
+
+if TYPE_CHECKING:
+    from eomc.scene import Scene
+
+Array = NDArray[np.float64]
+Pose = tuple[Array, Array]  # where a body's frame is in the world: offset (3,), rotation (3, 3)
+Motion = tuple[
+    int, str, Array, Array
+]  # coordinate, "t" or "r", axis and a point on it, in the world
+
+STEP = 1e-5  # of central differences: their error is about 1e-10
+NOTHING = 1e-7  # a column shorter than this, relative to the longest, is one of zeros
+RANK = 1e-6  # a singular value of columns of length one, relative to the largest: a zero
+STATES = 3  # random ones; a rank that holds almost everywhere is the largest of them
+
+
+@dataclass(frozen=True)
+class Mobility:
+    """What was counted and found. freedoms: of each joint, by kind; M: the count.
+
+    coordinates: of the scene; rank: how many move the bodies independently, almost everywhere.
+    remarks: in words, what is redundant, missing or singular.
+    """
+
+    scene: str
+    d: int
+    bodies: int
+    joints: Mapping[str, int]
+    M: int
+    coordinates: int
+    rank: int
+    remarks: tuple[str, ...]
+
+    def table(self) -> str:
+        """For people."""
+        kinds = ", ".join(
+            f"{n} {kind} (f = {_freedoms(kind, self.d)})" for kind, n in self.joints.items()
+        )
+        j, total = self.bodies, sum(n * _freedoms(k, self.d) for k, n in self.joints.items())
+        where = "in the plane" if self.d == 3 else "in space"
+        lines = [
+            f"{self.scene}: {self.M} {_plural('freedom', self.M)} {where}",
+            f"  N = {self.bodies + 1} links, the world among them",
+            f"  j = {j} joints: {kinds}",
+            f"  M = d(N - 1 - j) + sum f = {self.d}({self.bodies + 1} - 1 - {j}) + {total} "
+            f"= {self.M}",
+            f"  {self.coordinates} {_plural('coordinate', self.coordinates)}, {self.rank} of them "
+            "independent in how they move the bodies",
+            *(f"  - {remark}" for remark in self.remarks),
+        ]
+        return "\n".join(lines)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "scene": self.scene, "d": self.d, "N": self.bodies + 1, "joints": dict(self.joints),
+            "M": self.M, "coordinates": self.coordinates, "rank": self.rank,
+            "remarks": list(self.remarks),
+        }  # fmt: skip
+
+
+def count(scene: Scene) -> Mobility:
+    """The mobility of a scene. Raises EomcError for one without bodies."""
+    assembly = scene.assembly
+    if not assembly or not assembly.bodies:
+        raise EomcError(
+            f"{scene.file}: the scene has no [[body]]: mobility is counted from bodies and joints"
+        )
+    d = 3 if assembly.plane else 6
+    placed = [body for body in assembly.bodies if not body.joint]
+    joints = Counter(body.joint or FORMULAS for body in assembly.bodies)
+    M = sum(n * _freedoms(kind, d) for kind, n in joints.items())  # a tree: N - 1 - j = 0
+    kinematics = _Kinematics(scene, assembly)
+    names = kinematics.coordinates
+    found = list(kinematics.states())
+    if not found:
+        raise EomcError(f"{scene.file}: the bodies' positions have no value at the states tried")
+    generic = min(found, key=lambda at: (len(_null(at.moves)), len(_null(at.weighs))))
+    redundant = _null(generic.moves)
+    rank = len(names) - len(redundant)
+    remarks = [
+        *_fixed(assembly),
+        *_shared(assembly),
+        *_formulas_fix(placed, d, names, rank, M),
+        *_moves_nothing(generic, names, redundant, bool(scene.kinetic.names())),
+        *_in_a_row(assembly, kinematics),
+        *_singular_start(kinematics, redundant, generic),
+    ]
+    return Mobility(scene.name, d, len(assembly.bodies), joints, M, len(names), rank, (*remarks,))
+
+
+FORMULAS = "placed by formulas"
+
+
+@dataclass(frozen=True)
+class _Jacobian:
+    """Over the coordinates, a column each.
+
+    moves: velocities and angular velocities of all bodies, m/s and rad/s a unit of rate. weighs:
+    these times the roots of their inertias, so that D = weighs^T weighs.
+    """
+
+    moves: Array
+    weighs: Array
+
+
+def _freedoms(kind: str, d: int) -> int:
+    return d if kind == FORMULAS else len(JOINTS[kind].motions)
+
+
+# --- what there is to say -------------------------------------------------------------------------
+
+
+def _fixed(assembly: Assembly) -> Iterator[str]:
+    rigid = [body.name for body in assembly.bodies if body.joint == "fixed"]
+    if rigid:
+        yield f"fixed (f = 0), moving as one with what they are fixed to: {_listed(rigid)}"
+
+
+def _shared(assembly: Assembly) -> Iterator[str]:
+    holders: dict[str, list[str]] = {}
+    for body in assembly.bodies:
+        for name in body.coordinates:
+            holders.setdefault(name, []).append(body.name)
+    for name, bodies in holders.items():
+        if len(bodies) > 1:
+            yield (
+                f"'{name}' moves {len(bodies)} joints, those of {_listed(bodies)}: M counts each, "
+                f"they are {len(bodies) - 1} fewer"
+            )
+
+
+def _formulas_fix(
+    placed: Sequence[Body], d: int, names: Sequence[str], rank: int, M: int
+) -> Iterator[str]:
+    if placed:
+        yield (
+            f"{_listed(b.name for b in placed)}: M counts {d} freedoms for each body that is "
+            f"placed by formulas; the formulas fix {M - rank} of the {M}, which leaves {rank}"
+        )
+
+
+def _moves_nothing(
+    at: _Jacobian, names: Sequence[str], redundant: Array, by_hand: bool
+) -> Iterator[str]:
+    """Coordinates that no body hangs on, or that move bodies only in combinations."""
+    result = "D is singular" + (" unless [energy] gives it inertia" if by_hand else "")
+    for row in redundant:
+        yield f"redundant: {_combination(row, names)} moves no body; {result}"
+    known = redundant
+    for row in _null(at.weighs):
+        more = np.vstack([known, row])
+        if np.linalg.matrix_rank(more, tol=1e-4) > len(known):  # not a motion told above
+            known = more
+            what = _combination(row, names)
+            yield f"without inertia: {what} moves nothing that has inertia against it; {result}"
+
+
+def _in_a_row(assembly: Assembly, kinematics: _Kinematics) -> Iterator[str]:
+    """Joints one behind the other about the same line, or along the same direction."""
+    by_name = {body.name: body for body in assembly.bodies}
+    for body in assembly.bodies:
+        if body.joint not in ("revolute", "prismatic"):
+            continue
+        offset, rotation = kinematics.frames[body.name]
+        above = by_name.get(body.parent)
+        while above is not None and above.joint == "fixed":
+            o, r = kinematics.frames[above.name]
+            offset, rotation = o + r @ offset, r @ rotation
+            above = by_name.get(above.parent)
+        if above is None or above.joint != body.joint:
+            continue
+        first = kinematics.axes(above)[0]
+        second = rotation @ kinematics.axes(body)[0]
+        parallel = float(np.linalg.norm(np.cross(first, second))) < 1e-9
+        turns = body.joint == "revolute"
+        if not parallel or (turns and float(np.linalg.norm(np.cross(offset, first))) > 1e-9):
+            continue
+        how = "turn about the same line" if turns else "slide along the same direction"
+        pair = above.coordinates[0], body.coordinates[0]
+        yield (
+            f"'{pair[0]}' and '{pair[1]}' {how}, one behind the other: only what lies between the "
+            f"two joints tells them apart, {above.name} needs inertia of its own"
+        )
+
+
+def _singular_start(kinematics: _Kinematics, redundant: Array, generic: _Jacobian) -> Iterator[str]:
+    at_start = kinematics.jacobian(kinematics.start, 0.0)
+    names = kinematics.coordinates
+    if at_start is None:
+        yield "at the start the bodies' positions have no value"
+        return
+    for jacobian, usual, what in (
+        (at_start.moves, redundant, "move the bodies independently"),
+        (at_start.weighs, _null(generic.weighs), "have inertia"),
+    ):
+        null = _null(jacobian)
+        if len(null) > len(usual):
+            those = [name for name in names if any(name in _named(row, names) for row in null)]
+            yield (
+                f"singular start: {len(names) - len(null)} coordinates {what} there, elsewhere "
+                f"{len(names) - len(usual)}; start elsewhere in {_listed(those)}"
+            )
+            return
+
+
+def _combination(row: Array, names: Sequence[str]) -> str:
+    """A motion in words: one coordinate, or rates in a fixed proportion."""
+    those = _named(row, names)
+    if len(those) == 1:
+        return f"'{those[0]}'"
+    rates = dict(zip(names, row, strict=True))
+    return "the motion " + ", ".join(f"{name}_dot = {rates[name]:.4g}" for name in those)
+
+
+def _named(row: Array, names: Sequence[str]) -> list[str]:
+    large = np.abs(row) > 1e-3 * np.abs(row).max()
+    return [name for name, named in zip(names, large, strict=True) if named]
+
+
+def _null(columns: Array) -> Array:
+    """The null space, a row each, with as many zeros as elimination finds: (n - rank, n)."""
+    n = columns.shape[1]
+    sizes = np.linalg.norm(columns, axis=0)
+    there = np.flatnonzero(sizes > NOTHING * sizes.max(initial=0.0))
+    rows = [np.eye(n)[k] for k in range(n) if k not in there]
+    if len(there):
+        upper = np.linalg.qr(columns[:, there] / sizes[there], mode="r")  # as long as wide
+        _, values, vectors = np.linalg.svd(upper)
+        rank = int((values > RANK * values[0]).sum())
+        for row in _eliminated(vectors[rank:]):
+            full = np.zeros(n)
+            full[there] = row / sizes[there]
+            first = full[np.flatnonzero(np.abs(full) > 1e-3 * np.abs(full).max())[0]]
+            rows.append(full / (np.abs(full).max() * np.sign(first)))
+    return np.array(rows).reshape(-1, n)
+
+
+def _eliminated(rows: Array) -> Array:
+    """Gauss and Jordan's form of linearly independent rows."""
+    rows = rows.copy()
+    for k in range(len(rows)):
+        pivot = np.unravel_index(np.abs(rows[k:]).argmax(), rows[k:].shape)
+        rows[[k, k + int(pivot[0])]] = rows[[k + int(pivot[0]), k]]
+        column = int(pivot[1])
+        rows[k] /= rows[k, column]
+        others = [i for i in range(len(rows)) if i != k]
+        rows[others] -= np.outer(rows[others, column], rows[k])
+    return rows
+
+
+# --- forward kinematics ---------------------------------------------------------------------------
+
+
+class _Kinematics:
+    """A scene's bodies at a state, in plain numbers."""
+
+    def __init__(self, scene: Scene, assembly: Assembly) -> None:
+        self.coordinates = [c.name for c in scene.coordinates]
+        self.values = {p.name: p.value for p in (*scene.parameters, *scene.constants)}
+        self.definitions = dict(scene.definitions)
+        self.start = np.array(scene.start()[0])
+        self.tree = [body for body in assembly.bodies if body.joint]
+        self.placed = [body for body in assembly.bodies if not body.joint]
+        # these hang on parameters only
+        self.frames = {body.name: self.joint_frame(body) for body in self.tree}
+        self.centers = {body.name: self._vector(body.center, self.values) for body in self.tree}
+        self.roots = {body.name: self._roots(body) for body in assembly.bodies}
+        self.armature = np.diag(np.sqrt(self._armature(assembly)))
+
+    def states(self) -> Iterator[_Jacobian]:
+        """At random states: coordinates not too far from the start, where formulas have values."""
+        random = np.random.default_rng(0)
+        for _ in range(STATES):
+            q = self.start + random.uniform(-0.7, 0.7, len(self.start))
+            if jacobian := self.jacobian(q, random.uniform(0, 1)):
+                yield jacobian
+
+    def jacobian(self, q: Array, t: float) -> _Jacobian | None:
+        """At a state; None where a formula has no value there."""
+        try:
+            found = [*self._tree_rates(q), *self._placed_rates(q, t)]
+        except (ArithmeticError, ValueError, TypeError):
+            return None
+        moves, weighs = [], []
+        for body, turned, v, omega in found:
+            mass, inertia = self.roots[body.name]
+            moves += [v, omega]
+            weighs += [mass * v, inertia @ turned.T @ omega]
+        return _Jacobian(np.vstack(moves), np.vstack([*weighs, self.armature]))
+
+    def _tree_rates(self, q: Array) -> Iterator[tuple[Body, Array, Array, Array]]:
+        """Each body's rotation, and velocities of its centre and of turning over q: (3, nq)."""
+        held = self._held(q)
+        for body in self.tree:
+            (at, turned), above = held[body.name]
+            center = at + turned @ self.centers[body.name]
+            v, omega = np.zeros((3, len(q))), np.zeros((3, len(q)))
+            for k, kind, axis, point in above:
+                if kind == "t":
+                    v[:, k] += axis
+                else:
+                    v[:, k] += np.cross(axis, center - point)
+                    omega[:, k] += axis
+            yield body, turned, v, omega
+
+    def _held(self, q: Array) -> dict[str, tuple[Pose, list[Motion]]]:
+        """The frame of each body in the world, and all motions between the two."""
+        index = {name: k for k, name in enumerate(self.coordinates)}
+        held: dict[str, tuple[Pose, list[Motion]]] = {WORLD: ((np.zeros(3), np.eye(3)), [])}
+        for body in self.tree:
+            (at, turned), above = held[body.parent]
+            offset, rotation = self.frames[body.name]
+            at, turned, above = at + turned @ offset, turned @ rotation, list(above)
+            kinds = JOINTS[body.joint].motions  # slides come before turns, so points stay
+            for kind, axis, name in zip(kinds, self.axes(body), body.coordinates, strict=True):
+                k = index[name]
+                if kind == "t":
+                    above.append((k, kind, turned @ axis, at))
+                    at = at + turned @ axis * q[k]
+                else:
+                    above.append((k, kind, turned @ axis, at))
+                    turned = turned @ _turn(axis, q[k])
+            held[body.name] = (at, turned), above
+        return held
+
+    def _placed_rates(self, q: Array, t: float) -> Iterator[tuple[Body, Array, Array, Array]]:
+        """The same of bodies placed by formulas, by central differences."""
+        if not self.placed:
+            return
+        here = self._placed_at(q, t)
+        v = {name: np.zeros((3, len(q))) for name in here}
+        omega = {name: np.zeros((3, len(q))) for name in here}
+        for k in range(len(q)):
+            step = np.zeros(len(q))
+            step[k] = STEP
+            ahead, behind = self._placed_at(q + step, t), self._placed_at(q - step, t)
+            for name in here:
+                v[name][:, k] = (ahead[name][0] - behind[name][0]) / (2 * STEP)
+                # R(q + h) R(q - h)^T = 1 + 2 h [omega] + ..., antisymmetric up to h^3
+                turn = ahead[name][1] @ behind[name][1].T / (4 * STEP)
+                skew = turn - turn.T
+                omega[name][:, k] = skew[2, 1], skew[0, 2], skew[1, 0]
+        for body in self.placed:
+            yield body, here[body.name][1], v[body.name], omega[body.name]
+
+    def _placed_at(self, q: Array, t: float) -> dict[str, Pose]:
+        """Centre of mass and rotation of each body that is placed by formulas."""
+        known = {**self.values, **dict(zip(self.coordinates, map(float, q), strict=True)), "t": t}
+        for name, ((at, turned), _) in self._held(q).items():
+            if name != WORLD:
+                center = at + turned @ self.centers[name]
+                known |= {f"{name}_{x}": float(c) for x, c in zip("xyz", center, strict=True)}
+        return {
+            body.name: (
+                self._vector(body.position or (), known),
+                self._turned(body.rotation, known),
+            )
+            for body in self.placed
+        }
+
+    def joint_frame(self, body: Body) -> Pose:
+        """Where the joint's frame stands in the parent's."""
+        offset = self._vector(body.offset, self.values) if body.offset else np.zeros(3)
+        return offset, self._turned(body.rotation, self.values)
+
+    def axes(self, body: Body) -> list[Array]:
+        """The axis of each coordinate of a joint, in the frame that those before it moved."""
+        x, y, z = np.eye(3)
+        by_joint = {
+            "planar": [x, y, z],
+            "spherical": [z, y, x],
+            "free": [x, y, z, z, y, x],
+        }
+        given = [np.array(axis) / np.linalg.norm(axis) for axis in body.axes]
+        if body.joint == "revolute" and not given:
+            given = [z]  # of a plane scene
+        return by_joint.get(body.joint) or given * (len(body.coordinates) // max(len(given), 1))
+
+    def _roots(self, body: Body) -> tuple[float, Array]:
+        """The root of the mass, and of the inertia: 2 K = |root_m v|^2 + |root_I omega|^2."""
+        xx, yy, zz, xy, xz, yz = (self._number(entry, self.values) for entry in body.inertia)
+        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        root = np.sqrt(np.maximum(moments, 0))[:, None] * axes.T
+        return math.sqrt(max(self._number(body.mass, self.values), 0)), root
+
+    def _armature(self, assembly: Assembly) -> list[float]:
+        by_name = dict.fromkeys(self.coordinates, 0.0)
+        for body in assembly.bodies:
+            for name, armature in zip(body.coordinates, body.armature, strict=False):
+                by_name[name] += max(self._number(armature, self.values), 0)
+        return list(by_name.values())
+
+    def _vector(self, formulas_: Iterable[Formula], known: dict[str, float]) -> Array:
+        return np.array([self._number(formula, known) for formula in formulas_])
+
+    def _turned(self, turns: Iterable[Turn], known: dict[str, float]) -> Array:
+        rotation = np.eye(3)
+        for turn in turns:
+            axis = np.eye(3)["xyz".index(turn.axis)]
+            rotation = rotation @ _turn(axis, self._number(turn.angle, known))
+        return rotation
+
+    def _number(self, formula: Formula, known: dict[str, float]) -> float:
+        """The value of a formula; definitions are followed, and kept in `known`."""
+
+        def lookup(name: str) -> float:
+            if name not in known:
+                known[name] = self._number(self.definitions[name], known)
+            return known[name]
+
+        value = float(formulas.evaluate(formula, formulas.NUMERIC, lookup))
+        if not math.isfinite(value):
+            raise ValueError("not finite")
+        return value
+
+
+def _turn(axis: Array, angle: float) -> Array:
+    """The rotation by an angle about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turned: Array = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return turned
+
+
+def _listed(those: Iterable[str]) -> str:
+    names = list(those)
+    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+
+
+def _plural(word: str, n: int) -> str:
+    if n == 1:
+        return word
+    return word[:-1] + "ies" if word.endswith("y") else word + "s"

@@ -1,0 +1,63 @@
+"""XML of strangers, read as data: no entity is expanded, nothing that it names is opened."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree.ElementTree import ParseError
+
+from eomc.formulas import suggest
+from eomc.problems import EomcError
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+MAX_BYTES = 20_000_000  # the largest robot files without their meshes have one or two million
+
+
+def root(file: str | os.PathLike[str]) -> Element:
+    """The root element of an XML file. Raises EomcError with what is wrong and what to do."""
+    from defusedxml import DefusedXmlException
+    from defusedxml.ElementTree import fromstring
+
+    data = _bytes(Path(file), str(file))
+    if not data.strip():
+        raise EomcError(f"{file}: the file is empty")
+    try:
+        found: Element = fromstring(data, forbid_dtd=True)
+    except ParseError as fault:
+        if b"xacro:" in data and "unbound prefix" in str(fault):
+            raise EomcError(f"{file}: {RUN_XACRO}") from None
+        line, column = fault.position
+        why = re.sub(r": line \d+, column \d+$", "", str(fault))
+        raise EomcError(f"{file}:{line}:{column + 1}: not XML: {why}") from None
+    except DefusedXmlException:
+        raise EomcError(
+            f"{file}: it declares a document type or entities, which are not read: robot files "
+            "need none, remove <!DOCTYPE ...> and write out what its entities stand for"
+        ) from None
+    except (ValueError, LookupError) as fault:  # of the encoding that it claims
+        raise EomcError(f"{file}: not XML: {fault}") from None
+    return found
+
+
+RUN_XACRO = "it holds xacro macros: run xacro first (xacro robot.urdf.xacro > robot.urdf)"
+
+
+def _bytes(path: Path, shown: str) -> bytes:
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise EomcError(
+                f"{shown}: {size} bytes are more than the {MAX_BYTES} a robot file may have"
+            )
+        with path.open("rb") as file:
+            return file.read(MAX_BYTES)
+    except FileNotFoundError:
+        near = suggest(path.name, (p.name for p in path.parent.glob("*.[ux]*")))
+        raise EomcError(f"{shown}: there is no such file{near}") from None
+    except (OSError, ValueError) as fault:
+        why = getattr(fault, "strerror", None) or fault
+        raise EomcError(f"{shown}: can't be read ({why})") from None
