@@ -1,7 +1,7 @@
 # make demo    set up, build and check the cart-pole scenes, run one, draw it
 # make test    set up, run the quick tests
 # make bench   against numba, CasADi, heyoka and a NumPy loop; writes benchmarks/RESULTS.md
-# make test-all, make lint, make golden, make clean
+# make test-all, make test-slow, make lint, make golden, make clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -9,7 +9,7 @@ DEMO := scenes/cartpole.toml scenes/cartpole_driven.toml scenes/cartpole_tutoria
 # what a test run writes, it writes under build/
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
 
-.PHONY: demo test test-all lint golden bench clean
+.PHONY: demo test test-all test-slow lint golden bench clean
 
 demo: .venv/demo
 	@$(BIN)/eomc build $(DEMO)
@@ -27,8 +27,11 @@ demo: .venv/demo
 test: .venv/dev
 	$(BIN)/python -m pytest -n 2 -m "not slow"
 
-test-all: .venv/dev
+test-all: .venv/robots
 	$(BIN)/python -m pytest -n 2
+
+test-slow: .venv/robots
+	$(BIN)/python -m pytest -n 2 -m slow
 
 lint: .venv/dev
 	$(BIN)/ruff check .
@@ -63,3 +66,8 @@ clean:
 .venv/dev: pyproject.toml .venv/bin/python
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	@touch $@ .venv/demo
+
+# half a gigabyte of robots, and the simulator that they are held against
+.venv/robots: .venv/dev
+	$(BIN)/python -m pip install --quiet --editable ".[robots]"
+	@touch $@

@@ -8,23 +8,21 @@ solved with NumPy and stepped in a Python loop. Slow, short, and meant to be bel
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import sympy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sympy import Expr, ImmutableMatrix
 
-from eomc.formulas import suggest
+from eomc.answer import MATRICES, SCALARS, Answer, Values, Vector
+from eomc.jets import Jets
 from eomc.problems import EomcError
 from eomc.system import System, dot, t
 
-Vector = NDArray[np.float64]
-
-SCALARS = ("kinetic", "potential", "energy", "jacobi", "power")
-
+WRITTEN_OUT = 10_000  # some seconds of SymPy at five links
 SIMPLIFIED_WORK = 200_000  # squares of operations, added up: a few seconds of SymPy
 
 
@@ -83,6 +81,40 @@ def derive(system: System) -> Reference:
     )
 
 
+def of(system: System) -> Reference | Jets:
+    """The independent answer: written out where that is small, else by Taylor arithmetic.
+
+    Raises EomcError as `derive` and `Jets` do.
+    """
+    return derive(system) if is_small(system) else Jets(system)
+
+
+def is_small(system: System) -> bool:
+    """Whether `derive` takes seconds at most."""
+    return _written_out(system) <= WRITTEN_OUT
+
+
+def _written_out(system: System) -> float:
+    """Roughly how many operations `derive` would have in hand: those of K, written out, nq^2 times.
+
+    What a definition hangs on is counted as often as it is named; dot(e) is e once a coordinate.
+    """
+    sizes: dict[Expr, float] = {}
+    reach: dict[Expr, frozenset[Expr]] = {q: frozenset([q]) for q in system.q}
+
+    def size(e: Expr) -> float:
+        if e not in sizes:
+            held = [reach.get(s, frozenset()) for s in e.free_symbols]
+            reach[e] = reach.get(e, frozenset()).union(*held)
+            inside = sum(size(a) for a in e.args)
+            sizes[e] = inside * max(1, len(reach[e])) if isinstance(e, dot) else inside + 1
+        return sizes[e]
+
+    for name, body in system.definitions:
+        sizes[name], reach[name] = size(body), reach[body]
+    return size(system.kinetic) * len(system.q) ** 2 + size(system.potential)
+
+
 def _expander(system: System) -> Callable[[Expr], Expr]:
     """A function that puts definitions in and carries every dot(...) out."""
     known: dict[Expr, Expr] = {}
@@ -116,7 +148,7 @@ def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
 
 
 @dataclass(frozen=True)
-class Reference:
+class Reference(Answer):
     """The equations of `system` as expressions over q, qd, t, u and the parameters.
 
     D, C: (nq, nq); g, bias, tau: (nq, 1); signals: (nu, 1), the inputs by default.
@@ -138,78 +170,6 @@ class Reference:
         default_factory=dict, init=False, repr=False, compare=False
     )
 
-    def evaluate(
-        self,
-        name: str,
-        q: ArrayLike,
-        qd: ArrayLike | None = None,
-        t: float = 0.0,
-        u: ArrayLike | None = None,
-        params: Mapping[str, float] | None = None,
-    ) -> Any:
-        """The value of the field `name`: a float, an (nq,) or (nu,) vector or an (nq, nq) matrix.
-
-        q, qd: (nq,), m or rad per coordinate and their rates, qd None at rest; u: (nu,), None for
-        the scene's signals; params: values in place of defaults. nan where a formula has no
-        real value. Raises EomcError where params names no parameter.
-        """
-        q = np.asarray(q, float)
-        qd = np.zeros_like(q) if qd is None else np.asarray(qd, float)
-        return self._value(name, q, qd, t, u, self._values(params))
-
-    def acceleration(
-        self,
-        q: ArrayLike,
-        qd: ArrayLike,
-        t: float = 0.0,
-        u: ArrayLike | None = None,
-        params: Mapping[str, float] | None = None,
-    ) -> Vector:
-        """Solve D qdd = tau - bias: (nq,). Raises numpy.linalg.LinAlgError where D is singular."""
-        q, qd = np.asarray(q, float), np.asarray(qd, float)
-        return self._acceleration(q, qd, t, u, self._values(params))
-
-    def step(
-        self,
-        q: ArrayLike,
-        qd: ArrayLike,
-        h: float,
-        t: float = 0.0,
-        u: ArrayLike | None = None,
-        params: Mapping[str, float] | None = None,
-    ) -> tuple[Vector, Vector]:
-        """One step of the classical Runge-Kutta method of order 4: q and qd at t + h.
-
-        u None: the scene's signals at every stage; u given: held over the step.
-        """
-        q, qd = np.asarray(q, float), np.asarray(qd, float)
-        return self._step(q, qd, h, t, u, self._values(params))
-
-    def simulate(
-        self,
-        q0: ArrayLike | None = None,
-        qd0: ArrayLike | None = None,
-        h: float | None = None,
-        steps: int | None = None,
-        every: int = 1,
-        u: ArrayLike | None = None,
-        params: Mapping[str, float] | None = None,
-    ) -> tuple[Vector, Vector, Vector]:
-        """Run from the start: t (n,) and q, qd (n, nq), rows every `every` steps and the last."""
-        start = self.system.coordinates
-        q = np.array([c.start for c in start] if q0 is None else q0, float)
-        qd = np.array([c.rate for c in start] if qd0 is None else qd0, float)
-        h = self.system.run.h if h is None else h
-        steps = round(self.system.run.duration / h) if steps is None else steps
-        values = self._values(params)
-        rows = [(0.0, q, qd)]
-        for n in range(steps):
-            q, qd = self._step(q, qd, h, n * h, u, values)
-            if (n + 1) % every == 0 or n + 1 == steps:
-                rows.append(((n + 1) * h, q, qd))
-        times, qs, qds = zip(*rows, strict=True)
-        return np.array(times), np.array(qs), np.array(qds)
-
     def simplified(self) -> Reference:
         """The same in shorter forms, for people to read; what would take SymPy long stays."""
         names = ("D", "C", "g", "tau")
@@ -229,27 +189,36 @@ class Reference:
             kinetic=K, potential=P, energy=K + P, jacobi=jacobi, power=power,
         )  # fmt: skip
 
-    def _values(self, params: Mapping[str, float] | None) -> tuple[float, ...]:
-        """Parameters in the system's order."""
-        values = {p.name: p.value for p in self.system.parameters}
-        for name in params or {}:
-            if name not in values:
-                raise EomcError(f"'{name}' is not a parameter{suggest(name, values)}")
-        return tuple((values | dict(params or {})).values())
-
     def _value(
-        self, name: str, q: Vector, qd: Vector, t: float, u: ArrayLike | None,
-        values: tuple[float, ...],
-    ) -> Any:  # fmt: skip
+        self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> Any:
+        if q.ndim == 1:
+            return self._one(name, q, qd, float(t), u, values)
+        rows = len(q)
+        times = np.broadcast_to(t, rows).tolist()
+        us: Any = [None] * rows if u is None else np.asarray(u, float)
+        each = np.array([np.broadcast_to(value, rows) for value in values]).reshape(-1, rows).T
+        found = [
+            self._one(name, q[i], qd[i], times[i], us[i], tuple(each[i].tolist()))
+            for i in range(rows)
+        ]
+        return np.array(found)
+
+    def _one(
+        self, name: str, q: Vector, qd: Vector, t: float, u: ArrayLike | None, values: Values
+    ) -> Any:
+        """The value at one state."""
         if name == "signals" or not self.system.inputs:
             u = np.zeros(len(self.system.inputs))
         elif u is None:
-            u = self._value("signals", q, qd, t, None, values)
+            u = self._one("signals", q, qd, t, None, values)
         expr = getattr(self, name)
-        shape = () if name in SCALARS else expr.shape if name in ("D", "C") else (expr.rows,)
+        shape = () if name in SCALARS else expr.shape if name in MATRICES else (expr.rows,)
         try:
             found = self._function(name)(*q.tolist(), *qd.tolist(), t, *np.asarray(u), *values)
         except (ArithmeticError, ValueError):
+            return np.full(shape, math.nan)[()]
+        if any(isinstance(each, complex) for each in found):  # Python's power of a negative number
             return np.full(shape, math.nan)[()]
         return np.array(found, float).reshape(shape)[()]
 
@@ -262,28 +231,6 @@ class Reference:
                 symbols, entries, modules=[_JUMPS, "math"], cse=True
             )
         return self._functions[name]
-
-    def _acceleration(
-        self, q: Vector, qd: Vector, t: float, u: ArrayLike | None, values: tuple[float, ...]
-    ) -> Vector:
-        D, bias, tau = (self._value(name, q, qd, t, u, values) for name in ("D", "bias", "tau"))
-        return np.asarray(np.linalg.solve(D, tau - bias))
-
-    def _step(
-        self, q: Vector, qd: Vector, h: float, t: float, u: ArrayLike | None,
-        values: tuple[float, ...],
-    ) -> tuple[Vector, Vector]:  # fmt: skip
-        v1, a1 = qd, self._acceleration(q, qd, t, u, values)
-        v2 = qd + h / 2 * a1
-        a2 = self._acceleration(q + h / 2 * v1, v2, t + h / 2, u, values)
-        v3 = qd + h / 2 * a2
-        a3 = self._acceleration(q + h / 2 * v2, v3, t + h / 2, u, values)
-        v4 = qd + h * a3
-        a4 = self._acceleration(q + h * v3, v4, t + h, u, values)
-        return (
-            q + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4),
-            qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4),
-        )
 
 
 def _sign(x: float) -> float:

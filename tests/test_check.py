@@ -13,6 +13,8 @@ import pytest
 import sympy
 
 from cases import scene_system
+from eomc import check as checking
+from eomc import reference as references
 from eomc.check import Report, check
 from eomc.reference import Reference, derive
 from eomc.system import System, symbol
@@ -230,6 +232,40 @@ def test_what_is_wrong_fails(what: str) -> None:
     assert not report.passed
 
 
+@pytest.fixture
+def as_if_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference is Taylor arithmetic, and sizes come from changing all inputs at once."""
+    monkeypatch.setattr(references, "WRITTEN_OUT", 0)
+    monkeypatch.setattr(checking, "MOST_NUDGES", 0)
+
+
+@pytest.mark.parametrize("name", ["cartpole_driven", "foucault_pendulum"])
+def test_what_is_right_passes_as_if_large(name: str, as_if_large: None) -> None:
+    report = check(scene_system(name), StandIn(reference(name).simplified()))
+    assert report.passed, report.table()
+    assert report.states == checking.LARGE.states
+    assert report.reference == "Taylor arithmetic"
+    assert "6 random states, against Taylor arithmetic" in " ".join(report.table().split())
+    values = [row for row in report.rows if row.unit == "units of rounding"]
+    assert max(row.error for row in values) < 10  # sizes are smaller than with one by one
+
+
+@pytest.mark.parametrize(
+    "what",
+    ["a sign in D", "a sign in C", "the sign of Coriolis's force", "a sign in g", "a sign in bias",
+     "a sign in tau", "a sign in an acceleration", "accelerations without inputs",
+     "a weight of Runge and Kutta's", "the time of a step", "a parameter ignored in D",
+     "parameters ignored in a run", "kinetic energy", "energy", "jacobi, taken for the energy",
+     "the sign of the power"],
+)  # fmt: skip
+def test_what_is_wrong_fails_as_if_large(what: str, as_if_large: None) -> None:
+    name, break_, rows = BROKEN[what]
+    module = StandIn(reference(name))
+    break_(module)
+    report = check(scene_system(name), module)
+    assert rows <= failed(report), report.table()
+
+
 def test_a_module_that_raises_fails_with_its_words() -> None:
     module = StandIn(reference("mass_spring"))
     module.g = lambda *place, **how: {}["k"]  # type: ignore[method-assign]
@@ -277,6 +313,7 @@ def test_the_report_can_be_read_by_programs_and_people() -> None:
     report = check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)
     told = json.loads(json.dumps(report.as_dict(), allow_nan=False))
     assert told["passed"] is True
+    assert told["reference"] == "equations written out"
     assert {row["name"] for row in told["rows"]} >= {"D", "acceleration", "run", "order of rk4"}
     assert "order of rk4" in report.table()
     assert max(map(len, report.table().splitlines())) <= 100

@@ -179,6 +179,9 @@ def test_no_real_value_is_nan() -> None:
     assert math.isnan(reference.evaluate("potential", [0.0]))
     assert np.isnan(reference.evaluate("g", [0.0])).all()
     assert math.isnan(reference.evaluate("potential", [-1.0]))
+    power = derive(System.make("power", [x], v**2, x ** sympy.Rational(3, 2)))
+    assert math.isnan(power.evaluate("potential", [-1.0]))
+    np.testing.assert_array_equal(power.evaluate("potential", [[-1.0], [4.0]]), [math.nan, 8.0])
 
 
 @pytest.mark.parametrize("kinetic", [v**4, sympy.sqrt(1 - v**2), v**2 * sympy.tanh(v), abs(v) ** 3])
