@@ -5,13 +5,17 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from eomc.formulas import FormulaError
 from eomc.problems import Problem
 
 MAX_STATEMENT = 500  # lines
+
+ARRAYS = ("body", "spring", "damper")  # tables that may stand many times, in [[two brackets]]
+
+Path = tuple[str, ...]
 
 
 class Places:
@@ -20,8 +24,13 @@ class Places:
     def __init__(self, text: str, file: str) -> None:
         self.lines = text.split("\n")
         self.file = file
-        self._line: dict[tuple[str, ...], tuple[int, int]] = {}
-        prefix: tuple[str, ...] = ()
+        self._line: dict[Path, tuple[int, int]] = {}
+        self._under: dict[Path, list[Path]] = {}  # the paths that begin with one or two keys
+        self._key: dict[Path, str] = {}  # how the last key is written, where it is otherwise
+        self._text: dict[str, str] = {}  # how a text is written, where it is otherwise
+        self._from: dict[Path, Path] = {}  # what was repeated: the entry it came from
+        prefix: Path = ()
+        counts = dict.fromkeys(ARRAYS, 0)
         start = 0
         while start < len(self.lines):
             if self.lines[start].strip().startswith("#") or not self.lines[start].strip():
@@ -31,13 +40,25 @@ class Places:
             if end == start:
                 break  # hundreds of lines in one statement: no scene; the rest keeps no places
             statement = "\n".join(self.lines[start:end])
-            paths = list(_paths(tomllib.loads(statement)))
             header = statement.lstrip().startswith("[")
+            if header and statement.lstrip().startswith("[["):
+                for array in ARRAYS:
+                    counts[array] += array in tomllib.loads(statement)
+            paths = list(_paths(tomllib.loads(statement)))
+            if header:
+                paths = [_numbered(path, counts) for path in paths]
             for path in paths:
-                self._line.setdefault((() if header else prefix) + path, (start, end))
+                self._put((() if header else prefix) + path, (start, end))
             if header:
                 prefix = max(paths, key=len)
             start = end
+
+    def _put(self, path: Path, place: tuple[int, int]) -> None:
+        if path not in self._line:
+            self._line[path] = place
+            for length in (1, 2):
+                if len(path) >= length:
+                    self._under.setdefault(path[:length], []).append(path)
 
     def _end(self, start: int) -> int:
         """The line after the statement that begins at `start`; `start` where none is found."""
@@ -49,20 +70,45 @@ class Places:
             return end
         return start
 
-    def rename(self, given: tuple[str, ...], meant: tuple[str, ...]) -> None:
+    def rename(self, given: Path, meant: Path) -> None:
         """Let `meant` and what is under it stand where the misspelt `given` stands."""
-        for path, place in list(self._line.items()):
+        for path in list(self._under.get(given[:2], ())):
             if path[: len(given)] == given:
-                self._line.setdefault(meant + path[len(given) :], place)
+                self._put(meant + path[len(given) :], self._line[path])
+                self._key.setdefault(meant + path[len(given) :], self._key.get(path, path[-1]))
 
-    def source(self, path: tuple[str, ...]) -> str:
+    def repeat(self, given: Path, made: Sequence[Path]) -> None:
+        """Let each of `made` and what is under it stand where the entry `given` stands."""
+        under = list(self._under.get(given, ()))
+        named = (*given, "name")
+        for path in made:
+            if path == given:
+                continue
+            self._from[path] = given
+            if named in self._line and given[0] in ARRAYS:
+                # an entry of an array stands where its name stands
+                self._put(path, self._line[named])
+                self._key.setdefault(path, "name")
+            for old in under:
+                self._put(path + old[len(given) :], self._line[old])
+                self._key.setdefault(path + old[len(given) :], old[-1])
+
+    def rewrite(self, made: str, written: str) -> None:
+        """Let a text made by repetition be looked for as it is written."""
+        self._text.setdefault(made, written)
+
+    def origin(self, path: Path) -> Path:
+        """The entry as it is written that an entry comes from."""
+        return self._from.get(path[:2], path[:2]) + path[2:]
+
+    def source(self, path: Path) -> str:
         """The statement in which a key stands."""
         start, end = self._line.get(path, (0, 0))
         return "\n".join(self.lines[start:end])
 
     def problem(
         self,
-        path: tuple[str, ...],
+        path: Path,
         message: str,
         at: FormulaError | ast.expr | None = None,
         text: str | None = None,
@@ -78,7 +124,8 @@ class Places:
         if not known:
             return Problem(message, key, self.file, severity=severity)
         source = self.source(known)
-        offset, width = _spot(source, known[-1], at, text)
+        key_written = self._key.get(known, known[-1])
+        offset, width = _spot(source, key_written, at, text, self._text.get(text or ""))
         line = self._line[known][0] + source.count("\n", 0, max(offset, 0))
         column = offset - source.rfind("\n", 0, offset) - 1 if offset >= 0 else -1
         return Problem(
@@ -87,9 +134,16 @@ class Places:
 
 
 def _spot(
-    source: str, key: str, at: FormulaError | ast.expr | None, text: str | None
+    source: str,
+    key: str,
+    at: FormulaError | ast.expr | None,
+    text: str | None,
+    before: str | None = None,
 ) -> tuple[int, int]:
-    """Where in a statement the fault stands, and how wide it is; -1 where it can't be told."""
+    """Where in a statement the fault stands, and how wide it is; -1 where it can't be told.
+
+    before: the text as it was before repetition.
+    """
     text = (text or "").strip()
     column, width = 0, len(text) or 1
     if isinstance(at, FormulaError):
@@ -97,25 +151,42 @@ def _spot(
     elif at is not None:
         column, width = at.col_offset, (at.end_col_offset or 0) - at.col_offset
     for written in (str, _escaped) if text else ():
-        # blanks may be line breaks, one for one, so that columns stay
-        body = re.sub(r"\\\s", r"\\s", re.escape(written(text)))
-        quoted = re.search(rf"""(["'])\s*({body})\s*\1""", source)
-        if quoted is not None:
+        if quoted := _quoted(written(text), source):
             return quoted.start(2) + len(written(text[:column])), width
+    if before and (quoted := _quoted(before.strip(), source)):
+        return quoted.start(2), len(quoted[2])
     named = re.search(rf"(?<!\w){re.escape(key)}(?!\w)", source)
     return (named.start(), len(key)) if named else (-1, 1)
+
+
+def _quoted(text: str, source: str) -> re.Match[str] | None:
+    """The text in quotes; blanks may be line breaks, one for one, so that columns stay."""
+    body = re.sub(r"\\\s", r"\\s", re.escape(text))
+    return re.search(rf"""(["'])\s*({body})\s*\1""", source)
 
 
 def _escaped(text: str) -> str:
     return text.replace("\\", "\\\\").replace('"', '\\"')
 
 
-def _paths(tree: Mapping[str, Any], depth: int = 3) -> Iterator[tuple[str, ...]]:
-    """The keys of a tree as deep as a scene goes: table, name, key."""
+def _paths(tree: Mapping[str, Any], depth: int = 3) -> Iterator[Path]:
+    """The keys of a tree as deep as a scene goes: table, name, key; (array, "#1", key)."""
     for key, value in tree.items():
         yield (key,)
         if isinstance(value, list):
-            value = next((v for v in value if isinstance(v, dict)), None)
+            inside = [v for v in value if isinstance(v, dict)]
+            if key in ARRAYS and depth == 3:
+                value = {f"#{k}": v for k, v in enumerate(inside, start=1)}
+            else:
+                value = next(iter(inside), None)
         if isinstance(value, dict) and depth > 1:
             for rest in _paths(value, depth - 1):
                 yield (key, *rest)
+
+
+def _numbered(path: Path, counts: Mapping[str, int]) -> Path:
+    """A path of a header: [[body]] and [body.x] belong to the last body so far."""
+    if path[0] not in counts or len(path) < 2 or not counts[path[0]]:
+        return path
+    behind = path[2:] if path[1].startswith("#") else path[1:]
+    return (path[0], f"#{counts[path[0]]}", *behind)

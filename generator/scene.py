@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
-import math
 import os
 import re
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from graphlib import CycleError, TopologicalSorter
@@ -17,8 +15,19 @@ from typing import Any
 
 import pydantic
 
-from eomc import formulas, layout, names
-from eomc.formulas import Formula, FormulaError, suggest
+from eomc import bodycheck, formulas, layout, names, repeat
+from eomc.assembly import Assembly
+from eomc.checker import (
+    DOUBT,
+    INPUT,
+    NOTHING,
+    POSITION,
+    TIME,
+    VELOCITY,
+    Checker,
+    value_of,
+)
+from eomc.formulas import Formula, suggest
 from eomc.places import Places
 from eomc.problems import EomcError, Problem, SceneError
 
@@ -93,6 +102,7 @@ class Scene:
     dissipation: Formula
     forces: Mapping[str, Formula]
     run: Run
+    assembly: Assembly | None
     places: Places = field(repr=False, compare=False)
     warnings: tuple[Problem, ...] = ()
 
@@ -107,7 +117,7 @@ class Scene:
         values.update(parameters or {})
 
         def number(formula: Formula, key: str) -> float:
-            value, fault = _value(formula, values)
+            value, fault = value_of(formula, values)
             if fault:
                 raise EomcError(str(self.problem(key, fault, formula)))
             return value
@@ -127,24 +137,6 @@ class Scene:
         """A problem at a key such as `energy.kinetic`, with its line and its formula marked."""
         text = formula.text if formula else None
         return self.places.problem(tuple(key.split(".")), message, text=text, severity=severity)
-
-
-def _value(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
-    """The value of a formula and "", or nan and why it has none."""
-    try:
-        value = formulas.evaluate(formula, formulas.NUMERIC, known.__getitem__)
-        if isinstance(value, (int, float)) and math.isfinite(value):
-            return float(value), ""
-        fault = "has no real, finite value"
-    except ZeroDivisionError:
-        fault = "divides by zero"
-    except OverflowError:
-        fault = "is too large for a double"
-    except (ValueError, TypeError):
-        fault = "has no real value"
-    given = {n.id: known[n.id] for n in formula.names()}
-    where = ", ".join(f"{name} = {value:g}" for name, value in given.items())
-    return math.nan, f"'{formula.text}' {fault}" + (f" at {where}" if where else "")
 
 
 # --- reading --------------------------------------------------------------------------------------
@@ -232,36 +224,30 @@ _TOML_REMEDIES = {
     "Unclosed inline table": ": entries in { ... } are separated by commas and stand on one line",
 }
 
-# the kinds of thing a formula can hang on; what hangs on something faulty is in doubt
-_TIME, _INPUT, _POSITION, _VELOCITY = "the time", "inputs", "coordinates", "velocities"
-_DOUBT = "something faulty"
 
-_NOTHING: frozenset[str] = frozenset()
-
-
-class _Check:
+class _Check(Checker):
     """Everything that is checked in one scene, faults collected on the way."""
 
     def __init__(self, tree: dict[str, Any], places: Places) -> None:
-        self.places = places
-        self.problems: list[Problem] = []
-        self.used: set[str] = set()
-        self.mended: set[tuple[str, ...]] = set()
-        self.kinds: dict[str, frozenset[str]] = {}  # of every name that may be used so far
+        super().__init__(places)
+        if not repeat.expand(tree, self):
+            raise SceneError(self.problems)
+        self.bodies = bool(tree.get("body"))
         self.doc = self._layout(tree)
         self.tables = self._names()
-        self.definitions: dict[str, Formula] = {}
 
     def scene(self, digest: str) -> Scene:
         """The checked scene. Raises SceneError with every fault."""
         doc = self.doc
         self.kinds |= {
-            **dict.fromkeys((*doc.constants, *doc.parameters), _NOTHING),
-            **dict.fromkeys(doc.inputs, frozenset({_INPUT})),
-            **dict.fromkeys(doc.coordinates, frozenset({_POSITION})),
-            **{f"{c}_dot": frozenset({_VELOCITY}) for c in doc.coordinates},
-            "t": frozenset({_TIME}),
+            **dict.fromkeys((*doc.constants, *doc.parameters), NOTHING),
+            **dict.fromkeys(doc.inputs, frozenset({INPUT})),
+            **dict.fromkeys(doc.coordinates, frozenset({POSITION})),
+            **{f"{c}_dot": frozenset({VELOCITY}) for c in doc.coordinates},
+            "t": frozenset({TIME}),
         }
+        self.centers = bodycheck.centers(doc)
+        self.kinds |= dict.fromkeys(self.centers - {*self.tables}, frozenset({POSITION}))
         known: dict[str, float] = {}
         constants = self._quantities("constants", known)
         parameters = self._quantities("parameters", known)
@@ -270,6 +256,7 @@ class _Check:
         inputs = self._inputs()
         energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
         forces = self._forces()
+        assembly = bodycheck.assemble(self, doc, known)
         self._unused()
         if any(p.severity == "error" for p in self.problems):
             raise SceneError(self.problems)
@@ -287,20 +274,10 @@ class _Check:
             **energies,
             forces=forces,
             run=Run(doc.run.h, doc.run.duration, doc.run.method, doc.run.real, doc.run.batch),
+            assembly=assembly,
             places=self.places,
             warnings=tuple(self.problems),
         )
-
-    def say(
-        self,
-        path: tuple[str, ...],
-        message: str,
-        at: FormulaError | ast.expr | None = None,
-        text: str | None = None,
-        severity: str = "error",
-    ) -> None:
-        """Note a problem; `at` is its place in the formula `text`."""
-        self.problems.append(self.places.problem(path, message, at, text, severity))
 
     # layout and names
 
@@ -308,7 +285,7 @@ class _Check:
         """The document; faulty entries are told, taken out or mended, and the rest checked on."""
         for _ in range(100):
             try:
-                return layout.Document.model_validate(tree)
+                return layout.read(tree)
             except pydantic.ValidationError as fault:
                 errors = fault.errors()
             # misspelt keys first: what is missing may only be misspelt
@@ -338,7 +315,7 @@ class _Check:
             table[meant] = value
             self.places.rename(path, (*path[:-1], meant))
         elif isinstance(value, dict):
-            self.kinds |= dict.fromkeys(value, frozenset({_DOUBT}))
+            self.kinds |= dict.fromkeys(value, frozenset({DOUBT}))
 
     def _names(self) -> dict[str, str]:
         """Every declared name and its table."""
@@ -393,101 +370,6 @@ class _Check:
             )
             self.say((*path, "unit"), message, severity="warning")
 
-    # formulas
-
-    def _parse(self, path: tuple[str, ...], value: float | str) -> Formula | None:
-        text = value if isinstance(value, str) else repr(value)
-        if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
-            # "\theta" is a tab and 'heta', "\nu" a line break and 'u'
-            self.say(path, "LaTeX is not read: write names without backslash (theta)")
-            return None
-        try:
-            return formulas.parse(text)
-        except FormulaError as fault:
-            self.say(path, fault.message, fault, text)
-            return None
-
-    def _formula(
-        self,
-        path: tuple[str, ...],
-        value: float | str,
-        allowed: Collection[str] | None = None,
-        rule: str = "",
-    ) -> Formula | None:
-        """Parse a formula and check its names; None where it has a fault, which is told.
-
-        `rule` says in words which names are `allowed`, where not all are.
-        """
-        formula = self._parse(path, value)
-        return formula if formula and self._checked(path, formula, allowed, rule) else None
-
-    def _checked(
-        self,
-        path: tuple[str, ...],
-        formula: Formula,
-        allowed: Collection[str] | None = None,
-        rule: str = "",
-    ) -> bool:
-        before = len(self.problems)
-        for node in formula.names():
-            self.used.add(node.id)
-            if node.id not in (self.kinds if allowed is None else allowed):
-                self.say(path, self._refused(node.id, rule), node, formula.text)
-        if len(self.problems) == before:
-            still = allowed is not None and not {*self.doc.coordinates} & {*allowed}
-            for call in formula.calls("dot"):
-                if why := rule if still else self._no_rate(call.args[0]):
-                    self.say(path, f"dot(...) can't be used here: {why}", call, formula.text)
-        return len(self.problems) == before
-
-    def _refused(self, name: str, rule: str) -> str:
-        """Why `name` can't be used."""
-        if rule and (name in self.tables or name in self.kinds):
-            return f"'{name}' can't be used here: {rule}"
-        if name in self.tables:
-            return f"'{name}' is defined further down: move its line above this one"
-        start = f"'{name}' is not declared"
-        if name.endswith(("_ddot", "_dot_dot")):
-            return f"{start}: accelerations are what is solved for, no formula can use them"
-        owner = name.removesuffix("_dot")
-        match self.tables.get(owner) if owner != name else None:
-            case "definitions":
-                return f"{start}: write dot({owner}) for the rate of a definition"
-            case "inputs":
-                return f"{start}: nobody knows the rate of an input; add it as a further input"
-            case "parameters" | "constants" as table:
-                return f"{start}: '{owner}' stands in [{table}], so it doesn't move"
-        if near := suggest(name, self.kinds):
-            return start + near
-        if name in ("e", "E"):
-            return f"{start}: write exp(1), or declare it in [constants]"
-        return f"{start}: add it to [parameters], [constants], [inputs] or [definitions]"
-
-    def _no_rate(self, inside: ast.expr) -> str:
-        """Why dot(inside) can't be had, or the empty string."""
-        kinds = self.kinds_of(inside)
-        if _INPUT in kinds:
-            return "it holds inputs, whose rate nobody knows; add the rate as a further input"
-        if _VELOCITY in kinds:
-            return "it holds velocities, and their rates are what is solved for"
-        return ""
-
-    def kinds_of(self, node: ast.AST) -> frozenset[str]:
-        """What the value hangs on; dot(e) brings velocities where e moves."""
-        if isinstance(node, ast.Name):
-            return self.kinds.get(node.id, _NOTHING)
-        kinds = _NOTHING.union(*map(self.kinds_of, ast.iter_child_nodes(node)))
-        dot = (
-            isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "dot"
-        )
-        return kinds | {_VELOCITY} if dot and _POSITION in kinds else kinds
-
-    def _where(self, formula: Formula, kind: str) -> ast.expr:
-        """The first part of the formula that brings in `kind`."""
-        parts: list[ast.expr] = [*formula.calls("dot"), *formula.names()]
-        found = [part for part in parts if kind in self.kinds_of(part)]
-        return min(found, key=lambda part: part.col_offset, default=formula.tree)
-
     # tables
 
     def _quantities(self, table: str, known: dict[str, float]) -> list[Quantity]:
@@ -503,28 +385,17 @@ class _Check:
         out = []
         for name, entry in getattr(self.doc, table).items():
             path = (table, name, "value")
-            formula = self._formula(path, entry.value, allowed, rule)
-            known[name] = self._number(path, formula, known)
+            formula = self.formula(path, entry.value, allowed, rule)
+            known[name] = self.number(path, formula, known)
             if formula:
                 out.append(Quantity(name, entry.unit, known[name], entry.note, formula))
         return out
 
-    def _number(
-        self, path: tuple[str, ...], formula: Formula | None, known: Mapping[str, float]
-    ) -> float:
-        """The formula's value; nan where it has none, which is told."""
-        if formula is None or any(math.isnan(known[n.id]) for n in formula.names()):
-            return math.nan  # told already
-        value, fault = _value(formula, known)
-        if fault:
-            self.say(path, fault, text=formula.text)
-        return value
-
     def _coordinates(self, known: Mapping[str, float]) -> list[Coordinate]:
         def formula(path: tuple[str, ...], value: float | str) -> Formula | None:
             rule = f"a {path[-1]} is made of numbers, constants and parameters"
-            found = self._formula(path, value, known, rule)
-            self._number(path, found, known)
+            found = self.formula(path, value, known, rule)
+            self.number(path, found, known)
             return found
 
         out = []
@@ -536,20 +407,20 @@ class _Check:
         return out
 
     def _definitions(self) -> None:
-        parsed = {n: self._parse(("definitions", n), v) for n, v in self.doc.definitions.items()}
+        parsed = {n: self.parse(("definitions", n), v) for n, v in self.doc.definitions.items()}
         sound = {name: formula for name, formula in parsed.items() if formula}
         circular = self._circular(sound)
-        self.kinds |= dict.fromkeys(circular, frozenset({_DOUBT}))
+        self.kinds |= dict.fromkeys(circular, frozenset({DOUBT}))
         for name in parsed:
             formula = sound.get(name)
             path = ("definitions", name)
             if formula is None or name in circular or path in self.mended:
-                self.kinds[name] = frozenset({_DOUBT})
-            elif self._checked(path, formula):
+                self.kinds[name] = frozenset({DOUBT})
+            elif self.checked(path, formula):
                 self.definitions[name] = formula
                 self.kinds[name] = self.kinds_of(formula.tree)
             else:
-                self.kinds[name] = frozenset({_DOUBT})
+                self.kinds[name] = frozenset({DOUBT})
 
     def _circular(self, definitions: Mapping[str, Formula]) -> set[str]:
         """The names that hang on themselves, each ring told once."""
@@ -574,76 +445,54 @@ class _Check:
                 graph |= {name: [] for name in ring}
 
     def _inputs(self) -> list[Input]:
-        allowed = [name for name, kinds in self.kinds.items() if _INPUT not in kinds]
+        allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]
         rule = "a signal can't hang on inputs"
         out = []
         for name, entry in self.doc.inputs.items():
-            signal = self._formula(("inputs", name, "signal"), entry.signal, allowed, rule)
+            signal = self.formula(("inputs", name, "signal"), entry.signal, allowed, rule)
             if signal:
                 out.append(Input(name, entry.unit, signal, entry.note))
         return out
 
     def _energy(self, key: str) -> Formula:
         path = ("energy", key)
-        formula = self._formula(path, getattr(self.doc.energy, key))
+        formula = self.formula(path, getattr(self.doc.energy, key))
         if formula is None:
             return formulas.parse("0")
         kinds = self.kinds_of(formula.tree)
-        sure = _DOUBT not in kinds and not {path, ("energy",)} & self.mended
+        sure = DOUBT not in kinds and not {path, ("energy",)} & self.mended
         fault = partial(self.say, path, text=formula.text)
-        if _INPUT in kinds:
+        if INPUT in kinds:
             fault(
                 "an energy can't depend on inputs: let them act through [forces]",
-                self._where(formula, _INPUT),
+                self.where(formula, INPUT),
             )
-        if key == "potential" and _VELOCITY in kinds:
+        if key == "potential" and VELOCITY in kinds:
             fault(
                 "the potential energy can't depend on velocities: parts linear in them "
                 "(magnetic, gyroscopic) belong in 'kinetic' with the sign changed, "
                 "friction in 'dissipation'",
-                self._where(formula, _VELOCITY),
+                self.where(formula, VELOCITY),
             )
-        if key == "kinetic" and _VELOCITY not in kinds and sure:
+        if key == "kinetic" and VELOCITY not in kinds and sure and not self.bodies:
             velocities = " or ".join(f"{c}_dot" for c in self.doc.coordinates)
             fault(
                 "the kinetic energy has no velocities, so nothing has inertia: "
                 f"use {velocities}, or dot(...) of a definition",
             )
-        if key == "dissipation" and _VELOCITY not in kinds and sure and any(formula.names()):
+        if key == "dissipation" and VELOCITY not in kinds and sure and any(formula.names()):
             fault(
                 "the dissipation has no velocities, so it gives no force -dR/dq_dot: "
                 "viscous friction is b*x_dot**2/2",
             )
-        self._smooth(path, formula)
+        self.smooth(path, formula)
         return formula
-
-    def _smooth(self, path: tuple[str, ...], formula: Formula) -> None:
-        """Energies are differentiated, so nothing in them may jump."""
-        queue = [(path, formula)]
-        seen: set[str] = set()
-        while queue:
-            where, f = queue.pop()
-            for call in f.calls("sign", "heaviside"):
-                if {_TIME, _POSITION, _VELOCITY} & self.kinds_of(call):
-                    function = ast.unparse(call.func)
-                    self.say(
-                        where,
-                        f"{function}(...) jumps, and {'.'.join(path)} that uses it is "
-                        "differentiated: use abs, min or max (max(x, 0)**2 for a stop), a smooth "
-                        "tanh(x/width), or give the force itself in [forces]",
-                        call,
-                        f.text,
-                    )
-            for node in f.names():
-                if node.id in self.definitions and node.id not in seen:
-                    seen.add(node.id)
-                    queue.append((("definitions", node.id), self.definitions[node.id]))
 
     def _forces(self) -> dict[str, Formula]:
         out = {}
         known = list(self.doc.coordinates)
         for name, value in self.doc.forces.items():
-            formula = self._formula(("forces", name), value)
+            formula = self.formula(("forces", name), value)
             if name not in known:
                 remedy = suggest(name, known) or f": a force acts along {' or '.join(known)}"
                 self.say(("forces", name), f"'{name}' is not a coordinate{remedy}")

@@ -35,7 +35,8 @@ def equations(system: System, form: str = "text") -> str:
     """
     made = program.build(mechanics.derive(system))
     shown = [made[name].cost.flops for name in ("D", "C", "bias") if name in made]
-    if len(shown) < 3 or sum(shown) > WRITTEN_OUT:
+    long = len(shown) < 3 or sum(shown) > WRITTEN_OUT
+    if long or not reference.is_small(system):
         if form != "text":
             raise EomcError(
                 f"{system.name}: its equations would fill pages: 'eomc show' without --{form} "

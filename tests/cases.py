@@ -19,6 +19,7 @@ SCENES = Path(__file__).parent.parent / "scenes"
 ALIKE = {
     "mass_spring": "harmonic_1e6_periods",
     "cartpole": "cartpole_drop_physicalP",
+    "cartpole_bodies": "cartpole_drop_physicalP",
     "cartpole_driven": "cartpole_torque_physicalP",
     "cartpole_tutorial": "cartpole_drop_tutorialP",
     "simple_pendulum": "pendulum_large_swing",

@@ -1,5 +1,6 @@
 """No text, however broken, makes the reader fail otherwise than in words, or run anything."""
 
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -38,13 +39,80 @@ dissipation = "x_dot**2/10"
 [forces]
 x = "f - w"
 """
-TEXTS = (CARTPOLE, SMALL)
+BODIES = """eomc = 1
+name = "bodies"
+gravity = [0, "-g"]
+[constants]
+n = 3
+[coordinates]
+"q[i]" = { repeat = "i = 1..n", start = "0.1*i" }
+[parameters]
+l = 0.5
+g = 9.81
+[definitions]
+h = "link2_x + q3"
+[[body]]
+repeat = "i = 1..n-1"
+name = "link[i]"
+joint = "revolute"
+coordinates = "q[i]"
+offset = ["l", 0]
+rotation = "pi/2"
+mass = "2*l"
+center = ["i*l", 0]
+inertia = 1
+friction = 0.1
+actuator = "-q[i]"
+[[body]]
+name = "slide"
+parent = "link[n-1]"
+joint = "prismatic"
+coordinates = "q[n]"
+axis = [1, 0]
+mass = 3
+[[body]]
+name = "bob"
+position = ["h", "l"]
+rotation = "q[1]"
+mass = 1
+[[spring]]
+bodies = ["world", "bob"]
+points = [[0, 1], ["l", 0]]
+stiffness = 1
+length = 0.1
+[[damper]]
+bodies = ["link1", "slide"]
+turning = true
+damping = 2
+"""
+SPACE = """eomc = 1
+name = "space"
+gravity = [0, 0, -9.81]
+coordinates = { x = {}, y = {}, z = {}, a = {}, b = {}, c = {} }
+[[body]]
+name = "top"
+joint = "free"
+coordinates = ["x", "y", "z", "a", "b", "c"]
+rotation = [["z", 1], ["x", "pi/2"]]
+mass = 1
+inertia = [1, 2, 2.5, 0.1, 0, 0]
+damping = [0, 0, 0, 1, 1, 1]
+[[body]]
+name = "arm"
+parent = "top"
+joint = "fixed"
+offset = [0, 0, 1]
+mass = 1
+"""
+TEXTS = (CARTPOLE, SMALL, BODIES, SPACE)
 
 TOKENS = """+ - * / ** ( ) ,
 . ^ ' " \\ [ ] { } = == < > # ; : ! @ % & | ~ 0 1 2.5 1e5 1e400 .5 5. 0x1f
 1_0 1j 9**9**9 x theta x_dot theta_dot x_ddot t pi e dot( sin( cos( sqrt( log( min( max( atan2(
 abs( sign( heaviside( if else and or not in is lambda None True False nan inf import
 __import__('os').system('id') eval( exec( open( canary( x.__class__ θ ² − \t \n \x00 \\theta
+[i] [n] [n-1] [-1] [i/2] i n [[body]] [[spring]] [body] world link1 link2_x repeat=
+axis= joint= "fixed" "free" "revolute" parent= name= [0,0] [0,0,0] ["z",1]
 dot(dot(x)) (x-x) 0/0 /0 **0.5 **-1 **x (-1)""".replace("\n", " ").split(" ")
 
 EVENTS = ("exec", "os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "open")
@@ -134,6 +202,10 @@ values = st.recursive(
     max_leaves=3,
 )
 tables = ["coordinates", "parameters", "inputs", "definitions", "energy", "forces", "run", "eomc"]
+arrays = ["body", "spring", "damper", "gravity"]
+keys = """name parent joint coordinates axis offset position rotation mass center inertia armature
+damping friction friction_width actuator coordinate bodies points turning stiffness length
+repeat""".split()
 
 
 @fuzz
@@ -144,6 +216,32 @@ def test_values_of_any_type_anywhere(entries):
     for table in ("coordinates", "parameters", "energy", "definitions", "run"):
         harmless(SMALL + f"[{table}]\n{inside}\n")
         harmless(f"eomc = 1\nname = 'n'\n[{table}]\n{inside}\n")
+
+
+sized = st.recursive(
+    st.sampled_from(["0", "1", "-2.5", "1e99", "true", "inf", '"q1"', '"link1"', '"world"', '"z"',
+                     '"l"', '"q[n]"', '"i = 1..n"', '"i = n..9999999999"', '"free"',
+                     '"revolute"', '""']),
+    lambda inner: st.lists(inner, max_size=3).map(lambda v: f"[{', '.join(v)}]"),
+    max_leaves=7,
+)  # fmt: skip
+
+
+@fuzz
+@given(
+    st.sampled_from([BODIES, SPACE]),
+    st.sampled_from(["body", "spring", "damper"]),
+    st.dictionaries(st.sampled_from(keys), sized, max_size=6),
+    sized,
+)
+def test_bodies_with_values_of_any_type(text, array, entries, value):
+    entry = "\n".join(f"{key} = {value}" for key, value in entries.items())
+    harmless(f"{text}[[{array}]]\n{entry}\n")
+    harmless("\n".join(line for line in text.split("\n") if line.split(" =")[0] not in entries))
+    key = next(iter(entries), "mass")
+    harmless(re.sub(rf"(?m)^({key}) = .*$", lambda found: f"{key} = {value}", text))
+    for at_top in arrays:
+        harmless(f"{at_top} = {value}\n" + text.replace("gravity", "#", 1))
 
 
 @fuzz
@@ -176,12 +274,18 @@ def test_random_formula_texts(text):
         "".join(f"k{i} = 1\n" for i in range(3000)),
         SMALL.replace("\n", "\r\n"),
         SMALL.replace("\n", "\r"),
+        BODIES.replace("n = 3", "n = 20000"),
+        BODIES.replace("n = 3", "n = 3\nm = 1").replace("1..n-1", "1..-" + "9" * 5000),
+        BODIES.replace("q[n]", "q[" + "n+" * 4000 + "1]"),
+        BODIES.replace("n = 3", "n = 9999").replace('"0.1*i"', f'"{"i+" * 4900}1"'),
+        BODIES + "[[body]]\n" * 3000,
+        BODIES + '[[body]]\nname = "a"\nparent = "a"\n' * 1000,
         "\ufeff" + SMALL,
         "\ud800",
         b"\xff\xfee\x00",
         b"\x00" * 100,
     ],
-    ids=range(19),
+    ids=range(25),
 )  # fmt: skip
 def test_hostile_files(text):
     harmless(text)
