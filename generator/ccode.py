@@ -187,13 +187,17 @@ def body(
     keep: Callable[[str], str] | None = None,
     parameters: Sequence[str] = (),
     lane: bool = False,
+    stored: Mapping[str, str] | None = None,
+    pivots: int = 0,
 ) -> Body:
     """The statements of a function.
 
     where: how each name from outside is written (`m_c` -> `p->m_c`).
     keep: how the rest reads what parameters decide, where that lives in a struct; `parameters`
     are kept there too where the rest reads them. lane: without branches, for a loop over many.
+    stored: where values go that are no locals. pivots: how many the whole has, if this is a piece.
     """
+    stored = stored or {}
     stages = {a.name: a.stage for a in (*function.early, *function.body)}
     late_checks = [c for c in function.checks if stages.get(c[0].name, 0) > Stage.PARAMETER]
     late_ends = [*function.outputs, *(o for pair in late_checks for o in pair)]
@@ -204,8 +208,14 @@ def body(
     new = _numbered(function, inline)
     function, kept = rename(function, new), [new.get(n, n) for n in kept]
     inline = frozenset(new[n] for n in inline)
-    printer = Printer(prefix, real, where)
-    tolerance = 8 * real.epsilon * max(1, len(function.checks))
+    # a value may bear the name of something outside that is not read here
+    uses = function.uses
+    outside = {n: text for n, text in where.items() if n in uses}
+    printer = Printer(prefix, real, outside | dict(stored))
+    tolerance = 8 * real.epsilon * max(1, pivots, len(function.checks))
+
+    def set_to(name: str, text: str) -> str:
+        return f"{stored.get(name, f'const {real.name} {name}')} = {text};"
 
     early_lines = []
     for a in function.early:
@@ -213,7 +223,7 @@ def body(
         if a.name in inline:
             printer.inline[a.name] = (text, strength)
         else:
-            early_lines.append(f"const {real.name} {a.name} = {text};")
+            early_lines.append(set_to(a.name, text))
     early = {a.name for a in function.early}
     is_early = [not c[0].name or c[0].name in {*early, *parameters} for c in function.checks]
     checks = [(e, pair) for e, pair in zip(is_early, function.checks, strict=True)]
@@ -229,13 +239,13 @@ def body(
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             if names := angles.pop(a.value.args, None):
-                lines[a.stage] += _sincos(printer, a.value.args[0], names, lane)
+                lines[a.stage] += _sincos(printer, a.value.args[0], names, lane, stored)
             continue
         text, strength = printer.value(a.value)
         if a.name in inline:
             printer.inline[a.name] = (text, strength)
         else:
-            lines[a.stage].append(f"const {real.name} {a.name} = {text};")
+            lines[a.stage].append(set_to(a.name, text))
     return Body(
         early=(Block("parameters alone", tuple(early_lines)),) if early_lines else (),
         blocks=tuple(Block(_STAGE_COMMENTS[s], tuple(text)) for s, text in lines.items() if text),
@@ -260,19 +270,28 @@ def _fails(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) ->
     return f"{text} <= {limit}*{printer.operand(diagonal, 4)}"
 
 
-def _sincos(printer: Printer, angle: Operand, names: Mapping[str, str], lane: bool) -> list[str]:
+def _sincos(
+    printer: Printer,
+    angle: Operand,
+    names: Mapping[str, str],
+    lane: bool,
+    stored: Mapping[str, str],
+) -> list[str]:
     real = printer.real
     argument = printer.operand(angle)
     if real is not DOUBLE:
         suffix = real.function_suffix
-        return [f"const {real.name} {n} = {f}{suffix}({argument});" for f, n in names.items()]
+        made = {n: stored.get(n, f"const {real.name} {n}") for n in names.values()}
+        return [f"{made[n]} = {f}{suffix}({argument});" for f, n in names.items()]
     one = names.get("sin") or names["cos"].replace("cos", "sin") + "_"
     other = names.get("cos") or names["sin"].replace("sin", "cos") + "_"
+    local = [n for n in (one, other) if n not in stored]
+    both = ", ".join(f"&{stored.get(n, n)}" for n in (one, other))
     return [
-        f"{real.name} {one}, {other};",
-        f"{printer.prefix}_sincos_lane({argument}, &{one}, &{other}, trouble);"
+        *([f"{real.name} {', '.join(local)};"] if local else []),
+        f"{printer.prefix}_sincos_lane({argument}, {both}, trouble);"
         if lane
-        else f"{printer.prefix}_sincos({argument}, &{one}, &{other});",
+        else f"{printer.prefix}_sincos({argument}, {both});",
     ]
 
 

@@ -309,6 +309,8 @@ class _Sampler:
         inertia = np.outer(diagonal, diagonal) + reach["D"]
         rate = np.max(qd / self.spread)  # of change of D, in 1/s
         force = reach["bias"] + reach["g"] + reach["tau"] + rate * inertia @ qd
+        # a force that is zero along one coordinate may be the sum of what others have whole
+        force = np.maximum(force, diagonal * np.max(force / diagonal))
         energy = reach["kinetic_energy"] + reach["potential_energy"]
         size = {
             "D": inertia,

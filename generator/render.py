@@ -12,21 +12,25 @@ from importlib.resources import files
 import jinja2
 
 from eomc.ccode import REALS
-from eomc.context import Context, resource
+from eomc.context import resource, values
+from eomc.pieces import weight
 from eomc.program import Program
+from eomc.target import Target
 
 
 @dataclass(frozen=True)
 class Sources:
     """The text of the generated files by name, and what the extension is made of besides.
 
-    binding: C between the scene's functions and Python, with its cdef.
+    binding: C between the scene's functions and Python, with its cdef. operations: how many all
+    functions have together, which tells how long a compiler takes.
     """
 
     name: str
     files: Mapping[str, str]
     binding: str
     cdef: str
+    operations: int
 
 
 def environment() -> jinja2.Environment:
@@ -47,7 +51,8 @@ def render(program: Program, extension: str) -> Sources:
 
     Same program, same text.
     """
-    context = {**Context(program, REALS[program.system.run.real]).values(), "extension": extension}
+    target = Target(program, REALS[program.system.run.real])
+    context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name
     parts = ["runtime.py", *(["batch.py"] if program.system.run.batch else [])]
@@ -67,4 +72,5 @@ def render(program: Program, extension: str) -> Sources:
         },
         binding=text("binding.c"),
         cdef=text("binding.cdef"),
+        operations=sum(map(weight, program.functions.values())),
     )

@@ -140,11 +140,11 @@ BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
     "lowering": (lowered, {"acceleration", MOTION, "run"}),
     "printing": (printed, {"acceleration", "one step"}),
     "a weight of the stepper": (
-        text('{{ lit("2.0") }}*(a2', '{{ lit("1.0") }}*(a2'),
+        text('lit("2.0") ~ "*(a2', 'lit("1.0") ~ "*(a2'),
         {"one step", "run", "order of rk4"},
     ),
     "a sign in the stepper": (
-        text("h_2*a1.{{ c }};", "-h_2*a1.{{ c }};"),
+        text("h_2*a1.$;", "-h_2*a1.$;"),
         {"one step", "run", "order of rk4"},
     ),
     "the time in a stage": (

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -169,7 +168,6 @@ def test_every_case_is_looked_at() -> None:
     free = {name for name, case in cases().items() if not case["constraints"]}
     assert len(free) == 45
     assert free == {*PLAIN, *LOST, *AT_A_POLE, "harmonic_1e6_periods"}
-    assert {f.stem for f in Path(ROOT / "scenes").glob("*.toml")} == {*SCENES, "mass_spring"}
 
 
 def test_a_wrong_sign_would_be_seen() -> None:

@@ -1,0 +1,581 @@
+"""Accelerations, steppers and batches for the templates.
+
+A small acceleration is inlined into the steppers, its state in named scalars. A large one comes in
+pieces that are called, its state in arrays, and in a batch each piece is a loop over a tile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+from sympy import Rational, S
+
+from eomc import ccode
+from eomc.assignments import Function, Operand
+from eomc.ccode import Body, Real, indent
+from eomc.pieces import is_large, staged
+from eomc.program import TIME
+from eomc.steppers import METHODS, RK4, Row
+from eomc.target import TROUBLE, Access, Argument, Target, after, arguments, none_of, sentence
+
+NEAR = 16_384  # bytes that a tile of a small system may have: half a first-level cache
+WIDE = 131_072  # and of a large one: a part of a second-level cache
+
+
+def dynamics(target: Target) -> dict[str, Any]:
+    """What belongs to accelerations and steppers."""
+    s, function, real = target.system, target.program["acceleration"], target.real.name
+    P, NQ = target.prefix, f"{target.PREFIX}_NQ"
+    large = is_large(function)
+    prepare = _prepare_large(target, function) if large else _prepare(target, function)
+    kept = prepare["prepared_members"]
+    takes_c, takes_p = bool(kept), target.needs_p and "signal" in target.program
+    t, u = "t" if target.driven else "", "u" if s.inputs else ""
+    c, p = "c" if takes_c else "", "p" if takes_p else ""
+    scalar = _mode(target, function, prepare, takes_c, takes_p)
+    t_arg, u_arg = f"{real} t" if t else "", f"const {real} *u" if u else ""
+    outer = arguments(u_arg, target.p_arg)
+    x = f"{real} q[{NQ}], {real} qd[{NQ}]"
+    rows = f"long every, {real} *q_rows, {real} *qd_rows"
+    t0_arg = f"{real} t0" if t else ""
+    lane = _lane(target, function, prepare, scalar) if s.run.batch else None
+    crossing = len(lane["pieces"]["members"]) if lane and lane["pieces"] else 0
+    return prepare | {
+        "large": large,
+        "prepare_arguments": arguments(f"{P}_prepared *c" if takes_c else "", target.p_arg),
+        "prepare_call": arguments("&prepared" if takes_c else "", target.p_call),
+        "p_unused": target.needs_p and not prepare["has_prepare"] and not takes_p,
+        "takes_c": takes_c,
+        "cost": sentence(function),
+        "scalar": scalar,
+        "lane": lane,
+        "rates_now": f"{P}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
+        "stepper_call": after(t, "h", u, c, p),
+        "methods": [_method(name, target.real) for name in s.run.methods],
+        "method_names": repr(s.run.methods),
+        "t_call": after(t),
+        "p_call": after(target.p_call),
+        "acceleration_prototype": f"{P}_status {P}_acceleration("
+        + arguments(
+            f"{real} qdd[{NQ}]", f"const {real} q[{NQ}]", f"const {real} qd[{NQ}]", t_arg, outer
+        ) + ")",
+        "step_prototype": lambda name: f"{P}_status {P}_{name}_step("
+        + arguments(x, t_arg, f"{real} h", outer) + ")",
+        "run_prototype": lambda name: f"long {P}_{name}_run("
+        + arguments(
+            x, t0_arg, f"{real} h", "long first", "long steps",
+            u_arg and f"{u_arg}, long u_stride", rows, target.p_arg, f"{P}_status *status",
+        ) + ")",
+        "batch_prototype": lambda name: f"void {P}_{name}_batch("
+        + arguments(
+            "long count", f"{real} *q", f"{real} *qd", t0_arg, f"{real} h", "long first",
+            "long steps", u_arg and f"{u_arg}, long u_instance, long u_step",
+            f"{rows}, long row_count", target.p_arg and f"{target.p_arg}, long p_instance",
+            "long *done", "int *status",
+        ) + ")",
+        "tile": _tile(target, len(kept), crossing, large),
+        "input_names": target.input_names,
+        "sincos": target.sincos,
+        "prepare_lane": arguments(
+            "&prepared" if takes_c else "", "p + k*p_instance" if target.needs_p else ""
+        ),
+        "retry_call": after(
+            t, "h", u and "u ? u + (base + i)*u_instance + n*u_step : 0",
+            "&c" if takes_c else "", "p + (base + i)*p_instance" if takes_p else "",
+        ),
+        "tile_prototype": lambda name: f"{real} {P}_{name}_tile_step("
+        + arguments(f"{P}_tile *s", t_arg, f"{real} h", u and "int held") + ")",
+        "batch_binding": lambda name: f"{P}_{name}_batch("
+        + arguments(
+            "count", "q", "qd", t and "t0", "h", "first", "steps",
+            u and "u, u_instance, u_step", "every", "q_rows", "qd_rows", "row_count",
+            f"{target.p_cast}, p_instance" if target.needs_p else "", "done", "status",
+        ) + ")",
+        "vector_members": [f"{real} x[{NQ}];"] if large
+        else [f"{real} {', '.join(target.names)};"],
+        "vector_of": lambda name, element: _vector_of(target, large, name, element),
+        "prepared_here": f"const {P}_prepared c = "
+        + "{ " + ", ".join(f"s.c.{n}[i]" for n in kept) + " };",
+    }  # fmt: skip
+
+
+# --- what parameters alone decide -----------------------------------------------------------------
+
+
+def _prepare(target: Target, function: Function) -> dict[str, Any]:
+    own = [p.name for p in target.system.parameters]
+    body = target.body(function, keep=_in_prepared, parameters=own)
+    kept = _with_signal(target, list(body.kept))
+    return {
+        "prepared_members": kept,
+        "prepare_pieces": None,
+        "prepare_early": [line for block in body.early for line in block.lines],
+        "prepare_sets": [f"c->{n} = {'p->' if n in own else ''}{n};" for n in kept],
+        "prepare_result": none_of(body.early_failures),
+        "has_prepare": bool(kept or body.early_failures),
+        "body": body,
+    }
+
+
+def _prepare_large(target: Target, function: Function) -> dict[str, Any]:
+    """The same as a function of its own, itself in pieces where it is long."""
+    own = [p.name for p in target.system.parameters]
+    first, _ = staged(function, own)
+    kept = _with_signal(target, [o.name for o in first.outputs])
+    first = replace(first, outputs=tuple(Operand(S.One, n) for n in kept))
+    places = [f"c->{n}" for n in kept]
+    made = {"prepared_members": kept, "has_prepare": bool(kept or first.checks)}
+    if not is_large(first):
+        body = target.body(first)
+        sets = [f"{to} = {text};" for to, text in zip(places, body.results, strict=True)]
+        return made | {
+            "prepare_pieces": None,
+            "prepare_early": [line for block in body.early for line in block.lines],
+            "prepare_sets": sets,
+            "prepare_result": none_of(body.early_failures),
+        }
+    given = [Argument(target.p_arg, "p", frozenset(own))]
+    out = Argument(f"{target.prefix}_prepared *c", "c", frozenset())
+    cut = target.in_pieces(first, "prepare", given, places, out, lambda f: [])
+    return made | {
+        "prepare_pieces": cut,
+        "prepare_early": cut["locals"],
+        "prepare_sets": cut["calls"],
+        "prepare_result": cut["outcome"],
+    }
+
+
+def _with_signal(target: Target, kept: list[str]) -> list[str]:
+    """With the parameters that the signals read, since lanes have no others."""
+    if not (target.system.run.batch and "signal" in target.program):
+        return kept
+    own = [p.name for p in target.system.parameters]
+    uses = target.program["signal"].uses
+    return [n for n in own if n in kept or n in uses] + [n for n in kept if n not in own]
+
+
+def _in_prepared(name: str) -> str:
+    return f"c->{name}"
+
+
+# --- one trajectory -------------------------------------------------------------------------------
+
+
+def _mode(
+    target: Target,
+    function: Function,
+    prepare: Mapping[str, Any],
+    takes_c: bool,
+    takes_p: bool,
+) -> dict[str, Any]:
+    """solve, rates and steppers for one trajectory: they return whether D was regular."""
+    s, real, P = target.system, target.real.name, target.prefix
+    timed, u, large = TIME in function.uses, bool(s.inputs), "body" not in prepare
+    t_arg = f"{real} t" if target.driven else ""
+    u_arg = f"const {real} *u" if u else ""
+    c_arg = f"const {P}_prepared *c" if takes_c else ""
+    p_arg = target.p_arg if takes_p else ""
+    c, p = "c" if takes_c else "", "p" if takes_p else ""
+    state = f"const {P}_vector *q, const {P}_vector *qd"
+
+    def rates(time: str) -> str:
+        if u:
+            return after(time if target.driven else "", "u", c, p)
+        return after(time if timed else "", c)
+
+    def in_vector(array: str, name: str) -> str:
+        return f"{array}->x[{target.enum[name]}]" if large else f"{array}->{name}"
+
+    made: dict[str, Any] = {
+        "head": "static int" if large else "static inline int",
+        "vector": f"{P}_vector",
+        "solve": "solve",
+        "rates": "rates" if u else "solve",
+        "suffix": "",
+        "solve_arguments": arguments(
+            f"{P}_vector *a", state, f"{real} t" if timed else "", u_arg, c_arg
+        ),
+        "solve_u": after("t" if timed else "", "u", c),
+        "solve_now": after("t" if timed else "", "now", c),
+        "rates_arguments": arguments(f"{P}_vector *a", state, t_arg, u_arg, c_arg, p_arg),
+        "stepper_arguments": arguments(
+            f"{P}_vector *r, {P}_vector *v, {state}", t_arg, f"{real} h", u_arg, c_arg, p_arg
+        ),
+        "unused": _unread(target, function),
+        "pieces": None,
+        "signal_at": [_gathered(target, large, "q", "at"), _gathered(target, large, "qd", "moving")]
+        if target.signal_state
+        else [],
+        "signal_call": target.signal_call("now", "at", "moving"),
+        "call": rates,
+        "first": "int good = ",
+        "and": "good &= ",
+        "last": "return good;",
+        "each": lambda lines, width=4, index="i": indent(_each(target, large, lines, index), width),
+        "rows": indent(_rows(target, large), 12),
+        "own_signal": None,
+    }
+    if not large:
+        body: Body = prepare["body"]
+        return made | {
+            "loads": target.loads(function, in_vector, target.element),
+            "blocks": body.blocks,
+            "results": [
+                f"a->{name} = {r};" for name, r in zip(target.names, body.results, strict=True)
+            ],
+            "end": [f"return {none_of(body.failures)};"],
+        }
+    _, rest = staged(function, [p.name for p in s.parameters])
+    kept = prepare["prepared_members"]
+    groups = target.groups()
+    given = [
+        Argument(f"const {P}_vector *q", "q", groups["q"]),
+        Argument(f"const {P}_vector *qd", "qd", groups["qd"]),
+        Argument(f"{real} t", "t", groups["t"]),
+        Argument(u_arg, "u", groups["u"]),
+        Argument(f"const {P}_prepared *c", "c", frozenset(kept)),
+    ]
+    cut = target.in_pieces(
+        rest,
+        "solve",
+        given,
+        [in_vector("a", name) for name in target.names],
+        Argument(f"{P}_vector *a", "a", frozenset()),
+        lambda f: target.loads(f, in_vector, target.element),
+        {n: _in_prepared(n) for n in kept},
+    )
+    return made | {
+        "pieces": cut,
+        "unused": [*made["unused"], *(["c"] if takes_c and not rest.uses & set(kept) else [])],
+        "loads": cut["locals"],
+        "blocks": [],
+        "results": cut["calls"],
+        "end": [f"return {cut['outcome']};"],
+    }
+
+
+def _each(target: Target, large: bool, lines: Sequence[str], index: str = "i") -> list[str]:
+    """Statements for every coordinate: $ is its member of a vector, # its place in an array."""
+    if large:
+        inside = [line.replace("$", f"x[{index}]").replace("#", index) for line in lines]
+        return _loop(index, f"{target.PREFIX}_NQ", inside)
+    return [
+        line.replace("$", name).replace("#", target.enum[name])
+        for name in target.names
+        for line in lines
+    ]
+
+
+def _rows(target: Target, large: bool) -> list[str]:
+    """The state into the present rows."""
+    both = ("q_rows", "at"), ("qd_rows", "moving")
+    if large:
+        return _each(target, True, [f"{row}[#] = {x}.$;" for row, x in both])
+    return [f"{row}[{k}] = {x}.{name};" for k, name in enumerate(target.names) for row, x in both]
+
+
+def _loop(index: str, end: str, inside: Sequence[str]) -> list[str]:
+    brace = len(inside) > 1
+    head = f"for (int {index} = 0; {index} < {end}; {index}++)" + " {" * brace
+    return [head, *(f"    {line}" for line in inside), *(["}"] if brace else [])]
+
+
+def _gathered(target: Target, large: bool, of: str, name: str) -> str:
+    """The numbers of a vector as an array."""
+    inside = ", ".join(
+        f"{of}->x[{target.enum[n]}]" if large else f"{of}->{n}" for n in target.names
+    )
+    return f"const {target.real.name} {name}[{target.PREFIX}_NQ] = {{ {inside} }};"
+
+
+def _vector_of(target: Target, large: bool, name: str, element: str) -> str:
+    """A vector whose numbers are `element` with # for each place."""
+    inside = ", ".join(element.replace("#", target.enum[n]) for n in target.names)
+    inside = f"{{ {{ {inside} }} }}" if large else f"{{ {inside} }}"
+    return f"{target.prefix}_vector {name} = {inside};"
+
+
+def _unread(target: Target, function: Function) -> list[str]:
+    """Arguments that the body of a function does not read."""
+    groups, uses = target.groups(), function.uses
+    return [k for k in ("q", "qd", "u") if groups[k] and not uses & groups[k]]
+
+
+# --- many at once ---------------------------------------------------------------------------------
+
+
+def _lane(
+    target: Target, function: Function, prepare: Mapping[str, Any], mode: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The same for a batch: no branches; what goes wrong is noted in trouble.
+
+    Small: for one instance, inlined into the loop over a tile. Large: for a whole tile, each piece
+    such a loop.
+    """
+    s, real, P = target.system, target.real.name, target.prefix
+    large, held, timed = "body" not in prepare, bool(s.inputs), TIME in function.uses
+    kept = prepare["prepared_members"]
+    takes_c = bool(kept)
+    vector, lanes = ("lanes", "_lanes") if large else ("vector", "")
+    restrict = f"{target.PREFIX}_ALONE " if large else ""
+    trouble = f"{real} *{restrict}troubles" if large else f"{real} *trouble"
+    u_arg = f"const {P}_inputs{lanes} *u" if held else ""
+    c_arg = f"const {P}_prepared{lanes} *c" if takes_c else ""
+    t_arg = f"{real} t" if target.driven else ""
+    state = f"const {P}_{vector} *q, const {P}_{vector} *qd"
+    c = "c" if takes_c else ""
+    trouble_call = "troubles" if large else "trouble"
+
+    def rates(time: str) -> str:
+        if held:
+            return after(time if target.driven else "", "u", "held", c, trouble_call)
+        return after(time if timed else "", c, trouble_call)
+
+    made = dict(mode) | {
+        "head": "static void" if large else f"{target.PREFIX}_LANE void",
+        "inline": f"{target.PREFIX}_{'INLINE' if large else 'LANE'}",
+        "vector": f"{P}_{vector}",
+        "solve": "solve_lane",
+        "rates": "rates_lane" if held else "solve_lane",
+        "suffix": "_lane",
+        "solve_arguments": arguments(
+            f"{P}_{vector} *a", state, f"{real} t" if timed else "", u_arg, c_arg, trouble
+        ),
+        "solve_u": after("t" if timed else "", "held ? u : &now", c, trouble_call),
+        "rates_arguments": arguments(
+            f"{P}_{vector} *a", state, t_arg, u_arg, "int held", c_arg, trouble
+        ),
+        "inputs": f"{P}_inputs{lanes}",
+        "stepper_arguments": arguments(
+            f"{P}_{vector} *r, {P}_{vector} *v, {state}", t_arg, f"{real} h",
+            u_arg and f"{u_arg}, int held", c_arg, trouble,
+        ),
+        "call": rates,
+        "first": "",
+        "and": "",
+        "last": "",
+        "own_signal": _signal_lanes(target, kept, c_arg, trouble)
+        if large
+        else _signal_lane(target, kept, state, c_arg, trouble),
+    }  # fmt: skip
+    if not large:
+        return made | _lane_small(target, function, kept, made)
+    return made | _lane_large(target, function, kept, made)
+
+
+def _lane_small(
+    target: Target, function: Function, kept: Sequence[str], made: Mapping[str, Any]
+) -> dict[str, Any]:
+    s, P = target.system, target.prefix
+    own = [p.name for p in s.parameters]
+    body = target.body(function, keep=_in_prepared, parameters=own, lane=True)
+    one = f"1.0{target.real.suffix}"
+
+    def in_struct(array: str, name: str) -> str:
+        return f"{array}->{name}"
+
+    def one_of(what: str, name: str, elements: Iterable[str]) -> str:
+        return f"const {P}_{what} {name} = {{ {', '.join(elements)} }};"
+
+    at = [target.enum[n] for n in target.names]
+    given = [target.enum[n] for n in target.input_names]
+    return {
+        "unused": [*made["unused"], *([] if body.failures or body.sincos else ["trouble"])],
+        "loads": target.loads(function, in_struct, in_struct),
+        "blocks": body.blocks,
+        "end": [f"*trouble = {x} ? {one} : *trouble;" for x in body.failures],
+        "from_tile": [
+            one_of("vector", "q", (f"s->q.x[{k}][i]" for k in at)),
+            one_of("vector", "qd", (f"s->qd.x[{k}][i]" for k in at)),
+            *([one_of("inputs", "u", (f"s->u.x[{k}][i]" for k in given))] if s.inputs else []),
+            *([one_of("prepared", "c", (f"s->c.{n}[i]" for n in kept))] if kept else []),
+        ],
+        "stepper_call": after(
+            "t" if target.driven else "", "h", "&u, held" if s.inputs else "",
+            "&c" if kept else "", "&trouble",
+        ),
+    }  # fmt: skip
+
+
+def _lane_large(
+    target: Target, function: Function, kept: Sequence[str], made: Mapping[str, Any]
+) -> dict[str, Any]:
+    s, P = target.system, target.prefix
+    _, rest = staged(function, [p.name for p in s.parameters])
+    cut = target.in_pieces(
+        rest,
+        "solve_lane",
+        _lane_arguments(target, kept),
+        [_in_lanes(target)("a", name) for name in target.names],
+        Argument(f"{P}_lanes *{target.PREFIX}_ALONE a", "a", frozenset()),
+        lambda f: target.loads(f, _in_lanes(target), _in_lanes(target)),
+        {n: f"c->{n}[i]" for n in kept},
+        lane=True,
+    )
+    tile = f"{target.PREFIX}_TILE"
+
+    def each(lines: Sequence[str], width: int = 4) -> str:
+        inside = [line.replace("$", "x[j][i]") for line in lines]
+        return indent(_loop("j", f"{target.PREFIX}_NQ", _loop("i", tile, inside)), width)
+
+    return {
+        "pieces": cut,
+        "unused": [*made["unused"], *(["troubles"] if not cut["troubled"] else [])],
+        "loads": cut["locals"],
+        "blocks": [],
+        "results": cut["calls"],
+        "end": [],
+        "each": each,
+        "stepper_call": after(
+            "t" if target.driven else "", "h", "&s->u, held" if s.inputs else "",
+            "&s->c" if kept else "", "s->trouble",
+        ),
+    }  # fmt: skip
+
+
+def _in_lanes(target: Target) -> Access:
+    return lambda array, name: f"{array}->x[{target.enum[name]}][i]"
+
+
+def _lane_arguments(target: Target, kept: Sequence[str]) -> list[Argument]:
+    """What a piece over a tile may read."""
+    P, groups, real = target.prefix, target.groups(), target.real.name
+    return [
+        Argument(f"const {P}_lanes *q", "q", groups["q"]),
+        Argument(f"const {P}_lanes *qd", "qd", groups["qd"]),
+        Argument(f"{real} t", "t", groups["t"]),
+        Argument(f"const {P}_inputs_lanes *u", "u", groups["u"]),
+        Argument(f"const {P}_prepared_lanes *c", "c", frozenset(kept)),
+        Argument(f"{real} *{target.PREFIX}_ALONE troubles", "troubles", frozenset({TROUBLE})),
+    ]
+
+
+def _signal_lane(
+    target: Target, kept: Sequence[str], state: str, c_arg: str, trouble: str
+) -> dict[str, Any] | None:
+    """The scene's signals for one of many."""
+    if "signal" not in target.program:
+        return None
+    s, given = target.system, target.program["signal"]
+    where = {p.name: f"c->{p.name}" for p in s.parameters}
+    made = target.body(given, where=where, lane=True)
+
+    def in_struct(array: str, name: str) -> str:
+        return f"{array}->{name}"
+
+    unused = [] if not c_arg or given.uses & set(where) else ["c"]
+    return {
+        "pieces": None,
+        "arguments": arguments(
+            f"{target.prefix}_inputs *u", f"{target.real.name} t" if target.signal_t else "",
+            state if target.signal_state else "", c_arg, trouble,
+        ),
+        "unused": [*unused, *([] if made.sincos else ["trouble"]), *_unread_state(target, given)],
+        "loads": target.loads(given, in_struct, in_struct),
+        "blocks": [*made.early, *made.blocks],
+        "results": [
+            f"u->{i.name} = {r};" for i, r in zip(s.inputs, made.results, strict=True)
+        ],
+        "call": _signal_lane_call(target, c_arg, "trouble"),
+    }  # fmt: skip
+
+
+def _signal_lanes(
+    target: Target, kept: Sequence[str], c_arg: str, trouble: str
+) -> dict[str, Any] | None:
+    """The scene's signals for a whole tile."""
+    if "signal" not in target.program:
+        return None
+    P, given = target.prefix, target.program["signal"]
+    own = {p.name for p in target.system.parameters}
+    cut = target.in_pieces(
+        given,
+        "signal_lane",
+        _lane_arguments(target, [n for n in kept if n in own]),
+        [f"u->x[{target.enum[name]}][i]" for name in target.input_names],
+        Argument(f"{P}_inputs_lanes *{target.PREFIX}_ALONE u", "u", frozenset()),
+        lambda f: target.loads(f, _in_lanes(target), _in_lanes(target)),
+        {n: f"c->{n}[i]" for n in own},
+        lane=True,
+    )
+    state = f"const {P}_lanes *q, const {P}_lanes *qd"
+    return {
+        "pieces": cut,
+        "arguments": arguments(
+            f"{P}_inputs_lanes *u", f"{target.real.name} t" if target.signal_t else "",
+            state if target.signal_state else "", c_arg, trouble,
+        ),
+        "unused": [
+            *([] if not c_arg or given.uses & own else ["c"]),
+            *([] if cut["troubled"] else ["troubles"]),
+            *_unread_state(target, given),
+        ],
+        "loads": cut["locals"],
+        "blocks": [],
+        "results": cut["calls"],
+        "call": _signal_lane_call(target, c_arg, "troubles"),
+    }  # fmt: skip
+
+
+def _unread_state(target: Target, given: Function) -> list[str]:
+    if not target.signal_state:
+        return []
+    return [name for name in ("q", "qd") if not given.uses & target.groups()[name]]
+
+
+def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
+    return arguments(
+        "&now", "t" if target.signal_t else "", "q, qd" if target.signal_state else "",
+        "c" if c_arg else "", trouble,
+    )  # fmt: skip
+
+
+def _tile(target: Target, kept: int, crossing: int, large: bool) -> int:
+    """Instances side by side: 64, fewer where what belongs to them would not stay near."""
+    numbers = 2 * len(target.system.q) + len(target.system.u) + kept + 2
+    if large:
+        numbers += crossing + 6 * len(target.system.q)
+    near = WIDE if large else NEAR
+    return max(8, min(64, 1 << (near // (8 * numbers)).bit_length() - 1))
+
+
+# --- steppers -------------------------------------------------------------------------------------
+
+
+def _method(name: str, real: Real) -> dict[str, Any]:
+    """A stepper as its template wants it; RK4 has one of its own, written out by hand."""
+    m = METHODS[name]
+
+    def number(x: Fraction) -> str:
+        return ccode.number(Rational(x.numerator, x.denominator), real)
+
+    def total(row: Row) -> str:
+        terms = [(x, k + 1) for k, x in enumerate(row) if x]
+        text = " + ".join(f"{number(x)}*a{k}.$" for x, k in terms).replace("+ -", "- ")
+        return text or number(Fraction(0))
+
+    def lines(c: Fraction, positions: Row, velocities: Row) -> list[str]:
+        step = "h" if c == 1 else f"{number(c)}*h"
+        return [
+            f"r->$ = q->$ + ({step}*qd->$ + hh*({total(positions)}));",
+            f"v->$ = qd->$ + h*({total(velocities)});",
+        ]
+
+    stages = [] if m is RK4 else list(zip(m.c, m.a_squared, m.a, strict=True))[1:]
+    return {
+        "name": m.name,
+        "title": m.title,
+        "order": m.order,
+        "source": m.source,
+        "stages": m.stages,
+        "limits": m.limits,
+        "template": "rk4.c.jinja" if m is RK4 else "explicit.c.jinja",
+        "body": [
+            {"lines": lines(c, *rows), "time": "t + h" if c == 1 else f"t + {number(c)}*h"}
+            for c, *rows in stages
+        ],
+        "end": lines(Fraction(1), m.b_a, m.b),
+    }
