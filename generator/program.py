@@ -136,7 +136,9 @@ def _cheapest(name: str, system: System, routes: Mapping[str, Route]) -> Functio
     if len(made) > 1 and made[best].body != made[first].body:
         errors = {route: _rounding(function, system) for route, function in made.items()}
         least = min(errors.values())
-        best = next(r for r in by_weight if errors[r] <= LOST * max(least, 2.0**-50))
+        # so many roundings add up to their root, where nothing cancels
+        usual = 2.0**-52 * max(4.0, math.sqrt(len(made[best].body)))
+        best = next(r for r in by_weight if errors[r] <= LOST * max(least, usual))
     costs = tuple((route, f.cost) for route, f in made.items())
     return replace(made[best], route=best, routes=costs)
 

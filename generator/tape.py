@@ -227,9 +227,14 @@ class Tape:
             total = self._gather(Add(*terms))
             if not total.is_Add:
                 return total
-            weights = dict(split(term)[::-1] for term in total.args if not term.is_number)
-            constant = total.as_coeff_Add()[0]
+            return self._of_terms(total)
         return self._of_weights(weights, constant)
+
+    def _of_terms(self, total: Expr) -> Expr:
+        """What stands for a sum of atoms as SymPy has it."""
+        numbers = [term for term in total.args if term.is_number]  # 1/4 and sqrt(2), say
+        terms = [split(term) for term in total.args if not term.is_number]
+        return self._of_weights({name: weight for weight, name in terms if name}, Add(*numbers))
 
     def _of_weights(self, weights: dict[Symbol, Expr], constant: Expr = S.Zero) -> Expr:
         """What stands for a sum of weighted names; most weights in it are positive."""
@@ -299,11 +304,7 @@ class Tape:
 
     def _sum_of_parameters(self, atoms: Iterable[Expr]) -> Expr:
         total = Add(*atoms)
-        if not total.is_Add:
-            return total
-        constant = total.as_coeff_Add()[0]
-        terms = (split(term)[::-1] for term in total.args if not term.is_number)
-        return self._of_weights(dict(terms), constant)
+        return self._of_terms(total) if total.is_Add else total
 
     def _pythagoras(self, weights: dict[_Late, Expr]) -> dict[_Late, Expr]:
         again = True

@@ -349,3 +349,25 @@ def test_the_fast_way_and_the_plain_one_share_only_the_system() -> None:
     for module in ("tape", "mechanics", "program", "expand", "ccode", "render"):
         assert f"eomc.{module}" not in text
         assert f"import {module}" not in text
+
+
+@pytest.mark.parametrize("mass", ["m/2 + 1/4", "m/2 + sqrt(2)", "m*sqrt(3) + sqrt(2) + 1/3"])
+def test_irrational_constants_beside_parameters_stay(mass: str) -> None:
+    made = system.from_scene(
+        scene.parse(
+            f"""
+            eomc = 1
+            name = "irrational"
+            [coordinates]
+            x = {{}}
+            [parameters]
+            m = 1.0
+            [definitions]
+            u = "x*cos(0.3)"
+            [energy]
+            kinetic = "({mass})*dot(u)**2 + (m + 1/4)*(1 + x**2)*dot(u)**2"
+            potential = "(m + sqrt(2))*sin(x) + sqrt(2)*sin(x)"
+            """
+        )
+    )
+    assert_agree(made)
