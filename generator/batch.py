@@ -26,8 +26,9 @@ _SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
 class BatchRun:
     """Trajectories: t (n,), q and qd (batch, n, nq), status and steps (batch,).
 
-    status: "ok", "singular", "not finite" or "interrupted", one an instance; the rows behind the
-    last good one of an instance that could not go on are nan. steps: how many each has made.
+    status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the
+    rows behind the last good one of an instance that could not go on are nan. steps: how many each
+    has made.
     """
 
     def __init__(

@@ -44,6 +44,8 @@ class Real:
 DOUBLE = Real("double", "", "", "float64", 2.0**-52)
 FLOAT = Real("float", "f", "f", "float32", 2.0**-23)
 REALS = {r.name: r for r in (DOUBLE, FLOAT)}
+# gcc's, with libquadmath; for references only, since NumPy and most compilers don't know it
+QUAD = Real("__float128", "q", "q", "", 2.0**-112)
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ def number(value: Expr, real: Real = DOUBLE) -> str:
     >>> number(sympy.Rational(8, 3)), number(sympy.Rational(1, 100)), number(sympy.pi)
     ('(8.0/3.0)', '0.01', '3.141592653589793')
     """
+    if real is QUAD:
+        return _quad(value)
     if value.is_Rational:
         nearest = float(value)
         text = _decimal(nearest)
@@ -69,6 +73,14 @@ def number(value: Expr, real: Real = DOUBLE) -> str:
             )
         return text + real.suffix
     return _decimal(float(value.evalf(25))) + real.suffix
+
+
+def _quad(value: Expr) -> str:
+    """A literal of 40 digits, or a quotient of numbers that 113 bits hold."""
+    if value.is_Rational and max(abs(value.p), value.q) < 2**113:
+        return f"{value.p}.0q" if value.q == 1 else f"({value.p}.0q/{value.q}.0q)"
+    text = str(value.evalf(40))
+    return (text if "." in text or "e" in text else text + ".0") + "q"
 
 
 def _decimal(value: float) -> str:

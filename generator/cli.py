@@ -1,4 +1,4 @@
-"""The command: eomc new, import, build, check, run, show, dof, list.
+"""The command: eomc new, import, build, check, run, report, show, dof, list.
 
 Exit status: 0, 1 where a check failed or a run could not go on, 2 for bad input. What takes time
 to import (SymPy, pydantic, rich) is imported where it is needed: `eomc build` with nothing to do
@@ -22,6 +22,7 @@ import eomc
 from eomc.problems import EomcError, SceneError
 
 if TYPE_CHECKING:
+    from eomc.estimate import Estimate
     from eomc.problems import Problem
     from eomc.runtime import Run
 
@@ -284,8 +285,6 @@ def run(
     eomc run scenes/cartpole.toml --plot cartpole.png
     eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
     """
-    from eomc.steppers import METHODS
-
     _known_suffix(out, (".csv", ".npz"), "--out")
     _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
     with _status(f"building {scene.stem}", quiet or as_json):
@@ -293,6 +292,7 @@ def run(
     values, q0, qd0 = _overrides(scene, module, parameters, start)
     options: dict[str, Any] = {"h": h, "duration": duration, "params": values, "method": method}
     try:
+        unstable = module.advice(q0, qd0, h, params=values, method=method)
         with _progress("running", quiet or as_json) as progress:
             begun = time.perf_counter()
             done = _simulated(module, q0, qd0, every=every, progress=progress, **options)
@@ -301,34 +301,65 @@ def run(
         done, seconds = stop.run, time.perf_counter() - begun
     except (ValueError, MemoryError) as fault:
         raise EomcError(str(fault).replace("every=", "--every")) from None
-    error = None
-    if done.status == "ok" and 0 < seconds < 2 and done.steps:
-        halved = _simulated(
-            module,
-            q0,
-            qd0,
-            h=done.h / 2,
-            steps=2 * done.steps,
-            every=2 * done.steps,
-            params=values,
-            method=method,
-        )
-        if halved.status == "ok":
-            error = _end_error(done, halved, METHODS[method or module.methods[0]].order)
+    stopped = done.status == "interrupted"
+    if done.status == "ok" and seconds < 2:
+        try:
+            with _progress("finding its error", quiet or as_json) as progress:
+                done.estimate(progress)
+        except module.Interrupted:  # the run itself is whole
+            stopped = True
     if out:
         _write(out, module, done)
     if plot:
         from eomc import plot as plots
 
         plots.draw(eomc.read(scene).at(values), done.t, done.q, done.qd, done.energy, plot)
-    summary = _summary(module, method, done, seconds, error, plot=plot, out=out)
+    summary = _summary(module, done, seconds, unstable, plot=plot, out=out)
     if as_json:
         click.echo(json.dumps(summary, indent=1))
     elif not quiet:
         _print_summary(module, done, summary)
     if done.status != "ok":
         click.echo(f"eomc: {done.message}", err=True)
-        sys.exit(130 if done.status == "interrupted" else 1)
+    if stopped or done.status != "ok":
+        sys.exit(130 if stopped else 1)
+
+
+@main.command()
+@_SCENES
+@_BUILD
+@click.option("--digits", type=click.IntRange(1, 17), help="Answer for so many digits only.")
+@click.option("--json", "file", type=click.Path(path_type=Path), help="Write all figures to FILE.")
+@_QUIET
+def report(
+    scenes: Sequence[Path], root: Path, digits: int | None, file: Path | None, quiet: bool
+) -> None:
+    """Measure what every digit costs: each stepper over a range of h, against 25 digits or more.
+
+    Writes a page with pictures, build/NAME/report.html.
+
+    \b
+    eomc report scenes/cartpole.toml
+    eomc report scenes/cartpole.toml --digits 8
+    """
+    from eomc import report as reports
+
+    told = []
+    for scene in scenes:
+        with _progress(f"measuring {scene.stem}", quiet) as progress:
+            made = reports.report(scene, root, progress=progress)
+        told.append(made.as_dict())
+        if digits is not None:
+            click.echo(f"{made.scene}: {made.recommendation(digits)}")
+            continue
+        if not quiet:
+            click.echo(made.table())
+        page = root / made.scene / "report.html"
+        _write_text(page, reports.page(made))
+        if not quiet:
+            click.echo(f"\nwrote {page}\n")
+    if file is not None:
+        _write_text(file, json.dumps(told, indent=1) + "\n")
 
 
 @main.command()
@@ -477,23 +508,29 @@ def _simulated(module: Any, q0: Any, qd0: Any, **options: Any) -> Run:
         return done
 
 
-def _end_error(done: Run, halved: Run, order: int) -> dict[str, float]:
-    """The error of the last state, from the same run at half the step."""
-    import numpy as np
+def _error(done: Run) -> dict[str, Any] | None:
+    """A run's own error for JSON, which has no inf and no nan."""
+    error = done.error
+    if error is None:
+        return None
 
-    share = 2**order / (2**order - 1)
-    q = float(np.max(np.abs(done.q[-1] - halved.q[-1]))) * share
-    qd = float(np.max(np.abs(done.qd[-1] - halved.qd[-1]))) * share
-    return {"q": q, "qd": qd}
+    def said(x: float) -> float | None:
+        return x if abs(x) < float("inf") else None
+
+    return {
+        "q": said(float(error.q[-1].max())),
+        "qd": said(float(error.qd[-1].max())),
+        "end": {name: said(x) for name, x in error.end.items()},
+        "digits": error.digits,
+        "order": error.order,
+        "observed_order": said(error.observed),
+        "amplification": said(error.amplification),
+        "verdict": error.verdict,
+    }
 
 
 def _summary(
-    module: Any,
-    method: str | None,
-    done: Run,
-    seconds: float,
-    error: Mapping[str, float] | None,
-    **files: Path | None,
+    module: Any, done: Run, seconds: float, unstable: str | None, **files: Path | None
 ) -> dict[str, Any]:
     import numpy as np
 
@@ -502,7 +539,7 @@ def _summary(
         "scene": module._model.name,
         "status": done.status,
         "message": done.message,
-        "method": method or module.methods[0],
+        "method": done.method,
         "h": done.h,
         "steps": done.steps,
         "t": float(done.t[-1]),
@@ -516,7 +553,8 @@ def _summary(
         "jacobi_change": None
         if np.array_equal(energy, jacobi)
         else float(np.max(np.abs(jacobi - jacobi[0]))),
-        "error_estimate": error,
+        "error_estimate": _error(done),
+        "beyond_stability": unstable,
         "seconds": seconds,
         "steps_per_second": done.steps / seconds if seconds else None,
         "files": [str(path) for path in files.values() if path],
@@ -537,17 +575,32 @@ def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
     beside = "" if jacobi is None else f"; Jacobi's integral by {jacobi:.2g} J"
     end = summary["energy"]["end"]
     click.echo(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J{beside}")
-    if error := summary["error_estimate"]:
-        click.echo(
-            f"  error at the end about {error['q']:.1g} in q, {error['qd']:.1g} in qd "
-            "(from the same run at h/2)"
-        )
-        if error["q"] > 0.1 * max(1.0, *map(abs, summary["q"].values())):
-            click.echo("  this motion is not resolved: take a smaller --h, or a shorter --duration")
+    if summary["beyond_stability"]:
+        click.echo(f"  {summary['beyond_stability']}")
+    if done.error is not None:
+        _print_error(module, done.error)
     speed = summary["steps_per_second"] or 0.0
     click.echo(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
     for file in summary["files"]:
         click.echo(f"  wrote {file}")
+
+
+def _print_error(module: Any, error: Estimate) -> None:
+    import math
+
+    q, qd = float(error.q[-1].max()), float(error.qd[-1].max())
+    seen = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
+    click.echo(
+        f"  error at the end about {q:.1g} in q, {qd:.1g} in qd "
+        f"(from the same run in shorter steps; order {error.order}, {seen})"
+    )
+    digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
+    click.echo(
+        f"  right digits: {digits}; a difference at the start has become "
+        f"{error.amplification:.2g} times as large"
+    )
+    if not error.resolved:
+        click.echo(f"  this motion is not resolved: {error.verdict}")
 
 
 def _write(path: Path, module: Any, done: Run) -> None:
@@ -569,6 +622,13 @@ def _write(path: Path, module: Any, done: Run) -> None:
                 [repr(float(x)) for x in row]
                 for row in np.column_stack([done.t, done.q, done.qd, done.energy])
             )
+    except OSError as fault:
+        raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
+
+
+def _write_text(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
     except OSError as fault:
         raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
 

@@ -16,7 +16,7 @@ from eomc import __version__, ccode
 from eomc.assignments import evaluate
 from eomc.ccode import DOUBLE, indent
 from eomc.dynamics import dynamics
-from eomc.evaluations import KINDS, functions, takes_t
+from eomc.evaluations import KINDS, functions, linearization, takes_t
 from eomc.pieces import matrix
 from eomc.program import nearby
 from eomc.target import Target, after, arguments
@@ -30,7 +30,8 @@ def resource(package: str, name: str) -> str:
 def values(target: Target) -> dict[str, Any]:
     """Every variable of every template."""
     s, real, enum = target.system, target.real, target.enum
-    evaluations, moved = functions(target), dynamics(target)
+    evaluations, slopes = functions(target), linearization(target)
+    moved = dynamics(target, slopes)
     return {
         "title": s.title,
         "prefix": target.prefix,
@@ -76,7 +77,10 @@ def values(target: Target) -> dict[str, Any]:
         "has_p": target.needs_p,
         "batch": s.run.batch,
         "csrc": _csrc(target),
-        "in_pieces": moved["large"] or any(f["in_pieces"] for f in evaluations),
+        "slopes": slopes,
+        "in_pieces": moved["large"]
+        or any(f["in_pieces"] for f in evaluations)
+        or bool(slopes and slopes["inner"]["pieces"]),
         **moved,
         **_example(target),
         **_selftest(target),
@@ -205,8 +209,8 @@ def _face(target: Target) -> dict[str, Any]:
             tuple(n for n in ("energy", "jacobi") if n in target.program and takes_t(target, n))
         ),
         "face_functions": [
-            "C", "D", "acceleration", "bias", "energy", "g", "jacobi", "kinetic_energy",
-            "potential_energy", "power", "rhs", "signal", "simulate",
+            "C", "D", "acceleration", "advice", "bias", "energy", "g", "jacobi", "kinetic_energy",
+            "linearize", "potential_energy", "power", "rhs", "signal", "simulate",
             *(["simulate_batch"] if s.run.batch else []), "step",
             *(["step_batch"] if s.run.batch else []), "tau",
         ],

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from math import isfinite
 from typing import Any
 
 from sympy import Rational, S
@@ -18,15 +19,16 @@ from eomc.assignments import Function, Operand
 from eomc.ccode import Body, Real, indent
 from eomc.pieces import is_large, staged
 from eomc.program import TIME
-from eomc.steppers import METHODS, RK4, Row
+from eomc.steppers import METHODS, RK4, Method, Row
 from eomc.target import TROUBLE, Access, Argument, Target, after, arguments, none_of, sentence
 
 NEAR = 16_384  # bytes that a tile of a small system may have: half a first-level cache
+RESTART = 256  # steps from which implicit methods begin afresh, so that runs can be cut there
 WIDE = 131_072  # and of a large one: a part of a second-level cache
 
 
-def dynamics(target: Target) -> dict[str, Any]:
-    """What belongs to accelerations and steppers."""
+def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What belongs to accelerations and steppers; slopes: what evaluations.linearization gives."""
     s, function, real = target.system, target.program["acceleration"], target.real.name
     P, NQ = target.prefix, f"{target.PREFIX}_NQ"
     large = is_large(function)
@@ -54,7 +56,16 @@ def dynamics(target: Target) -> dict[str, Any]:
         "lane": lane,
         "rates_now": f"{P}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
         "stepper_call": after(t, "h", u, c, p),
-        "methods": [_method(name, target.real) for name in s.run.methods],
+        "methods": [
+            _implicit(target, METHODS[name], slopes, scalar, large)
+            if slopes is not None and METHODS[name].implicit
+            else _explicit(METHODS[name], target.real)
+            for name in s.run.methods
+        ],
+        "implicit": any(METHODS[name].implicit for name in s.run.methods),
+        "restart": RESTART,
+        "fabs": "fabs" + target.real.function_suffix,
+        "fmax": "fmax" + target.real.function_suffix,
         "method_names": repr(s.run.methods),
         "t_call": after(t),
         "p_call": after(target.p_call),
@@ -545,26 +556,13 @@ def _tile(target: Target, kept: int, crossing: int, large: bool) -> int:
 # --- steppers -------------------------------------------------------------------------------------
 
 
-def _method(name: str, real: Real) -> dict[str, Any]:
-    """A stepper as its template wants it; RK4 has one of its own, written out by hand."""
-    m = METHODS[name]
+def _number(x: Fraction, real: Real) -> str:
+    return ccode.number(Rational(x.numerator, x.denominator), real)
 
-    def number(x: Fraction) -> str:
-        return ccode.number(Rational(x.numerator, x.denominator), real)
 
-    def total(row: Row) -> str:
-        terms = [(x, k + 1) for k, x in enumerate(row) if x]
-        text = " + ".join(f"{number(x)}*a{k}.$" for x, k in terms).replace("+ -", "- ")
-        return text or number(Fraction(0))
-
-    def lines(c: Fraction, positions: Row, velocities: Row) -> list[str]:
-        step = "h" if c == 1 else f"{number(c)}*h"
-        return [
-            f"r->$ = q->$ + ({step}*qd->$ + hh*({total(positions)}));",
-            f"v->$ = qd->$ + h*({total(velocities)});",
-        ]
-
-    stages = [] if m is RK4 else list(zip(m.c, m.a_squared, m.a, strict=True))[1:]
+def _about(m: Method) -> dict[str, Any]:
+    """What a method's template says of it."""
+    undamped, decay = m.limits
     return {
         "name": m.name,
         "title": m.title,
@@ -572,10 +570,87 @@ def _method(name: str, real: Real) -> dict[str, Any]:
         "source": m.source,
         "stages": m.stages,
         "limits": m.limits,
+        "notes": m.notes,
+        "implicit": m.implicit,
+        "stability": f"h omega <= {undamped:.3g} undamped"
+        + (f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."),
+    }
+
+
+def _explicit(m: Method, real: Real) -> dict[str, Any]:
+    """An explicit method as its template wants it; RK4 has one of its own, written out by hand."""
+
+    def total(row: Row) -> str:
+        terms = [(x, k + 1) for k, x in enumerate(row) if x]
+        text = " + ".join(f"{_number(x, real)}*a{k}.$" for x, k in terms).replace("+ -", "- ")
+        return text or _number(Fraction(0), real)
+
+    def lines(c: Fraction, positions: Row, velocities: Row) -> list[str]:
+        step = "h" if c == 1 else f"{_number(c, real)}*h"
+        return [
+            f"r->$ = q->$ + ({step}*qd->$ + hh*({total(positions)}));",
+            f"v->$ = qd->$ + h*({total(velocities)});",
+        ]
+
+    def time(c: Fraction) -> str:
+        return "t + h" if c == 1 else f"t + {_number(c, real)}*h"
+
+    stages = [] if m is RK4 else list(zip(m.c, m.a_squared, m.a, strict=True))[1:]
+    first, half = m.c[0], _number(m.c[0], real)
+    return _about(m) | {
         "template": "rk4.c.jinja" if m is RK4 else "explicit.c.jinja",
-        "body": [
-            {"lines": lines(c, *rows), "time": "t + h" if c == 1 else f"t + {number(c)}*h"}
-            for c, *rows in stages
-        ],
+        "begin": [f"r->$ = q->$ + {half}*h*qd->$;"] if first else [],
+        "begin_at": "r, qd" if first else "q, qd",
+        "begin_time": time(first) if first else "t",
+        "body": [{"lines": lines(c, *rows), "time": time(c)} for c, *rows in stages],
         "end": lines(Fraction(1), m.b_a, m.b),
     }
+
+
+def _implicit(
+    target: Target, m: Method, slopes: Mapping[str, Any], scalar: Mapping[str, Any], large: bool
+) -> dict[str, Any]:
+    """An implicit method as its template wants it, for one trajectory."""
+    real, P, s = target.real, target.prefix, m.stages
+    t, u = ("t" if target.driven else ""), ("u" if target.system.inputs else "")
+    p = "p" if slopes["takes_p"] else ""
+    memory = f"{P}_{m.name}_memory *m"
+    own_p = p if "_params *p" not in scalar["stepper_arguments"] else ""
+    given = arguments(
+        memory, f"{real.name} h", f"const {real.name} *q", f"const {real.name} *qd",
+        t and f"{real.name} t", u and f"const {real.name} *u", p and target.p_arg,
+    )  # fmt: skip
+
+    def matrix(rows: Sequence[Row]) -> list[str]:
+        return ["{ " + ", ".join(_number(x, real) for x in row) + " }," for row in rows]
+
+    def total(matrix: str, of: str = "#") -> str:
+        return " + ".join(f"{matrix}[{j}]*a[{j}][{of}]" for j in range(s))
+
+    def now(at: str, moving: str, time: str) -> str:
+        return arguments("m", "h", at, moving, t and time, u, p)
+
+    last = [" + ".join(f"{_number(x, real)}*a[{j}][#]" for j, x in enumerate(row))
+            for row in (m.b_a, m.b)]  # fmt: skip
+    return _about(m) | {
+        "template": "gauss.c.jinja",
+        "arguments": arguments(scalar["stepper_arguments"], own_p and target.p_arg, memory),
+        "call_more": after(own_p, "&memory"),
+        "factor_arguments": given,
+        "factor_now": now("at_now", "moving_now", "t"),
+        "factor_mid": now("mid_q", "mid_qd", f"t + {_number(Fraction(1, 2), real)}*h"),
+        "eps": repr(real.epsilon) + real.suffix,
+        "c": [_number(x, real) for x in m.c],
+        "A": matrix(m.a),
+        "AA": matrix(m.a_squared),
+        "ahead": matrix(m.ahead),
+        "guess": " + ".join(f"ahead[i][{j}]*m->a[{j}][k]" for j in range(s)),
+        "gathered": [
+            _gathered(target, large, "q", "at_now"), _gathered(target, large, "qd", "moving_now"),
+        ],
+        "stage": [
+            f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*({total('AA[i]')}));",
+            f"moving.$ = qd->$ + h*({total('A[i]')});",
+        ],
+        "end": [f"r->$ = q->$ + (h*qd->$ + hh*({last[0]}));", f"v->$ = qd->$ + h*({last[1]});"],
+    }  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any
 from eomc.assignments import Function
 from eomc.pieces import is_large
 from eomc.program import TIME
-from eomc.target import Argument, Target, arguments, sentence
+from eomc.target import Argument, Target, arguments, none_of, sentence
 
 
 @dataclass(frozen=True)
@@ -236,3 +236,87 @@ def _binding_call(
         target.p_cast,
     )
     return f"{'' if size else 'out[k] = '}{target.prefix}_{name}({given});"
+
+
+# --- the derivatives of the accelerations ---------------------------------------------------------
+
+
+def linearization(target: Target) -> dict[str, Any] | None:
+    """NAME_slopes, [da/dq, da/dqd, da/du] as rows, and what NAME_linearization hands on of it."""
+    function = source(target, "linearization")
+    if function is None:
+        return None
+    s, real, groups = target.system, target.real.name, target.groups()
+    NQ, NU, P = f"{target.PREFIX}_NQ", f"{target.PREFIX}_NU", target.prefix
+    width = f"2*{NQ} + {NU}" if s.inputs else f"2*{NQ}"
+    declared = {
+        "q": f"const {real} *q", "qd": f"const {real} *qd", "t": f"{real} t",
+        "u": f"const {real} *u", "along": f"const {real} *along", "p": target.p_arg,
+    }  # fmt: skip
+    read = [key for key in ("q", "qd", "t", "u", "p") if function.uses & groups[key]]
+    used = set(read)
+    if "u" in read:  # by the signals
+        state = {"q", "qd"} if target.signal_state else set()
+        used |= state | ({"t"} if target.signal_t else set()) | ({"p"} if target.needs_p else set())
+    there = ["q", "qd", *(["t"] if target.driven else []), *(["u"] if s.inputs else [])]
+    there += ["p"] if target.needs_p else []
+    whole = "linearization" in target.program
+    told = sentence(function)
+    parts = [("A_q", NQ, "0"), ("A_qd", NQ, NQ), *([("B", NU, f"2*{NQ}")] if s.inputs else [])]
+    out = "slopes" if whole else "column"
+    keys = read if whole else ["along", *read]
+    made = _slopes(target, function, out, [Argument(declared[k], k, groups[k]) for k in keys])
+    cost = told if whole else f"By {width} columns, each: {told[0].lower() + told[1:]}"
+    return {
+        "cost": cost,
+        "width": width,
+        "read": read,
+        "by_columns": not whole,
+        "inner": made
+        | {"prototype": f"static int {P}_{'slopes' if whole else 'slopes_column'}("
+           + arguments(f"{real} *{out}", *(declared[k] for k in keys)) + ")",
+           "unused": [] if whole or function.uses & groups["along"] else ["along"]},
+        "outer": f"static int {P}_slopes("
+        + arguments(f"{real} *slopes", *(declared[key] for key in read)) + ")",
+        "column_call": arguments("column", *keys),
+        "call": arguments("slopes", *read),
+        "parts": [{"name": n, "width": w, "at": at} for n, w, at in parts],
+        "prototype": f"{P}_status {P}_linearization("
+        + arguments(
+            *(f"{real} {n}[{NQ}*{w}]" for n, w, _ in parts), f"const {real} q[{NQ}]",
+            f"const {real} qd[{NQ}]", f"{real} t" if target.driven else "",
+            declared["u"] if s.inputs else "", target.p_arg,
+        ) + ")",
+        "reads_u": "u" in read,
+        "unread": [name for name in there if name not in used],
+        "takes_p": "p" in used,
+        "signal_call": target.signal_call("now", "q", "qd"),
+        "binding": f"{P}_linearization("
+        + arguments(
+            *(f"{n} + {NQ}*{w}*k" for n, w, _ in parts), f"q + {NQ}*k", f"qd + {NQ}*k",
+            "t" if target.driven else "", "u" if s.inputs else "", target.p_cast,
+        ) + ")",
+    }  # fmt: skip
+
+
+def _slopes(target: Target, function: Function, out: str, given: list[Argument]) -> dict[str, Any]:
+    """The body that fills `out` and returns whether D was regular."""
+    results = [f"{out}[{k}]" for k in range(len(function.outputs))]
+    if is_large(function):
+        filled = Argument(f"{target.real.name} *{out}", out, frozenset())
+        cut = target.in_pieces(
+            function, "slopes", given, results, filled,
+            lambda f: target.loads(f, target.element, target.element),
+        )  # fmt: skip
+        return {
+            "pieces": cut, "loads": cut["locals"], "blocks": [], "results": cut["calls"],
+            "end": cut["outcome"],
+        }  # fmt: skip
+    body = target.body(function)
+    return {
+        "pieces": None,
+        "loads": target.loads(function, target.element, target.element),
+        "blocks": [*body.early, *body.blocks],
+        "results": [f"{to} = {x};" for to, x in zip(results, body.results, strict=True)],
+        "end": none_of([*body.early_failures, *body.failures]),
+    }

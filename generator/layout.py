@@ -10,7 +10,7 @@ import pydantic
 
 from eomc.formulas import nearest
 
-METHODS = ("rk4", "dp8")
+METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "euler", "verlet")
 REALS = ("double", "float")
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
@@ -68,6 +68,7 @@ class _Run(_Table):
     method: _Methods = ("rk4",)
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
+    linearize: pydantic.StrictBool = False
 
 
 def _spelled_out(value: object) -> object:

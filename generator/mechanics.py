@@ -188,6 +188,32 @@ def along(system: System) -> list[Symbol]:
     return [symbol(f"{c.name}{ALONG}") for c in system.coordinates]
 
 
+def directions(system: System) -> dict[Symbol, Symbol]:
+    """The entries of a direction in (q, qd, u), by what each goes along."""
+    return {x: symbol(f"{x.name}{ALONG}") for x in (*system.q, *system.qd, *system.u)}
+
+
+def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
+    """[da/dq, da/dqd, da/du] at held inputs, (nq, 2 nq + nu), of accelerations a on the tape.
+
+    By rows, or where that would be long a single column, the derivative along a direction whose
+    entries are `directions`. Raises SceneError where the accelerations jump.
+    """
+    entries = directions(system)
+    try:
+        if len(entries) * len(tape.live(accelerations)) > WRITTEN_OUT:
+            return (tuple(tape.forward(accelerations, entries)),)
+        columns = [tape.forward(accelerations, {x: S.One}) for x in entries]
+    except RoughError:
+        message = (
+            "the accelerations jump (sign or heaviside of a coordinate or velocity), so they have "
+            "no derivatives: make them smooth, say tanh(x/width), or do without linearize and the "
+            "implicit methods"
+        )
+        raise SceneError([system.problem("run", message)]) from None
+    return tuple(zip(*columns, strict=True))
+
+
 def _column(system: System, tape: Tape, recursion: Recursion, at: Mapping[Symbol, int]) -> Rows:
     """D e for a direction e."""
     direction = dict(zip(system.q, along(system), strict=True))
@@ -303,7 +329,7 @@ def on_tape(system: System, kinetic: Expr, potential: Expr) -> Energies:
     leaves |= {p.symbol: Stage.PARAMETER for p in system.parameters}
     leaves |= dict.fromkeys(system.u, Stage.TIME)
     leaves |= dict.fromkeys(system.q, Stage.POSITION)
-    leaves |= dict.fromkeys((*system.qd, *along(system)), Stage.VELOCITY)
+    leaves |= dict.fromkeys((*system.qd, *directions(system).values()), Stage.VELOCITY)
     tape = Tape(leaves)
     rates: dict[Symbol, Expr] = {**dict(zip(system.q, system.qd, strict=True)), t: S.One}
     known: dict[Symbol, Expr] = {}

@@ -14,10 +14,18 @@ from eomc.expand import Expander
 from eomc.lowering import lower
 from eomc.mechanics import Equations, Solution
 from eomc.problems import Problem, SceneError
+from eomc.steppers import METHODS
 from eomc.system import System, t
 from eomc.tape import Tape
 
 TIME = t.name
+_READERS = {
+    "signal": "and a signal reads",
+    "tau": "and forces or the dissipation read",
+    "bias": "and inertial forces here hang on",
+    "acceleration": "and here they hang on",
+}
+MOST_IMPLICIT = 360  # accelerations of all stages: their matrix, on the stack, is a megabyte
 LOST = 2  # times the rounding of another route: a route that has more is not taken
 
 
@@ -66,11 +74,18 @@ def build(equations: Mapping[str, Equations]) -> Program:
         if route in expanders:
             routes |= _expanded_solutions(e, expanders[route], names)
     best = functions["acceleration"] = _cheapest("acceleration", first.system, routes)
+    run = first.system.run
+    if run.linearize or any(METHODS[name].implicit for name in run.methods):
+        made = _linearization(first.system, routes[best.route])
+        functions[made.name] = replace(made, route=best.route)
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     last = list(equations.values())[-1]
     order = routes[best.route].order
-    return Program(first.system, functions, first.notes, order, last.passed_over)
+    whole = Program(first.system, functions, first.notes, order, last.passed_over)
+    if unsuited := _unsuited(whole):
+        raise SceneError(unsuited)
+    return whole
 
 
 @dataclass(frozen=True)
@@ -111,6 +126,47 @@ def _solving(e: Equations, solution: Solution, names: Sequence[str]) -> Route:
     labels = [f"{name}_ddot" for name in names]
     labels += [f"{what}_{names[k]}" for k in solution.order for what in ("d", "D")]
     return Route(e.tape, solution.acceleration, solution.pivots, labels, solution.order)
+
+
+def _unsuited(program: Program) -> list[Problem]:
+    """What [run] asks for and this system can't have."""
+    s, out = program.system, []
+    implicit = [name for name in s.run.methods if METHODS[name].implicit]
+    if implicit and s.run.batch:
+        message = f"'{implicit[0]}' is for one trajectory: leave out batch = true, or that method"
+        out.append(s.problem("run.batch", message))
+    for name in implicit:
+        size = METHODS[name].stages * len(s.q)
+        if size > MOST_IMPLICIT:
+            message = (
+                f"'{name}' would solve for {size} numbers at once, more than {MOST_IMPLICIT}: take "
+                "an explicit method, or one with fewer stages"
+            )
+            out.append(s.problem("run.method", message))
+    velocities = {x.name for x in s.qd}
+    read = {
+        name: sorted(program[name].uses & velocities)
+        for name in ("signal", "tau", "bias", "acceleration")
+        if name in program
+    }
+    if "verlet" in s.run.methods and (read["acceleration"] or read.get("signal")):
+        name = next(name for name, names in read.items() if names)
+        found = ", ".join(read[name])
+        message = (
+            f"'verlet' needs accelerations that hang on positions and time alone, "
+            f"{_READERS[name]} {found}. "
+            "Take 'rk4', 'dp8' or 'gauss4'"
+        )
+        out.append(s.problem("run.method", message))
+    return out
+
+
+def _linearization(system: System, way: Route) -> Function:
+    """The derivatives of the accelerations by the route that these go."""
+    rows = mechanics.linearization(system, way.tape, way.outputs)
+    by_rows = len(rows) == len(system.q) and len(rows[0]) > len(rows)
+    name = "linearization" if by_rows else "linearization_column"
+    return lower(name, way.tape, [x for row in rows for x in row], way.checks, ())
 
 
 def _expanded_solutions(e: Equations, expander: Expander, names: Sequence[str]) -> dict[str, Route]:

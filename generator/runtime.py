@@ -17,23 +17,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .estimate import Estimate, advice, estimate
+
 Array = NDArray[Any]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 Inputs = ArrayLike | Callable[[float, Array, Array], ArrayLike] | None
 
-STATUS = ("ok", "singular", "not finite")
+STATUS = ("ok", "singular", "not finite", "no convergence")
 _SAID = {
     "singular": "D is not positive definite there, so no acceleration exists",
     "not finite": "the state would no longer be finite: the step may be too long, "
     "or the motion runs into a singularity",
+    "no convergence": "the iteration for the step does not converge: take a smaller h",
     "interrupted": "interrupted",
 }
 _OF_POSITION = ("D", "g", "potential_energy")
+_MANY = 1000  # steps from which a look at the stability limit is worth its time
 _CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
 
 
 class MotionError(ArithmeticError):
-    """There is no finite acceleration at a state; `status` says why: singular or not finite."""
+    """There is no acceleration or step at a state; `status` says why, as that of a run."""
 
     def __init__(self, message: str, status: str) -> None:
         super().__init__(message)
@@ -51,18 +55,21 @@ class Interrupted(KeyboardInterrupt):
 class Run:
     """A trajectory: t (n,), q (n, nq), qd (n, nq), status.
 
-    status: "ok", "singular", "not finite" or "interrupted"; a run that is not ok ends with its
-    last good state, and `message` says where and why. energy (n,): K + P, computed when it is
-    asked for; `steps` were done, of size h.
+    status: "ok", "singular", "not finite", "no convergence" or "interrupted"; a run that is not ok
+    ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
+    when it is asked for; `steps` were done by `method`, of size h, and a row kept of `every` so
+    many. error: an Estimate, where it was asked for.
     """
 
     def __init__(
         self, model: Model, t: Array, q: Array, qd: Array, h: float, steps: int, status: str,
-        params: Array,
+        params: Array, every: int, u: Any, method: str,
     ) -> None:  # fmt: skip
         self.t, self.q, self.qd = t, q, qd
         self.h, self.steps, self.status = h, steps, status
-        self._model, self._params = model, params
+        self.every, self.method = every, method
+        self.error: Estimate | None = None
+        self._model, self._params, self._u = model, params, u
         self._energy: Array | None = None
 
     @property
@@ -84,6 +91,35 @@ class Run:
             for k, q, qd in self._model._by_time(name, self.t, self.q, self.qd)
         ]
         return np.concatenate(values)
+
+    def estimate(self, progress: Callable[[int, int], None] | None = None) -> Estimate:
+        """The run's own error, by doing it again in shorter steps; kept in `error`.
+
+        Where u is a function, it is called again, as often as in the run for each finer one.
+        """
+        try:
+            self.error = estimate(self, progress)
+        except KeyboardInterrupt:
+            raise Interrupted(self) from None
+        return self.error
+
+    def _again(
+        self, parts: int, every: int, nudge: Array | None,
+        progress: Callable[[int, int], None] | None,
+    ) -> Run:  # fmt: skip
+        """The same motion in steps of h/parts, from a start moved by `nudge` (2 nq,)."""
+        model, x = self._model, self.x[0]
+        if nudge is not None:
+            x = (x + nudge).astype(model.dtype)
+        u = self._u
+        if callable(u):
+            u = _held(u, parts)
+        elif u is not None and np.ndim(u) == 2:
+            u = np.repeat(u[: self.steps], parts, axis=0)
+        return model._trajectory(
+            x[: model.nq].copy(), x[model.nq :].copy(), self.h / parts, self.steps * parts, every,
+            u, self._params, self.method, float(self.t[0]), None, progress,
+        )  # fmt: skip
 
     @property
     def x(self) -> Array:
@@ -150,8 +186,9 @@ class Model:
         coordinates: Mapping[str, str], parameters: Mapping[str, float],
         inputs: Mapping[str, str], units: Mapping[str, str],
         start: tuple[Sequence[float], Sequence[float]], h: float, duration: float,
-        timed: Sequence[str], methods: Sequence[str], digest: str,
+        timed: Sequence[str], methods: Mapping[str, tuple[int, float, float]], digest: str,
     ) -> None:  # fmt: skip
+        """methods: order and stability limits (h omega undamped, h lambda decaying) of each."""
         self._ffi, self._lib = extension.ffi, extension.lib
         self._ctype = {"float64": "double[]", "float32": "float[]"}[dtype]
         self.name, self.title, self.digest = name, title, digest
@@ -166,7 +203,10 @@ class Model:
         self._p0 = np.array(list(parameters.values()), self.dtype)
         self._timed = frozenset(timed)
         self.methods = tuple(methods)
+        self.orders = {name: order for name, (order, _, _) in methods.items()}
+        self.limits = {name: (turn, decay) for name, (_, turn, decay) in methods.items()}
         self._told = False
+        self._advised: set[tuple[str, float]] = set()
         names = {
             "_names": self.parameters,
             "_defaults": tuple(parameters.values()),
@@ -399,6 +439,46 @@ class Model:
             result[...] = made
         return result
 
+    @property
+    def has_slopes(self) -> bool:
+        """Whether the module was built with the derivatives of its accelerations."""
+        return hasattr(self._lib, "linearization")
+
+    def linearize(
+        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Parameters = None
+    ) -> tuple[Array, Array]:
+        """d[q; qd]/dt = A dx + B du near a state, x = [q; qd]: A (2 nq, 2 nq), B (2 nq, nu).
+
+        Upper rows of A: [0, 1]; lower ones [dqdd/dq, dqdd/dqd], in rad or m per s^2 and per rad,
+        m or their rates; of B: 0, then dqdd/du. Exact derivatives, to rounding. u None: held at
+        the scene's signals, where these hang on the state as well.
+        Raises MotionError as `acceleration` does, ValueError where the module lacks them.
+        """
+        if not self.has_slopes:
+            raise ValueError(
+                f"linearize: {self.name} was built without it: a scene asks with [run] "
+                "linearize = true"
+            )
+        at, moving = self._state(q, qd)
+        n, m = self.nq, self.nu
+        if at.ndim != 1:
+            raise ValueError(f"q: shape {at.shape}, expected ({n},)")
+        A_q, A_qd, B_u = (np.empty((n, w), self.dtype) for w in (n, n, m))
+        status = self._ffi.new("int *")
+        self._lib.linearization(
+            1, self._pointer(A_q), self._pointer(A_qd), self._pointer(B_u if m else None),
+            self._pointer(at), self._pointer(moving), _number(t, "t"),
+            self._pointer(self._inputs(u)), self._pointer(self._parameters(params)), status,
+        )  # fmt: skip
+        if status[0]:
+            said = STATUS[status[0]]
+            what = _SAID[said] if said == "singular" else "a derivative is not finite there"
+            raise MotionError(f"at {_state_text(at, moving)}: {what}", said)
+        A, B = np.zeros((2 * n, 2 * n), self.dtype), np.zeros((2 * n, m), self.dtype)
+        A[:n, n:] = np.eye(n)
+        A[n:, :n], A[n:, n:], B[n:] = A_q, A_qd, B_u
+        return A, B
+
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
         n, state = self.nq, np.asarray(x, self.dtype)
@@ -473,7 +553,7 @@ class Model:
         duration: float | None = None, steps: int | None = None, every: int = 1,
         u: Inputs = None, params: Parameters = None, method: str | None = None, *, t0: float = 0.0,
         out: tuple[Array, Array] | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Callable[[int, int], None] | None = None, estimate: bool = False,
     ) -> Run:  # fmt: skip
         """A trajectory by fixed steps of size h, the loop in C and the GIL released.
 
@@ -483,10 +563,13 @@ class Model:
         u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; or
         a function u(t, q, qd) called before each step, which is some hundred times slower.
         out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
+        estimate: whether to find the run's own error, `run.error`, by doing it again in shorter
+        steps, which takes some nine times as long.
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
-        run = self._stepper(method, "run")
+        self._stepper(method, "run")
+        method = method or self.methods[0]
         q, qd = self.start
         if q0 is not None:
             q = self._array(q0, "q0", self.nq).copy()
@@ -499,6 +582,41 @@ class Model:
         steps = self._steps(h, duration, steps)
         every = _count(every, "every", 1)
         p = self._parameters(params).copy()
+        if steps >= _MANY and (method, h) not in self._advised:
+            self._advised.add((method, h))
+            first = self._table(u, steps)[1]
+            if first is not None and first.ndim == 2:
+                first = first[0]
+            if words := advice(self, q, qd, h, t0, first, p, method):
+                warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=2)
+        result = self._trajectory(q, qd, h, steps, every, u, p, method, t0, out, progress)
+        if result.status == "interrupted":
+            raise Interrupted(result)
+        if result.status != "ok":
+            warnings.warn(f"{self.name}: {result.message}", RuntimeWarning, stacklevel=2)
+        if estimate:
+            result.estimate()
+        return result
+
+    def advice(
+        self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
+        u: ArrayLike | None = None, params: Parameters = None, method: str | None = None, *,
+        t0: float = 0.0,
+    ) -> str | None:  # fmt: skip
+        """Where h is beyond the stability limit of the method at a start: that, in a sentence."""
+        q, qd = self.start
+        if q0 is not None or qd0 is not None:
+            q, qd = self._state(q if q0 is None else q0, qd if qd0 is None else qd0)
+        given, method = self._parameters(params), method or self.methods[0]
+        self._stepper(method, "run")
+        return advice(self, q, qd, self._size(h), _number(t0, "t0"), u, given, method)
+
+    def _trajectory(
+        self, q: Array, qd: Array, h: float, steps: int, every: int, u: Any, p: Array, method: str,
+        t0: float, out: tuple[Array, Array] | None, progress: Callable[[int, int], None] | None,
+    ) -> Run:  # fmt: skip
+        """A run from checked arguments, whatever its status; q and qd are moved along."""
+        run = getattr(self._lib, f"{method}_run")
         law, held, stride = self._table(u, steps)
         rows = 1 + steps // every + (steps % every > 0)
         try:
@@ -546,12 +664,10 @@ class Model:
             q_rows[kept], qd_rows[kept] = q, qd
             kept += 1
         t = t0 + h * np.minimum(np.arange(kept) * every, done)
-        result = Run(self, t, q_rows[:kept], qd_rows[:kept], h, done, said, p)
-        if said == "interrupted":
-            raise Interrupted(result) from None
-        if said != "ok":
-            warnings.warn(f"{self.name}: {result.message}", RuntimeWarning, stacklevel=2)
-        return result
+        kept_u = u if law else held
+        return Run(
+            self, t, q_rows[:kept], qd_rows[:kept], h, done, said, p, every, kept_u, method
+        )  # fmt: skip
 
     def _table(self, u: Any, steps: int) -> tuple[Callable[..., Any] | None, Array | None, int]:
         """(function, held values, values from one step to the next)."""
@@ -566,7 +682,7 @@ class Model:
                     f"{self.name}: u is a Python function, called before each step: some hundred "
                     "times slower than a table (steps, nu) or the scene's own signal",
                     RuntimeWarning,
-                    stacklevel=3,
+                    stacklevel=4,
                 )
             return u, None, 0
         if self.nu == 1 and np.ndim(u) <= 1 and np.size(u):
@@ -577,6 +693,20 @@ class Model:
         if len(array) != steps:
             raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a step")
         return None, array, self.nu
+
+
+def _held(law: Callable[..., Any], parts: int) -> Callable[..., Any]:
+    """A law u(t, q, qd) that is called before every `parts`-th step, and held between."""
+    done, u = 0, None
+
+    def held(t: float, q: Array, qd: Array) -> Any:
+        nonlocal done, u
+        if done % parts == 0:
+            u = law(t, q, qd)
+        done += 1
+        return u
+
+    return held
 
 
 def _number(value: Any, name: str) -> float:

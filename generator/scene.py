@@ -73,7 +73,8 @@ class Run:
     """How the scene is run unless the caller says otherwise: step size h and duration in s.
 
     methods: the steppers wanted, the one that runs use first. real: the C type that everything
-    is computed in. batch: whether many trajectories at once are wanted.
+    is computed in. batch: whether many trajectories at once are wanted. linearize: whether the
+    derivatives of the accelerations are.
     """
 
     h: float = 0.001
@@ -81,6 +82,7 @@ class Run:
     methods: tuple[str, ...] = ("rk4",)
     real: str = "double"
     batch: bool = False
+    linearize: bool = False
 
 
 @dataclass(frozen=True)
@@ -273,7 +275,14 @@ class _Check(Checker):
             definitions=tuple(self.definitions.items()),
             **energies,
             forces=forces,
-            run=Run(doc.run.h, doc.run.duration, doc.run.method, doc.run.real, doc.run.batch),
+            run=Run(
+                doc.run.h,
+                doc.run.duration,
+                doc.run.method,
+                doc.run.real,
+                doc.run.batch,
+                doc.run.linearize,
+            ),
             assembly=assembly,
             places=self.places,
             warnings=tuple(self.problems),

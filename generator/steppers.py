@@ -1,27 +1,31 @@
-"""Explicit Runge-Kutta methods: coefficients as exact fractions, and what is known of each.
+"""Runge-Kutta methods: coefficients as fractions, exact or to 40 digits, and what is known of each.
 
 For q'' = a(q, qd, t) a stage needs accelerations only: with A c = the rows' sums,
 
     Q_i = q + c_i h qd + h^2 sum_k (A A)_ik a_k        r = q  + h qd + h^2 sum_k (b A)_k a_k
     V_i = qd + h sum_k A_ik a_k                        v = qd + h sum_k b_k a_k
 
-(Hairer, Norsett & Wanner, *Solving Ordinary Differential Equations I*, sec. II.14).
+(Hairer, Norsett & Wanner, *Solving Ordinary Differential Equations I*, sec. II.14). Where A A and
+b A are put by others, it is a method of Nystrom: Euler's and Verlet's are written so.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal, localcontext
 from fractions import Fraction
+from math import comb, inf
 
 Row = tuple[Fraction, ...]
 
 
 @dataclass(frozen=True)
 class Method:
-    """An explicit method of fixed step: `a` below the diagonal, `b` the weights, c their nodes.
+    """A method of fixed step: `a` (below the diagonal if explicit), the weights `b`, their nodes c.
 
-    limits: the largest h omega of an undamped and h lambda of a decaying motion.
+    limits: the largest h omega of an undamped and h lambda of a decaying motion. notes: what else
+    to say of it. nodes, end: c and b A, where they are not those of `a`.
     """
 
     name: str
@@ -31,6 +35,9 @@ class Method:
     limits: tuple[float, float]
     a: tuple[Row, ...]
     b: Row
+    notes: tuple[str, ...] = ()
+    nodes: Row = ()
+    end: Row = ()
 
     @property
     def stages(self) -> int:
@@ -38,9 +45,14 @@ class Method:
         return len(self.b)
 
     @property
+    def implicit(self) -> bool:
+        """Whether the stages hang on one another."""
+        return any(any(row[i:]) for i, row in enumerate(self.a))
+
+    @property
     def c(self) -> Row:
         """The nodes, sum_k a_ik."""
-        return tuple(sum(row, Fraction(0)) for row in self.a)
+        return self.nodes or tuple(sum(row, Fraction(0)) for row in self.a)
 
     @property
     def a_squared(self) -> tuple[Row, ...]:
@@ -50,7 +62,12 @@ class Method:
     @property
     def b_a(self) -> Row:
         """b A: what they add to the position at the end, over h^2."""
-        return _times(self.b, self.a)
+        return self.end or _times(self.b, self.a)
+
+    @property
+    def ahead(self) -> tuple[Row, ...]:
+        """E: accelerations at the next step's nodes, E a, by the polynomial through this step's."""
+        return tuple(tuple(_value(basis, 1 + x) for basis in _lagrange(self.c)) for x in self.c)
 
 
 def _times(row: Row, a: tuple[Row, ...]) -> Row:
@@ -150,4 +167,111 @@ DP8 = Method(
     b=_DP8[12],
 )
 
-METHODS: Mapping[str, Method] = {m.name: m for m in (RK4, DP8)}
+# --- Gauss and Legendre ---------------------------------------------------------------------------
+
+_DIGITS = 45  # that the nodes are computed to, of which the last few may be off
+
+
+def _value(polynomial: Row, x: Fraction) -> Fraction:
+    """A polynomial, lowest power first."""
+    value = Fraction(0)
+    for coefficient in reversed(polynomial):
+        value = value * x + coefficient
+    return value
+
+
+def _integral(polynomial: Row) -> Row:
+    """From 0."""
+    return (Fraction(0), *(c / (k + 1) for k, c in enumerate(polynomial)))
+
+
+def _lagrange(nodes: Row) -> tuple[Row, ...]:
+    """The polynomials that are 1 at one of the nodes and 0 at the others."""
+    out = []
+    for i, at in enumerate(nodes):
+        basis = [Fraction(1)]
+        for other in (x for k, x in enumerate(nodes) if k != i):
+            shifted, kept = [Fraction(0), *basis], [*(-other * c for c in basis), Fraction(0)]
+            basis = [(a + b) / (at - other) for a, b in zip(shifted, kept, strict=True)]
+        out.append(tuple(basis))
+    return tuple(out)
+
+
+def _legendre_roots(s: int) -> Row:
+    """The s zeros of Legendre's polynomial P_s(2 x - 1), by Newton's iteration in decimals."""
+    p = [(-1) ** (s + k) * comb(s, k) * comb(s + k, k) for k in range(s + 1)]
+    roots: list[Decimal] = []
+    with localcontext() as context:
+        context.prec = _DIGITS + 10
+        for _ in range(s):
+            x = Decimal("-0.01")  # left of all: Newton goes to the first that is not yet there
+            for _ in range(100):
+                value = sum(c * x**k for k, c in enumerate(p))
+                slope = sum(k * c * x ** (k - 1) for k, c in enumerate(p) if k)
+                step = value / (slope - value * sum(1 / (x - root) for root in roots))
+                x -= step
+                if abs(step) < Decimal(10) ** -(_DIGITS + 5):
+                    break
+            roots.append(x)
+        return tuple(Fraction(round(x, _DIGITS)) for x in roots)
+
+
+def _gauss(s: int, name: str) -> Method:
+    """a_ij = the integral of the j-th Lagrange polynomial over the zeros c from 0 to c_i."""
+    c = _legendre_roots(s)
+    areas = [_integral(basis) for basis in _lagrange(c)]
+    return Method(
+        name=name,
+        title=f"the implicit method of Gauss and Legendre with {s} stages",
+        order=2 * s,
+        source="Hairer & Wanner, Solving ODEs II, sec. IV.5; zeros of Legendre's polynomial "
+        f"to {_DIGITS} digits",
+        limits=(inf, inf),
+        a=tuple(tuple(_value(area, x) for area in areas) for x in c),
+        b=tuple(_value(area, Fraction(1)) for area in areas),
+        notes=(
+            "A-stable: no step is too long for a motion that decays. Symmetric, and symplectic in",
+            "(q, p) where D is constant; where D hangs on q, in (q, qd) nearly so.",
+        ),
+    )
+
+
+GAUSS4, GAUSS6, GAUSS8 = (_gauss(s, f"gauss{2 * s}") for s in (2, 3, 4))
+
+# --- Euler and Verlet -----------------------------------------------------------------------------
+
+_ONE, _HALF, _ZERO = Fraction(1), Fraction(1, 2), Fraction(0)
+
+EULER = Method(
+    name="euler",
+    title="the semi-implicit method of Euler",
+    order=1,
+    source="Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. I.1.2",
+    limits=(2.0, 2.0),
+    a=((_ZERO,),),
+    b=(_ONE,),
+    notes=(
+        "v = qd + h a(q, qd), r = q + h v. Symplectic where D is constant and the forces hang on",
+        "positions alone; of order 1 everywhere.",
+    ),
+    end=(_ONE,),
+)
+VERLET = Method(
+    name="verlet",
+    title="the method of Stoermer and Verlet, position form",
+    order=2,
+    source="Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. I.1.4",
+    limits=(2.0, inf),
+    a=((_ZERO,),),
+    b=(_ONE,),
+    notes=(
+        "v = qd + h a(q + h/2 qd), r = q + h/2 (qd + v). For accelerations that hang on positions",
+        "and time alone; symmetric, and symplectic where the forces have a potential.",
+    ),
+    nodes=(_HALF,),
+    end=(_HALF,),
+)
+
+METHODS: Mapping[str, Method] = {
+    m.name: m for m in (RK4, DP8, GAUSS4, GAUSS6, GAUSS8, EULER, VERLET)
+}

@@ -151,6 +151,7 @@ class System:
         methods: Sequence[str] = ("rk4",),
         real: str = "double",
         batch: bool = False,
+        linearize: bool = False,
     ) -> System:
         r"""A system from SymPy expressions.
 
@@ -169,7 +170,7 @@ class System:
         return _Maker(name).make(
             coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
             inputs, definitions or {}, units or {}, title,
-            Run(h, duration, tuple(methods), real, batch),
+            Run(h, duration, tuple(methods), real, batch, linearize),
         )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from eomc.system import System
 _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 trouble held at "
-    "moving prepared along column".split()
+    "moving prepared along column slopes".split()
 )
 
 TROUBLE = "*trouble"  # what a lane notes its failure in, as a name that an argument brings
@@ -60,7 +60,20 @@ class Target:
     @cached_property
     def enum(self) -> dict[str, str]:
         """The enumerator of every coordinate and input."""
-        own = ("H", "NQ", "NU", "OK", "SINGULAR", "NOT_FINITE", "STAMP", "TILE", "LANE", "PIECE")
+        own = (
+            "NO_CONVERGENCE",
+            "RESTART",
+            "H",
+            "NQ",
+            "NU",
+            "OK",
+            "SINGULAR",
+            "NOT_FINITE",
+            "STAMP",
+            "TILE",
+            "LANE",
+            "PIECE",
+        )
         taken = {f"{self.PREFIX}_{w}" for w in own}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         wishes = [f"{self.PREFIX}_{name}" for name in indexed]
@@ -163,14 +176,15 @@ class Target:
     def loads(self, function: Function, state: Access, inputs: Access) -> list[str]:
         """Locals for the coordinates, velocities, inputs and directions that are used."""
         s, real, uses = self.system, self.real.name, function.uses
-        read = [(c.q.name, c.name, "q", state) for c in s.coordinates]
-        read += [(c.qd.name, c.name, "qd", state) for c in s.coordinates]
-        read += [(name, name, "u", inputs) for name in self.input_names]
-        read += [(c.name + ALONG, c.name, "along", state) for c in s.coordinates]
+        NQ = f"{self.PREFIX}_NQ"
+        read = [(c.q.name, state("q", c.name)) for c in s.coordinates]
+        read += [(c.qd.name, state("qd", c.name)) for c in s.coordinates]
+        read += [(name, inputs("u", name)) for name in self.input_names]
+        read += [(c.q.name + ALONG, state("along", c.name)) for c in s.coordinates]
+        read += [(c.qd.name + ALONG, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
+        read += [(name + ALONG, f"along[2*{NQ} + {self.enum[name]}]") for name in self.input_names]
         return [
-            f"const {real} {local(name)} = {element(array, of)};"
-            for name, of, array, element in read
-            if name in uses
+            f"const {real} {local(name)} = {element};" for name, element in read if name in uses
         ]
 
     def element(self, array: str, name: str) -> str:
@@ -186,7 +200,7 @@ class Target:
             "t": frozenset({TIME}),
             "u": frozenset(self.input_names),
             "p": frozenset(p.name for p in s.parameters),
-            "along": frozenset(c.name + ALONG for c in s.coordinates),
+            "along": frozenset(x.name + ALONG for x in (*s.q, *s.qd, *s.u)),
         }
 
     # functions in pieces

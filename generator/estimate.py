@@ -1,0 +1,338 @@
+"""How far a run may be trusted: its error by step doubling, and h against the stability limit.
+
+This file is copied beside each compiled extension like runtime.py.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from .runtime import Model, Run
+
+Array = NDArray[Any]
+
+_FINEST = 16  # h/16 is the shortest step taken to see a run converge
+_LONG = 2_000_000  # steps of a run beyond which no more than h/4 is taken
+_ROWS = 200  # from which on a run's own rows tell how large each coordinate becomes
+_TENTH = 0.1  # of a coordinate's scale: an answer more wrong than that is none
+_FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
+_SMOOTH = 1e6  # growth beyond which a difference may as well have met a jump of the forces
+_WALK = 0.3  # rms of the rounding of a sum, in units of eps/2 times its size (1/sqrt(12) to 1/2)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A run's own error, |q - exact| and |qd - exact| by step doubling, and what it is worth.
+
+    q, qd (n, nq): at every row, in the coordinates' units; inf where a finer run stopped before.
+    end: of the last row, by name, velocities as theta_dot. digits: how many of each coordinate are
+    right there, relative to its scale, its largest value along the run. order: the method's;
+    observed: log2 of what halving h divides the differences by, nan where only rounding is seen.
+    amplification: by what a tiny difference at the start has grown at the end, positions relative
+    to the largest of them, velocities likewise; at least, where it is as large as the motion.
+    verdict: why the motion is not resolved, in words, or "".
+    """
+
+    q: Array
+    qd: Array
+    end: dict[str, float]
+    digits: dict[str, float]
+    order: int
+    observed: float
+    amplification: float
+    verdict: str
+
+    @property
+    def resolved(self) -> bool:
+        """Whether nothing speaks against the figures."""
+        return not self.verdict
+
+
+def estimate(run: Run, progress: Callable[[int, int], None] | None = None) -> Estimate:
+    """The error of a run, from the same run at h/2 and h/4, and finer ones where they differ.
+
+    What the finest run leaves is taken from the last difference and the observed order, and
+    nothing falls below what rounding adds up to. Costs seven to nine times the run, or forty where
+    it does not converge.
+    """
+    if not run.steps:
+        return _nothing(run)
+    model, own = run._model, run.x.astype(float)
+    order, again = model.orders[run.method], _Again(run, progress)
+    eps = float(np.finfo(model.dtype).eps) / 2
+    counts = _counts(run, run.every, len(run))
+    scale, grown, amplification = _growth(run, own, eps, again)
+    rounding = eps * np.maximum(grown, np.abs(own))  # of one step, carried to each row
+    walk = _WALK * rounding * np.sqrt(counts)[:, None]
+    one = min(_size(rounding / scale), _SMOOTH * eps)
+    found, observed, stopped = _finer(run, own, scale, one, eps, again)
+
+    with np.errstate(invalid="ignore"):
+        whole = np.abs(own - found[-1])
+        rest = np.abs(found[-2] - found[-1])
+    sure = min(max(observed, 0.5), float(order)) if math.isfinite(observed) else float(order)
+    error = whole + rest / (2**sure - 1)
+    # a difference may vanish for a moment where two roundings agree, but not for long
+    least = np.maximum(eps * np.abs(own), np.minimum(walk, _around(np.maximum(whole, rest))))
+    error = np.maximum(error, np.where(counts[:, None] > 0, least, 0.0))
+    error[~np.isfinite(error)] = np.inf
+
+    names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
+    with np.errstate(divide="ignore"):
+        digits = np.clip(-np.log10(error[-1] / scale), 0.0, -math.log10(eps))
+    words = _verdict(
+        run, names, error / scale, walk / scale, observed, order, amplification, stopped
+    )
+    return Estimate(
+        q=error[:, : model.nq],
+        qd=error[:, model.nq :],
+        end=dict(zip(names, map(float, error[-1]), strict=True)),
+        digits=dict(zip(names, map(float, digits), strict=True)),
+        order=order,
+        observed=observed,
+        amplification=amplification,
+        verdict="; ".join(words),
+    )
+
+
+class _Again:
+    """The same run in shorter steps or from a moved start, and how far all of them have come."""
+
+    def __init__(self, run: Run, progress: Callable[[int, int], None] | None) -> None:
+        self.run, self.progress, self.spent = run, progress, 0
+
+    def __call__(self, parts: int, every: int, nudge: Array | None = None) -> Run:
+        """In steps of h/parts, keeping every so many of them."""
+        told = None if self.progress is None else self._told
+        made = self.run._again(parts, every, nudge, told)
+        self.spent += parts * self.run.steps
+        if made.status == "interrupted":
+            raise KeyboardInterrupt
+        return made
+
+    def _told(self, done: int, _: int) -> None:
+        total = 9 * self.run.steps
+        if self.progress is not None:
+            self.progress(min(self.spent + done, total), total)
+
+
+def _growth(run: Run, own: Array, eps: float, again: _Again) -> tuple[Array, Array, float]:
+    """The scales (2 nq,), what a start moved by one scale would become at each row if that were
+    little, (n, 2 nq), and by what the largest has grown at the end."""
+    nq, every, base = run._model.nq, run.every, own
+    if len(run) < _ROWS:
+        every = max(1, run.steps // _ROWS)
+        base = again(1, every).x.astype(float)
+    scale = _scale(base)
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
+
+    def moved(size: float) -> Array:
+        x = again(1, every, size * scale * signs).x.astype(float)
+        both = min(len(base), len(x))
+        with np.errstate(over="ignore"):
+            return _around(np.abs(x[:both] - base[:both])) / size
+
+    walked = eps * math.sqrt(run.steps)
+    size = max(20 * walked, 1e4 * eps)
+    grown = moved(size)
+    full = np.maximum.accumulate(np.max(grown / scale, axis=1) * size > _FULL)
+    if full.any():
+        # moved by less, though rounding shows: where that fills the scale, rounding fills a tenth
+        finer = moved(max(2 * walked, 30 * eps))
+        both = min(len(grown), len(finer))
+        grown = np.where(full[:both, None], np.maximum(grown[:both], finer[:both]), grown[:both])
+    together = np.repeat([scale[:nq].max(), scale[nq:].max()], nq)
+    amplification = float(np.max(grown[-1] / together))
+    counts, times = _counts(run, run.every, len(run)), _counts(run, every, len(grown))
+    rows = np.stack([np.interp(counts, times, column) for column in grown.T], axis=1)
+    return scale, rows, amplification
+
+
+def _finer(
+    run: Run, own: Array, scale: Array, one: float, eps: float, again: _Again
+) -> tuple[list[Array], float, Run | None]:
+    """The rows at h, h/2, h/4 and on until they converge; the order seen; a run that stopped.
+
+    one: the rounding of one step relative to the scales.
+    """
+    found, order = [own], run._model.orders[run.method]
+    stopped: Run | None = None
+    parts, last = 1, math.inf
+    while True:
+        parts *= 2
+        made = again(parts, run.every * parts)
+        if made.status != "ok":
+            stopped = stopped or made
+        found.append(_padded(made, len(run), parts * run.every))
+        now = _size((found[-1] - found[-2]) / scale)
+        if parts > 2:
+            seen = min(now, last) > 0 and max(now, last) < math.inf
+            observed = math.log2(last / now) if seen else math.nan
+            count = run.steps * parts
+            # roundings walk; where they are all alike they drift, up to some last digits
+            least = max(10 * one * math.sqrt(count), min(one * count, math.sqrt(eps)))
+            if observed > order - 1 or stopped:
+                return found, observed, stopped
+            if now <= least:
+                return found, math.nan, None
+            if 2 * parts > _FINEST or 2 * count > _LONG:
+                return found, observed, None
+        last = now
+
+
+def _nothing(run: Run) -> Estimate:
+    """The start itself has no error."""
+    names = [*run._model.coordinates, *(f"{c}_dot" for c in run._model.coordinates)]
+    none = np.zeros_like(run.q, dtype=float)
+    full = -math.log10(float(np.finfo(run._model.dtype).eps) / 2)
+    order = run._model.orders[run.method]
+    zero, digits = dict.fromkeys(names, 0.0), dict.fromkeys(names, full)
+    return Estimate(none, none.copy(), zero, digits, order, math.nan, 1.0, "")
+
+
+def _counts(run: Run, every: int, rows: int) -> Array:
+    """The steps done at each row."""
+    return np.minimum(np.arange(rows) * every, run.steps)
+
+
+def _scale(x: Array) -> Array:
+    """The largest value of each column; those that only rounding moves count as a millionth."""
+    largest = np.max(np.abs(x), axis=0)
+    whole = float(np.max(largest))
+    scale: Array = np.maximum(largest, 1e-6 * whole if whole else 1.0)
+    return scale
+
+
+def _around(x: Array) -> Array:
+    """The largest value of each column within some hundredths of the rows before and behind."""
+    starts = np.unique(np.linspace(0, len(x), 40, endpoint=False).astype(int))
+    blocks = np.maximum.reduceat(x, starts, axis=0)
+    wide = blocks.copy()
+    wide[1:] = np.maximum(wide[1:], blocks[:-1])
+    wide[:-1] = np.maximum(wide[:-1], blocks[1:])
+    around: Array = np.repeat(wide, np.diff([*starts, len(x)]), axis=0)
+    return around
+
+
+def _size(x: Array) -> float:
+    """Root mean square over all rows, inf where there are gaps."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.nan_to_num(np.sqrt(np.mean(np.square(x))), nan=np.inf))
+
+
+def _padded(run: Run, rows: int, every: int) -> Array:
+    """The states of a finer run beside the run's own rows: nan from where it stopped."""
+    out = np.full((rows, 2 * run._model.nq), np.nan)
+    kept = rows if run.status == "ok" else min(rows, 1 + run.steps // every)
+    out[:kept] = run.x[:kept]
+    return out
+
+
+def _verdict(
+    run: Run, names: Sequence[str], relative: Array, walk: Array, observed: float, order: int,
+    amplification: float, stopped: Run | None,
+) -> list[str]:  # fmt: skip
+    """What speaks against the run, one reason a string."""
+    words = []
+    if run.status != "ok":
+        words.append(f"the run stopped at t = {run.t[-1]:.6g} s")
+    if stopped is not None:
+        words.append(
+            f"with steps of {abs(stopped.h):.3g} s it stops at t = {stopped.t[-1]:.6g} s "
+            f"({stopped.status})"
+        )
+    if (walk[-1] > _TENTH).any():
+        lost = run.t[int(np.argmax((walk > _TENTH).any(axis=1)))]
+        words.append(
+            f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "
+            f"rounding with it; no run in {run._model.dtype} means anything from t = {lost:.4g} s"
+        )
+    wrong = relative > _TENTH
+    if wrong.any():
+        row = int(np.argmax(wrong.any(axis=1)))
+        name = names[int(np.argmax(relative[row]))]
+        words.append(
+            f"the error of {name} exceeds a tenth of its size from t = {run.t[row]:.4g} s on: "
+            "take a smaller h, or a shorter duration"
+        )
+    if observed < order - 1:
+        words.append(
+            f"halving h divides the differences by 2^{observed:.1f}, where {run.method} should by "
+            f"2^{order}: h is too long yet, forces jump, or rounding decides"
+        )
+    return words
+
+
+# --- stability ------------------------------------------------------------------------------------
+
+
+def advice(
+    model: Model, q: Array, qd: Array, h: float, t: float, u: Any, params: Any, method: str
+) -> str | None:
+    """A sentence where h is beyond the stability limit of the method at a state, else None.
+
+    The limit is that of the eigenvalues of the linearised motion: largest |imaginary part| and
+    fastest decay against the method's two limits. A mode that is as fast as the differences are
+    short comes from a jump of the forces, and is not counted.
+    """
+    undamped, decaying = model.limits[method]
+    found = _modes(model, q, qd, t, u, params, 1.0)
+    if found is None:
+        return None
+    turning, decay = found
+    longest = min(
+        undamped / turning if turning else math.inf, decaying / decay if decay else math.inf
+    )
+    if not 0 < longest < abs(h):
+        return None
+    if (again := _modes(model, q, qd, t, u, params, 100.0)) is None:
+        return None
+    if max(again) < max(turning, decay) / 2:
+        return None
+    if undamped * decay > decaying * turning:
+        mode = f"fastest decay {decay:.3g} 1/s"
+    else:
+        mode = f"fastest mode {turning:.3g} rad/s"
+    return (
+        f"h = {abs(h):g} s is beyond {method}'s stability limit of about {longest:.2g} s here "
+        f"({mode} at the start)"
+    )
+
+
+def _modes(
+    model: Model, q: Array, qd: Array, t: float, u: Any, params: Any, wide: float
+) -> tuple[float, float] | None:
+    """(largest |Im|, fastest decay) of the eigenvalues at a state, 1/s; None where there are none.
+
+    From the module's own derivatives where they are the motion's, else from differences of the
+    acceleration, `wide` times the usual distance apart.
+    """
+    n = model.nq
+    try:
+        if model.has_slopes and (u is not None or not model.nu):  # signals may hang on the state
+            A = model.linearize(q, qd, u, t, params)[0].astype(float)
+        else:
+            A = np.block(
+                [[np.zeros((n, n)), np.eye(n)], [_slopes(model, q, qd, t, u, params, wide)]]
+            )
+        values = np.linalg.eigvals(A)
+    except (ArithmeticError, np.linalg.LinAlgError):  # the run itself will tell
+        return None
+    return float(np.max(np.abs(values.imag))), float(max(0.0, np.max(-values.real)))
+
+
+def _slopes(model: Model, q: Array, qd: Array, t: float, u: Any, params: Any, wide: float) -> Array:
+    """[dqdd/dq, dqdd/dqd], (nq, 2 nq), by 2 nq + 1 accelerations."""
+    n, x = model.nq, np.concatenate([q, qd]).astype(float)
+    near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
+    states = np.vstack([x, x + np.diag(near)]).astype(model.dtype)
+    a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
+    slopes: Array = ((a[1:] - a[0]) / near[:, None]).T
+    return slopes
