@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import mpmath
@@ -197,7 +198,7 @@ def evaluate(
     not a finite, real number.
     """
     of = _many_digits() if exact else _DOUBLES
-    number = of["number"]
+    number = lru_cache(maxsize=None)(of["number"])  # most are 1 and -1
     known: dict[str, Any] = dict(values)
 
     def operand(o: Operand) -> Any:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from itertools import count
 
 import sympy
-from sympy import Expr
+from sympy import Expr, S
 
 from eomc.assignments import Call, Function, Operand, Product, Sum, Value, names_of, rename
-from eomc.tape import Stage
+from eomc.tape import Stage, is_negative
 
 MOST_INLINE = 5  # operations; longer expressions get a name of their own
 
@@ -124,25 +124,25 @@ class Printer:
 
     def _sum(self, value: Sum) -> str:
         # a positive term first, where there is one
-        terms = sorted(value.terms, key=lambda p: bool(p[0].is_negative))
+        terms = sorted(value.terms, key=lambda p: is_negative(p[0]))
         text = ""
-        if value.constant.is_positive:
+        if value.constant is not S.Zero and not is_negative(value.constant):
             text = number(value.constant, self.real)
         for weight, name in terms:
-            sign = "-" if weight.is_negative else "+"
+            sign = "-" if is_negative(weight) else "+"
             body = self.operand(Operand(abs(weight), name), 2)
             if not text:
                 text = f"-{body}" if sign == "-" else body
             else:
                 text += f" {sign} {body}"
-        if value.constant.is_negative:
+        if is_negative(value.constant):
             text += f" - {number(-value.constant, self.real)}"
         return text
 
     def _product(self, value: Product) -> tuple[str, int]:
         factors = [self.name(f, 4) for f in value.factors]
         c = value.coefficient
-        sign = "-" if c.is_negative else ""
+        sign = "-" if is_negative(c) else ""
         if abs(c) != 1:
             factors.insert(0, number(abs(c), self.real))
         if len(factors) == 1:

@@ -28,7 +28,7 @@ from eomc.assignments import (
     rename,
     renamed_value,
 )
-from eomc.tape import Stage, Tape, split
+from eomc.tape import Stage, Tape, is_negative, split
 
 
 def lower(
@@ -180,7 +180,7 @@ class _Work:
         """Numbers in front of results become part of a product, where they may cost nothing."""
         for k, o in enumerate(ends):
             if o.name in self.values and abs(o.coefficient) != 1:
-                sign = S.NegativeOne if o.coefficient.is_negative else S.One
+                sign = S.NegativeOne if is_negative(o.coefficient) else S.One
                 ends[k] = Operand(sign, self.new(Product(abs(o.coefficient), (o.name,))))
 
     def _uses(self, ends: Iterable[Operand]) -> Counter[str]:
@@ -227,7 +227,7 @@ class _Work:
                     inner = self.values.get(term)
                     single = uses[term] == 1 and term not in self.hints
                     if isinstance(inner, Product) and single and abs(weight) != 1:
-                        sign = S.NegativeOne if weight.is_negative else S.One
+                        sign = S.NegativeOne if is_negative(weight) else S.One
                         self._put(term, Product(inner.coefficient * abs(weight), inner.factors))
                         weight = sign
                     terms.append((weight, term))
@@ -271,7 +271,7 @@ class _Work:
                 elif len(factors_left) == 1:
                     terms.append((weight, factors_left[0]))
                 else:
-                    sign = S.NegativeOne if weight.is_negative else S.One
+                    sign = S.NegativeOne if is_negative(weight) else S.One
                     made = self.new(Product(abs(weight), factors_left))
                     uses[made] += 1
                     terms.append((sign, made))
@@ -301,7 +301,7 @@ class _Work:
                 continue
             if isinstance(value, Product):
                 early = [f for f in value.factors if self.stages[f] <= Stage.PARAMETER]
-                sign = S.NegativeOne if value.coefficient.is_negative else S.One
+                sign = S.NegativeOne if is_negative(value.coefficient) else S.One
                 if early and (len(early) > 1 or abs(value.coefficient) != 1):
                     late = [f for f in value.factors if f not in early]
                     made = self.new(Product(abs(value.coefficient), tuple(sorted(early))))

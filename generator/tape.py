@@ -240,9 +240,9 @@ class Tape:
         """What stands for a sum of weighted names; most weights in it are positive."""
         names = self._ordered(weights)
         last = weights[min(reversed(names), key=lambda name: self.stage[name])]
-        negative = sum(map(_is_negative, (constant, *weights.values())))
+        negative = sum(map(is_negative, (constant, *weights.values())))
         count = len(weights) + (constant is not S.Zero)
-        flip = 2 * negative > count or (2 * negative == count and _is_negative(last))
+        flip = 2 * negative > count or (2 * negative == count and is_negative(last))
         size = abs(last) if last.is_Rational else S.One
         if constant is not S.Zero or not all(w in (size, -size) for w in weights.values()):
             size = S.One
@@ -430,5 +430,6 @@ def split(atom: Expr) -> tuple[Expr, Symbol | None]:
     return Mul(*(f for f in atom.args if f is not symbol)), symbol
 
 
-def _is_negative(number: Expr) -> bool:
+def is_negative(number: Expr) -> bool:
+    """Whether a number is below zero; of fractions without asking SymPy, which takes long."""
     return bool(number.p < 0 if number.is_Rational else number.is_negative)

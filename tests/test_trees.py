@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trees
-from hypothesis import HealthCheck, Phase, assume, given, note, settings
+from hypothesis import HealthCheck, Phase, given, note, settings
 from hypothesis import strategies as st
 
 from eomc import check, mechanics, program, reference, scene, system
@@ -115,8 +115,8 @@ def value(function: Function, state: Mapping[str, float], made: System) -> np.nd
     return np.array([column for column, _ in columns]).T.ravel()
 
 
-def assert_every_route_agrees(made: System, answer: Answer) -> None:
-    """All that the answer knows, by every route, within rounding.
+def assert_every_route_agrees(made: System, answer: Answer, some: bool = True) -> None:
+    """All that the answer knows, by every route, within rounding; some: at one state at least.
 
     Energies and forces are sums of some hundred terms that may cancel: 1e-12 of the largest that
     belongs to the state. What a solution of D x = b may be off grows with D's condition.
@@ -138,7 +138,7 @@ def assert_every_route_agrees(made: System, answer: Answer) -> None:
                 assert rounding < 1e-9
             off = np.max(np.abs(value(function, state, made) - theirs))
             assert off <= rounding * scale, f"{name} by {route} is off by {off:.1e} of {scale:.1e}"
-    assume(told)
+    assert told or not some
 
 
 # --- every tree of up to three joints -------------------------------------------------------------
@@ -149,7 +149,7 @@ def look_at(text: str) -> None:
     made = made_of(text)
     answer = Jets(made)
     try:
-        assert_every_route_agrees(made, answer)
+        assert_every_route_agrees(made, answer, some=False)
     except EomcError as fault:  # rightly so where D is singular everywhere
         assert "has no inertia" in str(fault)
         for state in states(made):
