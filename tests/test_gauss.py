@@ -115,6 +115,7 @@ def test_coefficients(name: str) -> None:
         assert abs(found - (1 + c) ** (s - 1)) < exact
 
 
+@pytest.mark.slow
 def test_orders_by_check() -> None:
     for scene in ("cartpole_driven", "kapitza_pendulum"):  # inputs, explicit time
         path = variant(scene, f"gauss_{scene}", method=ALL)
@@ -123,6 +124,7 @@ def test_orders_by_check() -> None:
         assert {f"order of {m}" for m in GAUSS} <= {row.name for row in report.rows}
 
 
+@pytest.mark.slow
 def test_a_wrong_coefficient_is_found_by_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -214,6 +216,7 @@ def test_runs_are_the_same_however_they_are_cut() -> None:
     assert np.array_equal(q, whole.q[-1]) and np.array_equal(qd, whole.qd[-1])
 
 
+@pytest.mark.slow
 def test_float() -> None:
     m = eomc.load(variant("cartpole", "gauss_float", method=ALL, real='"float"'), MODULES)
     exact = eomc.load(variant("cartpole", "gauss_double", method=ALL), MODULES).simulate(h=0.01)
@@ -223,6 +226,7 @@ def test_float() -> None:
         assert np.max(np.abs(run.q[-1] - exact.q[-1])) < 1e-3
 
 
+@pytest.mark.slow
 def test_against_scipy_on_a_stiff_scene() -> None:
     from scipy.integrate import solve_ivp
 

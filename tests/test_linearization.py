@@ -91,6 +91,7 @@ def test_against_differences(scene: str) -> None:
             assert np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_a_long_chain_goes_column_by_column() -> None:
     path = variant("chain", "lin_long", method='["rk4", "dp8", "gauss8"]')
     text = path.read_text(encoding="utf-8")

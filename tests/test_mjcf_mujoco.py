@@ -16,6 +16,7 @@ from eomc.robots import Robot, RobotBody
 
 WANTED = "MuJoCo is what these tests compare with: pip install eomc[robots]"
 mujoco = pytest.importorskip("mujoco", reason=WANTED)
+pytestmark = pytest.mark.slow  # in the tier that installs what they compare with
 
 Array = NDArray[np.float64]
 

@@ -168,6 +168,7 @@ def everything(run: str, name: str = "everything") -> System:
     return system.from_scene(scene.parse(text, "everything.toml"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "run", ["", 'batch = true\nmethod = ["rk4", "dp8"]', 'real = "float"\nbatch = true']
 )
@@ -187,6 +188,7 @@ def test_pieces_are_clean_for_strict_compilers(
     assert subprocess.run(["./selftest"], cwd=tmp_path, stdout=subprocess.DEVNULL).returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", ["1", "77"])
 def test_the_hash_seed_decides_nothing(tmp_path: Path, seed: str) -> None:
     code = """
@@ -238,6 +240,7 @@ def module(made: Program, root: Path) -> ModuleType:
     return compiler.load(compiler.build(name, key, lambda extension: render(made, extension), root))
 
 
+@pytest.mark.slow
 def test_a_system_in_pieces_moves_as_it_does_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -94,6 +94,7 @@ def test_a_difference_of_an_oscillator_does_not_grow() -> None:
     assert g.amplification[-1] == pytest.approx(math.sqrt(2), rel=0.02)
 
 
+@pytest.mark.slow
 def test_condition_and_jumps_are_told(tmp_path: Path) -> None:
     """D = [[1, c], [c, 1]], c = 1 - 1e-9 cos x: condition (1 + c)/(1 - c) = 2e9 at x = 0."""
     x, y, v, w = sympy.symbols("x y x_dot y_dot")
@@ -130,6 +131,7 @@ class _Page(HTMLParser):
         self.links += [v or "" for k, v in attrs if k in ("src", "href", "xlink:href")]
 
 
+@pytest.mark.slow
 def test_the_page_is_one_file_with_its_pictures() -> None:
     pytest.importorskip("matplotlib")
     text = report.page(measured())
@@ -142,6 +144,7 @@ def test_the_page_is_one_file_with_its_pictures() -> None:
     assert text == report.page(measured())
 
 
+@pytest.mark.slow
 def test_names_are_escaped_on_the_page() -> None:
     from dataclasses import replace
 

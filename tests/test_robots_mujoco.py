@@ -33,6 +33,7 @@ from eomc.robots import Robot
 
 WANTED = "robots are compared with MuJoCo where it is there: pip install 'eomc[robots]'"
 mujoco = pytest.importorskip("mujoco", reason=WANTED)
+pytestmark = pytest.mark.slow  # in the tier that installs what they compare with
 
 Array = NDArray[np.float64]
 
