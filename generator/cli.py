@@ -139,6 +139,7 @@ def import_(
     from dataclasses import replace
 
     from eomc import mjcf, names, robots, urdf, xmlfile
+    from eomc.scene import MAX_BYTES
 
     element = xmlfile.root(file).tag
     if element == "mujoco":
@@ -159,10 +160,17 @@ def import_(
         robot = replace(robot, name=name)
     robot = robots.finished(robot)
     path = out or _scene_path(robot.name)
-    _write_new(path, robots.scene_text(robot))
+    text = robots.scene_text(robot)
+    if len(text.encode()) > MAX_BYTES:
+        raise EomcError(
+            f"{file}: its scene would have {len(text.encode())} bytes, and a scene has at most "
+            f"{MAX_BYTES}: cut out a part with --root and --tip"
+        )
+    _write_new(path, text)
+    called = "" if path.stem == robot.name else f"; its module is called {robot.name}"
     click.echo(
         f"wrote {path}: bodies {len(robot.bodies)}, coordinates {len(robot.motions)}, "
-        f"inputs {len(robot.drives)}"
+        f"inputs {len(robot.drives)}{called}"
     )
     if robot.left_out:
         click.echo("not modelled, or to be looked at:")

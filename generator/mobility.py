@@ -220,10 +220,12 @@ def _singular_start(kinematics: _Kinematics, redundant: Array, generic: _Jacobia
     ):
         null = _null(jacobian)
         if len(null) > len(usual):
-            those = [name for name in names if any(name in _named(row, names) for row in null)]
+            lost = _listed([_combination(row, names) for row in null])
             yield (
                 f"singular start: {len(names) - len(null)} coordinates {what} there, elsewhere "
-                f"{len(names) - len(usual)}; start elsewhere in {_listed(those)}"
+                f"{len(names) - len(usual)}; there {lost} is the one that doesn't: start with other "
+                "values of the coordinates that set the axes against one another, such as the pitch "
+                "between yaw and roll"
             )
             return
 

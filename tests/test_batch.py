@@ -179,3 +179,17 @@ def test_single_precision() -> None:
     exact = module("double_pendulum").simulate_batch(q0, qd0, steps=STEPS)
     error = np.max(np.abs(runs.q - exact.q))
     assert 1e-9 < error < 1e-4  # that of single precision, no more and no less
+
+
+@pytest.mark.parametrize("inputs", [True, False])
+def test_a_scene_without_parameters(tmp_path: Path, inputs: bool) -> None:
+    file = tmp_path / "bare.toml"
+    given = "[inputs]\nf = { signal = 0.5 }\n[forces]\nx = 'f'\n" if inputs else ""
+    file.write_text(
+        "eomc = 1\nname = 'bare'\n[coordinates]\nx = { start = 1.0 }\n"
+        f"{given}[energy]\nkinetic = 'x_dot**2/2'\npotential = 'x**2/2'\n[run]\nbatch = true\n"
+    )
+    bare = eomc.load(file, tmp_path)
+    runs = bare.simulate_batch([[1.0], [2.0]], [[0.0], [0.0]], h=0.01, steps=100, every=100)
+    alone = bare.simulate([2.0], [0.0], h=0.01, steps=100, every=100)
+    np.testing.assert_allclose(runs.q[1, -1], alone.q[-1], rtol=1e-14)
