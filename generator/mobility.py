@@ -223,8 +223,8 @@ def _singular_start(kinematics: _Kinematics, redundant: Array, generic: _Jacobia
             lost = _listed([_combination(row, names) for row in null])
             yield (
                 f"singular start: {len(names) - len(null)} coordinates {what} there, elsewhere "
-                f"{len(names) - len(usual)}: there {lost} does not. Start with another value of the "
-                "coordinate between, such as the pitch between yaw and roll"
+                f"{len(names) - len(usual)}: there {lost} does not. Start with another value of "
+                "the coordinate between, such as the pitch between yaw and roll"
             )
             return
 
