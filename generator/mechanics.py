@@ -417,12 +417,22 @@ def _has_inertia(system: System, D: Sequence[Sequence[Expr]]) -> None:
 
 
 def _no_inertia(system: System, name: str) -> NoReturn:
-    message = (
-        f"coordinate '{name}' has no inertia: the kinetic energy does not depend on "
-        f"{name}_dot, so nothing can be solved for its acceleration; "
-        "give it a mass, or make it an input"
-    )
-    raise SceneError([system.problem("energy.kinetic", message)])
+    links = system.tree.links if system.tree else ()
+    body = next((link.name for link in links if link.q.name == name), "")
+    if body:
+        key = f"body.{body}"
+        message = (
+            f"coordinate '{name}' has no inertia: nothing that the joint moves resists it, such as "
+            "a point mass on its axis; give the body inertia about it, or fix the joint"
+        )
+    else:
+        key = "energy.kinetic"
+        message = (
+            f"coordinate '{name}' has no inertia: the kinetic energy does not depend on "
+            f"{name}_dot, so nothing can be solved for its acceleration; "
+            "give it a mass, or make it an input"
+        )
+    raise SceneError([system.problem(key, message)])
 
 
 def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool) -> Rows:
