@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import textwrap
 from importlib.resources import files
+from itertools import chain
 from typing import Any
 
 from eomc import __version__, ccode
@@ -17,8 +18,7 @@ from eomc.assignments import evaluate
 from eomc.ccode import DOUBLE, indent
 from eomc.dynamics import dynamics
 from eomc.evaluations import KINDS, functions, linearization, takes_t
-from eomc.pieces import matrix
-from eomc.program import nearby
+from eomc.program import matrix, nearby
 from eomc.target import Target, after, arguments
 
 
@@ -146,7 +146,7 @@ def _selftest(target: Target) -> dict[str, Any]:
             if not regular or max(map(abs, qdd)) >= 1e8:
                 continue
             bias, _ = evaluate(target.program["bias"], known)
-            D = matrix(target.program.functions, "D", target.names, known)
+            D = chain.from_iterable(matrix(target.program, "D", known))
         except (ArithmeticError, ValueError):
             continue
         states.append(

@@ -27,6 +27,7 @@ from sympy import Expr, S, Symbol
 from eomc.articulated import MasslessError, accelerations
 from eomc.bodies import Tree, needed
 from eomc.problems import EomcError, SceneError
+from eomc.symbols import ALONG
 from eomc.system import System, dot, symbol, t
 from eomc.tape import RoughError, Stage, Tape
 from eomc.trees import Recursion
@@ -34,7 +35,6 @@ from eomc.trees import Recursion
 Vector = tuple[Expr, ...]
 Rows = tuple[Vector, ...]
 
-ALONG = "_along"  # a direction's entry along a coordinate
 LAGRANGE_DEFINITIONS = 12  # of a tree's world coordinates: beyond, recursion always needs less
 MOST_ROWS = 16  # coordinates from which D is computed column by column, where nothing needs it
 WRITTEN_OUT = 2500  # names on the tape, about, from which C is computed column by column

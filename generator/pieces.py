@@ -8,18 +8,17 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
 from sympy import S
 
-from eomc.assignments import Assignment, Call, Function, Operand, evaluate, names_of
+from eomc.assignments import Assignment, Call, Function, Operand, names_of
 from eomc.tape import Stage
 
 LARGE = 1000  # weight from which a function is cut
 PIECE = 500  # weight of a piece, up to a third more or less
-ALONG = "_along"  # behind a coordinate's name: its part of the direction in D_column and C_column
 
 
 @dataclass(frozen=True)
@@ -162,23 +161,3 @@ def staged(function: Function, parameters: Sequence[str]) -> tuple[Function, Fun
         checks=tuple(c for c, e in checks if e),
     )
     return first, rest
-
-
-def matrix(
-    functions: Mapping[str, Function],
-    name: str,
-    coordinates: Sequence[str],
-    values: Mapping[str, float],
-) -> list[float]:
-    """D or C in Python, row-major, be it a function of its own or one for D e resp. C e.
-
-    Raises what evaluate raises.
-    """
-    if name in functions:
-        return evaluate(functions[name], values)[0]
-    still = {c + ALONG: 0.0 for c in coordinates}
-    columns = [
-        evaluate(functions[f"{name}_column"], {**values, **still, c + ALONG: 1.0})[0]
-        for c in coordinates
-    ]
-    return [entry for row in zip(*columns, strict=True) for entry in row]

@@ -15,6 +15,7 @@ from eomc.lowering import lower
 from eomc.mechanics import Equations, Solution
 from eomc.problems import Problem, SceneError
 from eomc.steppers import METHODS
+from eomc.symbols import ALONG
 from eomc.system import System, t
 from eomc.tape import Tape
 
@@ -58,11 +59,14 @@ def build(equations: Mapping[str, Equations]) -> Program:
     first = next(iter(equations.values()))
     names = [c.name for c in first.system.coordinates]
     expanders = {route: Expander(e.tape) for route, e in equations.items() if route == "program"}
+    wanted = {route: _wanted(e) for route, e in equations.items()}
     functions: dict[str, Function] = {}
-    for name in _wanted(first):
+    for name in next(iter(wanted.values())):
         routes: dict[str, Route] = {}
         for route, e in equations.items():
-            outputs = _wanted(e)[name]
+            if name not in wanted[route]:  # D or C, by rows here and column by column there
+                continue
+            outputs = wanted[route][name]
             routes[route] = Route(e.tape, outputs)
             if route in expanders and (short := expanders[route].expand(outputs)) is not None:
                 routes["expanded"] = Route(e.tape, short)
@@ -204,7 +208,7 @@ def _rounding(function: Function, system: System) -> float:
     worst = 0.0
     for k in range(5 if len(function.body) < 500 else 2):
         values = nearby(system, k)
-        values |= {f"{c.name}{mechanics.ALONG}": 1.0 / (k + 1) for c in system.coordinates}
+        values |= {f"{c.name}{ALONG}": 1.0 / (k + 1) for c in system.coordinates}
         values |= {i.name: 0.7 + 0.1 * n for n, i in enumerate(system.inputs)}
         try:
             found, _ = evaluate(function, values)
@@ -257,17 +261,17 @@ def nearby(system: System, k: int) -> dict[str, float]:
     return out
 
 
-def mass_matrix(program: Program, values: Mapping[str, float]) -> list[list[float]]:
-    """D at the given values by name, in Python floats. Raises as `evaluate` does."""
+def matrix(program: Program, name: str, values: Mapping[str, float]) -> list[list[float]]:
+    """D or C at the given values by name, in Python floats, (nq, nq). Raises as `evaluate` does."""
     names = [c.name for c in program.system.coordinates]
     n = len(names)
-    if "D" in program:
-        flat, _ = evaluate(program["D"], values)
+    if name in program:
+        flat, _ = evaluate(program[name], values)
         return [flat[n * i : n * i + n] for i in range(n)]
     columns = []
-    for name in names:
-        unit = {f"{other}{mechanics.ALONG}": float(other == name) for other in names}
-        columns.append(evaluate(program["D_column"], {**values, **unit})[0])
+    for one in names:
+        unit = {f"{other}{ALONG}": float(other == one) for other in names}
+        columns.append(evaluate(program[f"{name}_column"], {**values, **unit})[0])
     return [list(row) for row in zip(*columns, strict=True)]
 
 
@@ -276,7 +280,7 @@ def _without_inertia(program: Program, k: int) -> str | None:
     names = [c.name for c in program.system.coordinates]
     n = len(names)
     try:
-        D = mass_matrix(program, nearby(program.system, k))
+        D = matrix(program, "D", nearby(program.system, k))
     except (ArithmeticError, ValueError):
         return names[0]
     A = [list(row) for row in D]

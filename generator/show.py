@@ -7,6 +7,7 @@ from sympy import Expr
 
 from eomc import ccode, mechanics, program, reference
 from eomc.problems import EomcError
+from eomc.symbols import ALONG
 from eomc.system import System, t
 
 WRITTEN_OUT = 400  # operations of D, C and bias up to which a person may want them written out
@@ -114,7 +115,7 @@ def _assignments(made: program.Program) -> str:
         for k, result in enumerate(body.results):
             place = f"{names[k // n]}, {names[k % n]}" if name in ("D", "C") else names[k]
             lines.append(f"{name}[{place}] = {result}")
-        meaning = _MEANING.get(name) or f"{name[0]} e for a direction e = ({names[0]}_along, ...)"
+        meaning = _MEANING.get(name) or f"{name[0]} e for a direction e = ({names[0]}{ALONG}, ...)"
         parts.append(f"{name}, {meaning}:\n" + ccode.indent(lines))
     return "\n\n".join(parts)
 

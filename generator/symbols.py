@@ -7,6 +7,9 @@ from sympy import Symbol
 
 t = Symbol("t", real=True)
 
+# behind a name: a direction's entry along it; no name of a user's ends so
+ALONG = "_along_"
+
 
 class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
     """The total time derivative of its argument, kept as it stands until it is asked for."""

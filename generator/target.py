@@ -10,8 +10,8 @@ from typing import Any
 from eomc import ccode, pieces
 from eomc.assignments import Call, Function, rename
 from eomc.ccode import DOUBLE, Body, Real
-from eomc.pieces import ALONG
 from eomc.program import TIME, Program
+from eomc.symbols import ALONG
 from eomc.system import System
 
 # names that the templates use inside functions; a user's name that is one of them gets a "_"

@@ -8,8 +8,8 @@ velocities, the accelerations and the forces that each link needs (Newton and Eu
 - composite bodies: D from the inertia of everything beyond a joint.
 
 articulated.py solves for the accelerations without D. Sources: Featherstone, *Rigid Body Dynamics
-Algorithms*, ch. 5 and 6; Khalil & Dombre, *Modeling,
-Identification and Control of Robots*, ch. 9 (the matrix U, the grouping of inertial parameters).
+Algorithms*, ch. 5 and 6; Khalil & Dombre, *Modeling, Identification and Control of Robots*, ch. 9
+(the matrix U, the grouping of inertial parameters).
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from eomc.bodies import Link, Matrix, Tree
 from eomc.tape import Tape
 
 Vector = tuple[Expr, Expr, Expr]
-Pairs = tuple[tuple[Expr, Expr], ...]
 
 ZERO: Vector = (S.Zero, S.Zero, S.Zero)
 AXES = ((1, 2), (2, 0), (0, 1))  # the other two of each axis, in their turning order
@@ -68,9 +67,6 @@ class Recursion:
         self.n = len(tree.links)
         self.gravity = self._vector(tree.gravity)
         self.still = self._vector(tree.still)
-        self.children = [
-            [c for c, other in enumerate(self.links) if other.parent == k] for k in range(self.n)
-        ]
         self.cosine = [self.define(sympy.cos(x.q)) if x.turns else S.One for x in self.links]
         self.sine = [self.define(sympy.sin(x.q)) if x.turns else S.Zero for x in self.links]
         self.rotation: list[Matrix] = [

@@ -35,6 +35,7 @@ from eomc.assignments import (
 )
 from eomc.program import Program
 from eomc.render import Sources, render
+from eomc.symbols import ALONG
 from eomc.system import System
 from eomc.tape import Stage
 
@@ -302,7 +303,7 @@ def by_columns(made: Program) -> Program:
             terms = []
             for j, c in enumerate(names):
                 o = whole.outputs[len(names) * i + j]
-                factors = (o.name, c + pieces.ALONG) if o.name else (c + pieces.ALONG,)
+                factors = (o.name, c + ALONG) if o.name else (c + ALONG,)
                 product = Product(abs(o.coefficient), factors)
                 body.append(Assignment(f"p_{i}_{j}", product, Stage.VELOCITY))
                 terms.append((S.NegativeOne if o.coefficient.is_negative else S.One, f"p_{i}_{j}"))
@@ -336,12 +337,38 @@ def test_matrices_by_columns_are_the_matrices(
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
     values = program.nearby(plain.system, 2)
-    names = [c.name for c in plain.system.coordinates]
-    exact = pieces.matrix(by_columns(plain).functions, "C", names, values)
-    assert exact == pytest.approx(evaluate(plain["C"], values)[0], rel=1e-13, abs=1e-13)
+    exact = program.matrix(by_columns(plain), "C", values)
+    expected, _ = evaluate(plain["C"], values)
+    np.testing.assert_allclose(np.ravel(exact), expected, rtol=1e-13, atol=1e-13)
 
 
 # --- names ---------------------------------------------------------------------------------------
+
+
+def test_parameters_may_be_called_like_directions(tmp_path: Path) -> None:
+    """The entries of a direction, for D and the Jacobian, have names that no scene can have."""
+    text = """
+        eomc = 1
+        name = "clash"
+        [coordinates]
+        x = { start = 1.0 }
+        y = {}
+        [parameters]
+        NAME = 2.0
+        [energy]
+        kinetic = "NAME*x_dot**2/2 + (1 + x**2)*y_dot**2/2"
+        [run]
+        linearize = true
+        """
+    q, qd = [0.3, 0.4], [0.2, -0.3]
+    found = []
+    for name in ("x_along", "m"):
+        made = system.from_scene(scene.parse(text.replace("NAME", name), "clash.toml"))
+        built = module(derived(made), tmp_path / name)
+        found.append((built.D(q), built.acceleration(q, qd), *built.linearize(q, qd)[:2]))
+    np.testing.assert_array_equal(found[0][0], np.diag([2.0, 1.09]))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_parameters_may_be_called_like_values(tmp_path: Path) -> None:

@@ -248,7 +248,7 @@ def in_python(text: str) -> Ask:
         state |= {x.name: float(v) for x, v in zip(made.u, u, strict=True)}
         state |= {p.name: p.value for p in made.parameters} | {"t": 0.0}
         if name == "D":
-            return np.array(program.mass_matrix(quick, state))
+            return np.array(program.matrix(quick, "D", state))
         found, regular = evaluate(quick[name], state)
         assert regular
         return np.array(found)

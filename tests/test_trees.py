@@ -22,6 +22,7 @@ from eomc.assignments import Function, evaluate, names_of
 from eomc.jets import Jets
 from eomc.problems import EomcError
 from eomc.program import Program
+from eomc.symbols import ALONG
 from eomc.system import System
 from eomc.trees import Recursion
 
@@ -109,7 +110,7 @@ def value(function: Function, state: Mapping[str, float], made: System) -> np.nd
         return np.array(found)
     names = [c.name for c in made.coordinates]
     columns = [
-        evaluate(function, {**state, **{f"{n}{mechanics.ALONG}": float(n == one) for n in names}})
+        evaluate(function, {**state, **{f"{n}{ALONG}": float(n == one) for n in names}})
         for one in names
     ]
     return np.array([column for column, _ in columns]).T.ravel()
@@ -298,7 +299,7 @@ def test_a_chain_is_its_closed_form(n: int) -> None:
     for state in states(made):
         q, qd = (np.array([state[x.name] for x in xs]) for xs in (made.q, made.qd))
         D, bias = hanging(n, state["m"], state["l"], state["g"], q, qd)
-        found = np.array(program.mass_matrix(quick, state))
+        found = np.array(program.matrix(quick, "D", state))
         np.testing.assert_allclose(found, D, rtol=0, atol=1e-13 * np.max(D))
         np.testing.assert_allclose(
             evaluate(quick["bias"], state)[0], bias, rtol=0, atol=1e-12 * np.max(np.abs(bias))
