@@ -1,7 +1,8 @@
-"""Derive the constants of csrc/sincos.h, and measure its error and its speed beside libm's.
+"""Derive the constants of csrc/sincos.h and sincosf.h; measure error and speed beside libm's.
 
 python benchmarks/sincos.py            error in ulp and time per call, two tables
-python benchmarks/sincos.py --derive   the constants, as they stand in the header
+python benchmarks/sincos.py --float    the same of sincosf.h, the error over every float
+python benchmarks/sincos.py --derive   the constants, as they stand in the headers
 """
 
 from __future__ import annotations
@@ -13,27 +14,59 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import mpmath
 import numpy as np
 from numpy.typing import NDArray
 
 CSRC = Path(__file__).resolve().parent.parent / "csrc"
-LIMIT = 2.0**20
-"""eomc_sincos_small holds up to here; beyond it libm answers."""
-LAST_MULTIPLE = 667543
-"""The last n with n pi/2 <= LIMIT."""
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]  # of either precision
+
+
+@dataclass(frozen=True)
+class Precision:
+    """One of the two headers.
+
+    limit: the largest |x| of eomc_sincos_small; beyond it libm answers. last_multiple: the last n
+    with n pi/2 <= limit. radius: the polynomials, of so many terms, are fitted on |r| <= radius:
+    pi/4, and what the rounding of n adds. with_fma, without_fma: bits of the parts of pi/2.
+    """
+
+    suffix: str
+    dtype: type[np.floating[Any]]
+    bits: int
+    limit: float
+    last_multiple: int
+    radius: str
+    terms: int
+    with_fma: tuple[int, ...]
+    without_fma: tuple[int, ...]
+
+    @property
+    def header(self) -> Path:
+        return CSRC / f"sincos{self.suffix}.h"
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """What makes the harness and the judge one of this type."""
+        return ("-DSINGLE",) if self.suffix else ()
+
+    @property
+    def smallest(self) -> int:
+        """log2 of the smallest number above 0."""
+        return -149 if self.suffix else -1074
+
+
+DOUBLE = Precision("", np.float64, 53, 2.0**20, 667543, "0.7854", 6, (53,) * 3, (33,) * 4)
+SINGLE = Precision("f", np.float32, 24, 2.0**13, 5215, "0.7862", 3, (24,) * 3, (11, 11, 11, 11, 24))
 
 # --- the constants -------------------------------------------------------------------------
-
-RADIUS = "0.7854"
-"""The polynomials are fitted on |r| <= RADIUS, a little more than pi/4."""
-TERMS = 6
 
 
 @dataclass(frozen=True)
@@ -44,22 +77,23 @@ class Polynomial:
     log2_error: float
 
 
-def derive() -> dict[str, Polynomial]:
+def derive(of: Precision) -> dict[str, Polynomial]:
     """P and Q of sin r = r + r^3 P(r^2) and cos r = 1 - r^2/2 + r^4 Q(r^2)."""
     with mpmath.workdps(40):
         return {
-            "sin": _fit(lambda r: r, lambda r: r**3, mpmath.sin),
-            "cos": _fit(lambda r: 1 - r * r / 2, lambda r: r**4, mpmath.cos),
+            "sin": _fit(of, lambda r: r, lambda r: r**3, mpmath.sin),
+            "cos": _fit(of, lambda r: 1 - r * r / 2, lambda r: r**4, mpmath.cos),
         }
 
 
 def _fit(
+    of: Precision,
     head: Callable[[mpmath.mpf], mpmath.mpf],
     factor: Callable[[mpmath.mpf], mpmath.mpf],
     function: Callable[[mpmath.mpf], mpmath.mpf],
 ) -> Polynomial:
     """Fit function = head + factor P(r^2), rounding one coefficient after the other."""
-    radius, nodes = mpmath.mpf(RADIUS), 400
+    radius, nodes = mpmath.mpf(of.radius), 400
     zs = [
         radius**2 * (1 - mpmath.cos(mpmath.pi * (2 * j + 1) / (2 * nodes))) / 2
         for j in range(nodes)
@@ -68,9 +102,10 @@ def _fit(
     weights = [factor(r) / function(r) for r in rs]
     rest = [(function(r) - head(r)) / function(r) for r in rs]
     coefficients: list[float] = []
-    for power in range(TERMS):
-        fitted = _remez(zs, weights, rest, TERMS - power)
-        coefficients.append(float(fitted[0]))
+    for power in range(of.terms):
+        fitted = _remez(zs, weights, rest, of.terms - power)
+        with mpmath.workprec(of.bits):
+            coefficients.append(float(+fitted[0]))
         rest = [t - w * coefficients[-1] for t, w in zip(rest, weights, strict=True)]
         weights = [w * z for w, z in zip(weights, zs, strict=True)]
     error = max(abs(t) for t in rest)
@@ -115,70 +150,103 @@ def _remez(
     raise ArithmeticError("the Remez exchange did not settle in 50 rounds")
 
 
-def parts_of_half_pi() -> dict[str, tuple[float, ...]]:
-    """pi/2 as sums of doubles, each cut (never rounded up) to 53 or to 33 bits."""
-    return {"with FMA": _parts(3, 53), "without FMA": _parts(4, 33)}
+def parts_of_half_pi(of: Precision) -> dict[str, tuple[float, ...]]:
+    """pi/2 as sums of numbers that are each cut (never rounded up) to so many bits."""
+    return {"with FMA": _parts(of.with_fma), "without FMA": _parts(of.without_fma)}
 
 
-def _parts(count: int, bits: int) -> tuple[float, ...]:
+def _parts(sizes: Sequence[int]) -> tuple[float, ...]:
     parts: list[float] = []
     with mpmath.workprec(400):
         rest = mpmath.pi / 2
-        for _ in range(count):
+        for bits in sizes:
             last_bit = mpmath.ldexp(1, int(mpmath.frexp(rest)[1]) - bits)
             parts.append(float(mpmath.floor(rest / last_bit) * last_bit))
             rest -= parts[-1]
     return tuple(parts)
 
 
-def print_constants() -> None:
-    print(f"2/pi  {float(2 / mpmath.pi)!r}")
-    print(f"magic {1.5 * 2.0**52!r}")
-    for which, parts in parts_of_half_pi().items():
-        print(f"pi/2 {which}: {', '.join(map(repr, parts))}")
-    for name, polynomial in derive().items():
-        print(f"{name}: relative error 2^{polynomial.log2_error:.1f} on |r| <= {RADIUS}")
+def print_constants(of: Precision) -> None:
+    def text(x: float) -> str:
+        return f"{of.dtype(x)!s}{of.suffix}"
+
+    print(f"{of.header.name}\n2/pi  {text(float(2 / mpmath.pi))}")
+    print(f"magic {text(1.5 * 2.0 ** (of.bits - 1))}")
+    for which, parts in parts_of_half_pi(of).items():
+        print(f"pi/2 {which}: {', '.join(map(text, parts))}")
+    for name, polynomial in derive(of).items():
+        print(f"{name}: relative error 2^{polynomial.log2_error:.1f} on |r| <= {of.radius}")
         for k, coefficient in enumerate(polynomial.coefficients):
-            print(f"  {'p' if name == 'sin' else 'q'}{k} {coefficient!r}")
+            print(f"  {'p' if name == 'sin' else 'q'}{k} {text(coefficient)}")
 
 
 # --- building ------------------------------------------------------------------------------
 
 HARNESS = """\
+#ifdef SINGLE
+#include "sincosf.h"
+#define FAST_FMA EOMC_FAST_FMAF
+#define SMALL eomc_sincosf_small
+#define ANY eomc_sincosf
+#define SIN sinf
+#define COS cosf
+typedef float real;
+#else
 #include "sincos.h"
-int fast_fma(void) { return EOMC_FAST_FMA; }
-void small(long n, const double *restrict x, double *restrict s, double *restrict c)
+#define FAST_FMA EOMC_FAST_FMA
+#define SMALL eomc_sincos_small
+#define ANY eomc_sincos
+#define SIN sin
+#define COS cos
+typedef double real;
+#endif
+int fast_fma(void) { return FAST_FMA; }
+void small(long n, const real *restrict x, real *restrict s, real *restrict c)
 {
-    for (long i = 0; i < n; i++) eomc_sincos_small(x[i], s + i, c + i);
+    for (long i = 0; i < n; i++) SMALL(x[i], s + i, c + i);
 }
-void any(long n, const double *restrict x, double *restrict s, double *restrict c)
+void any(long n, const real *restrict x, real *restrict s, real *restrict c)
 {
-    for (long i = 0; i < n; i++) eomc_sincos(x[i], s + i, c + i);
+    for (long i = 0; i < n; i++) ANY(x[i], s + i, c + i);
 }
-void libm(long n, const double *restrict x, double *restrict s, double *restrict c)
+void libm(long n, const real *restrict x, real *restrict s, real *restrict c)
 {
-    for (long i = 0; i < n; i++) { s[i] = sin(x[i]); c[i] = cos(x[i]); }
+    for (long i = 0; i < n; i++) { s[i] = SIN(x[i]); c[i] = COS(x[i]); }
 }
-typedef void loop(long, const double *restrict, double *restrict, double *restrict);
-void often(long times, loop *f, long n, const double *x, double *s, double *c)
+typedef void loop(long, const real *restrict, real *restrict, real *restrict);
+void often(long times, loop *f, long n, const real *x, real *s, real *c)
 {
     while (times-- > 0) f(n, x, s, c);
 }
-double any_chain(long n, const double *offset)
+double any_chain(long n, const real *offset)
 {
-    double x = 0.0, s, c;
-    for (long i = 0; i < n; i++) { eomc_sincos(x, &s, &c); x = offset[i] + 0.5 * s + 0.25 * c; }
+    real x = 0, s, c;
+    for (long i = 0; i < n; i++) { ANY(x, &s, &c); x = offset[i] + (real)0.5 * s + (real)0.25 * c; }
     return x;
 }
-double libm_chain(long n, const double *offset)
+double libm_chain(long n, const real *offset)
 {
-    double x = 0.0;
-    for (long i = 0; i < n; i++) x = offset[i] + 0.5 * sin(x) + 0.25 * cos(x);
+    real x = 0;
+    for (long i = 0; i < n; i++) x = offset[i] + (real)0.5 * SIN(x) + (real)0.25 * COS(x);
     return x;
 }
 """
 
 REFERENCE = """\
+#ifdef SINGLE
+#include <math.h>
+typedef float real;
+typedef double wide;
+#define BITS 24
+#define LOWEST -125
+#define SIN sin
+#define COS cos
+#define FREXP frexp
+#define LDEXP ldexp
+#else
+typedef double real;
+#define BITS 53
+#define LOWEST -1021
 #ifdef USE_QUADMATH
 #include <quadmath.h>
 typedef __float128 wide;
@@ -194,17 +262,18 @@ typedef long double wide;
 #define FREXP frexpl
 #define LDEXP ldexpl
 #endif
+#endif
 int wide_bytes(void) { return sizeof(wide); }
-static void widen(double *worst, wide exact, double got)
+static void widen(double *worst, wide exact, real got)
 {
     int e;
     FREXP(exact, &e);
-    if (e < -1021) e = -1021;
-    double error = (double)LDEXP(got - exact, 53 - e);
+    if (e < LOWEST) e = LOWEST;
+    double error = (double)LDEXP(got - exact, BITS - e);
     if (error < 0) error = -error;
     if (!(error <= *worst)) *worst = error;
 }
-void errors(long n, const double *x, long sets, const double *s, const double *c, double *worst)
+void errors(long n, const real *x, long sets, const real *s, const real *c, double *worst)
 {
     for (long i = 0; i < n; i++) {
         const wide sine = SIN(x[i]), cosine = COS(x[i]);
@@ -237,13 +306,13 @@ def build(source: str, name: str, folder: Path, flags: Sequence[str]) -> ctypes.
     command = [compiler(), "-shared", "-fPIC", f"-I{CSRC}", str(text), "-o", str(library)]
     subprocess.run([*command, *flags, "-lm"], check=True, capture_output=True, text=True)
     loaded = ctypes.CDLL(str(library))
-    for chain in ("any_chain", "libm_chain"):
-        if hasattr(loaded, chain):
-            getattr(loaded, chain).restype = ctypes.c_double
+    for name in ("any_chain", "libm_chain"):
+        if hasattr(loaded, name):
+            getattr(loaded, name).restype = ctypes.c_double
     return loaded
 
 
-def builds(folder: Path) -> dict[str, ctypes.CDLL]:
+def builds(folder: Path, of: Precision = DOUBLE) -> dict[str, ctypes.CDLL]:
     """The builds that this machine can run: vectorised or not, with FMA and without."""
     variants = {
         "vector": [*SPEED],
@@ -254,7 +323,8 @@ def builds(folder: Path) -> dict[str, ctypes.CDLL]:
     made: dict[str, ctypes.CDLL] = {}
     for name, flags in variants.items():
         try:
-            made[name] = build(HARNESS, name.replace(", ", "_").replace(" ", "_"), folder, flags)
+            library = name.replace(", ", "_").replace(" ", "_") + of.suffix
+            made[name] = build(HARNESS, library, folder, [*flags, *of.flags])
         except subprocess.CalledProcessError as error:
             if "-mno-fma" not in flags:
                 print(error.stderr)
@@ -264,12 +334,12 @@ def builds(folder: Path) -> dict[str, ctypes.CDLL]:
 
 
 def pointer(array: Array) -> ctypes.c_void_p:
-    assert array.dtype == np.float64 and array.flags.c_contiguous
+    assert array.flags.c_contiguous
     return ctypes.c_void_p(array.ctypes.data)
 
 
 def sincos(library: ctypes.CDLL, function: str, x: Array) -> tuple[Array, Array]:
-    """(sin x, cos x) by one of the harness's loops: small, any or libm."""
+    """(sin x, cos x) by one of the harness's loops: small, any or libm; x of the library's type."""
     s, c = np.empty_like(x), np.empty_like(x)
     getattr(library, function)(ctypes.c_long(x.size), pointer(x), pointer(s), pointer(c))
     return s, c
@@ -278,44 +348,90 @@ def sincos(library: ctypes.CDLL, function: str, x: Array) -> tuple[Array, Array]
 # --- error ---------------------------------------------------------------------------------
 
 
-def neighbours_of_multiples(ns: Sequence[int]) -> Array:
-    """The doubles on both sides of n pi/2: those that lose most digits in the reduction."""
+def neighbours_of_multiples(ns: Sequence[int], of: Precision = DOUBLE) -> Array:
+    """The numbers on both sides of n pi/2: those that lose most digits in the reduction."""
     with mpmath.workprec(400):
         half_pi = int(mpmath.floor(mpmath.ldexp(mpmath.pi / 2, 300)))
     points: list[float] = []
     for n in ns:
         multiple = n * half_pi
-        shift = multiple.bit_length() - 53
+        shift = multiple.bit_length() - of.bits
         below = multiple >> shift
         points += [math.ldexp(below, shift - 300), math.ldexp(below + 1, shift - 300)]
-    return np.array(points)
+    return np.array(points, of.dtype)
 
 
-def random_points(count: int, rng: np.random.Generator) -> dict[str, Array]:
+def random_points(count: int, rng: np.random.Generator, of: Precision = DOUBLE) -> dict[str, Array]:
     """Random arguments of both signs, in ranges of |x| and where the error is largest."""
 
     def spread(low: float, high: float) -> Array:
         return rng.uniform(low, high, count)
 
     def multiples() -> Array:
-        n = np.floor(np.exp2(rng.uniform(0.0, math.log2(LAST_MULTIPLE), count)))
+        n = np.floor(np.exp2(rng.uniform(0.0, math.log2(of.last_multiple), count)))
         return n * (math.pi / 2)
 
     sign = rng.choice([-1.0, 1.0], count)
     points = {
-        "2^-1074 to 2^-30": np.exp2(spread(-1074.0, -30.0)),
+        f"2^{of.smallest} to 2^-30": np.exp2(spread(of.smallest, -30.0)),
         "2^-30 to pi/4": np.exp2(spread(-30.0, math.log2(math.pi / 4))),
         "pi/4 to 2 pi": spread(math.pi / 4, 2 * math.pi),
         "2 pi to 1000": spread(2 * math.pi, 1000.0),
-        "1000 to 2^20": spread(1000.0, LIMIT),
+        f"1000 to {_power(of.limit)}": spread(1000.0, of.limit),
         "r in [1/2, pi/6]": multiples() + spread(0.5, math.pi / 6),
         "r in [0.7, pi/4]": multiples() + spread(0.7, math.pi / 4),
     }
-    return {name: np.minimum(x, LIMIT) * sign for name, x in points.items()}
+    return {name: (np.minimum(x, of.limit) * sign).astype(of.dtype) for name, x in points.items()}
 
 
-def reference(folder: Path) -> ctypes.CDLL:
-    """The high-precision judge: __float128 of libquadmath, or else long double."""
+def _power(x: float) -> str:
+    return f"2^{math.log2(x):.0f}"
+
+
+TINY = 2.0**-30
+"""Below it sin x = x (1 - 2^-62) and cos x = 1 - 2^-61, which must come out as x and 1."""
+
+
+def every_float(block: int = 2**20) -> dict[str, Iterator[Array]]:
+    """All floats from TINY to the limit by ranges, those above 0, in blocks."""
+
+    def bits(x: float) -> int:
+        return int(np.float32(x).view(np.uint32))
+
+    def blocks(first: int, end: int) -> Iterator[Array]:
+        for at in range(first, end, block):
+            yield np.arange(at, min(at + block, end), dtype=np.uint32).view(np.float32)
+
+    ends = {"2^-30": TINY, "pi/4": math.pi / 4, "2 pi": 2 * math.pi, "1000": 1000.0}
+    names = [*ends, _power(SINGLE.limit)]
+    marks = [*map(bits, ends.values()), bits(SINGLE.limit) + 1]
+    return {
+        f"{low} to {high}": blocks(first, end)
+        for low, high, first, end in zip(names, names[1:], marks, marks[1:], strict=False)
+    }
+
+
+def check_tiny_and_negative(made: dict[str, ctypes.CDLL]) -> None:
+    """Every float below TINY, and every negative one: what sine and cosine are exactly or by sign.
+
+    AssertionError where it is not so.
+    """
+    tiny = np.arange(int(np.float32(TINY).view(np.uint32)), dtype=np.uint32).view(np.float32)
+    for name in [name for name in made if name.startswith("vector")]:
+        for x in np.array_split(tiny, 800):
+            for signed in (x, -x):
+                s, c = sincos(made[name], "small", signed)
+                assert s.tobytes() == signed.tobytes() and (c == 1).all(), name
+        for x in chain.from_iterable(every_float().values()):
+            (s, c), (minus, same) = (sincos(made[name], "small", y) for y in (x, -x))
+            assert (-s).tobytes() == minus.tobytes() and c.tobytes() == same.tobytes(), name
+    print("\nbelow 2^-30: sin x = x and cos x = 1; negative: sin -x = -sin x, cos -x = cos x")
+
+
+def reference(folder: Path, of: Precision = DOUBLE) -> ctypes.CDLL:
+    """The judge of doubles: __float128 of libquadmath, or else long double; of floats: double."""
+    if of is SINGLE:
+        return build(REFERENCE, "reference_float", folder, ["-O2", *of.flags])
     try:
         flags = ["-O2", "-DUSE_QUADMATH", "-lquadmath"]
         return build(REFERENCE, "reference_quad", folder, flags)
@@ -327,38 +443,41 @@ def reference(folder: Path) -> ctypes.CDLL:
         return judge
 
 
-def print_errors(made: dict[str, ctypes.CDLL], points: dict[str, Array], folder: Path) -> None:
-    judge = reference(folder)
+def print_errors(
+    made: dict[str, ctypes.CDLL], points: dict[str, Iterator[Array]], judge: ctypes.CDLL
+) -> None:
+    """points: blocks of arguments, by what they are called."""
     columns = [name for name in made if name.startswith("vector")]
     print("\nlargest error in ulp" + "".join(f"{name:>24}" for name in [*columns, "libm"]))
     print(f"{'range of |x|':20}" + f"{'sin':>16}{'cos':>8}" * (len(columns) + 1))
-    for title, x in points.items():
-        results = [sincos(made[name], "small", x) for name in columns]
-        results.append(sincos(made["vector"], "libm", x))
-        s = np.concatenate([result[0] for result in results])
-        c = np.concatenate([result[1] for result in results])
-        worst = np.zeros((len(results), 2))
-        judge.errors(
-            ctypes.c_long(x.size),
-            pointer(x),
-            ctypes.c_long(len(results)),
-            pointer(s),
-            pointer(c),
-            pointer(worst),
-        )
+    for title, blocks in points.items():
+        worst = np.zeros((len(columns) + 1, 2))
+        for x in blocks:
+            results = [sincos(made[name], "small", x) for name in columns]
+            results.append(sincos(made["vector"], "libm", x))
+            s = np.concatenate([result[0] for result in results])
+            c = np.concatenate([result[1] for result in results])
+            judge.errors(
+                ctypes.c_long(x.size),
+                pointer(x),
+                ctypes.c_long(len(results)),
+                pointer(s),
+                pointer(c),
+                pointer(worst),
+            )
         print(f"{title:20}" + "".join(f"{es:16.3f}{ec:8.3f}" for es, ec in worst), flush=True)
 
 
 # --- time ----------------------------------------------------------------------------------
 
 
-def print_times(made: dict[str, ctypes.CDLL], rng: np.random.Generator) -> None:
+def print_times(made: dict[str, ctypes.CDLL], rng: np.random.Generator, of: Precision) -> None:
     """Shortest of 200 interleaved rounds; arguments within +-10, quadrants at random."""
-    x, offset = rng.uniform(-10.0, 10.0, 1024), rng.uniform(-10.0, 10.0, 16384)
+    x, offset = (rng.uniform(-10.0, 10.0, n).astype(of.dtype) for n in (1024, 16384))
     times = offset.size // x.size
     s, c = np.empty_like(x), np.empty_like(x)
 
-    def chain(library: ctypes.CDLL, name: str) -> Callable[[], float]:
+    def dependent(library: ctypes.CDLL, name: str) -> Callable[[], float]:
         function = getattr(library, name)
         return lambda: function(ctypes.c_long(offset.size), pointer(offset))
 
@@ -368,12 +487,12 @@ def print_times(made: dict[str, ctypes.CDLL], rng: np.random.Generator) -> None:
         return lambda: library.often(*sizes, pointer(x), pointer(s), pointer(c))
 
     work: dict[str, Callable[[], object]] = {
-        "dependent chain, libm": chain(made["vector"], "libm_chain"),
+        "dependent chain, libm": dependent(made["vector"], "libm_chain"),
         "array, libm": loop(made["vector"], "libm"),
     }
     for name, library in made.items():
         if name.startswith("scalar"):
-            work[f"dependent chain, {name}"] = chain(library, "any_chain")
+            work[f"dependent chain, {name}"] = dependent(library, "any_chain")
         work[f"array, {name}"] = loop(library, "small")
     best = dict.fromkeys(work, math.inf)
     for _ in range(200):
@@ -390,20 +509,30 @@ def print_times(made: dict[str, ctypes.CDLL], rng: np.random.Generator) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--derive", action="store_true", help="print the constants and stop")
-    parser.add_argument("--points", type=int, default=2_000_000, help="random points a range")
+    parser.add_argument("--float", action="store_true", help="sincosf.h instead of sincos.h")
+    parser.add_argument(
+        "--points", type=int, default=2_000_000, help="random points a range, of doubles"
+    )
     options = parser.parse_args()
     if options.derive:
-        print_constants()
+        print_constants(DOUBLE)
+        print_constants(SINGLE)
         return
+    of = SINGLE if options.float else DOUBLE
     rng = np.random.default_rng(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        made = builds(folder)
+        made = builds(folder, of)
         print(f"built with {compiler()}; FMA is used: {bool(made['vector'].fast_fma())}")
-        print_times(made, rng)
+        print_times(made, rng, of)
+        judge = reference(folder, of)
+        if of is SINGLE:
+            print_errors(made, every_float(), judge)
+            check_tiny_and_negative(made)
+            return
         points = random_points(options.points, rng)
-        points["next to n pi/2"] = neighbours_of_multiples(range(1, LAST_MULTIPLE + 1))
-        print_errors(made, points, folder)
+        points["next to n pi/2"] = neighbours_of_multiples(range(1, of.last_multiple + 1))
+        print_errors(made, {title: iter([x]) for title, x in points.items()}, judge)
 
 
 if __name__ == "__main__":

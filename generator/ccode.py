@@ -10,6 +10,7 @@ from itertools import count
 import sympy
 from sympy import Expr, S
 
+from eomc.angles import pair_of
 from eomc.assignments import Call, Function, Operand, Product, Sum, Value, names_of, rename
 from eomc.tape import Stage, is_negative
 
@@ -32,20 +33,24 @@ _STAGE_COMMENTS = {
 
 @dataclass(frozen=True)
 class Real:
-    """A floating-point type: its name in C and Python, the suffix of its literals and functions."""
+    """A floating-point type: its name in C and Python, the suffix of its literals and functions.
+
+    reach: the largest angle that the sincos of csrc/ takes; 0 where there is none for the type.
+    """
 
     name: str
     suffix: str
     function_suffix: str
     dtype: str
     epsilon: float
+    reach: float
 
 
-DOUBLE = Real("double", "", "", "float64", 2.0**-52)
-FLOAT = Real("float", "f", "f", "float32", 2.0**-23)
+DOUBLE = Real("double", "", "", "float64", 2.0**-52, 2.0**20)
+FLOAT = Real("float", "f", "f", "float32", 2.0**-23, 2.0**13)
 REALS = {r.name: r for r in (DOUBLE, FLOAT)}
 # gcc's, with libquadmath; for references only, since NumPy and most compilers don't know it
-QUAD = Real("__float128", "q", "q", "", 2.0**-112)
+QUAD = Real("__float128", "q", "q", "", 2.0**-112, 0.0)
 
 
 @dataclass(frozen=True)
@@ -265,7 +270,7 @@ def body(
         early_failures=early_failures,
         failures=tuple(_fails(printer, pair, tolerance) for e, pair in checks if not e),
         kept=tuple(kept),
-        sincos=real is DOUBLE and any("_sincos" in x for text in lines.values() for x in text),
+        sincos=real.reach > 0 and any("_sincos" in x for text in lines.values() for x in text),
     )
 
 
@@ -291,19 +296,18 @@ def _sincos(
 ) -> list[str]:
     real = printer.real
     argument = printer.operand(angle)
-    if real is not DOUBLE:
-        suffix = real.function_suffix
+    suffix = real.function_suffix
+    if not real.reach:
         made = {n: stored.get(n, f"const {real.name} {n}") for n in names.values()}
         return [f"{made[n]} = {f}{suffix}({argument});" for f, n in names.items()]
-    one = names.get("sin") or names["cos"].replace("cos", "sin") + "_"
-    other = names.get("cos") or names["sin"].replace("sin", "cos") + "_"
+    one, other = pair_of(names)
     local = [n for n in (one, other) if n not in stored]
     both = ", ".join(f"&{stored.get(n, n)}" for n in (one, other))
     return [
         *([f"{real.name} {', '.join(local)};"] if local else []),
-        f"{printer.prefix}_sincos_lane({argument}, {both}, trouble);"
+        f"{printer.prefix}_sincos{suffix}_lane({argument}, {both}, trouble);"
         if lane
-        else f"{printer.prefix}_sincos({argument}, {both});",
+        else f"{printer.prefix}_sincos{suffix}({argument}, {both});",
     ]
 
 

@@ -76,7 +76,7 @@ def values(target: Target) -> dict[str, Any]:
         "has_u": bool(s.inputs),
         "has_p": target.needs_p,
         "batch": s.run.batch,
-        "csrc": _csrc(target),
+        "csrc": _csrc(target, bool(moved["angles"])),
         "slopes": slopes,
         "in_pieces": moved["large"]
         or any(f["in_pieces"] for f in evaluations)
@@ -189,6 +189,11 @@ def _solved(target: Target) -> list[str]:
     if program["acceleration"].route == "articulated":
         way = "articulated bodies (Featherstone), the pivots d being those of D = L diag(d) L^T"
     order = ", ".join(program.system.coordinates[k].name for k in program.order)
+    if program["acceleration"].route == "tensions":
+        return textwrap.wrap(
+            "a = qdd by the tensions of the links, S = N T N^T = L diag(s) L^T, eliminated in the "
+            f"order of the links of {order}. Every mass must be positive.", 92,
+        )  # fmt: skip
     return textwrap.wrap(f"a = qdd by {way}, eliminated in the order {order}.", 92)
 
 
@@ -220,18 +225,23 @@ def _face(target: Target) -> dict[str, Any]:
         "run_binding": lambda name: f"{target.prefix}_{name}_run("
         + arguments(
             "q", "qd", "t0" if t else "", "h", "first", "steps", u and "u, u_stride",
-            "every", "q_rows", "qd_rows", target.p_cast, "&found",
+            "every", "q_rows", "qd_rows", target.p_cast,
+            f"({target.prefix}_{name}_memory *)memory", "&found",
         ) + ")",
     }  # fmt: skip
 
 
-def _csrc(target: Target) -> list[str]:
+def _csrc(target: Target, near: bool) -> list[str]:
     """The hand-written C that this scene needs, under its own prefix."""
-    if not target.sincos:
-        return []
-    text = resource("csrc", "sincos.h").replace("#include <math.h>\n", "")
-    own = text.replace("eomc_", f"{target.prefix}_").replace("EOMC_", f"{target.PREFIX}_")
-    return [own.strip()]
+    files = [
+        *([f"sincos{target.real.function_suffix}.h"] if target.sincos else []),
+        *(["near.h"] if near else []),
+    ]
+    texts = [resource("csrc", file).replace("#include <math.h>\n", "") for file in files]
+    return [
+        text.replace("eomc_", f"{target.prefix}_").replace("EOMC_", f"{target.PREFIX}_").strip()
+        for text in texts
+    ]
 
 
 def _comment(unit: str, note: str) -> str:

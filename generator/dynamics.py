@@ -12,18 +12,18 @@ from fractions import Fraction
 from math import isfinite
 from typing import Any
 
-from sympy import Rational, S
+from sympy import Expr, Rational, S
 
 from eomc import ccode
-from eomc.assignments import Function, Operand
-from eomc.ccode import Body, Real, indent
+from eomc.angles import Angle, apart
+from eomc.assignments import Function, Operand, Sum
+from eomc.ccode import DOUBLE, Body, Real, indent
 from eomc.pieces import is_large, staged
 from eomc.program import TIME
 from eomc.steppers import METHODS, RK4, Method, Row
 from eomc.target import TROUBLE, Access, Argument, Target, after, arguments, none_of, sentence
 
 NEAR = 16_384  # bytes that a tile of a small system may have: half a first-level cache
-RESTART = 256  # steps from which implicit methods begin afresh, so that runs can be cut there
 WIDE = 131_072  # and of a large one: a part of a second-level cache
 
 
@@ -32,12 +32,13 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
     s, function, real = target.system, target.program["acceleration"], target.real.name
     P, NQ = target.prefix, f"{target.PREFIX}_NQ"
     large = is_large(function)
-    prepare = _prepare_large(target, function) if large else _prepare(target, function)
+    turned, rest = _apart(target, function)
+    prepare = _prepare_large(target, function) if large else _prepare(target, rest, turned)
     kept = prepare["prepared_members"]
     takes_c, takes_p = bool(kept), target.needs_p and "signal" in target.program
     t, u = "t" if target.driven else "", "u" if s.inputs else ""
     c, p = "c" if takes_c else "", "p" if takes_p else ""
-    scalar = _mode(target, function, prepare, takes_c, takes_p)
+    scalar = _mode(target, rest, prepare, takes_c, takes_p, turned)
     t_arg, u_arg = f"{real} t" if t else "", f"const {real} *u" if u else ""
     outer = arguments(u_arg, target.p_arg)
     x = f"{real} q[{NQ}], {real} qd[{NQ}]"
@@ -59,11 +60,11 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "methods": [
             _implicit(target, METHODS[name], slopes, scalar, large)
             if slopes is not None and METHODS[name].implicit
-            else _explicit(METHODS[name], target.real)
+            else _explicit(METHODS[name], target.real, turned)
             for name in s.run.methods
         ],
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
-        "restart": RESTART,
+        "angles": _angles(target, turned),
         "fabs": "fabs" + target.real.function_suffix,
         "fmax": "fmax" + target.real.function_suffix,
         "method_names": repr(s.run.methods),
@@ -78,7 +79,8 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "run_prototype": lambda name: f"long {P}_{name}_run("
         + arguments(
             x, t0_arg, f"{real} h", "long first", "long steps",
-            u_arg and f"{u_arg}, long u_stride", rows, target.p_arg, f"{P}_status *status",
+            u_arg and f"{u_arg}, long u_stride", rows, target.p_arg,
+            f"{P}_{name}_memory *memory", f"{P}_status *status",
         ) + ")",
         "batch_prototype": lambda name: f"void {P}_{name}_batch("
         + arguments(
@@ -89,7 +91,8 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         ) + ")",
         "tile": _tile(target, len(kept), crossing, large),
         "input_names": target.input_names,
-        "sincos": target.sincos,
+        "sincos": f"{P}_sincos{target.real.function_suffix}" if target.sincos else "",
+        "reach": target.literal(target.real.reach),
         "prepare_lane": arguments(
             "&prepared" if takes_c else "", "p + k*p_instance" if target.needs_p else ""
         ),
@@ -97,7 +100,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
             t, "h", u and "u ? u + (base + i)*u_instance + n*u_step : 0",
             "&c" if takes_c else "", "p + (base + i)*p_instance" if takes_p else "",
         ),
-        "tile_prototype": lambda name: f"{real} {P}_{name}_tile_step("
+        "tile_prototype": lambda name: f"int {P}_{name}_tile_step("
         + arguments(f"{P}_tile *s", t_arg, f"{real} h", u and "int held") + ")",
         "batch_binding": lambda name: f"{P}_{name}_batch("
         + arguments(
@@ -113,12 +116,51 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
     }  # fmt: skip
 
 
+# --- sines and cosines apart ---------------------------------------------------------------------
+
+
+def _apart(target: Target, function: Function) -> tuple[tuple[Angle, ...], Function]:
+    """The angles that RK4 turns, and the acceleration that reads their sines and cosines."""
+    if target.real is not DOUBLE or "rk4" not in target.system.run.methods or is_large(function):
+        return (), function
+    return apart(function, target.names)
+
+
+def _angles(target: Target, turned: Sequence[Angle]) -> dict[str, Any] | None:
+    """The struct of sines and cosines, and how they are had at a place, and near one."""
+    if not turned:
+        return None
+
+    def along(angle: Angle, vector: str, offset: Expr) -> str:
+        where = {name: f"{vector}{name}" for _, name in angle.terms}
+        return ccode.Printer(P, target.real, where).value(Sum(angle.terms, offset))[0]
+
+    P, members = target.prefix, _sines(turned)
+    return {
+        "members": members,
+        "at": [
+            f"{P}_sincos({along(a, 'q->', a.offset)}, &s->{a.sine}, &s->{a.cosine});"
+            for a in turned
+        ],
+        "near": [
+            f"{P}_sincos_near({along(a, 'q->', a.offset)}, {along(a, 'd->', S.Zero)}, "
+            f"from->{a.sine}, from->{a.cosine}, &s->{a.sine}, &s->{a.cosine});"
+            for a in turned
+        ],
+    }
+
+
+def _sines(turned: Sequence[Angle]) -> list[str]:
+    return [name for a in turned for name in (a.sine, a.cosine)]
+
+
 # --- what parameters alone decide -----------------------------------------------------------------
 
 
-def _prepare(target: Target, function: Function) -> dict[str, Any]:
+def _prepare(target: Target, function: Function, turned: Sequence[Angle]) -> dict[str, Any]:
     own = [p.name for p in target.system.parameters]
-    body = target.body(function, keep=_in_prepared, parameters=own)
+    where = {name: f"s->{name}" for name in _sines(turned)}
+    body = target.body(function, where, keep=_in_prepared, parameters=own)
     kept = _with_signal(target, list(body.kept))
     return {
         "prepared_members": kept,
@@ -181,8 +223,12 @@ def _mode(
     prepare: Mapping[str, Any],
     takes_c: bool,
     takes_p: bool,
+    turned: Sequence[Angle],
 ) -> dict[str, Any]:
-    """solve, rates and steppers for one trajectory: they return whether D was regular."""
+    """solve, rates and steppers for one trajectory: they return whether D was regular.
+
+    turned: the angles whose sines and cosines are not computed in `function`.
+    """
     s, real, P = target.system, target.real.name, target.prefix
     timed, u, large = TIME in function.uses, bool(s.inputs), "body" not in prepare
     t_arg = f"{real} t" if target.driven else ""
@@ -191,6 +237,8 @@ def _mode(
     p_arg = target.p_arg if takes_p else ""
     c, p = "c" if takes_c else "", "p" if takes_p else ""
     state = f"const {P}_vector *q, const {P}_vector *qd"
+    s_arg, s_call = (f"const {P}_angles *s", "s") if turned else ("", "")
+    rates_rest = (t_arg, u_arg, c_arg, p_arg)
 
     def rates(time: str) -> str:
         if u:
@@ -201,17 +249,33 @@ def _mode(
         return f"{array}->x[{target.enum[name]}]" if large else f"{array}->{name}"
 
     made: dict[str, Any] = {
-        "head": "static int" if large else "static inline int",
+        "head": "static int"
+        if large
+        else f"{target.PREFIX}_INLINE int"
+        if turned
+        else "static inline int",
         "vector": f"{P}_vector",
-        "solve": "solve",
+        "solve": "solve_at" if turned and not u else "solve",
         "rates": "rates" if u else "solve",
+        "rates_at": ("rates" if u else "solve") + ("_at" if turned else ""),
         "suffix": "",
         "solve_arguments": arguments(
-            f"{P}_vector *a", state, f"{real} t" if timed else "", u_arg, c_arg
+            f"{P}_vector *a", state, s_arg, f"{real} t" if timed else "", u_arg, c_arg
         ),
-        "solve_u": after("t" if timed else "", "u", c),
-        "solve_now": after("t" if timed else "", "now", c),
-        "rates_arguments": arguments(f"{P}_vector *a", state, t_arg, u_arg, c_arg, p_arg),
+        "solve_u": after(s_call, "t" if timed else "", "u", c),
+        "solve_now": after(s_call, "t" if timed else "", "now", c),
+        "rates_arguments": arguments(f"{P}_vector *a", state, s_arg, *rates_rest),
+        "own_rates_arguments": arguments(f"{P}_vector *a", state, *rates_rest)
+        if u
+        else arguments(f"{P}_vector *a", state, f"{real} t" if timed else "", c_arg),
+        "rk4_arguments": arguments(
+            f"{P}_vector *r, {P}_vector *v, {P}_angles *s, {state}",
+            t_arg,
+            f"{real} h",
+            u_arg,
+            c_arg,
+            p_arg,
+        ),
         "stepper_arguments": arguments(
             f"{P}_vector *r, {P}_vector *v, {state}", t_arg, f"{real} h", u_arg, c_arg, p_arg
         ),
@@ -222,6 +286,7 @@ def _mode(
         else [],
         "signal_call": target.signal_call("now", "at", "moving"),
         "call": rates,
+        "call_at": lambda angles, time: f", {angles}{rates(time)}",
         "first": "int good = ",
         "and": "good &= ",
         "last": "return good;",
@@ -394,7 +459,9 @@ def _lane_small(
     at = [target.enum[n] for n in target.names]
     given = [target.enum[n] for n in target.input_names]
     return {
-        "unused": [*made["unused"], *([] if body.failures or body.sincos else ["trouble"])],
+        "unused": [
+            *_unread(target, function), *([] if body.failures or body.sincos else ["trouble"])
+        ],
         "loads": target.loads(function, in_struct, in_struct),
         "blocks": body.blocks,
         "end": [f"*trouble = {x} ? {one} : *trouble;" for x in body.failures],
@@ -577,7 +644,7 @@ def _about(m: Method) -> dict[str, Any]:
     }
 
 
-def _explicit(m: Method, real: Real) -> dict[str, Any]:
+def _explicit(m: Method, real: Real, turned: Sequence[Angle]) -> dict[str, Any]:
     """An explicit method as its template wants it; RK4 has one of its own, written out by hand."""
 
     def total(row: Row) -> str:
@@ -597,13 +664,17 @@ def _explicit(m: Method, real: Real) -> dict[str, Any]:
 
     stages = [] if m is RK4 else list(zip(m.c, m.a_squared, m.a, strict=True))[1:]
     first, half = m.c[0], _number(m.c[0], real)
+    angles = m is RK4 and bool(turned)
+    lane_template = "rk4.c.jinja" if m is RK4 else "explicit.c.jinja"
     return _about(m) | {
-        "template": "rk4.c.jinja" if m is RK4 else "explicit.c.jinja",
+        "angles": angles,
+        "template": "rk4_angles.c.jinja" if angles else lane_template,
+        "lane_template": lane_template,
         "begin": [f"r->$ = q->$ + {half}*h*qd->$;"] if first else [],
         "begin_at": "r, qd" if first else "q, qd",
         "begin_time": time(first) if first else "t",
         "body": [{"lines": lines(c, *rows), "time": time(c)} for c, *rows in stages],
-        "end": lines(Fraction(1), m.b_a, m.b),
+        "end": [f"r->$ = h*qd->$ + hh*({total(m.b_a)});", f"v->$ = h*({total(m.b)});"],
     }
 
 
@@ -635,7 +706,8 @@ def _implicit(
     return _about(m) | {
         "template": "gauss.c.jinja",
         "arguments": arguments(scalar["stepper_arguments"], own_p and target.p_arg, memory),
-        "call_more": after(own_p, "&memory"),
+        "call_more": after(own_p, "m"),
+        "angles": False,
         "factor_arguments": given,
         "factor_now": now("at_now", "moving_now", "t"),
         "factor_mid": now("mid_q", "mid_qd", f"t + {_number(Fraction(1, 2), real)}*h"),
@@ -652,5 +724,5 @@ def _implicit(
             f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*({total('AA[i]')}));",
             f"moving.$ = qd->$ + h*({total('A[i]')});",
         ],
-        "end": [f"r->$ = q->$ + (h*qd->$ + hh*({last[0]}));", f"v->$ = qd->$ + h*({last[1]});"],
+        "end": [f"r->$ = h*qd->$ + hh*({last[0]});", f"v->$ = h*({last[1]});"],
     }  # fmt: skip

@@ -24,33 +24,20 @@ from typing import NoReturn
 import sympy
 from sympy import Expr, S, Symbol
 
+from eomc import tensions
 from eomc.articulated import MasslessError, accelerations
-from eomc.bodies import Tree, needed
-from eomc.problems import EomcError, SceneError
+from eomc.bodies import Tree
+from eomc.elimination import Rows, Solution, Vector, solve, work
+from eomc.energies import Energies, directions, on_tape
+from eomc.problems import SceneError
 from eomc.symbols import ALONG
-from eomc.system import System, dot, symbol, t
+from eomc.system import System, symbol, t
 from eomc.tape import RoughError, Stage, Tape
 from eomc.trees import Recursion
-
-Vector = tuple[Expr, ...]
-Rows = tuple[Vector, ...]
 
 LAGRANGE_DEFINITIONS = 12  # of a tree's world coordinates: beyond, recursion always needs less
 MOST_ROWS = 16  # coordinates from which D is computed column by column, where nothing needs it
 WRITTEN_OUT = 2500  # names on the tape, about, from which C is computed column by column
-
-
-@dataclass(frozen=True)
-class Solution:
-    """qdd by one way of solving D qdd = tau - bias.
-
-    order: the order in which coordinates are eliminated; pivots: those of L diag(pivots) L^T, all
-    positive where D is positive definite, each beside a value of the size of what it came from.
-    """
-
-    acceleration: Vector
-    order: tuple[int, ...]
-    pivots: tuple[tuple[Expr, Expr], ...]
 
 
 @dataclass(frozen=True)
@@ -83,26 +70,14 @@ class Equations:
     notes: tuple[str, ...]
 
 
-@dataclass
-class Energies:
-    """K, P, R and Q on the tape, with the points y_k and their velocities w_k = dot(y_k)."""
-
-    tape: Tape
-    kinetic: Expr
-    potential: Expr
-    dissipation: Expr
-    forces: list[Expr]
-    signals: list[Expr]
-    points: dict[Symbol, Expr]  # w -> y
-
-
 def derive(system: System) -> dict[str, Equations]:
     """The equations of motion of `system` by each way that may be worth its while.
 
     "program" is Lagrange's way over the program of K and P; "tree" the recursive one, where bodies
-    hang on joints. Raises SceneError where K is not quadratic in the velocities or a coordinate
-    has no inertia. Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's
-    integral); C from Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
+    hang on joints. The first that there is has the tensions among its solutions, where they apply.
+    Raises SceneError where K is not quadratic in the velocities or a coordinate has no inertia.
+    Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral); C from
+    Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
     """
     out: dict[str, Equations] = {}
     try:
@@ -123,9 +98,14 @@ def _by_lagrange(system: System) -> Equations:
     e = on_tape(system, system.kinetic, system.potential)
     motion = _lagrange(system, e)
     _has_inertia(system, motion.D)
-    order, acceleration, pivots = solve(e.tape, motion.D, motion.balance)
-    solutions = {"program": Solution(acceleration, order, pivots)}
-    return _equations(system, e, motion, solutions, {})
+    solutions, passed_over = _by_tensions(system)
+    elimination = work(motion.D)
+    if solutions and len(system.q) > MOST_ROWS and elimination > _length(solutions["tensions"]):
+        passed_over["program"] = f"{elimination} flops for elimination alone"
+    else:
+        order, acceleration, pivots = solve(e.tape, motion.D, motion.balance)
+        solutions = {"program": Solution(e.tape, acceleration, order, pivots), **solutions}
+    return _equations(system, e, motion, solutions, passed_over)
 
 
 def _by_recursion(system: System, tree: Tree) -> Equations:
@@ -155,9 +135,11 @@ def _by_recursion(system: System, tree: Tree) -> Equations:
         except MasslessError as fault:
             _no_inertia(system, tree.links[fault.link].q.name)
         order = tuple(q.index(link.q) for link in reversed(tree.links))
-        solutions["articulated"] = Solution(tuple(found[at[x]] for x in q), order, pivots)
-    passed_over = {}
-    if len(system.definitions) > LAGRANGE_DEFINITIONS:
+        solutions["articulated"] = Solution(tape, tuple(found[at[x]] for x in q), order, pivots)
+    passed_over: dict[str, str] = {}
+    more: dict[str, Solution] = {}
+    if len(system.definitions) > LAGRANGE_DEFINITIONS:  # else Lagrange's way has the tensions
+        more, passed_over = _by_tensions(system)
         passed_over["program"] = f"{len(system.definitions)} world coordinates to differentiate"
     elimination = recursion.elimination()
     long = solutions and elimination > len(tape.live(solutions["articulated"].acceleration))
@@ -177,20 +159,29 @@ def _by_recursion(system: System, tree: Tree) -> Equations:
         passed_over["composite"] = f"{elimination} flops for elimination alone"
     else:
         order, acceleration, pivots = solve(tape, D, motion.balance)
-        solutions["composite"] = Solution(acceleration, order, pivots)
+        solutions["composite"] = Solution(tape, acceleration, order, pivots)
+    solutions |= more
     e.kinetic = tape.total([e.kinetic, recursion.kinetic_energy()])
     e.potential = tape.total([e.potential, recursion.potential_energy()])
     return _equations(system, e, replace(motion, D=D), solutions, passed_over)
 
 
+def _by_tensions(system: System) -> tuple[dict[str, Solution], dict[str, str]]:
+    """One more way to the accelerations, or why there is none."""
+    try:
+        return {"tensions": tensions.solution(system)}, {}
+    except tensions.UnsuitedError as why:
+        return {}, {"tensions": str(why)}
+
+
+def _length(solution: Solution) -> int:
+    """The names that a solution hangs on, about its operations."""
+    return len(solution.tape.live(solution.acceleration))
+
+
 def along(system: System) -> list[Symbol]:
     """The entries of a direction e, for D e and C e."""
     return [symbol(f"{c.name}{ALONG}") for c in system.coordinates]
-
-
-def directions(system: System) -> dict[Symbol, Symbol]:
-    """The entries of a direction in (q, qd, u), by what each goes along."""
-    return {x: symbol(f"{x.name}{ALONG}") for x in (*system.q, *system.qd, *system.u)}
 
 
 def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
@@ -323,63 +314,6 @@ def _equations(
     )
 
 
-def on_tape(system: System, kinetic: Expr, potential: Expr) -> Energies:
-    """K and P, with the system's dissipation, forces and signals, and what they are made of."""
-    leaves: dict[Symbol, Stage] = {t: Stage.TIME}
-    leaves |= {p.symbol: Stage.PARAMETER for p in system.parameters}
-    leaves |= dict.fromkeys(system.u, Stage.TIME)
-    leaves |= dict.fromkeys(system.q, Stage.POSITION)
-    leaves |= dict.fromkeys((*system.qd, *directions(system).values()), Stage.VELOCITY)
-    tape = Tape(leaves)
-    rates: dict[Symbol, Expr] = {**dict(zip(system.q, system.qd, strict=True)), t: S.One}
-    known: dict[Symbol, Expr] = {}
-    points: dict[Symbol, Expr] = {}
-
-    def value(expr: Expr) -> Expr:
-        velocities = {}
-        for moving in sorted(expr.atoms(dot), key=str):
-            position = tape.define(_position(system, moving).xreplace(known))
-            held = tape.leaves_of([position]) & {*system.qd, *system.u}
-            if held:
-                raise EomcError(
-                    f"{system.file or system.name}: {moving} is the rate of something that "
-                    f"depends on {', '.join(sorted(map(str, held)))}: only t, coordinates and "
-                    "parameters have known rates"
-                )
-            (velocity,) = tape.forward([position], rates)
-            inside = moving.args[0]
-            name = f"{inside}_dot" if inside.is_Symbol else f"w{len(points) + 1}"
-            velocity = tape.named(velocity, name)
-            if velocity in tape.rhs and tape.stage[velocity] is Stage.VELOCITY:
-                points.setdefault(velocity, position)
-            velocities[moving] = velocity
-        return tape.define(expr.xreplace(velocities).xreplace(known))
-
-    forces = system.forces or (S.Zero,) * len(system.coordinates)
-    ends = [kinetic, potential, system.dissipation, *forces, *(i.signal for i in system.inputs)]
-    for defined, expr in needed(system.definitions, ends):
-        known[defined] = tape.named(value(expr), defined.name)
-    return Energies(
-        tape,
-        value(kinetic),
-        value(potential),
-        value(system.dissipation),
-        [value(force) for force in forces],
-        [value(i.signal) for i in system.inputs],
-        points,
-    )
-
-
-def _position(system: System, moving: dot) -> Expr:
-    (inside,) = moving.args
-    if inside.has(dot):
-        raise EomcError(
-            f"{system.file or system.name}: {moving} would hold accelerations, which are what is "
-            "solved for"
-        )
-    return inside
-
-
 def _mass_matrix(
     system: System,
     e: Energies,
@@ -453,42 +387,6 @@ def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool)
         return (tuple(column(dict(zip(system.qd, along(system), strict=True)))),)
     columns = [column({velocity: S.One}) for velocity in system.qd]
     return tuple(tuple(column[i] for column in columns) for i in range(len(columns)))
-
-
-def solve(
-    tape: Tape, D: Rows, b: Sequence[Expr], short: Callable[[Expr], Expr] = lambda atom: atom
-) -> tuple[tuple[int, ...], Vector, tuple[tuple[Expr, Expr], ...]]:
-    """x with D x = b by L diag(d) L^T x = b, unrolled; zeros are neither stored nor computed.
-
-    Source: Golub & Van Loan, *Matrix Computations*, 4th ed., alg. 4.1.2. The next pivot is the
-    one with the fewest entries left beside it (minimum degree), the earliest known among equals.
-    short: rewrites what elimination makes, so that terms which cancel are gone.
-    """
-    n = len(b)
-    A = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
-    y = list(b)
-    left, order, pivots = list(range(n)), [], []
-    steps: list[tuple[int, Expr, dict[int, Expr]]] = []
-    while left:
-        k = min(left, key=lambda i: (sum((i, j) in A for j in left), tape.stage_of(A[i, i]), i))
-        left.remove(k)
-        order.append(k)
-        pivot = A[k, k]
-        pivots.append((pivot, D[k][k]))
-        inverse = tape.define(1 / pivot)
-        beside = {i: A[i, k] for i in left if (i, k) in A}
-        factors = {i: tape.define(a * inverse) for i, a in beside.items()}
-        for i, factor in factors.items():
-            y[i] = short(tape.define(y[i] - factor * y[k]))
-            for j, a in beside.items():
-                if j <= i:
-                    A[i, j] = A[j, i] = short(tape.define(A.get((i, j), S.Zero) - factor * a))
-        steps.append((k, inverse, factors))
-    x: dict[int, Expr] = {}
-    for k, inverse, factors in reversed(steps):
-        rest = [-factor * x[i] for i, factor in factors.items()]
-        x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *map(tape.define, rest)))
-    return tuple(order), tuple(x[i] for i in range(n)), tuple(pivots)
 
 
 def _notes(

@@ -10,9 +10,10 @@ from sympy import Expr
 
 from eomc import mechanics
 from eomc.assignments import Cost, Function, evaluate
+from eomc.elimination import Solution, solve
 from eomc.expand import Expander
 from eomc.lowering import lower
-from eomc.mechanics import Equations, Solution
+from eomc.mechanics import Equations
 from eomc.problems import Problem, SceneError
 from eomc.steppers import METHODS
 from eomc.symbols import ALONG
@@ -74,7 +75,7 @@ def build(equations: Mapping[str, Equations]) -> Program:
     routes = {}
     for route, e in equations.items():
         for way, solution in e.solutions.items():
-            routes[way] = _solving(e, solution, names)
+            routes[way] = _solving(solution, names)
         if route in expanders:
             routes |= _expanded_solutions(e, expanders[route], names)
     best = functions["acceleration"] = _cheapest("acceleration", first.system, routes)
@@ -84,9 +85,9 @@ def build(equations: Mapping[str, Equations]) -> Program:
         functions[made.name] = replace(made, route=best.route)
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
-    last = list(equations.values())[-1]
+    passed_over = {way: why for e in equations.values() for way, why in e.passed_over.items()}
     order = routes[best.route].order
-    whole = Program(first.system, functions, first.notes, order, last.passed_over)
+    whole = Program(first.system, functions, first.notes, order, passed_over)
     if unsuited := _unsuited(whole):
         raise SceneError(unsuited)
     return whole
@@ -126,10 +127,11 @@ def _wanted(e: Equations) -> dict[str, list[Expr]]:
     return wanted
 
 
-def _solving(e: Equations, solution: Solution, names: Sequence[str]) -> Route:
+def _solving(solution: Solution, names: Sequence[str]) -> Route:
     labels = [f"{name}_ddot" for name in names]
-    labels += [f"{what}_{names[k]}" for k in solution.order for what in ("d", "D")]
-    return Route(e.tape, solution.acceleration, solution.pivots, labels, solution.order)
+    pair = (solution.matrix.lower(), solution.matrix)
+    labels += [f"{what}_{names[k]}" for k in solution.order for what in pair]
+    return Route(solution.tape, solution.acceleration, solution.pivots, labels, solution.order)
 
 
 def _unsuited(program: Program) -> list[Problem]:
@@ -183,18 +185,23 @@ def _expanded_solutions(e: Equations, expander: Expander, names: Sequence[str]) 
     D = tuple(tuple(entries[max(i, j), min(i, j)] for j in range(n)) for i in range(n))
     routes = {}
     for route, short in (("expanded", lambda atom: atom), ("cancelled", expander.short)):
-        order, acceleration, pivots = mechanics.solve(e.tape, D, both[len(lower) :], short)
-        routes[route] = _solving(e, Solution(acceleration, order, pivots), names)
+        order, acceleration, pivots = solve(e.tape, D, both[len(lower) :], short)
+        routes[route] = _solving(Solution(e.tape, acceleration, order, pivots), names)
     return routes
 
 
 def _cheapest(name: str, system: System, routes: Mapping[str, Route]) -> Function:
     """By the route with the fewest operations among those that lose no digits against another."""
     made = {way: lower(name, r.tape, r.outputs, r.checks, r.labels) for way, r in routes.items()}
-    by_weight = sorted(made, key=lambda route: (_weight(made[route].cost), len(made[route].early)))
+
+    def rank(route: str) -> tuple[float, int]:  # D bears massless links: worth a fifth more
+        weight = _weight(made[route].cost) * (1.25 if route == "tensions" else 1.0)
+        return weight, len(made[route].early)
+
+    by_weight = sorted(made, key=rank)
     best, first = by_weight[0], next(iter(made))
     if len(made) > 1 and made[best].body != made[first].body:
-        errors = {route: _rounding(function, system) for route, function in made.items()}
+        errors = _roundings(made, system)
         least = min(errors.values())
         # so many roundings add up to their root, where nothing cancels
         usual = 2.0**-52 * max(4.0, math.sqrt(len(made[best].body)))
@@ -203,23 +210,31 @@ def _cheapest(name: str, system: System, routes: Mapping[str, Route]) -> Functio
     return replace(made[best], route=best, routes=costs)
 
 
-def _rounding(function: Function, system: System) -> float:
-    """The largest relative error of the results, in doubles, over some states around the start."""
-    worst = 0.0
-    for k in range(5 if len(function.body) < 500 else 2):
-        values = nearby(system, k)
-        values |= {f"{c.name}{ALONG}": 1.0 / (k + 1) for c in system.coordinates}
-        values |= {i.name: 0.7 + 0.1 * n for n, i in enumerate(system.inputs)}
-        try:
-            found, _ = evaluate(function, values)
-            exact, _ = evaluate(function, values, exact=True)
-        except (ArithmeticError, ValueError):
-            continue
-        size = max(map(abs, exact))
-        if size:
-            off = max(abs(a - b) for a, b in zip(found, exact, strict=True))
-            worst = max(worst, off / size)
-    return worst
+def _roundings(made: Mapping[str, Function], system: System) -> dict[str, float]:
+    """The largest relative error of each, in doubles, over some states around the start.
+
+    Infinite where one fails and another does not: a massless link has no tension, but may have D.
+    """
+    states = range(5 if all(len(f.body) < 500 for f in made.values()) else 2)
+    errors = {route: [_rounding(f, system, k) for k in states] for route, f in made.items()}
+    told = [k for k in states if any(math.isfinite(found[k]) for found in errors.values())]
+    return {route: max((found[k] for k in told), default=0.0) for route, found in errors.items()}
+
+
+def _rounding(function: Function, system: System, k: int) -> float:
+    """The relative error of the results at the k-th state around the start; inf without any."""
+    values = nearby(system, k)
+    values |= {f"{c.name}{ALONG}": 1.0 / (k + 1) for c in system.coordinates}
+    values |= {i.name: 0.7 + 0.1 * n for n, i in enumerate(system.inputs)}
+    try:
+        found, regular = evaluate(function, values)
+        exact, _ = evaluate(function, values, exact=True)
+    except (ArithmeticError, ValueError):
+        return math.inf
+    if not regular:
+        return math.inf
+    size, off = max(map(abs, exact)), max(abs(a - b) for a, b in zip(found, exact, strict=True))
+    return off / size if size else 0.0
 
 
 def _weight(cost: Cost) -> int:

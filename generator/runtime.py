@@ -58,16 +58,16 @@ class Run:
     status: "ok", "singular", "not finite", "no convergence" or "interrupted"; a run that is not ok
     ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
     when it is asked for; `steps` were done by `method`, of size h, and a row kept of `every` so
-    many. error: an Estimate, where it was asked for.
+    many. evaluations: of accelerations. error: an Estimate, where it was asked for.
     """
 
     def __init__(
         self, model: Model, t: Array, q: Array, qd: Array, h: float, steps: int, status: str,
-        params: Array, every: int, u: Any, method: str,
+        params: Array, every: int, u: Any, method: str, evaluations: int,
     ) -> None:  # fmt: skip
         self.t, self.q, self.qd = t, q, qd
         self.h, self.steps, self.status = h, steps, status
-        self.every, self.method = every, method
+        self.every, self.method, self.evaluations = every, method, evaluations
         self.error: Estimate | None = None
         self._model, self._params, self._u = model, params, u
         self._energy: Array | None = None
@@ -186,9 +186,9 @@ class Model:
         coordinates: Mapping[str, str], parameters: Mapping[str, float],
         inputs: Mapping[str, str], units: Mapping[str, str],
         start: tuple[Sequence[float], Sequence[float]], h: float, duration: float,
-        timed: Sequence[str], methods: Mapping[str, tuple[int, float, float]], digest: str,
+        timed: Sequence[str], methods: Mapping[str, tuple[int, int, float, float]], digest: str,
     ) -> None:  # fmt: skip
-        """methods: order and stability limits (h omega undamped, h lambda decaying) of each."""
+        """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
         self._ffi, self._lib = extension.ffi, extension.lib
         self._ctype = {"float64": "double[]", "float32": "float[]"}[dtype]
         self.name, self.title, self.digest = name, title, digest
@@ -203,8 +203,9 @@ class Model:
         self._p0 = np.array(list(parameters.values()), self.dtype)
         self._timed = frozenset(timed)
         self.methods = tuple(methods)
-        self.orders = {name: order for name, (order, _, _) in methods.items()}
-        self.limits = {name: (turn, decay) for name, (_, turn, decay) in methods.items()}
+        self.orders = {name: order for name, (order, *_) in methods.items()}
+        self.limits = {name: (turn, decay) for name, (_, _, turn, decay) in methods.items()}
+        self._stages = {name: stages for name, (_, stages, *_) in methods.items()}
         self._told = False
         self._advised: set[tuple[str, float]] = set()
         names = {
@@ -510,7 +511,7 @@ class Model:
         self._stepper(method, "run")(
             self._pointer(at), self._pointer(moving), _number(t, "t"), self._size(h), 0, 1,
             self._pointer(self._inputs(u)), 0, 0, self._ffi.NULL, self._ffi.NULL,
-            self._pointer(self._parameters(params)), status, total,
+            self._pointer(self._parameters(params)), self._ffi.NULL, status, total,
         )  # fmt: skip
         if status[0]:
             said = STATUS[status[0]]
@@ -632,6 +633,7 @@ class Model:
         at_q, at_qd, at_p = self._pointer(q), self._pointer(qd), self._pointer(p)
         at_u = self._pointer(held)
         rows_q, rows_qd = self._pointer(q_rows), self._pointer(qd_rows)
+        memory = self._ffi.new("long[]", getattr(self._lib, f"{method}_memory")())
         done, said = 0, "ok"
         chunk = 1 if law else min(steps, max(1, 4096 // self.nq))
         try:
@@ -646,7 +648,7 @@ class Model:
                 count = min(chunk, steps - done)
                 run(
                     at_q, at_qd, t0, h, done, count, at_u + done * stride if stride else at_u,
-                    stride, every, rows_q + row, rows_qd + row, at_p, status, total,
+                    stride, every, rows_q + row, rows_qd + row, at_p, memory, status, total,
                 )  # fmt: skip
                 done = total[0]
                 if status[0]:
@@ -665,8 +667,11 @@ class Model:
             kept += 1
         t = t0 + h * np.minimum(np.arange(kept) * every, done)
         kept_u = u if law else held
+        counted = getattr(self._lib, f"{method}_evaluations", None)
+        evaluations = counted(memory) if counted else self._stages[method] * done
         return Run(
-            self, t, q_rows[:kept], qd_rows[:kept], h, done, said, p, every, kept_u, method
+            self, t, q_rows[:kept], qd_rows[:kept], h, done, said, p, every, kept_u, method,
+            evaluations,
         )  # fmt: skip
 
     def _table(self, u: Any, steps: int) -> tuple[Callable[..., Any] | None, Array | None, int]:

@@ -127,6 +127,7 @@ _ROUTES = {
     "tree": "Newton and Euler along the tree",
     "composite": "Newton and Euler, D of composite bodies, L D L^T",
     "articulated": "Newton and Euler, articulated bodies",
+    "tensions": "the tensions of links between point masses",
 }
 
 

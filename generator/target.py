@@ -9,7 +9,7 @@ from typing import Any
 
 from eomc import ccode, pieces
 from eomc.assignments import Call, Function, rename
-from eomc.ccode import DOUBLE, Body, Real
+from eomc.ccode import Body, Real
 from eomc.program import TIME, Program
 from eomc.symbols import ALONG
 from eomc.system import System
@@ -114,7 +114,7 @@ class Target:
     @cached_property
     def sincos(self) -> bool:
         """Whether angles are reduced by our own code."""
-        return self.real is DOUBLE and any(
+        return self.real.reach > 0 and any(
             isinstance(a.value, Call) and a.value.function in ("sin", "cos")
             for f in self.program.functions.values()
             for a in f.body

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import _thread
+import platform
 import re
+import shutil
+import subprocess
 import threading
 import time
 from pathlib import Path
@@ -108,11 +111,14 @@ def test_an_instance_that_fails_on_the_way_keeps_its_last_state() -> None:
     assert np.isnan(runs.q[4, rows:]).all() and np.isfinite(runs.q[5]).all()
 
 
-def test_wide_angles_are_reduced_as_in_a_single_run() -> None:
-    m = module("cartpole")
-    q0 = np.array([[0.0, 3e6], [0.0, 1.0]])
+@pytest.mark.parametrize(("real", "wide"), [("double", 3e6), ("float", 3e4)])
+def test_wide_angles_are_reduced_as_in_a_single_run(real: str, wide: float) -> None:
+    m = module("cartpole", real=f'"{real}"')
+    q0 = np.array([[0.0, wide], [0.0, 1.0]])
     runs = m.simulate_batch(q0, steps=5)
-    assert np.array_equal(runs.q[0], m.simulate(q0[0], steps=5).q)
+    assert np.isfinite(runs.q).all()
+    ulp = np.spacing(m.start[0].dtype.type(wide))
+    np.testing.assert_allclose(runs.q[0], m.simulate(q0[0], steps=5).q, rtol=0, atol=5 * ulp)
 
 
 def test_step_batch_in_place_and_into_out() -> None:
@@ -179,6 +185,29 @@ def test_single_precision() -> None:
     exact = module("double_pendulum").simulate_batch(q0, qd0, steps=STEPS)
     error = np.max(np.abs(runs.q - exact.q))
     assert 1e-9 < error < 1e-4  # that of single precision, no more and no less
+
+
+@pytest.mark.skipif(
+    shutil.which("gcc") is None or platform.system() != "Linux" or platform.machine() != "x86_64",
+    reason="asks gcc about AVX2",
+)
+def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
+    """Nothing is wider than a float and nothing is called from a tile's loop."""
+    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
+    file = tmp_path / "cartpole.toml"
+    file.write_text(text.replace("[run]\n", '[run]\nreal = "float"\nbatch = true\n'))
+    for name, content in eomc.sources(eomc.read(file)).files.items():
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    told = subprocess.run(
+        ["gcc", "-std=c99", "-O3", "-mavx2", "-mfma", "-fno-math-errno", "-fno-trapping-math",
+         "-fno-tree-slp-vectorize", "-fopt-info-vec-optimized", "-Wdouble-promotion",
+         "-Wconversion", "-Werror", "-c", "cartpole.c"],
+        cwd=tmp_path, check=True, capture_output=True, text=True,
+    ).stderr  # fmt: skip
+    lines = (tmp_path / "cartpole.c").read_text(encoding="utf-8").splitlines()
+    at = next(k for k, line in enumerate(lines) if "_tile_step(" in line)
+    first = next(k for k, line in enumerate(lines[at:], at + 1) if "for (int i" in line)
+    assert re.search(rf"cartpole\.c:{first}:\d+: optimized: loop vectorized using 32 byte", told)
 
 
 @pytest.mark.parametrize("inputs", [True, False])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import warnings
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,8 @@ def counted(path: Path, method: str, h: float, steps: int) -> tuple[int, list[fl
     name, n = system.name, len(system.coordinates)
     files = eomc.sources(system).files
     source = re.sub(
-        rf"(static (?:inline )?int {name}_solve\([^)]*\)\n{{)", r"long evaluations;\n\1\n    "
-        "evaluations++;", files[f"{name}.c"], count=1,
+        rf"((?:static|[A-Z_]+_INLINE) (?:inline )?int {name}_solve(?:_at)?\([^)]*\)\n{{)",
+        r"long evaluations;\n\1\n    evaluations++;", files[f"{name}.c"], count=1,
     )  # fmt: skip
     assert "evaluations++" in source
     given = "q, qd, 0, " if re.search(rf"{name}_{method}_step\([^)]*\bt,", source) else "q, qd, "
@@ -72,7 +73,7 @@ int main(void)
     {name}_status status;
     for (int i = 0; i < {n}; i++)
         q[i] = {name}_q0[i], qd[i] = {name}_qd0[i];
-    {name}_{method}_run({given}{h!r}, 0, {steps}, 0, NULL, NULL, &{name}_defaults, &status);
+    {name}_{method}_run({given}{h!r}, 0, {steps}, 0, NULL, NULL, &{name}_defaults, NULL, &status);
     printf("%ld %d", evaluations, (int)status);
     for (int i = 0; i < {n}; i++)
         printf(" %.17g %.17g", q[i], qd[i]);
@@ -206,14 +207,17 @@ def test_no_convergence_is_told_and_the_last_state_kept() -> None:
 
 
 def test_runs_are_the_same_however_they_are_cut() -> None:
-    """At multiples of the restart, to the last bit; elsewhere to rounding."""
-    m = eomc.load(variant("kepler_orbit", "gauss_kepler", method=ALL), MODULES)
-    whole = m.simulate(h=0.02, steps=1024)
-    q, qd = m.start
-    for _ in range(4):
-        part = m.simulate(q, qd, h=0.02, steps=256)
-        q, qd = part.q[-1], part.qd[-1]
-    assert np.array_equal(q, whole.q[-1]) and np.array_equal(qd, whole.qd[-1])
+    """To the last bit, also where C is called for one step at a time."""
+    text = Path("scenes/cartpole_driven.toml").read_text(encoding="utf-8")
+    path = Path("build/tests/gauss_cut.toml")
+    path.write_text(text.replace("[run]\n", f"[run]\nmethod = {ALL}\n"), encoding="utf-8")
+    m = eomc.load(path, MODULES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for method in GAUSS:
+            whole = m.simulate(h=0.02, steps=700, u=0.5, method=method)
+            cut = m.simulate(h=0.02, steps=700, u=lambda t, q, qd: 0.5, method=method)
+            assert np.array_equal(whole.q, cut.q) and np.array_equal(whole.qd, cut.qd)
 
 
 @pytest.mark.slow

@@ -38,6 +38,11 @@ def same(run: Any, other: Any) -> bool:
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
+def close(found: Any, expected: Any) -> None:
+    """To the rounding of some hundred steps."""
+    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+
+
 # --- names and constants ---------------------------------------------------------------------
 
 
@@ -314,13 +319,14 @@ def test_rows_are_those_of_every_step(cartpole: ModuleType, steps: int, every: i
 
 @pytest.mark.parametrize("name", ["cartpole", "cartpole_driven", "kapitza_pendulum", "heavy_top"])
 def test_a_run_is_its_steps(modules: Modules, name: str) -> None:
-    """Bit for bit: the loop in C does what `step` does, again and again."""
+    """The loop in C does what `step` does, again and again; its sums lose less to rounding."""
     module = modules(name)
     run = module.simulate(steps=300)
     q, qd = module.start
     for k in range(300):
         q, qd = module.step(q, qd, t=run.t[k])
-        assert np.array_equal([q, qd], [run.q[k + 1], run.qd[k + 1]])
+        close(q, run.q[k + 1])
+        close(qd, run.qd[k + 1])
 
 
 def test_a_run_is_its_steps_under_inputs(driven: ModuleType) -> None:
@@ -329,7 +335,7 @@ def test_a_run_is_its_steps_under_inputs(driven: ModuleType) -> None:
     q, qd = np.array(Q), np.array(QD)
     for k in range(50):
         q, qd = driven.step(q, qd, t=run.t[k], u=table[k], params={"l": 1.5})
-    assert np.array_equal([q, qd], [run.q[-1], run.qd[-1]])
+    close([q, qd], [run.q[-1], run.qd[-1]])
 
 
 def test_a_run_from_a_later_time_is_its_steps(driven: ModuleType) -> None:
@@ -338,18 +344,19 @@ def test_a_run_from_a_later_time_is_its_steps(driven: ModuleType) -> None:
     q, qd = driven.start
     for k in range(200):
         q, qd = driven.step(q, qd, 0.003, t=run.t[k])
-    np.testing.assert_allclose([q, qd], [run.q[-1], run.qd[-1]], rtol=0, atol=1e-15)
+    close([q, qd], [run.q[-1], run.qd[-1]])
 
 
 def test_a_long_run_is_the_same_in_pieces(cartpole: ModuleType) -> None:
-    """The loop looks up now and then; that leaves no trace, nor does a new start half way."""
+    """The loop looks up now and then; that leaves no trace, and a new start half way little."""
     whole = cartpole.simulate(steps=30_000, every=100)
     piece = cartpole.simulate(steps=10_000, every=100)
     rows = [piece.q]
     for _ in range(2):
         piece = cartpole.simulate(piece.q[-1], piece.qd[-1], steps=10_000, every=100)
         rows.append(piece.q[1:])
-    assert np.array_equal(np.vstack(rows), whole.q)
+    np.testing.assert_allclose(np.vstack(rows), whole.q, rtol=0, atol=1e-11)
+    assert np.array_equal(cartpole.simulate(steps=30_000, every=100).q, whole.q)
 
 
 def test_looking_up_leaves_no_trace(driven: ModuleType) -> None:
@@ -364,10 +371,11 @@ def test_looking_up_leaves_no_trace(driven: ModuleType) -> None:
     assert [n for n, _ in seen] == sorted({n for n, _ in seen})
     assert {total for _, total in seen} == {steps}
     assert seen[-1][0] == steps
-    cut = 7 * 5000
-    first = driven.simulate(steps=cut, every=7, u=table[:cut])
-    rest = driven.simulate(first.q[-1], first.qd[-1], steps=steps - cut, every=7, u=table[cut:])
-    assert np.array_equal(run.q, np.vstack([first.q, rest.q[1:]]))
+    values = iter(table)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        one_by_one = driven.simulate(steps=steps, every=7, u=lambda t, q, qd: next(values))
+    assert same(run, one_by_one)
 
 
 def test_an_input_that_is_constant_tabulated_or_called(driven: ModuleType) -> None:
