@@ -8,6 +8,7 @@ ValueError with the name of the argument.
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,6 +34,7 @@ _SAID = {
 }
 _OF_POSITION = ("D", "g", "potential_energy")
 _MANY = 1000  # steps from which a look at the stability limit is worth its time
+_LARGE = 2**28  # bytes from which a look at the memory is worth its time
 _CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
 
 
@@ -190,7 +192,7 @@ class Model:
     ) -> None:  # fmt: skip
         """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
         self._ffi, self._lib = extension.ffi, extension.lib
-        self._ctype = {"float64": "double[]", "float32": "float[]"}[dtype]
+        self._ctype = self._ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype])
         self.name, self.title, self.digest = name, title, digest
         self.dtype = np.dtype(dtype)
         self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
@@ -201,10 +203,12 @@ class Model:
         self.h, self.duration = h, duration
         self._start = tuple(np.array(x, self.dtype) for x in start)
         self._p0 = np.array(list(parameters.values()), self.dtype)
+        self._p0.flags.writeable = False
         self._timed = frozenset(timed)
         self.methods = tuple(methods)
         self.orders = {name: order for name, (order, *_) in methods.items()}
         self.limits = {name: (turn, decay) for name, (_, _, turn, decay) in methods.items()}
+        self._memory = {name: getattr(self._lib, f"{name}_memory")() for name in methods}
         self._stages = {name: stages for name, (_, stages, *_) in methods.items()}
         self._told = False
         self._advised: set[tuple[str, float]] = set()
@@ -229,18 +233,22 @@ class Model:
         return self._ffi.from_buffer(self._ctype, array)
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:
-        try:
-            if np.asarray(value).dtype.kind in "USmM":  # text that looks like a number is none
-                raise TypeError
-            array = np.ascontiguousarray(value, self.dtype)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
+        if type(value) is np.ndarray and value.dtype == self.dtype and value.flags.c_contiguous:
+            array = value
+        else:
+            try:
+                if np.asarray(value).dtype.kind in "USmM":  # text that looks like a number is none
+                    raise TypeError
+                array = np.ascontiguousarray(value, self.dtype)
+            except (TypeError, ValueError):
+                raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
         if array.ndim not in (1, 2) or array.shape[-1] != width:
             raise ValueError(
                 f"{name}: shape {np.shape(value)}, expected ({width},) or (n, {width}): "
                 f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
             )
-        if not np.isfinite(array).all():
+        few = array.ndim == 1 and width <= 16  # then NumPy takes longer than Python
+        if not (all(map(math.isfinite, array.tolist())) if few else np.isfinite(array).all()):
             raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
         return array
 
@@ -582,7 +590,7 @@ class Model:
         t0 = _number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = _count(every, "every", 1)
-        p = self._parameters(params).copy()
+        p = self._p0 if params is None else self._parameters(params).copy()
         if steps >= _MANY and (method, h) not in self._advised:
             self._advised.add((method, h))
             first = self._table(u, steps)[1]
@@ -621,7 +629,8 @@ class Model:
         law, held, stride = self._table(u, steps)
         rows = 1 + steps // every + (steps % every > 0)
         try:
-            if out is None and rows * 2 * self.nq * self.dtype.itemsize > _memory():
+            size = rows * 2 * self.nq * self.dtype.itemsize
+            if size > _LARGE and out is None and size > _memory():
                 raise MemoryError
             q_rows, qd_rows = self._pair(out, (rows, self.nq))
         except MemoryError:
@@ -633,7 +642,7 @@ class Model:
         at_q, at_qd, at_p = self._pointer(q), self._pointer(qd), self._pointer(p)
         at_u = self._pointer(held)
         rows_q, rows_qd = self._pointer(q_rows), self._pointer(qd_rows)
-        memory = self._ffi.new("long[]", getattr(self._lib, f"{method}_memory")())
+        memory = self._ffi.new("long[]", self._memory[method])
         done, said = 0, "ok"
         chunk = 1 if law else min(steps, max(1, 4096 // self.nq))
         try:
@@ -662,15 +671,21 @@ class Model:
         except KeyboardInterrupt:
             done, said = total[0], "interrupted"
         kept = 1 + done // every
+        t = np.arange(0.0, kept * every, every)
+        t *= h
+        if t0:
+            t += t0
         if done % every:
             q_rows[kept], qd_rows[kept] = q, qd
+            t = np.append(t, t0 + h * done)
             kept += 1
-        t = t0 + h * np.minimum(np.arange(kept) * every, done)
+        if kept < rows:
+            q_rows, qd_rows = q_rows[:kept], qd_rows[:kept]
         kept_u = u if law else held
         counted = getattr(self._lib, f"{method}_evaluations", None)
         evaluations = counted(memory) if counted else self._stages[method] * done
         return Run(
-            self, t, q_rows[:kept], qd_rows[:kept], h, done, said, p, every, kept_u, method,
+            self, t, q_rows, qd_rows, h, done, said, p, every, kept_u, method,
             evaluations,
         )  # fmt: skip
 
@@ -720,13 +735,15 @@ def _number(value: Any, name: str) -> float:
         number = float("x" if isinstance(value, (str, bytes)) else value)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: {value!r} is not a number") from None
-    if not np.isfinite(number):
+    if not math.isfinite(number):
         raise ValueError(f"{name}: {value!r} is not a finite number")
     return number
 
 
 def _count(value: Any, name: str, least: int) -> int:
     """A whole number of steps, or a ValueError that names the argument."""
+    if type(value) is int and value >= least:
+        return value
     number = _number(value, name)
     if number != int(number) or number < least:
         raise ValueError(f"{name}: {value!r} is not a whole number of steps, {least} or more")
