@@ -36,12 +36,23 @@ def timed(run: Run, x: Array, h: float, steps: int) -> tuple[float, Array]:
     return time.perf_counter() - begun, last.reshape(len(last), -1)
 
 
-def ours(module: ModuleType) -> Run:
+def ours(module: ModuleType, method: str = "rk4") -> Run:
     def run(x: Array, h: float, steps: int) -> Array:
-        n = len(x) // 2
-        return module.simulate(x[:n], x[n:], h=h, steps=steps, every=steps).x[-1]
+        q, qd = x.reshape(2, -1)
+        return module.simulate(q, qd, h=h, steps=steps, every=steps, method=method).x[-1]
 
     return run
+
+
+def relative(module: ModuleType) -> Run:
+    """Ours of a chain in relative angles; absolute ones come and go."""
+    run = ours(module)
+
+    def absolute(x: Array, h: float, steps: int) -> Array:
+        last = run(np.diff(x.reshape(2, -1), prepend=0.0).ravel(), h, steps)
+        return np.cumsum(last.reshape(2, -1), axis=1).ravel()
+
+    return absolute
 
 
 def ours_batch(module: ModuleType, threads: int = 1) -> Run:
@@ -167,22 +178,5 @@ def by_heyoka(matrices: Matrices, n: int, h: float, fast: bool) -> Run:
             function(now, outputs=then)
             now, then = then, now
         return now
-
-    return run
-
-
-def taylor(matrices: Matrices, n: int, tolerance: float) -> Run:
-    """heyoka's adaptive Taylor integrator; it chooses its own steps."""
-    x = heyoka.make_vars(*[f"x{i}" for i in range(2 * n)])
-    rates = [*x[n:], *physics.acceleration(matrices, list(x), heyoka.sin, heyoka.cos)]
-    integrator = heyoka.taylor_adaptive(
-        list(zip(x, rates, strict=True)), np.zeros(2 * n), tol=tolerance
-    )
-
-    def run(x: Array, h: float, steps: int) -> Array:
-        integrator.time = 0.0
-        integrator.state[:] = x
-        integrator.propagate_until(h * steps)
-        return integrator.state.copy()
 
     return run

@@ -209,6 +209,7 @@ class Model:
         self.orders = {name: order for name, (order, *_) in methods.items()}
         self.limits = {name: (turn, decay) for name, (_, _, turn, decay) in methods.items()}
         self._memory = {name: getattr(self._lib, f"{name}_memory")() for name in methods}
+        self._counters = {n: getattr(self._lib, f"{n}_evaluations", None) for n in methods}
         self._stages = {name: stages for name, (_, stages, *_) in methods.items()}
         self._told = False
         self._advised: set[tuple[str, float]] = set()
@@ -682,7 +683,7 @@ class Model:
         if kept < rows:
             q_rows, qd_rows = q_rows[:kept], qd_rows[:kept]
         kept_u = u if law else held
-        counted = getattr(self._lib, f"{method}_evaluations", None)
+        counted = self._counters[method]
         evaluations = counted(memory) if counted else self._stages[method] * done
         return Run(
             self, t, q_rows, qd_rows, h, done, said, p, every, kept_u, method,
