@@ -12,6 +12,7 @@ from fractions import Fraction
 from math import isfinite
 from typing import Any
 
+import numpy as np
 from sympy import Expr, Rational, S
 
 from eomc import ccode
@@ -287,6 +288,7 @@ def _mode(
         "signal_call": target.signal_call("now", "at", "moving"),
         "call": rates,
         "call_at": lambda angles, time: f", {angles}{rates(time)}",
+        "compensated": True,
         "first": "int good = ",
         "and": "good &= ",
         "last": "return good;",
@@ -430,6 +432,7 @@ def _lane(
             u_arg and f"{u_arg}, int held", c_arg, trouble,
         ),
         "call": rates,
+        "compensated": False,
         "first": "",
         "and": "",
         "last": "",
@@ -627,6 +630,22 @@ def _number(x: Fraction, real: Real) -> str:
     return ccode.number(Rational(x.numerator, x.denominator), real)
 
 
+def _rounded(weights: Row, real: Real) -> Row:
+    """The weights as they are in C, with their sum as it is: what it lacks would add up over steps.
+
+    The smallest one takes what rounding left of the sum; of a symmetric method both of a pair.
+    """
+    rounded = [Fraction(float(x)) for x in np.array([float(x) for x in weights], real.dtype)]
+    lack = Fraction(round(sum(weights, Fraction(0)))) - sum(rounded, Fraction(0))
+    symmetric = weights == weights[::-1] and len(weights) > 1
+    for k in sorted(range(len(rounded)), key=lambda k: abs(rounded[k])):
+        places = {k, len(rounded) - 1 - k} if symmetric else {k}
+        wished = rounded[k] + lack / len(places)
+        if rounded[k] and Fraction(float(np.array(float(wished), real.dtype))) == wished:
+            return tuple(wished if n in places else x for n, x in enumerate(rounded))
+    return tuple(rounded)
+
+
 def _about(m: Method) -> dict[str, Any]:
     """What a method's template says of it."""
     undamped, decay = m.limits
@@ -674,7 +693,10 @@ def _explicit(m: Method, real: Real, turned: Sequence[Angle]) -> dict[str, Any]:
         "begin_at": "r, qd" if first else "q, qd",
         "begin_time": time(first) if first else "t",
         "body": [{"lines": lines(c, *rows), "time": time(c)} for c, *rows in stages],
-        "end": [f"r->$ = h*qd->$ + hh*({total(m.b_a)});", f"v->$ = h*({total(m.b)});"],
+        "end": [
+            f"r->$ = h*qd->$ + hh*({total(m.b_a)});",
+            f"v->$ = h*({total(_rounded(m.b, real))});",
+        ],
     }
 
 
@@ -702,7 +724,7 @@ def _implicit(
         return arguments("m", "h", at, moving, t and time, u, p)
 
     last = [" + ".join(f"{_number(x, real)}*a[{j}][#]" for j, x in enumerate(row))
-            for row in (m.b_a, m.b)]  # fmt: skip
+            for row in (m.b_a, _rounded(m.b, real))]  # fmt: skip
     return _about(m) | {
         "template": "gauss.c.jinja",
         "arguments": arguments(scalar["stepper_arguments"], own_p and target.p_arg, memory),

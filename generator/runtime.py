@@ -12,6 +12,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from time import perf_counter
 from typing import Any
 
@@ -64,15 +65,20 @@ class Run:
     """
 
     def __init__(
-        self, model: Model, t: Array, q: Array, qd: Array, h: float, steps: int, status: str,
+        self, model: Model, t0: float, q: Array, qd: Array, h: float, steps: int, status: str,
         params: Array, every: int, u: Any, method: str, evaluations: int,
     ) -> None:  # fmt: skip
-        self.t, self.q, self.qd = t, q, qd
+        self.t0, self.q, self.qd = t0, q, qd
         self.h, self.steps, self.status = h, steps, status
         self.every, self.method, self.evaluations = every, method, evaluations
         self.error: Estimate | None = None
         self._model, self._params, self._u = model, params, u
         self._energy: Array | None = None
+
+    @cached_property
+    def t(self) -> Array:
+        """The times of the rows, (n,), s."""
+        return self.t0 + self.h * np.minimum(self.every * np.arange(len(self.q)), self.steps)
 
     @property
     def energy(self) -> Array:
@@ -119,7 +125,7 @@ class Run:
         elif u is not None and np.ndim(u) == 2:
             u = np.repeat(u[: self.steps], parts, axis=0)
         return model._trajectory(
-            x[: model.nq].copy(), x[model.nq :].copy(), self.h / parts, self.steps * parts, every,
+            x[: model.nq], x[model.nq :], self.h / parts, self.steps * parts, every,
             u, self._params, self.method, float(self.t[0]), None, progress,
         )  # fmt: skip
 
@@ -139,7 +145,7 @@ class Run:
         )
 
     def __len__(self) -> int:
-        return len(self.t)
+        return len(self.q)
 
     def __repr__(self) -> str:
         return f"<Run of {self._model.name}: {self.message}>"
@@ -204,11 +210,13 @@ class Model:
         self._start = tuple(np.array(x, self.dtype) for x in start)
         self._p0 = np.array(list(parameters.values()), self.dtype)
         self._p0.flags.writeable = False
+        self._at_p0 = self._pointer(self._p0)
         self._timed = frozenset(timed)
         self.methods = tuple(methods)
         self.orders = {name: order for name, (order, *_) in methods.items()}
         self.limits = {name: (turn, decay) for name, (_, _, turn, decay) in methods.items()}
         self._memory = {name: getattr(self._lib, f"{name}_memory")() for name in methods}
+        self._runs = {name: getattr(self._lib, f"{name}_run") for name in methods}
         self._counters = {n: getattr(self._lib, f"{n}_evaluations", None) for n in methods}
         self._stages = {name: stages for name, (_, stages, *_) in methods.items()}
         self._told = False
@@ -580,11 +588,8 @@ class Model:
         """
         self._stepper(method, "run")
         method = method or self.methods[0]
-        q, qd = self.start
-        if q0 is not None:
-            q = self._array(q0, "q0", self.nq).copy()
-        if qd0 is not None:
-            qd = self._array(qd0, "qd0", self.nq).copy()
+        q = self._start[0] if q0 is None else self._array(q0, "q0", self.nq)
+        qd = self._start[1] if qd0 is None else self._array(qd0, "qd0", self.nq)
         if q.shape != (self.nq,) or qd.shape != (self.nq,):
             raise ValueError(f"q0, qd0: expected one state, ({self.nq},)")
         h = self._size(h)
@@ -625,24 +630,34 @@ class Model:
         self, q: Array, qd: Array, h: float, steps: int, every: int, u: Any, p: Array, method: str,
         t0: float, out: tuple[Array, Array] | None, progress: Callable[[int, int], None] | None,
     ) -> Run:  # fmt: skip
-        """A run from checked arguments, whatever its status; q and qd are moved along."""
-        run = getattr(self._lib, f"{method}_run")
+        """A run from checked arguments, whatever its status."""
+        run = self._runs[method]
         law, held, stride = self._table(u, steps)
         rows = 1 + steps // every + (steps % every > 0)
         try:
             size = rows * 2 * self.nq * self.dtype.itemsize
             if size > _LARGE and out is None and size > _memory():
                 raise MemoryError
-            q_rows, qd_rows = self._pair(out, (rows, self.nq))
+            # one array for both, and behind the rows the state that moves
+            both = np.empty((2, 1 if out else rows + 1, self.nq), self.dtype)
         except MemoryError:
             raise MemoryError(
                 f"{rows} rows of {2 * self.nq} numbers don't fit in memory: keep fewer with every="
             ) from None
+        base, width = self._pointer(both), both[0].size
+        if out is None:
+            q_rows, qd_rows = both[0, :-1], both[1, :-1]
+            rows_q, rows_qd = base, base + width
+        else:
+            q_rows, qd_rows = self._pair(out, (rows, self.nq))
+            rows_q, rows_qd = self._pointer(q_rows), self._pointer(qd_rows)
         q_rows[0], qd_rows[0] = q, qd
+        both[0, -1], both[1, -1] = q, qd
+        q, qd = both[0, -1], both[1, -1]
         status, total = self._ffi.new("int *"), self._ffi.new("long *")
-        at_q, at_qd, at_p = self._pointer(q), self._pointer(qd), self._pointer(p)
+        at_q, at_qd = base + (width - self.nq), base + (2 * width - self.nq)
+        at_p = self._at_p0 if p is self._p0 else self._pointer(p)
         at_u = self._pointer(held)
-        rows_q, rows_qd = self._pointer(q_rows), self._pointer(qd_rows)
         memory = self._ffi.new("long[]", self._memory[method])
         done, said = 0, "ok"
         chunk = 1 if law else min(steps, max(1, 4096 // self.nq))
@@ -666,19 +681,14 @@ class Model:
                     break
                 if progress is not None:
                     progress(done, steps)
-                if not law:
+                if not law and done < steps:
                     spent = perf_counter() - begun
                     chunk = int(count * min(16.0, max(0.25, _CHUNK_SECONDS / (spent + 1e-9)))) + 1
         except KeyboardInterrupt:
             done, said = total[0], "interrupted"
         kept = 1 + done // every
-        t = np.arange(0.0, kept * every, every)
-        t *= h
-        if t0:
-            t += t0
         if done % every:
             q_rows[kept], qd_rows[kept] = q, qd
-            t = np.append(t, t0 + h * done)
             kept += 1
         if kept < rows:
             q_rows, qd_rows = q_rows[:kept], qd_rows[:kept]
@@ -686,7 +696,7 @@ class Model:
         counted = self._counters[method]
         evaluations = counted(memory) if counted else self._stages[method] * done
         return Run(
-            self, t, q_rows, qd_rows, h, done, said, p, every, kept_u, method,
+            self, t0, q_rows, qd_rows, h, done, said, p, every, kept_u, method,
             evaluations,
         )  # fmt: skip
 

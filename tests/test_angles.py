@@ -1,0 +1,211 @@
+"""Sines that are turned from stage to stage, sums that are compensated, runs that are cut."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from types import ModuleType
+
+import mpmath
+import numpy as np
+import pytest
+from conftest import ROOT, needs
+from sympy import Rational, S
+
+import eomc
+from cases import SCENES
+from eomc import mechanics, program, scene, system
+from eomc.angles import apart
+from eomc.steppers import METHODS
+
+ODD = """
+eomc = 1
+name = "odd"
+[coordinates]
+a = { start = 0.4 }
+b = { start = -0.7 }
+[parameters]
+phase = 0.3
+[energy]
+kinetic = "a_dot**2/2 + b_dot**2/2 + a_dot*b_dot*cos(a - b)/3"
+potential = "cos(2*a) + sin(b + 1/2) + cos(a + phase)/2 + sin(a*b)/4 + cos(a - b)/5"
+"""
+
+
+def odd() -> program.Program:
+    return program.build(mechanics.derive(system.from_scene(scene.parse(ODD, "odd.toml"))))
+
+
+def stepped(module: ModuleType, h: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """RK4 as a textbook has it, over the module's accelerations."""
+    q, v = module.start
+    a = module.acceleration
+    for _ in range(steps):
+        k1, w1 = v, a(q, v)
+        k2, w2 = v + h / 2 * w1, a(q + h / 2 * k1, v + h / 2 * w1)
+        k3, w3 = v + h / 2 * w2, a(q + h / 2 * k2, v + h / 2 * w2)
+        k4, w4 = v + h * w3, a(q + h * k3, v + h * w3)
+        q, v = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), v + h / 6 * (w1 + 2 * w2 + 2 * w3 + w4)
+    return q, v
+
+
+def test_angles_that_are_linear_in_coordinates_are_found() -> None:
+    made = odd()
+    angles, rest = apart(made["acceleration"], ["a", "b"])
+    found = {(frozenset(angle.terms), angle.offset) for angle in angles}
+    half = Rational(1, 2)
+    one, two = S.One, S(2)
+    differences = [frozenset({(one, "a"), (-one, "b")}), frozenset({(-one, "a"), (one, "b")})]
+    assert (frozenset({(two, "a")}), S.Zero) in found
+    assert (frozenset({(one, "b")}), half) in found
+    assert any((d, S.Zero) in found for d in differences)
+    assert len(found) == 3  # a + phase and a*b are computed where they are needed
+    assert {name for a in angles for name in (a.sine, a.cosine)} & rest.uses
+    names = {a.name for a in rest.body}
+    assert not names & {name for a in angles for name in (a.sine, a.cosine)}
+
+
+@pytest.mark.parametrize("h", [0.001, 0.02, 0.3])
+def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path) -> None:
+    """Turns of some 1e-6, 1e-4 and, beyond what is turned, 1e-1."""
+    (tmp_path / "odd.toml").write_text(ODD, encoding="utf-8")
+    for path in (tmp_path / "odd.toml", SCENES / "cartpole.toml", SCENES / "double_pendulum.toml"):
+        module = eomc.load(path, tmp_path)
+        run = module.simulate(h=h, steps=20)
+        for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, 20), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_wide_angle_goes_to_libm(tmp_path: Path) -> None:
+    """Two million turns on it is the same motion, but for what rounding leaves of the angle."""
+    module = eomc.load(SCENES / "simple_pendulum.toml", tmp_path)
+    q, qd = module.start
+    there = module.simulate(q + 2e6 * 2 * np.pi, qd, h=0.01, steps=200)
+    here = module.simulate(q, qd, h=0.01, steps=200)
+    apart = there.q[-1] - 2e6 * 2 * np.pi - here.q[-1]
+    assert np.abs(apart).max() < 1e-7
+
+
+def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
+    """near.h in units of rounding of 1, from exact sines, up to its bound and beyond."""
+    compiler = needs("gcc")
+    headers = [(ROOT / "csrc" / f).read_text(encoding="utf-8") for f in ("sincos.h", "near.h")]
+    main = r"""
+    #include <stdio.h>
+    int main(void)
+    {
+        double x, d, s0, c0, s, c;
+
+        while (scanf("%lf %lf %lf %lf", &x, &d, &s0, &c0) == 4) {
+            eomc_sincos_near(x, d, s0, c0, &s, &c);
+            printf("%.17g %.17g\n", s, c);
+        }
+        return 0;
+    }
+    """
+    (tmp_path / "near.c").write_text("\n".join([*headers, main]), encoding="utf-8")
+    subprocess.run(
+        [compiler, "-std=c99", "-O2", "near.c", "-o", "near", "-lm"], cwd=tmp_path, check=True
+    )
+    random = np.random.default_rng(8)
+    at = random.uniform(-10, 10, 4000)
+    turns = random.choice([-1, 1], 4000) * 2.0 ** random.uniform(-40, -4, 4000)
+    turns[:4] = 0.0, 2.0**-6, -(2.0**-6), 2.0**-6 * (1 + 2.0**-52)
+    x = at + turns
+    with mpmath.workdps(40):
+        lines, exact = [], []
+        for now, turn in zip(x, turns, strict=True):
+            begin = mpmath.mpf(now) - mpmath.mpf(turn)
+            s0, c0 = float(mpmath.sin(begin)), float(mpmath.cos(begin))
+            lines.append(
+                f"{now!r} {turn!r} {s0!r} {c0!r}".replace("np.float64(", "").replace(")", "")
+            )
+            exact.append((mpmath.sin(now), mpmath.cos(now)))
+        done = subprocess.run(
+            ["./near"], cwd=tmp_path, input="\n".join(lines), capture_output=True, text=True,
+            check=True,
+        )  # fmt: skip
+        found = [tuple(map(float, line.split())) for line in done.stdout.splitlines()]
+        worst = max(
+            abs(mpmath.mpf(a) - b)
+            for pair, sure in zip(found, exact, strict=True)
+            for a, b in zip(pair, sure, strict=True)
+        )
+    assert 2.0**-55 < worst < 1.5 * 2.0**-53  # what s0 or c0 bring is up to a half of 2^-53
+
+
+@pytest.mark.parametrize(("method", "power"), [("rk4", 20), ("dp8", 18), ("gauss8", 15)])
+def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
+    """A step of an oscillator is a linear map R(h J): its power in 40 digits is the answer.
+
+    With plain sums 1e-13 and more, and nearly as much with weights as they are rounded.
+    """
+    text = (SCENES / "mass_spring.toml").read_text(encoding="utf-8")
+    names = '["rk4", "dp8", "gauss8"]'
+    (tmp_path / "mass_spring.toml").write_text(
+        text.replace("[run]\n", f"[run]\nmethod = {names}\n"), encoding="utf-8"
+    )
+    module = eomc.load(tmp_path / "mass_spring.toml", tmp_path)
+    (x,), (v,) = module.start
+    m, h, steps = METHODS[method], 2.0 ** (10 - power), 2**power
+    with mpmath.workdps(50):
+        hj = mpmath.matrix([[0, 1], [-4, 0]]) * mpmath.mpf(h)
+        s, one = m.stages, mpmath.eye(2)
+        a = [[mpmath.mpf(c.numerator) / c.denominator for c in row] for row in m.a]
+        b = [mpmath.mpf(c.numerator) / c.denominator for c in m.b]
+        big, ones = mpmath.eye(2 * s), mpmath.zeros(2 * s, 2)
+        for i in range(s):
+            for k, c in enumerate(a[i]):
+                big[2 * i : 2 * i + 2, 2 * k : 2 * k + 2] -= c * hj
+            ones[2 * i : 2 * i + 2, :] = one
+        stages = big**-1 * ones
+        step = one + sum((b[i] * hj * stages[2 * i : 2 * i + 2, :] for i in range(s)), 0 * one)
+        exact = step**steps * mpmath.matrix([x, v])
+        run = module.simulate(
+            h=h, steps=steps, every=steps, params={"k": 4.0, "m": 1.0}, method=method
+        )
+        off = [abs(mpmath.mpf(float(a)) - b) for a, b in zip(run.x[-1], exact, strict=True)]
+    fma = "fma" in Path("/proc/cpuinfo").read_text(encoding="utf-8")  # for what h/6 lacks
+    assert max(off) < (5e-15 if fma or method != "rk4" else 2e-13)
+
+
+def test_a_run_cut_in_c_is_the_same_to_the_last_bit(tmp_path: Path) -> None:
+    """With the memory handed on; without it, sums begin anew."""
+    for name, text in eomc.sources(eomc.read(SCENES / "cartpole.toml")).files.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    (tmp_path / "cut.c").write_text(
+        r"""
+        #include "cartpole.h"
+        #include <stdio.h>
+
+        int main(void)
+        {
+            for (int way = 0; way < 3; way++) {
+                double q[2] = { 0.0, 1.5 }, qd[2] = { 0.0, 0.0 };
+                cartpole_rk4_memory memory;
+                cartpole_status status;
+                long part[3] = { 2000, 0, 0 };
+
+                if (way > 0)
+                    part[0] = 1, part[1] = 700, part[2] = 1299;
+                memory.warm = 0;
+                for (long k = 0, n = 0; k < 3; n += part[k++])
+                    cartpole_rk4_run(q, qd, 0.01, n, part[k], 0, 0, 0, &cartpole_defaults,
+                        way < 2 ? &memory : 0, &status);
+                printf("%.17g %.17g %.17g %.17g\n", q[0], q[1], qd[0], qd[1]);
+            }
+            return 0;
+        }
+        """,
+        encoding="utf-8",
+    )
+    subprocess.run(
+        [needs("gcc"), "-std=c99", "-O2", "cut.c", "cartpole.c", "-o", "cut", "-lm"],
+        cwd=tmp_path, check=True,
+    )  # fmt: skip
+    done = subprocess.run(["./cut"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    whole, cut, forgotten = done.stdout.splitlines()
+    assert whole == cut
+    assert whole != forgotten
+    near = [np.array(line.split(), float) for line in (whole, forgotten)]
+    np.testing.assert_allclose(*near, rtol=0, atol=1e-12)
