@@ -1,6 +1,6 @@
 # make demo    set up, build and check the cart-pole scenes, run one, draw it
 # make test    set up, run the quick tests
-# make bench   against numba, CasADi, heyoka and a NumPy loop; writes benchmarks/RESULTS.md
+# make bench   against others (an environment of 2.6 GB, a C++ compiler); writes benchmarks/RESULTS.md, DIGITS.md
 # make test-all, make test-slow, make lint, make golden, make clean
 
 PYTHON ?= python3
@@ -46,6 +46,7 @@ golden: .venv/dev
 bench: build/bench/done
 	build/bench/bin/python benchmarks/loop.py
 	build/bench/bin/python benchmarks/peers.py
+	build/bench/bin/python benchmarks/digits.py
 
 build/bench/done: pyproject.toml benchmarks/requirements.txt
 	$(PYTHON) -m venv build/bench

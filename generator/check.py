@@ -46,6 +46,14 @@ NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
 
+# An advised h is held against runs of SPAN times its length, in steps of these parts of it. The
+# limit is that of the motion as it is linear at one place, and the motion goes on from there.
+FINE, PARTS, SPAN = 1 / 64, (1 / 8, 1 / 4, 1 / 2, 1, 2), 8
+BLOWN = 1e3  # times what a difference grows by in fine steps: unstable
+OFF = 0.1  # of the motion: the end of a stable run with steps as long as its limit is no answer
+PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
+AHEAD = 2000  # steps of the scene's h in which these lie
+
 
 @dataclass(frozen=True)
 class _Effort:
@@ -415,6 +423,9 @@ class _Check:
                 self.smooth_row(
                     "power balance", CLOSING_LIMIT, "order at which it closes", self.closing
                 )
+                for method in self.methods:
+                    if math.isfinite(min(METHODS[method].limits)):
+                        self.advice_row(method)
         else:
             self.row("states", 1, "states with a regular D", lambda: 0.0, least=True)
         kind = "Taylor arithmetic" if self.large else "equations written out"
@@ -441,6 +452,16 @@ class _Check:
         elif not row.passed and self.corners and not math.isnan(row.error):
             note = f"{unit}; not to be expected with {self.corners}"
             self.rows[-1] = replace(row, passed=True, unit=note)
+
+    def advice_row(self, method: str) -> None:
+        """At which part of the advised h a run is lost: not at a quarter of it, but at twice it."""
+        unit = "of the advised h, where runs are lost"
+        self.row(f"h of {method}", PARTS[0], unit, partial(self.advised, method), least=True)
+        row = self.rows[-1]
+        if math.isinf(row.error):
+            self.rows[-1] = replace(row, unit="no limit to test: " + self.untested)
+        elif not row.passed and self.corners and not math.isnan(row.error):
+            self.rows[-1] = replace(row, passed=True, unit=f"{unit}; no matter with {self.corners}")
 
     @cached_property
     def corners(self) -> str:
@@ -697,6 +718,84 @@ class _Check:
             if not gaps[-1] <= 1e3 * EPS * energy:
                 return math.log2(gaps[0] / gaps[-1]) / 2
         return math.inf
+
+    def advised(self, method: str) -> float:
+        """The least of PARTS of the advised h with which a run is lost; nan where none is.
+
+        From where the start of the motion allows the shortest h. Lost: it stops, or a difference
+        grows BLOWN times as much as in fine steps, or, in steps longer than advised, it ends OFF.
+        inf where there is nothing to test.
+        """
+        self.untested = "for forces of positions alone"
+        if method == "euler" and self._velocities_matter():
+            return math.inf
+        self.untested = "no mode turns or decays"
+        longest = self._longest(method, self.stiff, 1e3 * self.system.run.duration)
+        if math.isinf(longest):
+            return math.inf
+        fine, grown = self._ends(method, longest, FINE)
+        self.untested = "the motion does not go on"
+        if not math.isfinite(grown):
+            return math.inf
+        for part in PARTS:
+            end, growth = self._ends(method, longest, part)
+            wrong = part > 1 and not float(np.max(np.abs(end - fine))) <= OFF
+            if wrong or not growth <= BLOWN * max(1.0, grown):
+                return part
+        return math.nan
+
+    @cached_property
+    def stiff(self) -> State:
+        """Where, along the start of the motion, the shortest h is advised."""
+        start, run = self.expected[0].state, self.system.run
+        method = next(m for m in self.methods if math.isfinite(min(METHODS[m].limits)))
+        steps = min(AHEAD, math.ceil(run.duration / run.h))
+        every = max(1, steps * max(1, len(start.q) // 8) // PLACES)
+        found, longest = start, 1e3 * run.duration
+        for s in _rows(self._simulate(start, method, steps=steps, every=every), start):
+            if (here := self._longest(method, s, longest)) < longest:
+                found, longest = s, here
+        return found
+
+    def _longest(self, method: str, s: State, most: float) -> float:
+        """The longest h that the module does not advise against at a state, to 5 %; inf: `most`."""
+        low = most
+        while self._warns(method, s, low):
+            low /= 2
+        if low == most:
+            return math.inf
+        high = 2 * low
+        while high > 1.05 * low:
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if self._warns(method, s, middle) else (middle, high)
+        return high
+
+    def _velocities_matter(self) -> bool:
+        """Whether accelerations hang on velocities."""
+        s = self.expected[-1].state
+        still = replace(s, qd=0 * s.qd)
+        one, other = (_ask(self.module, "acceleration", x) for x in (s, still))
+        return not np.array_equal(one, other)
+
+    def _warns(self, method: str, s: State, h: float) -> bool:
+        """Whether the module advises against h at a state."""
+        told = self.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
+        return told is not None
+
+    def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
+        """The end of a run over SPAN times `longest`, scaled, and the growth of a difference."""
+        s = self.stiff
+        spread = np.array([self.sampler.spread, self.sampler.speed])
+        signs = np.random.default_rng(1).choice([-1.0, 1.0], spread.shape)
+        steps, ends = round(SPAN / part), []
+        for by in (0.0, NUDGE):
+            q, qd = np.array([s.q, s.qd]) + by * signs * spread
+            how = {"h": part * longest, "steps": steps, "every": steps, "t0": s.t}
+            run = self._simulate(replace(s, q=q, qd=qd), method, **how)
+            if run.status != "ok":
+                return np.full(spread.shape, math.inf), math.inf
+            ends.append(np.array([run.q[-1], run.qd[-1]]) / spread)
+        return ends[0], float(np.max(np.abs(ends[1] - ends[0]))) / NUDGE
 
     def _usual(self) -> Sequence[_Expected]:
         """Some states with the scene's own parameters and away from its start."""

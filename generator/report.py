@@ -55,8 +55,7 @@ class Point:
     """One run: N steps of h. Errors are relative; inf where it did not get to the end.
 
     q, qd, end: of the last state, positions and velocities apart and together; along: the largest
-    at any row; energy: likewise, energies: over time. evaluations: of accelerations, None where
-    the module does not count an iteration's.
+    at any row; energy: likewise, energies: over time. evaluations: of accelerations.
     """
 
     method: str
@@ -70,7 +69,7 @@ class Point:
     energy: float
     energies: Vector
     seconds: float
-    evaluations: int | None
+    evaluations: int
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,10 @@ class Line:
 
     observed: the order, nan where too few errors are clear of rounding. stable: the largest h
     measured that kept its error below 1 and so did all finer ones; advised: the one that
-    eigenvalues allow, inf for any. rounding: h from which on finer steps don't help, or nan.
+    eigenvalues allow, inf for any. Up to it a small difference does not grow by the method's
+    doing (`check` tests that), but errors add up over the whole motion: stable is 0.4 to 0.8 of
+    it for regular motions, a tenth or less where differences grow or the fast part is short.
+    rounding: h from which on finer steps don't help, or nan.
     """
 
     method: str
@@ -149,10 +151,10 @@ class Report:
                 f"{what}: out of reach here; the most is {-math.log10(p.along):.1f} digits, by "
                 f"{p.method} with h = {_time(p.h)}, {_time(p.seconds)} of computing"
             )
-        counted = "" if found.evaluations is None else f", {found.evaluations} evaluations"
         return (
             f"{what}: {found.method} with h = {_time(found.h)} "
-            f"({self.duration:g} s/{found.steps}), {_time(found.seconds)} of computing{counted}"
+            f"({self.duration:g} s/{found.steps}), {_time(found.seconds)} of computing, "
+            f"{found.evaluations} evaluations"
         )
 
     def recommendations(self) -> list[str]:
@@ -211,7 +213,7 @@ class Report:
 
         title = f"{self.scene}: up to t = {self.duration:g} s, against {self.digits:.0f} digits"
         table = Table(box=SIMPLE_HEAD, title=title, title_justify="left")
-        for head in ("stepper", "order", "observed", "stable h", "advised", "smallest error",
+        for head in ("stepper", "order", "observed", "usable h", "advised", "smallest error",
                      "at h", "computing", "rounding from"):  # fmt: skip
             table.add_column(head, justify="left" if head == "stepper" else "right")
         for row in self.rows():
@@ -400,9 +402,10 @@ def _line(
     clear = [
         math.log2(a / b) for a, b in pairwise(errors) if a < 0.01 and b > 300 * floor > 0 and b < a
     ]
-    settled = finest + 2 <= len(points) - 1 or (
-        finest < len(points) - 1 and floor < 1e-9 and errors[-1] > ROUNDED * floor
-    )
+    # the first that no finer step makes much better, and how many were tried
+    knee = next((k for k, e in enumerate(errors) if ROUNDED * e <= floor), finest)
+    tried = len(points) - 1 - knee
+    settled = math.isfinite(floor) and (tried > 1 or (tried == 1 and floor < 1e-9))
     stable = math.nan
     for p in reversed(points):
         if not p.along < LOST:
@@ -415,7 +418,7 @@ def _line(
         observed=statistics.median(clear) if clear else math.nan,
         stable=stable,
         advised=advised,
-        rounding=points[finest].h if settled else math.nan,
+        rounding=points[knee].h if settled else math.nan,
     )
 
 
@@ -451,9 +454,6 @@ def _point(module: ModuleType, against: _Against, name: str, duration: float, st
         spent.append(time.perf_counter() - begun)
         if sum(spent) > 0.5:
             break
-    counted = getattr(timed, "evaluations", None)
-    if counted is None and not METHODS[name].implicit:
-        counted = timed.steps * METHODS[name].stages
 
     def known(x: float) -> float:
         return x if math.isfinite(x) else math.inf
@@ -461,7 +461,7 @@ def _point(module: ModuleType, against: _Against, name: str, duration: float, st
     return Point(
         method=name, h=h, steps=steps, status=run.status, q=known(q), qd=known(qd),
         end=known(max(q, qd)), along=known(along), energy=known(energy), energies=energies,
-        seconds=statistics.median(spent), evaluations=counted,
+        seconds=statistics.median(spent), evaluations=timed.evaluations,
     )  # fmt: skip
 
 
@@ -583,7 +583,7 @@ def page(report: Report) -> str:
         (
             p.method, _time(p.h), str(p.steps), p.status, _figure(p.q, "{:.1e}"),
             _figure(p.qd, "{:.1e}"), _figure(p.along, "{:.1e}"), _figure(p.energy, "{:.1e}"),
-            "-" if p.evaluations is None else str(p.evaluations), _time(p.seconds),
+            str(p.evaluations), _time(p.seconds),
             _time(p.seconds / report.duration),
         )
         for p in report.points

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
+from conftest import Modules
 
 from cases import scene_system
 from eomc import check as checking
@@ -68,6 +70,9 @@ class StandIn:
         self, q: Any, qd: Any, t: float = 0.0, u: Any = None, params: Any = None
     ) -> Any:
         return self.reference.acceleration(q, qd, t, u, params)
+
+    def advice(self, q: Any, qd: Any, h: float, **how: Any) -> None:
+        return None
 
     def step(
         self, q: Any, qd: Any, *, h: float, t: float = 0.0, u: Any = None, params: Any = None
@@ -324,3 +329,34 @@ def test_the_same_seed_gives_the_same_report() -> None:
     first, second = (check(scene_system("cartpole"), module, states=4) for _ in range(2))
     assert first == second
     assert first != check(scene_system("cartpole"), module, states=4, seed=1)
+
+
+class Advising:
+    """A compiled module that advises for steps `by` times as long as they are."""
+
+    def __init__(self, module: Any, by: float) -> None:
+        self.module, self.by = module, by
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.module, name)
+
+    def advice(self, q: Any, qd: Any, h: float, **how: Any) -> str | None:
+        told: str | None = self.module.advice(q, qd, h * self.by, **how)
+        return told
+
+
+@pytest.mark.parametrize("name", ["cartpole", "mass_spring"])
+def test_advice_on_h_is_held_against_runs(modules: Modules, name: str) -> None:
+    """Right within a factor of eight one way, and of two the other."""
+    for by, good in ((1.0, True), (1 / 16, False), (16.0, False)):
+        report = check(scene_system(name), Advising(modules(name), by), states=4)
+        (row,) = (r for r in report.rows if r.name == "h of rk4")
+        assert row.passed == good, report.table()
+        assert failed(report) == (set() if good else {"h of rk4"})
+        assert not good or row.error in (0.25, 0.5, 1, 2)
+
+
+def test_where_no_mode_turns_there_is_no_h_to_test() -> None:
+    report = check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)
+    (row,) = (r for r in report.rows if r.name == "h of rk4")
+    assert row.passed and math.isinf(row.error) and row.unit.startswith("no limit to test")
