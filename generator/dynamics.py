@@ -6,10 +6,11 @@ pieces that are called, its state in arrays, and in a batch each piece is a loop
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from math import isfinite
+from math import isfinite, sqrt
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "large": large,
         "prepare_arguments": arguments(f"{P}_prepared *c" if takes_c else "", target.p_arg),
         "prepare_call": arguments("&prepared" if takes_c else "", target.p_call),
+        "prepare_unread": target.needs_p and not _reads_p(prepare),
         "p_unused": target.needs_p and not prepare["has_prepare"] and not takes_p,
         "takes_c": takes_c,
         "cost": sentence(function),
@@ -200,6 +202,11 @@ def _prepare_large(target: Target, function: Function) -> dict[str, Any]:
         "prepare_sets": cut["calls"],
         "prepare_result": cut["outcome"],
     }
+
+
+def _reads_p(prepare: Mapping[str, Any]) -> bool:
+    lines = [*prepare["prepare_early"], *prepare["prepare_sets"], prepare["prepare_result"]]
+    return any(re.search(r"\bp\b", line) for line in lines)
 
 
 def _with_signal(target: Target, kept: list[str]) -> list[str]:
@@ -635,6 +642,8 @@ def _rounded(weights: Row, real: Real) -> Row:
 
     The smallest one takes what rounding left of the sum; of a symmetric method both of a pair.
     """
+    if not real.dtype:  # 113 bits, for references
+        return weights
     rounded = [Fraction(float(x)) for x in np.array([float(x) for x in weights], real.dtype)]
     lack = Fraction(round(sum(weights, Fraction(0)))) - sum(rounded, Fraction(0))
     symmetric = weights == weights[::-1] and len(weights) > 1
@@ -706,7 +715,7 @@ def _implicit(
     """An implicit method as its template wants it, for one trajectory."""
     real, P, s = target.real, target.prefix, m.stages
     t, u = ("t" if target.driven else ""), ("u" if target.system.inputs else "")
-    p = "p" if slopes["takes_p"] else ""
+    p = "p" if slopes["takes_p"] or (slopes["signal_near"] and target.needs_p) else ""
     memory = f"{P}_{m.name}_memory *m"
     own_p = p if "_params *p" not in scalar["stepper_arguments"] else ""
     given = arguments(
@@ -734,6 +743,7 @@ def _implicit(
         "factor_now": now("at_now", "moving_now", "t"),
         "factor_mid": now("mid_q", "mid_qd", f"t + {_number(Fraction(1, 2), real)}*h"),
         "eps": repr(real.epsilon) + real.suffix,
+        "nudge": repr(sqrt(real.epsilon)) + real.suffix,
         "c": [_number(x, real) for x in m.c],
         "A": matrix(m.a),
         "AA": matrix(m.a_squared),

@@ -291,6 +291,9 @@ def linearization(target: Target) -> dict[str, Any] | None:
         "unread": [name for name in there if name not in used],
         "takes_p": "p" in used,
         "signal_call": target.signal_call("now", "q", "qd"),
+        "signal_near": target.signal_call("near_u", "near_q", "near_qd")
+        if target.signal_state
+        else "",
         "binding": f"{P}_linearization("
         + arguments(
             *(f"{n} + {NQ}*{w}*k" for n, w, _ in parts), f"q + {NQ}*k", f"qd + {NQ}*k",
