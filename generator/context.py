@@ -215,7 +215,7 @@ def _face(target: Target) -> dict[str, Any]:
         ),
         "face_functions": [
             "C", "D", "acceleration", "advice", "bias", "energy", "g", "jacobi", "kinetic_energy",
-            "linearize", "potential_energy", "power", "rhs", "signal", "simulate",
+            "linearize", "potential_energy", "power", "rhs", "sensitivity", "signal", "simulate",
             *(["simulate_batch"] if s.run.batch else []), "step",
             *(["step_batch"] if s.run.batch else []), "tau",
         ],

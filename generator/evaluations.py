@@ -17,7 +17,7 @@ class Kind:
     """What is known of a function before it is looked at: results, arguments, meaning."""
 
     out: str
-    shape: str  # "", "n", "n*n" or "m"
+    shape: str  # "", "n", "n*n", "n*p" or "m"
     qd: bool
     u: bool
     doc: str
@@ -42,6 +42,13 @@ KINDS: Mapping[str, Kind] = {
         True,
         True,
         "Power into the system, W: d(energy)/dt, or d(jacobi)/dt if there is one.",
+    ),
+    "sensitivity": Kind(
+        "E",
+        "n*p",
+        True,
+        True,
+        "E = dqdd/dp at held inputs, nq rows, a column for each parameter in its order.",
     ),
     "signal": Kind("u", "m", True, False, "u: the scene's own signals for the inputs."),
 }
@@ -73,7 +80,8 @@ def _function(target: Target, name: str) -> dict[str, Any]:
     assert function is not None
     by_columns = name not in target.program
     real, NQ, NU = target.real.name, f"{target.PREFIX}_NQ", f"{target.PREFIX}_NU"
-    size = {"n*n": f"{NQ}*{NQ}", "n": NQ, "m": NU}.get(kind.shape, "")
+    np = len(s.parameters)
+    size = {"n*n": f"{NQ}*{NQ}", "n*p": f"{NQ}*{np}", "n": NQ, "m": NU}.get(kind.shape, "")
     takes_u = kind.u and bool(s.inputs)
     takes_q = name != "signal" or target.signal_state
     timed = takes_t(target, name)

@@ -68,7 +68,7 @@ class _Run(_Table):
     method: _Methods = ("rk4",)
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
-    linearize: pydantic.StrictBool = False
+    linearize: pydantic.StrictBool | Literal["parameters"] = False
 
 
 def _spelled_out(value: object) -> object:

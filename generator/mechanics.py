@@ -191,10 +191,27 @@ def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> 
     entries are `directions`. Raises SceneError where the accelerations jump.
     """
     entries = directions(system)
+    if len(entries) * len(tape.live(accelerations)) > WRITTEN_OUT:
+        return (_slopes(system, tape, accelerations, [entries])[0],)
+    columns = _slopes(system, tape, accelerations, [{x: S.One} for x in entries])
+    return tuple(zip(*columns, strict=True))
+
+
+def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
+    """da/dp at held inputs, (nq, np), of accelerations a on the tape. Raises as linearization."""
+    entries = [{p.symbol: S.One} for p in system.parameters]
+    return tuple(zip(*_slopes(system, tape, accelerations, entries), strict=True))
+
+
+def _slopes(
+    system: System,
+    tape: Tape,
+    accelerations: Sequence[Expr],
+    along: Sequence[Mapping[Symbol, Expr]],
+) -> list[Vector]:
+    """The derivatives of accelerations along each of some directions."""
     try:
-        if len(entries) * len(tape.live(accelerations)) > WRITTEN_OUT:
-            return (tuple(tape.forward(accelerations, entries)),)
-        columns = [tape.forward(accelerations, {x: S.One}) for x in entries]
+        return [tuple(tape.forward(accelerations, entries)) for entries in along]
     except RoughError:
         message = (
             "the accelerations jump (sign or heaviside of a coordinate or velocity), so they have "
@@ -202,7 +219,6 @@ def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> 
             "implicit methods"
         )
         raise SceneError([system.problem("run", message)]) from None
-    return tuple(zip(*columns, strict=True))
 
 
 def _column(system: System, tape: Tape, recursion: Recursion, at: Mapping[Symbol, int]) -> Rows:

@@ -83,6 +83,11 @@ def build(equations: Mapping[str, Equations]) -> Program:
     if run.linearize or any(METHODS[name].implicit for name in run.methods):
         made = _linearization(first.system, routes[best.route])
         functions[made.name] = replace(made, route=best.route)
+    if run.linearize == "parameters" and first.system.parameters:
+        taken = routes[best.route]
+        rows = mechanics.sensitivity(first.system, taken.tape, taken.outputs)
+        made = lower("sensitivity", taken.tape, [x for row in rows for x in row], (), ())
+        functions["sensitivity"] = replace(made, route=best.route)
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     passed_over = {way: why for e in equations.values() for way, why in e.passed_over.items()}

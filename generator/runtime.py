@@ -497,6 +497,25 @@ class Model:
         A[n:, :n], A[n:, n:], B[n:] = A_q, A_qd, B_u
         return A, B
 
+    def sensitivity(
+        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Parameters = None
+    ) -> Array:
+        """dqdd/dp at a state, (nq, np), parameters in their order; exact derivatives, u held.
+
+        Raises MotionError where a derivative is not finite, ValueError where the module lacks them.
+        """
+        if not hasattr(self._lib, "sensitivity"):
+            raise ValueError(
+                f"sensitivity: {self.name} was built without it: a scene with parameters asks with "
+                '[run] linearize = "parameters"'
+            )
+        shape = (self.nq, len(self.parameters))
+        E: Array = self._evaluate("sensitivity", shape, q, qd, t, u, params, None)
+        if not np.isfinite(E).all():
+            where = _state_text(np.asarray(q), np.asarray(qd))
+            raise MotionError(f"at {where}: a derivative is not finite there", "not finite")
+        return E
+
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
         n, state = self.nq, np.asarray(x, self.dtype)

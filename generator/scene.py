@@ -74,7 +74,7 @@ class Run:
 
     methods: the steppers wanted, the one that runs use first. real: the C type that everything
     is computed in. batch: whether many trajectories at once are wanted. linearize: whether the
-    derivatives of the accelerations are.
+    derivatives of the accelerations are, "parameters" for those by parameters too.
     """
 
     h: float = 0.001
@@ -82,7 +82,7 @@ class Run:
     methods: tuple[str, ...] = ("rk4",)
     real: str = "double"
     batch: bool = False
-    linearize: bool = False
+    linearize: bool | str = False
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,7 @@ class System:
         methods: Sequence[str] = ("rk4",),
         real: str = "double",
         batch: bool = False,
-        linearize: bool = False,
+        linearize: bool | str = False,
     ) -> System:
         r"""A system from SymPy expressions.
 

@@ -119,3 +119,27 @@ def test_jumping_forces_are_refused() -> None:
     path.write_text(f'{text}\n[forces]\n{q} = "-sign({q}_dot)"\n', encoding="utf-8")
     with pytest.raises(eomc.SceneError, match="accelerations jump"):
         eomc.sources(eomc.read(path))
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cartpole_driven", "heavy_top", "chain"])
+def test_derivatives_by_parameters(name: str, tmp_path: Path) -> None:
+    """Against central differences, whose own error is that of h^2 and of rounding over h."""
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    head, _, tail = text.partition("[run]\n")
+    path = tmp_path / f"{name}.toml"
+    path.write_text(f'{head}[run]\nlinearize = "parameters"\n{tail}', encoding="utf-8")
+    m = eomc.load(path, tmp_path)
+    random = np.random.default_rng(3)
+    q, qd = random.uniform(0.3, 1.0, (2, len(m.coordinates)))
+    u = random.standard_normal(len(m.inputs)) if m.inputs else None
+    E = m.sensitivity(q, qd, u)
+    assert E.shape == (len(q), len(m.parameters))
+    for k, (p, value) in enumerate(m.defaults.items()):
+        by = 1e-5 * max(1.0, abs(value))
+        up, down = (m.acceleration(q, qd, u=u, params={p: value + s * by}) for s in (1, -1))
+        size = max(1.0, np.abs(E).max())
+        np.testing.assert_allclose(E[:, k], (up - down) / (2 * by), rtol=1e-6, atol=1e-7 * size)
+    assert np.abs(E).max() > 0
+    plain = eomc.load(SCENES / f"{name}.toml", tmp_path / "plain")
+    with pytest.raises(ValueError, match='linearize = "parameters"'):
+        plain.sensitivity(q, qd, u)
