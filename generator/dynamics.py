@@ -26,6 +26,7 @@ from eomc.steppers import METHODS, RK4, Method, Row
 from eomc.target import TROUBLE, Access, Argument, Target, after, arguments, none_of, sentence
 
 NEAR = 16_384  # bytes that a tile of a small system may have: half a first-level cache
+MANY_ANGLES = 5  # of which sines are computed side by side in a step of one trajectory
 WIDE = 131_072  # and of a large one: a part of a second-level cache
 
 
@@ -138,9 +139,22 @@ def _angles(target: Target, turned: Sequence[Angle]) -> dict[str, Any] | None:
         where = {name: f"{vector}{name}" for _, name in angle.terms}
         return ccode.Printer(P, target.real, where).value(Sum(angle.terms, offset))[0]
 
-    P, members = target.prefix, _sines(turned)
+    P, members, n = target.prefix, _sines(turned), len(turned)
+    ends = ("", "q"), ("N + ", "end")
     return {
         "members": members,
+        "count": n,
+        "many": n >= MANY_ANGLES,
+        "gathered": [
+            f"x[{at}{k}] = {along(a, of + '->', a.offset)};"
+            for at, of in ends
+            for k, a in enumerate(turned)
+        ],
+        "scattered": [
+            f"{to}->{a.sine} = sines[{at}{k}], {to}->{a.cosine} = cosines[{at}{k}];"
+            for (at, _), to in zip(ends, ("s", "s_end"), strict=True)
+            for k, a in enumerate(turned)
+        ],
         "at": [
             f"{P}_sincos({along(a, 'q->', a.offset)}, &s->{a.sine}, &s->{a.cosine});"
             for a in turned

@@ -69,7 +69,16 @@ def test_angles_that_are_linear_in_coordinates_are_found() -> None:
 def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path) -> None:
     """Turns of some 1e-6, 1e-4 and, beyond what is turned, 1e-1."""
     (tmp_path / "odd.toml").write_text(ODD, encoding="utf-8")
-    for path in (tmp_path / "odd.toml", SCENES / "cartpole.toml", SCENES / "double_pendulum.toml"):
+    links = range(1, 7)
+    coordinates = "".join(f"a{k} = {{ start = {0.3 * k} }}\n" for k in links)
+    energy = " + ".join(f"{k}*a{k}_dot**2/2" for k in links)
+    springs = " + ".join(f"cos(a{k} - a{k + 1})" for k in links[:-1])
+    many = f'eomc = 1\nname = "many"\n[coordinates]\n{coordinates}[energy]\n'
+    many += f'kinetic = "{energy} + a1_dot*a2_dot*sin(a1)/5"\npotential = "{springs}"\n'
+    (tmp_path / "many.toml").write_text(many, encoding="utf-8")
+    assert "_angles_both(" in eomc.sources(eomc.read(tmp_path / "many.toml")).files["many.c"]
+    own = (tmp_path / "odd.toml", tmp_path / "many.toml")
+    for path in (*own, SCENES / "cartpole.toml", SCENES / "double_pendulum.toml"):
         module = eomc.load(path, tmp_path)
         run = module.simulate(h=h, steps=20)
         for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, 20), strict=True):
