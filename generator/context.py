@@ -76,9 +76,10 @@ def values(target: Target) -> dict[str, Any]:
         "has_u": bool(s.inputs),
         "has_p": target.needs_p,
         "batch": s.run.batch,
-        "csrc": _csrc(target, bool(moved["angles"])),
+        "csrc": _csrc(target, bool(moved["angles"]), moved["lanes_turn"]),
         "slopes": slopes,
         "in_pieces": moved["large"]
+        or s.run.batch
         or any(f["in_pieces"] for f in evaluations)
         or bool(slopes and slopes["inner"]["pieces"]),
         **moved,
@@ -231,11 +232,12 @@ def _face(target: Target) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _csrc(target: Target, near: bool) -> list[str]:
+def _csrc(target: Target, near: bool, turn: bool) -> list[str]:
     """The hand-written C that this scene needs, under its own prefix."""
     files = [
         *([f"sincos{target.real.function_suffix}.h"] if target.sincos else []),
         *(["near.h"] if near else []),
+        *([f"turn{target.real.function_suffix}.h"] if turn else []),
     ]
     texts = [resource("csrc", file).replace("#include <math.h>\n", "") for file in files]
     return [

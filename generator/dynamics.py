@@ -7,7 +7,7 @@ pieces that are called, its state in arrays, and in a batch each piece is a loop
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from math import isfinite, sqrt
@@ -23,9 +23,18 @@ from eomc.ccode import DOUBLE, Body, Real, indent
 from eomc.pieces import is_large, staged
 from eomc.program import TIME
 from eomc.steppers import METHODS, RK4, Method, Row
-from eomc.target import TROUBLE, Access, Argument, Target, after, arguments, none_of, sentence
+from eomc.target import (
+    TROUBLE,
+    Access,
+    Argument,
+    Target,
+    after,
+    arguments,
+    none_of,
+    sentence,
+)
 
-NEAR = 16_384  # bytes that a tile of a small system may have: half a first-level cache
+NEAR = 32_768  # bytes that a tile of a small system may have: a first-level cache
 MANY_ANGLES = 5  # of which sines are computed side by side in a step of one trajectory
 WIDE = 131_072  # and of a large one: a part of a second-level cache
 
@@ -48,7 +57,12 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
     rows = f"long every, {real} *q_rows, {real} *qd_rows"
     t0_arg = f"{real} t0" if t else ""
     lane = _lane(target, function, prepare, scalar) if s.run.batch else None
-    crossing = len(lane["pieces"]["members"]) if lane and lane["pieces"] else 0
+    methods = [
+        _implicit(target, METHODS[name], slopes, scalar, large)
+        if slopes is not None and METHODS[name].implicit
+        else _explicit(METHODS[name], target.real, turned, lane)
+        for name in s.run.methods
+    ]
     return prepare | {
         "large": large,
         "prepare_arguments": arguments(f"{P}_prepared *c" if takes_c else "", target.p_arg),
@@ -59,14 +73,11 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "cost": sentence(function),
         "scalar": scalar,
         "lane": lane,
+        "lanes_turn": bool(lane and lane["angles"]),
         "rates_now": f"{P}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
         "stepper_call": after(t, "h", u, c, p),
-        "methods": [
-            _implicit(target, METHODS[name], slopes, scalar, large)
-            if slopes is not None and METHODS[name].implicit
-            else _explicit(METHODS[name], target.real, turned)
-            for name in s.run.methods
-        ],
+        "methods": methods,
+        "tile_rates": any(m.get("by_rates") for m in methods),
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
         "angles": _angles(target, turned),
         "fabs": "fabs" + target.real.function_suffix,
@@ -93,7 +104,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
             f"{rows}, long row_count", target.p_arg and f"{target.p_arg}, long p_instance",
             "long *done", "int *status",
         ) + ")",
-        "tile": _tile(target, len(kept), crossing, large),
+        "tile": _tile(target, len(kept), lane) if lane else 0,
         "input_names": target.input_names,
         "sincos": f"{P}_sincos{target.real.function_suffix}" if target.sincos else "",
         "reach": target.literal(target.real.reach),
@@ -135,10 +146,6 @@ def _angles(target: Target, turned: Sequence[Angle]) -> dict[str, Any] | None:
     if not turned:
         return None
 
-    def along(angle: Angle, vector: str, offset: Expr) -> str:
-        where = {name: f"{vector}{name}" for _, name in angle.terms}
-        return ccode.Printer(P, target.real, where).value(Sum(angle.terms, offset))[0]
-
     P, members, n = target.prefix, _sines(turned), len(turned)
     ends = ("", "q"), ("N + ", "end")
     return {
@@ -146,7 +153,7 @@ def _angles(target: Target, turned: Sequence[Angle]) -> dict[str, Any] | None:
         "count": n,
         "many": n >= MANY_ANGLES,
         "gathered": [
-            f"x[{at}{k}] = {along(a, of + '->', a.offset)};"
+            f"x[{at}{k}] = {_along(target, a, of + '->', a.offset)};"
             for at, of in ends
             for k, a in enumerate(turned)
         ],
@@ -156,12 +163,13 @@ def _angles(target: Target, turned: Sequence[Angle]) -> dict[str, Any] | None:
             for k, a in enumerate(turned)
         ],
         "at": [
-            f"{P}_sincos({along(a, 'q->', a.offset)}, &s->{a.sine}, &s->{a.cosine});"
+            f"{P}_sincos({_along(target, a, 'q->', a.offset)}, &s->{a.sine}, &s->{a.cosine});"
             for a in turned
         ],
         "near": [
-            f"{P}_sincos_near({along(a, 'q->', a.offset)}, {along(a, 'd->', S.Zero)}, "
-            f"from->{a.sine}, from->{a.cosine}, &s->{a.sine}, &s->{a.cosine});"
+            f"{P}_sincos_near({_along(target, a, 'q->', a.offset)}, "
+            f"{_along(target, a, 'd->', S.Zero)}, from->{a.sine}, "
+            f"from->{a.cosine}, &s->{a.sine}, &s->{a.cosine});"
             for a in turned
         ],
     }
@@ -411,94 +419,264 @@ def _lane(
 ) -> dict[str, Any]:
     """The same for a batch: no branches; what goes wrong is noted in trouble.
 
-    Small: for one instance, inlined into the loop over a tile. Large: for a whole tile, each piece
-    such a loop.
+    Accelerations and steppers of a whole tile. Large: each piece is a loop over it. Small: what one
+    instance needs is inlined into such loops, one for every stage of a step.
     """
     s, real, P = target.system, target.real.name, target.prefix
-    large, held, timed = "body" not in prepare, bool(s.inputs), TIME in function.uses
+    large, held = "body" not in prepare, bool(s.inputs)
+    timed = TIME in function.uses
     kept = prepare["prepared_members"]
-    takes_c = bool(kept)
-    vector, lanes = ("lanes", "_lanes") if large else ("vector", "")
-    restrict = f"{target.PREFIX}_ALONE " if large else ""
-    trouble = f"{real} *{restrict}troubles" if large else f"{real} *trouble"
-    u_arg = f"const {P}_inputs{lanes} *u" if held else ""
-    c_arg = f"const {P}_prepared{lanes} *c" if takes_c else ""
+    alone = f"{target.PREFIX}_ALONE "
+    troubles = f"{real} *{alone}troubles"
+    u_arg = f"const {P}_inputs_lanes *u" if held else ""
+    c_arg = f"const {P}_prepared_lanes *c" if kept else ""
     t_arg = f"{real} t" if target.driven else ""
-    state = f"const {P}_{vector} *q, const {P}_{vector} *qd"
-    c = "c" if takes_c else ""
-    trouble_call = "troubles" if large else "trouble"
+    state = f"const {P}_lanes *q, const {P}_lanes *qd"
+    c = "c" if kept else ""
 
     def rates(time: str) -> str:
         if held:
-            return after(time if target.driven else "", "u", "held", c, trouble_call)
-        return after(time if timed else "", c, trouble_call)
+            return after(time if target.driven else "", "u", "held", c, "troubles")
+        return after(time if timed else "", c, "troubles")
 
     made = dict(mode) | {
-        "head": "static void" if large else f"{target.PREFIX}_LANE void",
+        "head": "static void" if large else f"{target.PREFIX}_PIECE void",
         "inline": f"{target.PREFIX}_{'INLINE' if large else 'LANE'}",
-        "vector": f"{P}_{vector}",
+        "vector": f"{P}_lanes",
         "solve": "solve_lane",
-        "rates": "rates_lane" if held else "solve_lane",
+        "rates": ("rates_lane" if held else "solve_lane") if large else "rates_tile",
         "suffix": "_lane",
         "solve_arguments": arguments(
-            f"{P}_{vector} *a", state, f"{real} t" if timed else "", u_arg, c_arg, trouble
+            f"{P}_lanes *a", state, f"{real} t" if timed else "", u_arg, c_arg, troubles
         ),
-        "solve_u": after("t" if timed else "", "held ? u : &now", c, trouble_call),
+        "solve_u": after("t" if timed else "", "held ? u : &now", c, "troubles"),
         "rates_arguments": arguments(
-            f"{P}_{vector} *a", state, t_arg, u_arg, "int held", c_arg, trouble
+            f"{P}_lanes *{'' if large else alone}a", state, t_arg, u_arg,
+            "int held" if held else "", c_arg, troubles,
         ),
-        "inputs": f"{P}_inputs{lanes}",
+        "inputs": f"{P}_inputs_lanes",
         "stepper_arguments": arguments(
-            f"{P}_{vector} *r, {P}_{vector} *v, {state}", t_arg, f"{real} h",
-            u_arg and f"{u_arg}, int held", c_arg, trouble,
+            f"{P}_lanes *r, {P}_lanes *v" if large else f"{P}_lanes *{alone}r, {P}_lanes *{alone}v",
+            state, t_arg, f"{real} h", u_arg and f"{u_arg}, int held", c_arg, troubles,
+        ),
+        "stepper_call": lambda troubles: after(
+            "t" if target.driven else "", "h", "&s->u, held" if held else "",
+            "&s->c" if kept else "", troubles,
         ),
         "call": rates,
         "compensated": False,
         "first": "",
         "and": "",
         "last": "",
-        "own_signal": _signal_lanes(target, kept, c_arg, trouble)
-        if large
-        else _signal_lane(target, kept, state, c_arg, trouble),
+        "each": lambda lines, width=4: indent(_each_of_tile(target, lines), width),
+        "flag": "long long" if real == "double" else "int",  # as wide as a real
+        "angles": None,
+        "one": None,
+        "pieces": None,
+        "own_signal": _signal_lanes(target, kept, c_arg, troubles) if large else None,
     }  # fmt: skip
     if not large:
-        return made | _lane_small(target, function, kept, made)
+        return made | _lane_small(target, function, kept)
     return made | _lane_large(target, function, kept, made)
 
 
-def _lane_small(
-    target: Target, function: Function, kept: Sequence[str], made: Mapping[str, Any]
-) -> dict[str, Any]:
-    s, P = target.system, target.prefix
+def _each_of_tile(target: Target, lines: Sequence[str]) -> list[str]:
+    """Statements for every coordinate of every instance."""
+    inside = [line.replace("$", "x[j][i]") for line in lines]
+    return _loop("j", f"{target.PREFIX}_NQ", _loop("i", f"{target.PREFIX}_TILE", inside))
+
+
+def _lane_small(target: Target, function: Function, kept: Sequence[str]) -> dict[str, Any]:
+    """Accelerations of one instance, and how loops over a tile call them."""
+    s, real, P = target.system, target.real, target.prefix
+    held, timed = bool(s.inputs), TIME in function.uses
+    reach = real.reach and "rk4" in s.run.methods
+    turned, rest = apart(function, target.names) if reach else ((), function)
     own = [p.name for p in s.parameters]
-    body = target.body(function, keep=_in_prepared, parameters=own, lane=True)
-    one = f"1.0{target.real.suffix}"
+    where = {name: f"s->{name}" for name in _sines(turned)}
+    body = target.body(rest, where, keep=_in_prepared, parameters=own, lane=True)
+    u_arg = f"const {P}_inputs *u" if held else ""
+    c_arg = f"const {P}_prepared *c" if kept else ""
+    s_arg, s_call = (f"const {P}_angles *s", "s") if turned else ("", "")
+    t_arg, t = (f"{real.name} t", "t") if timed else ("", "")
+    state = f"const {P}_vector *q, const {P}_vector *qd"
+    trouble, c = f"{real.name} *trouble", "c" if kept else ""
+    at = [target.enum[n] for n in target.names]
 
     def in_struct(array: str, name: str) -> str:
         return f"{array}->{name}"
 
-    def one_of(what: str, name: str, elements: Iterable[str]) -> str:
-        return f"const {P}_{what} {name} = {{ {', '.join(elements)} }};"
+    def call(angles: str, time: str, hold: str, troubles: str) -> str:
+        now = time if (target.driven if held else timed) else ""
+        return after(
+            angles if turned else "", now, f"&given, {hold}" if held else "",
+            "&here" if kept else "", f"&{troubles}[i]",
+        )  # fmt: skip
 
-    at = [target.enum[n] for n in target.names]
-    given = [target.enum[n] for n in target.input_names]
-    return {
-        "unused": [
-            *_unread(target, function), *([] if body.failures or body.sincos else ["trouble"])
-        ],
-        "loads": target.loads(function, in_struct, in_struct),
-        "blocks": body.blocks,
-        "end": [f"*trouble = {x} ? {one} : *trouble;" for x in body.failures],
-        "from_tile": [
-            one_of("vector", "q", (f"s->q.x[{k}][i]" for k in at)),
-            one_of("vector", "qd", (f"s->qd.x[{k}][i]" for k in at)),
-            *([one_of("inputs", "u", (f"s->u.x[{k}][i]" for k in given))] if s.inputs else []),
-            *([one_of("prepared", "c", (f"s->c.{n}[i]" for n in kept))] if kept else []),
-        ],
-        "stepper_call": after(
-            "t" if target.driven else "", "h", "&u, held" if s.inputs else "",
-            "&c" if kept else "", "&trouble",
+    one = {
+        "head": f"{target.PREFIX}_LANE void",
+        "solve": "solve_lane",
+        "rates": "rates_lane" if held else "solve_lane",
+        "each": lambda lines, width=4: indent(_each(target, False, lines), width),
+        "solve_arguments": arguments(
+            f"{P}_vector *a", state, s_arg, t_arg, u_arg, c_arg, trouble
         ),
+        "solve_u": after(s_call, t, "held ? u : &now", c, "trouble"),
+        "rates_arguments": arguments(
+            f"{P}_vector *a", state, s_arg, f"{real.name} t" if target.driven else "", u_arg,
+            "int held", c_arg, trouble,
+        ),
+        "inputs": f"{P}_inputs",
+        "own_signal": _signal_lane(target, kept, state, c_arg, trouble),
+        "unused": [
+            *_unread(target, rest), *([] if body.failures or body.sincos else ["trouble"])
+        ],
+        "loads": target.loads(rest, in_struct, in_struct),
+        "blocks": body.blocks,
+        "results": [
+            f"a->{name} = {r};" for name, r in zip(target.names, body.results, strict=True)
+        ],
+        "end": [f"*trouble = {x} ? 1.0{real.suffix} : *trouble;" for x in body.failures],
+    }  # fmt: skip
+    return {
+        "one": one,
+        "angles": _angles_lane(target, turned),
+        "odd": [
+            f"const {real.name} sum = "
+            + " + ".join(f"{x}.{n}" for n in target.names for x in ("q", "qd"))
+            + ";",
+            f"odd |= !((sum - sum) + s->trouble[i] + {'far' if turned else 's->idle'}[i] < 1);",
+        ],
+        "sum": " + ".join(f"{x}.x[{k}][i]" for k in at for x in "rv"),
+        "rates_given": [
+            *_of_instance(target, "at", "vector", "q->x[#][i]", target.names),
+            *_of_instance(target, "moving", "vector", "qd->x[#][i]", target.names),
+            *_given(target, kept, "u->", "c->"),
+        ],
+        "rates_call": call("&s", "t", "held", "troubles"),
+        "rates_held": lambda hold: arguments(
+            "a, q, qd", "t" if target.driven else "", "u", hold, c, "troubles"
+        ),
+        "stages": _stages(target, turned, _given(target, kept, "s->u.", "s->c."), call),
+    }
+
+
+def _of_instance(
+    target: Target, name: str, struct: str, element: str, members: Sequence[str]
+) -> list[str]:
+    """A struct of one instance's numbers; # in `element` is the place of each."""
+    inside = ", ".join(element.replace("#", target.enum[n]) for n in members)
+    return [f"const {target.prefix}_{struct} {name} = {{ {inside} }};"]
+
+
+def _given(target: Target, kept: Sequence[str], u: str, c: str) -> list[str]:
+    """The inputs and the prepared values of one instance."""
+    lines = []
+    if target.system.inputs:
+        lines += _of_instance(target, "given", "inputs", f"{u}x[#][i]", target.input_names)
+    if kept:
+        inside = ", ".join(f"{c}{n}[i]" for n in kept)
+        lines.append(f"const {target.prefix}_prepared here = {{ {inside} }};")
+    return lines
+
+
+def _angles_lane(target: Target, turned: Sequence[Angle]) -> dict[str, Any] | None:
+    """The sines and cosines of an instance: at a place, on both sides of it, a little further."""
+    if not turned:
+        return None
+    P, f = target.prefix, target.real.function_suffix
+
+    def both(struct: str, angle: Angle) -> str:
+        return f"&{struct}->{angle.sine}, &{struct}->{angle.cosine}"
+
+    return {
+        "members": _sines(turned),
+        "at": [
+            f"{P}_sincos{f}_lane({_along(target, a, 'q->', a.offset)}, {both('s', a)}, trouble);"
+            for a in turned
+        ],
+        "around": [
+            f"{P}_sincos_around{f}({_along(target, a, 'q->', a.offset)}, "
+            f"{_along(target, a, 'd->', S.Zero)}, "
+            f"{both('back', a)}, {both('s', a)}, {both('on', a)}, far);"
+            for a in turned
+        ],
+        "turned": [
+            f"{P}_turn{f}({_along(target, a, 'd->', S.Zero)}, from->{a.sine}, from->{a.cosine}, "
+            f"{both('s', a)});"
+            for a in turned
+        ],
+        "far": [f"*far = {P}_far{f}({_along(target, a, 'd->', S.Zero)}, *far);" for a in turned],
+    }
+
+
+def _along(target: Target, angle: Angle, vector: str, offset: Expr) -> str:
+    """An angle of a vector of coordinates."""
+    where = {name: f"{vector}{name}" for _, name in angle.terms}
+    printer = ccode.Printer(target.prefix, target.real, where)
+    return printer.value(Sum(angle.terms, offset))[0]
+
+
+def _stages(
+    target: Target,
+    turned: Sequence[Angle],
+    given: Sequence[str],
+    call: Callable[[str, str, str, str], str],
+) -> dict[str, Any]:
+    """The stages of RK4 as loops over a tile: how each has its place, and what it leaves."""
+    P, real, members = target.prefix, target.real.name, _sines(turned)
+    t_arg, t = (f"{real} t", "t") if target.driven else ("", "")
+    u_arg = "int held" if target.system.inputs else ""
+    q, qd, two = "s->q.x[#][i]", "s->qd.x[#][i]", target.literal(2.0)
+    a1, a2, a3, a4 = (f"a{k}.x[#][i]" for k in (1, 2, 3, 4))
+    plans = [
+        ("back", "t", [f"at.$ = {q};", f"moving.$ = {qd};"], ""),
+        ("mid", "t + h_2", [f"at.$ = {q} + h_2*{qd};", f"moving.$ = {qd} + h_2*{a1};"], ""),
+        (
+            "mid", "t + h_2",
+            [f"at.$ = ({q} + h_2*{qd}) + hh_4*{a1};", f"moving.$ = {qd} + h_2*{a2};"],
+            f"d.$ = hh_4*{a1};",
+        ),
+        (
+            "on", "t + h",
+            [f"at.$ = ({q} + h*{qd}) + hh_2*{a2};", f"moving.$ = {qd} + h*{a3};"],
+            f"d.$ = hh_2*{a2};",
+        ),
+    ]  # fmt: skip
+    loops = []
+    for k, (near, time, lines, d) in enumerate(plans, 1):
+        from_near = ", ".join(f"{near}.{n}[i]" for n in members)
+        loops.append(
+            {
+                "given": given,
+                "angles": [
+                    f"const {P}_angles s_near = {{ {from_near} }};",
+                    *([f"{P}_angles s_at;", f"{P}_vector d;"] if d else []),
+                ],
+                "lines": lines + ([d] if d and turned else []),
+                "turned": [f"{P}_angles_turned(&s_at, &d, &s_near);"] if d else [],
+                "call": call("&s_at" if d else "&s_near", time, "held", "s->trouble"),
+                "ends": [f"a{k}.x[#][i] = a.$;"],
+                "looks_ahead": turned and k == 2,
+            }
+        )
+    far_arg, far = (f"{real} *far", "far") if turned else ("", "")
+    return {
+        "prototype": f"{target.PREFIX}_LANE int {P}_rk4_stages("
+        + arguments(
+            f"{P}_lanes *r, {P}_lanes *v", far_arg, f"{P}_tile *s", t_arg, f"{real} h", u_arg
+        ) + ")",
+        "around": [f"{x}.{n}[i] = s_{x}.{n};" for x in ("back", "mid", "on") for n in members],
+        "loops": loops,
+        "ahead": [[plans[2][3]], [plans[3][3]]],
+        "ends": [
+            f"q.$ = {q} + (h*{qd} + hh_6*({a1} + ({a2} + {a3})));",
+            f"qd.$ = {qd} + h_6*(({a1} + {a4}) + {two}*({a2} + {a3}));",
+            "r->x[#][i] = q.$;",
+            "v->x[#][i] = qd.$;",
+        ],
+        "call": lambda hold: f"{P}_rk4_stages("
+        + arguments("&r, &v", far, "s", t, "h", hold) + ")",
     }  # fmt: skip
 
 
@@ -517,12 +695,6 @@ def _lane_large(
         {n: f"c->{n}[i]" for n in kept},
         lane=True,
     )
-    tile = f"{target.PREFIX}_TILE"
-
-    def each(lines: Sequence[str], width: int = 4) -> str:
-        inside = [line.replace("$", "x[j][i]") for line in lines]
-        return indent(_loop("j", f"{target.PREFIX}_NQ", _loop("i", tile, inside)), width)
-
     return {
         "pieces": cut,
         "unused": [*made["unused"], *(["troubles"] if not cut["troubled"] else [])],
@@ -530,12 +702,7 @@ def _lane_large(
         "blocks": [],
         "results": cut["calls"],
         "end": [],
-        "each": each,
-        "stepper_call": after(
-            "t" if target.driven else "", "h", "&s->u, held" if s.inputs else "",
-            "&s->c" if kept else "", "s->trouble",
-        ),
-    }  # fmt: skip
+    }
 
 
 def _in_lanes(target: Target) -> Access:
@@ -635,13 +802,21 @@ def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
     )  # fmt: skip
 
 
-def _tile(target: Target, kept: int, crossing: int, large: bool) -> int:
-    """Instances side by side: 64, fewer where what belongs to them would not stay near."""
-    numbers = 2 * len(target.system.q) + len(target.system.u) + kept + 2
-    if large:
-        numbers += crossing + 6 * len(target.system.q)
-    near = WIDE if large else NEAR
-    return max(8, min(64, 1 << (near // (8 * numbers)).bit_length() - 1))
+def _tile(target: Target, kept: int, lane: Mapping[str, Any]) -> int:
+    """Instances side by side: as many as stay near with what belongs to them.
+
+    Small: eight vectors of 32 bytes at most, since more brought nothing.
+    """
+    s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
+    numbers = 2 * n + len(s.u) + kept + 2
+    if lane["pieces"]:
+        most, near, size = 64, WIDE, 8
+        numbers += len(lane["pieces"]["members"]) + 6 * n
+    else:
+        most, near = 256 // size, NEAR
+        numbers += (2 + max(METHODS[name].stages for name in s.run.methods)) * n
+        numbers += 1 + 3 * len(lane["angles"]["members"]) if lane["angles"] else 1
+    return max(8, min(most, 1 << (near // (size * numbers)).bit_length() - 1))
 
 
 # --- steppers -------------------------------------------------------------------------------------
@@ -686,7 +861,9 @@ def _about(m: Method) -> dict[str, Any]:
     }
 
 
-def _explicit(m: Method, real: Real, turned: Sequence[Angle]) -> dict[str, Any]:
+def _explicit(
+    m: Method, real: Real, turned: Sequence[Angle], lane: Mapping[str, Any] | None
+) -> dict[str, Any]:
     """An explicit method as its template wants it; RK4 has one of its own, written out by hand."""
 
     def total(row: Row) -> str:
@@ -708,7 +885,10 @@ def _explicit(m: Method, real: Real, turned: Sequence[Angle]) -> dict[str, Any]:
     first, half = m.c[0], _number(m.c[0], real)
     angles = m is RK4 and bool(turned)
     lane_template = "rk4.c.jinja" if m is RK4 else "explicit.c.jinja"
+    by_stages = m is RK4 and bool(lane and lane["one"])
     return _about(m) | {
+        "by_stages": by_stages,
+        "by_rates": not by_stages or bool(lane and lane["angles"]),
         "angles": angles,
         "template": "rk4_angles.c.jinja" if angles else lane_template,
         "lane_template": lane_template,

@@ -70,6 +70,41 @@ def test_place_and_threads_change_no_bit() -> None:
     assert np.array_equal(turned.q, one.q[::-1])
 
 
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("name", ["cartpole", "cartpole_driven", "double_pendulum"])
+def test_a_fast_neighbour_changes_no_bit(name: str, real: str) -> None:
+    """Sines are turned in slow instances and computed in fast ones, whatever is beside them."""
+    m = module(name, real=f'"{real}"')
+    q0, qd0 = starts(m, 192)
+    q0, qd0 = q0.astype(m.dtype), qd0.astype(m.dtype)
+    fast = np.random.default_rng(3).random(192) < 0.1
+    fast[64:128] = np.arange(64) % 64 != 5  # a tile with one that is slow
+    qd0[fast] *= 300
+    h = 0.01
+    mixed = m.simulate_batch(q0, qd0, h=h, steps=STEPS)
+    for some in (fast, ~fast):
+        apart = m.simulate_batch(q0[some], qd0[some], h=h, steps=STEPS)
+        assert np.array_equal(apart.q, mixed.q[some]) and np.array_equal(apart.qd, mixed.qd[some])
+    if name != "cartpole_driven":  # t0 + n h is rounded otherwise
+        half = STEPS // 2
+        begun = m.simulate_batch(q0, qd0, h=h, steps=half)
+        ended = m.simulate_batch(begun.q[:, -1], begun.qd[:, -1], h=h, steps=half)
+        assert np.array_equal(ended.q, mixed.q[:, half:])
+
+
+@pytest.mark.parametrize("h", [0.005, 0.02, 0.05, 0.2])
+def test_turned_sines_are_as_good_as_computed_ones(h: float) -> None:
+    """On both sides of the bounds, 1/8 for h/2 qd and 1/64 for h^2/2 qdd."""
+    m = module("cartpole")
+    q0, qd0 = starts(m, 300)
+    qd0[:, 1] = np.linspace(-20, 20, 300)
+    runs = m.simulate_batch(q0, qd0, h=h, steps=1)
+    for k in range(300):
+        alone = m.simulate(q0[k], qd0[k], h=h, steps=1)
+        assert np.max(np.abs(runs.q[k] - alone.q)) < 4e-15 * (1 + 20 * h)
+        assert np.max(np.abs(runs.qd[k] - alone.qd)) < 4e-15 * (20 + 400 * h)
+
+
 def test_parameters_and_inputs_of_its_own() -> None:
     m = module("cartpole_driven")
     q0, qd0 = starts(m, 70)
@@ -205,9 +240,12 @@ def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
         cwd=tmp_path, check=True, capture_output=True, text=True,
     ).stderr  # fmt: skip
     lines = (tmp_path / "cartpole.c").read_text(encoding="utf-8").splitlines()
-    at = next(k for k, line in enumerate(lines) if "_tile_step(" in line)
-    first = next(k for k, line in enumerate(lines[at:], at + 1) if "for (int i" in line)
-    assert re.search(rf"cartpole\.c:{first}:\d+: optimized: loop vectorized using 32 byte", told)
+    at = next(k for k, line in enumerate(lines) if "_rk4_stages(" in line)
+    end = lines.index("}", at)
+    loops = [k for k, line in enumerate(lines[:end], 1) if k > at and "for (int i" in line]
+    assert len(loops) == 6  # the angles, four stages, the end
+    for k in loops:
+        assert re.search(rf"cartpole\.c:{k}:\d+: optimized: loop vectorized using 32 byte", told)
 
 
 @pytest.mark.parametrize("inputs", [True, False])

@@ -148,7 +148,7 @@ BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
         {"one step", "run", "order of rk4"},
     ),
     "the time in a stage": (
-        text('m.call("t + h_2")', 'm.call("t - h_2")'),
+        text('"t + h_2")', '"t - h_2")'),
         {"one step", "run"},
     ),
     "the time of a step in a run": (
