@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from sympy import Expr, Rational, S
 
-from eomc import ccode
+from eomc import ccode, side
 from eomc.angles import Angle, apart
 from eomc.assignments import Function, Operand, Sum
 from eomc.ccode import DOUBLE, Body, Real, indent
 from eomc.pieces import is_large, staged
 from eomc.program import TIME
 from eomc.steppers import METHODS, RK4, Method, Row
+from eomc.system import System
 from eomc.target import (
     TROUBLE,
     Access,
@@ -57,10 +58,9 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
     rows = f"long every, {real} *q_rows, {real} *qd_rows"
     t0_arg = f"{real} t0" if t else ""
     lane = _lane(target, function, prepare, scalar) if s.run.batch else None
+    side_by_side = side.lane(target, function, kept) if _swept(s) and not large else None
     methods = [
-        _implicit(target, METHODS[name], slopes, scalar, large)
-        if slopes is not None and METHODS[name].implicit
-        else _explicit(METHODS[name], target.real, turned, lane)
+        _method(target, METHODS[name], slopes, scalar, side_by_side, turned, lane)
         for name in s.run.methods
     ]
     return prepare | {
@@ -73,12 +73,14 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "cost": sentence(function),
         "scalar": scalar,
         "lane": lane,
+        "side_by_side": side_by_side,
         "lanes_turn": bool(lane and lane["angles"]),
         "rates_now": f"{P}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
         "stepper_call": after(t, "h", u, c, p),
         "methods": methods,
         "tile_rates": any(m.get("by_rates") for m in methods),
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
+        "newton": any(METHODS[name].newton for name in s.run.methods),
         "angles": _angles(target, turned),
         "fabs": "fabs" + target.real.function_suffix,
         "fmax": "fmax" + target.real.function_suffix,
@@ -129,6 +131,11 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "prepared_here": f"const {P}_prepared c = "
         + "{ " + ", ".join(f"s.c.{n}[i]" for n in kept) + " };",
     }  # fmt: skip
+
+
+def _swept(system: System) -> bool:
+    """Whether some method has its stages side by side."""
+    return any(METHODS[name].sweeps for name in system.run.methods)
 
 
 # --- sines and cosines apart ---------------------------------------------------------------------
@@ -233,7 +240,8 @@ def _reads_p(prepare: Mapping[str, Any]) -> bool:
 
 def _with_signal(target: Target, kept: list[str]) -> list[str]:
     """With the parameters that the signals read, since lanes have no others."""
-    if not (target.system.run.batch and "signal" in target.program):
+    by_lanes = target.system.run.batch or _swept(target.system)
+    if not (by_lanes and "signal" in target.program):
         return kept
     own = [p.name for p in target.system.parameters]
     uses = target.program["signal"].uses
@@ -856,9 +864,25 @@ def _about(m: Method) -> dict[str, Any]:
         "limits": m.limits,
         "notes": m.notes,
         "implicit": m.implicit,
+        "newton": m.newton,
+        "sweeps": m.sweeps,
         "stability": f"h omega <= {undamped:.3g} undamped"
         + (f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."),
     }
+
+
+def _method(
+    target: Target, m: Method, slopes: Mapping[str, Any] | None, scalar: Mapping[str, Any],
+    side_by_side: Mapping[str, Any] | None, turned: Sequence[Angle],
+    lane: Mapping[str, Any] | None,
+) -> dict[str, Any]:  # fmt: skip
+    """A method as its template wants it."""
+    large = scalar["pieces"] is not None
+    if m.sweeps:
+        return _side_by_side(target, m, scalar, side_by_side)
+    if slopes is not None and m.newton:
+        return _implicit(target, m, slopes, scalar, large)
+    return _explicit(m, target.real, turned, lane)
 
 
 def _explicit(
@@ -949,6 +973,79 @@ def _implicit(
         "stage": [
             f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*({total('AA[i]')}));",
             f"moving.$ = qd->$ + h*({total('A[i]')});",
+        ],
+        "end": [f"r->$ = h*qd->$ + hh*({last[0]});", f"v->$ = h*({last[1]});"],
+    }  # fmt: skip
+
+
+def _side_by_side(
+    target: Target, m: Method, scalar: Mapping[str, Any], lane: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """A method of few sweeps as its template wants it, for one trajectory.
+
+    lane: what a loop over the stages calls; None where accelerations are long, and stages take
+    turns.
+    """
+    real, P, s = target.real, target.prefix, m.stages
+    timed = TIME in target.program["acceleration"].uses
+    t, u = ("t" if target.driven else ""), ("u" if target.system.inputs else "")
+    rest = scalar["stepper_arguments"].split(", ", 2)[2]
+    c, p = ("c" if "_prepared *c" in rest else ""), ("p" if "_params *p" in rest else "")
+    stages, memory = f"{P}_{m.name}_stages", f"{P}_{m.name}_memory *m"
+    large, alone = scalar["pieces"] is not None, f"{target.PREFIX}_ALONE"
+
+    def by_stage(rows: Sequence[Row]) -> list[str]:
+        columns = zip(*rows, strict=True)
+        return ["{ " + ", ".join(_number(x, real) for x in column) + " }," for column in columns]
+
+    def total(terms: Sequence[str]) -> str:
+        """In pairs, since a sum in a row would wait for each of its terms."""
+        while len(terms) > 1:
+            pairs = [" + ".join(terms[k : k + 2]) for k in range(0, len(terms), 2)]
+            terms = [f"({pair})" for pair in pairs] if len(pairs) > 1 else pairs
+        return terms[0]
+
+    def held(given: str) -> str:
+        return after(t and "t + c_[i]*h", "&given", given, c, "&bad")
+
+    last = [total([f"{_number(x, real)}*a.x[#][{k}]" for k, x in enumerate(row)])
+            for row in (m.b_a, _rounded(m.b, real))]  # fmt: skip
+    inputs = ", ".join(f"u ? u[{target.enum[n]}] : {target.zero}" for n in target.input_names)
+    return _about(m) | {
+        "template": "picard.c.jinja",
+        "angles": False,
+        "arguments": arguments(scalar["stepper_arguments"], memory),
+        "call_more": after("m"),
+        "inline": f"{target.PREFIX}_LANE" if lane else "static inline",
+        "side_by_side": lane is not None,
+        "sum": total([f"w[{k}][i]*a[{k}]" for k in range(s)]),
+        "c": [_number(x, real) for x in m.c],
+        "A": by_stage(m.a),
+        "AA": by_stage(m.a_squared),
+        "A_ahead": by_stage(m.a_ahead),
+        "AA_ahead": by_stage(m.a_squared_ahead),
+        "sweep_arguments": arguments(
+            f"{stages} *{alone} b", f"const {stages} *{alone} a",
+            f"const {P}_{m.name}_sums *w", rest,
+        ),
+        "sweep": lambda of, sums: f"{P}_{m.name}_sweep("
+        + arguments(of, f"&{P}_{m.name}_{sums}", "q", "qd", t, "h", u, c, p) + ");",
+        "settle_arguments": arguments(f"{stages} *a", "int fresh", rest, memory),
+        "settle_call": arguments("&a", "!smooth", "q", "qd", t, "h", u, c, p, "m"),
+        "given": f"const {P}_inputs given = {{ {inputs} }};",
+        "lanes": [
+            {"only": "if (u)", "call": held("1")}, {"only": "else", "call": held("0")},
+        ] if u else [{"only": "", "call": after("t + c_[i]*h" if timed else "", c, "&bad")}],
+        "eps": repr(real.epsilon) + real.suffix,
+        # steps that five sweeps do not do are long, and err by more than this
+        "enough": repr(max(1e-8, real.epsilon)) + real.suffix,
+        "loose": f"{max(1e-6, 512 * real.epsilon):.0e}" + real.suffix,
+        "gathered": [
+            _gathered(target, large, "q", "at_now"), _gathered(target, large, "qd", "moving_now"),
+        ],
+        "stage": [
+            f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*{P}_{m.name}_sum(w->AA, a->x[#], i));",
+            f"moving.$ = qd->$ + h*{P}_{m.name}_sum(w->A, a->x[#], i);",
         ],
         "end": [f"r->$ = h*qd->$ + hh*({last[0]});", f"v->$ = h*({last[1]});"],
     }  # fmt: skip

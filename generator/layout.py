@@ -10,7 +10,7 @@ import pydantic
 
 from eomc.formulas import nearest
 
-METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "euler", "verlet")
+METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "gauss16", "euler", "verlet")
 REALS = ("double", "float")
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from sympy import Expr
 
 from eomc import mechanics
-from eomc.assignments import Cost, Function, evaluate
+from eomc.assignments import Call, Cost, Function, evaluate
 from eomc.elimination import Solution, solve
 from eomc.expand import Expander
 from eomc.lowering import lower
@@ -18,7 +18,7 @@ from eomc.problems import Problem, SceneError
 from eomc.steppers import METHODS
 from eomc.symbols import ALONG
 from eomc.system import System, t
-from eomc.tape import Tape
+from eomc.tape import Stage, Tape
 
 TIME = t.name
 _READERS = {
@@ -80,7 +80,7 @@ def build(equations: Mapping[str, Equations]) -> Program:
             routes |= _expanded_solutions(e, expanders[route], names)
     best = functions["acceleration"] = _cheapest("acceleration", first.system, routes)
     run = first.system.run
-    if run.linearize or any(METHODS[name].implicit for name in run.methods):
+    if run.linearize or any(METHODS[name].newton for name in run.methods):
         made = _linearization(first.system, routes[best.route])
         functions[made.name] = replace(made, route=best.route)
     if run.linearize == "parameters" and first.system.parameters:
@@ -146,7 +146,7 @@ def _unsuited(program: Program) -> list[Problem]:
     if implicit and s.run.batch:
         message = f"'{implicit[0]}' is for one trajectory: leave out batch = true, or that method"
         out.append(s.problem("run.batch", message))
-    for name in implicit:
+    for name in (name for name in implicit if METHODS[name].newton):
         size = METHODS[name].stages * len(s.q)
         if size > MOST_IMPLICIT:
             message = (
@@ -154,6 +154,13 @@ def _unsuited(program: Program) -> list[Problem]:
                 "an explicit method, or one with fewer stages"
             )
             out.append(s.problem("run.method", message))
+    swept = [name for name in implicit if METHODS[name].sweeps]
+    if swept and (jumps := _jumps(program)):
+        message = (
+            f"'{swept[0]}' needs smooth accelerations, and {jumps} of a coordinate or velocity "
+            "jumps: make it smooth, say tanh(x/width), or take 'rk4' or 'dp8'"
+        )
+        out.append(s.problem("run.method", message))
     velocities = {x.name for x in s.qd}
     read = {
         name: sorted(program[name].uses & velocities)
@@ -170,6 +177,16 @@ def _unsuited(program: Program) -> list[Problem]:
         )
         out.append(s.problem("run.method", message))
     return out
+
+
+def _jumps(program: Program) -> str:
+    """A function in the accelerations that jumps on the way; the empty string where none does."""
+    for name in ("acceleration", "signal"):
+        for a in program[name].body if name in program else ():
+            if isinstance(a.value, Call) and a.stage >= Stage.POSITION:
+                if a.value.function in ("sign", "heaviside"):
+                    return a.value.function
+    return ""
 
 
 def _linearization(system: System, way: Route) -> Function:

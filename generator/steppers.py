@@ -12,7 +12,7 @@ b A are put by others, it is a method of Nystrom: Euler's and Verlet's are writt
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
 from fractions import Fraction
 from math import comb, inf
@@ -25,7 +25,8 @@ class Method:
     """A method of fixed step: `a` (below the diagonal if explicit), the weights `b`, their nodes c.
 
     limits: the largest h omega of an undamped and h lambda of a decaying motion. notes: what else
-    to say of it. nodes, end: c and b A, where they are not those of `a`.
+    to say of it. nodes, end: c and b A, where they are not those of `a`. sweeps: after how many the
+    stages of an implicit method count as found, where these are few and fixed; 0 elsewhere.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Method:
     notes: tuple[str, ...] = ()
     nodes: Row = ()
     end: Row = ()
+    sweeps: int = 0
 
     @property
     def stages(self) -> int:
@@ -48,6 +50,11 @@ class Method:
     def implicit(self) -> bool:
         """Whether the stages hang on one another."""
         return any(any(row[i:]) for i, row in enumerate(self.a))
+
+    @property
+    def newton(self) -> bool:
+        """Whether the stages are found with derivatives, however stiff the motion is."""
+        return self.implicit and not self.sweeps
 
     @property
     def c(self) -> Row:
@@ -68,6 +75,16 @@ class Method:
     def ahead(self) -> tuple[Row, ...]:
         """E: accelerations at the next step's nodes, E a, by the polynomial through this step's."""
         return tuple(tuple(_value(basis, 1 + x) for basis in _lagrange(self.c)) for x in self.c)
+
+    @property
+    def a_ahead(self) -> tuple[Row, ...]:
+        """A E: `a` for the accelerations of the step before."""
+        return tuple(_times(row, self.ahead) for row in self.a)
+
+    @property
+    def a_squared_ahead(self) -> tuple[Row, ...]:
+        """A A E."""
+        return tuple(_times(row, self.ahead) for row in self.a_squared)
 
 
 def _times(row: Row, a: tuple[Row, ...]) -> Row:
@@ -238,6 +255,35 @@ def _gauss(s: int, name: str) -> Method:
 
 GAUSS4, GAUSS6, GAUSS8 = (_gauss(s, f"gauss{2 * s}") for s in (2, 3, 4))
 
+
+def _swept(s: int, sweeps: int, name: str, limits: tuple[float, float]) -> Method:
+    """The same with stages from the step before, continued as a polynomial, and a few sweeps.
+
+    P. J. van der Houwen & B. P. Sommeijer, J. Comput. Appl. Math. 29 (1990), 111-127, who iterate
+    for the sake of stages side by side. What is continued errs by h^s, and each sweep takes a
+    factor of h from that, or h^2 where velocities have no part in accelerations. sweeps: odd, since
+    two sets of accelerations take turns.
+    """
+    order = min(2 * s, s + sweeps)
+    return replace(
+        _gauss(s, name),
+        title=f"the method of Gauss and Legendre with {s} stages, found in {sweeps} sweeps",
+        order=order,
+        limits=limits,
+        notes=(
+            "The accelerations at the stages begin as the polynomial through those of the step",
+            f"before, and {sweeps} sweeps put those found there in their place, all stages side by",
+            "side (van der Houwen & Sommeijer, J. Comput. Appl. Math. 29 (1990), 111-127, iterate",
+            f"so). Of order {2 * s}, and {order} where accelerations hang on velocities. No",
+            "derivatives: h must be small against the fastest motion, also where that died out.",
+        ),
+        sweeps=sweeps,
+    )
+
+
+# the limits are those up to which sweeps, as many as it takes, find the stages: a test has them
+GAUSS16 = _swept(8, 5, "gauss16", (9.0, 7.2))
+
 # --- Euler and Verlet -----------------------------------------------------------------------------
 
 _ONE, _HALF, _ZERO = Fraction(1), Fraction(1, 2), Fraction(0)
@@ -273,5 +319,5 @@ VERLET = Method(
 )
 
 METHODS: Mapping[str, Method] = {
-    m.name: m for m in (RK4, DP8, GAUSS4, GAUSS6, GAUSS8, EULER, VERLET)
+    m.name: m for m in (RK4, DP8, GAUSS4, GAUSS6, GAUSS8, GAUSS16, EULER, VERLET)
 }

@@ -72,6 +72,7 @@ class Target:
             "STAMP",
             "TILE",
             "LANE",
+            "ALONE",
             "PIECE",
         )
         taken = {f"{self.PREFIX}_{w}" for w in own}
