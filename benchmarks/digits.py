@@ -146,7 +146,7 @@ def fewest(error: Callable[[int], float], wanted: float, worth: Callable[[int], 
 
 
 def ours(module: ModuleType, case: Case, error: Error, wanted: float) -> Way:
-    """The quickest of our methods, each at its longest step; those that iterate at shorter ones too.
+    """The quickest of our methods, each at its longest step; what iterates at shorter ones too.
 
     A longer step may want more sweeps than it saves.
     """
