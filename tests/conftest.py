@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import warnings
 from collections.abc import Iterator
 from functools import cache
@@ -14,6 +15,10 @@ import pytest
 import eomc
 from cases import SCENES
 from eomc import scene, system
+
+# in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).parent.parent
 MODULES = ROOT / "build" / "tests" / "modules"  # kept from one run of the tests to the next
