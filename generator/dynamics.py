@@ -535,7 +535,7 @@ def _lane_small(target: Target, function: Function, kept: Sequence[str]) -> dict
             "int held", c_arg, trouble,
         ),
         "inputs": f"{P}_inputs",
-        "own_signal": _signal_lane(target, kept, state, c_arg, trouble),
+        "own_signal": side.signal(target, state, c_arg, trouble),
         "unused": [
             *_unread(target, rest), *([] if body.failures or body.sincos else ["trouble"])
         ],
@@ -728,36 +728,6 @@ def _lane_arguments(target: Target, kept: Sequence[str]) -> list[Argument]:
         Argument(f"const {P}_prepared_lanes *c", "c", frozenset(kept)),
         Argument(f"{real} *{target.PREFIX}_ALONE troubles", "troubles", frozenset({TROUBLE})),
     ]
-
-
-def _signal_lane(
-    target: Target, kept: Sequence[str], state: str, c_arg: str, trouble: str
-) -> dict[str, Any] | None:
-    """The scene's signals for one of many."""
-    if "signal" not in target.program:
-        return None
-    s, given = target.system, target.program["signal"]
-    where = {p.name: f"c->{p.name}" for p in s.parameters}
-    made = target.body(given, where=where, lane=True)
-
-    def in_struct(array: str, name: str) -> str:
-        return f"{array}->{name}"
-
-    unused = [] if not c_arg or given.uses & set(where) else ["c"]
-    return {
-        "pieces": None,
-        "arguments": arguments(
-            f"{target.prefix}_inputs *u", f"{target.real.name} t" if target.signal_t else "",
-            state if target.signal_state else "", c_arg, trouble,
-        ),
-        "unused": [*unused, *([] if made.sincos else ["trouble"]), *_unread_state(target, given)],
-        "loads": target.loads(given, in_struct, in_struct),
-        "blocks": [*made.early, *made.blocks],
-        "results": [
-            f"u->{i.name} = {r};" for i, r in zip(s.inputs, made.results, strict=True)
-        ],
-        "call": _signal_lane_call(target, c_arg, "trouble"),
-    }  # fmt: skip
 
 
 def _signal_lanes(

@@ -38,7 +38,7 @@ def lane(target: Target, function: Function, kept: Sequence[str]) -> dict[str, A
         "rates_arguments": arguments(
             f"{P}_vector *a", state, t_arg, u_arg, "int held", c_arg, trouble
         ),
-        "own_signal": _signal(target, state, c_arg, trouble),
+        "own_signal": signal(target, state, c_arg, trouble),
         "unused": [*_unread(target, function, ("q", "qd", "u")), *quiet],
         "loads": target.loads(function, _member, _member),
         "blocks": body.blocks,
@@ -49,8 +49,8 @@ def lane(target: Target, function: Function, kept: Sequence[str]) -> dict[str, A
     }
 
 
-def _signal(target: Target, state: str, c_arg: str, trouble: str) -> dict[str, Any] | None:
-    """The scene's signals at a stage."""
+def signal(target: Target, state: str, c_arg: str, trouble: str) -> dict[str, Any] | None:
+    """The scene's signals for one stage, or one of many."""
     if "signal" not in target.program:
         return None
     s, given = target.system, target.program["signal"]
