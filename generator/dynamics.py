@@ -496,23 +496,11 @@ def _each_of_tile(target: Target, lines: Sequence[str]) -> list[str]:
 
 def _lane_small(target: Target, function: Function, kept: Sequence[str]) -> dict[str, Any]:
     """Accelerations of one instance, and how loops over a tile call them."""
-    s, real, P = target.system, target.real, target.prefix
+    s, real = target.system, target.real
     held, timed = bool(s.inputs), TIME in function.uses
     reach = real.reach and "rk4" in s.run.methods
     turned, rest = apart(function, target.names) if reach else ((), function)
-    own = [p.name for p in s.parameters]
-    where = {name: f"s->{name}" for name in _sines(turned)}
-    body = target.body(rest, where, keep=_in_prepared, parameters=own, lane=True)
-    u_arg = f"const {P}_inputs *u" if held else ""
-    c_arg = f"const {P}_prepared *c" if kept else ""
-    s_arg, s_call = (f"const {P}_angles *s", "s") if turned else ("", "")
-    t_arg, t = (f"{real.name} t", "t") if timed else ("", "")
-    state = f"const {P}_vector *q, const {P}_vector *qd"
-    trouble, c = f"{real.name} *trouble", "c" if kept else ""
     at = [target.enum[n] for n in target.names]
-
-    def in_struct(array: str, name: str) -> str:
-        return f"{array}->{name}"
 
     def call(angles: str, time: str, hold: str, troubles: str) -> str:
         now = time if (target.driven if held else timed) else ""
@@ -521,31 +509,9 @@ def _lane_small(target: Target, function: Function, kept: Sequence[str]) -> dict
             "&here" if kept else "", f"&{troubles}[i]",
         )  # fmt: skip
 
-    one = {
-        "head": f"{target.PREFIX}_LANE void",
-        "solve": "solve_lane",
-        "rates": "rates_lane" if held else "solve_lane",
-        "each": lambda lines, width=4: indent(_each(target, False, lines), width),
-        "solve_arguments": arguments(
-            f"{P}_vector *a", state, s_arg, t_arg, u_arg, c_arg, trouble
-        ),
-        "solve_u": after(s_call, t, "held ? u : &now", c, "trouble"),
-        "rates_arguments": arguments(
-            f"{P}_vector *a", state, s_arg, f"{real.name} t" if target.driven else "", u_arg,
-            "int held", c_arg, trouble,
-        ),
-        "inputs": f"{P}_inputs",
-        "own_signal": side.signal(target, state, c_arg, trouble),
-        "unused": [
-            *_unread(target, rest), *([] if body.failures or body.sincos else ["trouble"])
-        ],
-        "loads": target.loads(rest, in_struct, in_struct),
-        "blocks": body.blocks,
-        "results": [
-            f"a->{name} = {r};" for name, r in zip(target.names, body.results, strict=True)
-        ],
-        "end": [f"*trouble = {x} ? 1.0{real.suffix} : *trouble;" for x in body.failures],
-    }  # fmt: skip
+    one = side.lane(target, rest, kept, _sines(turned)) | {
+        "each": lambda lines, width=4: indent(_each(target, False, lines), width)
+    }
     return {
         "one": one,
         "angles": _angles_lane(target, turned),
@@ -563,7 +529,7 @@ def _lane_small(target: Target, function: Function, kept: Sequence[str]) -> dict
         ],
         "rates_call": call("&s", "t", "held", "troubles"),
         "rates_held": lambda hold: arguments(
-            "a, q, qd", "t" if target.driven else "", "u", hold, c, "troubles"
+            "a, q, qd", "t" if target.driven else "", "u", hold, "c" if kept else "", "troubles"
         ),
         "stages": _stages(target, turned, _given(target, kept, "s->u.", "s->c."), call),
     }

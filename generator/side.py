@@ -10,11 +10,13 @@ from eomc.program import TIME
 from eomc.target import Target, after, arguments
 
 
-def lane(target: Target, function: Function, kept: Sequence[str]) -> dict[str, Any]:
+def lane(
+    target: Target, function: Function, kept: Sequence[str], sines: Sequence[str] = ()
+) -> dict[str, Any]:
     """What lane.c.jinja prints: solve, and where there are inputs rates and signals.
 
     What goes wrong is noted in trouble, so that a loop over stages has no branches. kept: what
-    parameters alone decide.
+    parameters alone decide. sines: sines and cosines that come from outside, in a struct s.
     """
     s, real, P = target.system, target.real.name, target.prefix
     timed, given = TIME in function.uses, bool(s.inputs)
@@ -22,8 +24,10 @@ def lane(target: Target, function: Function, kept: Sequence[str]) -> dict[str, A
     c_arg, c = (f"const {P}_prepared *c", "c") if kept else ("", "")
     u_arg = f"const {P}_inputs *u" if given else ""
     state, trouble = f"const {P}_vector *q, const {P}_vector *qd", f"{real} *trouble"
+    s_arg, s_call = (f"const {P}_angles *s", "s") if sines else ("", "")
+    where = {name: f"s->{name}" for name in sines}
     own = [p.name for p in s.parameters]
-    body = target.body(function, keep=lambda n: f"c->{n}", parameters=own, lane=True)
+    body = target.body(function, where, keep=lambda n: f"c->{n}", parameters=own, lane=True)
     one = f"1.0{target.real.suffix}"
     quiet = [] if body.failures or body.sincos else ["trouble"]
     return {
@@ -32,11 +36,11 @@ def lane(target: Target, function: Function, kept: Sequence[str]) -> dict[str, A
         "solve": "solve_lane",
         "rates": "rates_lane" if given else "solve_lane",
         "solve_arguments": arguments(
-            f"{P}_vector *a", state, f"{real} t" if timed else "", u_arg, c_arg, trouble
+            f"{P}_vector *a", state, s_arg, f"{real} t" if timed else "", u_arg, c_arg, trouble
         ),
-        "solve_u": after("t" if timed else "", "held ? u : &now", c, "trouble"),
+        "solve_u": after(s_call, "t" if timed else "", "held ? u : &now", c, "trouble"),
         "rates_arguments": arguments(
-            f"{P}_vector *a", state, t_arg, u_arg, "int held", c_arg, trouble
+            f"{P}_vector *a", state, s_arg, t_arg, u_arg, "int held", c_arg, trouble
         ),
         "own_signal": signal(target, state, c_arg, trouble),
         "unused": [*_unread(target, function, ("q", "qd", "u")), *quiet],
