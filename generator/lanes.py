@@ -1,0 +1,328 @@
+"""Accelerations and steps of many instances at once, for the templates.
+
+Large: each piece is a loop over a tile. Small: what one instance needs is inlined into such loops,
+one for every stage of a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from eomc import side, turning, vectors
+from eomc.angles import Angle, apart
+from eomc.assignments import Function
+from eomc.ccode import DOUBLE, indent
+from eomc.pieces import staged
+from eomc.program import TIME
+from eomc.steppers import METHODS
+from eomc.target import TROUBLE, Access, Argument, Target, after, arguments
+
+NEAR = 32_768  # bytes that a tile of a small system may have: a first-level cache
+WIDE = 131_072  # and of a large one: a part of a second-level cache
+
+
+def lane(
+    target: Target, function: Function, prepare: Mapping[str, Any], mode: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The same for a batch: no branches; what goes wrong is noted in trouble.
+
+    Accelerations and steppers of a whole tile. Large: each piece is a loop over it. Small: what one
+    instance needs is inlined into such loops, one for every stage of a step.
+    """
+    s, real, P = target.system, target.real.name, target.prefix
+    large, held = "body" not in prepare, bool(s.inputs)
+    timed = TIME in function.uses
+    kept = prepare["prepared_members"]
+    alone = f"{target.PREFIX}_ALONE "
+    troubles = f"{real} *{alone}troubles"
+    u_arg = f"const {P}_inputs_lanes *u" if held else ""
+    c_arg = f"const {P}_prepared_lanes *c" if kept else ""
+    t_arg = f"{real} t" if target.driven else ""
+    state = f"const {P}_lanes *q, const {P}_lanes *qd"
+    c = "c" if kept else ""
+
+    def rates(time: str) -> str:
+        if held:
+            return after(time if target.driven else "", "u", "held", c, "troubles")
+        return after(time if timed else "", c, "troubles")
+
+    made = dict(mode) | {
+        "head": "static void" if large else f"{target.PREFIX}_PIECE void",
+        "inline": f"{target.PREFIX}_{'INLINE' if large else 'LANE'}",
+        "vector": f"{P}_lanes",
+        "solve": "solve_lane",
+        "rates": ("rates_lane" if held else "solve_lane") if large else "rates_tile",
+        "suffix": "_lane",
+        "solve_arguments": arguments(
+            f"{P}_lanes *a", state, f"{real} t" if timed else "", u_arg, c_arg, troubles
+        ),
+        "solve_u": after("t" if timed else "", "held ? u : &now", c, "troubles"),
+        "rates_arguments": arguments(
+            f"{P}_lanes *{'' if large else alone}a", state, t_arg, u_arg,
+            "int held" if held else "", c_arg, troubles,
+        ),
+        "inputs": f"{P}_inputs_lanes",
+        "stepper_arguments": arguments(
+            f"{P}_lanes *r, {P}_lanes *v" if large else f"{P}_lanes *{alone}r, {P}_lanes *{alone}v",
+            state, t_arg, f"{real} h", u_arg and f"{u_arg}, int held", c_arg, troubles,
+        ),
+        "stepper_call": lambda troubles: after(
+            "t" if target.driven else "", "h", "&s->u, held" if held else "",
+            "&s->c" if kept else "", troubles,
+        ),
+        "call": rates,
+        "compensated": False,
+        "first": "",
+        "and": "",
+        "last": "",
+        "each": lambda lines, width=4: indent(_each_of_tile(target, lines), width),
+        "flag": "long long" if real == "double" else "int",  # as wide as a real
+        "angles": None,
+        "one": None,
+        "pieces": None,
+        "own_signal": _signal_lanes(target, kept, c_arg, troubles) if large else None,
+    }  # fmt: skip
+    if not large:
+        return made | _lane_small(target, function, kept)
+    return made | _lane_large(target, function, kept, made)
+
+
+def _each_of_tile(target: Target, lines: Sequence[str]) -> list[str]:
+    """Statements for every coordinate of every instance."""
+    inside = [line.replace("$", "x[j][i]") for line in lines]
+    return vectors.loop(
+        "j", f"{target.PREFIX}_NQ", vectors.loop("i", f"{target.PREFIX}_TILE", inside)
+    )
+
+
+def _lane_small(target: Target, function: Function, kept: Sequence[str]) -> dict[str, Any]:
+    """Accelerations of one instance, and how loops over a tile call them."""
+    s, real = target.system, target.real
+    held, timed = bool(s.inputs), TIME in function.uses
+    reach = real.reach and "rk4" in s.run.methods
+    turned, rest = apart(function, target.names) if reach else ((), function)
+    at = [target.enum[n] for n in target.names]
+
+    def call(angles: str, time: str, hold: str, troubles: str) -> str:
+        now = time if (target.driven if held else timed) else ""
+        return after(
+            angles if turned else "", now, f"&given, {hold}" if held else "",
+            "&here" if kept else "", f"&{troubles}[i]",
+        )  # fmt: skip
+
+    one = side.lane(target, rest, kept, turning.sines(turned)) | {
+        "each": lambda lines, width=4: indent(vectors.each(target, False, lines), width)
+    }
+    return {
+        "one": one,
+        "angles": turning.lane(target, turned),
+        "odd": [
+            f"const {real.name} sum = "
+            + " + ".join(f"{x}.{n}" for n in target.names for x in ("q", "qd"))
+            + ";",
+            f"odd |= !((sum - sum) + s->trouble[i] + {'far' if turned else 's->idle'}[i] < 1);",
+        ],
+        "sum": " + ".join(f"{x}.x[{k}][i]" for k in at for x in "rv"),
+        "rates_given": [
+            *_of_instance(target, "at", "vector", "q->x[#][i]", target.names),
+            *_of_instance(target, "moving", "vector", "qd->x[#][i]", target.names),
+            *_given(target, kept, "u->", "c->"),
+        ],
+        "rates_call": call("&s", "t", "held", "troubles"),
+        "rates_held": lambda hold: arguments(
+            "a, q, qd", "t" if target.driven else "", "u", hold, "c" if kept else "", "troubles"
+        ),
+        "stages": _stages(target, turned, _given(target, kept, "s->u.", "s->c."), call),
+    }
+
+
+def _of_instance(
+    target: Target, name: str, struct: str, element: str, members: Sequence[str]
+) -> list[str]:
+    """A struct of one instance's numbers; # in `element` is the place of each."""
+    inside = ", ".join(element.replace("#", target.enum[n]) for n in members)
+    return [f"const {target.prefix}_{struct} {name} = {{ {inside} }};"]
+
+
+def _given(target: Target, kept: Sequence[str], u: str, c: str) -> list[str]:
+    """The inputs and the prepared values of one instance."""
+    lines = []
+    if target.system.inputs:
+        lines += _of_instance(target, "given", "inputs", f"{u}x[#][i]", target.input_names)
+    if kept:
+        inside = ", ".join(f"{c}{n}[i]" for n in kept)
+        lines.append(f"const {target.prefix}_prepared here = {{ {inside} }};")
+    return lines
+
+
+def _stages(
+    target: Target,
+    turned: Sequence[Angle],
+    given: Sequence[str],
+    call: Callable[[str, str, str, str], str],
+) -> dict[str, Any]:
+    """The stages of RK4 as loops over a tile: how each has its place, and what it leaves."""
+    P, real, members = target.prefix, target.real.name, turning.sines(turned)
+    t_arg, t = (f"{real} t", "t") if target.driven else ("", "")
+    u_arg = "int held" if target.system.inputs else ""
+    q, qd, two = "s->q.x[#][i]", "s->qd.x[#][i]", target.literal(2.0)
+    a1, a2, a3, a4 = (f"a{k}.x[#][i]" for k in (1, 2, 3, 4))
+    plans = [
+        ("back", "t", [f"at.$ = {q};", f"moving.$ = {qd};"], ""),
+        ("mid", "t + h_2", [f"at.$ = {q} + h_2*{qd};", f"moving.$ = {qd} + h_2*{a1};"], ""),
+        (
+            "mid", "t + h_2",
+            [f"at.$ = ({q} + h_2*{qd}) + hh_4*{a1};", f"moving.$ = {qd} + h_2*{a2};"],
+            f"d.$ = hh_4*{a1};",
+        ),
+        (
+            "on", "t + h",
+            [f"at.$ = ({q} + h*{qd}) + hh_2*{a2};", f"moving.$ = {qd} + h*{a3};"],
+            f"d.$ = hh_2*{a2};",
+        ),
+    ]  # fmt: skip
+    loops = []
+    for k, (near, time, lines, d) in enumerate(plans, 1):
+        from_near = ", ".join(f"{near}.{n}[i]" for n in members)
+        loops.append(
+            {
+                "given": given,
+                "angles": [
+                    f"const {P}_angles s_near = {{ {from_near} }};",
+                    *([f"{P}_angles s_at;", f"{P}_vector d;"] if d else []),
+                ],
+                "lines": lines + ([d] if d and turned else []),
+                "turned": [f"{P}_angles_turned(&s_at, &d, &s_near);"] if d else [],
+                "call": call("&s_at" if d else "&s_near", time, "held", "s->trouble"),
+                "ends": [f"a{k}.x[#][i] = a.$;"],
+                "looks_ahead": turned and k == 2,
+            }
+        )
+    far_arg, far = (f"{real} *far", "far") if turned else ("", "")
+    return {
+        "prototype": f"{target.PREFIX}_LANE int {P}_rk4_stages("
+        + arguments(
+            f"{P}_lanes *r, {P}_lanes *v", far_arg, f"{P}_tile *s", t_arg, f"{real} h", u_arg
+        ) + ")",
+        "around": [f"{x}.{n}[i] = s_{x}.{n};" for x in ("back", "mid", "on") for n in members],
+        "loops": loops,
+        "ahead": [[plans[2][3]], [plans[3][3]]],
+        "ends": [
+            f"q.$ = {q} + (h*{qd} + hh_6*({a1} + ({a2} + {a3})));",
+            f"qd.$ = {qd} + h_6*(({a1} + {a4}) + {two}*({a2} + {a3}));",
+            "r->x[#][i] = q.$;",
+            "v->x[#][i] = qd.$;",
+        ],
+        "call": lambda hold: f"{P}_rk4_stages("
+        + arguments("&r, &v", far, "s", t, "h", hold) + ")",
+    }  # fmt: skip
+
+
+def _lane_large(
+    target: Target, function: Function, kept: Sequence[str], made: Mapping[str, Any]
+) -> dict[str, Any]:
+    s, P = target.system, target.prefix
+    _, rest = staged(function, [p.name for p in s.parameters])
+    cut = target.in_pieces(
+        rest,
+        "solve_lane",
+        _lane_arguments(target, kept),
+        [_in_lanes(target)("a", name) for name in target.names],
+        Argument(f"{P}_lanes *{target.PREFIX}_ALONE a", "a", frozenset()),
+        lambda f: target.loads(f, _in_lanes(target), _in_lanes(target)),
+        {n: f"c->{n}[i]" for n in kept},
+        lane=True,
+    )
+    return {
+        "pieces": cut,
+        "unused": [*made["unused"], *(["troubles"] if not cut["troubled"] else [])],
+        "loads": cut["locals"],
+        "blocks": [],
+        "results": cut["calls"],
+        "end": [],
+    }
+
+
+def _in_lanes(target: Target) -> Access:
+    return lambda array, name: f"{array}->x[{target.enum[name]}][i]"
+
+
+def _lane_arguments(target: Target, kept: Sequence[str]) -> list[Argument]:
+    """What a piece over a tile may read."""
+    P, groups, real = target.prefix, target.groups(), target.real.name
+    return [
+        Argument(f"const {P}_lanes *q", "q", groups["q"]),
+        Argument(f"const {P}_lanes *qd", "qd", groups["qd"]),
+        Argument(f"{real} t", "t", groups["t"]),
+        Argument(f"const {P}_inputs_lanes *u", "u", groups["u"]),
+        Argument(f"const {P}_prepared_lanes *c", "c", frozenset(kept)),
+        Argument(f"{real} *{target.PREFIX}_ALONE troubles", "troubles", frozenset({TROUBLE})),
+    ]
+
+
+def _signal_lanes(
+    target: Target, kept: Sequence[str], c_arg: str, trouble: str
+) -> dict[str, Any] | None:
+    """The scene's signals for a whole tile."""
+    if "signal" not in target.program:
+        return None
+    P, given = target.prefix, target.program["signal"]
+    own = {p.name for p in target.system.parameters}
+    cut = target.in_pieces(
+        given,
+        "signal_lane",
+        _lane_arguments(target, [n for n in kept if n in own]),
+        [f"u->x[{target.enum[name]}][i]" for name in target.input_names],
+        Argument(f"{P}_inputs_lanes *{target.PREFIX}_ALONE u", "u", frozenset()),
+        lambda f: target.loads(f, _in_lanes(target), _in_lanes(target)),
+        {n: f"c->{n}[i]" for n in own},
+        lane=True,
+    )
+    state = f"const {P}_lanes *q, const {P}_lanes *qd"
+    return {
+        "pieces": cut,
+        "arguments": arguments(
+            f"{P}_inputs_lanes *u", f"{target.real.name} t" if target.signal_t else "",
+            state if target.signal_state else "", c_arg, trouble,
+        ),
+        "unused": [
+            *([] if not c_arg or given.uses & own else ["c"]),
+            *([] if cut["troubled"] else ["troubles"]),
+            *_unread_state(target, given),
+        ],
+        "loads": cut["locals"],
+        "blocks": [],
+        "results": cut["calls"],
+        "call": _signal_lane_call(target, c_arg, "troubles"),
+    }  # fmt: skip
+
+
+def _unread_state(target: Target, given: Function) -> list[str]:
+    if not target.signal_state:
+        return []
+    return [name for name in ("q", "qd") if not given.uses & target.groups()[name]]
+
+
+def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
+    return arguments(
+        "&now", "t" if target.signal_t else "", "q, qd" if target.signal_state else "",
+        "c" if c_arg else "", trouble,
+    )  # fmt: skip
+
+
+def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> int:
+    """Instances side by side: as many as stay near with what belongs to them.
+
+    Small: eight vectors of 32 bytes at most, since more brought nothing.
+    """
+    s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
+    numbers = 2 * n + len(s.u) + kept + 2
+    if lane["pieces"]:
+        most, near, size = 64, WIDE, 8
+        numbers += len(lane["pieces"]["members"]) + 6 * n
+    else:
+        most, near = 256 // size, NEAR
+        numbers += (2 + max(METHODS[name].stages for name in s.run.methods)) * n
+        numbers += 1 + 3 * len(lane["angles"]["members"]) if lane["angles"] else 1
+    return max(8, min(most, 1 << (near // (size * numbers)).bit_length() - 1))
