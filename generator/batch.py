@@ -7,7 +7,6 @@ side by side in vector registers and in threads; no result depends on either.
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from time import perf_counter
@@ -16,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number
+from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number, _size
 
 _GROUP = 64  # instances in a tile, or a multiple of those in one
 _WORTH = 20_000  # steps in all from which threads pay
+_NAMES = np.array([*STATUS, "interrupted"])
 _SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
 
 
@@ -74,7 +74,7 @@ class BatchModel(Model):
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
         """
         step = self._stepper(method, "batch")
-        h, t0 = self._size(h), _number(t0, "t0")
+        h, t0 = self.h if h is None else _size(h), _number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = _count(every, "every", 1)
         q, qd, table, held, count = self._instances(q0, qd0, params, u, steps)
@@ -90,17 +90,17 @@ class BatchModel(Model):
         q_rows[:, 0], qd_rows[:, 0] = q, qd
         work = _Work(self, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows)
         whole = work.run(threads, progress)
-        status = np.array([*STATUS, "interrupted"])[work.status]
-        kept = 1 + work.done // every + (work.done % every > 0)
         if steps % every:
             q_rows[:, -1], qd_rows[:, -1] = q, qd
-        for k in np.flatnonzero(work.done < steps):
+        short = work.done < steps
+        for k in short.nonzero()[0]:
             # the last good state stands where the next row would have
-            last = kept[k] - 1
+            last = -(-work.done[k] // every)
             q_rows[k, last], qd_rows[k, last] = q[k], qd[k]
             q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
+        status = _NAMES[work.status]
         if not whole:
-            status[(work.status == 0) & (work.done < steps)] = "interrupted"
+            status[(work.status == 0) & short] = "interrupted"
         t = t0 + h * np.minimum(np.arange(rows) * every, steps)
         run = BatchRun(t, q_rows, qd_rows, h, work.done, status, count * steps)
         if not whole:
@@ -127,7 +127,7 @@ class BatchModel(Model):
             self._out(x, (len(x), self.nq), name)
         if len(q) != len(qd):
             raise ValueError(f"qd: {len(qd)} instances where q has {len(q)}")
-        h, t = self._size(h), _number(t, "t")
+        h, t = self.h if h is None else _size(h), _number(t, "t")
         table, held = self._parameter_rows(params), self._input_rows(u, 1)
         for name, given in (("params", table), ("u", held)):
             if given is not None and len(given) not in (1, len(q)):
@@ -155,8 +155,9 @@ class BatchModel(Model):
         for name, size in sizes.items():
             if size not in (1, count):
                 raise ValueError(f"{name}: {size} instances where others have {count}")
-        q, qd = (np.array(np.broadcast_to(x, (count, self.nq)), order="C") for x in (q, qd))
-        return q, qd, table, held, count
+        starts = np.empty((2, count, self.nq), self.dtype)
+        starts[0], starts[1] = q, qd
+        return starts[0], starts[1], table, held, count
 
     def _parameter_rows(self, params: Any) -> Array:
         if params is None or isinstance(params, Params):
@@ -220,18 +221,18 @@ class _Work:
         count = len(q)
         self.done = np.zeros(count, np.dtype("l"))
         self.status = np.zeros(count, np.dtype("i"))
-        self.stop = threading.Event()
+        self.stop = False
         self.moved = 0
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
         count = len(self.q)
-        if threads is None:
-            threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-        if threads < 1:
+        if threads is not None and threads < 1:
             raise ValueError(f"threads: {threads} is not a positive number")
         if count * self.steps < _WORTH:
             threads = 1
+        elif threads is None:
+            threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         tiles = -(-count // _GROUP)
         size = _GROUP * max(1, min(16, tiles // (4 * threads)))
         groups = [(at, min(size, count - at)) for at in range(0, count, size)]
@@ -253,7 +254,7 @@ class _Work:
                 if progress is not None:
                     progress(self.moved, total)
         except BaseException as fault:
-            self.stop.set()
+            self.stop = True
             for future in waiting:
                 future.cancel()
             wait(waiting)
@@ -285,7 +286,7 @@ class _Work:
             rows = self.q_rows.shape[1]
             q_rows, qd_rows = pointer(self.q_rows[at:end]), pointer(self.qd_rows[at:end])
         first, chunk = 0, max(1, 2048 // max(1, count // 16) // n)
-        while first < self.steps and not self.stop.is_set():
+        while first < self.steps and not self.stop:
             many = min(chunk, self.steps - first)
             begun = perf_counter()
             self.step(

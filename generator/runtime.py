@@ -8,15 +8,16 @@ ValueError with the name of the argument.
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from math import ceil, isfinite
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
 from .estimate import Estimate, advice, estimate
@@ -36,6 +37,8 @@ _SAID = {
 _OF_POSITION = ("D", "g", "potential_energy")
 _MANY = 1000  # steps from which a look at the stability limit is worth its time
 _LARGE = 2**28  # bytes from which a look at the memory is worth its time
+_FEW = 32  # numbers that Python looks at sooner than NumPy
+_CHUNK = 4096  # steps times coordinates before the first look, some ms
 _CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
 
 
@@ -64,6 +67,9 @@ class Run:
     many. evaluations: of accelerations. error: an Estimate, where it was asked for.
     """
 
+    error: Estimate | None = None
+    _energy: Array | None = None
+
     def __init__(
         self, model: Model, t0: float, q: Array, qd: Array, h: float, steps: int, status: str,
         params: Array, every: int, u: Any, method: str, evaluations: int,
@@ -71,9 +77,7 @@ class Run:
         self.t0, self.q, self.qd = t0, q, qd
         self.h, self.steps, self.status = h, steps, status
         self.every, self.method, self.evaluations = every, method, evaluations
-        self.error: Estimate | None = None
         self._model, self._params, self._u = model, params, u
-        self._energy: Array | None = None
 
     @cached_property
     def t(self) -> Array:
@@ -198,6 +202,7 @@ class Model:
     ) -> None:  # fmt: skip
         """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
         self._ffi, self._lib = extension.ffi, extension.lib
+        self._address = self._ffi.from_buffer  # bound once
         self._ctype = self._ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype])
         self.name, self.title, self.digest = name, title, digest
         self.dtype = np.dtype(dtype)
@@ -207,18 +212,17 @@ class Model:
         self.units = dict(units)
         self.nq, self.nu = len(self.coordinates), len(self.inputs)
         self.h, self.duration = h, duration
-        self._start = tuple(np.array(x, self.dtype) for x in start)
-        self._p0 = np.array(list(parameters.values()), self.dtype)
-        self._p0.flags.writeable = False
-        self._at_p0 = self._pointer(self._p0)
+        self._null = self._ffi.NULL
+        self._plenty = _LARGE // self._bytes(1)  # rows
+        self._start = (self._constant(start[0]), self._constant(start[1]))
+        self._p0 = self._constant(tuple(parameters.values()))
+        known = (*self._start, self._p0)
+        *self._at_start, self._at_p0 = (self._address(self._ctype, x) for x in known)
         self._timed = frozenset(timed)
         self.methods = tuple(methods)
         self.orders = {name: order for name, (order, *_) in methods.items()}
         self.limits = {name: (turn, decay) for name, (_, _, turn, decay) in methods.items()}
-        self._memory = {name: getattr(self._lib, f"{name}_memory")() for name in methods}
-        self._runs = {name: getattr(self._lib, f"{name}_run") for name in methods}
-        self._counters = {n: getattr(self._lib, f"{n}_evaluations", None) for n in methods}
-        self._stages = {name: stages for name, (_, stages, *_) in methods.items()}
+        self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
         self._told = False
         self._advised: set[tuple[str, float]] = set()
         names = {
@@ -236,28 +240,48 @@ class Model:
 
     # --- arguments -----------------------------------------------------------------------------
 
+    def _loop(self, name: str, stages: int) -> tuple[Any, Any, Any, int]:
+        """A method's loop in C, the type of what it keeps, what counts evaluations, its stages."""
+        run, work = getattr(self._lib, f"{name}_run"), self._ffi.typeof(f"{name}_work *")
+        return run, work, getattr(self._lib, f"{name}_evaluations", None), stages
+
+    def _constant(self, values: Sequence[float]) -> Array:
+        array = np.array(values, self.dtype)
+        array.flags.writeable = False
+        return array
+
     def _pointer(self, array: Array | None) -> Any:
-        if array is None:
-            return self._ffi.NULL
-        return self._ffi.from_buffer(self._ctype, array)
+        return self._null if array is None else self._address(self._ctype, array)
+
+    def _given(self, u: Any, params: Any) -> tuple[Any, Any]:
+        """The addresses of inputs and parameters."""
+        held = self._null if u is None else self._pointer(self._inputs(u))
+        return held, self._at_p0 if params is None else self._pointer(self._parameters(params))
+
+    def _numbers(self, value: ArrayLike, name: str) -> Array:
+        """A C-contiguous array of the module's numbers, of any shape."""
+        try:
+            array = np.asarray(value)
+            if array.dtype.kind in "cUSmM":  # text that looks like a number is none
+                raise TypeError
+            return np.ascontiguousarray(array, self.dtype)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:
-        if type(value) is np.ndarray and value.dtype == self.dtype and value.flags.c_contiguous:
+        """Finite numbers, (width,) or (n, width)."""
+        if type(value) is ndarray and value.dtype == self.dtype and value.flags.c_contiguous:
             array = value
         else:
-            try:
-                if np.asarray(value).dtype.kind in "USmM":  # text that looks like a number is none
-                    raise TypeError
-                array = np.ascontiguousarray(value, self.dtype)
-            except (TypeError, ValueError):
-                raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
-        if array.ndim not in (1, 2) or array.shape[-1] != width:
+            array = self._numbers(value, name)
+        if array.ndim == 1 and array.size == width <= _FEW and isfinite(sum(array.tolist())):
+            return array  # of few numbers the sum tells soonest; it may overflow all the same
+        if array.shape[-1:] != (width,) or array.ndim > 2:
             raise ValueError(
                 f"{name}: shape {np.shape(value)}, expected ({width},) or (n, {width}): "
                 f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
             )
-        few = array.ndim == 1 and width <= 16  # then NumPy takes longer than Python
-        if not (all(map(math.isfinite, array.tolist())) if few else np.isfinite(array).all()):
+        if not np.isfinite(array).all():
             raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
         return array
 
@@ -265,6 +289,12 @@ class Model:
         at, moving = self._array(q, "q", self.nq), self._array(qd, "qd", self.nq)
         if at.shape != moving.shape:
             raise ValueError(f"qd: shape {moving.shape} beside q of shape {at.shape}")
+        return at, moving
+
+    def _one(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
+        at, moving = self._state(q, qd)
+        if at.ndim != 1:
+            raise ValueError(f"q: shape {at.shape}, expected ({self.nq},)")
         return at, moving
 
     def _parameters(self, params: Any) -> Array:
@@ -283,7 +313,7 @@ class Model:
         try:
             array = np.ascontiguousarray(params, self.dtype)
         except (TypeError, ValueError):
-            array = np.empty(0, self.dtype)
+            array = empty(0, self.dtype)
         if array.shape != self._p0.shape or not np.isfinite(array).all():
             raise ValueError(
                 f"params: expected a dict, Params or {len(self._p0)} finite numbers in the order "
@@ -296,16 +326,14 @@ class Model:
             return None
         if not self.nu:
             raise ValueError("u: this scene has no inputs")
-        if self.nu == 1 and np.ndim(u) == 0:
-            u = [u]
-        array = self._array(u, "u", self.nu)
+        array = self._array(u.reshape(1) if type(u) is ndarray and not u.ndim else u, "u", self.nu)
         if array.ndim != 1:
             raise ValueError(f"u: shape {array.shape}, expected ({self.nu},): one value an input")
         return array
 
     def _out(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
         if out is None:
-            return np.empty(shape, self.dtype)
+            return empty(shape, self.dtype)
         good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.c_contiguous
         if not good or out.shape != shape or not out.flags.writeable:
             raise ValueError(
@@ -317,7 +345,7 @@ class Model:
     def _pair(self, out: Any, shape: tuple[int, ...]) -> tuple[Array, Array]:
         """Arrays for positions and velocities: those given, or new ones."""
         if out is None:
-            return np.empty(shape, self.dtype), np.empty(shape, self.dtype)
+            return empty(shape, self.dtype), empty(shape, self.dtype)
         if not isinstance(out, (tuple, list)) or len(out) != 2:
             raise ValueError("out: expected a pair of arrays, (q, qd)")
         return self._out(out[0], shape, "out[0]"), self._out(out[1], shape, "out[1]")
@@ -334,23 +362,22 @@ class Model:
             at, moving = self._state(q, qd)  # type: ignore[arg-type]  # None is told there
         rows = at.shape[:-1]
         result = self._out(out, rows + shape)
-        if np.ndim(t) and rows:  # a time for each row
+        if rows and np.ndim(t):  # a time for each row
             if np.shape(t) != rows:
                 raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
             for k, now in enumerate(np.asarray(t)):
                 row_qd = None if moving is None else moving[k]
                 result[k] = self._evaluate(name, shape, at[k], row_qd, now, u, params, None)
             return result
-        time, held, table = _number(t, "t"), self._inputs(u), self._parameters(params)
+        time, (inputs, p) = _number(t, "t"), self._given(u, params)
+        address, real = self._address, self._ctype
         function = getattr(self._lib, name, None)
         if function is None:  # no forces, no power
             result[...] = 0
         else:
-            function(
-                rows[0] if rows else 1,
-                self._pointer(result), self._pointer(at), self._pointer(moving), time,
-                self._pointer(held), self._pointer(table),
-            )  # fmt: skip
+            from_qd = self._null if moving is None else address(real, moving)
+            to, from_q = address(real, result), address(real, at)
+            function(rows[0] if rows else 1, to, from_q, from_qd, time, inputs, p)
         return result if result.ndim else result[()]
 
     def _by_time(
@@ -441,16 +468,16 @@ class Model:
         """
         at, moving = self._state(q, qd)
         result = self._out(out, at.shape)
-        made = result if out is None else np.empty(at.shape, self.dtype)
-        status = self._ffi.new("int *")
-        done = self._lib.acceleration(
-            at.shape[0] if at.ndim == 2 else 1,
-            self._pointer(made), self._pointer(at), self._pointer(moving), _number(t, "t"),
-            self._pointer(self._inputs(u)), self._pointer(self._parameters(params)), status,
+        made = result if out is None else empty(at.shape, self.dtype)
+        inputs, p = self._given(u, params)
+        address, real = self._address, self._ctype
+        found = self._lib.acceleration(
+            1 if at.ndim == 1 else len(at), address(real, made), address(real, at),
+            address(real, moving), _number(t, "t"), inputs, p,
         )  # fmt: skip
-        if status[0]:
+        done, said = found >> 2, STATUS[found & 3]
+        if said != "ok":
             where = _state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
-            said = STATUS[status[0]]
             what = _SAID[said] if said == "singular" else "the acceleration is not finite there"
             raise MotionError(f"at {where}: {what}", said)
         if made is not result:
@@ -477,16 +504,14 @@ class Model:
                 f"linearize: {self.name} was built without it: a scene asks with [run] "
                 "linearize = true"
             )
-        at, moving = self._state(q, qd)
+        at, moving = self._one(q, qd)
         n, m = self.nq, self.nu
-        if at.ndim != 1:
-            raise ValueError(f"q: shape {at.shape}, expected ({n},)")
-        A_q, A_qd, B_u = (np.empty((n, w), self.dtype) for w in (n, n, m))
+        A_q, A_qd, B_u = (empty((n, w), self.dtype) for w in (n, n, m))
         status = self._ffi.new("int *")
         self._lib.linearization(
             1, self._pointer(A_q), self._pointer(A_qd), self._pointer(B_u if m else None),
             self._pointer(at), self._pointer(moving), _number(t, "t"),
-            self._pointer(self._inputs(u)), self._pointer(self._parameters(params)), status,
+            *self._given(u, params), status,
         )  # fmt: skip
         if status[0]:
             said = STATUS[status[0]]
@@ -521,7 +546,7 @@ class Model:
         n, state = self.nq, np.asarray(x, self.dtype)
         if state.shape != (2 * n,):
             raise ValueError(f"x: shape {state.shape}, expected ({2 * n},): q, then qd")
-        out = np.empty(2 * n, self.dtype)
+        out = empty(2 * n, self.dtype)
         out[:n] = state[n:]
         out[n:] = self.acceleration(state[:n], state[n:], t, u, params)
         return out
@@ -538,41 +563,30 @@ class Model:
         u None: the scene's signals, followed through the step. Raises MotionError where the step
         can't be made; `out` is untouched then.
         """
-        at, moving = self._state(q, qd)
-        if at.ndim != 1:
-            raise ValueError(f"q: shape {at.shape}, expected ({self.nq},)")
-        at, moving = at.copy(), moving.copy()
-        into = None if out is None else self._pair(out, at.shape)
-        status, total = self._ffi.new("int *"), self._ffi.new("long *")
-        self._stepper(method, "run")(
-            self._pointer(at), self._pointer(moving), _number(t, "t"), self._size(h), 0, 1,
-            self._pointer(self._inputs(u)), 0, 0, self._ffi.NULL, self._ffi.NULL,
-            self._pointer(self._parameters(params)), self._ffi.NULL, status, total,
+        at, moving = self._one(q, qd)
+        h = self.h if h is None else _size(h)
+        inputs, p = self._given(u, params)
+        ends = self._pair(out, at.shape)
+        address, real = self._address, self._ctype
+        found = self._stepper(method, "step")(
+            address(real, ends[0]), address(real, ends[1]), address(real, at),
+            address(real, moving), _number(t, "t"), h, inputs, p,
         )  # fmt: skip
-        if status[0]:
-            said = STATUS[status[0]]
+        if found:
+            said = STATUS[found]
             raise MotionError(
                 f"no step from t = {t:.9g}, {_state_text(at, moving)}: {_SAID[said]}", said
             )
-        if into is None:
-            return at, moving
-        into[0][...], into[1][...] = at, moving
-        return into
+        return ends
 
     def _stepper(self, method: str | None, what: str) -> Any:
-        """The C function of a method: its run, or its batch."""
+        """The C function of a method: its step, run or batch."""
         if method is not None and method not in self.methods:
             raise ValueError(
                 f"method: {method!r} is not in this module, which has {', '.join(self.methods)}: "
                 "a scene asks for several with a list, [run] method = [...]"
             )
         return getattr(self._lib, f"{method or self.methods[0]}_{what}")
-
-    def _size(self, h: float | None) -> float:
-        size = self.h if h is None else _number(h, "h")
-        if size == 0:
-            raise ValueError("h: 0 is not a step size: give a number of seconds")
-        return size
 
     def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
         if steps is not None:
@@ -583,7 +597,7 @@ class Model:
         if time < 0:
             raise ValueError(f"duration: {duration} is not a time in s")
         # the first multiple of h that is not before the duration, rounding aside
-        return int(np.ceil(time / abs(h) * (1 - 1e-12)))
+        return ceil(time / abs(h) * (1 - 1e-12))
 
     def simulate(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
@@ -605,13 +619,15 @@ class Model:
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
-        self._stepper(method, "run")
-        method = method or self.methods[0]
+        if method is None:
+            method = self.methods[0]
+        else:
+            self._stepper(method, "run")
         q = self._start[0] if q0 is None else self._array(q0, "q0", self.nq)
         qd = self._start[1] if qd0 is None else self._array(qd0, "qd0", self.nq)
-        if q.shape != (self.nq,) or qd.shape != (self.nq,):
+        if q.ndim != 1 or qd.ndim != 1:
             raise ValueError(f"q0, qd0: expected one state, ({self.nq},)")
-        h = self._size(h)
+        h = self.h if h is None else _size(h)
         t0 = _number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = _count(every, "every", 1)
@@ -643,81 +659,79 @@ class Model:
             q, qd = self._state(q if q0 is None else q0, qd if qd0 is None else qd0)
         given, method = self._parameters(params), method or self.methods[0]
         self._stepper(method, "run")
-        return advice(self, q, qd, self._size(h), _number(t0, "t0"), u, given, method)
+        h = self.h if h is None else _size(h)
+        return advice(self, q, qd, h, _number(t0, "t0"), u, given, method)
 
     def _trajectory(
         self, q: Array, qd: Array, h: float, steps: int, every: int, u: Any, p: Array, method: str,
         t0: float, out: tuple[Array, Array] | None, progress: Callable[[int, int], None] | None,
     ) -> Run:  # fmt: skip
         """A run from checked arguments, whatever its status."""
-        run = self._runs[method]
-        law, held, stride = self._table(u, steps)
-        rows = 1 + steps // every + (steps % every > 0)
+        run, work_type, counted, stages = self._loops[method]
+        nq, address, real, null = self.nq, self._address, self._ctype, self._null
+        law, held, stride = (None, None, 0) if u is None else self._table(u, steps)
+        rows = 1 - -steps // every
         try:
-            size = rows * 2 * self.nq * self.dtype.itemsize
-            if size > _LARGE and out is None and size > _memory():
+            if rows > self._plenty and out is None and self._bytes(rows) > _memory():
                 raise MemoryError
-            # one array for both, and behind the rows the state that moves
-            both = np.empty((2, 1 if out else rows + 1, self.nq), self.dtype)
+            if out is None:
+                q_rows, qd_rows = empty((rows, nq), self.dtype), empty((rows, nq), self.dtype)
+            else:
+                q_rows, qd_rows = self._pair(out, (rows, nq))
         except MemoryError:
             raise MemoryError(
-                f"{rows} rows of {2 * self.nq} numbers don't fit in memory: keep fewer with every="
+                f"{rows} rows of {2 * nq} numbers don't fit in memory: keep fewer with every="
             ) from None
-        base, width = self._pointer(both), both[0].size
-        if out is None:
-            q_rows, qd_rows = both[0, :-1], both[1, :-1]
-            rows_q, rows_qd = base, base + width
-        else:
-            q_rows, qd_rows = self._pair(out, (rows, self.nq))
-            rows_q, rows_qd = self._pointer(q_rows), self._pointer(qd_rows)
-        q_rows[0], qd_rows[0] = q, qd
-        both[0, -1], both[1, -1] = q, qd
-        q, qd = both[0, -1], both[1, -1]
-        status, total = self._ffi.new("int *"), self._ffi.new("long *")
-        at_q, at_qd = base + (width - self.nq), base + (2 * width - self.nq)
-        at_p = self._at_p0 if p is self._p0 else self._pointer(p)
-        at_u = self._pointer(held)
-        memory = self._ffi.new("long[]", self._memory[method])
-        done, said = 0, "ok"
-        chunk = 1 if law else min(steps, max(1, 4096 // self.nq))
+        to_q, to_qd = address(real, q_rows), address(real, qd_rows)
+        from_q = self._at_start[0] if q is self._start[0] else address(real, q)
+        from_qd = self._at_start[1] if qd is self._start[1] else address(real, qd)
+        at_p = self._at_p0 if p is self._p0 else address(real, p)
+        at_u = null if held is None else address(real, held)
+        done, chunk = 0, 1 if law else _CHUNK // nq or 1
+        # what goes from one call to the next, and what is counted; a single call may do without
+        single = steps <= chunk and counted is None
+        work = null if single else self._ffi.new(work_type)
         try:
-            while done < steps:
-                if law:
+            while True:
+                if law and done < steps:
+                    if done:  # else the start is not among the rows yet
+                        row = -(-done // every)
+                        q, qd = q_rows[row], qd_rows[row]
                     held = self._inputs(law(t0 + done * h, q.copy(), qd.copy()))
                     if held is None:
                         raise ValueError("u: the function returned None, not the inputs")
-                    at_u = self._pointer(held)
-                begun = perf_counter()
-                row = (1 + done // every) * self.nq
-                count = min(chunk, steps - done)
-                run(
-                    at_q, at_qd, t0, h, done, count, at_u + done * stride if stride else at_u,
-                    stride, every, rows_q + row, rows_qd + row, at_p, memory, status, total,
-                )  # fmt: skip
-                done = total[0]
-                if status[0]:
-                    said = STATUS[status[0]]
+                    at_u = address(real, held)
+                count = steps - done
+                if count > chunk:
+                    count, begun = chunk, perf_counter()
+                found = run(
+                    to_q, to_qd, from_q, from_qd, t0, h, count, at_u, stride, every, at_p, work
+                )
+                done, said = found >> 2, STATUS[found & 3]
+                if said != "ok":
                     break
-                if progress is not None:
+                if progress is not None and done:
                     progress(done, steps)
-                if not law and done < steps:
+                if done == steps:
+                    break
+                if not law:
                     spent = perf_counter() - begun
                     chunk = int(count * min(16.0, max(0.25, _CHUNK_SECONDS / (spent + 1e-9)))) + 1
         except KeyboardInterrupt:
-            done, said = total[0], "interrupted"
-        kept = 1 + done // every
-        if done % every:
-            q_rows[kept], qd_rows[kept] = q, qd
-            kept += 1
-        if kept < rows:
+            done, said = work.done if work else done, "interrupted"
+            if not done:
+                q_rows[0], qd_rows[0] = q, qd
+        if done < steps:
+            kept = 1 - -done // every
             q_rows, qd_rows = q_rows[:kept], qd_rows[:kept]
-        kept_u = u if law else held
-        counted = self._counters[method]
-        evaluations = counted(memory) if counted else self._stages[method] * done
+        evaluations = counted(work) if counted else stages * done
         return Run(
-            self, t0, q_rows, qd_rows, h, done, said, p, every, kept_u, method,
+            self, t0, q_rows, qd_rows, h, done, said, p, every, u if law else held, method,
             evaluations,
         )  # fmt: skip
+
+    def _bytes(self, rows: int) -> int:
+        return rows * 2 * self.nq * self.dtype.itemsize
 
     def _table(self, u: Any, steps: int) -> tuple[Callable[..., Any] | None, Array | None, int]:
         """(function, held values, values from one step to the next)."""
@@ -735,9 +749,10 @@ class Model:
                     stacklevel=4,
                 )
             return u, None, 0
-        if self.nu == 1 and np.ndim(u) <= 1 and np.size(u):
-            u = np.reshape(u, (-1, 1)) if np.size(u) > 1 else np.reshape(u, 1)
-        array = self._array(u, "u", self.nu)
+        array = self._numbers(u, "u")
+        if self.nu == 1 and array.ndim < 2 and array.size:
+            array = array.reshape((-1, 1) if array.size > 1 else 1)
+        array = self._array(array, "u", self.nu)
         if array.ndim == 1:
             return None, array, 0
         if len(array) != steps:
@@ -761,13 +776,23 @@ def _held(law: Callable[..., Any], parts: int) -> Callable[..., Any]:
 
 def _number(value: Any, name: str) -> float:
     """A finite number, or a ValueError that names the argument."""
+    if type(value) is float and isfinite(value):
+        return value
     try:
         number = float("x" if isinstance(value, (str, bytes)) else value)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: {value!r} is not a number") from None
-    if not math.isfinite(number):
+    if not isfinite(number):
         raise ValueError(f"{name}: {value!r} is not a finite number")
     return number
+
+
+def _size(h: Any) -> float:
+    """A step size, or a ValueError."""
+    size = _number(h, "h")
+    if size == 0:
+        raise ValueError("h: 0 is not a step size: give a number of seconds")
+    return size
 
 
 def _count(value: Any, name: str, least: int) -> int:

@@ -186,6 +186,25 @@ def test_takes_whatever_looks_like_an_array(cartpole: ModuleType, given: Any) ->
     assert same(ours, plain)
 
 
+def test_numbers_whose_sum_overflows_are_finite(cartpole: ModuleType) -> None:
+    large = np.array([1e308, 1e308])
+    assert np.isfinite(cartpole.D(large)).all()
+    assert cartpole.simulate(large, steps=0).q.tolist() == [large.tolist()]
+    with pytest.raises(ValueError, match=r"q: .*inf.* is not finite"):
+        cartpole.D([math.inf, -math.inf])
+
+
+def test_a_run_may_go_on_in_the_arrays_it_is_given(driven: ModuleType) -> None:
+    """Its start a row of them; `u` a table, `every` one that leaves a last row of its own."""
+    u = np.sin(np.arange(10.0))
+    rows = np.empty((5, 2)), np.empty((5, 2))
+    first = driven.simulate(Q, QD, steps=10, every=3, u=u, out=rows)
+    plain = driven.simulate(first.q[-1].copy(), first.qd[-1].copy(), steps=10, every=3, u=u)
+    again = driven.simulate(rows[0][-1], rows[1][-1], steps=10, every=3, u=u, out=rows)
+    assert again.q is rows[0]
+    assert same(plain, again)
+
+
 def test_rows_of_a_larger_array(cartpole: ModuleType) -> None:
     wide = np.random.default_rng(3).normal(size=(5, 4))
     q, qd = wide[:, :2], wide[:, 2:]  # not contiguous
@@ -468,6 +487,7 @@ BAD_VALUES = [
     ("D", (None,), {}, r"q: "),
     ("D", (["a", "b"],), {}, r"q: .*not an array of numbers"),
     ("D", ([1 + 2j, 0],), {}, r"q: "),
+    ("D", (np.array([1 + 2j, 0]),), {}, r"q: .*not an array of numbers"),
     ("D", ([[1, 2], [3]],), {}, r"q: "),
     ("D", ([1, NAN],), {}, r"q: .*nan.* is not finite"),
     ("D", ([1, math.inf],), {}, r"q: .*inf.* is not finite"),
@@ -778,6 +798,32 @@ def test_ctrl_c_in_the_progress_bar(driven: ModuleType) -> None:
     run = caught.value.run
     assert 10_000 < run.steps < 10**6
     assert same(run, driven.simulate(steps=run.steps, every=9))
+
+
+@pytest.mark.parametrize("steps", [10, 10**6])
+def test_ctrl_c_in_the_first_look_keeps_what_was_done(cartpole: ModuleType, steps: int) -> None:
+    """In a run that is one call in C as in one that is many."""
+
+    def stop(done: int, steps: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        cartpole.simulate(steps=steps, every=3, progress=stop)
+    run = caught.value.run
+    assert (run.status, 0 < run.steps <= steps) == ("interrupted", True)
+    assert same(run, cartpole.simulate(steps=run.steps, every=3))
+
+
+def test_ctrl_c_before_anything_was_done_leaves_the_start(driven: ModuleType) -> None:
+    def law(t: float, q: Any, qd: Any) -> float:
+        raise KeyboardInterrupt
+
+    with warnings.catch_warnings(), pytest.raises(KeyboardInterrupt) as caught:
+        warnings.simplefilter("ignore")
+        driven.simulate(Q, QD, steps=9, u=law)
+    run = caught.value.run
+    assert (run.status, run.steps, run.evaluations) == ("interrupted", 0, 0)
+    assert (run.q.tolist(), run.qd.tolist()) == ([Q], [QD])
 
 
 def test_ctrl_c_in_an_input(driven: ModuleType) -> None:
