@@ -76,13 +76,55 @@ def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path
     many = f'eomc = 1\nname = "many"\n[coordinates]\n{coordinates}[energy]\n'
     many += f'kinetic = "{energy} + a1_dot*a2_dot*sin(a1)/5"\npotential = "{springs}"\n'
     (tmp_path / "many.toml").write_text(many, encoding="utf-8")
-    assert "_angles_both(" in eomc.sources(eomc.read(tmp_path / "many.toml")).files["many.c"]
     own = (tmp_path / "odd.toml", tmp_path / "many.toml")
     for path in (*own, SCENES / "cartpole.toml", SCENES / "double_pendulum.toml"):
         module = eomc.load(path, tmp_path)
         run = module.simulate(h=h, steps=20)
         for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, 20), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_steps_leave_what_was_foretold_and_come_back(tmp_path: Path) -> None:
+    """A pole that falls: it turns by h^2 a/8 from the angles foretold, up to 2^-12.5 is near."""
+    h, steps = 0.016, 800
+    module = eomc.load(SCENES / "cartpole.toml", tmp_path)
+    run = module.simulate(h=h, steps=steps)
+    turns = h**2 / 8 * np.abs(module.acceleration(run.q, run.qd)[:, 1])
+    assert turns.max() > 1.2 * 2.0**-12.5 and turns.min() < 0.5 * 2.0**-12.5
+    for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, steps), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("signal", ["2*sin(3*t)", "2*cos(t)*a - a_dot", "0.7"])
+def test_signals_and_held_inputs_reach_steps_near_what_was_foretold(
+    signal: str, tmp_path: Path
+) -> None:
+    """Signals of time, of the state and constant ones; and inputs held over a step each."""
+    scene = ODD.replace("[energy]", f'[inputs]\nu = {{ signal = "{signal}" }}\n[energy]')
+    text = scene.replace('name = "odd"', 'name = "pushed"') + '[forces]\nb = "u"\n'
+    (tmp_path / "pushed.toml").write_text(text, encoding="utf-8")
+    module = eomc.load(tmp_path / "pushed.toml", tmp_path)
+    h, steps, acceleration = 0.004, 60, module.acceleration
+
+    def textbook(u: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        q, v = module.start
+        for n in range(steps):
+            now = None if u is None else u[n]
+            t = n * h
+            k1, w1 = v, acceleration(q, v, t=t, u=now)
+            k2 = v + h / 2 * w1
+            w2 = acceleration(q + h / 2 * k1, k2, t=t + h / 2, u=now)
+            k3 = v + h / 2 * w2
+            w3 = acceleration(q + h / 2 * k2, k3, t=t + h / 2, u=now)
+            k4 = v + h * w3
+            w4 = acceleration(q + h * k3, k4, t=t + h, u=now)
+            q, v = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), v + h / 6 * (w1 + 2 * w2 + 2 * w3 + w4)
+        return q, v
+
+    for u in (None, np.random.default_rng(2).standard_normal((steps, 1))):
+        run = module.simulate(h=h, steps=steps, u=u)
+        for found, expected in zip((run.q[-1], run.qd[-1]), textbook(u), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
 def test_a_wide_angle_goes_to_libm(tmp_path: Path) -> None:
@@ -143,6 +185,71 @@ def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
     assert 2.0**-55 < worst < 1.5 * 2.0**-53  # what s0 or c0 bring is up to a half of 2^-53
 
 
+@pytest.mark.parametrize("vectors", [True, False])
+def test_sines_near_what_was_foretold_are_sines(vectors: bool, tmp_path: Path) -> None:
+    """foretold.h in units of rounding of 1, in vector registers and without, up to its bounds."""
+    compiler = needs("gcc")
+    names = "sincos.h", "foretold.h", "foretold_both.h"
+    text = "\n".join((ROOT / "csrc" / f).read_text(encoding="utf-8") for f in names)
+    if not vectors:
+        text = text.replace("#ifdef __GNUC__", "#if 0")
+    main = r"""
+    #include <stdio.h>
+    int main(void)
+    {
+        double x[2], d, s, c, far;
+        int wrong = 0;
+
+        while (scanf("%lf %lf %lf", &x[0], &x[1], &d) == 3) {
+            eomc_foretold f, g;
+            eomc_known k[2];
+
+            far = 0;
+            eomc_foretell(&f, x[0], 1.0, 0.0, 0.0, x[1] - x[0]);
+            g.x[0] = f.x[1], g.x[1] = f.x[0];
+            eomc_foretold_both(&f, &g);
+            for (int k = 0; k < 2; k++, eomc_foretold_at(&g))
+                for (int i = 0; i < 2; i++)
+                    wrong |= f.x[i] - f.x[i] == 0
+                        && (f.s[i] != g.s[1 - i] || f.c[i] != g.c[1 - i]);
+            eomc_know(&k[0], &k[1], &f, &far);
+            for (int i = 0; i < 2; i++) {
+                eomc_turn_on(d, &k[i], &s, &c, &far);
+                printf("%.17g %.17g %.17g ", f.x[i], s, c);
+            }
+            printf("%d\n", eomc_are_near(far));
+        }
+        return wrong;
+    }
+    """
+    (tmp_path / "foretold.c").write_text(text + main, encoding="utf-8")
+    subprocess.run(
+        [compiler, "-std=c99", "-O2", "foretold.c", "-o", "foretold", "-lm"],
+        cwd=tmp_path, check=True,
+    )  # fmt: skip
+    random = np.random.default_rng(9)
+    x = np.where(random.random((4000, 2)) < 0.5, 1, 1e4) * random.uniform(-10, 10, (4000, 2))
+    x[:40] = np.pi / 2 * np.arange(-40, 40).reshape(40, 2)
+    d = random.choice([-1, 1], 4000) * 2.0 ** random.uniform(-40, -12.51, 4000)  # two fit
+    beyond = [(0.1, 0.2, 2.0**-12), (2.0**20, 2.0**20 + 10, 0.0), (np.nan, 1.0, 0.0)]
+    beyond += [(np.inf, np.inf, 0.0), (1.0, 1.0, np.nan)]
+    rows = [*zip(*x.T, d, strict=True), *beyond]
+    lines = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
+    done = subprocess.run(
+        ["./foretold"], cwd=tmp_path, input=lines, capture_output=True, text=True, check=True
+    )
+    found = [[float(value) for value in line.split()] for line in done.stdout.splitlines()]
+    assert [row[-1] for row in found] == [1] * 4000 + [0] * len(beyond)
+    with mpmath.workdps(40):
+        worst = max(
+            abs(mpmath.mpf(value) - sure(mpmath.mpf(row[at]) + mpmath.mpf(turn)))
+            for row, turn in zip(found[:4000], d, strict=True)
+            for at in (0, 3)
+            for value, sure in ((row[at + 1], mpmath.sin), (row[at + 2], mpmath.cos))
+        )
+    assert 2.0**-55 < worst < 2 * 2.0**-53
+
+
 @pytest.mark.parametrize(("method", "power"), [("rk4", 20), ("dp8", 18), ("gauss8", 15)])
 def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
     """A step of an oscillator is a linear map R(h J): its power in 40 digits is the answer.
@@ -178,38 +285,39 @@ def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
     assert max(off) < (5e-15 if fma or method != "rk4" else 2e-13)
 
 
-def test_a_run_cut_in_c_is_the_same_to_the_last_bit(tmp_path: Path) -> None:
-    """With the memory handed on; without it, sums begin anew."""
-    for name, text in eomc.sources(eomc.read(SCENES / "cartpole.toml")).files.items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    (tmp_path / "cut.c").write_text(
-        r"""
-        #include "cartpole.h"
+@pytest.mark.parametrize(
+    ("name", "h"), [("cartpole", 0.005), ("cartpole", 0.016), ("double_pendulum", 0.004)]
+)
+def test_a_run_cut_in_c_is_the_same_to_the_last_bit(name: str, h: float, tmp_path: Path) -> None:
+    """With the memory handed on; without it, sums begin anew. Near what was foretold, and not."""
+    for file, text in eomc.sources(eomc.read(SCENES / f"{name}.toml")).files.items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    main = r"""
+        #include "NAME.h"
         #include <stdio.h>
 
         int main(void)
         {
             for (int way = 0; way < 3; way++) {
                 double q[2] = { 0.0, 1.5 }, qd[2] = { 0.0, 0.0 };
-                cartpole_rk4_memory memory;
-                cartpole_status status;
+                NAME_rk4_memory memory;
+                NAME_status status;
                 long part[3] = { 2000, 0, 0 };
 
                 if (way > 0)
                     part[0] = 1, part[1] = 700, part[2] = 1299;
                 memory.warm = 0;
                 for (long k = 0, n = 0; k < 3; n += part[k++])
-                    cartpole_rk4_run(q, qd, 0.01, n, part[k], 0, 0, 0, &cartpole_defaults,
+                    NAME_rk4_run(q, qd, H, n, part[k], 0, 0, 0, &NAME_defaults,
                         way < 2 ? &memory : 0, &status);
                 printf("%.17g %.17g %.17g %.17g\n", q[0], q[1], qd[0], qd[1]);
             }
             return 0;
         }
-        """,
-        encoding="utf-8",
-    )
+        """
+    (tmp_path / "cut.c").write_text(main.replace("NAME", name), encoding="utf-8")
     subprocess.run(
-        [needs("gcc"), "-std=c99", "-O2", "cut.c", "cartpole.c", "-o", "cut", "-lm"],
+        [needs("gcc"), "-std=c99", "-O2", f"-DH={h}", "cut.c", f"{name}.c", "-o", "cut", "-lm"],
         cwd=tmp_path, check=True,
     )  # fmt: skip
     done = subprocess.run(["./cut"], cwd=tmp_path, capture_output=True, text=True, check=True)
