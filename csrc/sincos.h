@@ -53,19 +53,15 @@ EOMC_INLINE double eomc_mul_add(double a, double b, double c)
 #endif
 }
 
-/* s = sin x, c = cos x for |x| <= 2^20; anything else gives nonsense. */
-EOMC_INLINE void eomc_sincos_small(double x, double *s, double *c)
+/* sin r and cos r for |x| <= 2^20; anything else gives nonsense. n: the integer, in the last bits
+ * of shifted = n + 1.5 2^52. */
+EOMC_INLINE void eomc_sincos_reduced(double x, double *shifted, double *sin_r,
+    double *cos_r)
 {
     /* Doubles next to 1.5 2^52 are 1 apart, so adding it and taking it off again rounds to the
      * nearest integer; 1.5, not 1, leaves room for negative ones. */
     const double magic = 6755399441055744.0;
-    const double n = eomc_mul_add(x, 0.6366197723675814, magic) - magic;
-
-    /* m = n modulo 4, between -2 and 2; a and b are then exact, and ready before r is.  Not a
-     * conditional, which would become a jump.  0.0 - m, not -m: b = +0.0 keeps sin(-0.0). */
-    const double m = n - 4.0 * (eomc_mul_add(n, 0.25, magic) - magic);
-    const double a = 1.0 - fabs(m);
-    const double b = (0.0 - m) * (2.0 - fabs(m));
+    const double n = (*shifted = eomc_mul_add(x, 0.6366197723675814, magic)) - magic;
 
     /* r = x - n pi/2, with pi/2 in parts.  The last part only matters where r is tiny and
      * sin r = r: it goes into r_fine, which is not waited for.  All parts are positive, so
@@ -97,8 +93,24 @@ EOMC_INLINE void eomc_sincos_small(double x, double *s, double *c)
     const double q45 = eomc_mul_add(z, -1.1358749082675865e-11, 2.0875705393755688e-09);
     const double p = eomc_mul_add(z2, eomc_mul_add(z2, p45, p23), p01);
     const double q = eomc_mul_add(z2, eomc_mul_add(z2, q45, q23), q01);
-    const double sin_r = eomc_mul_add(r3, p, r_fine);
-    const double cos_r = eomc_mul_add(z, eomc_mul_add(z, q, -0.5), 1.0);
+    *sin_r = eomc_mul_add(r3, p, r_fine);
+    *cos_r = eomc_mul_add(z, eomc_mul_add(z, q, -0.5), 1.0);
+}
+
+/* s = sin x, c = cos x for |x| <= 2^20; anything else gives nonsense. */
+EOMC_INLINE void eomc_sincos_small(double x, double *s, double *c)
+{
+    const double magic = 6755399441055744.0;
+    double shifted, sin_r, cos_r;
+
+    eomc_sincos_reduced(x, &shifted, &sin_r, &cos_r);
+
+    /* m = n modulo 4, between -2 and 2; a and b are then exact, and ready before r is.  Not a
+     * conditional, which would become a jump.  0.0 - m, not -m: b = +0.0 keeps sin(-0.0). */
+    const double n = shifted - magic;
+    const double m = n - 4.0 * (eomc_mul_add(n, 0.25, magic) - magic);
+    const double a = 1.0 - fabs(m);
+    const double b = (0.0 - m) * (2.0 - fabs(m));
 
     /* Exact: one product is zero, the other has a factor of 1 or -1. */
     *s = eomc_mul_add(-b, cos_r, a * sin_r);

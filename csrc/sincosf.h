@@ -54,19 +54,15 @@ EOMC_INLINE float eomc_mul_addf(float a, float b, float c)
 #endif
 }
 
-/* s = sin x, c = cos x for |x| <= 2^13; anything else gives nonsense. */
-EOMC_INLINE void eomc_sincosf_small(float x, float *s, float *c)
+/* sin r and cos r for |x| <= 2^13; anything else gives nonsense. n: the integer, in the last bits
+ * of shifted = n + 1.5 2^23. */
+EOMC_INLINE void eomc_sincosf_reduced(float x, float *shifted, float *sin_r,
+    float *cos_r)
 {
     /* Floats next to 1.5 2^23 are 1 apart, so adding it and taking it off again rounds to the
      * nearest integer; 1.5, not 1, leaves room for negative ones. */
     const float magic = 12582912.0f;
-    const float n = eomc_mul_addf(x, 0.63661975f, magic) - magic;
-
-    /* m = n modulo 4, between -2 and 2; a and b are then exact, and ready before r is.  Not a
-     * conditional, which would become a jump.  0.0f - m, not -m: b = +0.0f keeps sin(-0.0f). */
-    const float m = n - 4.0f * (eomc_mul_addf(n, 0.25f, magic) - magic);
-    const float a = 1.0f - fabsf(m);
-    const float b = (0.0f - m) * (2.0f - fabsf(m));
+    const float n = (*shifted = eomc_mul_addf(x, 0.63661975f, magic)) - magic;
 
     /* r = x - n pi/2, with pi/2 in parts.  The last part only matters where r is tiny and
      * sin r = r: it goes into r_fine, which is not waited for.  All parts are positive, so
@@ -93,8 +89,24 @@ EOMC_INLINE void eomc_sincosf_small(float x, float *s, float *c)
     const float q12 = eomc_mul_addf(z, 2.4432327e-05f, -0.001388731f);
     const float p = eomc_mul_addf(z, p12, -0.16666655f);
     const float q = eomc_mul_addf(z, q12, 0.041666646f);
-    const float sin_r = eomc_mul_addf(r3, p, r_fine);
-    const float cos_r = eomc_mul_addf(z, eomc_mul_addf(z, q, -0.5f), 1.0f);
+    *sin_r = eomc_mul_addf(r3, p, r_fine);
+    *cos_r = eomc_mul_addf(z, eomc_mul_addf(z, q, -0.5f), 1.0f);
+}
+
+/* s = sin x, c = cos x for |x| <= 2^13; anything else gives nonsense. */
+EOMC_INLINE void eomc_sincosf_small(float x, float *s, float *c)
+{
+    const float magic = 12582912.0f;
+    float shifted, sin_r, cos_r;
+
+    eomc_sincosf_reduced(x, &shifted, &sin_r, &cos_r);
+
+    /* m = n modulo 4, between -2 and 2; a and b are then exact, and ready before r is.  Not a
+     * conditional, which would become a jump.  0.0f - m, not -m: b = +0.0f keeps sin(-0.0f). */
+    const float n = shifted - magic;
+    const float m = n - 4.0f * (eomc_mul_addf(n, 0.25f, magic) - magic);
+    const float a = 1.0f - fabsf(m);
+    const float b = (0.0f - m) * (2.0f - fabsf(m));
 
     /* Exact: one product is zero, the other has a factor of 1 or -1. */
     *s = eomc_mul_addf(-b, cos_r, a * sin_r);

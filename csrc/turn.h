@@ -8,18 +8,19 @@
  * and cos d = 1 + d^2 (-1/2 + d^2 B), A and B are Chebyshev series in d^2, cut off; that is off by
  * 2^-56.7 at most.
  *
- * far: squares of angles over those of the largest that are allowed are added to it; where it stays
- * below 1, none of them was too large.
+ * far: angles, or their squares, over those of the largest that are allowed are added to it; where
+ * it stays below 1, none of them was too large.
  */
 
-/* What an angle d that eomc_turn is given adds to far. */
-EOMC_INLINE double eomc_far(double d, double far)
+/* What an angle x of which the sine is computed adds to far. */
+EOMC_INLINE double eomc_far_at(double x, double far)
 {
-    return eomc_mul_add(d * 4096.0, d, far);
+    return eomc_mul_add(fabs(x), 9.5367431640625e-07, far);
 }
 
 /* By d, |d| <= 2^-6. */
-EOMC_INLINE void eomc_turn(double d, double s0, double c0, double *s, double *c)
+EOMC_INLINE void eomc_turn(double d, double s0, double c0,
+    double *s, double *c)
 {
     const double z = d * d;
     const double a = eomc_mul_add(z, 0.008333284892876857, -0.1666666666651884);
@@ -31,9 +32,9 @@ EOMC_INLINE void eomc_turn(double d, double s0, double c0, double *s, double *c)
     *c = eomc_mul_add(-s0, sin_d, eomc_mul_add(c0, less, c0));
 }
 
-/* At x - d, x and x + d, |x| <= 2^20, |d| <= 2^-3. */
-EOMC_INLINE void eomc_sincos_around(double x, double d, double *s_back, double *c_back,
-    double *s, double *c, double *s_on, double *c_on, double *far)
+/* By -d and by d, |d| <= 2^-3. */
+EOMC_INLINE void eomc_turn_both(double d, double s0, double c0,
+    double *s_back, double *c_back, double *s_on, double *c_on, double *far)
 {
     const double z = d * d;
     const double a23 = eomc_mul_add(z, 2.754949151820351e-06, -0.0001984126907687799);
@@ -43,16 +44,12 @@ EOMC_INLINE void eomc_sincos_around(double x, double d, double *s_back, double *
     const double b = eomc_mul_add(z, b12, 0.04166666666663382);
     const double sin_d = eomc_mul_add(d * z, a, d);
     const double less = z * eomc_mul_add(z, b, -0.5);
-    double s0, c0, s1, c1;
+    const double s1 = eomc_mul_add(s0, less, s0);
+    const double c1 = eomc_mul_add(c0, less, c0);
 
-    eomc_sincos_small(x, &s0, &c0);
-    s1 = eomc_mul_add(s0, less, s0);
-    c1 = eomc_mul_add(c0, less, c0);
     *s_back = eomc_mul_add(-c0, sin_d, s1);
     *c_back = eomc_mul_add(s0, sin_d, c1);
-    *s = s0;
-    *c = c0;
     *s_on = eomc_mul_add(c0, sin_d, s1);
     *c_on = eomc_mul_add(-s0, sin_d, c1);
-    *far = eomc_mul_add(z, 64.0, eomc_mul_add(x * 9.094947017729282e-13, x, *far));
+    *far = eomc_mul_add(z, 64.0, *far);
 }

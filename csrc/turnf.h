@@ -5,10 +5,10 @@
  * off by 2^-27 of 1 at most.
  */
 
-/* What an angle d that eomc_turnf is given adds to far. */
-EOMC_INLINE float eomc_farf(float d, float far)
+/* What an angle x of which the sine is computed adds to far. */
+EOMC_INLINE float eomc_far_atf(float x, float far)
 {
-    return eomc_mul_addf(d * 256.0f, d, far);
+    return eomc_mul_addf(fabsf(x), 0.00012207031f, far);
 }
 
 /* By d, |d| <= 2^-4. */
@@ -22,25 +22,21 @@ EOMC_INLINE void eomc_turnf(float d, float s0, float c0, float *s, float *c)
     *c = eomc_mul_addf(-s0, sin_d, eomc_mul_addf(c0, less, c0));
 }
 
-/* At x - d, x and x + d, |x| <= 2^13, |d| <= 1/4. */
-EOMC_INLINE void eomc_sincos_aroundf(float x, float d, float *s_back, float *c_back, float *s,
-    float *c, float *s_on, float *c_on, float *far)
+/* By -d and by d, |d| <= 1/4. */
+EOMC_INLINE void eomc_turn_bothf(float d, float s0, float c0,
+    float *s_back, float *c_back, float *s_on, float *c_on, float *far)
 {
     const float z = d * d;
     const float a = eomc_mul_addf(z, 0.008320942f, -0.16666657f);
     const float b = eomc_mul_addf(z, -0.0013873398f, 0.041666653f);
     const float sin_d = eomc_mul_addf(d * z, a, d);
     const float less = z * eomc_mul_addf(z, b, -0.5f);
-    float s0, c0, s1, c1;
+    const float s1 = eomc_mul_addf(s0, less, s0);
+    const float c1 = eomc_mul_addf(c0, less, c0);
 
-    eomc_sincosf_small(x, &s0, &c0);
-    s1 = eomc_mul_addf(s0, less, s0);
-    c1 = eomc_mul_addf(c0, less, c0);
     *s_back = eomc_mul_addf(-c0, sin_d, s1);
     *c_back = eomc_mul_addf(s0, sin_d, c1);
-    *s = s0;
-    *c = c0;
     *s_on = eomc_mul_addf(c0, sin_d, s1);
     *c_on = eomc_mul_addf(-s0, sin_d, c1);
-    *far = eomc_mul_addf(z, 16.0f, eomc_mul_addf(x * 1.4901161e-08f, x, *far));
+    *far = eomc_mul_addf(z, 16.0f, *far);
 }

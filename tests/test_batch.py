@@ -243,7 +243,7 @@ def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
     at = next(k for k, line in enumerate(lines) if "_rk4_stages(" in line)
     end = lines.index("}", at)
     loops = [k for k, line in enumerate(lines[:end], 1) if k > at and "for (int i" in line]
-    assert len(loops) == 6  # the angles, four stages, the end
+    assert len(loops) == 8  # three of angles, four stages, the end
     for k in loops:
         assert re.search(rf"cartpole\.c:{k}:\d+: optimized: loop vectorized using 32 byte", told)
 
@@ -260,3 +260,23 @@ def test_a_scene_without_parameters(tmp_path: Path, inputs: bool) -> None:
     runs = bare.simulate_batch([[1.0], [2.0]], [[0.0], [0.0]], h=0.01, steps=100, every=100)
     alone = bare.simulate([2.0], [0.0], h=0.01, steps=100, every=100)
     np.testing.assert_allclose(runs.q[1, -1], alone.q[-1], rtol=1e-14)
+
+
+def test_instances_that_end_one_after_another_leave_the_last_alone() -> None:
+    """Copies take the places of those that ended, and may have to be replaced themselves."""
+    m = module("mass_spring")
+    k = np.full(70, m.defaults["k"])
+    k[:63] *= np.geomspace(
+        1e6, 1e9, 63
+    )  # the stiffer, the sooner it overflows; one of a tile stays
+    k[66] *= 1e8
+    runs = m.simulate_batch(steps=400, every=5, params={"k": k})
+    stays = np.setdiff1d(np.arange(63, 70), [66])
+    assert set(runs.status[stays]) == {"ok"} and len(set(runs.steps[:63])) > 10
+    for at in (0, 31, 62, 66):
+        with pytest.warns(RuntimeWarning):
+            alone = m.simulate(steps=400, every=5, params={"k": k[at]})
+        assert (runs.status[at], runs.steps[at]) == (alone.status, alone.steps)
+        assert np.allclose(runs.q[at, : len(alone.t)], alone.q, rtol=1e-9)
+    undisturbed = m.simulate_batch(steps=400, every=5, params={"k": k[stays]})
+    assert np.array_equal(runs.q[stays], undisturbed.q)
