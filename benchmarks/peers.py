@@ -175,8 +175,12 @@ def batch(name: str, root: Path, rounds: int) -> list[Row]:
     if (name, "threads") in BARS and free_cores() > 1.7:
         os.sched_setaffinity(0, CORES)
         case, two = replace(case, steps=100), runners.ours_batch(module, threads=2)
-        peer = Peer("one thread", mine, bars(name, "threads"), agrees=0.0)
-        rows += compare(f"65,536 times {name}, two threads", case, wide, two, [peer], rounds)
+        both = runners.ours_in_processes(module, wide, sorted(CORES)[-2:])
+        peers = [
+            Peer("one thread", mine, bars(name, "threads"), agrees=0.0),
+            Peer("two processes, half each", both, agrees=0.0),
+        ]
+        rows += compare(f"65,536 times {name}, two threads", case, wide, two, peers, rounds)
         os.sched_setaffinity(0, {max(CORES)})
     return rows
 

@@ -6,11 +6,16 @@ x0 is [q; qd], (2 nq,), or (2 nq, batch).
 from __future__ import annotations
 
 import ctypes
+import importlib
 import math
+import multiprocessing
+import os
 import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -62,6 +67,42 @@ def ours_batch(module: ModuleType, threads: int = 1) -> Run:
         return np.hstack([done.q[:, -1], done.qd[:, -1]]).T
 
     return run
+
+
+def ours_in_processes(module: ModuleType, x: Array, cores: Sequence[int]) -> Run:
+    """Ours in a process for each of the cores at once, each with its share of x: what the machine
+    has for threads to reach."""
+    context = multiprocessing.get_context("spawn")
+    n, pipes, lasts = len(x) // 2, [], []
+    for core, share in zip(cores, np.split(x, len(cores), axis=1), strict=True):
+        mine, other = context.Pipe()
+        last = context.RawArray("d", share.size)
+        given = str(module.__file__), share, core, other, last
+        context.Process(target=_share, args=given, daemon=True).start()
+        pipes.append(mine)
+        lasts.append(np.frombuffer(last).reshape(2 * n, -1))
+
+    def run(_: Array, h: float, steps: int) -> Array:
+        for pipe in pipes:
+            pipe.send((h, steps))
+        for pipe in pipes:
+            pipe.recv()
+        return np.hstack(lasts)
+
+    return run
+
+
+def _share(file: str, x: Array, core: int, pipe: Connection, last: Any) -> None:
+    """One of these processes: runs of its share, each when it is told to."""
+    folder = Path(file).parent
+    sys.path.insert(0, str(folder.parent))
+    os.sched_setaffinity(0, {core})
+    run = ours_batch(importlib.import_module(folder.name))
+    out = np.frombuffer(last).reshape(x.shape)
+    while True:
+        h, steps = pipe.recv()
+        out[:] = run(x, h, steps)
+        pipe.send(None)
 
 
 def numba_loop(matrices: Matrices, n: int) -> Callable[..., Any]:

@@ -351,7 +351,8 @@ def _numbered(function: Function, inline: frozenset[str]) -> dict[str, str]:
 
 def indent(lines: Iterable[str], width: int = 4) -> str:
     """Lines of one block, indented; long ones broken after operators."""
-    return "\n".join(" " * width + line for text in lines for line in broken(text, 100 - width))
+    whole = [line for text in lines for line in broken(text, 100 - width)]
+    return "\n".join((" " * width + line).rstrip() for line in whole)
 
 
 def broken(text: str, width: int = 100) -> Sequence[str]:

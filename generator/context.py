@@ -76,9 +76,10 @@ def values(target: Target) -> dict[str, Any]:
         "has_u": bool(s.inputs),
         "has_p": target.needs_p,
         "batch": s.run.batch,
-        "csrc": _csrc(target, bool(moved["angles"]), moved["lanes_turn"]),
+        "csrc": _csrc(target, moved["turned"], moved["lanes_turn"], bool(moved["pairs"])),
         "slopes": slopes,
         "in_pieces": moved["large"]
+        or bool(moved["pairs"] or moved["angles"])
         or s.run.batch
         or any(f["in_pieces"] for f in evaluations)
         or bool(slopes and slopes["inner"]["pieces"]),
@@ -225,19 +226,26 @@ def _face(target: Target) -> dict[str, Any]:
         + ")",
         "run_binding": lambda name: f"{target.prefix}_{name}_run("
         + arguments(
-            "q", "qd", "t0" if t else "", "h", "first", "steps", u and "u, u_stride",
-            "every", "q_rows", "qd_rows", target.p_cast,
-            f"({target.prefix}_{name}_memory *)memory", "&found",
+            "q", "qd", "t0" if t else "", "h", "first", "steps",
+            u and "u ? u + first*u_stride : u, u_stride", "every",
+            f"q_rows + {NQ}*(row + 1)", f"qd_rows + {NQ}*(row + 1)", target.p_cast,
+            "work ? &work->memory : NULL", "&found",
         ) + ")",
+        "step_binding": lambda name: f"{target.prefix}_{name}_step("
+        + arguments("at", "moving", t, "h", u, target.p_cast) + ")",
     }  # fmt: skip
 
 
-def _csrc(target: Target, near: bool, turn: bool) -> list[str]:
+def _csrc(target: Target, turned: int, lanes: bool, pairs: bool) -> list[str]:
     """The hand-written C that this scene needs, under its own prefix."""
+    suffix = target.real.function_suffix
     files = [
-        *([f"sincos{target.real.function_suffix}.h"] if target.sincos else []),
-        *(["near.h"] if near else []),
-        *([f"turn{target.real.function_suffix}.h"] if turn else []),
+        *([f"sincos{suffix}.h"] if target.sincos else []),
+        *(["near.h", "foretold.h"] if turned else []),
+        *(["foretold_both.h"] if turned > 1 else []),
+        *([f"quadrants{suffix}.h"] if target.sincos and target.system.run.batch else []),
+        *([f"turn{suffix}.h"] if lanes or pairs else []),
+        *(["around.h"] if pairs else []),
     ]
     texts = [resource("csrc", file).replace("#include <math.h>\n", "") for file in files]
     return [

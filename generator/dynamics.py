@@ -13,11 +13,12 @@ from typing import Any
 
 from sympy import S
 
-from eomc import lanes, methods, side, turning, vectors
+from eomc import foretold, lanes, methods, pairs, side, turning, vectors
 from eomc.angles import Angle
 from eomc.assignments import Function, Operand
 from eomc.ccode import Body, indent
-from eomc.pieces import is_large, staged
+from eomc.pairs import Parts
+from eomc.pieces import is_large, staged, with_names
 from eomc.program import TIME
 from eomc.steppers import METHODS
 from eomc.system import System
@@ -35,23 +36,28 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
     """What belongs to accelerations and steppers; slopes: what evaluations.linearization gives."""
     s, function, real = target.system, target.program["acceleration"], target.real.name
     P, NQ = target.prefix, f"{target.PREFIX}_NQ"
-    large = is_large(function)
-    turned, rest = turning.turned_apart(target, function)
-    prepare = _prepare_large(target, function) if large else _prepare(target, rest, turned)
+    parts = pairs.apart(target, function)
+    large, arrays = is_large(function), is_large(function) or parts is not None
+    turned, rest = ((), function) if parts else turning.turned_apart(target, function)
+    prepare = _prepare_apart(target, function) if arrays else _prepare(target, rest, turned)
     kept = prepare["prepared_members"]
+    if parts:  # in loops over many it is printed anew
+        function = with_names(function, frozenset(kept))
     takes_c, takes_p = bool(kept), target.needs_p and "signal" in target.program
     t, u = "t" if target.driven else "", "u" if s.inputs else ""
     c, p = "c" if takes_c else "", "p" if takes_p else ""
-    scalar = _mode(target, rest, prepare, takes_c, takes_p, turned)
+    scalar = _mode(target, rest, prepare, takes_c, takes_p, turned, parts)
+    faster = "pairs" if parts else "angles" if turned else ""
+
     t_arg, u_arg = f"{real} t" if t else "", f"const {real} *u" if u else ""
     outer = arguments(u_arg, target.p_arg)
     x = f"{real} q[{NQ}], {real} qd[{NQ}]"
     rows = f"long every, {real} *q_rows, {real} *qd_rows"
     t0_arg = f"{real} t0" if t else ""
     lane = lanes.lane(target, function, prepare, scalar) if s.run.batch else None
-    side_by_side = side.lane(target, function, kept) if _swept(s) and not large else None
+    side_by_side = side.lane(target, function, kept, arrays) if _swept(s) and not large else None
     chosen = [
-        methods.method(target, METHODS[name], slopes, scalar, side_by_side, turned, lane)
+        methods.method(target, METHODS[name], slopes, scalar, side_by_side, faster, lane)
         for name in s.run.methods
     ]
     return prepare | {
@@ -73,6 +79,9 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
         "newton": any(METHODS[name].newton for name in s.run.methods),
         "angles": turning.scalar(target, turned),
+        "foretold": foretold.steps(target, turned, rest.uses, scalar, c, p),
+        "turned": len(turned),
+        "pairs": scalar["pairs"],
         "fabs": "fabs" + target.real.function_suffix,
         "fmax": "fmax" + target.real.function_suffix,
         "method_names": repr(s.run.methods),
@@ -108,17 +117,15 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
             t, "h", u and "u ? u + (base + i)*u_instance + n*u_step : 0",
             "&c" if takes_c else "", "p + (base + i)*p_instance" if takes_p else "",
         ),
-        "tile_prototype": lambda name: f"int {P}_{name}_tile_step("
-        + arguments(f"{P}_tile *s", t_arg, f"{real} h", u and "int held") + ")",
         "batch_binding": lambda name: f"{P}_{name}_batch("
         + arguments(
             "count", "q", "qd", t and "t0", "h", "first", "steps",
             u and "u, u_instance, u_step", "every", "q_rows", "qd_rows", "row_count",
             f"{target.p_cast}, p_instance" if target.needs_p else "", "done", "status",
         ) + ")",
-        "vector_members": [f"{real} x[{NQ}];"] if large
+        "vector_members": [f"{real} x[{NQ}];"] if arrays
         else [f"{real} {', '.join(target.names)};"],
-        "vector_of": lambda name, element: vectors.vector_of(target, large, name, element),
+        "vector_of": lambda name, element: vectors.vector_of(target, arrays, name, element),
         "prepared_here": f"const {P}_prepared c = "
         + "{ " + ", ".join(f"s.c.{n}[i]" for n in kept) + " };",
     }  # fmt: skip
@@ -145,7 +152,7 @@ def _prepare(target: Target, function: Function, turned: Sequence[Angle]) -> dic
     }
 
 
-def _prepare_large(target: Target, function: Function) -> dict[str, Any]:
+def _prepare_apart(target: Target, function: Function) -> dict[str, Any]:
     """The same as a function of its own, itself in pieces where it is long."""
     own = [p.name for p in target.system.parameters]
     first, _ = staged(function, own)
@@ -154,7 +161,7 @@ def _prepare_large(target: Target, function: Function) -> dict[str, Any]:
     places = [f"c->{n}" for n in kept]
     made = {"prepared_members": kept, "has_prepare": bool(kept or first.checks)}
     if not is_large(first):
-        body = target.body(first)
+        body = target.body(first, parameters=own)
         sets = [f"{to} = {text};" for to, text in zip(places, body.results, strict=True)]
         return made | {
             "prepare_pieces": None,
@@ -199,13 +206,15 @@ def _mode(
     takes_c: bool,
     takes_p: bool,
     turned: Sequence[Angle],
+    parts: Parts | None,
 ) -> dict[str, Any]:
     """solve, rates and steppers for one trajectory: they return whether D was regular.
 
-    turned: the angles whose sines and cosines are not computed in `function`.
+    turned: the angles whose sines and cosines are not computed in `function`. parts: its two parts,
+    where places are taken in pairs.
     """
     s, real, P = target.system, target.real.name, target.prefix
-    timed, u, large = TIME in function.uses, bool(s.inputs), "body" not in prepare
+    timed, u, arrays = TIME in function.uses, bool(s.inputs), "body" not in prepare
     t_arg = f"{real} t" if target.driven else ""
     u_arg = f"const {real} *u" if u else ""
     c_arg = f"const {P}_prepared *c" if takes_c else ""
@@ -221,11 +230,11 @@ def _mode(
         return after(time if timed else "", c)
 
     def in_vector(array: str, name: str) -> str:
-        return f"{array}->x[{target.enum[name]}]" if large else f"{array}->{name}"
+        return f"{array}->{vectors.member(target, arrays, name)}"
 
     made: dict[str, Any] = {
         "head": "static int"
-        if large
+        if arrays
         else f"{target.PREFIX}_INLINE int"
         if turned
         else "static inline int",
@@ -257,8 +266,8 @@ def _mode(
         "unused": _unread(target, function),
         "pieces": None,
         "signal_at": [
-            vectors.gathered(target, large, "q", "at"),
-            vectors.gathered(target, large, "qd", "moving"),
+            vectors.gathered(target, arrays, "q", "at"),
+            vectors.gathered(target, arrays, "qd", "moving"),
         ]
         if target.signal_state
         else [],
@@ -270,12 +279,15 @@ def _mode(
         "and": "good &= ",
         "last": "return good;",
         "each": lambda lines, width=4, index="i": indent(
-            vectors.each(target, large, lines, index), width
+            vectors.each(target, arrays, lines, index), width
         ),
-        "rows": indent(vectors.rows(target, large), 12),
+        "rows": indent(vectors.rows(target, arrays), 12),
+        "arrays": arrays,
+        "flag": "int" if real == "float" else "long long",  # as wide as a real
+        "pairs": None,
         "own_signal": None,
     }
-    if not large:
+    if not arrays:
         body: Body = prepare["body"]
         return made | {
             "loads": target.loads(function, in_vector, target.element),
@@ -285,8 +297,17 @@ def _mode(
             ],
             "end": [f"return {none_of(body.failures)};"],
         }
-    _, rest = staged(function, [p.name for p in s.parameters])
     kept = prepare["prepared_members"]
+    if parts:
+        made["pairs"] = two = pairs.context(target, parts, kept, timed, takes_p)
+        return made | {
+            "unused": [],
+            "loads": two["solve_locals"],
+            "blocks": [],
+            "results": two["solve_lines"],
+            "end": two["solve_end"],
+        }
+    _, rest = staged(function, [p.name for p in s.parameters])
     groups = target.groups()
     given = [
         Argument(f"const {P}_vector *q", "q", groups["q"]),

@@ -32,7 +32,11 @@ class Solution:
 
 
 def solve(
-    tape: Tape, D: Rows, b: Sequence[Expr], short: Callable[[Expr], Expr] = lambda atom: atom
+    tape: Tape,
+    D: Rows,
+    b: Sequence[Expr],
+    short: Callable[[Expr], Expr] = lambda atom: atom,
+    kept: Callable[[Expr], Expr] = lambda atom: atom,
 ) -> tuple[tuple[int, ...], Vector, Pairs]:
     """x with D x = b by L diag(d) L^T x = b, unrolled; zeros are neither stored nor computed.
 
@@ -40,7 +44,9 @@ def solve(
     one with the fewest entries left beside it (minimum degree), among equals the earliest known,
     and then the one with the fewest divisions in a row behind it: a chain is eliminated from both
     its ends, each at the other's side in a processor.
-    short: rewrites what elimination makes, so that terms which cancel are gone.
+    short: rewrites what elimination makes, so that terms which cancel are gone. kept: what is done
+    with the entries of L; where they are kept whole, each x waits for one operation on the one
+    before, not for two.
     """
     n = len(b)
     A = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
@@ -61,7 +67,7 @@ def solve(
         beside = {i: A[i, k] for i in left if (i, k) in A}
         for i in beside:
             behind[i] = max(behind[i], behind[k] + 1)
-        factors = {i: tape.define(a * inverse) for i, a in beside.items()}
+        factors = {i: kept(tape.define(a * inverse)) for i, a in beside.items()}
         for i, factor in factors.items():
             y[i] = short(tape.define(y[i] - factor * y[k]))
             for j, a in beside.items():

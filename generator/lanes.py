@@ -13,13 +13,13 @@ from eomc import side, turning, vectors
 from eomc.angles import Angle, apart
 from eomc.assignments import Function
 from eomc.ccode import DOUBLE, indent
-from eomc.pieces import staged
+from eomc.pieces import is_large, staged
 from eomc.program import TIME
 from eomc.steppers import METHODS
 from eomc.target import TROUBLE, Access, Argument, Target, after, arguments
 
-NEAR = 32_768  # bytes that a tile of a small system may have: a first-level cache
-WIDE = 131_072  # and of a large one: a part of a second-level cache
+KEPT = {"a1": "first", "a2": "second", "a3": "third", "a4": "fourth"}  # by the stages of RK4
+NEAR = 32_768  # bytes that a tile may have: a first-level cache
 
 
 def lane(
@@ -31,7 +31,7 @@ def lane(
     instance needs is inlined into such loops, one for every stage of a step.
     """
     s, real, P = target.system, target.real.name, target.prefix
-    large, held = "body" not in prepare, bool(s.inputs)
+    large, held = is_large(function), bool(s.inputs)
     timed = TIME in function.uses
     kept = prepare["prepared_members"]
     alone = f"{target.PREFIX}_ALONE "
@@ -67,6 +67,11 @@ def lane(
             f"{P}_lanes *r, {P}_lanes *v" if large else f"{P}_lanes *{alone}r, {P}_lanes *{alone}v",
             state, t_arg, f"{real} h", u_arg and f"{u_arg}, int held", c_arg, troubles,
         ),
+        "tile_prototype": lambda name: f"int {P}_{name}_tile_step("
+        + arguments(
+            f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
+            t_arg, f"{real} h", "int held" if held else "",
+        ) + ")",
         "stepper_call": lambda troubles: after(
             "t" if target.driven else "", "h", "&s->u, held" if held else "",
             "&s->c" if kept else "", troubles,
@@ -77,14 +82,13 @@ def lane(
         "and": "",
         "last": "",
         "each": lambda lines, width=4: indent(_each_of_tile(target, lines), width),
-        "flag": "long long" if real == "double" else "int",  # as wide as a real
         "angles": None,
         "one": None,
         "pieces": None,
         "own_signal": _signal_lanes(target, kept, c_arg, troubles) if large else None,
     }  # fmt: skip
     if not large:
-        return made | _lane_small(target, function, kept)
+        return made | _lane_small(target, function, kept, mode["arrays"])
     return made | _lane_large(target, function, kept, made)
 
 
@@ -96,60 +100,45 @@ def _each_of_tile(target: Target, lines: Sequence[str]) -> list[str]:
     )
 
 
-def _lane_small(target: Target, function: Function, kept: Sequence[str]) -> dict[str, Any]:
+def _lane_small(
+    target: Target, function: Function, kept: Sequence[str], arrays: bool
+) -> dict[str, Any]:
     """Accelerations of one instance, and how loops over a tile call them."""
     s, real = target.system, target.real
     held, timed = bool(s.inputs), TIME in function.uses
     reach = real.reach and "rk4" in s.run.methods
     turned, rest = apart(function, target.names) if reach else ((), function)
-    at = [target.enum[n] for n in target.names]
 
-    def call(angles: str, time: str, hold: str, troubles: str) -> str:
+    def call(angles: str, time: str, hold: str, trouble: str = "&trouble") -> str:
         now = time if (target.driven if held else timed) else ""
         return after(
             angles if turned else "", now, f"&given, {hold}" if held else "",
-            "&here" if kept else "", f"&{troubles}[i]",
+            "&here" if kept else "", trouble,
         )  # fmt: skip
 
-    one = side.lane(target, rest, kept, turning.sines(turned)) | {
-        "each": lambda lines, width=4: indent(vectors.each(target, False, lines), width)
-    }
+    one = side.lane(target, rest, kept, arrays, turning.sines(turned))
     return {
         "one": one,
-        "angles": turning.lane(target, turned),
-        "odd": [
-            f"const {real.name} sum = "
-            + " + ".join(f"{x}.{n}" for n in target.names for x in ("q", "qd"))
-            + ";",
-            f"odd |= !((sum - sum) + s->trouble[i] + {'far' if turned else 's->idle'}[i] < 1);",
-        ],
-        "sum": " + ".join(f"{x}.x[{k}][i]" for k in at for x in "rv"),
+        "angles": turning.lane(target, turned, arrays),
         "rates_given": [
-            *_of_instance(target, "at", "vector", "q->x[#][i]", target.names),
-            *_of_instance(target, "moving", "vector", "qd->x[#][i]", target.names),
+            "const " + vectors.vector_of(target, arrays, "at", "q->x[#][i]"),
+            "const " + vectors.vector_of(target, arrays, "moving", "qd->x[#][i]"),
             *_given(target, kept, "u->", "c->"),
         ],
-        "rates_call": call("&s", "t", "held", "troubles"),
+        "rates_call": call("&s", "t", "held", "&troubles[i]"),
         "rates_held": lambda hold: arguments(
             "a, q, qd", "t" if target.driven else "", "u", hold, "c" if kept else "", "troubles"
         ),
-        "stages": _stages(target, turned, _given(target, kept, "s->u.", "s->c."), call),
+        "stages": _stages(target, arrays, turned, _given(target, kept, "s->u.", "s->c."), call),
     }
-
-
-def _of_instance(
-    target: Target, name: str, struct: str, element: str, members: Sequence[str]
-) -> list[str]:
-    """A struct of one instance's numbers; # in `element` is the place of each."""
-    inside = ", ".join(element.replace("#", target.enum[n]) for n in members)
-    return [f"const {target.prefix}_{struct} {name} = {{ {inside} }};"]
 
 
 def _given(target: Target, kept: Sequence[str], u: str, c: str) -> list[str]:
     """The inputs and the prepared values of one instance."""
     lines = []
     if target.system.inputs:
-        lines += _of_instance(target, "given", "inputs", f"{u}x[#][i]", target.input_names)
+        inside = ", ".join(f"{u}x[{target.enum[n]}][i]" for n in target.input_names)
+        lines.append(f"const {target.prefix}_inputs given = {{ {inside} }};")
     if kept:
         inside = ", ".join(f"{c}{n}[i]" for n in kept)
         lines.append(f"const {target.prefix}_prepared here = {{ {inside} }};")
@@ -158,64 +147,73 @@ def _given(target: Target, kept: Sequence[str], u: str, c: str) -> list[str]:
 
 def _stages(
     target: Target,
+    arrays: bool,
     turned: Sequence[Angle],
     given: Sequence[str],
-    call: Callable[[str, str, str, str], str],
+    call: Callable[[str, str, str], str],
 ) -> dict[str, Any]:
-    """The stages of RK4 as loops over a tile: how each has its place, and what it leaves."""
+    """The stages of RK4 as loops over a tile: what each reads, and what it leaves."""
     P, real, members = target.prefix, target.real.name, turning.sines(turned)
+    alone, two = f"{target.PREFIX}_ALONE ", target.literal(2.0)
     t_arg, t = (f"{real} t", "t") if target.driven else ("", "")
-    u_arg = "int held" if target.system.inputs else ""
-    q, qd, two = "s->q.x[#][i]", "s->qd.x[#][i]", target.literal(2.0)
-    a1, a2, a3, a4 = (f"a{k}.x[#][i]" for k in (1, 2, 3, 4))
     plans = [
-        ("back", "t", [f"at.$ = {q};", f"moving.$ = {qd};"], ""),
-        ("mid", "t + h_2", [f"at.$ = {q} + h_2*{qd};", f"moving.$ = {qd} + h_2*{a1};"], ""),
-        (
-            "mid", "t + h_2",
-            [f"at.$ = ({q} + h_2*{qd}) + hh_4*{a1};", f"moving.$ = {qd} + h_2*{a2};"],
-            f"d.$ = hh_4*{a1};",
-        ),
-        (
-            "on", "t + h",
-            [f"at.$ = ({q} + h*{qd}) + hh_2*{a2};", f"moving.$ = {qd} + h*{a3};"],
-            f"d.$ = hh_2*{a2};",
-        ),
-    ]  # fmt: skip
+        ("back", "t", []),
+        ("mid", "t + h_2", ["at.$ = q.$ + h_2*qd.$;", "moving.$ = qd.$ + h_2*a1.$;"]),
+        ("mid", "t + h_2", ["at.$ = (q.$ + h_2*qd.$) + hh_4*a1.$;", "moving.$ = qd.$ + h_2*a2.$;"]),
+        ("on", "t + h", ["at.$ = (q.$ + h*qd.$) + hh_2*a2.$;", "moving.$ = qd.$ + h*a3.$;"]),
+    ]
+    read: tuple[list[str], ...] = [], ["a1"], ["a1", "a2"], ["a2", "a3"]
+
+    def earlier(names: Sequence[str]) -> list[str]:
+        """The state, and accelerations of earlier stages."""
+        places = {"q": "from->q", "qd": "from->qd"} | {name: KEPT[name] for name in names}
+        return [
+            "const " + vectors.vector_of(target, arrays, name, of + ".x[#][i]")
+            for name, of in places.items()
+        ]
+
     loops = []
-    for k, (near, time, lines, d) in enumerate(plans, 1):
-        from_near = ", ".join(f"{near}.{n}[i]" for n in members)
+    for k, (near, time, lines) in enumerate(plans, 1):
+        sines = ", ".join(f"{near}.{n}[i]" for n in members)
         loops.append(
             {
-                "given": given,
-                "angles": [
-                    f"const {P}_angles s_near = {{ {from_near} }};",
-                    *([f"{P}_angles s_at;", f"{P}_vector d;"] if d else []),
+                "given": [
+                    *earlier(read[k - 1]),
+                    *given,
+                    *([f"const {P}_angles s_at = {{ {sines} }};"] if turned else []),
                 ],
-                "lines": lines + ([d] if d and turned else []),
-                "turned": [f"{P}_angles_turned(&s_at, &d, &s_near);"] if d else [],
-                "call": call("&s_at" if d else "&s_near", time, "held", "s->trouble"),
-                "ends": [f"a{k}.x[#][i] = a.$;"],
-                "looks_ahead": turned and k == 2,
+                "vectors": ["at", "moving", f"a{k}"] if lines else ["a1"],
+                "begins": k == 1 and not turned,
+                "lines": lines,
+                "call": f"(&a{k}, {'&at, &moving' if lines else '&q, &qd'}"
+                + call("&s_at", time, "held") + ");",
+                "kept": [f"{KEPT[f'a{k}']}.x[#][i] = a{k}.$;"],
+                "ahead": f"trouble += ({P}_angles_squares(&a1) + {P}_angles_squares(&a2))*far_2;"
+                if turned and k == 2
+                else "",
             }
-        )
-    far_arg, far = (f"{real} *far", "far") if turned else ("", "")
+        )  # fmt: skip
     return {
         "prototype": f"{target.PREFIX}_LANE int {P}_rk4_stages("
         + arguments(
-            f"{P}_lanes *r, {P}_lanes *v", far_arg, f"{P}_tile *s", t_arg, f"{real} h", u_arg
+            f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
+            t_arg, f"{real} h", "int held" if target.system.inputs else "",
         ) + ")",
-        "around": [f"{x}.{n}[i] = s_{x}.{n};" for x in ("back", "mid", "on") for n in members],
-        "loops": loops,
-        "ahead": [[plans[2][3]], [plans[3][3]]],
+        "call": lambda hold: f"{P}_rk4_stages(" + arguments("to, from, s", t, "h", hold) + ")",
+        "before": loops[:2],
+        "after": loops[2:],
+        "all": earlier(list(KEPT)),
         "ends": [
-            f"q.$ = {q} + (h*{qd} + hh_6*({a1} + ({a2} + {a3})));",
-            f"qd.$ = {qd} + h_6*(({a1} + {a4}) + {two}*({a2} + {a3}));",
-            "r->x[#][i] = q.$;",
-            "v->x[#][i] = qd.$;",
+            "at.$ = q.$ + (h*qd.$ + hh_6*(a1.$ + (a2.$ + a3.$)));",
+            f"moving.$ = qd.$ + h_6*((a1.$ + a4.$) + {two}*(a2.$ + a3.$));",
+            "to->q.x[#][i] = at.$;",
+            "to->qd.x[#][i] = moving.$;",
         ],
-        "call": lambda hold: f"{P}_rk4_stages("
-        + arguments("&r, &v", far, "s", t, "h", hold) + ")",
+        "sum": " + ".join(
+            f"{x}.{vectors.member(target, arrays, n)}"
+            for n in target.names
+            for x in ("at", "moving")
+        ),
     }  # fmt: skip
 
 
@@ -312,17 +310,12 @@ def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
 
 
 def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> int:
-    """Instances side by side: as many as stay near with what belongs to them.
-
-    Small: eight vectors of 32 bytes at most, since more brought nothing.
-    """
+    """Instances side by side: as many as stay near with what belongs to them, 64 at most."""
     s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
-    numbers = 2 * n + len(s.u) + kept + 2
+    numbers = 4 * n + len(s.u) + kept + 1  # two states, and whether there was trouble
     if lane["pieces"]:
-        most, near, size = 64, WIDE, 8
-        numbers += len(lane["pieces"]["members"]) + 6 * n
+        numbers += len(lane["pieces"]["members"]) + 4 * n
     else:
-        most, near = 256 // size, NEAR
-        numbers += (2 + max(METHODS[name].stages for name in s.run.methods)) * n
-        numbers += 1 + 3 * len(lane["angles"]["members"]) if lane["angles"] else 1
-    return max(8, min(most, 1 << (near // (size * numbers)).bit_length() - 1))
+        numbers += max(METHODS[name].stages for name in s.run.methods) * n
+        numbers += 3 * len(lane["angles"]["members"]) if lane["angles"] else 0
+    return max(8, min(64, 1 << (NEAR // (size * numbers)).bit_length() - 1))

@@ -11,11 +11,12 @@ import numpy as np
 from sympy import Rational
 
 from eomc import ccode, vectors
-from eomc.angles import Angle
 from eomc.ccode import Real
 from eomc.program import TIME
 from eomc.steppers import RK4, Method, Row
 from eomc.target import Target, after, arguments
+
+RK4_BY = {"angles": "rk4_angles.c.jinja", "pairs": "rk4_pairs.c.jinja"}  # what makes it faster
 
 
 def _number(x: Fraction, real: Real) -> str:
@@ -61,21 +62,19 @@ def _about(m: Method) -> dict[str, Any]:
 
 def method(
     target: Target, m: Method, slopes: Mapping[str, Any] | None, scalar: Mapping[str, Any],
-    side_by_side: Mapping[str, Any] | None, turned: Sequence[Angle],
+    side_by_side: Mapping[str, Any] | None, faster: str,
     lane: Mapping[str, Any] | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """A method as its template wants it."""
-    large = scalar["pieces"] is not None
+    """A method as its template wants it. faster: what RK4 makes use of, if anything."""
+    arrays = scalar["arrays"]
     if m.sweeps:
         return _side_by_side(target, m, scalar, side_by_side)
     if slopes is not None and m.newton:
-        return _implicit(target, m, slopes, scalar, large)
-    return _explicit(m, target.real, turned, lane)
+        return _implicit(target, m, slopes, scalar, arrays)
+    return _explicit(m, target.real, faster, lane)
 
 
-def _explicit(
-    m: Method, real: Real, turned: Sequence[Angle], lane: Mapping[str, Any] | None
-) -> dict[str, Any]:
+def _explicit(m: Method, real: Real, faster: str, lane: Mapping[str, Any] | None) -> dict[str, Any]:
     """An explicit method as its template wants it; RK4 has one of its own, written out by hand."""
 
     def total(row: Row) -> str:
@@ -95,14 +94,14 @@ def _explicit(
 
     stages = [] if m is RK4 else list(zip(m.c, m.a_squared, m.a, strict=True))[1:]
     first, half = m.c[0], _number(m.c[0], real)
-    angles = m is RK4 and bool(turned)
+    faster = faster if m is RK4 else ""
     lane_template = "rk4.c.jinja" if m is RK4 else "explicit.c.jinja"
     by_stages = m is RK4 and bool(lane and lane["one"])
     return _about(m) | {
         "by_stages": by_stages,
         "by_rates": not by_stages or bool(lane and lane["angles"]),
-        "angles": angles,
-        "template": "rk4_angles.c.jinja" if angles else lane_template,
+        "angles": faster == "angles",
+        "template": RK4_BY.get(faster, lane_template),
         "lane_template": lane_template,
         "begin": [f"r->$ = q->$ + {half}*h*qd->$;"] if first else [],
         "begin_at": "r, qd" if first else "q, qd",
@@ -116,7 +115,7 @@ def _explicit(
 
 
 def _implicit(
-    target: Target, m: Method, slopes: Mapping[str, Any], scalar: Mapping[str, Any], large: bool
+    target: Target, m: Method, slopes: Mapping[str, Any], scalar: Mapping[str, Any], arrays: bool
 ) -> dict[str, Any]:
     """An implicit method as its template wants it, for one trajectory."""
     real, P, s = target.real, target.prefix, m.stages
@@ -156,8 +155,8 @@ def _implicit(
         "ahead": matrix(m.ahead),
         "guess": " + ".join(f"ahead[i][{j}]*m->a[{j}][k]" for j in range(s)),
         "gathered": [
-            vectors.gathered(target, large, "q", "at_now"),
-            vectors.gathered(target, large, "qd", "moving_now"),
+            vectors.gathered(target, arrays, "q", "at_now"),
+            vectors.gathered(target, arrays, "qd", "moving_now"),
         ],
         "stage": [
             f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*({total('AA[i]')}));",
@@ -181,7 +180,7 @@ def _side_by_side(
     rest = scalar["stepper_arguments"].split(", ", 2)[2]
     c, p = ("c" if "_prepared *c" in rest else ""), ("p" if "_params *p" in rest else "")
     stages, memory = f"{P}_{m.name}_stages", f"{P}_{m.name}_memory *m"
-    large, alone = scalar["pieces"] is not None, f"{target.PREFIX}_ALONE"
+    arrays, alone = scalar["arrays"], f"{target.PREFIX}_ALONE"
 
     def by_stage(rows: Sequence[Row]) -> list[str]:
         columns = zip(*rows, strict=True)
@@ -230,8 +229,8 @@ def _side_by_side(
         "enough": repr(max(1e-8, real.epsilon)) + real.suffix,
         "loose": f"{max(1e-6, 512 * real.epsilon):.0e}" + real.suffix,
         "gathered": [
-            vectors.gathered(target, large, "q", "at_now"),
-            vectors.gathered(target, large, "qd", "moving_now"),
+            vectors.gathered(target, arrays, "q", "at_now"),
+            vectors.gathered(target, arrays, "qd", "moving_now"),
         ],
         "stage": [
             f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*{P}_{m.name}_sum(w->AA, a->x[#], i));",

@@ -19,6 +19,7 @@ from eomc.tape import Stage
 
 LARGE = 1000  # weight from which a function is cut
 PIECE = 500  # weight of a piece, up to a third more or less
+LANE_PIECE = 180  # the same in loops over a tile: the processor is to see a few instances at once
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def split(function: Function, piece: int) -> tuple[Piece, ...]:
     crossing = frozenset().union(*reads)
     return tuple(
         Piece(
-            _with_names(part, crossing),
+            with_names(part, crossing),
             tuple(outputs[k]),
             tuple(a.name for a in run if a.name in reads[k]),
             tuple(a.name for a in runs[k] if a.name in crossing),
@@ -135,7 +136,9 @@ def _angle(a: Assignment) -> tuple[Operand, ...]:
     return a.value.args if sine and isinstance(a.value, Call) else ()
 
 
-def _with_names(function: Function, names: frozenset[str]) -> Function:
+def with_names(function: Function, names: frozenset[str]) -> Function:
+    """The function with values that keep their names in print."""
+
     def marked(run: tuple[Assignment, ...]) -> tuple[Assignment, ...]:
         return tuple(replace(a, named=True) if a.name in names else a for a in run)
 

@@ -5,18 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from eomc import vectors
 from eomc.assignments import Function
+from eomc.ccode import indent
 from eomc.program import TIME
-from eomc.target import Target, after, arguments
+from eomc.target import Access, Target, after, arguments
 
 
 def lane(
-    target: Target, function: Function, kept: Sequence[str], sines: Sequence[str] = ()
+    target: Target,
+    function: Function,
+    kept: Sequence[str],
+    arrays: bool,
+    sines: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What lane.c.jinja prints: solve, and where there are inputs rates and signals.
 
     What goes wrong is noted in trouble, so that a loop over stages has no branches. kept: what
-    parameters alone decide. sines: sines and cosines that come from outside, in a struct s.
+    parameters alone decide. arrays: whether vectors are arrays. sines: sines and cosines that come
+    from outside, in a struct s.
     """
     s, real, P = target.system, target.real.name, target.prefix
     timed, given = TIME in function.uses, bool(s.inputs)
@@ -42,18 +49,22 @@ def lane(
         "rates_arguments": arguments(
             f"{P}_vector *a", state, s_arg, t_arg, u_arg, "int held", c_arg, trouble
         ),
-        "own_signal": signal(target, state, c_arg, trouble),
+        "own_signal": signal(target, state, c_arg, trouble, arrays),
+        "each": lambda lines, width=4: indent(vectors.one_by_one(target, arrays, lines), width),
         "unused": [*_unread(target, function, ("q", "qd", "u")), *quiet],
-        "loads": target.loads(function, _member, _member),
+        "loads": target.loads(function, _members(target, arrays), _input),
         "blocks": body.blocks,
         "results": [
-            f"a->{name} = {r};" for name, r in zip(target.names, body.results, strict=True)
+            f"a->{vectors.member(target, arrays, name)} = {r};"
+            for name, r in zip(target.names, body.results, strict=True)
         ],
         "end": [f"*trouble = {x} ? {one} : *trouble;" for x in body.failures],
     }
 
 
-def signal(target: Target, state: str, c_arg: str, trouble: str) -> dict[str, Any] | None:
+def signal(
+    target: Target, state: str, c_arg: str, trouble: str, arrays: bool
+) -> dict[str, Any] | None:
     """The scene's signals for one stage, or one of many."""
     if "signal" not in target.program:
         return None
@@ -75,13 +86,17 @@ def signal(target: Target, state: str, c_arg: str, trouble: str) -> dict[str, An
             *([] if made.sincos else ["trouble"]),
             *(_unread(target, given, ("q", "qd")) if at else []),
         ],
-        "loads": target.loads(given, _member, _member),
+        "loads": target.loads(given, _members(target, arrays), _input),
         "blocks": [*made.early, *made.blocks],
         "results": [f"u->{i.name} = {r};" for i, r in zip(s.inputs, made.results, strict=True)],
     }  # fmt: skip
 
 
-def _member(array: str, name: str) -> str:
+def _members(target: Target, arrays: bool) -> Access:
+    return lambda array, name: f"{array}->{vectors.member(target, arrays, name)}"
+
+
+def _input(array: str, name: str) -> str:
     return f"{array}->{name}"
 
 

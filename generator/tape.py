@@ -95,6 +95,13 @@ class Tape:
         self.hint.setdefault(symbol, name)
         return symbol
 
+    def whole(self, atom: Expr) -> Expr:
+        """The atom, its name kept whole inside products."""
+        symbol = split(atom)[1]
+        if symbol is not None:
+            self._solid.add(symbol)
+        return atom
+
     def stage_of(self, atom: Expr) -> Stage:
         """The binding time of what `define` returned."""
         symbol = split(atom)[1]

@@ -216,19 +216,24 @@ class Target:
         loads: Callable[[Function], list[str]],
         where: Mapping[str, str] | None = None,
         lane: bool = False,
+        pair: bool = False,
     ) -> dict[str, Any]:
         """A long function as several static ones, for pieces.c.jinja.
 
         what: its name in C, behind the prefix. given: the arguments; a piece has those that it
-        reads, and `out` where results are ready, which go to the places `results`. lane: each piece
-        is a loop over a tile.
+        reads, and `out` where results are ready, which go to the places `results`. lane, pair: each
+        piece is a loop over a tile, or over two.
         """
-        parts = pieces.split(unclashed(function), pieces.PIECE)
-        at = "[i]" if lane else ""
+        function = unclashed(function)
+        small = pieces.LANE_PIECE if lane else pieces.PIECE
+        piece = small if pieces.is_large(function) else pieces.LARGE
+        parts = pieces.split(function, piece)
+        end = f"{self.PREFIX}_TILE" if lane else "2" if pair else ""
+        at = "[i]" if end else ""
         values = f"{self.prefix}_{what}_values"
         crossing = [name for part in parts for name in part.keeps]
         struct = Argument(
-            f"{values} *{self.PREFIX + '_ALONE ' if lane else ''}s", "&s", frozenset(crossing)
+            f"{values} *{self.PREFIX + '_ALONE ' if end else ''}s", "&s", frozenset(crossing)
         )
         handed = {name: f"s->{name}{at}" for name in crossing}
         made, calls = [], []
@@ -244,7 +249,7 @@ class Target:
             )
             failures = [*body.early_failures, *body.failures]
             checks = bool(failures)
-            troubled = lane and (body.sincos or checks)
+            troubled = bool(end) and (checks or (lane and body.sincos))
             read = f.uses | {TROUBLE} if troubled else f.uses
             needed = [a for a in given if a.names & read]
             if crossing and (part.reads or part.keeps):
@@ -253,15 +258,15 @@ class Target:
                 needed.insert(0, out)
             name = f"{self.prefix}_{what}_{k}"
             call = f"{name}({arguments(*(a.passed for a in needed))});"
-            calls.append(f"good &= {call}" if checks and not lane else call)
+            calls.append(f"good &= {call}" if checks and not end else call)
             one = f"1.0{self.real.suffix}"
             ends = [f"return {none_of(failures)};"] if checks else []
-            if lane:
+            if end:
                 ends = [f"*trouble = {x} ? {one} : *trouble;" for x in failures]
             made.append(
                 {
                     "comment": _about(k, part, len(parts), what),
-                    "prototype": f"{self.PREFIX}_PIECE {'int' if checks and not lane else 'void'} "
+                    "prototype": f"{self.PREFIX}_PIECE {'int' if checks and not end else 'void'} "
                     f"{name}({arguments(*(a.declared for a in needed)) or 'void'})",
                     "trouble": troubled,
                     "loads": loads(f),
@@ -279,9 +284,9 @@ class Target:
         return {
             "what": what,
             "type": values,
-            "members": [name + (f"[{self.PREFIX}_TILE]" if lane else "") for name in crossing],
-            "loop": lane,
-            "width": 8 if lane else 4,
+            "members": [name + (f"[{end}]" if end else "") for name in crossing],
+            "loop": end,
+            "width": 8 if end else 4,
             "pieces": made,
             "calls": calls,
             "troubled": any(m["trouble"] for m in made),

@@ -338,7 +338,7 @@ class _Links:
             tape.total([self._dot(x, groups[g].beta), *map(self._less, given(g, x))])
             for g, x in rows
         ]
-        order, tensions, pivots = solve(tape, matrix, right)
+        order, tensions, pivots = solve(tape, matrix, right, kept=tape.whole)
         turning = []
         for g, (u, square) in enumerate(zip(slopes, squares, strict=True)):
             drawn = [

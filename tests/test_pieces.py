@@ -70,6 +70,7 @@ def in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nearly every function is long."""
     monkeypatch.setattr(pieces, "LARGE", 20)
     monkeypatch.setattr(pieces, "PIECE", 25)
+    monkeypatch.setattr(pieces, "LANE_PIECE", 25)
 
 
 # --- where functions are cut ---------------------------------------------------------------------
@@ -171,15 +172,21 @@ def everything(run: str, name: str = "everything") -> System:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "run", ["", 'batch = true\nmethod = ["rk4", "dp8"]', 'real = "float"\nbatch = true']
+    "run",
+    ["", 'method = "dp8"', 'batch = true\nmethod = ["rk4", "dp8"]', 'real = "float"\nbatch = true'],
 )
 def test_pieces_are_clean_for_strict_compilers(
     in_small_pieces: None, tmp_path: Path, run: str
 ) -> None:
-    """As C with gcc and clang, and as C++; the self-test passes."""
+    """As C with gcc and clang, and as C++; the self-test passes.
+
+    RK4 in doubles has its accelerations in two parts, places in pairs.
+    """
     made = render(derived(everything(run)), "_everything")
     source = written(made, tmp_path)
-    assert "_solve_4(" in made.files[source] and "_C_4(" in made.files[source]
+    paired = "float" not in run and run != 'method = "dp8"'
+    parts = ("_configuration_2(", "_motion_2(") if paired else ("_solve_4(",)
+    assert all(part in made.files[source] for part in (*parts, "_C_4("))
     assert ("_solve_lane_4(" in made.files[source]) == ("batch" in run)
     for command in ("gcc", "clang"):
         compiled(needs(command), *STRICT, "-O2", "-c", source, "selftest.c", "main.c", cwd=tmp_path)
@@ -196,7 +203,7 @@ def test_the_hash_seed_decides_nothing(tmp_path: Path, seed: str) -> None:
 import sys
 from eomc import mechanics, pieces, program, read
 from eomc.render import render
-pieces.LARGE, pieces.PIECE = 20, 25
+pieces.LARGE, pieces.PIECE, pieces.LANE_PIECE = 20, 25, 25
 for name in sys.argv[1:]:
     print(render(program.build(mechanics.derive(read(name))), "_x").files)
 """
@@ -208,7 +215,7 @@ for name in sys.argv[1:]:
         ).stdout
         for s in ("0", seed)
     ]  # fmt: skip
-    assert "_solve_2(" in outcomes[0]
+    assert "_motion_1(" in outcomes[0] and "_C_2(" in outcomes[0]
     assert outcomes[0] == outcomes[1]
 
 
@@ -251,6 +258,7 @@ def test_a_system_in_pieces_moves_as_it_does_whole(
     whole = module(plain, tmp_path / "whole")
     monkeypatch.setattr(pieces, "LARGE", 20)
     monkeypatch.setattr(pieces, "PIECE", 25)
+    monkeypatch.setattr(pieces, "LANE_PIECE", 25)
     cut = module(plain, tmp_path / "cut")
     random_state = np.random.default_rng(3)
     q0, qd0 = (x + 0.1 * random_state.standard_normal((75, 3)) for x in whole.start)
@@ -325,6 +333,7 @@ def test_matrices_by_columns_are_the_matrices(
     if small:
         monkeypatch.setattr(pieces, "LARGE", 5)
         monkeypatch.setattr(pieces, "PIECE", 8)
+        monkeypatch.setattr(pieces, "LANE_PIECE", 8)
     made = render(by_columns(plain), "_x")
     source = written(made, tmp_path)
     assert f"By {len(plain.system.q)} columns, each: " in made.files[f"{name}.h"]

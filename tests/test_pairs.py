@@ -1,0 +1,176 @@
+"""RK4 with its places in pairs: an acceleration in two parts, one of them for two at once."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+import eomc
+from eomc import mechanics, pairs, program, reference, scene, system
+from eomc.ccode import DOUBLE
+from eomc.target import Target
+
+# angles alone, as sums, with a number, with a parameter and times a coordinate; a coordinate that
+# is no angle; time, feedback and friction
+ODD = """
+eomc = 1
+name = "odd"
+[coordinates]
+x = { start = 0.3, rate = 0.2 }
+a = { start = 0.4, rate = -1.0 }
+b = { start = -0.7, rate = 0.6 }
+c = { start = 1.1 }
+d = { start = 2.0, rate = 0.4 }
+e = { start = -0.2 }
+[parameters]
+phase = 0.3
+m = 1.2
+[inputs]
+u = { signal = "0.3*sin(2*t) - 0.1*a_dot + 0.05*c - m*x/20" }
+w = { signal = "0.1*cos(t)" }
+[definitions]
+K1 = "m*x_dot**2*(2 + x**2/10)/2 + a_dot**2 + b_dot**2 + c_dot**2 + d_dot**2 + 2*e_dot**2"
+K2 = "a_dot*b_dot*cos(a - b)/3 + b_dot*c_dot*sin(b + 1/2)/4 + x_dot*c_dot*cos(c + phase)/5"
+P = "cos(2*a) + sin(b + 1/2) + cos(c + phase)/2"
+K3 = "c_dot*d_dot*cos(c - d)/3 + d_dot*e_dot*cos(2*e)/4 + t*x_dot/9"
+[energy]
+kinetic = "K1 + K2 + K3"
+potential = "P + sin(a*b)/4 + x**2*(1 + cos(3*t)/5) + cos(d)"
+[forces]
+a = "u"
+e = "w - 0.1*e_dot*abs(e_dot)"
+x = "-x_dot*u/10"
+[run]
+h = 0.01
+"""
+
+
+@cache
+def odd(run: str = "") -> system.System:
+    return system.from_scene(scene.parse(ODD + run, "odd.toml"))
+
+
+def chain(links: int) -> str:
+    """Point masses on links with absolute angles, let go at rest."""
+    numbers = range(1, links + 1)
+    angles = "".join(f"a{k} = {{ start = {0.3 + 0.1 * k:.1f} }}\n" for k in numbers)
+    places = 'x0 = "0"\ny0 = "0"\n'
+    for k in numbers:
+        places += f'x{k} = "x{k - 1} + l*sin(a{k})"\ny{k} = "y{k - 1} - l*cos(a{k})"\n'
+    kinetic = " + ".join(f"dot(x{k})**2 + dot(y{k})**2" for k in numbers)
+    height = " + ".join(f"y{k}" for k in numbers)
+    return (
+        f'eomc = 1\nname = "links{links}"\n[coordinates]\n{angles}'
+        f"[parameters]\nm = 1.0\nl = 1.0\ng = 9.81\n[definitions]\n{places}"
+        f'[energy]\nkinetic = "m*({kinetic})/2"\npotential = "m*g*({height})"\n'
+    )
+
+
+def test_parts_are_the_whole() -> None:
+    """What stands in the first part hangs on neither time, inputs nor velocities."""
+    target = Target(program.build(mechanics.derive(odd())), DOUBLE)
+    function = target.program["acceleration"]
+    parts = pairs.apart(target, function)
+    assert parts is not None
+    sines = {name for a in parts.angles for name in (a.sine, a.cosine)}
+    early = {"phase", "m", *(a.name for a in function.early)}
+    assert parts.configuration.uses <= {"x", "a", "b", "c", "d", "e"} | sines | early
+    assert len(parts.configuration.body) + len(parts.motion.body) < len(function.body)
+    assert {o.name for o in parts.configuration.outputs} == set(parts.kept)
+    assert set(parts.kept) <= parts.motion.uses
+    assert len(parts.configuration.checks) + len(parts.motion.checks) <= len(function.checks)
+
+
+def test_few_angles_and_light_configurations_stay_whole(modules: Modules) -> None:
+    for name in ("cartpole", "double_pendulum", "tumbling_box", "suspension"):
+        source = (Path(modules(name).__file__).parent / f"{name}.c").read_text(encoding="utf-8")
+        assert "_pair;" not in source
+    source = (Path(modules("chain").__file__).parent / "chain.c").read_text(encoding="utf-8")
+    assert "} chain_pair;" in source
+
+
+@pytest.mark.parametrize("h", [0.001, 0.02, 0.2, 0.45])
+def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modules) -> None:
+    """Turned by little, by nearly what is allowed, by more: then sines are computed anew."""
+    module, trusted = modules.of_text(ODD), reference.derive(odd())
+    for u in (None, [0.2, -0.1]):
+        run = module.simulate(h=h, steps=12, u=u)
+        _, q, qd = trusted.simulate(h=h, steps=12, u=u)
+        scale = np.abs(qd).max() + 1
+        np.testing.assert_allclose(run.q, q, rtol=1e-11, atol=1e-12 * scale)
+        np.testing.assert_allclose(run.qd, qd, rtol=1e-11, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("links", [5, 8])
+def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
+    module = modules.of_text(chain(links))
+    made = system.from_scene(scene.parse(chain(links), "links.toml"))
+    trusted = reference.of(made)
+    _, q, qd = trusted.simulate(h=0.002, steps=50)
+    run = module.simulate(h=0.002, steps=50)
+    np.testing.assert_allclose(run.q, q, rtol=1e-11)
+    np.testing.assert_allclose(run.qd, qd, rtol=1e-10, atol=1e-11)
+
+
+def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
+    """Two million turns on it is the same motion, but for what rounding leaves of the angle."""
+    module = modules.of_text(chain(5))
+    q, qd = module.start
+    there = module.simulate(q + 2e6 * 2 * np.pi, qd, h=0.01, steps=50)
+    here = module.simulate(q, qd, h=0.01, steps=50)
+    assert np.abs(there.q[-1] - 2e6 * 2 * np.pi - here.q[-1]).max() < 1e-7
+
+
+def test_faults_are_told(modules: Modules) -> None:
+    """A singular D, a state that is not finite: each with the last good state."""
+    module = modules.of_text(chain(5))
+    q, qd = module.start
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        singular = module.simulate(h=0.01, steps=3, params={"m": 0.0})
+        fast = module.simulate(q, qd + 1e160, h=0.5, steps=20)
+    assert (singular.status, fast.status) == ("singular", "not finite")
+    for run in (singular, fast):
+        assert len(run.q) == 1
+        assert np.isfinite(run.q).all()
+
+
+@pytest.mark.parametrize("text", [ODD, chain(6)])
+def test_all_that_shares_it_agrees(text: str, modules: Modules) -> None:
+    """Batches, other steppers and a run that is cut, over the same two parts."""
+    head = text.partition("[run]")[0]
+
+    def built(name: str, run: str) -> ModuleType:
+        return modules.of_text(head.replace('name = "', f'name = "{name}') + f"[run]\n{run}\n")
+
+    module = built("many_", 'batch = true\nmethod = ["rk4", "dp8"]')
+    q, qd = module.start
+    starts = q + 0.02 * np.arange(40)[:, None] * np.linspace(-1, 1, len(q))
+    moving = np.tile(qd, (40, 1))
+    for h in (0.01, 0.05):
+        batch = module.simulate_batch(starts, moving, h, steps=20)
+        assert set(batch.status) == {"ok"}
+        for k in (0, 17, 39):
+            alone = module.simulate(starts[k], qd, h=h, steps=20)
+            np.testing.assert_allclose(batch.q[k, -1], alone.q[-1], rtol=1e-10, atol=1e-11)
+    whole = module.simulate(h=0.01, steps=40)
+    assert (module.simulate(h=0.01, steps=40, every=7).q[-1] == whole.q[-1]).all()
+    implicit = built("stiff_", 'method = ["rk4", "gauss8", "gauss16"]')
+    expected = module.simulate(h=0.005, steps=100, method="dp8").x[-1]
+    for method in ("gauss8", "gauss16"):
+        run = implicit.simulate(h=0.005, steps=100, method=method)
+        np.testing.assert_allclose(run.x[-1], expected, rtol=1e-9, atol=1e-10)
+
+
+def test_it_is_faster_where_it_is_taken(tmp_path: Path) -> None:
+    """The file says so in its head, and keeps no sines from step to step."""
+    (tmp_path / "links.toml").write_text(chain(10), encoding="utf-8")
+    files = eomc.sources(eomc.read(tmp_path / "links.toml")).files
+    assert "Places are taken in pairs" in files["links10.c"]
+    assert "angles s;" not in files["links10.h"]
