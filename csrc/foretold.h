@@ -3,7 +3,8 @@
  *
  * What a step needs lies by some h^2 a away from
  *
- *     x + t x' + t^2/2 x'',   t = 3/2 h and 2 h,   x, x' and x'' one step before,
+ *     x + t x' + t^2/2 x'',   t = 3/2 h and 2 h,   x, x' and x'' one step before
+ * (of the first step t = h/2 and h, from its start),
  *
  * so their sines and cosines are computed while nobody waits for them, side by side, and those of
  * the stages are turned from there by the distance d:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from functools import cached_property
 from time import perf_counter
 from typing import Any
 
@@ -32,11 +33,16 @@ class BatchRun:
     """
 
     def __init__(
-        self, t: Array, q: Array, qd: Array, h: float, steps: Array, status: Array, wanted: int
+        self, t: Array, q: Array, qd: Array, h: float, steps: Array, codes: Array, wanted: int
     ) -> None:
         self.t, self.q, self.qd = t, q, qd
-        self.h, self.steps, self.status = h, steps, status
-        self.wanted = wanted
+        self.h, self.steps, self.wanted = h, steps, wanted
+        self._codes = codes
+
+    @cached_property
+    def status(self) -> Array:
+        """How each ended; made when it is asked for, since so many words take time."""
+        return np.asarray(_NAMES[self._codes])
 
     @property
     def message(self) -> str:
@@ -49,7 +55,7 @@ class BatchRun:
         )
 
     def __len__(self) -> int:
-        return len(self.status)
+        return len(self._codes)
 
     def __repr__(self) -> str:
         return f"<BatchRun: {self.message}>"
@@ -98,11 +104,10 @@ class BatchModel(Model):
             last = -(-work.done[k] // every)
             q_rows[k, last], qd_rows[k, last] = q[k], qd[k]
             q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
-        status = _NAMES[work.status]
         if not whole:
-            status[(work.status == 0) & short] = "interrupted"
+            work.status[(work.status == 0) & short] = len(_NAMES) - 1
         t = t0 + h * np.minimum(np.arange(rows) * every, steps)
-        run = BatchRun(t, q_rows, qd_rows, h, work.done, status, count * steps)
+        run = BatchRun(t, q_rows, qd_rows, h, work.done, work.status, count * steps)
         if not whole:
             raise Interrupted(run)
         return run
@@ -127,6 +132,8 @@ class BatchModel(Model):
             self._out(x, (len(x), self.nq), name)
         if len(q) != len(qd):
             raise ValueError(f"qd: {len(qd)} instances where q has {len(q)}")
+        if len(q) and np.may_share_memory(q, qd):
+            raise ValueError("qd: lies in the memory of q, where q is to be written")
         h, t = self.h if h is None else _size(h), _number(t, "t")
         table, held = self._parameter_rows(params), self._input_rows(u, 1)
         for name, given in (("params", table), ("u", held)):
@@ -152,6 +159,8 @@ class BatchModel(Model):
             "u": 1 if held is None else len(held),
         }
         count = max(sizes.values())
+        if empty := [name for name, size in sizes.items() if not size]:
+            raise ValueError(f"{empty[0]}: no instances")
         for name, size in sizes.items():
             if size not in (1, count):
                 raise ValueError(f"{name}: {size} instances where others have {count}")

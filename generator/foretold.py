@@ -66,6 +66,7 @@ def steps(
     first = "t0 + (" + real + ")(first + {})*h"
     return {
         "count": n,
+        "placed": placed,
         "vectors": ("mid, end, place, " if placed else "")
         + "v, r, a1, a2, a3, a4, inner, sum, to, going",
         "arguments": arguments(

@@ -167,6 +167,27 @@ def test_step_batch_in_place_and_into_out() -> None:
     out = np.empty_like(q0), np.empty_like(qd0)
     m.step_batch(q0, qd0, h=0.01, out=out)
     assert np.array_equal(out[0], runs.q[:, 1])
+    with pytest.raises(ValueError, match="qd: lies in the memory of q"):
+        m.step_batch(q, q, h=0.01)
+
+
+def test_no_instances_in_c_read_nothing(tmp_path: Path) -> None:
+    """No parameters are there either: a NULL that is followed would end the program."""
+    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
+    (tmp_path / "cartpole.toml").write_text(
+        text.replace("[run]\n", "[run]\nbatch = true\n"), encoding="utf-8"
+    )
+    for file, made in eomc.sources(eomc.read(tmp_path / "cartpole.toml")).files.items():
+        (tmp_path / file).write_text(made, encoding="utf-8")
+    call = "cartpole_rk4_batch(0, 0, 0, 0.01, 0, 5, 0, 0, 0, 0, 0, 1, 0, 0);"
+    (tmp_path / "none.c").write_text(
+        f'#include "cartpole.h"\nint main(void)\n{{\n    {call}\n    return 0;\n}}\n',
+        encoding="utf-8",
+    )
+    subprocess.run(
+        ["cc", "-std=c99", "none.c", "cartpole.c", "-o", "none", "-lm"], cwd=tmp_path, check=True
+    )
+    assert subprocess.run(["./none"], cwd=tmp_path).returncode == 0
 
 
 def test_ctrl_c_stops_within_a_second_and_keeps_what_was_done() -> None:
@@ -196,6 +217,7 @@ def test_progress_reaches_the_end() -> None:
         ({"u": [1.0]}, "u: this scene has no inputs"),
         ({"q0": np.zeros((2, 3))}, "q0"),
         ({"q0": np.zeros((3, 2)), "params": {"m_c": [1.0, 2.0]}}, "params: 2 instances"),
+        ({"q0": np.zeros((0, 2)), "qd0": np.zeros((0, 2))}, "q0: no instances"),
         ({"every": 0}, "every"),
         ({"threads": 0}, "threads"),
         ({"method": "euler"}, "method"),
