@@ -326,3 +326,43 @@ def test_a_run_cut_in_c_is_the_same_to_the_last_bit(name: str, h: float, tmp_pat
     assert whole != forgotten
     near = [np.array(line.split(), float) for line in (whole, forgotten)]
     np.testing.assert_allclose(*near, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["rk4", "dp8", "gauss8", "gauss16"])
+def test_a_memory_of_another_state_is_not_believed(method: str, tmp_path: Path) -> None:
+    """A state changed by hand between two calls moves on as it would with no memory at all."""
+    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
+    (tmp_path / "cartpole.toml").write_text(
+        text.replace("[run]\n", f'[run]\nmethod = "{method}"\n'), encoding="utf-8"
+    )
+    for file, made in eomc.sources(eomc.read(tmp_path / "cartpole.toml")).files.items():
+        (tmp_path / file).write_text(made, encoding="utf-8")
+    main = r"""
+        #include "cartpole.h"
+        #include <stdio.h>
+
+        int main(void)
+        {
+            for (int way = 0; way < 2; way++) {
+                double q[2] = { 0.0, 0.5 }, qd[2] = { 0.0, 0.0 };
+                cartpole_METHOD_memory memory = { 0 };
+                cartpole_status status;
+
+                cartpole_METHOD_run(q, qd, 0.005, 0, 17, 0, 0, 0, &cartpole_defaults, &memory,
+                    &status);
+                q[1] += 1e-5;
+                cartpole_METHOD_run(q, qd, 0.005, 17, 1, 0, 0, 0, &cartpole_defaults,
+                    way ? &memory : 0, &status);
+                printf("%.17g %.17g %.17g %.17g\n", q[0], q[1], qd[0], qd[1]);
+            }
+            return 0;
+        }
+        """
+    (tmp_path / "hand.c").write_text(main.replace("METHOD", method), encoding="utf-8")
+    subprocess.run(
+        ["cc", "-std=c99", "-O2", "hand.c", "cartpole.c", "-o", "hand", "-lm"],
+        cwd=tmp_path, check=True,
+    )  # fmt: skip
+    done = subprocess.run(["./hand"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    without, kept = done.stdout.splitlines()
+    assert kept == without
