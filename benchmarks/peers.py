@@ -284,8 +284,8 @@ TAIL = """
 - Our kernels by hand: `benchmarks/kernels/`, the same method with every trick we know; by gcc or
   clang, the faster.
 - Ours: `simulate` and `simulate_batch` from Python, all checks and copies included.
-- *Two processes, half each*: our batch in a process on either core at once, which is what the machine
-  has for two threads to reach.
+- *Two processes, half each*: our batch in a process on either core at once, which is what the
+  machine has for two threads to reach.
 - At the same error: our steppers at the longest step, the others at the loosest tolerance, that end
   within 1e-9 of the answer. JiTCODE's right-hand side is C with our flags, SciPy's is numba's.
 """
