@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number, _size
 
 _GROUP = 64  # instances in a tile, or a multiple of those in one
+_TILES = 64  # at most in a group: threads ask for the next one seldom, and end together
 _WORTH = 20_000  # steps in all from which threads pay
 _NAMES = np.array([*STATUS, "interrupted"])
 _SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
@@ -164,9 +165,15 @@ class BatchModel(Model):
         for name, size in sizes.items():
             if size not in (1, count):
                 raise ValueError(f"{name}: {size} instances where others have {count}")
-        starts = np.empty((2, count, self.nq), self.dtype)
-        starts[0], starts[1] = q, qd
-        return starts[0], starts[1], table, held, count
+
+        def own(x: Array, given: Any) -> Array:
+            """A row for each instance in memory that is nobody else's."""
+            fresh = isinstance(given, np.ndarray) and not np.may_share_memory(x, given)
+            if fresh and len(x) == count and x.ndim == 2:
+                return x
+            return np.array(np.broadcast_to(x, (count, self.nq)), order="C")
+
+        return own(q, q0), own(qd, qd0), table, held, count
 
     def _parameter_rows(self, params: Any) -> Array:
         if params is None or isinstance(params, Params):
@@ -243,7 +250,7 @@ class _Work:
         elif threads is None:
             threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         tiles = -(-count // _GROUP)
-        size = _GROUP * max(1, min(16, tiles // (4 * threads)))
+        size = _GROUP * max(1, min(_TILES, tiles // (4 * threads)))
         groups = [(at, min(size, count - at)) for at in range(0, count, size)]
         total = count * self.steps
         if threads == 1 or len(groups) == 1:
