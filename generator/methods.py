@@ -114,6 +114,12 @@ def _explicit(m: Method, real: Real, faster: str, lane: Mapping[str, Any] | None
     }
 
 
+def _start(target: Target, arrays: bool) -> list[str]:
+    """The state that a step begins from, as arrays."""
+    both = ("q", "at_now"), ("qd", "moving_now")
+    return [vectors.gathered(target, arrays, of, name) for of, name in both]
+
+
 def _implicit(
     target: Target, m: Method, slopes: Mapping[str, Any], scalar: Mapping[str, Any], arrays: bool
 ) -> dict[str, Any]:
@@ -154,10 +160,7 @@ def _implicit(
         "AA": matrix(m.a_squared),
         "ahead": matrix(m.ahead),
         "guess": " + ".join(f"ahead[i][{j}]*m->a[{j}][k]" for j in range(s)),
-        "gathered": [
-            vectors.gathered(target, arrays, "q", "at_now"),
-            vectors.gathered(target, arrays, "qd", "moving_now"),
-        ],
+        "gathered": _start(target, arrays),
         "stage": [
             f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*({total('AA[i]')}));",
             f"moving.$ = qd->$ + h*({total('A[i]')});",
@@ -228,10 +231,7 @@ def _side_by_side(
         # steps that five sweeps do not do are long, and err by more than this
         "enough": repr(max(1e-8, real.epsilon)) + real.suffix,
         "loose": f"{max(1e-6, 512 * real.epsilon):.0e}" + real.suffix,
-        "gathered": [
-            vectors.gathered(target, arrays, "q", "at_now"),
-            vectors.gathered(target, arrays, "qd", "moving_now"),
-        ],
+        "gathered": _start(target, arrays),
         "stage": [
             f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*{P}_{m.name}_sum(w->AA, a->x[#], i));",
             f"moving.$ = qd->$ + h*{P}_{m.name}_sum(w->A, a->x[#], i);",

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 from sympy import Expr, S
@@ -27,8 +28,8 @@ LOOPED = 10  # coordinates from which on loops over them pay
 
 @dataclass(frozen=True)
 class Parts:
-    """angles: those whose sines and cosines come from outside; configuration: gives what `motion`
-    reads of it, `kept`; early: what both read of what parameters decide."""
+    """angles: those whose sines and cosines come from outside. configuration: gives the values that
+    `motion` reads of it, by their names `kept`. What parameters alone decide is in neither."""
 
     angles: tuple[Angle, ...]
     configuration: Function
@@ -61,7 +62,8 @@ def apart(target: Target, function: Function) -> Parts | None:
     motion = replace(
         rest, body=tuple(late), checks=tuple(pair for early, pair in checks if not early)
     )
-    kept = tuple(a.name for a in first if a.name in motion.uses)
+    read = motion.uses
+    kept = tuple(a.name for a in first if a.name in read)
     configuration = replace(
         rest,
         name="configuration",
@@ -79,12 +81,11 @@ def apart(target: Target, function: Function) -> Parts | None:
 
 
 def _numbered(function: Function, kept: Sequence[str]) -> dict[str, str]:
-    """w1, w2, ... for values that have no name of their own and are handed on."""
+    """k1, k2, ... for values that have no name of their own and are handed on."""
     own = {a.name for a in function.body if a.named}
     taken = {*function.uses, *(a.name for a in function.body)}
-    plain = [name for name in kept if name not in own]
-    fresh = (f"k{n}" for n in range(1, len(plain) + len(taken) + 1) if f"k{n}" not in taken)
-    return dict(zip(plain, fresh, strict=False))
+    fresh = (name for n in count(1) if (name := f"k{n}") not in taken)
+    return dict(zip((name for name in kept if name not in own), fresh, strict=False))
 
 
 def context(
@@ -95,7 +96,7 @@ def context(
     kept: what parameters alone decide; timed: whether accelerations hang on t by themselves;
     takes_p: whether the scene's signals need the parameters.
     """
-    P, real, count = target.prefix, target.real.name, len(parts.angles)
+    P, real = target.prefix, target.real.name
     groups = target.groups()
     where = {n: f"c->{n}" for n in kept}
 
@@ -171,7 +172,7 @@ def context(
 
     return {
         "members": [f"{name}[2]" for name in parts.kept],
-        "count": count,
+        "count": len(parts.angles),
         "configuration": configuration,
         "motion": motion,
         "angles": _angles(target, parts.angles),
