@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from sympy import Expr, S
 
-from eomc.assignments import Assignment, Call, Function, Operand, Sum, Value, names_of
+from eomc.assignments import Assignment, Call, Function, Operand, Sum, Value
 
 
 @dataclass(frozen=True)
@@ -69,5 +69,5 @@ def _without(function: Function, gone: Collection[str]) -> Function:
     for a in reversed(function.body):
         if a.name not in gone and a.name in needed:
             body.append(a)
-            needed.update(names_of(a.value))
+            needed.update(a.value.names)
     return replace(function, body=tuple(reversed(body)))

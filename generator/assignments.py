@@ -7,9 +7,9 @@ first. Knows nothing of mechanics or C.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import mpmath
@@ -25,6 +25,11 @@ class Sum:
     terms: tuple[tuple[Expr, str], ...]
     constant: Expr = S.Zero
 
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names on this right-hand side, repeated as often as they stand there."""
+        return tuple([n for _, n in self.terms])
+
 
 @dataclass(frozen=True)
 class Product:
@@ -33,6 +38,11 @@ class Product:
     coefficient: Expr
     factors: tuple[str, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """As of a sum."""
+        return self.factors
+
 
 @dataclass(frozen=True)
 class Call:
@@ -40,6 +50,11 @@ class Call:
 
     function: str
     args: tuple[Operand, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """As of a sum."""
+        return tuple([a.name for a in self.args if a.name])
 
 
 @dataclass(frozen=True)
@@ -107,22 +122,13 @@ class Function:
     route: str
     routes: tuple[tuple[str, Cost], ...]
 
-    @property
+    @cached_property
     def uses(self) -> frozenset[str]:
         """Every name that the function reads."""
         made = {a.name for a in (*self.early, *self.body)}
-        read = {n for a in (*self.early, *self.body) for n in names_of(a.value)}
+        read = {n for a in (*self.early, *self.body) for n in a.value.names}
         ends = [*self.outputs, *(o for pair in self.checks for o in pair)]
         return frozenset(read | {o.name for o in ends if o.name}) - made
-
-
-def names_of(value: Value) -> tuple[str, ...]:
-    """The names on a right-hand side, repeated as often as they stand there."""
-    if isinstance(value, Sum):
-        return tuple(n for _, n in value.terms)
-    if isinstance(value, Product):
-        return value.factors
-    return tuple(a.name for a in value.args if a.name)
 
 
 def rename(function: Function, new: Mapping[str, str]) -> Function:
@@ -197,29 +203,58 @@ def evaluate(
     digits and then rounded where `exact`. Raises ArithmeticError or ValueError where a result is
     not a finite, real number.
     """
+    return evaluator(function, exact)(values)
+
+
+def evaluator(
+    function: Function, exact: bool = False
+) -> Callable[[Mapping[str, float]], tuple[list[float], bool]]:
+    """`evaluate` of one function for many states: its numbers are converted once."""
     of = _many_digits() if exact else _DOUBLES
     number = lru_cache(maxsize=None)(of["number"])  # most are 1 and -1
-    known: dict[str, Any] = dict(values)
 
-    def operand(o: Operand) -> Any:
-        return number(o.coefficient) * known[o.name] if o.name else number(o.coefficient)
+    def atom(o: Operand) -> tuple[Any, str]:
+        return number(o.coefficient), o.name
 
+    steps: list[tuple[str, Callable[..., Any], Any, Sequence[Any]]] = []
     for a in (*function.early, *function.body):
         v = a.value
         if isinstance(v, Sum):
-            known[a.name] = sum((number(w) * known[n] for w, n in v.terms), number(v.constant))
+            terms = [(number(w), n) for w, n in v.terms]
+            steps.append((a.name, _added, number(v.constant), terms))
         elif isinstance(v, Product):
-            known[a.name] = math.prod((known[n] for n in v.factors), start=number(v.coefficient))
+            steps.append((a.name, _multiplied, number(v.coefficient), v.factors))
         else:
-            known[a.name] = of[v.function](*map(operand, v.args))
-    try:
-        results = [float(operand(o)) for o in function.outputs]
-    except TypeError:  # a complex number
-        raise ValueError(f"{function.name} is not real") from None
-    if not all(map(math.isfinite, results)):
-        raise ValueError(f"{function.name} is not finite")
-    tolerance = 8 * 2.0**-52 * max(1, len(function.checks))
-    return results, all(
-        operand(pivot) > (0 if pivot == diagonal else tolerance * operand(diagonal))
-        for pivot, diagonal in function.checks
-    )
+            steps.append((a.name, _called, of[v.function], [atom(o) for o in v.args]))
+    outputs = [atom(o) for o in function.outputs]
+    checks = [(atom(pivot), atom(diagonal)) for pivot, diagonal in function.checks]
+    tolerance = 8 * 2.0**-52 * max(1, len(checks))
+
+    def evaluated(values: Mapping[str, float]) -> tuple[list[float], bool]:
+        known: dict[str, Any] = {"": 1, **values}  # a number alone has no name
+        for name, do, first, rest in steps:
+            known[name] = do(known, first, rest)
+        try:
+            results = [float(c * known[n]) for c, n in outputs]
+        except TypeError:  # a complex number
+            raise ValueError(f"{function.name} is not real") from None
+        if not all(map(math.isfinite, results)):
+            raise ValueError(f"{function.name} is not finite")
+        return results, all(
+            c * known[n] > (0 if (c, n) == (e, m) else tolerance * (e * known[m]))
+            for (c, n), (e, m) in checks
+        )
+
+    return evaluated
+
+
+def _added(known: Mapping[str, Any], constant: Any, terms: Sequence[tuple[Any, str]]) -> Any:
+    return sum([w * known[n] for w, n in terms], constant)
+
+
+def _multiplied(known: Mapping[str, Any], coefficient: Any, factors: Sequence[str]) -> Any:
+    return math.prod([known[n] for n in factors], start=coefficient)
+
+
+def _called(known: Mapping[str, Any], do: Callable[..., Any], args: Sequence[Any]) -> Any:
+    return do(*[c * known[n] for c, n in args])

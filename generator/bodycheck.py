@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from mpmath import mp
+
 from eomc import formulas, names
 from eomc.assembly import (
     JOINTS,
@@ -288,11 +290,9 @@ class _Bodies:
         """What no body can have: a negative principal moment, one above the sum of the others."""
         if not all(abs(x) < 1e150 for x in inertia):
             return
-        import numpy as np  # only here: most scenes are read without it
-
         xx, yy, zz, xy, xz, yz = inertia
-        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        small, middle, large = np.linalg.eigvalsh(tensor).tolist()
+        tensor = mp.matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # NumPy takes 0.1 s to load
+        small, middle, large = sorted(map(float, mp.eigsy(tensor, eigvals_only=True)))
         tiny = ROUNDING * max(abs(small), abs(large))
         shown = f"{small:.4g}, {middle:.4g} and {large:.4g} kg m^2"
         if small < -tiny:

@@ -11,7 +11,7 @@ import sympy
 from sympy import Expr, S
 
 from eomc.angles import pair_of
-from eomc.assignments import Call, Function, Operand, Product, Sum, Value, names_of, rename
+from eomc.assignments import Call, Function, Operand, Product, Sum, Value, rename
 from eomc.tape import Stage, is_negative
 
 MOST_INLINE = 5  # operations; longer expressions get a name of their own
@@ -218,7 +218,7 @@ def body(
     stages = {a.name: a.stage for a in (*function.early, *function.body)}
     late_checks = [c for c in function.checks if stages.get(c[0].name, 0) > Stage.PARAMETER]
     late_ends = [*function.outputs, *(o for pair in late_checks for o in pair)]
-    late_reads = {n for a in function.body for n in names_of(a.value)} | {o.name for o in late_ends}
+    late_reads = {n for a in function.body for n in a.value.names} | {o.name for o in late_ends}
     early_names = [*parameters, *(a.name for a in function.early)]
     kept = [n for n in early_names if n in late_reads] if keep else []
     inline = _inlined(function, frozenset(kept))
@@ -318,7 +318,7 @@ def _inlined(function: Function, kept: frozenset[str]) -> frozenset[str]:
     everything = (*function.early, *function.body)
     for a in everything:
         twice = isinstance(a.value, Call) and a.value.function in ("sign", "heaviside")
-        for name in names_of(a.value):
+        for name in a.value.names:
             uses[name] += 2 if twice else 1
             stage_of_reader[name] = a.stage
     last = max((a.stage for a in everything), default=Stage.NUMBER)
@@ -330,8 +330,8 @@ def _inlined(function: Function, kept: frozenset[str]) -> frozenset[str]:
     inline: set[str] = set()
     weight: dict[str, int] = {}
     for a in everything:
-        own = len(names_of(a.value)) + (isinstance(a.value, Call))
-        weight[a.name] = own + sum(weight[n] for n in names_of(a.value) if n in inline)
+        own = len(a.value.names) + (isinstance(a.value, Call))
+        weight[a.name] = own + sum(weight[n] for n in a.value.names if n in inline)
         sine = isinstance(a.value, Call) and a.value.function in ("sin", "cos", "reciprocal")
         same = stage_of_reader.get(a.name) == a.stage
         if uses[a.name] == 1 and same and not a.named and not sine and a.name not in kept:

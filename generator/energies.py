@@ -58,7 +58,7 @@ def on_tape(system: System, kinetic: Expr, potential: Expr) -> Energies:
             inside = moving.args[0]
             name = f"{inside}_dot" if inside.is_Symbol else f"w{len(points) + 1}"
             velocity = tape.named(velocity, name)
-            if velocity in tape.rhs and tape.stage[velocity] is Stage.VELOCITY:
+            if velocity in tape.parts and tape.stage[velocity] is Stage.VELOCITY:
                 points.setdefault(velocity, position)
             velocities[moving] = velocity
         return tape.define(expr.xreplace(velocities).xreplace(known))

@@ -84,7 +84,7 @@ class Expander:
         return {((symbol.name, _ONE),): S.One}
 
     def _of(self, name: Symbol) -> Polynomial:
-        rhs = self.tape.rhs[name]
+        rhs = self.tape.rhs(name)
         named = name in self.tape.hint and self.tape.stage[name] <= Stage.PARAMETER
         if named or not (rhs.is_Add or rhs.is_Mul or rhs.is_Pow):
             return self._whole(name)

@@ -24,7 +24,6 @@ from eomc.assignments import (
     Product,
     Sum,
     Value,
-    names_of,
     rename,
     renamed_value,
 )
@@ -82,16 +81,21 @@ class _Work:
     # taking over from the tape
 
     def take(self, symbol: Symbol) -> None:
-        rhs = self.tape.rhs[symbol]
-        if rhs.is_Add:
-            constant = Sum((), sum((a for a in rhs.args if a.is_number), S.Zero)).constant
-            terms = tuple((o.coefficient, o.name) for o in map(self.operand, rhs.args) if o.name)
-            self._put(symbol.name, Sum(terms, constant))
-        elif rhs.is_Mul or rhs.is_Pow:
-            self._put(symbol.name, self._product(rhs, symbol.name))
+        tape = self.tape
+        if symbol in tape.weights:
+            terms = tuple((w, self.leaf(name)) for name, w in tape.weights[symbol].items())
+            self._put(symbol.name, Sum(terms, tape.constant[symbol]))
+        elif symbol in tape.powers:
+            # plain factors first, then powers, as SymPy sorts them
+            powers = sorted(
+                tape.powers[symbol].items(), key=lambda p: (p[1] is not S.One, p[0].name)
+            )
+            factors = [f for name, e in powers for f in self._power(self.operand(name), e)]
+            self._put(symbol.name, self._plain(Product(S.One, tuple(factors))))
+        elif (rhs := tape.rhs(symbol)).is_Mul or rhs.is_Pow:
+            self._put(symbol.name, self._product(rhs))
         else:
             function = rhs.func.__name__.lower()
-            function = {"heaviside": "heaviside"}.get(function, function)
             args = rhs.args[:1] if function == "heaviside" else rhs.args
             if function in ("min", "max"):
                 args = sorted(args, key=str)
@@ -103,11 +107,15 @@ class _Work:
         factor, symbol = split(atom)
         if symbol is None:
             return Operand(factor)
+        return Operand(factor, self.leaf(symbol))
+
+    def leaf(self, symbol: Symbol) -> str:
+        """The symbol's name; a leaf's stage is kept."""
         if symbol in self.tape.leaves:
             self.stages[symbol.name] = self.tape.leaves[symbol]
-        return Operand(factor, symbol.name)
+        return str(symbol.name)
 
-    def _product(self, rhs: Expr, name: str) -> Value:
+    def _product(self, rhs: Expr) -> Value:
         coefficient: Expr = S.One
         factors: list[str] = []
         for factor in sympy.Mul.make_args(rhs):
@@ -119,9 +127,13 @@ class _Work:
                 factors.append(self.new(Call("pow", args)))
             else:
                 factors += self._power(self.operand(base), exponent)
-        if len(factors) == 1 and coefficient == 1 and factors[0] in self.values:
-            return self.values[factors[0]]
-        return Product(coefficient, tuple(factors))
+        return self._plain(Product(coefficient, tuple(factors)))
+
+    def _plain(self, product: Product) -> Value:
+        """The product, or what its one factor stands for."""
+        if len(product.factors) == 1 and product.coefficient == 1:
+            return self.values.get(product.factors[0], product)
+        return product
 
     def _power(self, base: Operand, exponent: Expr) -> list[str]:
         """Whole powers as repeated factors, halves by a square root, the rest by pow."""
@@ -156,7 +168,7 @@ class _Work:
         self.stages[name] = self._stage(value)
 
     def _stage(self, value: Value) -> Stage:
-        return max((self.stages[n] for n in names_of(value)), default=Stage.NUMBER)
+        return max((self.stages[n] for n in value.names), default=Stage.NUMBER)
 
     # putting in order
 
@@ -186,7 +198,7 @@ class _Work:
     def _uses(self, ends: Iterable[Operand]) -> Counter[str]:
         uses: Counter[str] = Counter(o.name for o in ends if o.name)
         for value in self.values.values():
-            uses.update(names_of(value))
+            uses.update(value.names)
         return uses
 
     def _drop(self, ends: Iterable[Operand]) -> None:
@@ -197,7 +209,7 @@ class _Work:
             name = queue.pop()
             if name in self.values and name not in needed:
                 needed.add(name)
-                queue.extend(names_of(self.values[name]))
+                queue.extend(self.values[name].names)
         self.values = {n: v for n, v in self.values.items() if n in needed}
         self.known = {v: n for n, v in reversed(self.values.items())}
 
@@ -369,6 +381,12 @@ class _Work:
         return sorted(ordered, key=lambda a: a.stage)
 
 
+def _as_sympy_sorts(power: tuple[Symbol, Expr]) -> tuple[bool, str]:
+    """Plain factors first, then powers."""
+    name, exponent = power
+    return exponent is not S.One, name.name
+
+
 Term = tuple[Expr, str]  # (weight, name)
 _Pair = tuple[str, str, Expr]  # (name, name, weight of the second over that of the first)
 
@@ -432,7 +450,7 @@ def _in_order(values: Mapping[str, Value]) -> list[str]:
         stack = [start]
         while stack:
             name = stack[-1]
-            missing = [n for n in names_of(values[name]) if n in values and n not in done]
+            missing = [n for n in values[name].names if n in values and n not in done]
             if missing:
                 stack.extend(reversed(missing))
             else:
@@ -514,6 +532,6 @@ def _leaves(function: Function, arg: Operand) -> tuple[str, ...]:
     """The names in a sum of two or three, for sin_q1_q2; nothing where the argument is more."""
     for a in (*function.early, *function.body):
         if a.name == arg.name and isinstance(a.value, Sum) and len(a.value.terms) <= 3:
-            names = names_of(a.value)
+            names = a.value.names
             return () if any(n.startswith("_") for n in names) else names
     return ()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from math import isfinite, sqrt
 from typing import Any
 
-import numpy as np
 from sympy import Rational
 
 from eomc import ccode, vectors
@@ -23,6 +23,12 @@ def _number(x: Fraction, real: Real) -> str:
     return ccode.number(Rational(x.numerator, x.denominator), real)
 
 
+def _nearest(x: Fraction, real: Real) -> Fraction:
+    """The double nearest to x, or the float nearest to that."""
+    form = {"float64": "d", "float32": "f"}[real.dtype]
+    return Fraction(*struct.unpack(form, struct.pack(form, float(x))))
+
+
 def _rounded(weights: Row, real: Real) -> Row:
     """The weights as they are in C, with their sum as it is: what it lacks would add up over steps.
 
@@ -30,13 +36,13 @@ def _rounded(weights: Row, real: Real) -> Row:
     """
     if not real.dtype:  # 113 bits, for references
         return weights
-    rounded = [Fraction(float(x)) for x in np.array([float(x) for x in weights], real.dtype)]
+    rounded = [_nearest(x, real) for x in weights]
     lack = Fraction(round(sum(weights, Fraction(0)))) - sum(rounded, Fraction(0))
     symmetric = weights == weights[::-1] and len(weights) > 1
     for k in sorted(range(len(rounded)), key=lambda k: abs(rounded[k])):
         places = {k, len(rounded) - 1 - k} if symmetric else {k}
         wished = rounded[k] + lack / len(places)
-        if rounded[k] and Fraction(float(np.array(float(wished), real.dtype))) == wished:
+        if rounded[k] and _nearest(wished, real) == wished:
             return tuple(wished if n in places else x for n, x in enumerate(rounded))
     return tuple(rounded)
 

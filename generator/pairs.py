@@ -18,7 +18,7 @@ from sympy import Expr, S
 
 from eomc import angles, ccode, pieces, vectors
 from eomc.angles import Angle
-from eomc.assignments import Assignment, Function, Operand, Sum, names_of, rename
+from eomc.assignments import Assignment, Function, Operand, Sum, rename
 from eomc.ccode import DOUBLE
 from eomc.target import TROUBLE, Argument, Target, arguments
 
@@ -51,7 +51,7 @@ def apart(target: Target, function: Function) -> Parts | None:
     place = {*target.names, *sines}
     first: list[Assignment] = []
     for a in rest.body:
-        if place.issuperset(set(names_of(a.value)) - fixed):
+        if place.issuperset(set(a.value.names) - fixed):
             place.add(a.name)
             first.append(a)
     made = {a.name for a in first}

@@ -14,7 +14,7 @@ from itertools import accumulate
 
 from sympy import S
 
-from eomc.assignments import Assignment, Call, Function, Operand, names_of
+from eomc.assignments import Assignment, Call, Function, Operand
 from eomc.tape import Stage
 
 LARGE = 1000  # weight from which a function is cut
@@ -50,7 +50,7 @@ def is_large(function: Function) -> bool:
 def _weight(a: Assignment) -> int:
     if isinstance(a.value, Call):
         return 15 if a.value.function in ("sin", "cos") else 2
-    return max(1, len(names_of(a.value)) - 1)
+    return max(1, len(a.value.names) - 1)
 
 
 def split(function: Function, piece: int) -> tuple[Piece, ...]:
@@ -113,7 +113,7 @@ def _cuts(run: list[Assignment], piece: int) -> list[int]:
     """Where pieces end: within a third of their size, there where the fewest values cross."""
     last: dict[str, int] = {}
     for k, a in enumerate(run):
-        last |= dict.fromkeys(names_of(a.value), k)
+        last |= dict.fromkeys(a.value.names, k)
     ended = Counter(last[a.name] for a in run if a.name in last)
     alive = accumulate((a.name in last) - ended[k] for k, a in enumerate(run))
     crossing = list(alive)  # values made up to here and read behind it

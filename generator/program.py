@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sympy import Expr
 
 from eomc import mechanics
-from eomc.assignments import Call, Cost, Function, evaluate
+from eomc.assignments import Call, Cost, Function, evaluator
 from eomc.elimination import Solution, solve
 from eomc.expand import Expander
 from eomc.lowering import lower
@@ -238,25 +238,29 @@ def _roundings(made: Mapping[str, Function], system: System) -> dict[str, float]
     Infinite where one fails and another does not: a massless link has no tension, but may have D.
     """
     states = range(5 if all(len(f.body) < 500 for f in made.values()) else 2)
-    errors = {route: [_rounding(f, system, k) for k in states] for route, f in made.items()}
+    errors = {route: _errors(f, system, states) for route, f in made.items()}
     told = [k for k in states if any(math.isfinite(found[k]) for found in errors.values())]
     return {route: max((found[k] for k in told), default=0.0) for route, found in errors.items()}
 
 
-def _rounding(function: Function, system: System, k: int) -> float:
-    """The relative error of the results at the k-th state around the start; inf without any."""
-    values = nearby(system, k)
-    values |= {f"{c.name}{ALONG}": 1.0 / (k + 1) for c in system.coordinates}
-    values |= {i.name: 0.7 + 0.1 * n for n, i in enumerate(system.inputs)}
-    try:
-        found, regular = evaluate(function, values)
-        exact, _ = evaluate(function, values, exact=True)
-    except (ArithmeticError, ValueError):
-        return math.inf
-    if not regular:
-        return math.inf
-    size, off = max(map(abs, exact)), max(abs(a - b) for a, b in zip(found, exact, strict=True))
-    return off / size if size else 0.0
+def _errors(function: Function, system: System, states: Iterable[int]) -> list[float]:
+    """The relative errors of the results at those states around the start; inf where none are."""
+    plain, exact, out = evaluator(function), evaluator(function, exact=True), []
+    for k in states:
+        values = nearby(system, k)
+        values |= {f"{c.name}{ALONG}": 1.0 / (k + 1) for c in system.coordinates}
+        values |= {i.name: 0.7 + 0.1 * n for n, i in enumerate(system.inputs)}
+        try:
+            (found, regular), (true, _) = plain(values), exact(values)
+        except (ArithmeticError, ValueError):
+            regular = False
+        if not regular:
+            out.append(math.inf)
+            continue
+        size = max(map(abs, true))
+        off = max(abs(a - b) for a, b in zip(found, true, strict=True))
+        out.append(off / size if size else 0.0)
+    return out
 
 
 def _weight(cost: Cost) -> int:
@@ -303,12 +307,12 @@ def matrix(program: Program, name: str, values: Mapping[str, float]) -> list[lis
     names = [c.name for c in program.system.coordinates]
     n = len(names)
     if name in program:
-        flat, _ = evaluate(program[name], values)
+        flat, _ = evaluator(program[name])(values)
         return [flat[n * i : n * i + n] for i in range(n)]
-    columns = []
+    column, columns = evaluator(program[f"{name}_column"]), []
     for one in names:
         unit = {f"{other}{ALONG}": float(other == one) for other in names}
-        columns.append(evaluate(program[f"{name}_column"], {**values, **unit})[0])
+        columns.append(column({**values, **unit})[0])
     return [list(row) for row in zip(*columns, strict=True)]
 
 

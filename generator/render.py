@@ -5,9 +5,13 @@ The only file that knows Jinja. What the templates are given is made in context.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from importlib.util import cache_from_source
+from pathlib import Path
 
 import jinja2
 
@@ -38,12 +42,24 @@ def environment() -> jinja2.Environment:
     loader = jinja2.FunctionLoader(lambda name: resource("templates", name))
     return jinja2.Environment(
         loader=loader,
+        bytecode_cache=_bytecode(),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
         autoescape=False,  # the output is C and Python, no HTML
     )
+
+
+def _bytecode() -> jinja2.BytecodeCache | None:
+    """Templates compiled to Python, kept where this module's own bytecode is, if it may be.
+
+    Compiling them takes a fifth of a second, a third of what a small scene takes to be derived.
+    """
+    folder = Path(cache_from_source(__file__)).parent
+    if sys.dont_write_bytecode or not os.access(folder, os.W_OK):
+        return None
+    return jinja2.FileSystemBytecodeCache(str(folder), "eomc-template-%s.cache")
 
 
 def render(program: Program, extension: str) -> Sources:

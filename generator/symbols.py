@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import sympy
 from sympy import Symbol
 
@@ -18,6 +20,7 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
     is_real = True
 
 
+@lru_cache(maxsize=10_000)  # SymPy takes ten times as long to find one that it has
 def symbol(name: str) -> Symbol:
     """The symbol of a name; all of a system's symbols are real."""
     return Symbol(name, real=True)

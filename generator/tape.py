@@ -47,15 +47,16 @@ class Tape:
 
     def __init__(self, leaves: Mapping[Symbol, Stage]) -> None:
         self.leaves = dict(leaves)
-        self.rhs: dict[Symbol, Expr] = {}
         self.stage: dict[Symbol, Stage] = dict(leaves)
         self.hint: dict[Symbol, str] = {}
-        self.parts: dict[Symbol, tuple[Symbol, ...]] = {}  # names in the right-hand side
+        self.parts: dict[Symbol, tuple[Symbol, ...]] = {}  # names in each right-hand side
+        self.powers: dict[Symbol, Powers] = {}  # of names that are products
+        self.weights: dict[Symbol, dict[Symbol, Expr]] = {}  # of names that are sums
+        self.constant: dict[Symbol, Expr] = {}  # of names that are sums
         self._number: dict[Symbol, int] = {}
         self._known: dict[object, Symbol] = {}  # by right-hand side, sums and products by content
         self._solid: set[Symbol] = set()  # names that stay whole inside products
-        self._powers: dict[Symbol, Powers] = {}  # of names that are products
-        self._weights: dict[Symbol, dict[Symbol, Expr]] = {}  # of names that are sums
+        self._rhs: dict[Symbol, Expr] = {}  # of functions, and of others where they were asked for
         self._late: dict[Symbol, tuple[_Late, Expr]] = {}
         self.squares: dict[Symbol, Symbol] = {}  # sin(a) <-> cos(a), where both are there
         self._partial: dict[tuple[Symbol, Symbol], Expr] = {}
@@ -109,22 +110,37 @@ class Tape:
 
     def is_sine(self, symbol: Symbol) -> bool:
         """Whether the name stands for a sine."""
-        return isinstance(self.rhs.get(symbol), sympy.sin)
+        return isinstance(self._rhs.get(symbol), sympy.sin)
+
+    def rhs(self, symbol: Symbol) -> Expr:
+        """What a name stands for, as SymPy has it; the tape itself keeps sums and products apart.
+
+        Raises KeyError for a leaf.
+        """
+        if symbol not in self._rhs:
+            if symbol in self.weights:
+                terms = [self.scaled(w, name) for name, w in self.weights[symbol].items()]
+                constant = self.constant[symbol]
+                numbers = [constant] if constant is not S.Zero else []
+                self._rhs[symbol] = Add._from_args([*numbers, *terms])
+            else:
+                self._rhs[symbol] = Mul(*(Pow(x, e) for x, e in self.powers[symbol].items()))
+        return self._rhs[symbol]
 
     def _name(self, rhs: Expr) -> Symbol:
         found = self._known.get(rhs)
         if found is None:
             if rhs.has(*_ROUGH):
                 raise RoughError("a derivative of something that jumps is needed")
-            found = self._new(rhs, rhs, rhs.free_symbols)
+            found = self._new(rhs, self._ordered(rhs.free_symbols))
+            self._rhs[found] = rhs
         return found
 
-    def _new(self, key: object, rhs: Expr, parts: Iterable[Symbol]) -> Symbol:
-        found = Symbol(f"_{len(self.rhs):06d}", real=True)
+    def _new(self, key: object, parts: tuple[Symbol, ...]) -> Symbol:
+        found = Symbol(f"_{len(self.parts):06d}", real=True)
         self._known[key] = found
-        self._number[found] = len(self.rhs)
-        self.rhs[found] = rhs
-        self.parts[found] = self._ordered(parts)
+        self._number[found] = len(self.parts)
+        self.parts[found] = parts
         self.stage[found] = max(self.stage[s] for s in self.parts[found])
         return found
 
@@ -136,7 +152,7 @@ class Tape:
         """The symbol as a product of powers: its factors where it is one, itself elsewhere."""
         if symbol in self._solid:
             return {symbol: S.One}
-        return self._powers.get(symbol) or {symbol: S.One}
+        return self.powers.get(symbol) or {symbol: S.One}
 
     def scaled(self, number: Expr, atom: Expr) -> Expr:
         """A number times an atom."""
@@ -188,10 +204,8 @@ class Tape:
             return next(iter(powers))
         key = ("product", frozenset(powers.items()))
         if (found := self._known.get(key)) is None:
-            names = self._ordered(powers)
-            rhs = Mul(*(Pow(name, powers[name]) for name in names))
-            found = self._new(key, rhs, names)
-            self._powers[found] = powers
+            found = self._new(key, self._ordered(powers))
+            self.powers[found] = powers
         return found
 
     def times(self, one: Expr, other: Expr) -> Expr:
@@ -259,10 +273,9 @@ class Tape:
             constant = constant / sign
         key = ("sum", frozenset(weights.items()), constant)
         if (found := self._known.get(key)) is None:
-            terms = [self.scaled(weights[name], name) for name in names]
-            rhs = Add._from_args([*([constant] if constant is not S.Zero else []), *terms])
-            found = self._new(key, rhs, names)
-            self._weights[found] = weights
+            found = self._new(key, names)
+            self.weights[found] = {name: weights[name] for name in names}
+            self.constant[found] = constant
         return self.scaled(sign, found)
 
     def _can_gather(self, weights: Mapping[Symbol, Expr], constant: Expr) -> bool:
@@ -340,7 +353,7 @@ class Tape:
         queue = [s for atom in atoms for s in atom.free_symbols]
         while queue:
             symbol = queue.pop()
-            if symbol in self.rhs and symbol not in found:
+            if symbol in self.parts and symbol not in found:
                 found.add(symbol)
                 if symbol not in stop:
                     queue.extend(self.parts[symbol])
@@ -359,10 +372,10 @@ class Tape:
         """d rhs(symbol)/d part, as `define` returns it."""
         key = (symbol, part)
         if key not in self._partial:
-            if symbol in self._weights:
-                self._partial[key] = self._weights[symbol][part]
-            elif symbol in self._powers:
-                powers = dict(self._powers[symbol])
+            if symbol in self.weights:
+                self._partial[key] = self.weights[symbol][part]
+            elif symbol in self.powers:
+                powers = dict(self.powers[symbol])
                 power = powers[part]
                 powers[part] = power - 1
                 whole: Powers = {}
@@ -372,7 +385,7 @@ class Tape:
                         whole[n] = whole.get(n, S.Zero) + inner * e
                 self._partial[key] = self.scaled(power, self._of_powers(whole))
             else:
-                self._partial[key] = self.define(self.rhs[symbol].diff(part))
+                self._partial[key] = self.define(self.rhs(symbol).diff(part))
         return self._partial[key]
 
     def forward(self, outputs: Sequence[Expr], seeds: Mapping[Symbol, Expr]) -> list[Expr]:
@@ -421,7 +434,7 @@ class Tape:
         for symbol in self.live(outputs):
             changed = {part: new[part] for part in self.parts[symbol] if part in new}
             if changed:
-                new[symbol] = self.define(self.rhs[symbol].xreplace(changed))
+                new[symbol] = self.define(self.rhs(symbol).xreplace(changed))
         return [self.define(output.xreplace(new)) for output in outputs]
 
 

@@ -126,7 +126,7 @@ class _Links:
 
     def _mass(self, momentum: Expr, speed: Symbol) -> Expr:
         factor, symbol = split(momentum)
-        rhs = self.tape.rhs.get(symbol, S.One) if symbol else S.One
+        rhs = self.tape.rhs(symbol) if symbol in self.tape.parts else S.One
         if symbol == speed:
             mass = factor
         else:
@@ -155,7 +155,7 @@ class _Links:
         return {b: self.tape.scaled(factor, c) for b, c in known.items()}
 
     def _terms(self, symbol: Symbol) -> dict[Symbol, Expr]:
-        tape, rhs = self.tape, self.tape.rhs[symbol]
+        tape, rhs = self.tape, self.tape.rhs(symbol)
         if rhs.is_Add:
             parts: dict[Symbol, list[Expr]] = {}
             for term in rhs.args:
