@@ -33,7 +33,7 @@ from sympy import S
 import eomc
 from eomc import ccode, mechanics, program
 from eomc import compile as compiler
-from eomc.assignments import Call, Function, Operand, names_of
+from eomc.assignments import Call, Function, Operand
 from eomc.tape import Stage
 
 HERE = Path(__file__).resolve().parent
@@ -152,7 +152,7 @@ def panda_body(function: Function) -> str:
     late = tuple(a for a in rest if a.stage is Stage.VELOCITY)
     assert len(early) + len(late) == len(rest) and not function.early
     known = {*where, *(a.name for a in early)}
-    kept = sorted({n for a in late for n in names_of(a.value)} & known)
+    kept = sorted({n for a in late for n in a.value.names} & known)
     ends = tuple(Operand(S.One, name) for name in kept)
     first = replace(function, body=early, outputs=ends, checks=())
     configuration = ccode.body(first, "panda", where, PAIR)

@@ -17,6 +17,7 @@ stands its bar, where it has one. Robots come from example-robot-data (pip insta
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import statistics
@@ -147,6 +148,7 @@ def inside(path: Path, root: Path) -> None:
     from eomc import mechanics, program, render
     from eomc.render import Sources
 
+    gc.disable()  # as eomc.read and eomc.sources do
     begun = time.perf_counter()
     system = eomc.read(path)
     spent = time.perf_counter() - begun
@@ -206,7 +208,9 @@ def row(case: Case, rounds: int) -> str:
         for k in range(rounds):
             root = Path(folder) / f"build{k}"
             command = [sys.executable, __file__, "--inside", str(path), str(root)]
-            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+            done = subprocess.run(
+                command, check=True, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
+            )
             rows.append(json.loads(done.stdout))
             colds.append(cold(path, name, str(root / "cold")))
     first = rows[0]
