@@ -97,6 +97,6 @@ def render(program: Program, extension: str) -> Sources:
 
 
 def _straight(program: Program, pairs: bool) -> bool:
-    """Batches are loops over instances, and implicit methods have loops over a matrix."""
+    """Batches are loops over instances, implicit methods have loops over stages or a matrix."""
     run = program.system.run
-    return pairs and not run.batch and not any(METHODS[name].newton for name in run.methods)
+    return pairs and not run.batch and not any(METHODS[name].implicit for name in run.methods)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import gc
+import json
 import os
 import shutil
 import signal
@@ -112,6 +114,80 @@ def test_what_is_found_is_found_without_sympy(scene: Path, root: Path) -> None:
     eomc.build(scene, root)
     code = "import sys, eomc; eomc.load(*sys.argv[1:]).D([0.0]); sys.exit('sympy' in sys.modules)"
     subprocess.run([sys.executable, "-c", code, str(scene), str(root)], check=True)
+
+
+def test_templates_are_compiled_once_and_kept_with_pythons_bytecode(
+    scene: Path, tmp_path: Path
+) -> None:
+    kept, before = tmp_path / "kept", None
+    for k in range(3):
+        root = tmp_path / f"build{k}"
+        keeps = {"PYTHONPYCACHEPREFIX": str(kept), "PYTHONDONTWRITEBYTECODE": ""}
+        process = started(scene, root, **keeps)
+        assert process.communicate()[0].strip() == "True"
+        text = (root / "simple_pendulum" / "simple_pendulum.c").read_bytes()
+        assert text == (before or text)
+        before = text
+        files = list(kept.rglob("eomc-template-*.cache"))
+        assert len(files) > 5
+        for file in files:  # whatever happens to them
+            file.write_bytes(b"nonsense" if k else file.read_bytes()[:-40])
+
+
+def test_no_bytecode_is_written_where_python_may_write_none(scene: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    keeps = {"PYTHONPYCACHEPREFIX": str(kept), "PYTHONDONTWRITEBYTECODE": "1"}
+    assert started(scene, tmp_path / "build", **keeps).communicate()[0].strip() == "True"
+    assert not kept.exists()
+
+
+def test_garbage_is_collected_again(scene: Path, tmp_path: Path) -> None:
+    assert gc.isenabled()
+    eomc.sources(eomc.read(scene))
+    assert gc.isenabled()
+    scene.write_text("no scene", encoding="utf-8")
+    with pytest.raises(eomc.SceneError):
+        eomc.read(scene)
+    assert gc.isenabled()
+    gc.disable()  # somebody else's wish
+    try:
+        with pytest.raises(eomc.SceneError):
+            eomc.read(scene)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+@pytest.mark.parametrize(
+    ("links", "run", "straight"),
+    [
+        (5, "", True),
+        (2, "", False),
+        (5, "batch = true", False),
+        (5, 'method = "gauss4"', False),
+        (5, 'method = ["rk4", "dp8"]', True),
+        (5, 'method = ["rk4", "gauss16"]', False),
+    ],
+)
+def test_long_straight_scenes_are_compiled_with_flags_of_their_own(
+    links: int, run: str, straight: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("EOMC_CFLAGS")
+    monkeypatch.setenv("CC", needs("gcc"))
+    text = (SCENES / "chain.toml").read_text(encoding="utf-8")
+    assert "value = 5," in text and "[run]\n" in text
+    file = tmp_path / "chain.toml"
+    text = text.replace("value = 5,", f"value = {links},").replace("[run]\n", f"[run]\n{run}\n")
+    file.write_text(text, encoding="utf-8")
+    assert eomc.sources(eomc.read(file)).straight is straight
+    if links == 5 and not run:
+        for name, level in (("gcc", "-O2"), ("clang", "-O3")):
+            if shutil.which(name):
+                monkeypatch.setenv("CC", name)
+                built = eomc.build(file, tmp_path / name)
+                told = json.loads((built.folder / compiler.MANIFEST).read_text(encoding="utf-8"))
+                assert level in told["flags"].split()
+                assert set(compiler.FLAGS) <= set(told["flags"].split())
 
 
 def test_what_a_build_hangs_on(
