@@ -125,10 +125,13 @@ def _write_new(path: Path, text: str) -> None:
     "--base", type=click.Choice(["fixed", "free"]), help="Of the root, instead of the file's."
 )
 @click.option("--no-drives", is_flag=True, help="No input for each joint.")
+@click.option(
+    "--mend-inertias", is_flag=True, help="Take the nearest inertia for one that no body can have."
+)
 @click.option("--include", is_flag=True, help="Open what <include> names, in the file's folder.")
 def import_(
     file: Path, out: Path | None, name: str | None, locks: Sequence[str], root: str, tip: str,
-    base: str | None, no_drives: bool, include: bool,
+    base: str | None, no_drives: bool, mend_inertias: bool, include: bool,
 ) -> None:  # fmt: skip
     """Write the scene of a robot file, URDF or MJCF, and say what it leaves out.
 
@@ -154,6 +157,8 @@ def import_(
         robot = robots.based(robot, free=base == "free")
     if no_drives:
         robot = replace(robot, drives=())
+    if mend_inertias:
+        robot = robots.mended(robot)
     if name is not None:
         if why := names.module_fault(name):
             raise EomcError(f"--name: {why}")
@@ -470,7 +475,7 @@ def _overrides(
     if values:  # the start may be a formula in the parameters
         from eomc import scene as scenes
 
-        q0[:], qd0[:] = scenes.read(scene).start(values)
+        q0[:], qd0[:] = scenes.read(scene, values).start()  # and may be bad for a body
     states = {name: (q0, k) for k, name in enumerate(module.coordinates)}
     states |= {f"{name}_dot": (qd0, k) for k, name in enumerate(module.coordinates)}
     for name, value in _pairs(start, "--start", {**module.defaults, **values}):

@@ -29,6 +29,7 @@ from eomc.robots import (
     scaled,
     turned,
     unit,
+    yaw_pitch_roll,
 )
 
 # tags in a body that say nothing about its motion, and those that would
@@ -159,7 +160,7 @@ def _joint(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | Non
         align = a.get("align", "auto")
         if align == "true" or (align == "auto" and settings.alignfree):
             told.leave("alignment of free joints with the principal axes (alignfree)", name)
-        start = (*pose.place, *masses.angles(pose.turn))
+        start = (*pose.place, *yaw_pitch_roll(pose.turn))
         motions = tuple(
             replace(m, start=s, rest=s) for m, s in zip(free_motions(), start, strict=True)
         )
@@ -582,7 +583,7 @@ def _started(root: Tag, joints: Sequence[Found], told: Told) -> list[Found]:
                     told.fault(tag, f"the quaternion of joint {joint.name} has the length zero")
                     continue
                 w, x, y, z = mine[-4:]
-                mine = (*mine[:-4], *masses.angles(from_quaternion(w, x, y, z)))
+                mine = (*mine[:-4], *yaw_pitch_roll(from_quaternion(w, x, y, z)))
             motions = (replace(m, start=v) for m, v in zip(joint.motions, mine, strict=True))
             out.append(joint._replace(motions=tuple(motions)))
     for joint in out:

@@ -213,12 +213,15 @@ def numbers(
         return None
     least = most if least is None else least
     try:
-        values = tuple(float(word) for word in text.split())
+        values = tuple(xmlfile.number(word) for word in text.split())
     except ValueError:
         told.fault(tag, f'{key}="{text}" holds something that is not a number')
         return None
     if not all(math.isfinite(value) for value in values):
         told.fault(tag, f'{key}="{text}" must be finite')
+        return None
+    if any(abs(value) > xmlfile.LARGE for value in values):
+        told.fault(tag, f'{key}="{text}" is more than {xmlfile.LARGE:g}, which can\'t be meant')
         return None
     if not least <= len(values) <= most:
         wanted = str(most) if least == most else f"{least} to {most}"

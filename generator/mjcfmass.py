@@ -106,19 +106,6 @@ def _toward(z: Vector) -> Matrix:
     return from_axis_angle(axis, math.atan2(sine, z[2]))
 
 
-def angles(turn: Matrix) -> Vector:
-    """Yaw, pitch and roll with turn = Rz(yaw) Ry(pitch) Rx(roll).
-
-    Where they are singular, at a pitch of a quarter turn, the roll is 0.
-    """
-    cosine = math.hypot(turn[0][0], turn[1][0])
-    pitch = math.atan2(-turn[2][0], cosine)
-    if cosine < 1e-9:
-        return math.atan2(-turn[0][1], turn[1][1]) + 0.0, pitch + 0.0, 0.0
-    yaw = math.atan2(turn[1][0], turn[0][0])
-    return yaw + 0.0, pitch + 0.0, math.atan2(turn[2][1], turn[2][2]) + 0.0
-
-
 def direction(vector: Sequence[float], what: str, tag: Tag, told: Told) -> Vector | None:
     """`vector` of length one; None, and told, where it has none."""
     x, y, z = vector
@@ -392,6 +379,9 @@ def _bounded(mass: Mass, tag: Tag, reader: Reader) -> Mass:
     """`mass` under boundmass, boundinertia and balanceinertia; its inertia checked."""
     s, told = reader.settings, reader.told
     inertia = mass.inertia
+    if not all(math.isfinite(x) for x in (mass.mass, *mass.center, *inertia)):
+        told.fault(tag, "its mass or inertia overflows: check sizes, densities and places")
+        return Mass()
     if s.boundinertia > 0 or s.balance:
         moments, axes = principal(inertia)
         bounded = [max(m, s.boundinertia) for m in moments] if s.boundinertia > 0 else moments

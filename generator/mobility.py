@@ -4,7 +4,9 @@ The count (Chebychev, Grübler, Kutzbach; e.g. Angeles, *Fundamentals of Robotic
 Systems*) is held against ranks: of the poses of all bodies over the coordinates, which shows
 coordinates that move nothing or nothing of their own, and of the mass matrix of the bodies, which
 shows those that move nothing with inertia. Both are taken from plain forward kinematics, of bodies
-placed by formulas from its finite differences, at random states and at the start.
+placed by formulas from its finite differences, at random states and at the start. Where the joints
+of a tree can be eliminated one by one, nothing is redundant and no rank need be taken, which makes
+thousands of bodies a matter of seconds.
 """
 
 from __future__ import annotations
@@ -19,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eomc import formulas
-from eomc.assembly import JOINTS, WORLD, Assembly, Body, Turn
+from eomc.assembly import JOINTS, WORLD, Assembly, Body, Damper, Spring, Turn
 from eomc.formulas import Formula
-from eomc.problems import EomcError
+from eomc.problems import EomcError, Problem
 
 if TYPE_CHECKING:
     from eomc.scene import Scene
@@ -35,6 +37,8 @@ Motion = tuple[
 STEP = 1e-5  # of central differences: their error is about 1e-10
 NOTHING = 1e-7  # a column shorter than this, relative to the longest, is one of zeros
 RANK = 1e-6  # a singular value of columns of length one, relative to the largest: a zero
+TOGETHER = 1e-12  # apart, relative to how far both are from the origin: that is rounding
+PIVOT = 1e-10  # of an inertia beside those that it is made of: above it, it is none of rounding
 STATES = 3  # random ones; a rank that holds almost everywhere is the largest of them
 
 
@@ -99,18 +103,64 @@ def count(scene: Scene) -> Mobility:
     found = list(kinematics.states())
     if not found:
         raise EomcError(f"{scene.file}: the bodies' positions have no value at the states tried")
-    generic = min(found, key=lambda at: (len(_null(at.moves)), len(_null(at.weighs))))
-    redundant = _null(generic.moves)
-    rank = len(names) - len(redundant)
+    generic = min(found, key=lambda null: (len(null.moves), len(null.weighs)))
+    rank = len(names) - len(generic.moves)
     remarks = [
         *_fixed(assembly),
         *_shared(assembly),
         *_formulas_fix(placed, d, names, rank, M),
-        *_moves_nothing(generic, names, redundant, bool(scene.kinetic.names())),
+        *_moves_nothing(generic, names, bool(scene.kinetic.names())),
         *_in_a_row(assembly, kinematics),
-        *_singular_start(kinematics, redundant, generic),
+        *_singular_start(kinematics, generic),
+        *(f"{problem.key}: {problem.message}" for problem in meeting(scene)),
     ]
     return Mobility(scene.name, d, len(assembly.bodies), joints, M, len(names), rank, (*remarks,))
+
+
+def meeting(scene: Scene) -> list[Problem]:
+    """A warning for each spring and damper whose ends meet at the start.
+
+    Its force has no direction there. A spring without rest length needs none.
+    """
+    assembly = scene.assembly
+    if not assembly:
+        return []
+    lines: list[tuple[str, Spring | Damper]] = []
+    for k, spring in enumerate(assembly.springs, start=1):
+        if spring.points and not _is_zero(spring.length, scene):
+            lines.append((f"spring.{k}", spring))
+    for k, damper in enumerate(assembly.dampers, start=1):
+        if damper.points:
+            lines.append((f"damper.{k}", damper))
+    if not lines:
+        return []
+    kinematics = _Kinematics(scene, assembly)
+    poses = kinematics.poses(kinematics.start)
+    if poses is None:
+        return []
+    found = []
+    for key, line in lines:
+        assert line.bodies and line.points
+        one, other = (
+            poses[name][0] + poses[name][1] @ kinematics._vector(point, kinematics.values)
+            for name, point in zip(line.bodies, line.points, strict=True)
+        )
+        size = max(float(np.abs(one).max()), float(np.abs(other).max()))
+        if float(np.linalg.norm(one - other)) <= TOGETHER * size:
+            what = "its ends meet at the start, where its force has no direction: "
+            remedy = "start elsewhere, or choose other points"
+            if isinstance(line, Spring):
+                remedy += ", or a rest length of zero, which needs no direction"
+            found.append(scene.problem(key, what + remedy, severity="warning"))
+    return found
+
+
+def _is_zero(formula: Formula, scene: Scene) -> bool:
+    """Whether it is zero whatever the parameters are."""
+    constants = {c.name: c.value for c in scene.constants}
+    if any(node.id not in constants for node in formula.names()):
+        return False
+    return float(formulas.evaluate(formula, formulas.NUMERIC, constants.__getitem__)) == 0
 
 
 FORMULAS = "placed by formulas"
@@ -123,6 +173,14 @@ class _Jacobian:
     moves: velocities and angular velocities of all bodies, m/s and rad/s a unit of rate. weighs:
     these times the roots of their inertias, so that D = weighs^T weighs.
     """
+
+    moves: Array
+    weighs: Array
+
+
+@dataclass(frozen=True)
+class _Null:
+    """Motions that move no body, and those that move nothing with inertia, a row each."""
 
     moves: Array
     weighs: Array
@@ -164,15 +222,13 @@ def _formulas_fix(
         )
 
 
-def _moves_nothing(
-    at: _Jacobian, names: Sequence[str], redundant: Array, by_hand: bool
-) -> Iterator[str]:
+def _moves_nothing(at: _Null, names: Sequence[str], by_hand: bool) -> Iterator[str]:
     """Coordinates that no body hangs on, or that move bodies only in combinations."""
     result = "D is singular" + (" unless [energy] gives it inertia" if by_hand else "")
-    for row in redundant:
+    for row in at.moves:
         yield f"redundant: {_combination(row, names)} moves no body; {result}"
-    known = redundant
-    for row in _null(at.weighs):
+    known = at.moves
+    for row in at.weighs:
         more = np.vstack([known, row])
         if np.linalg.matrix_rank(more, tol=1e-4) > len(known):  # not a motion told above
             known = more
@@ -208,17 +264,16 @@ def _in_a_row(assembly: Assembly, kinematics: _Kinematics) -> Iterator[str]:
         )
 
 
-def _singular_start(kinematics: _Kinematics, redundant: Array, generic: _Jacobian) -> Iterator[str]:
-    at_start = kinematics.jacobian(kinematics.start, 0.0)
+def _singular_start(kinematics: _Kinematics, generic: _Null) -> Iterator[str]:
+    at_start = kinematics.null(kinematics.start, 0.0)
     names = kinematics.coordinates
     if at_start is None:
         yield "at the start the bodies' positions have no value"
         return
-    for jacobian, usual, what in (
-        (at_start.moves, redundant, "move the bodies independently"),
-        (at_start.weighs, _null(generic.weighs), "have inertia"),
+    for null, usual, what in (
+        (at_start.moves, generic.moves, "move the bodies independently"),
+        (at_start.weighs, generic.weighs, "have inertia"),
     ):
-        null = _null(jacobian)
         if len(null) > len(usual):
             lost = _listed([_combination(row, names) for row in null])
             yield (
@@ -293,13 +348,82 @@ class _Kinematics:
         self.roots = {body.name: self._roots(body) for body in assembly.bodies}
         self.armature = np.diag(np.sqrt(self._armature(assembly)))
 
-    def states(self) -> Iterator[_Jacobian]:
+    def states(self) -> Iterator[_Null]:
         """At random states: coordinates not too far from the start, where formulas have values."""
         random = np.random.default_rng(0)
         for _ in range(STATES):
             q = self.start + random.uniform(-0.7, 0.7, len(self.start))
-            if jacobian := self.jacobian(q, random.uniform(0, 1)):
-                yield jacobian
+            if null := self.null(q, random.uniform(0, 1)):
+                yield null
+                if not len(null.weighs):
+                    return
+
+    def null(self, q: Array, t: float) -> _Null | None:
+        """What moves nothing at a state; None where a formula has no value there."""
+        if self.is_regular(q):
+            return _Null(*np.zeros((2, 0, len(q))))
+        found = self.jacobian(q, t)
+        return _Null(_null(found.moves), _null(found.weighs)) if found else None
+
+    def is_regular(self, q: Array) -> bool:
+        """Whether every joint of a tree, armature left out, is seen to have inertia of its own.
+
+        The joints are eliminated from the last one inwards (articulated bodies; Featherstone,
+        *Rigid Body Dynamics Algorithms*, ch. 7), which takes as long as the tree is. A pivot that
+        may be rounding is not judged: then the answer is False.
+        """
+        if self.placed or len({c for b in self.tree for c in b.coordinates}) < len(q):
+            return False
+        frames = self._frames(q)
+        inertia: dict[str, Array] = {}  # of what is beyond a joint, in the world's directions
+        size: dict[str, float] = {}  # of what went into it
+        for body in reversed(self.tree):
+            (at, turned), motions = frames[body.name]
+            mass, root = self.roots[body.name]
+            own = _spatial(mass**2, turned @ self.centers[body.name], root @ turned.T)
+            beyond = own + inertia.pop(body.name, 0)
+            scale = max(float(np.abs(beyond).max()), size.pop(body.name, 0.0))
+            for kind, axis in reversed(motions):
+                s = np.concatenate([axis, np.zeros(3)] if kind == "r" else [np.zeros(3), axis])
+                u = beyond @ s
+                if s @ u <= PIVOT * scale:
+                    return False
+                beyond = beyond - np.outer(u, u) / (s @ u)
+            if body.parent != WORLD:
+                shift = np.eye(6)
+                shift[3:, :3] = -_cross(at - frames[body.parent][0][0])
+                inertia[body.parent] = inertia.get(body.parent, 0) + shift.T @ beyond @ shift
+                size[body.parent] = max(size.get(body.parent, 0.0), scale)
+        return True
+
+    def poses(self, q: Array) -> dict[str, Pose] | None:
+        """Of each body's frame, of a placed one its centre's; None where a formula has no value."""
+        held = {name: pose for name, (pose, _) in self._frames(q).items()}
+        try:
+            return held | (self._placed_at(q, 0.0) if self.placed else {})
+        except (ArithmeticError, ValueError, TypeError):
+            return None
+
+    def _frames(self, q: Array) -> dict[str, tuple[Pose, list[tuple[str, Array]]]]:
+        """Of each body its frame, and its joint's motions: "t" or "r" and the axis in the world."""
+        index = {name: k for k, name in enumerate(self.coordinates)}
+        out: dict[str, tuple[Pose, list[tuple[str, Array]]]] = {
+            WORLD: ((np.zeros(3), np.eye(3)), [])
+        }
+        for body in self.tree:
+            at, turned = out[body.parent][0]
+            offset, rotation = self.frames[body.name]
+            at, turned = at + turned @ offset, turned @ rotation
+            motions = []
+            kinds = JOINTS[body.joint].motions  # slides come before turns, so points stay
+            for kind, axis, name in zip(kinds, self.axes(body), body.coordinates, strict=True):
+                motions.append((kind, turned @ axis))
+                if kind == "t":
+                    at = at + turned @ axis * q[index[name]]
+                else:
+                    turned = turned @ _turn(axis, q[index[name]])
+            out[body.name] = (at, turned), motions
+        return out
 
     def jacobian(self, q: Array, t: float) -> _Jacobian | None:
         """At a state; None where a formula has no value there."""
@@ -440,10 +564,22 @@ class _Kinematics:
         return value
 
 
+def _cross(v: Array) -> Array:
+    """[v] with [v] w = v x w."""
+    x, y, z = v
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _spatial(mass: float, center: Array, root: Array) -> Array:
+    """The inertia (6, 6) of turning rate and velocity at a point: mass, its centre, root^T root."""
+    c = _cross(center)
+    coupled = mass * c
+    return np.block([[root.T @ root - coupled @ c, coupled], [-coupled, mass * np.eye(3)]])
+
+
 def _turn(axis: Array, angle: float) -> Array:
     """The rotation by an angle about a unit axis (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    cross = _cross(axis)
     turned: Array = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
     return turned
 

@@ -27,6 +27,11 @@ remainder remquo rint round scalbln scalbn tgamma trunc sincos fpclassify isfini
 isnormal signbit isgreater isgreaterequal isless islessequal islessgreater isunordered
 float_t double_t linux unix i386""".split()
 
+# macros of the C library, in headers that come along with ours, that could be a scene's enumerator
+MACROS = """M_E M_PI M_LN2 M_LN10 M_SQRT2 M_LOG2E M_LOG10E FP_NAN FP_ZERO FP_NORMAL FP_INFINITE
+FP_SUBNORMAL FD_SET FD_CLR FD_ZERO F_LOCK F_TEST F_TLOCK F_ULOCK L_SET L_INCR L_XTND S_IREAD
+S_IWRITE S_IEXEC SEEK_SET SEEK_CUR SEEK_END PY_VERSION CO_NESTED""".split()
+
 _FORMULA = "abs sign heaviside dot min max pi t".split()
 
 _WHY = {
@@ -91,4 +96,7 @@ def module_fault(name: str) -> str | None:
         return why
     if name in sys.stdlib_module_names or name in ("numpy", "cffi", "eomc", "sympy", "test"):
         return f"'{name}' is the name of a Python module, which it would hide: use {name}_scene"
+    if name.upper() in ("F", "R", "W", "X"):
+        macro = f"{name.upper()}_OK"
+        return f"'{name}' would make a name {macro}, a macro of unistd.h: use {name}_scene"
     return None

@@ -221,6 +221,19 @@ def turns_of(a: Matrix) -> tuple[tuple[str, float], ...]:
     return tuple((axis, angle) for axis, angle in turns if abs(angle) >= _SNAP)
 
 
+def yaw_pitch_roll(a: Matrix) -> Vector:
+    """The angles (rad) with a = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Where they are singular, at a pitch of a quarter turn, the roll is 0.
+    """
+    cosine = math.hypot(a[0][0], a[1][0])
+    pitch = math.atan2(-a[2][0], cosine)
+    if cosine < 1e-9:
+        return math.atan2(-a[0][1], a[1][1]) + 0.0, pitch + 0.0, 0.0
+    yaw = math.atan2(a[1][0], a[0][0])
+    return yaw + 0.0, pitch + 0.0, math.atan2(a[2][1], a[2][2]) + 0.0
+
+
 def rotated_inertia(inertia: Inertia, a: Matrix) -> Inertia:
     """A I A^T: a tensor along axes that stand in the new ones as `a` says, along the new ones."""
     if a == IDENTITY:
@@ -253,38 +266,58 @@ def principal(inertia: Inertia) -> tuple[list[float], list[Vector]]:
 
 
 def indefinite(inertia: Inertia) -> str:
-    """In words, with a remedy, that a principal moment is negative beyond rounding, or ""."""
+    """In words, with one that would do, that a principal moment is negative, or ""."""
     moments, _ = principal(inertia)
     if moments[0] >= -TRIANGLE * max(map(abs, moments)):
         return ""
     return (
         f"its smallest principal moment of inertia is {moments[0]:.4g} kg m^2, and no body has "
-        f"a negative one: correct it in the file, {_near(inertia)} would do"
+        f"a negative one: correct it in the file, {_shown(nearest(inertia))} would do"
     )
 
 
 def unbalanced(inertia: Inertia) -> str:
-    """In words, with a remedy, that a moment is larger than the other two together, or ""."""
+    """In words, with one that would do, that a moment exceeds the other two together, or ""."""
     (small, middle, large), _ = principal(inertia)
     if large <= (small + middle) * (1 + TRIANGLE):
         return ""
     return (
         f"its principal moments of inertia {small:.4g}, {middle:.4g}, {large:.4g} break the "
-        f"triangle inequality, and no body has such: correct it, {_near(inertia)} would do"
+        f"triangle inequality, and no body has such: correct it, {_shown(nearest(inertia))} would "
+        "do"
     )
 
 
-def _near(inertia: Inertia) -> str:
-    """The tensor with the principal moments cut down to what a body can have."""
-    (small, middle, large), axes = principal(inertia)
-    small, middle = max(small, 0.0), max(middle, 0.0)
-    near = [0.0] * 6
-    for moment, axis in zip((small, middle, min(large, small + middle)), axes, strict=True):
-        for i in range(3):
-            for j in range(i, 3):
-                near[_INTO_MATRIX[i][j]] += moment * axis[i] * axis[j]
+def nearest(inertia: Inertia) -> Inertia:
+    """The tensor that a body can have with the least sum of squares of what changes (Frobenius).
+
+    It has the same axes. Its principal moments are I = (b + c, a + c, a + b) with the second
+    moments a, b, c >= 0 of the mass along them: least squares, of which some are zero.
+    """
+    import numpy as np
+
+    given, axes = principal(inertia)
+    moments = np.array(given)
+    sums = 1.0 - np.eye(3)
+    best, least = np.zeros(3), float(moments @ moments)
+    for kept in ((0, 1, 2), (0, 1), (0, 2), (1, 2), (0,), (1,), (2,)):
+        second = np.linalg.lstsq(sums[:, kept], moments, rcond=None)[0]
+        found = sums[:, kept] @ second
+        off = float((found - moments) @ (found - moments))
+        if min(second) >= 0 and off < least:
+            best, least = found, off
+    directions = np.array(axes)
+    tensor = (directions.T * best) @ directions
     dust = 1e-12 * max(map(abs, inertia))
-    return f"[{', '.join(f'{x:.8g}' if abs(x) > dust else '0' for x in near)}]"
+    a, b, c, d, e, f = (
+        float(x) if abs(x := tensor[i, j]) > dust else 0.0
+        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    )
+    return a, b, c, d, e, f
+
+
+def _shown(inertia: Inertia) -> str:
+    return f"[{', '.join(f'{x:.8g}' for x in inertia)}]"
 
 
 # --- what a user asks for -------------------------------------------------------------------------
@@ -407,10 +440,26 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
     return _without_loose_drives(replace(robot, bodies=tuple(bodies), left_out=left_out))
 
 
+def mended(robot: Robot) -> Robot:
+    """The robot with the nearest tensor in place of each that no body can have; they are told."""
+    bodies, told = [], []
+    for body in robot.bodies:
+        inertia = _without_dust(body)
+        if indefinite(inertia) or unbalanced(inertia):
+            (low, _, high), new = principal(inertia)[0], nearest(inertia)
+            told.append(
+                f"body {body.name}: its inertia {_shown(inertia)} is that of no body (principal "
+                f"moments {low:.4g} to {high:.4g} kg m^2): {_shown(new)} is in its place"
+            )
+            body = replace(body, inertia=new)
+        bodies.append(body)
+    return replace(robot, bodies=tuple(bodies), left_out=(*robot.left_out, *told))
+
+
 def based(robot: Robot, free: bool) -> Robot:
     """The robot with its first body free, or fixed to the world where it starts.
 
-    Raises EomcError where several bodies stand on the world.
+    A free one starts where it was fixed. Raises EomcError where several bodies stand on the world.
     """
     roots = [body for body in robot.bodies if body.parent == WORLD]
     if len(roots) != 1:
@@ -422,7 +471,11 @@ def based(robot: Robot, free: bool) -> Robot:
         motions = free_motions()
         if taken & {m.name for m in motions}:
             motions = free_motions("base")
-        new = replace(root, joint="free", motions=motions, axes=())
+        at = (*root.offset, *yaw_pitch_roll(root.rotation))
+        motions = tuple(replace(m, start=s) for m, s in zip(motions, at, strict=True))
+        new = replace(
+            root, joint="free", motions=motions, axes=(), offset=ORIGIN, rotation=IDENTITY
+        )  # fmt: skip
     elif not free and root.motions:
         offset, rotation = moved(root, [m.start for m in root.motions])
         new = replace(
@@ -460,7 +513,7 @@ def _joined(*notes: str) -> str:
 
 def _listed(those: Collection[str], most: int = 12) -> str:
     """Names in a line, the first of many."""
-    shown = ", ".join(list(those)[:most])
+    shown = ", ".join(list(those)[:most]) or "none"
     return shown + (f" and {len(those) - most} more" if len(those) > most else "")
 
 
@@ -480,12 +533,16 @@ def finished(robot: Robot) -> Robot:
             f"{robot.name}: nothing moves in this robot, no joint has a coordinate; with "
             "--base free its root does"
         )
-    faults = [f"body {b.name}: {why}" for b in robot.bodies if (why := indefinite(b.inertia))]
+    faults = [
+        f"body {b.name}: {why}, as --mend-inertias writes"
+        for b in robot.bodies
+        if (why := indefinite(b.inertia))
+    ]
     if faults := [*faults, *_without_inertia(robot)]:
         raise EomcError("\n".join(faults))
     robot = _named(robot)  # after the faults, which have the names that --lock takes
     found = tuple(
-        f"body {body.name}: {why}; until then the scene is refused"
+        f"body {body.name}: {why}, as --mend-inertias writes; until then the scene is refused"
         for body in robot.bodies
         if (why := unbalanced(body.inertia))
     )

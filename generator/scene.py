@@ -144,11 +144,15 @@ class Scene:
 # --- reading --------------------------------------------------------------------------------------
 
 
-def read(file: str | os.PathLike[str]) -> Scene:
-    """Read and check a scene file. Raises SceneError with every fault, EomcError if unreadable."""
+def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = None) -> Scene:
+    """Read and check a scene file, with other values in place of those of its parameters.
+
+    Raises SceneError with every fault, EomcError if unreadable.
+    """
     path = Path(file)
     try:
-        data = path.read_bytes()
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
         others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
         near = suggest(path.name, others)
@@ -156,15 +160,17 @@ def read(file: str | os.PathLike[str]) -> Scene:
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
         raise EomcError(f"{file}: can't be read ({why})") from None
-    return parse(data, str(file))
+    return parse(data, str(file), parameters)
 
 
-def parse(data: bytes | str, file: str = "scene.toml") -> Scene:
-    """Check the text of a scene. Raises SceneError with every fault."""
+def parse(
+    data: bytes | str, file: str = "scene.toml", parameters: Mapping[str, float] | None = None
+) -> Scene:
+    """Check the text of a scene, as `read` does. Raises SceneError with every fault."""
     if isinstance(data, str):
         data = data.encode(errors="surrogatepass")
     if len(data) > MAX_BYTES:
-        raise EomcError(f"{file}: {len(data)} bytes are more than the {MAX_BYTES} a scene may have")
+        raise EomcError(f"{file}: it has more than the {MAX_BYTES} bytes a scene may have")
     try:
         text = data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as fault:
@@ -179,7 +185,8 @@ def parse(data: bytes | str, file: str = "scene.toml") -> Scene:
         raise SceneError([_toml_problem(fault, text, file)]) from None
     except RecursionError:
         raise SceneError([Problem("the TOML is nested too deeply", file=file)]) from None
-    return _Check(tree, Places(text, file)).scene(hashlib.sha256(data).hexdigest())
+    check = _Check(tree, Places(text, file), parameters or {})
+    return check.scene(hashlib.sha256(data).hexdigest())
 
 
 def _encoding_problem(data: bytes, at: int, file: str) -> Problem:
@@ -230,8 +237,11 @@ _TOML_REMEDIES = {
 class _Check(Checker):
     """Everything that is checked in one scene, faults collected on the way."""
 
-    def __init__(self, tree: dict[str, Any], places: Places) -> None:
+    def __init__(
+        self, tree: dict[str, Any], places: Places, parameters: Mapping[str, float]
+    ) -> None:
         super().__init__(places)
+        self.values = parameters
         if not repeat.expand(tree, self):
             raise SceneError(self.problems)
         self.bodies = bool(tree.get("body"))
@@ -396,6 +406,8 @@ class _Check(Checker):
             path = (table, name, "value")
             formula = self.formula(path, entry.value, allowed, rule)
             known[name] = self.number(path, formula, known)
+            if table == "parameters":
+                known[name] = self.values.get(name, known[name])
             if formula:
                 out.append(Quantity(name, entry.unit, known[name], entry.note, formula))
         return out

@@ -11,6 +11,8 @@ from eomc.symbols import ALONG
 from eomc.system import System, t
 
 WRITTEN_OUT = 400  # operations of D, C and bias up to which a person may want them written out
+LONG = 10**12  # above or below the line of a fraction, which is then shown as a decimal
+TINY = 1e-25  # a factor below it is what rounding left of a zero
 
 _MATRICES = ("D", "C", "g", "tau")
 _SCALARS = ("kinetic", "potential", "jacobi", "power")
@@ -46,7 +48,7 @@ def equations(system: System, form: str = "text") -> str:
         return _assignments(made)
     plain = reference.derive(system)
     found = plain.simplified()
-    values = {name: getattr(found, name) for name in (*_MATRICES, *_SCALARS)}
+    values = {name: _readable(getattr(found, name)) for name in (*_MATRICES, *_SCALARS)}
     if sympy.expand(plain.jacobi - plain.energy) == 0:
         del values["jacobi"]
     values = {
@@ -55,6 +57,30 @@ def equations(system: System, form: str = "text") -> str:
         if name in ("D", "C", "g", "kinetic", "potential") or not _nothing(value)
     }
     return {"text": _text, "latex": _latex, "python": _python}[form](system, values)
+
+
+def _readable(value: Expr | sympy.MatrixBase) -> Expr | sympy.MatrixBase:
+    """With decimals for fractions that nobody reads, as those of 50 digits of slanted axes.
+
+    At 30 digits more of them fall together, and what rounding left of zeros is gone.
+    """
+    if isinstance(value, sympy.MatrixBase):
+        return value.applyfunc(_readable)
+    if not _long(value):
+        return value
+    short = sympy.trigsimp(_rounded(sympy.expand(value)))
+    plain = _rounded(sympy.expand(short))  # each factor whole again
+    return plain.xreplace({x: sympy.Float(x, 15) for x in _long(plain)})
+
+
+def _rounded(e: Expr) -> Expr:
+    return e.xreplace(
+        {x: sympy.Rational(str(sympy.Float(x, 30))) if abs(x) > TINY else 0 for x in _long(e)}
+    )
+
+
+def _long(e: Expr) -> set[sympy.Rational]:
+    return {x for x in e.atoms(sympy.Rational) if max(abs(x.p), x.q) >= LONG}
 
 
 def _nothing(value: Expr | sympy.MatrixBase) -> bool:

@@ -272,12 +272,22 @@ def from_scene(scene: Scene) -> System:
         note=scene.note,
         file=scene.file,
         digest=scene.digest,
-        warnings=scene.warnings,
+        warnings=(*scene.warnings, *_at_the_start(scene)),
         place=scene.problem,
     )
     if problems:
         raise SceneError(problems)
     return system
+
+
+def _at_the_start(scene: Scene) -> list[Problem]:
+    """Warnings of springs and dampers that have no direction there."""
+    assembly = getattr(scene, "assembly", None)
+    if not assembly or not any(line.points for line in (*assembly.springs, *assembly.dampers)):
+        return []
+    from eomc import mobility  # and with it NumPy, which few scenes need here
+
+    return mobility.meeting(scene)
 
 
 # --- from Python --------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,10 +25,22 @@ if TYPE_CHECKING:
 
 GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
 
-LARGE = 1e100  # numbers beyond it, and sizes below 1/LARGE, overflow when they are multiplied
-
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-_JOINT_PARTS = {"origin", "parent", "child", "axis", "dynamics", "limit", "mimic"}
+# what is read of a link and of a joint, each at most once, and the attributes that it may have
+_ATTRIBUTES = {
+    "inertial": set(),
+    "mass": {"value"},
+    "inertia": {"ixx", "iyy", "izz", "ixy", "ixz", "iyz"},
+    "origin": {"xyz", "rpy"},
+    "parent": {"link"},
+    "child": {"link"},
+    "axis": {"xyz"},
+    "dynamics": {"damping", "friction"},
+    "limit": {"lower", "upper", "effort", "velocity"},
+    "mimic": {"joint", "multiplier", "offset"},
+}
+_LINK_PARTS = ("inertial", "visual", "collision")
+_JOINT_PARTS = ("origin", "parent", "child", "axis", "dynamics", "limit", "mimic")
 _SHAPES = ("mesh", "box", "cylinder", "sphere", "capsule")
 
 
@@ -71,6 +84,8 @@ class _Reader:
         self.path = path
         self.shown = shown
         self.faults: list[Problem] = []
+        self.strange: dict[str, dict[str, None]] = {}  # attributes that are not read, by tag
+        self.places: dict[str, dict[str, None]] = {}  # and where they stand
 
     def robot(self) -> Robot:
         """The robot. Raises SceneError with every fault."""
@@ -96,6 +111,17 @@ class _Reader:
         """Note a fault of a link or joint."""
         self.faults.append(Problem(message, key, self.shown))
 
+    def _parts(self, element: Element, tags: Sequence[str], key: str) -> None:
+        """Tell parts that are there twice; attributes that they should not have are for later."""
+        for tag in tags:
+            parts = element.findall(tag)
+            if len(parts) > 1:
+                self.say(key, f"it has {len(parts)} <{tag}>: leave the one that is meant")
+            for attribute in (a for part in parts for a in part.attrib):
+                if attribute not in _ATTRIBUTES[tag]:
+                    self.strange.setdefault(tag, {})[attribute] = None
+                    self.places.setdefault(tag, {})[key] = None
+
     # --- links
 
     def _named(self, tag: str) -> dict[str, Element]:
@@ -113,11 +139,13 @@ class _Reader:
 
     def _link(self, name: str, link: Element) -> RobotBody:
         key = f"link {name}"
+        self._parts(link, ("inertial",), key)
         inertial = link.find("inertial")
         if inertial is None:
             shapes = _shapes(link)
             note = f"a {shapes[0]} only, no <inertial>" if shapes else "no <inertial>"
             return RobotBody(name, note=note)
+        self._parts(inertial, ("origin", "mass", "inertia"), key)
         mass, tensor = inertial.find("mass"), inertial.find("inertia")
         if mass is None or tensor is None:
             lacks = '<mass value="..."/>' if mass is None else '<inertia ixx="..." .../>'
@@ -142,6 +170,7 @@ class _Reader:
             known = f"known are {', '.join(_TYPES)}"
             found = f"unknown type '{kind}'" if kind else "it has no type"
             self.say(key, found + (suggest(kind, _TYPES) or f": {known}"))
+        self._parts(joint, _JOINT_PARTS, key)
         ends = [self._end(joint, end, key, bodies) for end in ("parent", "child")]
         offset, rotation = self._origin(joint, key)
         axis: Vector = (1.0, 0.0, 0.0)
@@ -305,9 +334,18 @@ class _Reader:
         if limited:
             out.append(f"limits of {len(limited)} joints: their values are in the notes")
         rest = Counter(str(e.tag) for e in self.root if e.tag not in ("link", "joint"))
-        for parts, known in ((links, {"inertial", "visual", "collision"}), (joints, _JOINT_PARTS)):
+        for parts, known in ((links, _LINK_PARTS), (joints, _JOINT_PARTS)):
             rest.update(str(e.tag) for part in parts for e in part if e.tag not in known)
         out += [f"<{tag}>, {n} {_plural('element', n)}" for tag, n in sorted(rest.items())]
+        for tag, those in self.strange.items():
+            first, *others = self.places[tag]
+            more = f" and {len(others)} more" if others else ""
+            what = f"attributes that URDF does not give <{tag}>: {', '.join(those)}"
+            out.append(f"{what} ({first}{more})")
+        floating = [j.get("name", "") for j in joints if j.get("type") == "floating"
+                    and j.find("dynamics") is not None]  # fmt: skip
+        if floating:
+            out.append(f"<dynamics> of floating joints: {', '.join(floating)}")
         return out
 
     # --- numbers
@@ -325,7 +363,8 @@ class _Reader:
             return default
         words = written.split()
         if len(words) != 3:
-            self.say(key, f'{attribute}="{written}" of <{element.tag}> is not three numbers')
+            what = f'{attribute}="{written}" of <{element.tag}> is not three numbers'
+            self.say(key, what + _macro(written))
             return default
         x, y, z = (self._value(word, f"{attribute} of <{element.tag}>", key) for word in words)
         return x, y, z
@@ -341,18 +380,23 @@ class _Reader:
     def _value(self, word: str, what: str, key: str) -> float:
         """The number; 0 where it is none, so that the rest is read too."""
         try:
-            value = float(word)
+            value = xmlfile.number(word)
         except ValueError:
-            remedy = "; " + xmlfile.RUN_XACRO if "${" in word else ""
-            self.say(key, f"{what}: '{word}' is not a number{remedy}")
+            self.say(key, f"{what}: '{word}' is not a number{_macro(word)}")
             return 0.0
         if not math.isfinite(value):
             self.say(key, f"{what}: '{word}' is not a finite number")
             return 0.0
-        if abs(value) > LARGE:
-            self.say(key, f"{what}: '{word}' is more than {LARGE:g}, which can't be meant")
+        large = xmlfile.LARGE
+        if abs(value) > large:
+            self.say(key, f"{what}: '{word}' is more than {large:g}, which can't be meant")
             return 0.0
-        return value if abs(value) > 1 / LARGE else 0.0
+        return value if abs(value) > 1 / large else 0.0
+
+
+def _macro(written: str) -> str:
+    """The remedy where a number is one of xacro's, or ""."""
+    return "; " + xmlfile.RUN_XACRO if "${" in written or "$(" in written else ""
 
 
 def _shapes(link: Element) -> list[str]:

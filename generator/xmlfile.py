@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree.ElementTree import ParseError
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 MAX_BYTES = 20_000_000  # the largest robot files without their meshes have one or two million
+LARGE = 1e100  # numbers beyond it, and sizes below 1/LARGE, overflow when they are multiplied
 
 
 def root(file: str | os.PathLike[str]) -> Element:
@@ -43,20 +45,31 @@ def root(file: str | os.PathLike[str]) -> Element:
     return found
 
 
+def number(word: str) -> float:
+    """The number that a word is; ValueError for what only Python takes for one, as 1_0."""
+    if "_" in word or not word.isascii():
+        raise ValueError(word)
+    return float(word)
+
+
 RUN_XACRO = "it holds xacro macros: run xacro first (xacro robot.urdf.xacro > robot.urdf)"
 
 
 def _bytes(path: Path, shown: str) -> bytes:
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):  # a pipe would be waited for
+            what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe or device"
+            raise EomcError(f"{shown}: can't be read (it is {what}, not a file)")
+        if found.st_size > MAX_BYTES:
             raise EomcError(
-                f"{shown}: {size} bytes are more than the {MAX_BYTES} a robot file may have"
+                f"{shown}: {found.st_size} bytes are more than the {MAX_BYTES} a robot file may "
+                "have"
             )
         with path.open("rb") as file:
             return file.read(MAX_BYTES)
     except FileNotFoundError:
-        near = suggest(path.name, (p.name for p in path.parent.glob("*.[ux]*")))
+        near = suggest(path.name, (p.name for p in path.parent.glob("*.[ux]*") if p.exists()))
         raise EomcError(f"{shown}: there is no such file{near}") from None
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault

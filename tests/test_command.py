@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,6 +66,7 @@ def test_parameters_and_start_on_the_command_line(here: Path) -> None:
     [
         (["run", "cartpole.toml", "--set", "mc=3"], "did you mean 'm_c'?"),
         (["run", "cartpole.toml", "--set", "m_c"], "write --set NAME=VALUE"),
+        (["run", "cartpole_bodies.toml", "--set", "m_p=-1"], "body.pole.mass: is -1 kg"),
         (["run", "cartpole.toml", "--start", "theta=1/0"], "divides by zero"),
         (["run", "cartpole.toml", "--h", "0"], "h: 0 is not a step size"),
         (["run", "cartpole.toml", "--method", "dp8"], "which has rk4"),
@@ -75,6 +78,7 @@ def test_parameters_and_start_on_the_command_line(here: Path) -> None:
     ],
 )
 def test_bad_input_is_status_2_and_says_what_to_do(here: Path, words: list[str], said: str) -> None:
+    shutil.copy(SCENES / "cartpole_bodies.toml", here)
     done = eomc(*words)
     assert done.exit_code == 2, done.output
     assert said in done.output
@@ -100,6 +104,39 @@ def test_show(here: Path) -> None:
     exec(eomc("show", "cartpole.toml", "--python").output, space)  # it is Python
     assert str(space["D"]).count("m_p") >= 3
     assert "1 division, 1 sincos" in eomc("show", "cartpole.toml", "--cost").output
+
+
+SLANTED = """
+eomc = 1
+name = "slanted"
+gravity = [0, 0, -9.81]
+[coordinates]
+q = {}
+[parameters]
+m = 1
+[[body]]
+name = "flap"
+joint = "revolute"
+coordinates = "q"
+axis = [1, 2, 3]
+mass = "m"
+center = [0.1, 0.2, -0.1]
+inertia = [0.1, 0.2, 0.3]
+"""
+
+
+def test_fractions_of_slanted_axes_are_shown_as_decimals(here: Path) -> None:
+    """D = n.J n + m |n x c|^2 with n = (1, 2, 3)/sqrt(14), which has no short fraction."""
+    (here / "slanted.toml").write_text(SLANTED, encoding="utf-8")
+    for form in ([], ["--latex"], ["--python"]):
+        text = eomc("show", "slanted.toml", *form).output
+        assert "mass matrix" in text or form
+        assert not re.search(r"\d{18}", text), text
+    space: dict[str, Any] = {}
+    exec(text, space)
+    n, c = np.array([1, 2, 3]) / np.sqrt(14), np.array([0.1, 0.2, -0.1])
+    right = n**2 @ [0.1, 0.2, 0.3] + 2 * np.sum(np.cross(n, c) ** 2)
+    assert float(space["D"][0].subs(space["m"], 2)) == pytest.approx(right, rel=1e-13)  # 15 digits
 
 
 @pytest.mark.parametrize("command", ["new", "build", "check", "run", "show", "list"])

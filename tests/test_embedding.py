@@ -230,6 +230,21 @@ def test_the_object_has_its_own_names_no_data_and_no_wishes(kit: Path, name: str
     assert ("T", f"{name}_rk4_step") in found
 
 
+def test_enumerators_are_none_of_the_librarys_macros(tmp_path: Path) -> None:
+    """A coordinate E of a scene m: math.h has an M_E of its own."""
+    text = """
+eomc = 1
+name = "m"
+[coordinates]
+E = { start = 1 }
+[energy]
+kinetic = "E_dot**2/2"
+"""
+    for file, content in eomc.sources(system.from_scene(scene.parse(text))).files.items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    compiled("cc", "-std=gnu99", "-include", "math.h", "-c", "m.c", cwd=tmp_path)
+
+
 @kits
 def test_what_is_not_wanted_is_not_there(kit: Path, name: str) -> None:
     """No input, no signal and no u; no force, no tau; no time, no t; nothing of a batch."""

@@ -113,6 +113,21 @@ def test_geoms_add_up_about_their_common_centre(tmp_path: Path) -> None:
     assert body.inertia == pytest.approx((own + steiner, own + steiner, own, 0, 0, 0), rel=CLOSE)
 
 
+def test_geoms_off_all_planes_have_products_of_inertia(tmp_path: Path) -> None:
+    places = np.array([[0.1, 0.2, 0.4], [-0.3, 0.5, 0.1], [0.2, -0.4, 0.6]])
+    m = np.array([1.0, 2.0, 0.5])
+    geoms = "".join(
+        f'<geom size="0.1" mass="{k}" pos="{x} {y} {z}"/>'
+        for k, (x, y, z) in zip(m, places, strict=True)
+    )
+    (body,) = model(tmp_path, f"<body><joint/>{geoms}</body>").bodies
+    x, y, z = (places - m @ places / m.sum()).T
+    own = 0.4 * m.sum() * 0.01
+    moments = [own + m @ (a * a + b * b) for a, b in ((y, z), (x, z), (x, y))]
+    products = [-m @ (a * b) for a, b in ((x, y), (x, z), (y, z))]
+    assert body.inertia == pytest.approx((*moments, *products), rel=1e-13)  # some roundings
+
+
 def test_a_capsule_from_one_point_to_another(tmp_path: Path) -> None:
     geom = '<geom type="capsule" size="0.1" fromto="1 0 0 1 0.4 0" mass="2"/>'
     upright = '<geom type="capsule" size="0.1 0.2" mass="2"/>'
@@ -460,6 +475,9 @@ def test_a_nest_of_a_thousand_bodies_is_read(tmp_path: Path) -> None:
         ('<body pos="1 2"/>', "", ['pos="1 2" has 2 numbers; it takes 3']),
         ('<body pos="1 2 z"/>', "", ["not a number"]),
         ('<body pos="1 2 nan"/>', "", ["finite"]),
+        ('<body pos="1 2 1e200"/>', "", ["more than 1e+100, which can't be meant"]),
+        ('<body pos="1 2 1_0"/>', "", ["not a number"]),
+        ('<body><geom size="1e90" density="1e90"/></body>', "", ["inertia overflows"]),
         ('<body quat="1 0 0 0" euler="1 2 3"/>', "", ["given twice, by quat and euler"]),
         (
             '<body name="a"><inertial pos="0 0 0" mass="1" diaginertia="1 1 3"/></body>',

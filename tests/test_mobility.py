@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from eomc import mobility, scene
+from eomc import mobility, scene, system
 from eomc.cli import main
 from eomc.mobility import Mobility
 from eomc.problems import EomcError
@@ -205,6 +205,127 @@ def test_the_mass_matrix_behind_the_ranks_is_that_of_a_pendulum() -> None:
     assert at is not None
     # I + m l^2 + armature; a few roundings
     assert (at.weighs.T @ at.weighs)[0, 0] == pytest.approx(0.3 + 2 * 0.25 + 0.05, rel=1e-14)
+
+
+def test_the_mass_matrix_behind_the_ranks_has_the_signs_of_a_cart_pole() -> None:
+    """D = [[M + m, m l cos q], [m l cos q, m l^2 + J]], the pole hanging down, x to the right."""
+    text = (
+        'eomc = 1\nname = "p_1"\ngravity = [0, 0]\n[coordinates]\nx = {}\nq = {}\n'
+        + body("cart", "prismatic", "x", axis="[1, 0]", mass="3", inertia="")
+        + body("pole", "revolute", "q", "cart", mass="2", center="[0, -0.5]", inertia="0.1")
+    )
+    checked = scene.parse(text)
+    assert checked.assembly
+    at = mobility._Kinematics(checked, checked.assembly).jacobian(np.array([0.2, 0.4]), 0.0)
+    assert at is not None
+    across = 2 * 0.5 * np.cos(0.4)
+    right = [[5, across], [across, 2 * 0.25 + 0.1]]
+    np.testing.assert_allclose(at.weighs.T @ at.weighs, right, rtol=1e-14)  # a few roundings
+
+
+def test_a_joint_behind_a_fixed_body_is_followed_through_its_frame() -> None:
+    """The mount stands turned about the first axis: what it offsets sideways, it offsets."""
+    for offset, same in (("[0, 0, 0.5]", False), ("[0.5, 0, 0]", True)):
+        found = count(
+            body("a", "revolute", "p"),
+            body("mount", "fixed", parent="a", rotation='[["y", "pi/2"]]'),
+            body("b", "revolute", "q", "mount", offset=offset, axis="[-1, 0, 0]"),
+            coordinates="p q",
+        )
+        told = any("turn about the same line" in remark for remark in found.remarks)
+        assert told is same
+
+
+def suspended(start: str, rest: str) -> str:
+    """A bob on a spring and a damper that hang at the origin, and a body placed by a formula."""
+    ends = 'bodies = ["world", "bob"]\npoints = [[1, 0], [0, 0]]\n'
+    return (
+        'eomc = 1\nname = "s_1"\ngravity = [0, 0]\n[parameters]\nl = 0\n[coordinates]\n'
+        f"x = {{ start = {start} }}\n"
+        + body("bob", "prismatic", "x", axis="[1, 0]", inertia="")
+        + f"[[spring]]\n{ends}stiffness = 1\nlength = {rest}\n"
+        + f"[[damper]]\n{ends}damping = 1\n"
+        + '[[body]]\nname = "lamp"\nposition = ["2*x", 0]\nmass = 1\n'
+        + '[[damper]]\nbodies = ["bob", "lamp"]\npoints = [[1, 0], [0, 0]]\ndamping = 1\n'
+    )
+
+
+@pytest.mark.parametrize(
+    ("start", "rest", "told"),
+    [
+        ("0.2", "0.1", []),
+        ("1", "0.1", ["spring.1", "damper.1", "damper.2"]),
+        ("1", '"l"', ["spring.1", "damper.1", "damper.2"]),  # zero, but it may be set
+        ("1", "0", ["damper.1", "damper.2"]),
+    ],
+)
+def test_ends_that_meet_at_the_start_are_told(start: str, rest: str, told: list[str]) -> None:
+    made = scene.parse(suspended(start, rest))
+    found = mobility.meeting(made)
+    assert [problem.key for problem in found] == told
+    warnings = system.from_scene(made).warnings[len(made.warnings) :]
+    assert [problem.key for problem in warnings] == told
+    remarks = [r for r in mobility.count(made).remarks if "its ends meet at the start" in r]
+    assert [r.partition(":")[0] for r in remarks] == told
+
+
+def test_thousands_of_bodies_take_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where joints can be eliminated one by one, no matrix as wide as the scene is made."""
+    text = """
+eomc = 1
+name = "chain"
+gravity = [0, -9.81]
+[coordinates]
+"q[i]" = { repeat = "i = 0..1500" }
+[[body]]
+name = "link[0]"
+joint = "revolute"
+coordinates = "q[0]"
+mass = 1
+center = [1, 0]
+[[body]]
+repeat = "i = 1..1500"
+name = "link[i]"
+parent = "link[i-1]"
+joint = "revolute"
+coordinates = "q[i]"
+offset = [1, 0]
+mass = 1
+center = [1, 0]
+"""
+    monkeypatch.delattr(mobility, "_null")
+    found = mobility.count(scene.parse(text))
+    assert (found.M, found.rank) == (1501, 1501) and not found.remarks
+
+
+def test_elimination_does_not_judge_what_may_be_rounding() -> None:
+    """A pivot of nothing but rounding, and one that is small but there: J = 1e-9 m l^2."""
+    for inertia, regular in (("", False), ("[1e-9, 1e-9, 1e-9]", True)):
+        text = (
+            'eomc = 1\nname = "p_1"\ngravity = [0, 0, 0]\n[coordinates]\np = {}\nq = {}\n'
+            + body("arm", "revolute", "p", axis="[0.3, 0.5, 0.7]", center="[0.5, 0, 0]")
+            + body("bob", "revolute", "q", "arm", offset="[1, 0.3, 0]", axis="[0.2, 0.3, 0.7]",
+                   center="[0.2, 0.3, 0.7]", inertia=inertia)
+        )  # fmt: skip
+        checked = scene.parse(text)
+        assert checked.assembly
+        kinematics = mobility._Kinematics(checked, checked.assembly)
+        assert kinematics.is_regular(np.array([0.4, 1.0])) is regular
+
+
+@pytest.mark.parametrize(("center", "regular"), [("-0.3", False), ("0.3", True)])
+def test_elimination_knows_where_a_mass_is(center: str, regular: bool) -> None:
+    """A point mass beside a joint's axis, or on it, in the frame of a body that stands apart."""
+    text = (
+        'eomc = 1\nname = "p_1"\ngravity = [0, 0, 0]\n[coordinates]\np = {}\n'
+        + body("post", "revolute", "p", mass="", inertia="")
+        + body("bob", "fixed", "", "post", offset="[0.3, 0, 1]", center=f"[{center}, 0, 0]",
+               inertia="")
+    )  # fmt: skip
+    checked = scene.parse(text)
+    assert checked.assembly
+    kinematics = mobility._Kinematics(checked, checked.assembly)
+    assert kinematics.is_regular(np.array([0.4])) is regular
 
 
 def test_a_long_chain_has_all_its_freedoms() -> None:

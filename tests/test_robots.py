@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eomc import names, robots
+from eomc import names, robots, scene
 from eomc.problems import EomcError
-from eomc.robots import Drive, Motion, Robot, RobotBody
+from eomc.robots import Drive, Inertia, Motion, Robot, RobotBody
 
 angles = st.one_of(
     st.floats(-math.pi, math.pi),
@@ -91,11 +91,53 @@ def test_tensors_that_no_body_has_are_told_with_one_that_would_do() -> None:
     assert not robots.unbalanced((1.0, 1.0, 2.0, 0, 0, 0))
     assert not robots.indefinite((0.0, 0.0, 0.0, 0, 0, 0))
     told = robots.unbalanced((1.0, 1.0, 2.1, 0, 0, 0))
-    assert "1, 1, 2.1 break the triangle inequality" in told and "[1, 1, 2, 0, 0, 0]" in told
+    assert (
+        "1, 1, 2.1 break the triangle inequality" in told
+        and "[1.0333333, 1.0333333, 2.0666667, 0, 0, 0] would do" in told
+    )
     assert "-1" in robots.indefinite((1.0, 1.0, -1.0, 0, 0, 0))
-    near = robots._near((0.001, 0.002, 0.006, 0.0003, -0.0002, 0.0004))
-    mended = tuple(float(word) for word in near.strip("[]").split(","))
-    assert len(mended) == 6 and not robots.unbalanced(mended)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "inertia",
+    [(0.001, 0.002, 0.006, 0.0003, -0.0002, 0.0004), (1.0, 1.0, -1.0, 0, 0, 0),
+     (1e-8, 2e-8, 4e-8, 6e-8, 1e-8, 1e-8), (-1.0, -2.0, -0.5, 0.1, 0, 0)],
+)  # fmt: skip
+def test_the_nearest_tensor_is_a_bodys_and_none_is_nearer(inertia: Inertia) -> None:
+    near = robots.nearest(inertia)
+    assert not robots.indefinite(near) and not robots.unbalanced(near)
+
+    def off(other: Inertia) -> float:
+        """Of all nine entries."""
+        difference = np.array(other) - inertia
+        return float(difference**2 @ [1, 1, 1, 2, 2, 2])
+
+    random = np.random.default_rng(2)
+    for k in range(300):  # others, drawn from wide to close by
+        points = random.normal(size=(4, 3))
+        m = np.abs(random.normal(size=4)) * max(map(abs, inertia)) / 3
+        x, y, z = (points - m @ points / m.sum()).T
+        bodys = np.array([m @ (y * y + z * z), m @ (x * x + z * z), m @ (x * x + y * y),
+                          -m @ (x * y), -m @ (x * z), -m @ (y * z)])  # fmt: skip
+        part = 10.0 ** -(k % 5)  # between two bodies' tensors lie those of bodies
+        other = tuple(part * bodys + (1 - part) * np.array(near))
+        assert off(near) <= off(other) + 1e-12 * off((0, 0, 0, 0, 0, 0))
+    good = (1.0, 1.1, 1.2, 0.1, 0, 0)
+    assert robots.nearest(good) == pytest.approx(good, rel=1e-14)  # eigenvalues and back
+
+
+def test_tensors_that_no_body_has_are_mended_where_it_is_asked_for() -> None:
+    bad = replace(arm().bodies[2], inertia=(0.1, 0.1, 0.3, 0.0, 0.0, 0.0))
+    worse = replace(arm().bodies[1], inertia=(0.1, -0.1, 0.3, 0.0, 0.0, 0.0))
+    bodies = tuple({"boom": bad, "column": worse}.get(b.name, b) for b in arm().bodies)
+    mended = robots.mended(replace(arm(), bodies=bodies))
+    text = robots.scene_text(mended)
+    assert "# - body column: its inertia [0.1, -0.1, 0.3, 0, 0, 0] is that of no body" in text
+    assert "# - body boom: its inertia [0.1, 0.1, 0.3, 0, 0, 0] is that of no body" in text
+    inertias = [b["inertia"] for b in tomllib.loads(text)["body"] if "inertia" in b]
+    assert inertias[1] == pytest.approx([0.4 / 3, 0.4 / 3, 0.8 / 3])
+    scene.parse(text)
+    assert robots.mended(arm()) == arm()
 
 
 # --- a robot ------------------------------------------------------------------------------------
@@ -188,6 +230,14 @@ def test_a_base_is_freed_and_fixed_again() -> None:
     free = robots.based(arm(), free=True)
     assert [m.name for m in free.motions][:6] == ["x", "y", "z", "yaw", "pitch", "roll"]
     assert robots.based(free, free=False) == arm()
+    root = replace(arm().bodies[0], offset=(1.0, 2.0, 3.0), rotation=robots.from_rpy(0.1, 0.2, 0.3))
+    stood = replace(arm(), bodies=(root, *arm().bodies[1:]))
+    free = robots.based(stood, free=True)
+    assert [m.start for m in free.motions[:6]] == pytest.approx([1, 2, 3, 0.3, 0.2, 0.1])
+    at_start = {m.name: m.start for m in free.motions}
+    hooks = place(free, "hook", at_start), place(stood, "hook", at_start)
+    for ours, theirs in zip(*hooks, strict=True):
+        assert np.allclose(ours, theirs, atol=1e-15)
     crowd = replace(arm(), bodies=(*arm().bodies, RobotBody("other")))
     with pytest.raises(EomcError, match="2 bodies stand on the world"):
         robots.based(crowd, free=True)
@@ -214,12 +264,12 @@ def test_the_scene_says_what_differs_from_the_defaults_and_no_more() -> None:
 
 
 def test_springs_of_joints() -> None:
-    body = replace(
-        arm().bodies[1], motions=(Motion("pan", "rad", stiffness=3.0, rest=math.pi / 4),)
-    )
+    motion = Motion("pan", "rad", stiffness=3.0, rest=math.pi / 4, armature=0.02, friction=0.1)
+    body = replace(arm().bodies[1], motions=(motion,))
     robot = replace(arm(), bodies=(RobotBody("base"), body), drives=())
     tree = tomllib.loads(robots.scene_text(robot))
     assert tree["spring"] == [{"coordinate": "pan", "stiffness": 3, "length": "pi/4"}]
+    assert (tree["body"][1]["armature"], tree["body"][1]["friction"]) == (0.02, 0.1)
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))

@@ -274,6 +274,36 @@ def test_scenes_of_bodies_read_without_warnings(name):
     assert made.assembly.bodies
 
 
+def test_values_are_checked_where_a_parameter_is_set():
+    text = """
+eomc = 1
+name = "swing"
+gravity = [0, "-g"]
+[coordinates]
+q = { start = "w" }
+[parameters]
+g = 9.81
+m = 1
+w = 0.1
+[[body]]
+name = "bob"
+joint = "revolute"
+coordinates = "q"
+mass = "m"
+center = [0, -1]
+friction = 0.2
+friction_width = "w"
+"""
+    assert scene.parse(text, parameters={"w": 0.3}).start()[0] == [0.3]
+    for values, told in (
+        ({"w": 0}, "body.bob.friction_width: is 0, and must be greater than zero"),
+        ({"w": -1}, "body.bob.friction_width: is -1"),
+        ({"m": -2}, "body.bob.mass: is -2 kg"),
+    ):
+        with pytest.raises(SceneError, match=told):
+            scene.parse(text, parameters=values)
+
+
 def test_thousands_of_bodies_are_read():
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
     made = scene.parse(text.replace("value = 5", "value = 4000"))  # and 4000 coordinates

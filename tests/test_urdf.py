@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,6 +100,17 @@ def test_what_is_not_modelled_is_told(read: Reader) -> None:
         assert words in told
 
 
+def test_attributes_that_are_not_read_are_told(read: Reader) -> None:
+    """A stiffness in <dynamics>, a misspelt axis: without them it is another robot."""
+    text = ARM.replace('damping="0.4"', 'damping="0.4" K="30"').replace("<axis xyz", "<axis xzy")
+    told = read(text).left_out
+    assert "attributes that URDF does not give <dynamics>: K (joint shoulder)" in told
+    assert any("<axis>: xzy (joint shoulder" in words for words in told)
+    assert not any("attributes" in words for words in read(ARM).left_out)
+    floats = ARM.replace('type="revolute"', 'type="floating"')
+    assert "<dynamics> of floating joints: shoulder" in read(floats).left_out
+
+
 def test_no_file_that_it_names_is_opened(read: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     plain = Path.open
@@ -181,6 +193,13 @@ def joint(name: str, parent: str, child: str, rest: str = "") -> str:
         ('damping="0.4"', 'damping="-0.4"', "joint shoulder: its damping is negative"),
         ('name="slide"', 'name="base"', "link base: a second link has this name"),
         ('name="extend"', "", "joint 2: it has no name"),
+        ('<mass value="2"/>', '<mass value="1_0"/>', "'1_0' is not a number"),
+        ('<mass value="2"/>', '<mass value="२"/>', "'२' is not a number"),
+        ('<mass value="2"/>', '<mass value="2"/><mass value="3"/>',
+         "link upper-arm: it has 2 <mass>: leave the one that is meant"),
+        ('<parent link="base"/>', '<parent link="base"/><parent link="slide"/>',
+         "joint shoulder: it has 2 <parent>"),
+        ('xyz="0 0 0.5"', 'xyz="$(arg x) 0 0"', "is not three numbers; it holds xacro macros"),
     ],
 )  # fmt: skip
 def test_faults_name_the_link_or_joint_and_the_remedy(
@@ -233,8 +252,14 @@ def test_files_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "crane.urdf").write_text(ARM, encoding="utf-8")
     with pytest.raises(EomcError, match="did you mean 'crane"):
         urdf.read(tmp_path / "crain.urdf")
-    with pytest.raises(EomcError, match="can't be read"):
+    with pytest.raises(EomcError, match="can't be read \\(it is a folder"):
         urdf.read(tmp_path)
+    os.mkfifo(tmp_path / "pipe.urdf")
+    with pytest.raises(EomcError, match="can't be read \\(it is a pipe"):  # and is not waited for
+        urdf.read(tmp_path / "pipe.urdf")
+    (tmp_path / "gone.urdf").symlink_to(tmp_path / "nothing")
+    with pytest.raises(EomcError, match="no such file; did you mean 'crane"):
+        urdf.read(tmp_path / "gone.urdf")
     monkeypatch.setattr("eomc.xmlfile.MAX_BYTES", 100)
     with pytest.raises(EomcError, match="more than the 100"):
         urdf.read(tmp_path / "crane.urdf")
@@ -277,6 +302,20 @@ def test_import_writes_a_scene_that_reads_without_a_warning(here: Path) -> None:
     assert arm.name == "upper_arm" and arm.joint == "revolute" and arm.axes == ((0, 0.6, 0.8),)
     again = CliRunner().invoke(main, ["import", "crane.urdf"])
     assert again.exit_code == 2 and "stays as it is" in again.output
+
+
+def test_import_mends_inertias_where_it_is_asked_to(here: Path) -> None:
+    text = ARM.replace('izz="0.25"', 'izz="25"')
+    assert text != ARM
+    (here / "crane.urdf").write_text(text, encoding="utf-8")
+    done = CliRunner().invoke(main, ["import", "crane.urdf", "--out", "bad.toml"])
+    assert "as --mend-inertias writes" in done.output
+    with pytest.raises(EomcError, match="larger than the two others"):
+        scene.read("bad.toml")
+    words = ["import", "crane.urdf", "--out", "good.toml", "--mend-inertias"]
+    done = CliRunner().invoke(main, words)
+    assert "body upper-arm: its inertia" in done.output and "is in its place" in done.output
+    scene.read("good.toml")
 
 
 def test_import_goes_into_scenes_where_there_is_one(here: Path) -> None:
