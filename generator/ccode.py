@@ -96,9 +96,12 @@ def _decimal(value: float) -> str:
 class Printer:
     """Prints one function's values; `where` says how a name from outside is written in C."""
 
-    def __init__(self, prefix: str, real: Real, where: Mapping[str, str]) -> None:
+    def __init__(
+        self, prefix: str, real: Real, where: Mapping[str, str], in_order: bool = False
+    ) -> None:
         self.prefix = prefix
         self.real = real
+        self.in_order = in_order
         self.where = dict(where)
         self.inline: dict[str, tuple[str, int]] = {}
 
@@ -128,8 +131,8 @@ class Printer:
         return (text, strength) if strength >= binding else (f"({text})", 4)
 
     def _sum(self, value: Sum) -> str:
-        # a positive term first, where there is one
-        terms = sorted(value.terms, key=lambda p: is_negative(p[0]))
+        # a positive term first, where there is one and their order is free
+        terms = sorted(value.terms, key=lambda p: not self.in_order and is_negative(p[0]))
         text = ""
         if value.constant is not S.Zero and not is_negative(value.constant):
             text = number(value.constant, self.real)
@@ -206,6 +209,7 @@ def body(
     lane: bool = False,
     stored: Mapping[str, str] | None = None,
     pivots: int = 0,
+    in_order: bool = False,
 ) -> Body:
     """The statements of a function.
 
@@ -213,6 +217,7 @@ def body(
     keep: how the rest reads what parameters decide, where that lives in a struct; `parameters`
     are kept there too where the rest reads them. lane: without branches, for a loop over many.
     stored: where values go that are no locals. pivots: how many the whole has, if this is a piece.
+    in_order: terms of sums stay in their order.
     """
     stored = stored or {}
     stages = {a.name: a.stage for a in (*function.early, *function.body)}
@@ -228,7 +233,7 @@ def body(
     # a value may bear the name of something outside that is not read here
     uses = function.uses
     outside = {n: text for n, text in where.items() if n in uses}
-    printer = Printer(prefix, real, outside | dict(stored))
+    printer = Printer(prefix, real, outside | dict(stored), in_order)
     tolerance = 8 * real.epsilon * max(1, pivots, len(function.checks))
 
     def set_to(name: str, text: str) -> str:

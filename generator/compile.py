@@ -38,7 +38,9 @@ FLAGS = ("-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-sl
 LEVEL = ("-O3",)
 # gcc's -O3 without what long straight lines don't profit from: three quarters of its time, and
 # steps that take 0.93 to 0.99; other compilers know no such flags
-STRAIGHT = ("-O2", "-ftree-loop-vectorize", "-fvect-cost-model=dynamic", "-fsplit-paths")
+STRAIGHT = (
+    "-O2", "-ftree-loop-vectorize", "-fvect-cost-model=dynamic", "-fsplit-paths", "-fpeel-loops",
+)  # fmt: skip
 STANDARD = "-std=gnu99"  # c99 would forbid the contraction to FMA
 MANIFEST = "build.json"
 # operations over which gcc takes some twenty seconds (0.3 ms each, in pieces) and clang two thirds

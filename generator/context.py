@@ -245,7 +245,7 @@ def _csrc(target: Target, turned: int, lanes: bool, pairs: bool) -> list[str]:
         *(["foretold_both.h"] if turned > 1 else []),
         *([f"quadrants{suffix}.h"] if target.sincos and target.system.run.batch else []),
         *([f"turn{suffix}.h"] if lanes or pairs else []),
-        *(["around.h"] if pairs else []),
+        *(["around.h", "beside.h"] if pairs else []),
     ]
     texts = [resource("csrc", file).replace("#include <math.h>\n", "") for file in files]
     if pairs and target.sincos:  # loops have sines of their own, and compilers a third less to do

@@ -76,6 +76,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "stepper_call": after(t, "h", u, c, p),
         "methods": chosen,
         "tile_rates": any(m.get("by_rates") for m in chosen),
+        "finite": s.run.batch or not all(m["pairs"] for m in chosen),
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
         "newton": any(METHODS[name].newton for name in s.run.methods),
         "angles": turning.scalar(target, turned),
@@ -123,7 +124,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
             u and "u, u_instance, u_step", "every", "q_rows", "qd_rows", "row_count",
             f"{target.p_cast}, p_instance" if target.needs_p else "", "done", "status",
         ) + ")",
-        "vector_members": [f"{real} x[{NQ}];"] if arrays
+        "vector_members": [f"{real} x[{pairs.width(target, parts) if parts else NQ}];"] if arrays
         else [f"{real} {', '.join(target.names)};"],
         "vector_of": lambda name, element: vectors.vector_of(target, arrays, name, element),
         "prepared_here": f"const {P}_prepared c = "
@@ -223,6 +224,7 @@ def _mode(
     state = f"const {P}_vector *q, const {P}_vector *qd"
     s_arg, s_call = (f"const {P}_angles *s", "s") if turned else ("", "")
     rates_rest = (t_arg, u_arg, c_arg, p_arg)
+    alone = f"{target.PREFIX}_ALONE " if parts else ""
 
     def rates(time: str) -> str:
         if u:
@@ -261,7 +263,12 @@ def _mode(
             p_arg,
         ),
         "stepper_arguments": arguments(
-            f"{P}_vector *r, {P}_vector *v, {state}", t_arg, f"{real} h", u_arg, c_arg, p_arg
+            f"{P}_vector *{alone}r, {P}_vector *{alone}v, {state}",
+            t_arg,
+            f"{real} h",
+            u_arg,
+            c_arg,
+            p_arg,
         ),
         "unused": _unread(target, function),
         "pieces": None,
@@ -280,6 +287,10 @@ def _mode(
         "last": "return good;",
         "each": lambda lines, width=4, index="i": indent(
             vectors.each(target, arrays, lines, index), width
+        ),
+        "whole": lambda lines, width=4: indent(
+            vectors.each(target, arrays, lines, width=pairs.width(target, parts) if parts else 0),
+            width,
         ),
         "rows": indent(vectors.rows(target, arrays), 12),
         "arrays": arrays,

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import sympy
 from sympy import Expr, S
 
-from eomc.tape import Tape
+from eomc.tape import Stage, Tape
 
 Vector = tuple[Expr, ...]
 Rows = tuple[Vector, ...]
 Pairs = tuple[tuple[Expr, Expr], ...]
+
+LONGEST = 16  # pivots in one product: beyond, it could leave the range of a double
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ def solve(
     b: Sequence[Expr],
     short: Callable[[Expr], Expr] = lambda atom: atom,
     kept: Callable[[Expr], Expr] = lambda atom: atom,
+    prompt: bool = False,
 ) -> tuple[tuple[int, ...], Vector, Pairs]:
     """x with D x = b by L diag(d) L^T x = b, unrolled; zeros are neither stored nor computed.
 
@@ -47,32 +50,50 @@ def solve(
     short: rewrites what elimination makes, so that terms which cancel are gone. kept: what is done
     with the entries of L; where they are kept whole, each x waits for one operation on the one
     before, not for two.
+    prompt: so that x waits for less, at the price of more operations. A pivot that parameters
+    decide is taken as if it had an entry less beside it, so every other of a chain goes first.
+    Along what is left a pivot is p = N/M, N and M made of those before without a division,
+
+        p_i - a^2/p_k = (N_i N_k - a^2 M_i M_k)/(M_i N_k),
+
+    and all divisions M/N are done side by side. It rounds as the other form does. Of such a pivot
+    N is given, beside M times the entry that it came from.
     """
     n = len(b)
     A = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
     y = list(b)
     left, order, pivots, behind = list(range(n)), [], [], [0] * n
+    over, length = [S.One] * n, [1] * n  # M; A has N in its diagonal, a product of so many pivots
     steps: list[tuple[int, Expr, dict[int, Expr]]] = []
     while left:
 
         def rank(i: int) -> tuple[int, int, int, int]:
-            return sum((i, j) in A for j in left), tape.stage_of(A[i, i]), behind[i], i
+            stage, beside = tape.stage_of(A[i, i]), sum((i, j) in A for j in left)
+            return beside - (prompt and stage <= Stage.PARAMETER), stage, behind[i], i
 
         k = min(left, key=rank)
         left.remove(k)
         order.append(k)
         pivot = A[k, k]
-        pivots.append((pivot, D[k][k]))
-        inverse = tape.define(1 / pivot)
+        pivots.append((pivot, tape.define(over[k] * D[k][k])))
+        inverse = tape.define(over[k] / pivot)
         beside = {i: A[i, k] for i in left if (i, k) in A}
         for i in beside:
             behind[i] = max(behind[i], behind[k] + 1)
         factors = {i: kept(tape.define(a * inverse)) for i, a in beside.items()}
+        chained = prompt and len(beside) == 1 and tape.stage_of(pivot) > Stage.PARAMETER
         for i, factor in factors.items():
             y[i] = short(tape.define(y[i] - factor * y[k]))
             for j, a in beside.items():
-                if j <= i:
+                if j < i:
                     A[i, j] = A[j, i] = short(tape.define(A.get((i, j), S.Zero) - factor * a))
+            a = beside[i]
+            if chained and length[i] + length[k] <= LONGEST:
+                N = A[i, i] * pivot - kept(tape.define(a * a)) * over[i] * over[k]
+                A[i, i], over[i] = kept(tape.define(N)), kept(tape.define(over[i] * pivot))
+                length[i] += length[k]
+            else:
+                A[i, i] = short(tape.define(A[i, i] - factor * a * over[i]))
         steps.append((k, inverse, factors))
     x: dict[int, Expr] = {}
     for k, inverse, factors in reversed(steps):

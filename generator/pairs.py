@@ -9,7 +9,8 @@ part, follows stage by stage.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -18,12 +19,15 @@ from sympy import Expr, S
 
 from eomc import angles, ccode, pieces, vectors
 from eomc.angles import Angle
-from eomc.assignments import Assignment, Function, Operand, Sum, rename
+from eomc.assignments import Assignment, Function, Operand, Product, Sum, rename
 from eomc.ccode import DOUBLE
+from eomc.tape import Stage, is_negative
 from eomc.target import TROUBLE, Argument, Target, arguments
 
 FEWEST = 5  # angles from which on it pays to have them side by side
-LOOPED = 10  # coordinates from which on loops over them pay
+FOUR = 4  # numbers that are loaded and stored at once
+SUM, PRODUCT, QUOTIENT = 4, 3, 13  # cycles until their results are there, about
+SHORT = 400  # operations of a step up to which its parts are inlined
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,8 @@ def apart(target: Target, function: Function) -> Parts | None:
             place.add(a.name)
             first.append(a)
     made = {a.name for a in first}
-    late = [a for a in rest.body if a.name not in made]
+    late, more = _without_factors([a for a in rest.body if a.name not in made], place, fixed)
+    first += more
     checks = [
         (made.issuperset({o.name for o in pair if o.name} - fixed), pair) for pair in rest.checks
     ]
@@ -77,7 +82,64 @@ def apart(target: Target, function: Function) -> Parts | None:
     configuration, motion = rename(configuration, new), rename(motion, new)
     kept = tuple(new.get(name, name) for name in kept)
     named = frozenset(kept)
-    return Parts(tuple(turned), pieces.with_names(configuration, named), motion, kept)
+    configuration = pieces.with_names(configuration, named)
+    return Parts(tuple(turned), _last_come_last(configuration), _last_come_last(motion), kept)
+
+
+def _without_factors(
+    late: Sequence[Assignment], place: Set[str], fixed: Set[str]
+) -> tuple[list[Assignment], list[Assignment]]:
+    """Products with one factor of all that the place decides in them; and these factors."""
+    made: dict[Product, str] = {}
+    out = []
+    for a in late:
+        if isinstance(a.value, Product):
+            known = [f for f in a.value.factors if f in place or f in fixed]
+            sign, size = a.value.coefficient, S.One
+            if abs(sign) != 1:
+                sign, size = (-S.One, -sign) if is_negative(sign) else (S.One, sign)
+            if not place.isdisjoint(known) and (size != 1 or len(known) > 1):
+                factor = Product(size, tuple(known))
+                name = made.setdefault(factor, f"_f{len(made)}")
+                rest = [f for f in a.value.factors if f not in known]
+                a = replace(a, value=Product(sign, (name, *rest)))
+        out.append(a)
+    return out, [Assignment(name, value, Stage.POSITION) for value, name in made.items()]
+
+
+def _last_come_last(function: Function) -> Function:
+    """The function with the terms of its sums in the order in which they are known.
+
+    What is known last waits for one operation then: a b + c d is taken as a b + (c d), with one
+    operation behind a b, so of the first two the later stands first.
+    """
+    uses = Counter(n for a in function.body for n in a.value.names)
+    uses.update(o.name for o in function.outputs)
+    values = {a.name: a.value for a in function.body if not a.named and uses[a.name] == 1}
+    ready: dict[str, int] = {}
+    body = []
+    for a in function.body:
+        value = a.value
+        if isinstance(value, Sum):
+
+            def known(term: tuple[Expr, str]) -> tuple[int, bool]:
+                """When a term's last operand is known, and whether a product is left to do."""
+                weight, name = term
+                if isinstance(inner := values.get(name), Product):
+                    return max(ready.get(n, 0) for n in inner.factors), True
+                return ready.get(name, 0), abs(weight) != 1
+
+            terms = sorted(value.terms, key=lambda term: known(term)[0])
+            if len(terms) > 1 and value.constant == 0 and known(terms[1])[1]:
+                terms[:2] = terms[1::-1]
+            value = replace(value, terms=tuple(terms))
+            ready[a.name] = max(known(term)[0] for term in terms) + SUM
+        elif isinstance(value, Product):
+            ready[a.name] = max(ready.get(n, 0) for n in value.factors) + PRODUCT
+        else:
+            ready[a.name] = max((ready.get(n, 0) for n in value.names), default=0) + QUOTIENT
+        body.append(replace(a, value=value))
+    return replace(function, body=tuple(body))
 
 
 def _numbered(function: Function, kept: Sequence[str]) -> dict[str, str]:
@@ -99,17 +161,18 @@ def context(
     P, real = target.prefix, target.real.name
     groups = target.groups()
     where = {n: f"c->{n}" for n in kept}
+    inline = _step_weight(parts) <= SHORT
 
     def sines(index: str) -> dict[str, str]:
         found = {}
         for k, a in enumerate(parts.angles):
-            found[a.sine] = f"at->sine[{2 * k} + {index}]"
-            found[a.cosine] = f"at->cosine[{2 * k} + {index}]"
+            found[a.sine] = f"at->sine[{_beside(k)} + {index}]"
+            found[a.cosine] = f"at->cosine[{_beside(k)} + {index}]"
         return found
 
     def state(index: str) -> Callable[[str, str], str]:
         return lambda array, name: (
-            f"at->q[2*{target.enum[name]} + {index}]"
+            f"at->q[{_beside(target.names.index(name))} + {index}]"
             if array == "q"
             else f"qd->x[{target.enum[name]}]"
         )
@@ -128,6 +191,8 @@ def context(
         lambda f: target.loads(f, state("i"), target.element),
         where | sines("i"),
         pair=True,
+        inline=inline,
+        in_order=True,
     )
     u_arg = f"const {real} *u"
     motion = target.in_pieces(
@@ -143,10 +208,13 @@ def context(
             Argument(f"const {P}_prepared *c", "c", frozenset(kept)),
         ],
         [f"a->x[{target.enum[name]}]" for name in target.names],
-        Argument(f"{P}_vector *a", "a", frozenset()),
+        Argument(f"{P}_vector *{target.PREFIX}_ALONE a", "a", frozenset()),
         lambda f: target.loads(f, state("lane"), target.element),
         where | sines("lane") | {name: f"k->{name}[lane]" for name in parts.kept},
+        inline=inline,
+        in_order=True,
     )
+    _put_together(target, motion["pieces"], width(target, parts))
     t, driven = "t" if timed else "", "t" if target.driven else ""
     u, c, p = "u" if groups["u"] else "", "c" if kept else "", "p" if takes_p else ""
     t_arg, c_arg = f"{real} t", f"const {P}_prepared *c" if c else ""
@@ -159,7 +227,9 @@ def context(
         "return !(troubles[0] + troubles[1] > 0);" if configuration["troubled"] else "return 1;",
     ]
     motion_lines = [*motion["locals"], *motion["calls"], f"return {motion['outcome']};"]
-    place_now = ", ".join(f"at->q[2*{target.enum[name]} + lane]" for name in target.names)
+    place_now = ", ".join(state("lane")("q", name) for name in target.names)
+    places = bool(groups["q"] & (parts.configuration.uses | parts.motion.uses))
+    places = places or (bool(groups["u"]) and target.signal_state)
 
     def motion_call(given: str, time: str) -> str:
         return f"{P}_motion({arguments('a, lane, k, at, qd', time, given, c)})"
@@ -172,10 +242,27 @@ def context(
 
     return {
         "members": [f"{name}[2]" for name in parts.kept],
+        "width": width(target, parts),
         "count": len(parts.angles),
+        "whole": _whole(len(parts.angles)),
+        "inline": f"{target.PREFIX}_INLINE" if inline else "static",
+        "places": places,
+        "each": lambda lines: ccode.indent(
+            vectors.each(target, True, lines, width=width(target, parts))
+        ),
         "configuration": configuration,
         "motion": motion,
-        "angles": _angles(target, parts.angles),
+        "angles": {
+            name: _angles(target, parts, *given)
+            for name, given in {
+                "one": ("x", "one->x", True),
+                "other": ("y", "other->x", True),
+                "d": ("x", "d->x", False),
+                "e": ("y", "e->x", False),
+                "mid": ("x", "mid->x", True),
+                "turn": ("turn", "d->x", False),
+            }.items()
+        },
         "configuration_arguments": arguments(f"{P}_kept *k, const {P}_pair *at", c_arg),
         "configuration_call": arguments("&k, &now", c),
         "configuration_lines": configuration_lines,
@@ -198,11 +285,10 @@ def context(
         "moved_now": motion_call("now", t),
         "moved_given": motion_call("u", t),
         "stage": stage,
-        "each": lambda lines: ccode.indent(_each(target, lines)),
         "solve_locals": [f"{P}_pair at;", f"{P}_kept k;", "int good;"],
         "solve_lines": [
-            *vectors.each(target, True, ["at.q[2*#] = at.q[2*# + 1] = q->$;"]),
-            f"{P}_pair_angles(&at);",
+            f"{P}_pair_angles(&at, q, q);",
+            *([f"{P}_pair_places(&at, q, q);"] if places else []),
             f"good = {P}_configuration({arguments('&k, &at', c)});",
         ],
         "solve_end": [f"return {P}_motion({arguments('a, 0, &k, &at, qd', t, u, c)}) && good;"],
@@ -214,49 +300,78 @@ def _unread(names: Sequence[str], lines: Sequence[str]) -> list[str]:
     return [n for n in names if not any(re.search(rf"\b{n}\b", line) for line in lines)]
 
 
-def _each(target: Target, lines: Sequence[str]) -> list[str]:
-    """Statements for every coordinate, one by one where they are few: what was stored one by one
-    just before can't be loaded several at a time without waiting."""
-    if len(target.names) < LOOPED:
-        return vectors.one_by_one(target, True, lines)
-    return vectors.each(target, True, lines)
+def _whole(count: int) -> int:
+    """Places for so many numbers, a multiple of four."""
+    return -(-count // FOUR) * FOUR
 
 
-def _angles(target: Target, turned: Sequence[Angle]) -> dict[str, Any]:
-    """Where the angles of two places and of one are found, and what they are turned by."""
+def width(target: Target, parts: Parts) -> int:
+    """Places in a vector: loops over whole registers go up to there, behind the coordinates over
+    zeros; angles that are coordinates are read from there too."""
+    first = target.names.index(parts.angles[0].terms[0][1])
+    return max(_whole(len(target.names)), _whole(first + _whole(len(parts.angles))))
 
-    def gathered(to: str, vector: str, offset: bool, pair: bool) -> dict[str, Any]:
-        first = target.names.index(turned[0].terms[0][1])
-        plain = all(
-            a.terms == ((S.One, name),) and (a.offset == 0 or not offset)
-            for a, name in zip(turned, target.names[first:], strict=False)
-        )
-        if plain:
-            start = target.enum[target.names[first]]
-            at = f"{vector} + {'2*' if pair else ''}{start}" if first else vector
-            return {"declared": f"const {target.real.name} *const {to} = {at};", "lines": []}
+
+def _beside(k: int) -> int:
+    """Where number k of two places stands in an array of both, as beside.h has it."""
+    return 2 * (k - k % FOUR) + (0, 4, 2, 6)[k % FOUR]
+
+
+def _step_weight(parts: Parts) -> int:
+    """The operations of the parts in a step, those for both places counted once."""
+    return 2 * pieces.weight(parts.configuration) + 4 * pieces.weight(parts.motion)
+
+
+def _put_together(target: Target, cut: Sequence[dict[str, Any]], wide: int) -> None:
+    """The accelerations that a piece makes, stored four at a time where all four are there."""
+    n, P = len(target.names), target.prefix
+    place = {f"a->x[{target.enum[name]}]": k for k, name in enumerate(target.names)}
+    for piece in cut:
+        ready = {}
+        rest = []
+        for line in piece["ends"]:
+            to, _, text = line.partition(" = ")
+            if to in place:
+                ready[place[to]] = text.removesuffix(";")
+            else:
+                rest.append(line)
+        if piece is cut[-1]:
+            ready |= dict.fromkeys(range(n, wide), target.zero)
         lines = []
-        for k, a in enumerate(turned):
-            text = _along(target, a, vector, pair, a.offset if offset else S.Zero)
-            lines.append(f"{to}[{2 * k} + i] = {text};" if pair else f"{to}[{k}] = {text};")
-        return {
-            "declared": f"{target.real.name} {to}[{(2 if pair else 1) * len(turned)}];",
-            "lines": vectors.loop("i", "2", lines) if pair else lines,
-        }
+        for begin in range(0, wide, FOUR):
+            block = [k for k in range(begin, begin + FOUR) if k in ready]
+            if len(block) == FOUR:
+                four = ", ".join(ready[k] for k in block)
+                lines.append(f"{P}_put(a->x + {begin}, {four});")
+            else:
+                lines += [f"a->x[{k}] = {ready[k]};" for k in block]
+        piece["ends"] = lines + rest
 
+
+def _angles(target: Target, parts: Parts, to: str, vector: str, offset: bool) -> dict[str, Any]:
+    """Where the angles of one place are found, or without offset what they are turned by."""
+    turned, real = parts.angles, target.real.name
+    first = target.names.index(turned[0].terms[0][1])
+    names = target.names[first : first + len(turned)]
+    plain = len(names) == len(turned) and all(
+        a.terms == ((S.One, name),) and (a.offset == 0 or not offset)
+        for a, name in zip(turned, names, strict=True)
+    )
+    if plain:
+        at = f"{vector} + {first}" if first else vector
+        return {"declared": f"const {real} *const {to} = {at};", "lines": []}
+    texts = [_along(target, a, vector, a.offset if offset else S.Zero) for a in turned]
+    texts += [target.zero] * (_whole(len(texts)) - len(texts))
     return {
-        "pair": gathered("x", "at->q", True, True),
-        "pair_change": gathered("x", "d", False, True),
-        "mid": gathered("x", "mid->x", True, False),
-        "mid_change": gathered("turn", "d->x", False, False),
+        "declared": f"{real} {to}[{len(texts)}];",
+        "lines": [
+            f"{target.prefix}_put({to} + {k}, {', '.join(texts[k : k + FOUR])});"
+            for k in range(0, len(texts), FOUR)
+        ],
     }
 
 
-def _along(target: Target, angle: Angle, vector: str, pair: bool, offset: Expr) -> str:
+def _along(target: Target, angle: Angle, vector: str, offset: Expr) -> str:
     """An angle of coordinates in an array."""
-
-    def place(name: str) -> str:
-        return f"2*{target.enum[name]} + i" if pair else target.enum[name]
-
-    where = {name: f"{vector}[{place(name)}]" for _, name in angle.terms}
+    where = {name: f"{vector}[{target.enum[name]}]" for _, name in angle.terms}
     return ccode.Printer(target.prefix, target.real, where).value(Sum(angle.terms, offset))[0]

@@ -97,11 +97,14 @@ class Tape:
         return symbol
 
     def whole(self, atom: Expr) -> Expr:
-        """The atom, its name kept whole inside products."""
-        symbol = split(atom)[1]
-        if symbol is not None:
-            self._solid.add(symbol)
-        return atom
+        """The atom as a name, or minus a name, that is kept whole inside products."""
+        factor, symbol = split(atom)
+        if symbol is None:
+            return atom
+        if abs(factor) != 1:
+            factor, symbol = S.One, self._name(atom)
+        self._solid.add(symbol)
+        return self.scaled(factor, symbol)
 
     def stage_of(self, atom: Expr) -> Stage:
         """The binding time of what `define` returned."""

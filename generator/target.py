@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from eomc import ccode, pieces
+from eomc import ccode, names, pieces
 from eomc.assignments import Call, Function, rename
 from eomc.ccode import Body, Real
 from eomc.program import TIME, Program
@@ -75,7 +75,7 @@ class Target:
             "ALONE",
             "PIECE",
         )
-        taken = {f"{self.PREFIX}_{w}" for w in own}
+        taken = {f"{self.PREFIX}_{w}" for w in own} | {*names.MACROS}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         wishes = [f"{self.PREFIX}_{name}" for name in indexed]
         return dict(zip(indexed, _unique(wishes, taken), strict=True))
@@ -217,12 +217,15 @@ class Target:
         where: Mapping[str, str] | None = None,
         lane: bool = False,
         pair: bool = False,
+        inline: bool = False,
+        in_order: bool = False,
     ) -> dict[str, Any]:
         """A long function as several static ones, for pieces.c.jinja.
 
         what: its name in C, behind the prefix. given: the arguments; a piece has those that it
         reads, and `out` where results are ready, which go to the places `results`. lane, pair: each
-        piece is a loop over a tile, or over two.
+        piece is a loop over a tile, or over two. inline: no function of its own in the end.
+        in_order: terms of sums stay in their order.
         """
         function = unclashed(function)
         small = pieces.LANE_PIECE if lane else pieces.PIECE
@@ -236,6 +239,7 @@ class Target:
             f"{values} *{self.PREFIX + '_ALONE ' if end else ''}s", "&s", frozenset(crossing)
         )
         handed = {name: f"s->{name}{at}" for name in crossing}
+        kind = "INLINE" if inline else "PIECE"
         made, calls = [], []
         pivots = len(function.checks)
         for k, part in enumerate(parts, 1):
@@ -246,6 +250,7 @@ class Target:
                 stored={name: handed[name] for name in part.keeps},
                 pivots=pivots,
                 lane=lane,
+                in_order=in_order,
             )
             failures = [*body.early_failures, *body.failures]
             checks = bool(failures)
@@ -266,7 +271,7 @@ class Target:
             made.append(
                 {
                     "comment": _about(k, part, len(parts), what),
-                    "prototype": f"{self.PREFIX}_PIECE {'int' if checks and not end else 'void'} "
+                    "prototype": f"{self.PREFIX}_{kind} {'int' if checks and not end else 'void'} "
                     f"{name}({arguments(*(a.declared for a in needed)) or 'void'})",
                     "trouble": troubled,
                     "loads": loads(f),

@@ -338,7 +338,8 @@ class _Links:
             tape.total([self._dot(x, groups[g].beta), *map(self._less, given(g, x))])
             for g, x in rows
         ]
-        order, tensions, pivots = solve(tape, matrix, right, kept=tape.whole)
+        prompt = not self.system.run.batch  # where many are computed at once, none is waited for
+        order, tensions, pivots = solve(tape, matrix, right, kept=tape.whole, prompt=prompt)
         turning = []
         for g, (u, square) in enumerate(zip(slopes, squares, strict=True)):
             drawn = [

@@ -12,11 +12,16 @@ def member(target: Target, arrays: bool, name: str) -> str:
     return f"x[{target.enum[name]}]" if arrays else name
 
 
-def each(target: Target, arrays: bool, lines: Sequence[str], index: str = "i") -> list[str]:
-    """Statements for every coordinate: $ is its member of a vector, # its place in an array."""
+def each(
+    target: Target, arrays: bool, lines: Sequence[str], index: str = "i", width: int = 0
+) -> list[str]:
+    """Statements for every coordinate: $ is its member of a vector, # its place in an array.
+
+    width: the places of a vector, where loops are to go over all of them.
+    """
     if arrays:
         inside = [line.replace("$", f"x[{index}]").replace("#", index) for line in lines]
-        return loop(index, f"{target.PREFIX}_NQ", inside)
+        return loop(index, str(width or f"{target.PREFIX}_NQ"), inside)
     return one_by_one(target, False, lines)
 
 

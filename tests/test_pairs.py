@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -10,10 +11,13 @@ from types import ModuleType
 import numpy as np
 import pytest
 from conftest import Modules
+from sympy import S
 
 import eomc
 from eomc import mechanics, pairs, program, reference, scene, system
+from eomc.assignments import Assignment, Operand, Product, Sum
 from eomc.ccode import DOUBLE
+from eomc.tape import Stage
 from eomc.target import Target
 
 # angles alone, as sums, with a number, with a parameter and times a coordinate; a coordinate that
@@ -100,10 +104,65 @@ def test_parts_are_the_whole() -> None:
     sines = {name for a in parts.angles for name in (a.sine, a.cosine)}
     early = {"phase", "m", *(a.name for a in function.early)}
     assert parts.configuration.uses <= {"x", "a", "b", "c", "d", "e"} | sines | early
-    assert len(parts.configuration.body) + len(parts.motion.body) < len(function.body)
+    place = {"x", "a", "b", "c", "d", "e"} | sines | {a.name for a in parts.configuration.body}
+    for a in parts.motion.body:
+        assert not place.issuperset(set(a.value.names) - early)
+        if isinstance(a.value, Product):  # one factor of all that the place decides
+            known = [name for name in a.value.factors if name in place | early]
+            assert len(known) <= 1 or place.isdisjoint(known)
+            assert abs(a.value.coefficient) == 1 or place.isdisjoint(known)
     assert {o.name for o in parts.configuration.outputs} == set(parts.kept)
     assert set(parts.kept) <= parts.motion.uses
     assert len(parts.configuration.checks) + len(parts.motion.checks) <= len(function.checks)
+
+
+def test_what_is_known_last_comes_last() -> None:
+    """And of two products the one known later stands first, where it is fused with the sum."""
+    u, v, late, last = ((S.One, name) for name in ("u", "v", "late", "last"))
+    values = {
+        "late": Product(S.One, ("u", "v")),
+        "last": Sum((late, v)),
+        "sum": Sum((last, u, late)),
+        "soon": Product(S.One, ("u", "u")),
+        "then": Product(S.One, ("last", "v")),
+        "both": Sum(((S.One, "soon"), (S.NegativeOne, "then"))),
+    }
+    function = Target(program.build(mechanics.derive(odd())), DOUBLE).program["acceleration"]
+    body = tuple(Assignment(name, value, Stage.VELOCITY) for name, value in values.items())
+    outputs = (Operand(S.One, "sum"), Operand(S.One, "both"))
+    made = pairs._last_come_last(replace(function, body=body, outputs=outputs))
+    found = {a.name: a.value for a in made.body}
+    assert found["sum"] == Sum((u, late, last))
+    assert found["both"] == Sum(((S.NegativeOne, "then"), (S.One, "soon")))
+
+
+MORE = """
+eomc = 1
+name = "more"
+[coordinates]
+a = { start = 0.3, rate = 0.7 }
+b = { start = -0.4, rate = 0.2 }
+c = { start = 1.2 }
+d = { start = 0.9, rate = -0.6 }
+e = { start = -1.3 }
+[energy]
+kinetic = "a_dot**2 + b_dot**2*(2 + cos(a)) + c_dot**2*(2 + cos(b)) + d_dot**2 + e_dot**2*L"
+potential = "cos(a) + cos(b) + cos(c) + cos(d) + cos(e) + sin(a + b)"
+[definitions]
+L = "2 + cos(d)*sin(c)/2"
+[run]
+h = 0.01
+"""
+
+
+def test_more_angles_than_coordinates(modules: Modules) -> None:
+    """Every coordinate is an angle, and a sum of two is one more."""
+    module = modules.of_text(MORE)
+    trusted = reference.of(system.from_scene(scene.parse(MORE, "more.toml")))
+    _, q, qd = trusted.simulate(h=0.01, steps=50)
+    run = module.simulate(h=0.01, steps=50)
+    np.testing.assert_allclose(run.q, q, rtol=1e-11)
+    np.testing.assert_allclose(run.qd, qd, rtol=1e-10, atol=1e-11)
 
 
 def test_few_angles_and_light_configurations_stay_whole(modules: Modules) -> None:

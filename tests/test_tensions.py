@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from cases import scene_system
 from eomc import mechanics, program, scene, system, tensions
-from eomc.assignments import Function, evaluate
+from eomc.assignments import Call, Function, evaluate
 from eomc.jets import Jets
 from eomc.lowering import lower
 from eomc.system import System, dot, symbol, t
@@ -259,20 +259,50 @@ def test_bodies_that_are_points_in_relative_angles() -> None:
 # --- what it costs -------------------------------------------------------------------------------
 
 
+BATCH = "\n[run]\nbatch = true\n"
+
+
 @pytest.mark.parametrize("n, equal, unequal", [(5, 82, 104), (10, 177, 224), (20, 367, 464)])
 def test_flops_of_a_chain(n: int, equal: int, unequal: int) -> None:
-    """19 a link, and five more where masses and lengths differ."""
+    """19 a link, and five more where masses and lengths differ; up to 24 where none is to wait."""
     chain = [k - 1 for k in range(n)]
-    assert by_tensions(made_of(links(chain))).cost.flops <= equal
-    assert by_tensions(made_of(links(chain, equal=False))).cost.flops <= unequal
+    assert by_tensions(made_of(links(chain) + BATCH)).cost.flops <= equal
+    assert by_tensions(made_of(links(chain, equal=False) + BATCH)).cost.flops <= unequal
+    prompt = by_tensions(made_of(links(chain))).cost
+    assert prompt.flops <= 24 * n
+    assert prompt.divisions <= n // 2
 
 
 def test_a_chain_is_eliminated_from_both_ends() -> None:
     """So that only half of its divisions wait for one another."""
-    order = tensions.solution(made_of(links([k - 1 for k in range(9)]))).order
+    order = tensions.solution(made_of(links([k - 1 for k in range(9)]) + BATCH)).order
     assert [order.index(k) for k in range(4)] == sorted(order.index(k) for k in range(4))
     assert [order.index(k) for k in (8, 7, 6, 5)] == sorted(order.index(k) for k in (5, 6, 7, 8))
     assert order[-1] == 4
+
+
+def test_every_other_link_goes_first_where_one_trajectory_is_all() -> None:
+    """Their pivots hang on parameters alone; the others then from both ends."""
+    order = tensions.solution(made_of(links([k - 1 for k in range(9)]))).order
+    assert set(order[:5]) == {0, 2, 4, 6, 8}
+    assert set(order[5:7]) == {1, 7}
+
+
+def test_divisions_do_not_wait_for_one_another() -> None:
+    """No reciprocal of what a place decides is made of another."""
+    function = by_tensions(made_of(links([k - 1 for k in range(12)])))
+    values = {a.name: a.value for a in function.body}
+
+    def divisions_in_a_row(name: str) -> int:
+        value = values.get(name)
+        if value is None:
+            return 0
+        before = max(map(divisions_in_a_row, value.names), default=0)
+        return before + (isinstance(value, Call) and value.function == "reciprocal")
+
+    made = [n for n, v in values.items() if isinstance(v, Call) and v.function == "reciprocal"]
+    assert len(made) >= 5
+    assert max(map(divisions_in_a_row, made)) == 1
 
 
 def test_it_is_taken_where_it_is_the_cheapest() -> None:
