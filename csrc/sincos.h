@@ -53,30 +53,41 @@ EOMC_INLINE double eomc_mul_add(double a, double b, double c)
 #endif
 }
 
-/* sin r and cos r for |x| <= 2^20; anything else gives nonsense. n: the integer, in the last bits
- * of shifted = n + 1.5 2^52. */
-EOMC_INLINE void eomc_sincos_reduced(double x, double *shifted, double *sin_r,
-    double *cos_r)
+/* r for |x| <= 2^20; anything else gives nonsense. n: the integer, in the last bits of
+ * shifted = n + 1.5 2^52. */
+EOMC_INLINE double eomc_sincos_reduce(double x, double *shifted)
 {
     /* Doubles next to 1.5 2^52 are 1 apart, so adding it and taking it off again rounds to the
      * nearest integer; 1.5, not 1, leaves room for negative ones. */
     const double magic = 6755399441055744.0;
     const double n = (*shifted = eomc_mul_add(x, 0.6366197723675814, magic)) - magic;
 
-    /* r = x - n pi/2, with pi/2 in parts.  The last part only matters where r is tiny and
-     * sin r = r: it goes into r_fine, which is not waited for.  All parts are positive, so
-     * that x = -0.0 stays -0.0. */
+    /* r = x - n pi/2, with pi/2 in parts.  All parts are positive, so that
+     * x = -0.0 stays -0.0. */
 #if EOMC_FAST_FMA
     const double above = fma(-n, 1.5707963267948966, x); /* exact */
-    const double r = fma(-n, 6.123233995736765e-17, above);
-    const double r_fine = fma(-n, 1.0828566739219139e-32, r);
+    return fma(-n, 6.123233995736765e-17, above);
 #else
     /* Parts of 33 bits: their products with n < 2^20 are exact. */
     const double above = x - n * 1.5707963267341256; /* exact */
     const double second = n * 6.077100506303966e-11;
     const double rounded = above - second;
     const double lost = (above - rounded) - second;
-    const double r = rounded - (n * 2.0222662487111665e-21 - lost);
+    return rounded - (n * 2.0222662487111665e-21 - lost);
+#endif
+}
+
+/* sin r and cos r of a reduced angle. */
+EOMC_INLINE void eomc_sincos_series(double r, double shifted, double *sin_r,
+    double *cos_r)
+{
+    const double n = shifted - 6755399441055744.0;
+
+    /* The last part of pi/2 only matters where r is tiny and sin r = r: it goes into r_fine, which
+     * is not waited for. */
+#if EOMC_FAST_FMA
+    const double r_fine = fma(-n, 1.0828566739219139e-32, r);
+#else
     const double r_fine = r - n * 8.478427660348229e-32;
 #endif
 
@@ -102,8 +113,9 @@ EOMC_INLINE void eomc_sincos_small(double x, double *s, double *c)
 {
     const double magic = 6755399441055744.0;
     double shifted, sin_r, cos_r;
+    const double r = eomc_sincos_reduce(x, &shifted);
 
-    eomc_sincos_reduced(x, &shifted, &sin_r, &cos_r);
+    eomc_sincos_series(r, shifted, &sin_r, &cos_r);
 
     /* m = n modulo 4, between -2 and 2; a and b are then exact, and ready before r is.  Not a
      * conditional, which would become a jump.  0.0 - m, not -m: b = +0.0 keeps sin(-0.0). */

@@ -54,30 +54,41 @@ EOMC_INLINE float eomc_mul_addf(float a, float b, float c)
 #endif
 }
 
-/* sin r and cos r for |x| <= 2^13; anything else gives nonsense. n: the integer, in the last bits
- * of shifted = n + 1.5 2^23. */
-EOMC_INLINE void eomc_sincosf_reduced(float x, float *shifted, float *sin_r,
-    float *cos_r)
+/* r for |x| <= 2^13; anything else gives nonsense. n: the integer, in the last bits of
+ * shifted = n + 1.5 2^23. */
+EOMC_INLINE float eomc_sincosf_reduce(float x, float *shifted)
 {
     /* Floats next to 1.5 2^23 are 1 apart, so adding it and taking it off again rounds to the
      * nearest integer; 1.5, not 1, leaves room for negative ones. */
     const float magic = 12582912.0f;
     const float n = (*shifted = eomc_mul_addf(x, 0.63661975f, magic)) - magic;
 
-    /* r = x - n pi/2, with pi/2 in parts.  The last part only matters where r is tiny and
-     * sin r = r: it goes into r_fine, which is not waited for.  All parts are positive, so
-     * that x = -0.0f stays -0.0f. */
+    /* r = x - n pi/2, with pi/2 in parts.  All parts are positive, so that
+     * x = -0.0f stays -0.0f. */
 #if EOMC_FAST_FMAF
     const float above = fmaf(-n, 1.5707963f, x); /* exact */
-    const float r = fmaf(-n, 7.5497894e-08f, above);
-    const float r_fine = fmaf(-n, 5.3903025e-15f, r);
+    return fmaf(-n, 7.5497894e-08f, above);
 #else
     /* Parts of 11 bits, but for the last: their products with n < 2^13 are exact. */
     const float above = (x - n * 1.5703125f) - n * 0.0004837513f; /* exact */
     const float second = n * 7.5495336e-08f;
     const float rounded = above - second;
     const float lost = (above - rounded) - second;
-    const float r = rounded - (n * 2.563283e-12f - lost);
+    return rounded - (n * 2.563283e-12f - lost);
+#endif
+}
+
+/* sin r and cos r of a reduced angle. */
+EOMC_INLINE void eomc_sincosf_series(float r, float shifted, float *sin_r,
+    float *cos_r)
+{
+    const float n = shifted - 12582912.0f;
+
+    /* The last part of pi/2 only matters where r is tiny and sin r = r: it goes into r_fine, which
+     * is not waited for. */
+#if EOMC_FAST_FMAF
+    const float r_fine = fmaf(-n, 5.3903025e-15f, r);
+#else
     const float r_fine = r - n * 6.1232336e-17f;
 #endif
 
@@ -98,8 +109,9 @@ EOMC_INLINE void eomc_sincosf_small(float x, float *s, float *c)
 {
     const float magic = 12582912.0f;
     float shifted, sin_r, cos_r;
+    const float r = eomc_sincosf_reduce(x, &shifted);
 
-    eomc_sincosf_reduced(x, &shifted, &sin_r, &cos_r);
+    eomc_sincosf_series(r, shifted, &sin_r, &cos_r);
 
     /* m = n modulo 4, between -2 and 2; a and b are then exact, and ready before r is.  Not a
      * conditional, which would become a jump.  0.0f - m, not -m: b = +0.0f keeps sin(-0.0f). */

@@ -7,16 +7,7 @@
  * Error: what s0 and c0 bring, and one unit of rounding of 1 at most besides.  In sin d = d + d^3 A
  * and cos d = 1 + d^2 (-1/2 + d^2 B), A and B are Chebyshev series in d^2, cut off; that is off by
  * 2^-56.7 at most.
- *
- * far: angles, or their squares, over those of the largest that are allowed are added to it; where
- * it stays below 1, none of them was too large.
  */
-
-/* What an angle x of which the sine is computed adds to far. */
-EOMC_INLINE double eomc_far_at(double x, double far)
-{
-    return eomc_mul_add(fabs(x), 9.5367431640625e-07, far);
-}
 
 /* By d, |d| <= 2^-6. */
 EOMC_INLINE void eomc_turn(double d, double s0, double c0,
@@ -34,7 +25,7 @@ EOMC_INLINE void eomc_turn(double d, double s0, double c0,
 
 /* By -d and by d, |d| <= 2^-3. */
 EOMC_INLINE void eomc_turn_both(double d, double s0, double c0,
-    double *s_back, double *c_back, double *s_on, double *c_on, double *far)
+    double *s_back, double *c_back, double *s_on, double *c_on)
 {
     const double z = d * d;
     const double a23 = eomc_mul_add(z, 2.754949151820351e-06, -0.0001984126907687799);
@@ -51,5 +42,4 @@ EOMC_INLINE void eomc_turn_both(double d, double s0, double c0,
     *c_back = eomc_mul_add(s0, sin_d, c1);
     *s_on = eomc_mul_add(c0, sin_d, s1);
     *c_on = eomc_mul_add(-s0, sin_d, c1);
-    *far = eomc_mul_add(z, 64.0, *far);
 }

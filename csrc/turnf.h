@@ -5,12 +5,6 @@
  * off by 2^-27 of 1 at most.
  */
 
-/* What an angle x of which the sine is computed adds to far. */
-EOMC_INLINE float eomc_far_atf(float x, float far)
-{
-    return eomc_mul_addf(fabsf(x), 0.00012207031f, far);
-}
-
 /* By d, |d| <= 2^-4. */
 EOMC_INLINE void eomc_turnf(float d, float s0, float c0, float *s, float *c)
 {
@@ -24,7 +18,7 @@ EOMC_INLINE void eomc_turnf(float d, float s0, float c0, float *s, float *c)
 
 /* By -d and by d, |d| <= 1/4. */
 EOMC_INLINE void eomc_turn_bothf(float d, float s0, float c0,
-    float *s_back, float *c_back, float *s_on, float *c_on, float *far)
+    float *s_back, float *c_back, float *s_on, float *c_on)
 {
     const float z = d * d;
     const float a = eomc_mul_addf(z, 0.008320942f, -0.16666657f);
@@ -38,5 +32,4 @@ EOMC_INLINE void eomc_turn_bothf(float d, float s0, float c0,
     *c_back = eomc_mul_addf(s0, sin_d, c1);
     *s_on = eomc_mul_addf(c0, sin_d, s1);
     *c_on = eomc_mul_addf(-s0, sin_d, c1);
-    *far = eomc_mul_addf(z, 16.0f, *far);
 }

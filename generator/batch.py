@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from functools import cached_property
 from time import perf_counter
 from typing import Any
@@ -16,12 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number, _size
+from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number, _size, _unmasked
 
-_GROUP = 64  # instances in a tile, or a multiple of those in one
-_TILES = 64  # at most in a group: threads ask for the next one seldom, and end together
+_GROUP = 128  # instances in a tile, or a multiple of those in one
+_TILES = 64  # at most in a group: threads ask for the next one seldom
+_SHARES = 8  # groups of a thread, so that all end together
+_SHORT = 8  # numbers; NumPy's loops along so short rows take longer than all else
 _WORTH = 20_000  # steps in all from which threads pay
 _NAMES = np.array([*STATUS, "interrupted"])
+_SLOWEST = 1.5e-6  # seconds a step of an instance and coordinate: assumed until one was timed
 _SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
 
 
@@ -65,6 +68,12 @@ class BatchRun:
 class BatchModel(Model):
     """A model whose extension steps many instances at once."""
 
+    def __init__(self, extension: Any, **scene: Any) -> None:
+        super().__init__(extension, **scene)
+        self._whole = (self._ffi.typeof("long[]"), self._ffi.typeof("int[]"))  # done, status
+        # seconds a step of an instance, by the function that makes it; they only cut work up
+        self._paces: dict[Any, float] = {}
+
     def simulate_batch(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
@@ -84,18 +93,17 @@ class BatchModel(Model):
         h, t0 = self.h if h is None else _size(h), _number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = _count(every, "every", 1)
-        q, qd, table, held, count = self._instances(q0, qd0, params, u, steps)
+        starts, table, held, count = self._instances(q0, qd0, params, u, steps)
         rows = 1 + steps // every + (steps % every > 0)
         try:
-            q_rows = np.empty((count, rows, self.nq), self.dtype)
-            qd_rows = np.empty_like(q_rows)
+            q, qd = (np.empty((count, self.nq), self.dtype) for _ in range(2))
+            q_rows, qd_rows = (np.empty((count, rows, self.nq), self.dtype) for _ in range(2))
         except MemoryError:
             raise MemoryError(
                 f"{count} times {rows} rows of {2 * self.nq} numbers don't fit in memory: "
                 "keep fewer with every="
             ) from None
-        q_rows[:, 0], qd_rows[:, 0] = q, qd
-        work = _Work(self, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows)
+        work = _Work(self, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows, starts)
         whole = work.run(threads, progress)
         if steps % every:
             q_rows[:, -1], qd_rows[:, -1] = q, qd
@@ -127,7 +135,7 @@ class BatchModel(Model):
         step = self._stepper(method, "batch")
         if out is not None:
             into = self._pair(out, np.shape(q))
-            into[0][...], into[1][...] = q, qd
+            into[0][...], into[1][...] = _unmasked(q, "q"), _unmasked(qd, "qd")
             q, qd = into
         for name, x in (("q", q), ("qd", qd)):
             self._out(x, (len(x), self.nq), name)
@@ -140,17 +148,32 @@ class BatchModel(Model):
         for name, given in (("params", table), ("u", held)):
             if given is not None and len(given) not in (1, len(q)):
                 raise ValueError(f"{name}: {len(given)} instances where q has {len(q)}")
-        work = _Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
-        work.run(threads, None)
-        return work.status
+        count = len(q)
+        if count >= _WORTH or (threads is not None and threads < 1):
+            work = _Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
+            work.run(threads, None)
+            return work.status
+        # too few for threads, or for a look at Ctrl-C: straight into C
+        address, real, null = self._c
+        done, status = np.zeros(count, "l"), np.zeros(count, "i")
+        step(
+            count, address(real, q), address(real, qd), t, h, 0, 1, self._pointer(held),
+            self.nu if held is not None and len(held) > 1 else 0, 0, 0, null, null, 0,
+            address(real, table), 1 if len(table) > 1 else 0, address(self._whole[0], done),
+            address(self._whole[1], status),
+        )  # fmt: skip
+        return status
 
     def _instances(
         self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int
-    ) -> tuple[Array, Array, Array, Array | None, int]:
-        """(q, qd, parameters, inputs, batch), one row an instance; a single one serves for all."""
+    ) -> tuple[tuple[Array, Array], Array, Array | None, int]:
+        """((q, qd), parameters, inputs, batch), one row an instance; a single one serves for all.
+
+        q and qd may be what was given: they are to be read only.
+        """
         start = self.start
-        q = self._array(start[0] if q0 is None else q0, "q0", self.nq)
-        qd = self._array(start[1] if qd0 is None else qd0, "qd0", self.nq)
+        q = self._rows_of(start[0] if q0 is None else q0, "q0")
+        qd = self._rows_of(start[1] if qd0 is None else qd0, "qd0")
         table = self._parameter_rows(params)
         held = self._input_rows(u, steps)
         sizes = {
@@ -166,20 +189,26 @@ class BatchModel(Model):
             if size not in (1, count):
                 raise ValueError(f"{name}: {size} instances where others have {count}")
 
-        def own(x: Array, given: Any) -> Array:
-            """A row for each instance in memory that is nobody else's."""
-            fresh = isinstance(given, np.ndarray) and not np.may_share_memory(x, given)
-            if fresh and len(x) == count and x.ndim == 2:
-                return x
-            return np.array(np.broadcast_to(x, (count, self.nq)), order="C")
+        both = np.broadcast_to(q, (count, self.nq)), np.broadcast_to(qd, (count, self.nq))
+        return both, table, held, count
 
-        return own(q, q0), own(qd, qd0), table, held, count
+    def _rows_of(self, given: ArrayLike, name: str) -> Array:
+        """(nq,) or (n, nq), finite; an array that is that already need not be contiguous."""
+        if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2:
+            _unmasked(given, name)
+            if given.dtype != self.dtype:
+                wide, given = given, np.empty(given.shape, self.dtype)
+                with np.errstate(over="ignore"):
+                    _copy(wide, given)
+            if given.shape[1] == self.nq and np.isfinite(given).all():
+                return given
+        return self._array(given, name, self.nq)
 
     def _parameter_rows(self, params: Any) -> Array:
         if params is None or isinstance(params, Params):
             return self._parameters(params)[None]
         if not isinstance(params, Mapping):
-            array = np.ascontiguousarray(params, self.dtype)
+            array = np.ascontiguousarray(_unmasked(params, "params"), self.dtype)
             if array.ndim == 2 and array.shape[1] == len(self.parameters):
                 if not np.isfinite(array).all():
                     raise ValueError("params: not all numbers are finite")
@@ -189,7 +218,7 @@ class BatchModel(Model):
         count = max(sizes.values(), default=1)
         table = np.tile(self._p0, (count, 1))
         for name, value in params.items():
-            column = np.asarray(value, self.dtype)
+            column = np.asarray(_unmasked(value, f"params: {name}"), self.dtype)
             if name not in self.parameters:
                 self._parameters({name: 0.0})  # raises, with the names there are
             if column.ndim > 1 or (column.ndim and len(column) != count):
@@ -207,7 +236,7 @@ class BatchModel(Model):
             raise ValueError("u: this scene has no inputs")
         if callable(u):
             raise ValueError("u: a Python function can't be called for many at once: give a table")
-        array = np.ascontiguousarray(u, self.dtype)
+        array = np.ascontiguousarray(_unmasked(u, "u"), self.dtype)
         if array.ndim < 2:
             array = array.reshape(1, 1, -1)
         elif array.ndim == 2:
@@ -228,13 +257,14 @@ class _Work:
     def __init__(
         self, model: BatchModel, step: Any, q: Array, qd: Array, h: float, t0: float,
         steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None,
-        qd_rows: Array | None,
+        qd_rows: Array | None, starts: tuple[Array, Array] | None = None,
     ) -> None:  # fmt: skip
         self.model, self.step, self.q, self.qd = model, step, q, qd
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
         self.held, self.table = held, table
-        self.q_rows, self.qd_rows = q_rows, qd_rows
+        self.q_rows, self.qd_rows, self.starts = q_rows, qd_rows, starts
         count = len(q)
+        self.begun: set[int] = set()
         self.done = np.zeros(count, np.dtype("l"))
         self.status = np.zeros(count, np.dtype("i"))
         self.stop = False
@@ -250,9 +280,20 @@ class _Work:
         elif threads is None:
             threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         tiles = -(-count // _GROUP)
-        size = _GROUP * max(1, min(_TILES, tiles // (4 * threads)))
+        size = _GROUP * max(1, min(_TILES, tiles // (_SHARES * threads) if threads > 1 else tiles))
         groups = [(at, min(size, count - at)) for at in range(0, count, size)]
-        total = count * self.steps
+        whole = self._all_of(groups, threads, progress)
+        for group in groups:
+            self._begin(*group)  # those that Ctrl-C came before
+        return whole
+
+    def _all_of(
+        self,
+        groups: list[tuple[int, int]],
+        threads: int,
+        progress: Callable[[int, int], None] | None,
+    ) -> bool:
+        total = len(self.q) * self.steps
         if threads == 1 or len(groups) == 1:
             try:
                 for group in groups:
@@ -264,7 +305,7 @@ class _Work:
         waiting: set[Future[None]] = {pool.submit(self._group, *group) for group in groups}
         try:
             while waiting:
-                ended, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_COMPLETED)
+                ended, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_EXCEPTION)
                 for future in ended:
                     future.result()
                 if progress is not None:
@@ -279,15 +320,29 @@ class _Work:
             raise
         return True
 
+    def _begin(self, at: int, count: int) -> None:
+        """The starts of a group into what is moved, and into the first rows."""
+        if at in self.begun or self.starts is None:
+            return
+        part = slice(at, at + count)
+        for start, x, rows in zip(
+            self.starts, (self.q, self.qd), (self.q_rows, self.qd_rows), strict=True
+        ):
+            _copy(start[part], x[part])
+            if rows is not None:
+                _copy(start[part], rows[part, 0])
+        self.begun.add(at)
+
     def _group(self, at: int, count: int, told: Callable[[], object] = lambda: None) -> None:
         """Instances at, ..., at + count - 1 through all steps, a piece of some time at once."""
-        model, n = self.model, self.model.nq
+        self._begin(at, count)
+        model = self.model
         pointer = model._pointer
-        null = model._ffi.NULL
+        null = model._c[2]
         end = at + count
         q, qd = pointer(self.q[at:end]), pointer(self.qd[at:end])
-        done = model._ffi.from_buffer("long[]", self.done[at:end])
-        status = model._ffi.from_buffer("int[]", self.status[at:end])
+        address, (long, integer) = model._c[0], model._whole
+        done, status = address(long, self.done[at:end]), address(integer, self.status[at:end])
         each = len(self.table) > 1
         table = pointer(self.table[at:end] if each else self.table)
         u, u_instance, u_step = null, 0, 0
@@ -301,9 +356,10 @@ class _Work:
         if self.q_rows is not None and self.qd_rows is not None:
             rows = self.q_rows.shape[1]
             q_rows, qd_rows = pointer(self.q_rows[at:end]), pointer(self.qd_rows[at:end])
-        first, chunk = 0, max(1, 2048 // max(1, count // 16) // n)
+        first = 0
         while first < self.steps and not self.stop:
-            many = min(chunk, self.steps - first)
+            pace = model._paces.get(self.step, _SLOWEST * model.nq)
+            many = min(max(1, int(_SECONDS / (pace * count))), self.steps - first)
             begun = perf_counter()
             self.step(
                 count, q, qd, self.t0, self.h, first, many, u + first * u_step if u_step else u,
@@ -313,8 +369,17 @@ class _Work:
             spent = perf_counter() - begun
             first += many
             self.moved += many * count  # a figure for the bar; threads may lose one another's
-            chunk = int(many * min(16.0, max(0.25, _SECONDS / (spent + 1e-9)))) + 1
+            model._paces[self.step] = max(1e-10, spent / (many * count))
             told()
+
+
+def _copy(x: Array, into: Array) -> None:
+    """x (n, nq) into rows that may be apart: short ones column by column, which NumPy would not."""
+    if x.shape[1] > _SHORT:
+        into[...] = x
+        return
+    for j in range(x.shape[1]):
+        into[:, j] = x[:, j]
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}

@@ -7,6 +7,7 @@ one for every stage of a step.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 from eomc import side, turning, vectors
@@ -41,6 +42,7 @@ def lane(
     t_arg = f"{real} t" if target.driven else ""
     state = f"const {P}_lanes *q, const {P}_lanes *qd"
     c = "c" if kept else ""
+    own = bool(kept) and target.needs_p and not large
 
     def rates(time: str) -> str:
         if held:
@@ -70,8 +72,9 @@ def lane(
         "tile_prototype": lambda name: f"int {P}_{name}_tile_step("
         + arguments(
             f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
-            t_arg, f"{real} h", "int held" if held else "",
+            t_arg, f"{real} h", "int held" if held else "", "int own" if own else "",
         ) + ")",
+        "own": own,
         "stepper_call": lambda troubles: after(
             "t" if target.driven else "", "h", "&s->u, held" if held else "",
             "&s->c" if kept else "", troubles,
@@ -117,9 +120,12 @@ def _lane_small(
         )  # fmt: skip
 
     one = side.lane(target, rest, kept, arrays, turning.sines(turned))
+    angles = turning.lane(target, turned, arrays)
+    own = bool(kept) and target.needs_p
+    k = "own ? i : 0" if own else "0"
     return {
         "one": one,
-        "angles": turning.lane(target, turned, arrays),
+        "angles": angles,
         "rates_given": [
             "const " + vectors.vector_of(target, arrays, "at", "q->x[#][i]"),
             "const " + vectors.vector_of(target, arrays, "moving", "qd->x[#][i]"),
@@ -129,19 +135,33 @@ def _lane_small(
         "rates_held": lambda hold: arguments(
             "a, q, qd", "t" if target.driven else "", "u", hold, "c" if kept else "", "troubles"
         ),
-        "stages": _stages(target, arrays, turned, _given(target, kept, "s->u.", "s->c."), call),
+        "stages": _stages(
+            target, arrays, turned, angles, own, _given(target, kept, "s->u.", "s->c.", k), call
+        ),
     }
 
 
-def _given(target: Target, kept: Sequence[str], u: str, c: str) -> list[str]:
+def _given(target: Target, kept: Sequence[str], u: str, c: str, k: str = "i") -> list[str]:
     """The inputs and the prepared values of one instance."""
     lines = []
     if target.system.inputs:
         inside = ", ".join(f"{u}x[{target.enum[n]}][i]" for n in target.input_names)
         lines.append(f"const {target.prefix}_inputs given = {{ {inside} }};")
     if kept:
-        inside = ", ".join(f"{c}{n}[i]" for n in kept)
+        inside = ", ".join(f"{c}{n}[{k}]" for n in kept)
         lines.append(f"const {target.prefix}_prepared here = {{ {inside} }};")
+    return lines
+
+
+def _each_known(names: Sequence[str], call: Callable[[list[str]], str]) -> list[str]:
+    """A call by what is zero and what is not, so that each can be compiled for its case."""
+    if not names:
+        return [call([])]
+    lines: list[str] = []
+    for case in product((1, 0), repeat=len(names)):
+        asked = " && ".join(n for n, one in zip(names, case, strict=True) if one)
+        lines += [f"{'else ' if lines else ''}{f'if ({asked})' if asked else ''}".rstrip()]
+        lines += ["    " + call([str(x) for x in case])]
     return lines
 
 
@@ -149,12 +169,14 @@ def _stages(
     target: Target,
     arrays: bool,
     turned: Sequence[Angle],
+    angles: Mapping[str, Any] | None,
+    own: bool,
     given: Sequence[str],
     call: Callable[[str, str, str], str],
 ) -> dict[str, Any]:
     """The stages of RK4 as loops over a tile: what each reads, and what it leaves."""
     P, real, members = target.prefix, target.real.name, turning.sines(turned)
-    alone, two = f"{target.PREFIX}_ALONE ", target.literal(2.0)
+    alone = f"{target.PREFIX}_ALONE "
     t_arg, t = (f"{real} t", "t") if target.driven else ("", "")
     plans = [
         ("back", "t", []),
@@ -172,9 +194,11 @@ def _stages(
             for name, of in places.items()
         ]
 
+    good = [*(angles["slowly"] + angles["narrow"] if angles else []), "sum - sum == 0"]
     loops = []
     for k, (near, time, lines) in enumerate(plans, 1):
         sines = ", ".join(f"{near}.{n}[i]" for n in members)
+        first = vectors.member(target, arrays, target.names[0])
         loops.append(
             {
                 "given": [
@@ -183,29 +207,34 @@ def _stages(
                     *([f"const {P}_angles s_at = {{ {sines} }};"] if turned else []),
                 ],
                 "vectors": ["at", "moving", f"a{k}"] if lines else ["a1"],
-                "begins": k == 1 and not turned,
                 "lines": lines,
                 "call": f"(&a{k}, {'&at, &moving' if lines else '&q, &qd'}"
                 + call("&s_at", time, "held") + ");",
+                "spoilt": f"a{k}.{first} += trouble < 1 ? 0 : ({real})NAN;",
                 "kept": [f"{KEPT[f'a{k}']}.x[#][i] = a{k}.$;"],
-                "ahead": f"trouble += ({P}_angles_squares(&a1) + {P}_angles_squares(&a2))*far_2;"
-                if turned and k == 2
-                else "",
             }
         )  # fmt: skip
+    ended = [
+        "const " + vectors.vector_of(target, arrays, name, f"to->{of}.x[#][i]")
+        for name, of in (("at", "q"), ("moving", "qd"))
+    ]
     return {
         "prototype": f"{target.PREFIX}_LANE int {P}_rk4_stages("
         + arguments(
             f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
             t_arg, f"{real} h", "int held" if target.system.inputs else "",
+            "int own" if own else "",
         ) + ")",
-        "call": lambda hold: f"{P}_rk4_stages(" + arguments("to, from, s", t, "h", hold) + ")",
+        "calls": _each_known(
+            ["held"] * bool(target.system.inputs) + ["own"] * own,
+            lambda known: f"odd = {P}_rk4_stages({arguments('to, from, s', t, 'h', *known)});",
+        ),
         "before": loops[:2],
         "after": loops[2:],
         "all": earlier(list(KEPT)),
         "ends": [
             "at.$ = q.$ + (h*qd.$ + hh_6*(a1.$ + (a2.$ + a3.$)));",
-            f"moving.$ = qd.$ + h_6*((a1.$ + a4.$) + {two}*(a2.$ + a3.$));",
+            "moving.$ = qd.$ + h_6*(((a1.$ + (a2.$ + a3.$)) + (a2.$ + a3.$)) + a4.$);",
             "to->q.x[#][i] = at.$;",
             "to->qd.x[#][i] = moving.$;",
         ],
@@ -214,6 +243,8 @@ def _stages(
             for n in target.names
             for x in ("at", "moving")
         ),
+        "looked": [*(earlier(["a1", "a2"]) if angles else []), *ended],
+        "good": ["int good = 1;", *(f"good &= {x};" for x in good)],
     }  # fmt: skip
 
 
@@ -310,7 +341,8 @@ def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
 
 
 def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> int:
-    """Instances side by side: as many as stay near with what belongs to them, 64 at most."""
+    """Instances side by side: as many as stay near with what belongs to them, and no row of their
+    numbers above 512 bytes."""
     s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
     numbers = 4 * n + len(s.u) + kept + 1  # two states, and whether there was trouble
     if lane["pieces"]:
@@ -318,4 +350,4 @@ def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> int:
     else:
         numbers += max(METHODS[name].stages for name in s.run.methods) * n
         numbers += 3 * len(lane["angles"]["members"]) if lane["angles"] else 0
-    return max(8, min(64, 1 << (NEAR // (size * numbers)).bit_length() - 1))
+    return max(8, min(512 // size, 1 << (NEAR // (size * numbers)).bit_length() - 1))

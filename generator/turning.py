@@ -46,15 +46,16 @@ def scalar(target: Target, turned: Sequence[Angle]) -> dict[str, Any] | None:
 def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any] | None:
     """The sines and cosines of an instance: at a place; in loops over a tile, turned from others.
 
-    around: a vector and statements with it, for two loops of every angle: computed at q + h/2 qd,
-    turned to q and q + h qd. further: turned from the middle by h^2/4 a1 and from the end by
-    h^2/2 a2, in place.
+    around: statements for three loops of every angle: reduced at q + h/2 qd, their sine and cosine,
+    and turned to q and q + h qd. further: turned from the middle by h^2/4 a1 and from the end by
+    h^2/2 a2, in place. within: that all angles are within what turns are good for.
     """
     if not turned:
         return None
     P, f = target.prefix, target.real.function_suffix
-
-    r = target.literal(64.0 if target.real is DOUBLE else 16.0)  # over 1 is what turns are good for
+    # what turn_both and turn of csrc/turn.h, turnf.h are good for
+    both_by, by = (0.125, 0.015625) if target.real is DOUBLE else (0.25, 0.0625)
+    vector = f"{P}_vector"
 
     def both(struct: str, angle: Angle, at: str = "") -> str:
         return f"&{struct}{angle.sine}{at}, &{struct}{angle.cosine}{at}"
@@ -68,36 +69,58 @@ def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any
     def sum_of(angle: Angle, vector: str, offset: Expr = S.Zero) -> str:
         return along(target, angle, vector, offset, arrays)
 
-    def far(angle: Angle) -> str:
-        return target.zero if angle is turned[0] else "s->trouble[i]"
-
     def turn(angle: Angle, of: str) -> str:
         d = sum_of(angle, "d.")
         place = f"{of}.{angle.sine}[i], {of}.{angle.cosine}[i], {both(of + '.', angle, '[i]')}"
         return f"{P}_turn{f}({d}, {place});"
 
-    def at(angle: Angle) -> list[str]:
+    def within(angle: Angle, v: str, most: str) -> str:
+        return f"fabs{f}({sum_of(angle, v)}) <= {most}"
+
+    def slowly(angle: Angle, q: str, qd: str) -> list[str]:
+        reach = target.literal(target.real.reach - both_by)
+        return [f"fabs{f}({sum_of(angle, q, angle.offset)}) <= {reach}", within(angle, qd, "slow")]
+
+    def odd(conditions: Sequence[str]) -> str:
+        return "odd |= !(" + " & ".join(f"({x})" for x in conditions) + ");"
+
+    def reduced(angle: Angle) -> list[str]:
         x = sum_of(angle, "at.", angle.offset)
         return [
-            *coordinates(angle, "at.$ = from->q.x[#][i] + h_2*from->qd.x[#][i];"),
-            f"{P}_sincos{f}_side_by_side({x}, {both('mid.', angle, '[i]')});",
-            f"s->trouble[i] = {P}_far_at{f}({x}, {far(angle)});",
+            f"{vector} at, moving;",
+            "",
+            *coordinates(angle, "at.$ = from->q.x[#][i];"),
+            *coordinates(angle, "moving.$ = from->qd.x[#][i];"),
+            odd(slowly(angle, "at.", "moving.")),
+            *coordinates(angle, "at.$ += h_2*moving.$;"),
+            f"mid.{angle.sine}[i] = {P}_sincos{f}_reduce({x}, &mid.{angle.cosine}[i]);",
         ]
+
+    def computed(angle: Angle) -> list[str]:
+        r = f"mid.{angle.sine}[i], mid.{angle.cosine}[i]"
+        return [f"{P}_sincos{f}_of_reduced({r}, {both('mid.', angle, '[i]')});"]
 
     def around(angle: Angle) -> list[str]:
         d = sum_of(angle, "d.")
         middle = f"mid.{angle.sine}[i], mid.{angle.cosine}[i]"
         sides = f"{both('back.', angle, '[i]')}, {both('on.', angle, '[i]')}"
         return [
+            f"{vector} d;",
+            "",
             *coordinates(angle, "d.$ = h_2*from->qd.x[#][i];"),
-            f"{P}_turn_both{f}({d}, {middle}, {sides}, &s->trouble[i]);",
+            f"{P}_turn_both{f}({d}, {middle}, {sides});",
         ]
 
     def further(angle: Angle) -> list[str]:
         return [
-            *coordinates(angle, "d.$ = hh_4*first.x[#][i];"),
+            f"{vector} a1, a2, d;",
+            "",
+            *coordinates(angle, "a1.$ = first.x[#][i];"),
+            *coordinates(angle, "a2.$ = second.x[#][i];"),
+            odd([within(angle, v, "small") for v in ("a1.", "a2.")]),
+            *coordinates(angle, "d.$ = hh_4*a1.$;"),
             turn(angle, "mid"),
-            *coordinates(angle, "d.$ = hh_2*second.x[#][i];"),
+            *coordinates(angle, "d.$ = hh_2*a2.$;"),
             turn(angle, "on"),
         ]
 
@@ -107,15 +130,14 @@ def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any
             f"{P}_sincos{f}_lane({sum_of(a, 'q->', a.offset)}, {both('s->', a)}, trouble);"
             for a in turned
         ],
-        "around": [x for a in turned for x in (("at", at(a)), ("d", around(a)))],
-        "further": [("d", further(a)) for a in turned],
-        "far_2": f"({r}*hh_2)*({r}*hh_2)",
-        "squares": {
-            "given": f"const {target.real.name} "
-            + ", ".join(f"d{k} = {sum_of(a, 'd->')}" for k, a in enumerate(turned, 1))
-            + ";",
-            "sum": " + ".join(f"d{k}*d{k}" for k in range(1, len(turned) + 1)),
-        },
+        "around": [x for a in turned for x in (reduced(a), computed(a), around(a))],
+        "further": [further(a) for a in turned],
+        "slow": f"{target.literal(both_by)}/fabs{f}(h_2)",
+        "small": f"{target.literal(by)}/hh_2",
+        "slowly": [x for a in turned for x in slowly(a, "q.", "qd.")],
+        "narrow": [within(a, v, "small") for v in ("a1.", "a2.") for a in turned],
+        "within": " && ".join(within(a, "d.", "most") for a in turned),
+        "changes": "const " + vectors.vector_of(target, arrays, "d", "v->x[#][i]"),
     }
 
 

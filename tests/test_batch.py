@@ -119,6 +119,33 @@ def test_parameters_and_inputs_of_its_own() -> None:
     assert np.max(np.abs(constant.q[k] - alone.q)) < 1e-12
 
 
+def test_equal_parameters_of_its_own_change_no_bit() -> None:
+    """What all share is compiled apart from what each has."""
+    m = module("cartpole_driven")
+    q0, qd0 = starts(m, 130)
+    for u in (None, [0.5]):
+        shared = m.simulate_batch(q0, qd0, steps=STEPS, params={"l": 1.5}, u=u)
+        own = m.simulate_batch(q0, qd0, steps=STEPS, params={"l": np.full(130, 1.5)}, u=u)
+        assert np.array_equal(shared.q, own.q) and np.array_equal(shared.qd, own.qd)
+
+
+def test_starts_of_any_layout_are_read_and_left_alone() -> None:
+    m = module("cartpole")
+    q0, qd0 = starts(m, 300)
+    wanted = m.simulate_batch(q0, qd0, steps=STEPS)
+    wide = np.empty((2, 2, 600))
+    wide[0, :, ::2], wide[1, :, ::2] = q0.T, qd0.T
+    strided = wide[0, :, ::2].T, wide[1, :, ::2].T
+    runs = m.simulate_batch(*strided, steps=STEPS)
+    assert np.array_equal(runs.q, wanted.q) and np.array_equal(runs.qd, wanted.qd)
+    assert np.array_equal(strided[0], q0) and np.array_equal(strided[1], qd0)
+    from_one = m.simulate_batch(q0[0], qd0, steps=STEPS)
+    assert np.array_equal(from_one.q[:, 0], np.tile(q0[0], (300, 1)))
+    q0[7, 1] = np.nan
+    with pytest.raises(ValueError, match="q0"):
+        m.simulate_batch(q0.T.copy().T, qd0, steps=STEPS)
+
+
 def test_a_bad_instance_leaves_the_others_alone() -> None:
     m = module("kepler_orbit")
     q0, qd0 = np.tile(m.start[0], (100, 1)), np.tile(m.start[1], (100, 1))
@@ -171,6 +198,19 @@ def test_step_batch_in_place_and_into_out() -> None:
         m.step_batch(q, q, h=0.01)
 
 
+def test_a_step_of_many_is_the_first_of_their_run() -> None:
+    """Parameters and inputs of each instance's own, and shared ones."""
+    m = module("cartpole_driven")
+    q0, qd0 = starts(m, 5)
+    masses, forces = np.linspace(1.0, 3.0, 5), np.linspace(-1.0, 1.0, 5)[:, None]
+    for how in ({"params": {"m_c": masses}}, {"u": forces}, {"u": 0.5, "params": {"l": 1.5}}):
+        q, qd = q0.copy(), qd0.copy()
+        assert not m.step_batch(q, qd, **how).any()
+        runs = m.simulate_batch(q0, qd0, steps=1, **how)
+        assert np.array_equal(q, runs.q[:, 1])
+        assert np.array_equal(qd, runs.qd[:, 1])
+
+
 def test_no_instances_in_c_read_nothing(tmp_path: Path) -> None:
     """No parameters are there either: a NULL that is followed would end the program."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
@@ -199,6 +239,21 @@ def test_ctrl_c_stops_within_a_second_and_keeps_what_was_done() -> None:
         m.simulate_batch(q0, qd0, steps=10**9, every=10**8)
     assert time.perf_counter() - begun < 1.3
     assert stop.value.run.steps.sum() > 0 and "interrupted" in stop.value.run.message
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_instances_that_ctrl_c_came_before_are_at_their_start(threads: int) -> None:
+    m = module("kepler_orbit")
+    count = 30_000  # more than a thread takes at once
+    q0 = np.tile(m.start[0], (count, 1)) * np.linspace(0.9, 1.1, count)[:, None]
+    qd0 = np.tile(m.start[1], (count, 1))
+    threading.Timer(0.3, _thread.interrupt_main).start()
+    with pytest.raises(m.Interrupted) as stop:
+        m.simulate_batch(q0, qd0, steps=10**6, every=10**6, threads=threads)
+    run = stop.value.run
+    assert run.steps[0] > 0 and run.steps[-1] == 0
+    assert np.array_equal(run.q[-1, 0], q0[-1]) and np.isnan(run.q[-1, 1]).all()
+    assert np.array_equal(run.qd[:, 0], qd0)
 
 
 def test_progress_reaches_the_end() -> None:
@@ -265,9 +320,24 @@ def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
     at = next(k for k, line in enumerate(lines) if "_rk4_stages(" in line)
     end = lines.index("}", at)
     loops = [k for k, line in enumerate(lines[:end], 1) if k > at and "for (int i" in line]
-    assert len(loops) == 8  # three of angles, four stages, the end
+    assert len(loops) == 10  # four of angles, four stages, the end, and who was no good
     for k in loops:
         assert re.search(rf"cartpole\.c:{k}:\d+: optimized: loop vectorized using 32 byte", told)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "kepler_orbit", "furuta_pendulum"])
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_strict_compilers_have_no_complaint(name: str, real: str, tmp_path: Path) -> None:
+    """With angles that are turned and without, steppers by stages and by rates."""
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    run = f'[run]\nreal = "{real}"\nbatch = true\nmethod = ["rk4", "dp8"]\n'
+    (tmp_path / "strict.toml").write_text(text.replace("[run]\n", run), encoding="utf-8")
+    for file, content in eomc.sources(eomc.read(tmp_path / "strict.toml")).files.items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    warnings = "-Wall -Wextra -Wpedantic -Wconversion -Wdouble-promotion -Werror".split()
+    for compiler in filter(shutil.which, ("gcc", "clang")):
+        given = [compiler, "-std=c99", *warnings, "-c", f"{name}.c", "-o", "out.o"]
+        subprocess.run(given, cwd=tmp_path, check=True)
 
 
 @pytest.mark.parametrize("inputs", [True, False])
@@ -302,3 +372,24 @@ def test_instances_that_end_one_after_another_leave_the_last_alone() -> None:
         assert np.allclose(runs.q[at, : len(alone.t)], alone.q, rtol=1e-9)
     undisturbed = m.simulate_batch(steps=400, every=5, params={"k": k[stays]})
     assert np.array_equal(runs.q[stays], undisturbed.q)
+
+
+def test_masked_numbers_are_refused_by_name() -> None:
+    """They have no value; where nothing is masked, a masked array is as good as any."""
+    many = module("cartpole")
+    q, qd = (np.tile(x, (2, 1)) for x in many.start)
+    masked = np.ma.array(q, mask=[[0, 1], [0, 0]])
+    tries = {
+        "q0": lambda: many.simulate_batch(masked, qd, steps=1),
+        "q": lambda: many.step_batch(masked, qd),
+        "qd": lambda: many.step_batch(q, masked, out=(q.copy(), qd.copy())),
+        "params: m_c": lambda: many.step_batch(
+            q, qd, params={"m_c": np.ma.array([1.0, 2.0], mask=[0, 1])}
+        ),
+        "params": lambda: many.step_batch(q, qd, params=np.ma.array(np.ones((2, 4)), mask=True)),
+    }
+    for name, call in tries.items():
+        with pytest.raises(ValueError, match=rf"^{name}: \d of \d numbers are masked"):
+            call()
+    plain = many.simulate_batch(np.ma.array(q), qd, steps=3)
+    assert np.array_equal(plain.q, many.simulate_batch(q, qd, steps=3).q)

@@ -40,18 +40,18 @@ void turn(long n, const real *d, real *s, real *c)
 
 void turn_on(long n, const real *d, real *s, real *c)
 {
-    real back, back_too, far = 0;
+    real back, back_too;
 
     for (long i = 0; i < n; i++)
-        eomc_turn_both$(d[i], s[i], c[i], &back, &back_too, &s[i], &c[i], &far);
+        eomc_turn_both$(d[i], s[i], c[i], &back, &back_too, &s[i], &c[i]);
 }
 
 void turn_back(long n, const real *d, real *s, real *c)
 {
-    real on, on_too, far = 0;
+    real on, on_too;
 
     for (long i = 0; i < n; i++)
-        eomc_turn_both$(-d[i], s[i], c[i], &s[i], &c[i], &on, &on_too, &far);
+        eomc_turn_both$(-d[i], s[i], c[i], &s[i], &c[i], &on, &on_too);
 }
 """
 FLAGS = {"vector": ["-O3", "-march=native"], "scalar": ["-O1", "-fno-tree-vectorize"]}
