@@ -4,7 +4,9 @@
 
 - overhead of `simulate(steps=10)`: its time less ten steps' time; a step's time is the slope
   between runs of 2,000 and 12,000 steps, in the same rounds; in processor time of the thread, so
-  that others on the same core do not count;
+  that others on the same core do not count. On a machine shared with others it comes in two sizes,
+  up to 1.8 apart: where somebody else has the other half of the physical core, an interpreter gets
+  half of the instructions through, while a chain of dependent multiplications takes no longer;
 - import: of a built scene in a fresh process, bytecode in place, after NumPy is there.
 """
 

@@ -44,7 +44,8 @@ def timed(run: Run, x: Array, h: float, steps: int) -> tuple[float, Array]:
 def ours(module: ModuleType, method: str = "rk4") -> Run:
     def run(x: Array, h: float, steps: int) -> Array:
         q, qd = x.reshape(2, -1)
-        return module.simulate(q, qd, h=h, steps=steps, every=steps, method=method).x[-1]
+        done = module.simulate(q, qd, h=h, steps=steps, every=steps, method=method)
+        return np.concatenate([done.q[-1], done.qd[-1]])
 
     return run
 

@@ -9,6 +9,7 @@ ValueError with the name of the argument.
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
@@ -36,7 +37,7 @@ _SAID = {
 }
 _OF_POSITION = ("D", "g", "potential_energy")
 _MANY = 1000  # steps from which a look at the stability limit is worth its time
-_LARGE = 2**28  # bytes from which a look at the memory is worth its time
+_LARGE = 2**24  # positions from which a look at the memory is worth its time
 _FEW = 32  # numbers that Python looks at sooner than NumPy
 _CHUNK = 4096  # steps times coordinates before the first look, some ms
 _CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
@@ -58,6 +59,23 @@ class Interrupted(KeyboardInterrupt):
         self.run = run
 
 
+class _Half:
+    """q or qd of a run: a half of its rows, made when it is first asked for, and kept."""
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, run: Run | None, owner: type) -> Array:
+        if run is None:
+            return self  # type: ignore[return-value]  # on the class, as for help()
+        half: Array = run._rows[self.index]
+        run.__dict__[self.name] = half
+        return half
+
+
 class Run:
     """A trajectory: t (n,), q (n, nq), qd (n, nq), status.
 
@@ -67,17 +85,26 @@ class Run:
     many. evaluations: of accelerations. error: an Estimate, where it was asked for.
     """
 
+    q, qd = _Half(0), _Half(1)
     error: Estimate | None = None
     _energy: Array | None = None
 
     def __init__(
-        self, model: Model, t0: float, q: Array, qd: Array, h: float, steps: int, status: str,
-        params: Array, every: int, u: Any, method: str, evaluations: int,
+        self, model: Model, t0: float, rows: Array | tuple[Array, Array], h: float, steps: int,
+        status: str, params: Array, every: int, u: Any, method: str, evaluations: int,
     ) -> None:  # fmt: skip
-        self.t0, self.q, self.qd = t0, q, qd
-        self.h, self.steps, self.status = h, steps, status
-        self.every, self.method, self.evaluations = every, method, evaluations
-        self._model, self._params, self._u = model, params, u
+        """rows: q and qd, in one array (2, n, nq) or two."""
+        self.t0 = t0
+        self.h = h
+        self.steps = steps
+        self.status = status
+        self.every = every
+        self.method = method
+        self.evaluations = evaluations
+        self._model = model
+        self._rows = rows
+        self._params = params
+        self._u = u
 
     @cached_property
     def t(self) -> Array:
@@ -88,15 +115,15 @@ class Run:
     def energy(self) -> Array:
         """K + P along the run, (n,), J."""
         if self._energy is None:
-            self._energy = self._rows("energy")
+            self._energy = self._values("energy")
         return self._energy
 
     @property
     def jacobi(self) -> Array:
         """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic."""
-        return self._rows("jacobi")
+        return self._values("jacobi")
 
-    def _rows(self, name: str) -> Array:
+    def _values(self, name: str) -> Array:
         function = getattr(self._model, name)
         values = [
             np.atleast_1d(function(q, qd, t=float(self.t[k]), params=self._params))
@@ -129,8 +156,10 @@ class Run:
         elif u is not None and np.ndim(u) == 2:
             u = np.repeat(u[: self.steps], parts, axis=0)
         return model._trajectory(
-            x[: model.nq], x[model.nq :], self.h / parts, self.steps * parts, every,
-            u, self._params, self.method, float(self.t[0]), None, progress,
+            x[: model.nq], x[model.nq :], model._pointer(x[: model.nq]),
+            model._pointer(x[model.nq :]), self.h / parts, self.steps * parts, every, u,
+            self._params, model._pointer(self._params), self.method, float(self.t[0]), None,
+            progress,
         )  # fmt: skip
 
     @property
@@ -201,9 +230,11 @@ class Model:
         timed: Sequence[str], methods: Mapping[str, tuple[int, int, float, float]], digest: str,
     ) -> None:  # fmt: skip
         """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
+        # fewer than thirty attributes: beside more of them CPython 3.11 looks up each the slow way
         self._ffi, self._lib = extension.ffi, extension.lib
-        self._address = self._ffi.from_buffer  # bound once
-        self._ctype = self._ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype])
+        real = self._ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype])
+        # what any call needs: address(real, array), and the address of nothing
+        self._c = (self._ffi.from_buffer, real, self._ffi.NULL)
         self.name, self.title, self.digest = name, title, digest
         self.dtype = np.dtype(dtype)
         self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
@@ -211,20 +242,17 @@ class Model:
         self.defaults = dict(parameters)
         self.units = dict(units)
         self.nq, self.nu = len(self.coordinates), len(self.inputs)
+        self._shape = (self.nq,) if self.nq <= _FEW else None  # of a state that is soon looked at
         self.h, self.duration = h, duration
-        self._null = self._ffi.NULL
-        self._plenty = _LARGE // self._bytes(1)  # rows
         self._start = (self._constant(start[0]), self._constant(start[1]))
         self._p0 = self._constant(tuple(parameters.values()))
-        known = (*self._start, self._p0)
-        *self._at_start, self._at_p0 = (self._address(self._ctype, x) for x in known)
+        self._at = tuple(self._pointer(x) for x in (*self._start, self._p0))
         self._timed = frozenset(timed)
         self.methods = tuple(methods)
         self.orders = {name: order for name, (order, *_) in methods.items()}
         self.limits = {name: (turn, decay) for name, (_, _, turn, decay) in methods.items()}
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
-        self._told = False
-        self._advised: set[tuple[str, float]] = set()
+        self._warned: set[Any] = set()  # methods with a step size, and u
         names = {
             "_names": self.parameters,
             "_defaults": tuple(parameters.values()),
@@ -240,10 +268,13 @@ class Model:
 
     # --- arguments -----------------------------------------------------------------------------
 
-    def _loop(self, name: str, stages: int) -> tuple[Any, Any, Any, int]:
-        """A method's loop in C, the type of what it keeps, what counts evaluations, its stages."""
-        run, work = getattr(self._lib, f"{name}_run"), self._ffi.typeof(f"{name}_work *")
-        return run, work, getattr(self._lib, f"{name}_evaluations", None), stages
+    def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
+        """A method's step and loop in C, steps at once, stages; what is kept and counted."""
+        step, run = (getattr(self._lib, f"{name}_{what}") for what in ("step", "run"))
+        work = self._ffi.typeof(f"{name}_work *")
+        counted = getattr(self._lib, f"{name}_evaluations", None)
+        short = -1 if counted else min(_MANY - 1, _CHUNK // self.nq)
+        return step, run, short, stages, work, counted
 
     def _constant(self, values: Sequence[float]) -> Array:
         array = np.array(values, self.dtype)
@@ -251,15 +282,38 @@ class Model:
         return array
 
     def _pointer(self, array: Array | None) -> Any:
-        return self._null if array is None else self._address(self._ctype, array)
+        address, real, null = self._c
+        return null if array is None else address(real, array)
 
     def _given(self, u: Any, params: Any) -> tuple[Any, Any]:
         """The addresses of inputs and parameters."""
-        held = self._null if u is None else self._pointer(self._inputs(u))
-        return held, self._at_p0 if params is None else self._pointer(self._parameters(params))
+        held = self._c[2] if u is None else self._pointer(self._inputs(u))
+        return held, self._at[2] if params is None else self._pointer(self._parameters(params))
+
+    def _listed(self, x: Any) -> Any:
+        """A state (nq,) as a list, which C takes soonest; None for all that needs a closer look."""
+        if type(x) is ndarray and x.dtype is self.dtype and x.shape == self._shape:
+            numbers = x.tolist()
+            if isfinite(sum(numbers)):  # tells soonest; it may overflow all the same
+                return numbers
+        return None
+
+    def _read(self, q: Any, qd: Any) -> tuple[Any, Any, Array, Array]:
+        """What C reads a state, or many, from, and these as arrays."""
+        if (
+            type(q) is type(qd) is ndarray and q.shape == qd.shape == self._shape
+            and q.dtype is qd.dtype is self.dtype
+        ):  # fmt: skip
+            from_q, from_qd = q.tolist(), qd.tolist()
+            if isfinite(sum(from_q) + sum(from_qd)):
+                return from_q, from_qd, q, qd
+        at, moving = self._state(q, qd)
+        return self._pointer(at), self._pointer(moving), at, moving
 
     def _numbers(self, value: ArrayLike, name: str) -> Array:
         """A C-contiguous array of the module's numbers, of any shape."""
+        if not isinstance(value, list):
+            _unmasked(value, name)
         try:
             array = np.asarray(value)
             if array.dtype.kind in "cUSmM":  # text that looks like a number is none
@@ -270,7 +324,7 @@ class Model:
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:
         """Finite numbers, (width,) or (n, width)."""
-        if type(value) is ndarray and value.dtype == self.dtype and value.flags.c_contiguous:
+        if type(value) is ndarray and value.dtype is self.dtype and value.flags.c_contiguous:
             array = value
         else:
             array = self._numbers(value, name)
@@ -281,6 +335,8 @@ class Model:
                 f"{name}: shape {np.shape(value)}, expected ({width},) or (n, {width}): "
                 f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
             )
+        if array.size <= _FEW and isfinite(sum(array.ravel().tolist())):
+            return array
         if not np.isfinite(array).all():
             raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
         return array
@@ -310,6 +366,7 @@ class Model:
             for name, value in params.items():
                 given._set(name, value)
             return np.asarray(given._array)
+        _unmasked(params, "params")
         try:
             array = np.ascontiguousarray(params, self.dtype)
         except (TypeError, ValueError):
@@ -334,6 +391,7 @@ class Model:
     def _out(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
         if out is None:
             return empty(shape, self.dtype)
+        _unmasked(out, name)
         good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.c_contiguous
         if not good or out.shape != shape or not out.flags.writeable:
             raise ValueError(
@@ -356,13 +414,20 @@ class Model:
         self, name: str, shape: tuple[int, ...], q: ArrayLike, qd: ArrayLike | None, t: float,
         u: Any, params: Any, out: Any,
     ) -> Any:  # fmt: skip
+        address, real, null = self._c
+        at: Any
+        moving: Array | None
         if name in _OF_POSITION:
-            at, moving = self._array(q, "q", self.nq), None
+            at, moving, from_q, from_qd = q, None, self._listed(q), null
+            if from_q is None:
+                at = self._array(q, "q", self.nq)
+                from_q = address(real, at)
         else:
-            at, moving = self._state(q, qd)  # type: ignore[arg-type]  # None is told there
+            from_q, from_qd, at, moving = self._read(q, qd)
         rows = at.shape[:-1]
         result = self._out(out, rows + shape)
         if rows and np.ndim(t):  # a time for each row
+            _unmasked(t, "t")
             if np.shape(t) != rows:
                 raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
             for k, now in enumerate(np.asarray(t)):
@@ -370,14 +435,13 @@ class Model:
                 result[k] = self._evaluate(name, shape, at[k], row_qd, now, u, params, None)
             return result
         time, (inputs, p) = _number(t, "t"), self._given(u, params)
-        address, real = self._address, self._ctype
         function = getattr(self._lib, name, None)
         if function is None:  # no forces, no power
             result[...] = 0
         else:
-            from_qd = self._null if moving is None else address(real, moving)
-            to, from_q = address(real, result), address(real, at)
-            function(rows[0] if rows else 1, to, from_q, from_qd, time, inputs, p)
+            function(
+                rows[0] if rows else 1, address(real, result), from_q, from_qd, time, inputs, p
+            )
         return result if result.ndim else result[()]
 
     def _by_time(
@@ -466,17 +530,17 @@ class Model:
 
         Raises MotionError where D is singular or a result is not finite.
         """
-        at, moving = self._state(q, qd)
-        result = self._out(out, at.shape)
-        made = result if out is None else empty(at.shape, self.dtype)
+        from_q, from_qd, at, moving = self._read(q, qd)
+        made = result = empty(at.shape, self.dtype)
+        if out is not None:
+            result = self._out(out, at.shape)
         inputs, p = self._given(u, params)
-        address, real = self._address, self._ctype
         found = self._lib.acceleration(
-            1 if at.ndim == 1 else len(at), address(real, made), address(real, at),
-            address(real, moving), _number(t, "t"), inputs, p,
+            1 if at.ndim == 1 else len(at), self._pointer(made), from_q, from_qd,
+            _number(t, "t"), inputs, p,
         )  # fmt: skip
-        done, said = found >> 2, STATUS[found & 3]
-        if said != "ok":
+        if found & 3:
+            done, said = found >> 2, STATUS[found & 3]
             where = _state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
             what = _SAID[said] if said == "singular" else "the acceleration is not finite there"
             raise MotionError(f"at {where}: {what}", said)
@@ -543,7 +607,7 @@ class Model:
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
-        n, state = self.nq, np.asarray(x, self.dtype)
+        n, state = self.nq, np.asarray(_unmasked(x, "x"), self.dtype)
         if state.shape != (2 * n,):
             raise ValueError(f"x: shape {state.shape}, expected ({2 * n},): q, then qd")
         out = empty(2 * n, self.dtype)
@@ -563,15 +627,20 @@ class Model:
         u None: the scene's signals, followed through the step. Raises MotionError where the step
         can't be made; `out` is untouched then.
         """
-        at, moving = self._one(q, qd)
+        from_q, from_qd, at, moving = self._read(q, qd)
+        if at.ndim != 1:
+            self._one(q, qd)
         h = self.h if h is None else _size(h)
         inputs, p = self._given(u, params)
-        ends = self._pair(out, at.shape)
-        address, real = self._address, self._ctype
-        found = self._stepper(method, "step")(
-            address(real, ends[0]), address(real, ends[1]), address(real, at),
-            address(real, moving), _number(t, "t"), h, inputs, p,
-        )  # fmt: skip
+        address, real, null = self._c
+        if out is None:
+            both = empty((2, self.nq), self.dtype)
+            ends, to_q, to_qd = (both[0], both[1]), address(real, both), null
+        else:
+            ends = self._pair(out, at.shape)
+            to_q, to_qd = address(real, ends[0]), address(real, ends[1])
+        step = self._loops[self._method(method)][0]
+        found = step(to_q, to_qd, from_q, from_qd, _number(t, "t"), h, inputs, p)
         if found:
             said = STATUS[found]
             raise MotionError(
@@ -579,14 +648,20 @@ class Model:
             )
         return ends
 
-    def _stepper(self, method: str | None, what: str) -> Any:
-        """The C function of a method: its step, run or batch."""
-        if method is not None and method not in self.methods:
+    def _method(self, method: str | None) -> str:
+        """The name of a method that the module has."""
+        if method is None:
+            return self.methods[0]
+        if method not in self.methods:
             raise ValueError(
                 f"method: {method!r} is not in this module, which has {', '.join(self.methods)}: "
                 "a scene asks for several with a list, [run] method = [...]"
             )
-        return getattr(self._lib, f"{method or self.methods[0]}_{what}")
+        return method
+
+    def _stepper(self, method: str | None, what: str) -> Any:
+        """The C function of a method: its step, run or batch."""
+        return getattr(self._lib, f"{self._method(method)}_{what}")
 
     def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
         if steps is not None:
@@ -619,30 +694,51 @@ class Model:
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
-        if method is None:
-            method = self.methods[0]
-        else:
-            self._stepper(method, "run")
-        q = self._start[0] if q0 is None else self._array(q0, "q0", self.nq)
-        qd = self._start[1] if qd0 is None else self._array(qd0, "qd0", self.nq)
-        if q.ndim != 1 or qd.ndim != 1:
-            raise ValueError(f"q0, qd0: expected one state, ({self.nq},)")
+        method = self.methods[0] if method is None else self._method(method)
+        q, qd = self._start
+        from_q, from_qd, at_p = self._at
+        if q0 is not None:
+            q, from_q = self._from(q0, "q0")
+        if qd0 is not None:
+            qd, from_qd = self._from(qd0, "qd0")
         h = self.h if h is None else _size(h)
+        p = self._p0
+        if params is not None:
+            p = self._parameters(params).copy()
+            at_p = self._pointer(p)
+        if (
+            type(steps) is int and type(every) is int and type(t0) is float and isfinite(t0)
+            and u is None and duration is None and out is None and progress is None and every > 0
+            and not estimate
+        ):  # fmt: skip
+            # few steps, nothing unusual: all else, and what fails, goes the long way
+            _, run, short, stages, _, _ = self._loops[method]
+            if 0 <= steps <= short:
+                address, real, null = self._c
+                rows = empty((2, 1 - -steps // every, self.nq), self.dtype)
+                if run(
+                    address(real, rows), null, from_q, from_qd, t0, h, steps, null, 0,
+                    every, at_p, null,
+                ) == 4 * steps:  # fmt: skip
+                    return Run(
+                        self, t0, rows, h, steps, "ok", p, every, None, method, stages * steps
+                    )
         t0 = _number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = _count(every, "every", 1)
-        p = self._p0 if params is None else self._parameters(params).copy()
-        if steps >= _MANY and (method, h) not in self._advised:
-            self._advised.add((method, h))
+        if steps >= _MANY and (method, h) not in self._warned:
+            self._warned.add((method, h))
             first = self._table(u, steps)[1]
             if first is not None and first.ndim == 2:
                 first = first[0]
             if words := advice(self, q, qd, h, t0, first, p, method):
                 warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=2)
-        result = self._trajectory(q, qd, h, steps, every, u, p, method, t0, out, progress)
-        if result.status == "interrupted":
-            raise Interrupted(result)
+        result = self._trajectory(
+            q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress
+        )
         if result.status != "ok":
+            if result.status == "interrupted":
+                raise Interrupted(result)
             warnings.warn(f"{self.name}: {result.message}", RuntimeWarning, stacklevel=2)
         if estimate:
             result.estimate()
@@ -657,35 +753,43 @@ class Model:
         q, qd = self.start
         if q0 is not None or qd0 is not None:
             q, qd = self._state(q if q0 is None else q0, qd if qd0 is None else qd0)
-        given, method = self._parameters(params), method or self.methods[0]
-        self._stepper(method, "run")
+        given, method = self._parameters(params), self._method(method)
         h = self.h if h is None else _size(h)
         return advice(self, q, qd, h, _number(t0, "t0"), u, given, method)
 
+    def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
+        """A start, (nq,), and what C reads it from."""
+        if (numbers := self._listed(x0)) is not None:
+            return x0, numbers  # type: ignore[return-value]  # an array, as was seen
+        x = self._array(x0, name, self.nq)
+        if x.ndim != 1:
+            raise ValueError(f"q0, qd0: expected one state, ({self.nq},)")
+        return x, self._pointer(x)
+
     def _trajectory(
-        self, q: Array, qd: Array, h: float, steps: int, every: int, u: Any, p: Array, method: str,
-        t0: float, out: tuple[Array, Array] | None, progress: Callable[[int, int], None] | None,
+        self, q: Array, qd: Array, from_q: Any, from_qd: Any, h: float, steps: int, every: int,
+        u: Any, p: Array, at_p: Any, method: str, t0: float, out: tuple[Array, Array] | None,
+        progress: Callable[[int, int], None] | None,
     ) -> Run:  # fmt: skip
-        """A run from checked arguments, whatever its status."""
-        run, work_type, counted, stages = self._loops[method]
-        nq, address, real, null = self.nq, self._address, self._ctype, self._null
+        """A run from checked arguments, whatever its status; C reads from_q, from_qd and at_p."""
+        _, run, _, stages, work_type, counted = self._loops[method]
+        nq, (address, real, null) = self.nq, self._c
         law, held, stride = (None, None, 0) if u is None else self._table(u, steps)
         rows = 1 - -steps // every
+        both: Any = out
         try:
-            if rows > self._plenty and out is None and self._bytes(rows) > _memory():
+            if out is not None:
+                both = self._pair(out, (rows, nq))
+            elif rows * nq > _LARGE and self._bytes(rows) > _memory():
                 raise MemoryError
-            if out is None:
-                q_rows, qd_rows = empty((rows, nq), self.dtype), empty((rows, nq), self.dtype)
             else:
-                q_rows, qd_rows = self._pair(out, (rows, nq))
+                both = empty((2, rows, nq), self.dtype)
         except MemoryError:
             raise MemoryError(
                 f"{rows} rows of {2 * nq} numbers don't fit in memory: keep fewer with every="
             ) from None
+        q_rows, qd_rows = both[0], both[1]
         to_q, to_qd = address(real, q_rows), address(real, qd_rows)
-        from_q = self._at_start[0] if q is self._start[0] else address(real, q)
-        from_qd = self._at_start[1] if qd is self._start[1] else address(real, qd)
-        at_p = self._at_p0 if p is self._p0 else address(real, p)
         at_u = null if held is None else address(real, held)
         done, chunk = 0, 1 if law else _CHUNK // nq or 1
         # what goes from one call to the next, and what is counted; a single call may do without
@@ -723,10 +827,10 @@ class Model:
                 q_rows[0], qd_rows[0] = q, qd
         if done < steps:
             kept = 1 - -done // every
-            q_rows, qd_rows = q_rows[:kept], qd_rows[:kept]
+            both = q_rows[:kept], qd_rows[:kept]
         evaluations = counted(work) if counted else stages * done
         return Run(
-            self, t0, q_rows, qd_rows, h, done, said, p, every, u if law else held, method,
+            self, t0, both, h, done, said, p, every, u if law else held, method,
             evaluations,
         )  # fmt: skip
 
@@ -740,8 +844,8 @@ class Model:
         if not self.nu:
             raise ValueError("u: this scene has no inputs")
         if callable(u):
-            if not self._told:
-                self._told = True
+            if "u" not in self._warned:
+                self._warned.add("u")
                 warnings.warn(
                     f"{self.name}: u is a Python function, called before each step: some hundred "
                     "times slower than a table (steps, nu) or the scene's own signal",
@@ -772,6 +876,17 @@ def _held(law: Callable[..., Any], parts: int) -> Callable[..., Any]:
         return u
 
     return held
+
+
+def _unmasked(value: Any, name: str) -> Any:
+    """The value; a ValueError where it is an array with masked numbers, for these have none."""
+    ma = sys.modules.get("numpy.ma")  # NumPy imports it when it is first asked for
+    if ma and isinstance(value, ma.MaskedArray) and ma.is_masked(value):
+        raise ValueError(
+            f"{name}: {ma.count_masked(value)} of {value.size} numbers are masked: "
+            "fill them in first, with .filled(...), or leave these rows out"
+        )
+    return value
 
 
 def _number(value: Any, name: str) -> float:

@@ -178,6 +178,7 @@ def test_many_states_at_once_are_the_same_one_by_one(driven: ModuleType, name: s
         np.array([2.0, 1.0])[::-1],
         np.array([1, 2], dtype=object),
         np.array([1.0, 2.0], ">f8"),
+        np.ma.array([1.0, 2.0], mask=False),
     ],
 )
 def test_takes_whatever_looks_like_an_array(cartpole: ModuleType, given: Any) -> None:
@@ -237,6 +238,24 @@ def test_out_is_written_to_and_returned(cartpole: ModuleType) -> None:
     run = cartpole.simulate(steps=5, out=rows)
     assert np.shares_memory(run.q, rows[0])
     assert np.array_equal(rows[1], cartpole.simulate(steps=5).qd)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 9, 10])
+@pytest.mark.parametrize("how", [{}, {"q0": np.array(Q), "params": {"m_c": 3.0}, "h": -0.01}])
+def test_a_few_steps_by_the_short_way_are_those_by_the_long(
+    driven: ModuleType, monkeypatch: pytest.MonkeyPatch, how: Any, steps: int
+) -> None:
+    """Arguments that are all plain go straight into C; with one more they are looked at."""
+    asked = {"steps": steps, "every": 3, "t0": 0.5, **how}
+    long = driven.simulate(progress=lambda done, of: None, **asked)
+    monkeypatch.setattr(driven._model, "_trajectory", None)
+    short = driven.simulate(**asked)
+    assert same(long, short)
+    for name in ("h", "steps", "status", "every", "method", "evaluations", "message"):
+        assert getattr(long, name) == getattr(short, name)
+    assert short.q is short.q
+    assert short.q.flags.c_contiguous
+    assert len(short.q) == len(short.qd) == 1 + -(-steps // 3)
 
 
 @pytest.mark.parametrize("params", [{"m_c": 3, "g": 1.5}, [3, 2, 2, 1.5], "Params"])
@@ -438,7 +457,7 @@ def test_a_function_sees_time_and_state_and_may_keep_them(driven: ModuleType) ->
 
 def test_a_function_is_said_to_be_slow_once(tmp_path: Path) -> None:
     driven = eomc.load(SCENES / "cartpole_driven.toml", MODULES)
-    driven._model._told = False
+    driven._model._warned.discard("u")
     with pytest.warns(RuntimeWarning, match=r"cartpole_driven: u is a Python function.*slower"):
         driven.simulate(steps=2, u=lambda t, q, qd: 0.0)
     with warnings.catch_warnings():
@@ -480,6 +499,7 @@ def test_energy_of_a_run_is_that_of_its_rows(everything: ModuleType) -> None:
 # --- what is refused ----------------------------------------------------------------------------
 
 NAN = math.nan
+MASKED = np.ma.array([0.3, 1.1], mask=[0, 1])
 BAD_VALUES = [
     ("D", ([1],), {}, r"q: shape \(1,\), expected \(2,\) or \(n, 2\): x, theta"),
     ("D", ([[[1, 2]]],), {}, r"q: shape \(1, 1, 2\)"),
@@ -521,6 +541,18 @@ BAD_VALUES = [
     ("step", (Q, QD), {"h": 0}, r"h: 0 is not a step size"),
     ("step", (Q, QD), {"h": NAN}, r"h: nan"),
     ("step", (Q, QD), {"h": "small"}, r"h: "),
+    ("D", (MASKED,), {}, r"q: 1 of 2 numbers are masked: fill them in first, with .filled"),
+    ("acceleration", ([MASKED.data] * 2, np.ma.array([QD] * 2, mask=True)), {}, r"qd: 4 of 4 num"),
+    ("step", (Q, QD), {"u": np.ma.array([1.0], mask=True)}, r"u: 1 of 1 numbers are masked"),
+    ("D", ([Q, Q],), {"t": MASKED}, r"t: 1 of 2 numbers are masked"),
+    (
+        "D",
+        (Q,),
+        {"params": np.ma.array([2.0, 2, 2, 9.8], mask=[0, 0, 1, 0])},
+        r"params: 1 of 4 num",
+    ),
+    ("acceleration", (Q, QD), {"out": MASKED.copy()}, r"out: 1 of 2 numbers are masked"),
+    ("rhs", (0, np.ma.array([*Q, *QD], mask=[0, 0, 0, 1])), {}, r"x: 1 of 4 numbers are masked"),
     ("rhs", (0, [1, 2]), {}, r"x: shape \(2,\), expected \(4,\): q, then qd"),
     ("rhs", (0, None), {}, r"x: "),
 ]
@@ -542,6 +574,9 @@ BAD_RUNS = [
     ({"q0": [1]}, r"q0: shape \(1,\), expected \(2,\)"),
     ({"q0": [[1, 2]]}, r"q0.*: expected one state, \(2,\)"),
     ({"qd0": [NAN, 0]}, r"qd0: .*nan.* is not finite"),
+    ({"q0": MASKED, "steps": 1}, r"q0: 1 of 2 numbers are masked: fill them in"),
+    ({"u": np.ma.masked_less([0.0, 1.0], 0.5), "steps": 2}, r"u: 1 of 2 numbers are masked"),
+    ({"u": lambda t, q, qd: MASKED[1:], "steps": 2}, r"u: 1 of 1 numbers are masked"),
     ({"h": 0}, r"h: 0 is not a step size"),
     ({"h": math.inf}, r"h: inf"),
     ({"h": "a"}, r"h: "),
@@ -573,7 +608,8 @@ BAD_RUNS = [
 ]
 
 
-@pytest.mark.parametrize(("how", "words"), BAD_RUNS, ids=str)
+# the words as names: a function's own differ from process to process
+@pytest.mark.parametrize(("how", "words"), BAD_RUNS, ids=[words for _, words in BAD_RUNS])
 def test_a_wrong_argument_of_a_run_is_named(driven: ModuleType, how: Any, words: str) -> None:
     with pytest.raises(ValueError, match="(?s)^" + words):
         driven.simulate(**how)
