@@ -114,8 +114,7 @@ def single(name: str, root: Path, rounds: int) -> list[Row]:
 def panda(_: str, root: Path, rounds: int) -> list[Row]:
     """The imported Panda alone, and 4,096 of it against one."""
     case = work.panda()
-    module = load(case, root, "batch = true\n")
-    one = runners.ours(module)
+    one, module = runners.ours(load(case, root)), load(case, root, "batch = true\n")
     made = program.build(mechanics.derive(eomc.read(write(case, root))))["acceleration"]
     kernel = kernels.panda_run(made, case.x0, case.h, folder(root))
     peers = [

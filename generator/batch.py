@@ -37,11 +37,18 @@ class BatchRun:
     """
 
     def __init__(
-        self, t: Array, q: Array, qd: Array, h: float, steps: Array, codes: Array, wanted: int
-    ) -> None:
-        self.t, self.q, self.qd = t, q, qd
-        self.h, self.steps, self.wanted = h, steps, wanted
-        self._codes = codes
+        self, t0: float, q: Array, qd: Array, h: float, steps: Array, codes: Array, every: int,
+        wanted: int,
+    ) -> None:  # fmt: skip
+        self.t0, self.q, self.qd = t0, q, qd
+        self.h, self.steps, self.every = h, steps, every
+        self._codes, self._wanted = codes, wanted
+
+    @cached_property
+    def t(self) -> Array:
+        """The time of each row, (n,), s."""
+        steps = np.minimum(np.arange(self.q.shape[1]) * self.every, self._wanted)
+        return np.asarray(self.t0 + self.h * steps)
 
     @cached_property
     def status(self) -> Array:
@@ -54,9 +61,8 @@ class BatchRun:
         names, counts = np.unique(self.status, return_counts=True)
         told = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         done = int(self.steps.sum())
-        return (
-            f"{len(self.status)} instances, {done} of {self.wanted} steps of {self.h:g} s: {told}"
-        )
+        wanted = len(self) * self._wanted
+        return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {told}"
 
     def __len__(self) -> int:
         return len(self._codes)
@@ -107,16 +113,16 @@ class BatchModel(Model):
         whole = work.run(threads, progress)
         if steps % every:
             q_rows[:, -1], qd_rows[:, -1] = q, qd
-        short = work.done < steps
-        for k in short.nonzero()[0]:
-            # the last good state stands where the next row would have
-            last = -(-work.done[k] // every)
-            q_rows[k, last], qd_rows[k, last] = q[k], qd[k]
-            q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
-        if not whole:
-            work.status[(work.status == 0) & short] = len(_NAMES) - 1
-        t = t0 + h * np.minimum(np.arange(rows) * every, steps)
-        run = BatchRun(t, q_rows, qd_rows, h, work.done, work.status, count * steps)
+        if not whole or work.status.any():
+            short = work.done < steps
+            for k in short.nonzero()[0]:
+                # the last good state stands where the next row would have
+                last = -(-work.done[k] // every)
+                q_rows[k, last], qd_rows[k, last] = q[k], qd[k]
+                q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
+            if not whole:
+                work.status[(work.status == 0) & short] = len(_NAMES) - 1
+        run = BatchRun(t0, q_rows, qd_rows, h, work.done, work.status, every, steps)
         if not whole:
             raise Interrupted(run)
         return run
@@ -189,8 +195,9 @@ class BatchModel(Model):
             if size not in (1, count):
                 raise ValueError(f"{name}: {size} instances where others have {count}")
 
-        both = np.broadcast_to(q, (count, self.nq)), np.broadcast_to(qd, (count, self.nq))
-        return both, table, held, count
+        whole = (count, self.nq)  # broadcast_to takes a while even where nothing is to be done
+        q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
+        return (q, qd), table, held, count
 
     def _rows_of(self, given: ArrayLike, name: str) -> Array:
         """(nq,) or (n, nq), finite; an array that is that already need not be contiguous."""
@@ -200,8 +207,11 @@ class BatchModel(Model):
                 wide, given = given, np.empty(given.shape, self.dtype)
                 with np.errstate(over="ignore"):
                     _copy(wide, given)
-            if given.shape[1] == self.nq and np.isfinite(given).all():
-                return given
+            if given.shape[1] == self.nq:
+                with np.errstate(all="ignore"):
+                    total = given.sum()  # tells soonest; it may overflow all the same
+                if np.isfinite(total) or np.isfinite(given).all():
+                    return given
         return self._array(given, name, self.nq)
 
     def _parameter_rows(self, params: Any) -> Array:

@@ -39,7 +39,7 @@ _OF_POSITION = ("D", "g", "potential_energy")
 _MANY = 1000  # steps from which a look at the stability limit is worth its time
 _LARGE = 2**24  # positions from which a look at the memory is worth its time
 _FEW = 32  # numbers that Python looks at sooner than NumPy
-_CHUNK = 4096  # steps times coordinates before the first look, some ms
+_CHUNK = 16_384  # steps times coordinates before the first look, some ms
 _CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
 
 
