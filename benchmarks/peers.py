@@ -267,9 +267,8 @@ TAIL = """
   same LDL^T: what a user of these has who writes energies, as ours do.
 - numba: RK4 in scalars in one compiled loop, `fastmath={"contract"}`, which allows FMA as gcc does
   for us and nothing else. The wheel of llvmlite has no SVML, so its batch is not vectorised.
-- CasADi: the whole step as one SX function, its C compiled with our flags, with those that long
-  scenes get (`-O2 -ftree-loop-vectorize ...`) and without `-fno-tree-slp-vectorize` (the fastest is
-  kept), called from a loop in the same file.
+- CasADi: the whole step as one SX function, its C compiled with our flags with and without
+  `-fno-tree-slp-vectorize` (the faster is kept), called from a loop in the same file.
 - heyoka: the whole step as one compiled function called on all 4,096 columns at once.
 - JAX: double precision, all steps as one `lax.scan` over a tuple of scalars, compiled whole; the
   batch by `vmap` or `lax.map`, the faster. Chains are left out: XLA computes shared values again

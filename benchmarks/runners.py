@@ -179,8 +179,7 @@ void run(double *x, double h, long steps)
 def by_casadi(matrices: Matrices, x0: Array, h: float, root: Path) -> Run:
     """C generated from the whole step as one SX function, called in a loop in the same file.
 
-    Compiled with either of our sets of flags, and without the one that suits our code; the fastest
-    is kept."""
+    Compiled with our flags and without the one that suits our code; the faster is kept."""
     x, size = casadi.SX.sym("x", len(x0)), casadi.SX.sym("h")
     after = physics.rk4(matrices, [x[i] for i in range(len(x0))], size, casadi.sin, casadi.cos)
     step = casadi.Function("step", [x, size], [casadi.vertcat(*after)])
@@ -193,10 +192,9 @@ def by_casadi(matrices: Matrices, x0: Array, h: float, root: Path) -> Run:
     file.write_text(code + CASADI_DRIVER % {"nx": len(x0), **sizes})
     runs = []
     without = tuple(flag for flag in compiler.flags() if "slp" not in flag)
-    found = compiler.find_compiler()
-    for k, flags in enumerate((compiler.flags(), compiler.flags(found.is_gcc), without)):
+    for k, flags in enumerate((compiler.flags(), without)):
         library = folder / f"step{k}.so"
-        command = [*found.command, compiler.STANDARD, *flags, "-fPIC", "-shared"]
+        command = [*compiler.find_compiler().command, compiler.STANDARD, *flags, "-fPIC", "-shared"]
         subprocess.run([*command, str(file), "-o", str(library), "-lm"], check=True)
         function = ctypes.CDLL(str(library)).run
         function.argtypes = [ctypes.c_void_p, ctypes.c_double, ctypes.c_long]

@@ -34,13 +34,7 @@ if TYPE_CHECKING:
     from eomc.render import Sources
 
 # no -ffast-math: it breaks the reduction of angles and the checks for singular D
-FLAGS = ("-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize")
-LEVEL = ("-O3",)
-# gcc's -O3 without what long straight lines don't profit from: three quarters of its time, and
-# steps that take 0.93 to 0.99; other compilers know no such flags
-STRAIGHT = (
-    "-O2", "-ftree-loop-vectorize", "-fvect-cost-model=dynamic", "-fsplit-paths", "-fpeel-loops",
-)  # fmt: skip
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize")
 STANDARD = "-std=gnu99"  # c99 would forbid the contraction to FMA
 MANIFEST = "build.json"
 # operations over which gcc takes some twenty seconds (0.3 ms each, in pieces) and clang two thirds
@@ -53,12 +47,6 @@ class Compiler:
 
     command: tuple[str, ...]
     identity: str
-
-    @property
-    def is_gcc(self) -> bool:
-        """Whether it is gcc beyond doubt: `cc` may be a link to it, a wrapper doesn't tell."""
-        path = shutil.which(self.command[0])
-        return path is not None and "gcc" in Path(path).resolve().name
 
 
 @dataclass(frozen=True)
@@ -106,16 +94,13 @@ def _identity(path: str) -> str:
     return f"{real} {stat.st_size} {stat.st_mtime_ns}"
 
 
-def flags(straight: bool = False) -> tuple[str, ...]:
-    """The optimisation flags: $EOMC_CFLAGS where it is set; otherwise LEVEL or STRAIGHT, and FLAGS.
-
-    straight: of a scene whose steps are long and have hardly a loop, by gcc (Sources.straight).
-    """
+def flags() -> tuple[str, ...]:
+    """The optimisation flags: $EOMC_CFLAGS where it is set, FLAGS otherwise."""
     given = os.environ.get("EOMC_CFLAGS")
     if given is not None:
         return tuple(shlex.split(given))
     wide = ("-mprefer-vector-width=512",) if "avx512f" in _processor() else ()
-    return (*(STRAIGHT if straight else LEVEL), *FLAGS, *wide)
+    return (*FLAGS, *wide)
 
 
 @lru_cache(maxsize=1)
@@ -151,8 +136,7 @@ def key(scene_digest: str, options: str = "") -> str:
     small, large = compiler_for(0), compiler_for(MANY + 1)
     parts = (
         scene_digest, options, _generator_digest(), small.identity, large.identity,
-        STANDARD, *flags(), *flags(True), _processor(), sys.version,
-        str(sysconfig.get_config_var("EXT_SUFFIX")),
+        STANDARD, *flags(), _processor(), sys.version, str(sysconfig.get_config_var("EXT_SUFFIX")),
     )  # fmt: skip
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
@@ -220,15 +204,14 @@ def _build(
         (beside / file).write_text(text, encoding="utf-8")
     library = extension + str(sysconfig.get_config_var("EXT_SUFFIX"))
     compiler = compiler_for(made.operations)
-    optimized = flags(made.straight and compiler.is_gcc)
-    _compile(made, extension, beside, library, compiler, optimized)
+    _compile(made, extension, beside, library, compiler)
     kept = [library, *made.files]
     manifest = {
         "key": wanted,
         "name": name,
         "eomc": __version__,
         "compiler": " ".join(compiler.command),
-        "flags": " ".join((STANDARD, *optimized)),
+        "flags": " ".join((STANDARD, *flags())),
         "files": {file: (beside / file).stat().st_size for file in kept},
     }
     (beside / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
@@ -241,14 +224,7 @@ def _build(
         path.unlink(missing_ok=True)
 
 
-def _compile(
-    made: Sources,
-    extension: str,
-    folder: Path,
-    library: str,
-    compiler: Compiler,
-    optimized: Sequence[str],
-) -> None:
+def _compile(made: Sources, extension: str, folder: Path, library: str, compiler: Compiler) -> None:
     import cffi
 
     name = made.name
@@ -259,7 +235,7 @@ def _compile(
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
     common = [*compiler.command, STANDARD, "-fPIC", "-fvisibility=hidden"]
     jobs = [
-        [*common, *optimized, "-c", f"{name}.c", "-o", "scene.o"],
+        [*common, *flags(), "-c", f"{name}.c", "-o", "scene.o"],
         # the wrapper's speed is that of the calls in it
         [*common, "-O1", *include, "-c", "binding.c", "-o", "binding.o"],
     ]

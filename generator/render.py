@@ -19,7 +19,6 @@ from eomc.ccode import REALS
 from eomc.context import resource, values
 from eomc.pieces import weight
 from eomc.program import Program
-from eomc.steppers import METHODS
 from eomc.target import Target
 
 
@@ -28,8 +27,7 @@ class Sources:
     """The text of the generated files by name, and what the extension is made of besides.
 
     binding: C between the scene's functions and Python, with its cdef. operations: how many all
-    functions have together, which tells how long a compiler takes. straight: whether steps are long
-    and have hardly a loop.
+    functions have together, which tells how long a compiler takes.
     """
 
     name: str
@@ -37,7 +35,6 @@ class Sources:
     binding: str
     cdef: str
     operations: int
-    straight: bool
 
 
 def environment() -> jinja2.Environment:
@@ -92,11 +89,4 @@ def render(program: Program, extension: str) -> Sources:
         binding=text("binding.c"),
         cdef=text("binding.cdef"),
         operations=sum(map(weight, program.functions.values())),
-        straight=_straight(program, bool(context["pairs"])),
     )
-
-
-def _straight(program: Program, pairs: bool) -> bool:
-    """Batches are loops over instances, implicit methods have loops over stages or a matrix."""
-    run = program.system.run
-    return pairs and not run.batch and not any(METHODS[name].implicit for name in run.methods)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import json
 import os
 import shutil
 import signal
@@ -156,38 +155,6 @@ def test_garbage_is_collected_again(scene: Path, tmp_path: Path) -> None:
         assert not gc.isenabled()
     finally:
         gc.enable()
-
-
-@pytest.mark.parametrize(
-    ("links", "run", "straight"),
-    [
-        (5, "", True),
-        (2, "", False),
-        (5, "batch = true", False),
-        (5, 'method = "gauss4"', False),
-        (5, 'method = ["rk4", "dp8"]', True),
-        (5, 'method = ["rk4", "gauss16"]', False),
-    ],
-)
-def test_long_straight_scenes_are_compiled_with_flags_of_their_own(
-    links: int, run: str, straight: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("EOMC_CFLAGS")
-    monkeypatch.setenv("CC", needs("gcc"))
-    text = (SCENES / "chain.toml").read_text(encoding="utf-8")
-    assert "value = 5," in text and "[run]\n" in text
-    file = tmp_path / "chain.toml"
-    text = text.replace("value = 5,", f"value = {links},").replace("[run]\n", f"[run]\n{run}\n")
-    file.write_text(text, encoding="utf-8")
-    assert eomc.sources(eomc.read(file)).straight is straight
-    if links == 5 and not run:
-        for name, level in (("gcc", "-O2"), ("clang", "-O3")):
-            if shutil.which(name):
-                monkeypatch.setenv("CC", name)
-                built = eomc.build(file, tmp_path / name)
-                told = json.loads((built.folder / compiler.MANIFEST).read_text(encoding="utf-8"))
-                assert level in told["flags"].split()
-                assert set(compiler.FLAGS) <= set(told["flags"].split())
 
 
 def test_what_a_build_hangs_on(
