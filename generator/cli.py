@@ -495,10 +495,15 @@ def _pairs(
 
     from eomc import formulas
 
+    seen: set[str] = set()
     for pair in given:
         name, equals, text = pair.partition("=")
+        name = name.strip()
         if not equals:
             raise EomcError(f"{option} {pair}: write {option} NAME=VALUE")
+        if name in seen:
+            raise EomcError(f"{option} {pair}: '{name}' has a value already: give it once")
+        seen.add(name)
         try:
             value = float(
                 formulas.evaluate(formulas.parse(text), formulas.NUMERIC, known.__getitem__)
@@ -509,7 +514,7 @@ def _pairs(
             raise EomcError(f"{option} {pair}: {fault}") from None
         if not math.isfinite(value):
             raise EomcError(f"{option} {pair}: not a finite number")
-        yield name.strip(), value
+        yield name, value
 
 
 def _simulated(module: Any, q0: Any, qd0: Any, **options: Any) -> Run:

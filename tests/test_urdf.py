@@ -377,6 +377,10 @@ def test_the_options_of_import(here: Path, words: list[str], coordinates: int, i
     [
         (["--lock", "extent=0"], "did you mean 'extend'?"),
         (["--lock", "extend"], "write --lock NAME=VALUE"),
+        (
+            ["--lock", "extend=0", "--lock", "extend=1"],
+            "'extend' has a value already: give it once",
+        ),
         (["--root", "nowhere"], "no body is called 'nowhere'"),
         (["--name", "class"], "Python keyword"),
         (["--include"], "--include is for MJCF"),
