@@ -14,7 +14,7 @@ Vector = tuple[Expr, ...]
 Rows = tuple[Vector, ...]
 Pairs = tuple[tuple[Expr, Expr], ...]
 
-LONGEST = 16  # pivots in one product: beyond, it could leave the range of a double
+LONGEST = 8  # pivots in one product, so that those of 1e-38 to 1e38 stay in the range of a double
 
 
 @dataclass(frozen=True)

@@ -338,7 +338,9 @@ class _Links:
             tape.total([self._dot(x, groups[g].beta), *map(self._less, given(g, x))])
             for g, x in rows
         ]
-        prompt = not self.system.run.batch  # where many are computed at once, none is waited for
+        # many computed at once don't wait, and products of pivots would leave the range of a float
+        run = self.system.run
+        prompt = run.real == "double" and not run.batch
         order, tensions, pivots = solve(tape, matrix, right, kept=tape.whole, prompt=prompt)
         turning = []
         for g, (u, square) in enumerate(zip(slopes, squares, strict=True)):

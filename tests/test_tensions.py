@@ -305,6 +305,26 @@ def test_divisions_do_not_wait_for_one_another() -> None:
     assert max(map(divisions_in_a_row, made)) == 1
 
 
+@pytest.mark.parametrize("size", [1e-34, 1e34])
+def test_masses_of_any_size(size: float) -> None:
+    """Products of pivots stay in the range of a double; accelerations hang on ratios of masses."""
+    n = 40
+    made = made_of(links([k - 1 for k in range(n)], equal=False))
+    ours, state = by_tensions(made), states(made)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
+    scaled = {**state, **{f"m{k}": size * state[f"m{k}"] for k in range(n)}}
+    (expected, _), (found, regular) = evaluate(ours, state), evaluate(ours, scaled)
+    assert regular
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+
+
+def test_a_float_has_no_room_for_products_of_pivots() -> None:
+    chain = links([k - 1 for k in range(9)])
+    plain, many = (by_tensions(made_of(f"{chain}\n[run]\n{run}\n")) for run in (
+        'real = "float"', "batch = true",
+    ))  # fmt: skip
+    assert plain == many
+
+
 def test_it_is_taken_where_it_is_the_cheapest() -> None:
     for n in (3, 5, 10):
         made = made_of(links([k - 1 for k in range(n)]))
