@@ -249,7 +249,7 @@ def body(
     early = {a.name for a in function.early}
     is_early = [not c[0].name or c[0].name in {*early, *parameters} for c in function.checks]
     checks = [(e, pair) for e, pair in zip(is_early, function.checks, strict=True)]
-    early_failures = tuple(_fails(printer, pair, tolerance) for e, pair in checks if e)
+    early_failures = _failures(printer, [pair for e, pair in checks if e], tolerance)
     if keep is not None:
         printer.where |= {name: keep(name) for name in kept}
 
@@ -273,10 +273,18 @@ def body(
         blocks=tuple(Block(_STAGE_COMMENTS[s], tuple(text)) for s, text in lines.items() if text),
         results=tuple(printer.operand(o) for o in function.outputs),
         early_failures=early_failures,
-        failures=tuple(_fails(printer, pair, tolerance) for e, pair in checks if not e),
+        failures=_failures(printer, [pair for e, pair in checks if not e], tolerance),
         kept=tuple(kept),
         sincos=real.reach > 0 and any("_sincos" in x for text in lines.values() for x in text),
     )
+
+
+def _failures(
+    printer: Printer, pairs: Iterable[tuple[Operand, Operand]], tolerance: float
+) -> tuple[str, ...]:
+    """Conditions under which a pivot is no good, each once; a positive number always is."""
+    asked = [(p, d) for p, d in pairs if p.name or not (p == d and p.coefficient > 0)]
+    return tuple(dict.fromkeys(_fails(printer, pair, tolerance) for pair in asked))
 
 
 def _fails(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) -> str:

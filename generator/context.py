@@ -20,6 +20,7 @@ from eomc.dynamics import dynamics
 from eomc.evaluations import KINDS, functions, linearization, takes_t
 from eomc.program import matrix, nearby
 from eomc.target import Target, after, arguments
+from eomc.tensions import is_prompt
 
 
 def resource(package: str, name: str) -> str:
@@ -192,9 +193,11 @@ def _solved(target: Target) -> list[str]:
         way = "articulated bodies (Featherstone), the pivots d being those of D = L diag(d) L^T"
     order = ", ".join(program.system.coordinates[k].name for k in program.order)
     if program["acceleration"].route == "tensions":
+        fractions = "Along a chain s = N/M: s_k is N there, and S_k is M times the entry it was. "
         return textwrap.wrap(
             "a = qdd by the tensions of the links, S = N T N^T = L diag(s) L^T, eliminated in the "
-            f"order of the links of {order}. Every mass must be positive.", 92,
+            f"order of the links of {order}. {fractions if is_prompt(program.system) else ''}"
+            "Every mass must be positive.", 92,
         )  # fmt: skip
     return textwrap.wrap(f"a = qdd by {way}, eliminated in the order {order}.", 92)
 

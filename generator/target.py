@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -304,7 +305,7 @@ class Target:
 
 
 def _about(k: int, part: pieces.Piece, count: int, what: str) -> str:
-    """What a piece computes from what, in a sentence."""
+    """What a piece computes from what, in a sentence, as lines of a comment."""
     named = [n for n in part.keeps if not (n[0] == "w" and n[1:].isdigit())]
     made = ", ".join(named[:8]) + (", ..." if len(part.keeps) > 8 else "")
     told = [f"{what}, {k} of {count}: {pieces.weight(part.function)} operations"]
@@ -314,7 +315,7 @@ def _about(k: int, part: pieces.Piece, count: int, what: str) -> str:
         told.append(f"{len(part.keeps)} for those behind" + (f" ({made})" if named else ""))
     if part.outputs:
         told.append(f"{len(part.outputs)} results")
-    return ", ".join(told) + "."
+    return textwrap.fill(", ".join(told) + ".", 94, subsequent_indent=" * ")
 
 
 def unclashed(function: Function) -> Function:

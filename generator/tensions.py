@@ -61,6 +61,14 @@ class Group:
     across: tuple[tuple[Expr, ...], ...]
 
 
+def is_prompt(system: System) -> bool:
+    """Whether tensions are eliminated so that little is waited for, see elimination.solve.
+
+    Many computed at once don't wait, and products of pivots would leave the range of a float.
+    """
+    return system.run.real == "double" and not system.run.batch
+
+
 def solution(system: System) -> Solution:
     """qdd by the tensions. Raises UnsuitedError where the system is not of this kind."""
     most = 2 * len(system.q)  # velocities; with more there are more tensions than coordinates
@@ -338,10 +346,9 @@ class _Links:
             tape.total([self._dot(x, groups[g].beta), *map(self._less, given(g, x))])
             for g, x in rows
         ]
-        # many computed at once don't wait, and products of pivots would leave the range of a float
-        run = self.system.run
-        prompt = run.real == "double" and not run.batch
-        order, tensions, pivots = solve(tape, matrix, right, kept=tape.whole, prompt=prompt)
+        order, tensions, pivots = solve(
+            tape, matrix, right, kept=tape.whole, prompt=is_prompt(self.system)
+        )
         turning = []
         for g, (u, square) in enumerate(zip(slopes, squares, strict=True)):
             drawn = [
