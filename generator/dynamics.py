@@ -107,7 +107,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
             f"{rows}, long row_count", target.p_arg and f"{target.p_arg}, long p_instance",
             "long *done", "int *status",
         ) + ")",
-        "tile": lanes.tile(target, len(kept), lane) if lane else 0,
+        **(lanes.tile(target, len(kept), lane) if lane else {}),
         "input_names": target.input_names,
         "sincos": f"{P}_sincos{target.real.function_suffix}" if target.sincos else "",
         "reach": target.literal(target.real.reach),

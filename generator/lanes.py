@@ -17,7 +17,7 @@ from eomc.ccode import DOUBLE, indent
 from eomc.pieces import is_large, staged
 from eomc.program import TIME
 from eomc.steppers import METHODS
-from eomc.target import TROUBLE, Access, Argument, Target, after, arguments
+from eomc.target import TROUBLE, WIDE, Access, Argument, Target, after, arguments
 
 KEPT = {"a1": "first", "a2": "second", "a3": "third", "a4": "fourth"}  # by the stages of RK4
 NEAR = 32_768  # bytes that a tile may have: a first-level cache
@@ -36,7 +36,7 @@ def lane(
     timed = TIME in function.uses
     kept = prepare["prepared_members"]
     alone = f"{target.PREFIX}_ALONE "
-    troubles = f"{real} *{alone}troubles"
+    rest = f"int wide, {real} *{alone}troubles"  # how many to take, and what went wrong
     u_arg = f"const {P}_inputs_lanes *u" if held else ""
     c_arg = f"const {P}_prepared_lanes *c" if kept else ""
     t_arg = f"{real} t" if target.driven else ""
@@ -46,8 +46,8 @@ def lane(
 
     def rates(time: str) -> str:
         if held:
-            return after(time if target.driven else "", "u", "held", c, "troubles")
-        return after(time if timed else "", c, "troubles")
+            return after(time if target.driven else "", "u", "held", c, "wide, troubles")
+        return after(time if timed else "", c, "wide, troubles")
 
     made = dict(mode) | {
         "head": "static void" if large else f"{target.PREFIX}_PIECE void",
@@ -57,27 +57,28 @@ def lane(
         "rates": ("rates_lane" if held else "solve_lane") if large else "rates_tile",
         "suffix": "_lane",
         "solve_arguments": arguments(
-            f"{P}_lanes *a", state, f"{real} t" if timed else "", u_arg, c_arg, troubles
+            f"{P}_lanes *a", state, f"{real} t" if timed else "", u_arg, c_arg, rest
         ),
-        "solve_u": after("t" if timed else "", "held ? u : &now", c, "troubles"),
+        "solve_u": after("t" if timed else "", "held ? u : &now", c, "wide, troubles"),
         "rates_arguments": arguments(
             f"{P}_lanes *{'' if large else alone}a", state, t_arg, u_arg,
-            "int held" if held else "", c_arg, troubles,
+            "int held" if held else "", c_arg, rest,
         ),
         "inputs": f"{P}_inputs_lanes",
         "stepper_arguments": arguments(
             f"{P}_lanes *r, {P}_lanes *v" if large else f"{P}_lanes *{alone}r, {P}_lanes *{alone}v",
-            state, t_arg, f"{real} h", u_arg and f"{u_arg}, int held", c_arg, troubles,
+            state, t_arg, f"{real} h", u_arg and f"{u_arg}, int held", c_arg, rest,
         ),
         "tile_prototype": lambda name: f"int {P}_{name}_tile_step("
         + arguments(
             f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
             t_arg, f"{real} h", "int held" if held else "", "int own" if own else "",
+            "int wide",
         ) + ")",
         "own": own,
         "stepper_call": lambda troubles: after(
             "t" if target.driven else "", "h", "&s->u, held" if held else "",
-            "&s->c" if kept else "", troubles,
+            "&s->c" if kept else "", "wide", troubles,
         ),
         "call": rates,
         "compensated": False,
@@ -88,7 +89,7 @@ def lane(
         "angles": None,
         "one": None,
         "pieces": None,
-        "own_signal": _signal_lanes(target, kept, c_arg, troubles) if large else None,
+        "own_signal": _signal_lanes(target, kept, c_arg, rest) if large else None,
     }  # fmt: skip
     if not large:
         return made | _lane_small(target, function, kept, mode["arrays"])
@@ -98,9 +99,7 @@ def lane(
 def _each_of_tile(target: Target, lines: Sequence[str]) -> list[str]:
     """Statements for every coordinate of every instance."""
     inside = [line.replace("$", "x[j][i]") for line in lines]
-    return vectors.loop(
-        "j", f"{target.PREFIX}_NQ", vectors.loop("i", f"{target.PREFIX}_TILE", inside)
-    )
+    return vectors.loop("j", f"{target.PREFIX}_NQ", vectors.loop("i", target.tile_end, inside))
 
 
 def _lane_small(
@@ -133,12 +132,13 @@ def _lane_small(
         ],
         "rates_call": call("&s", "t", "held", "&troubles[i]"),
         "rates_held": lambda hold: arguments(
-            "a, q, qd", "t" if target.driven else "", "u", hold, "c" if kept else "", "troubles"
+            "a, q, qd", "t" if target.driven else "", "u", hold, "c" if kept else "",
+            "wide, troubles",
         ),
         "stages": _stages(
             target, arrays, turned, angles, own, _given(target, kept, "s->u.", "s->c.", k), call
         ),
-    }
+    }  # fmt: skip
 
 
 def _given(target: Target, kept: Sequence[str], u: str, c: str, k: str = "i") -> list[str]:
@@ -223,11 +223,13 @@ def _stages(
         + arguments(
             f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
             t_arg, f"{real} h", "int held" if target.system.inputs else "",
-            "int own" if own else "",
+            "int own" if own else "", "int wide",
         ) + ")",
         "calls": _each_known(
             ["held"] * bool(target.system.inputs) + ["own"] * own,
-            lambda known: f"odd = {P}_rk4_stages({arguments('to, from, s', t, 'h', *known)});",
+            lambda known: (
+                f"odd = {P}_rk4_stages({arguments('to, from, s', t, 'h', *known, 'wide')});"
+            ),
         ),
         "before": loops[:2],
         "after": loops[2:],
@@ -286,6 +288,7 @@ def _lane_arguments(target: Target, kept: Sequence[str]) -> list[Argument]:
         Argument(f"{real} t", "t", groups["t"]),
         Argument(f"const {P}_inputs_lanes *u", "u", groups["u"]),
         Argument(f"const {P}_prepared_lanes *c", "c", frozenset(kept)),
+        Argument("int wide", "wide", frozenset({WIDE})),
         Argument(f"{real} *{target.PREFIX}_ALONE troubles", "troubles", frozenset({TROUBLE})),
     ]
 
@@ -336,18 +339,19 @@ def _unread_state(target: Target, given: Function) -> list[str]:
 def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
     return arguments(
         "&now", "t" if target.signal_t else "", "q, qd" if target.signal_state else "",
-        "c" if c_arg else "", trouble,
+        "c" if c_arg else "", "wide", trouble,
     )  # fmt: skip
 
 
-def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> int:
+def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> dict[str, int]:
     """Instances side by side: as many as stay near with what belongs to them, and no row of their
-    numbers above 512 bytes."""
+    numbers above 512 bytes. A tile that is not full is taken by blocks: rows of 64 bytes."""
     s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
     numbers = 4 * n + len(s.u) + kept + 1  # two states, and whether there was trouble
     if lane["pieces"]:
-        numbers += len(lane["pieces"]["members"]) + 4 * n
+        numbers += len(lane["pieces"]["members"]) // 2 + 4 * n  # of those, not all live at once
     else:
         numbers += max(METHODS[name].stages for name in s.run.methods) * n
         numbers += 3 * len(lane["angles"]["members"]) if lane["angles"] else 0
-    return max(8, min(512 // size, 1 << (NEAR // (size * numbers)).bit_length() - 1))
+    block, near = 64 // size, NEAR // (size * numbers)
+    return {"tile": max(block, min(512 // size, near // block * block)), "block": block}

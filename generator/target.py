@@ -19,10 +19,11 @@ from eomc.system import System
 _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 trouble held at "
-    "moving prepared along column slopes".split()
+    "moving prepared along column slopes wide troubles".split()
 )
 
 TROUBLE = "*trouble"  # what a lane notes its failure in, as a name that an argument brings
+WIDE = "*wide"  # how many instances of a tile are to be taken, likewise
 
 Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C
 
@@ -72,6 +73,7 @@ class Target:
             "NOT_FINITE",
             "STAMP",
             "TILE",
+            "BLOCK",
             "LANE",
             "ALONE",
             "PIECE",
@@ -136,6 +138,11 @@ class Target:
     def p_cast(self) -> str:
         """The parameters where they come as plain numbers."""
         return f"(const {self.prefix}_params *)p" if self.needs_p else ""
+
+    @property
+    def tile_end(self) -> str:
+        """Where loops over the instances of a tile end; compilers see that it is a multiple."""
+        return f"(wide & -{self.PREFIX}_BLOCK)"
 
     @property
     def zero(self) -> str:
@@ -232,7 +239,8 @@ class Target:
         small = pieces.LANE_PIECE if lane else pieces.PIECE
         piece = small if pieces.is_large(function) else pieces.LARGE
         parts = pieces.split(function, piece)
-        end = f"{self.PREFIX}_TILE" if lane else "2" if pair else ""
+        end = self.tile_end if lane else "2" if pair else ""
+        size = f"{self.PREFIX}_TILE" if lane else end
         at = "[i]" if end else ""
         values = f"{self.prefix}_{what}_values"
         crossing = [name for part in parts for name in part.keeps]
@@ -256,7 +264,7 @@ class Target:
             failures = [*body.early_failures, *body.failures]
             checks = bool(failures)
             troubled = bool(end) and (checks or (lane and body.sincos))
-            read = f.uses | {TROUBLE} if troubled else f.uses
+            read = f.uses | {WIDE, *([TROUBLE] if troubled else [])}
             needed = [a for a in given if a.names & read]
             if crossing and (part.reads or part.keeps):
                 needed.insert(0, struct)
@@ -290,7 +298,7 @@ class Target:
         return {
             "what": what,
             "type": values,
-            "members": [name + (f"[{end}]" if end else "") for name in crossing],
+            "members": [name + (f"[{size}]" if end else "") for name in crossing],
             "loop": end,
             "width": 8 if end else 4,
             "pieces": made,
