@@ -9,7 +9,7 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
-from conftest import ROOT, needs
+from conftest import MODULES, ROOT, needs
 from sympy import Rational, S
 
 import eomc
@@ -250,18 +250,21 @@ def test_sines_near_what_was_foretold_are_sines(vectors: bool, tmp_path: Path) -
     assert 2.0**-55 < worst < 2 * 2.0**-53
 
 
-@pytest.mark.parametrize(("method", "power"), [("rk4", 20), ("dp8", 18), ("gauss8", 15)])
+@pytest.mark.parametrize(
+    ("method", "power"), [("rk4", 20), ("dp8", 18), ("gauss8", 15), ("gauss16", 15)]
+)
 def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
     """A step of an oscillator is a linear map R(h J): its power in 40 digits is the answer.
 
     With plain sums 1e-13 and more, and nearly as much with weights as they are rounded.
     """
     text = (SCENES / "mass_spring.toml").read_text(encoding="utf-8")
-    names = '["rk4", "dp8", "gauss8"]'
+    names = '["rk4", "dp8", "gauss8", "gauss16"]'
     (tmp_path / "mass_spring.toml").write_text(
-        text.replace("[run]\n", f"[run]\nmethod = {names}\n"), encoding="utf-8"
+        text.replace("[run]\n", f"[run]\nmethod = {names}\n").replace('"mass_spring"', '"sums"'),
+        encoding="utf-8",
     )
-    module = eomc.load(tmp_path / "mass_spring.toml", tmp_path)
+    module = eomc.load(tmp_path / "mass_spring.toml", MODULES)
     (x,), (v,) = module.start
     m, h, steps = METHODS[method], 2.0 ** (10 - power), 2**power
     with mpmath.workdps(50):

@@ -177,6 +177,16 @@ def test_a_run_that_stopped_has_an_error_as_far_as_it_went(modules: Modules) -> 
     assert len(error.q) == len(run) and "the run stopped" in error.verdict
 
 
+def test_a_run_that_stopped_read_as_much_of_its_inputs(driven: ModuleType) -> None:
+    """Shorter steps hold each row as long as it was held, up to where the run ended."""
+    u = np.full((60, 1), 0.3)
+    u[33] = 1e300  # too much for the square of what it makes of theta_dot
+    run = quiet(driven, steps=60, u=u, estimate=True)
+    assert run.status == "not finite" and 33 <= run.steps < 60
+    before = quiet(driven, steps=run.steps, u=u[: run.steps], estimate=True)
+    assert np.array_equal(run.error.q, before.error.q)
+
+
 def test_no_convergence_is_told(modules: Modules) -> None:
     """x'' = -4e4 x^3 in steps of 800 radians: no iteration finds the stages of an implicit step."""
     text = SPRING.format(name="stiff_implicit", k=1e4, dissipation="0")

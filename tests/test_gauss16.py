@@ -174,6 +174,15 @@ def test_a_step_is_right_or_told_however_long_it_is() -> None:
         assert status == ("ok" if within else "no convergence")
 
 
+@pytest.mark.parametrize("turn", [2.5, 3.0])
+def test_sweeps_go_on_where_the_last_one_moved_by_more_than_a_millionth(turn: float) -> None:
+    """Five alone would leave as much; what is moved by less is left with a hundredth of that."""
+    m = scene("g16_spring", SPRING.format(name="g16_spring"))
+    run = m.simulate(h=turn, steps=10)
+    assert run.evaluations > 1.2 * run.steps * A_STEP
+    assert np.max(np.abs(run.q[:, 0] - np.cos(run.t))) < 2e-8
+
+
 def test_the_energy_of_a_pendulum_does_not_drift() -> None:
     """1,000 periods in 40,000 steps: less than a rounding of the largest energy each."""
     m = eomc.load(variant("simple_pendulum", "g16_pendulum", method='"gauss16"'), MODULES)
@@ -234,6 +243,11 @@ def test_angles_that_vectors_can_not_do() -> None:
     off = far.q[:, 1] - 2 * np.pi * turns - near.q[:, 1]
     assert np.max(np.abs(off)) < 1e-7  # a rounding of the angle is 5e-10
     assert far.evaluations < 1.5 * far.steps * A_STEP
+    # where vectors make nonsense: angles too wide to move, and a motion under their sines
+    for wide in np.linspace(2e16, 6e16, 9):
+        how = {"h": 0.02, "steps": 50}
+        runs = [quietly(m, [0.0, wide], [0.3, 0.5], **how, method=name) for name in m.methods]
+        np.testing.assert_allclose(runs[0].qd, runs[1].qd, rtol=1e-9)
 
 
 def test_a_singular_mass_matrix_is_told() -> None:

@@ -324,8 +324,11 @@ def test_without_arguments_the_scenes_run(cartpole: ModuleType) -> None:
 
 @pytest.mark.parametrize(
     ("h", "duration", "steps"),
-    [(0.1, 0.3, 3), (0.1, 1.0, 10), (0.3, 1.0, 4), (0.01, 20, 2000), (0.1, 0, 0), (-0.1, 1, 10)],
-)
+    [
+        (0.1, 0.3, 3), (0.1, 1.0, 10), (0.3, 1.0, 4), (0.01, 20, 2000), (0.1, 0, 0), (-0.1, 1, 10),
+        (0.01, 0.07, 7),  # 7.000000000000001 of them
+    ],
+)  # fmt: skip
 def test_a_duration_is_covered_by_whole_steps(
     cartpole: ModuleType, h: float, duration: float, steps: int
 ) -> None:
@@ -440,19 +443,26 @@ def test_the_signal_is_followed_through_the_step(driven: ModuleType) -> None:
     assert np.max(np.abs(held - exact)) > 100 * errors[1]
 
 
-def test_a_function_sees_time_and_state_and_may_keep_them(driven: ModuleType) -> None:
-    seen = []
+@pytest.mark.parametrize("every", [1, 7])
+def test_a_function_sees_time_and_state_and_may_keep_them(driven: ModuleType, every: int) -> None:
+    """Those of each step, whichever rows are kept."""
+    seen: list[tuple[float, np.ndarray, np.ndarray]] = []
+    given: list[float] = []
 
     def law(t: float, q: np.ndarray, qd: np.ndarray) -> float:
         seen.append((t, q, qd))
-        return float(-10 * q[0] - qd[0])
+        given.append(float(-10 * q[0] - qd[0]))
+        return given[-1]
 
+    how = {"h": 0.01, "steps": 20, "t0": 2.0}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        run = driven.simulate([0.1, 3.0], h=0.01, steps=20, t0=2.0, u=law)
+        called = driven.simulate([0.1, 3.0], u=law, every=every, **how)
+    run = driven.simulate([0.1, 3.0], u=given, **how)
     assert [at for at, _, _ in seen] == run.t[:-1].tolist()
     assert np.array_equal([q for _, q, _ in seen], run.q[:-1])
     assert np.array_equal([qd for _, _, qd in seen], run.qd[:-1])
+    assert np.array_equal(called.x[-1], run.x[-1])
 
 
 def test_a_function_is_said_to_be_slow_once(tmp_path: Path) -> None:
@@ -545,6 +555,7 @@ BAD_VALUES = [
     ("acceleration", ([MASKED.data] * 2, np.ma.array([QD] * 2, mask=True)), {}, r"qd: 4 of 4 num"),
     ("step", (Q, QD), {"u": np.ma.array([1.0], mask=True)}, r"u: 1 of 1 numbers are masked"),
     ("D", ([Q, Q],), {"t": MASKED}, r"t: 1 of 2 numbers are masked"),
+    ("D", ([Q, Q],), {"t": [0.0]}, r"t: shape \(1,\), expected one number or \(2,\)"),
     (
         "D",
         (Q,),
@@ -580,6 +591,7 @@ BAD_RUNS = [
     ({"h": 0}, r"h: 0 is not a step size"),
     ({"h": math.inf}, r"h: inf"),
     ({"h": "a"}, r"h: "),
+    ({"h": "0.1"}, r"h: '0.1' is not a number"),
     ({"duration": -1}, r"duration: -1 is not a time"),
     ({"duration": NAN}, r"duration: nan"),
     ({"duration": "long"}, r"duration: "),

@@ -18,7 +18,7 @@ from sympy import S
 from test_embedding import STRICT, compiled
 
 import eomc
-from cases import SCENES
+from cases import SCENES, scene_system
 from eomc import compile as compiler
 from eomc import mechanics, pieces, program, scene, system
 from eomc.assignments import (
@@ -294,6 +294,21 @@ def test_a_bad_instance_leaves_the_others_alone_in_pieces_too(
     assert runs.status[41] == "not finite" and runs.steps[41] == 0
     others = np.arange(70) != 41
     assert np.array_equal(runs.q[others], good.q[others])
+
+
+def test_signals_and_held_inputs_reach_a_batch_in_pieces(
+    in_small_pieces: None, tmp_path: Path
+) -> None:
+    made = scene_system("cartpole_driven")
+    m = module(derived(replace(made, run=replace(made.run, batch=True))), tmp_path)
+    assert "_solve_lane_2(" in (tmp_path / made.name / f"{made.name}.c").read_text(encoding="utf-8")
+    q0, qd0 = (np.tile(x, (9, 1)) for x in m.start)
+    q0[:, 1] += np.linspace(-1, 1, 9)
+    for u in (None, [0.5]):
+        runs = m.simulate_batch(q0, qd0, steps=STEPS, u=u)
+        alone = m.simulate(q0[7], qd0[7], steps=STEPS, u=u)
+        # the same operations, contracted to FMA in other places
+        np.testing.assert_allclose(runs.q[7], alone.q, rtol=0, atol=1e-12)
 
 
 # --- matrices by columns -------------------------------------------------------------------------

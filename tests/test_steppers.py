@@ -13,9 +13,10 @@ import pytest
 
 import eomc
 from cases import cases, scene_text
-from eomc import steppers
+from eomc import methods, steppers
+from eomc.ccode import DOUBLE, FLOAT, Real
 from eomc.check import check
-from eomc.steppers import DP8, RK4, Method
+from eomc.steppers import DP8, METHODS, RK4, Method
 
 SCENES = Path(__file__).parent.parent / "scenes"
 MODULES = Path("build/tests/modules")
@@ -40,6 +41,20 @@ def test_order_conditions(method: Method) -> None:
     assert abs(dot(method.b, powers[-1]) - Fraction(1, method.order)) < exact
     next_one = tuple(c**method.order for c in method.c)
     assert abs(dot(method.b, next_one) - Fraction(1, method.order + 1)) > exact
+
+
+@pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda real: real.name)
+@pytest.mark.parametrize("method", METHODS.values(), ids=lambda m: m.name)
+def test_weights_as_they_are_in_c_add_up_to_one(method: Method, real: Real) -> None:
+    """Each a number of C's type, off by no more than all of them are if rounded one by one."""
+    found = methods._rounded(method.b, real)
+    kind = np.dtype(real.dtype).type
+    assert [Fraction(float(kind(float(x)))) for x in found] == list(found)
+    assert sum(found) == 1
+    assert [x == 0 for x in found] == [x == 0 for x in method.b]
+    assert (found == found[::-1]) == (method.b == method.b[::-1])
+    most = Fraction(real.epsilon) / 2 * sum(map(abs, method.b))
+    assert all(abs(x - y) <= most for x, y in zip(found, method.b, strict=True))
 
 
 def case_module(name: str) -> tuple[ModuleType, dict]:

@@ -281,6 +281,13 @@ def test_a_chain_is_eliminated_from_both_ends() -> None:
     assert order[-1] == 4
 
 
+@pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
+def test_the_order_names_the_last_coordinate_of_each_angle(relative: bool) -> None:
+    """That of the link itself, whatever it is measured from."""
+    order = tensions.solution(made_of(links(CHAIN, relative=relative))).order
+    assert sorted(order) == [0, 1, 2, 3, 4]
+
+
 def test_every_other_link_goes_first_where_one_trajectory_is_all() -> None:
     """Their pivots hang on parameters alone; the others then from both ends."""
     order = tensions.solution(made_of(links([k - 1 for k in range(9)]))).order
@@ -315,6 +322,20 @@ def test_masses_of_any_size(size: float) -> None:
     (expected, _), (found, regular) = evaluate(ours, state), evaluate(ours, scaled)
     assert regular
     np.testing.assert_allclose(found, expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("n", [9, 20])
+def test_products_of_pivots_lose_nothing(n: int) -> None:
+    """In 40 digits; 20 links leave five products on one side of the last pivot, four on the other,
+    more than there may be in one."""
+    chain = links([k - 1 for k in range(n)], equal=False)
+    made = made_of(chain)
+    prompt, plain = by_tensions(made), by_tensions(made_of(chain + BATCH))
+    assert prompt != plain
+    for state in states(made, 2):
+        (found, _), (expected, _) = (evaluate(f, state, exact=True) for f in (prompt, plain))
+        size = np.max(np.abs(expected))
+        np.testing.assert_allclose(found, expected, rtol=4 * EPS, atol=4 * EPS * size)
 
 
 def test_a_float_has_no_room_for_products_of_pivots() -> None:
@@ -356,6 +377,22 @@ def test_what_is_of_another_kind_is_passed_over_with_the_reason(why: str) -> Non
     built = program.build(mechanics.derive(UNSUITED[why]))
     assert "tensions" not in dict(built["acceleration"].routes)
     assert why in built.passed_over["tensions"]
+
+
+def test_a_negative_mass_is_told() -> None:
+    """Where it is a number nothing is left of it to look at in a tape; D is indefinite."""
+    made = System.make(
+        "negative",
+        [a, b],
+        sum(dot(e) ** 2 for e in FIRST) - 2 * sum(dot(e) ** 2 for e in hung(FIRST, R, b)),
+        0,
+        parameters=PARAMETERS,
+    )
+    with pytest.raises(tensions.UnsuitedError, match="no sum of masses"):
+        tensions.solution(made)
+    acceleration = program.build(mechanics.derive(made))["acceleration"]
+    for state in states(made):
+        assert not evaluate(acceleration, state)[1]
 
 
 def test_angles_that_do_not_determine_the_coordinates() -> None:
