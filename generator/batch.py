@@ -21,7 +21,6 @@ from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number,
 _GROUP = 128  # instances in a tile, or a multiple of those in one
 _TILES = 64  # at most in a group: threads ask for the next one seldom
 _SHARES = 8  # groups of a thread, so that all end together
-_SHORT = 8  # numbers; NumPy's loops along so short rows take longer than all else
 _WORTH = 20_000  # steps in all from which threads pay
 _NAMES = np.array([*STATUS, "interrupted"])
 _SLOWEST = 1.5e-6  # seconds a step of an instance and coordinate: assumed until one was timed
@@ -113,7 +112,7 @@ class BatchModel(Model):
         whole = work.run(threads, progress)
         if steps % every:
             q_rows[:, -1], qd_rows[:, -1] = q, qd
-        if not whole or work.status.any():
+        if not whole or work.failed:
             short = work.done < steps
             for k in short.nonzero()[0]:
                 # the last good state stands where the next row would have
@@ -175,7 +174,7 @@ class BatchModel(Model):
     ) -> tuple[tuple[Array, Array], Array, Array | None, int]:
         """((q, qd), parameters, inputs, batch), one row an instance; a single one serves for all.
 
-        q and qd may be what was given: they are to be read only.
+        q and qd may be what was given: they are to be read only, and not known to be finite.
         """
         start = self.start
         q = self._rows_of(start[0] if q0 is None else q0, "q0")
@@ -200,18 +199,11 @@ class BatchModel(Model):
         return (q, qd), table, held, count
 
     def _rows_of(self, given: ArrayLike, name: str) -> Array:
-        """(nq,) or (n, nq), finite; an array that is that already need not be contiguous."""
-        if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2:
+        """(nq,) or (n, nq); an array that is that already need not be contiguous, nor finite."""
+        if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == self.nq:
             _unmasked(given, name)
-            if given.dtype != self.dtype:
-                wide, given = given, np.empty(given.shape, self.dtype)
-                with np.errstate(over="ignore"):
-                    _copy(wide, given)
-            if given.shape[1] == self.nq:
-                with np.errstate(all="ignore"):
-                    total = given.sum()  # tells soonest; it may overflow all the same
-                if np.isfinite(total) or np.isfinite(given).all():
-                    return given
+            if given.dtype in (self.dtype, np.float64) and given.flags.aligned:
+                return given
         return self._array(given, name, self.nq)
 
     def _parameter_rows(self, params: Any) -> Array:
@@ -272,13 +264,23 @@ class _Work:
         self.model, self.step, self.q, self.qd = model, step, q, qd
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
         self.held, self.table = held, table
-        self.q_rows, self.qd_rows, self.starts = q_rows, qd_rows, starts
-        count = len(q)
-        self.begun: set[int] = set()
-        self.done = np.zeros(count, np.dtype("l"))
-        self.status = np.zeros(count, np.dtype("i"))
-        self.stop = False
+        self.starts = starts
+        self.rows = 0 if q_rows is None else q_rows.shape[1]
+        self.done, self.status = np.zeros(len(q), "l"), np.zeros(len(q), "i")
+        address, (long, integer) = model._c[0], model._whole
+        self.ends = address(long, self.done), address(integer, self.status)
+        self.at = tuple(model._pointer(x) for x in (q, qd, q_rows, qd_rows))
+        self.failed = self.stop = False
         self.moved = 0
+
+    def _places(self, at: int) -> tuple[Any, ...]:
+        """The addresses of an instance's q, qd and rows of both."""
+        first = self.model.nq * at
+        q, qd, q_rows, qd_rows = self.at
+        if not self.rows:
+            return q + first, qd + first, q_rows, qd_rows
+        row = first * self.rows
+        return q + first, qd + first, q_rows + row, qd_rows + row
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
@@ -292,10 +294,8 @@ class _Work:
         tiles = -(-count // _GROUP)
         size = _GROUP * max(1, min(_TILES, tiles // (_SHARES * threads) if threads > 1 else tiles))
         groups = [(at, min(size, count - at)) for at in range(0, count, size)]
-        whole = self._all_of(groups, threads, progress)
-        for group in groups:
-            self._begin(*group)  # those that Ctrl-C came before
-        return whole
+        self._begin_all(threads if len(groups) > 1 else 1)
+        return self._all_of(groups, threads, progress)
 
     def _all_of(
         self,
@@ -330,29 +330,47 @@ class _Work:
             raise
         return True
 
-    def _begin(self, at: int, count: int) -> None:
-        """The starts of a group into what is moved, and into the first rows."""
-        if at in self.begun or self.starts is None:
+    def _begin_all(self, threads: int) -> None:
+        """The starts of all into what is moved, and into the first rows.
+
+        Raises ValueError where one is not finite, before any is moved.
+        """
+        if self.starts is None:
             return
-        part = slice(at, at + count)
-        for start, x, rows in zip(
-            self.starts, (self.q, self.qd), (self.q_rows, self.qd_rows), strict=True
-        ):
-            _copy(start[part], x[part])
-            if rows is not None:
-                _copy(start[part], rows[part, 0])
-        self.begun.add(at)
+        count = len(self.q)
+        share = -(-count // threads)
+        parts = [(at, min(share, count - at)) for at in range(0, count, share)]
+        if len(parts) == 1:
+            self._begin(*parts[0])
+        else:
+            for future in [_pool(threads).submit(self._begin, *part) for part in parts]:
+                future.result()
+
+    def _begin(self, at: int, count: int) -> None:
+        assert self.starts is not None
+        q, qd, q_rows, qd_rows = self._places(at)
+        names = ("q0", q, q_rows), ("qd0", qd, qd_rows)
+        for start, (name, x, rows) in zip(self.starts, names, strict=True):
+            (next_one, across), first = start.strides, start.__array_interface__["data"][0]
+            if not self.model._lib.batch_start(
+                count,
+                first + at * next_one,
+                start.dtype.itemsize == 8,
+                next_one,
+                across,
+                x,
+                rows,
+                self.rows,
+            ):
+                self.model._array(start, name, self.model.nq)  # raises, and shows them
 
     def _group(self, at: int, count: int, told: Callable[[], object] = lambda: None) -> None:
         """Instances at, ..., at + count - 1 through all steps, a piece of some time at once."""
-        self._begin(at, count)
         model = self.model
-        pointer = model._pointer
-        null = model._c[2]
+        pointer, null = model._pointer, model._c[2]
         end = at + count
-        q, qd = pointer(self.q[at:end]), pointer(self.qd[at:end])
-        address, (long, integer) = model._c[0], model._whole
-        done, status = address(long, self.done[at:end]), address(integer, self.status[at:end])
+        q, qd, q_rows, qd_rows = self._places(at)
+        done, status = (x + at for x in self.ends)
         each = len(self.table) > 1
         table = pointer(self.table[at:end] if each else self.table)
         u, u_instance, u_step = null, 0, 0
@@ -361,35 +379,22 @@ class _Work:
             u = pointer(self.held[at:end] if len(self.held) > 1 else self.held)
             u_instance = many * width if len(self.held) > 1 else 0
             u_step = width if many > 1 else 0
-        q_rows = qd_rows = null
-        rows = 0
-        if self.q_rows is not None and self.qd_rows is not None:
-            rows = self.q_rows.shape[1]
-            q_rows, qd_rows = pointer(self.q_rows[at:end]), pointer(self.qd_rows[at:end])
         first = 0
         while first < self.steps and not self.stop:
             pace = model._paces.get(self.step, _SLOWEST * model.nq)
             many = min(max(1, int(_SECONDS / (pace * count))), self.steps - first)
             begun = perf_counter()
-            self.step(
+            failed = self.step(
                 count, q, qd, self.t0, self.h, first, many, u + first * u_step if u_step else u,
-                u_instance, u_step, self.every, q_rows, qd_rows, rows, table,
+                u_instance, u_step, self.every, q_rows, qd_rows, self.rows, table,
                 1 if each else 0, done, status,
             )  # fmt: skip
             spent = perf_counter() - begun
+            self.failed |= failed
             first += many
             self.moved += many * count  # a figure for the bar; threads may lose one another's
             model._paces[self.step] = max(1e-10, spent / (many * count))
             told()
-
-
-def _copy(x: Array, into: Array) -> None:
-    """x (n, nq) into rows that may be apart: short ones column by column, which NumPy would not."""
-    if x.shape[1] > _SHORT:
-        into[...] = x
-        return
-    for j in range(x.shape[1]):
-        into[:, j] = x[:, j]
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}

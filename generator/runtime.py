@@ -338,7 +338,10 @@ class Model:
         if array.size <= _FEW and isfinite(sum(array.ravel().tolist())):
             return array
         if not np.isfinite(array).all():
-            raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
+            if array.size <= _FEW:
+                raise ValueError(f"{name}: {array} is not finite")
+            place = np.argwhere(~np.isfinite(array))[0].tolist()
+            raise ValueError(f"{name}{place} is {array[tuple(place)]}, not finite")
         return array
 
     def _state(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
