@@ -324,28 +324,19 @@ def _step_weight(parts: Parts) -> int:
 
 def _put_together(target: Target, cut: Sequence[dict[str, Any]], wide: int) -> None:
     """The accelerations that a piece makes, stored four at a time where all four are there."""
-    n, P = len(target.names), target.prefix
-    place = {f"a->x[{target.enum[name]}]": k for k, name in enumerate(target.names)}
     for piece in cut:
-        ready = {}
-        rest = []
-        for line in piece["ends"]:
-            to, _, text = line.partition(" = ")
-            if to in place:
-                ready[place[to]] = text.removesuffix(";")
-            else:
-                rest.append(line)
+        ready = dict(piece["results"])
         if piece is cut[-1]:
-            ready |= dict.fromkeys(range(n, wide), target.zero)
+            ready |= dict.fromkeys(range(len(target.names), wide), target.zero)
         lines = []
         for begin in range(0, wide, FOUR):
             block = [k for k in range(begin, begin + FOUR) if k in ready]
             if len(block) == FOUR:
                 four = ", ".join(ready[k] for k in block)
-                lines.append(f"{P}_put(a->x + {begin}, {four});")
+                lines.append(f"{target.prefix}_put(a->x + {begin}, {four});")
             else:
                 lines += [f"a->x[{k}] = {ready[k]};" for k in block]
-        piece["ends"] = lines + rest
+        piece["stores"] = lines
 
 
 def _angles(target: Target, parts: Parts, to: str, vector: str, offset: bool) -> dict[str, Any]:

@@ -277,6 +277,7 @@ class Target:
             ends = [f"return {none_of(failures)};"] if checks else []
             if end:
                 ends = [f"*trouble = {x} ? {one} : *trouble;" for x in failures]
+            found = dict(zip(part.outputs, body.results, strict=True))
             made.append(
                 {
                     "comment": _about(k, part, len(parts), what),
@@ -285,13 +286,9 @@ class Target:
                     "trouble": troubled,
                     "loads": loads(f),
                     "blocks": [*body.early, *body.blocks],
-                    "ends": [
-                        *(
-                            f"{results[place]} = {text};"
-                            for place, text in zip(part.outputs, body.results, strict=True)
-                        ),
-                        *ends,
-                    ],
+                    "results": found,
+                    "stores": [f"{results[place]} = {text};" for place, text in found.items()],
+                    "ends": ends,
                 }
             )
         checked = any(call.startswith("good") for call in calls)
