@@ -76,6 +76,8 @@ class BatchModel(Model):
     def __init__(self, extension: Any, **scene: Any) -> None:
         super().__init__(extension, **scene)
         self._whole = (self._ffi.typeof("long[]"), self._ffi.typeof("int[]"))  # done, status
+        # what takes a step of many, by the method
+        self._batch_steps = {x: self._stepper(x, "batch_step") for x in (None, *self.methods)}
         # seconds a step of an instance, by the function that makes it; they only cut work up
         self._paces: dict[Any, float] = {}
 
@@ -137,37 +139,49 @@ class BatchModel(Model):
         Returns the status of each, (batch,) integers: 0 where the step was made; elsewhere
         STATUS tells, and the state is as it was. u, params: as in `simulate_batch`.
         """
-        step = self._stepper(method, "batch")
+        if method not in self._batch_steps:
+            self._method(method)  # raises, with those there are
         if out is not None:
             into = self._pair(out, np.shape(q))
             into[0][...], into[1][...] = _unmasked(q, "q"), _unmasked(qd, "qd")
             q, qd = into
-        for name, x in (("q", q), ("qd", qd)):
-            self._out(x, (len(x), self.nq), name)
-        if len(q) != len(qd):
-            raise ValueError(f"qd: {len(qd)} instances where q has {len(q)}")
-        if len(q) and np.may_share_memory(q, qd):
+        self._movable(q, "q")
+        self._movable(qd, "qd")
+        count = len(q)
+        if count != len(qd):
+            raise ValueError(f"qd: {len(qd)} instances where q has {count}")
+        if count and not (q.base is qd.base is None and q is not qd) and np.may_share_memory(q, qd):
             raise ValueError("qd: lies in the memory of q, where q is to be written")
         h, t = self.h if h is None else _size(h), _number(t, "t")
-        table, held = self._parameter_rows(params), self._input_rows(u, 1)
+        held = None if u is None else self._input_rows(u, 1)
+        table = None if params is None else self._parameter_rows(params)
         for name, given in (("params", table), ("u", held)):
-            if given is not None and len(given) not in (1, len(q)):
-                raise ValueError(f"{name}: {len(given)} instances where q has {len(q)}")
-        count = len(q)
+            if given is not None and len(given) not in (1, count):
+                raise ValueError(f"{name}: {len(given)} instances where q has {count}")
         if count >= _WORTH or (threads is not None and threads < 1):
+            table, step = self._parameter_rows(params), self._stepper(method, "batch")
             work = _Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
             work.run(threads, None)
             return work.status
         # too few for threads, or for a look at Ctrl-C: straight into C
         address, real, null = self._c
-        done, status = np.zeros(count, "l"), np.zeros(count, "i")
-        step(
-            count, address(real, q), address(real, qd), t, h, 0, 1, self._pointer(held),
-            self.nu if held is not None and len(held) > 1 else 0, 0, 0, null, null, 0,
-            address(real, table), 1 if len(table) > 1 else 0, address(self._whole[0], done),
-            address(self._whole[1], status),
+        status = np.empty(count, "i")
+        self._batch_steps[method](
+            count, address(real, q), address(real, qd), t, h,
+            null if held is None else address(real, held),
+            self.nu if held is not None and len(held) > 1 else 0,
+            self._at[2] if table is None else address(real, table),
+            1 if table is not None and len(table) > 1 else 0, address(self._whole[1], status),
         )  # fmt: skip
         return status
+
+    def _movable(self, x: Array, name: str) -> None:
+        """A ValueError where C can't move these states in place."""
+        if type(x) is np.ndarray and x.dtype is self.dtype and x.shape[1:] == (self.nq,):
+            flags = x.flags
+            if flags.c_contiguous and flags.writeable:
+                return
+        self._out(x, (len(x), self.nq), name)
 
     def _instances(
         self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int
@@ -176,7 +190,7 @@ class BatchModel(Model):
 
         q and qd may be what was given: they are to be read only, and not known to be finite.
         """
-        start = self.start
+        start = self._start
         q = self._rows_of(start[0] if q0 is None else q0, "q0")
         qd = self._rows_of(start[1] if qd0 is None else qd0, "qd0")
         table = self._parameter_rows(params)
@@ -238,19 +252,20 @@ class BatchModel(Model):
             raise ValueError("u: this scene has no inputs")
         if callable(u):
             raise ValueError("u: a Python function can't be called for many at once: give a table")
-        array = np.ascontiguousarray(_unmasked(u, "u"), self.dtype)
-        if array.ndim < 2:
-            array = array.reshape(1, 1, -1)
-        elif array.ndim == 2:
-            array = array[:, None, :]
+        if type(u) is np.ndarray and u.dtype is self.dtype and u.flags.c_contiguous:
+            array = u
+        else:
+            array = np.ascontiguousarray(_unmasked(u, "u"), self.dtype)
+        if array.ndim < 3:
+            array = array[:, None] if array.ndim == 2 else array.reshape(1, 1, -1)
         if array.ndim != 3 or array.shape[2] != self.nu or array.shape[1] not in (1, steps):
             raise ValueError(
                 f"u: shape {np.shape(u)}, expected ({self.nu},), (batch, {self.nu}) or "
                 f"(batch, {steps}, {self.nu})"
             )
-        if not np.isfinite(array).all():
+        if not self._lib.all_finite(array.size, self._pointer(array)):
             raise ValueError("u: not all numbers are finite")
-        return np.ascontiguousarray(array)
+        return array
 
 
 class _Work:
