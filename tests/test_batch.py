@@ -402,14 +402,16 @@ def test_step_batch_in_place_and_into_out() -> None:
         m.step_batch(q, q, h=0.01)
 
 
-def test_a_step_of_many_is_the_first_of_their_run() -> None:
-    """Parameters and inputs of each instance's own, and shared ones."""
+@pytest.mark.parametrize("count", [5, 2500])
+def test_a_step_of_many_is_the_first_of_their_run(count: int) -> None:
+    """Parameters and inputs of each instance's own, and shared ones; C takes 1,024 at once."""
     m = module("cartpole_driven")
-    q0, qd0 = starts(m, 5)
-    masses, forces = np.linspace(1.0, 3.0, 5), np.linspace(-1.0, 1.0, 5)[:, None]
-    for how in ({"params": {"m_c": masses}}, {"u": forces}, {"u": 0.5, "params": {"l": 1.5}}):
+    q0, qd0 = starts(m, count)
+    masses, forces = np.linspace(1.0, 3.0, count), np.linspace(-1.0, 1.0, count)[:, None]
+    for how in ({}, {"params": {"m_c": masses}}, {"u": forces}, {"u": 0.5, "params": {"l": 1.5}}):
         q, qd = q0.copy(), qd0.copy()
-        assert not m.step_batch(q, qd, **how).any()
+        status = m.step_batch(q, qd, **how)
+        assert status.shape == (count,) and not status.any()
         runs = m.simulate_batch(q0, qd0, steps=1, **how)
         assert np.array_equal(q, runs.q[:, 1])
         assert np.array_equal(qd, runs.qd[:, 1])
