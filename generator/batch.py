@@ -97,6 +97,8 @@ class BatchModel(Model):
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
         """
         step = self._stepper(method, "batch")
+        if progress is not None and not callable(progress):
+            raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
         h, t0 = self.h if h is None else _size(h), _number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = _count(every, "every", 1)
@@ -137,7 +139,8 @@ class BatchModel(Model):
         """One step of many instances, q and qd (batch, nq) in place, or from them into `out`.
 
         Returns the status of each, (batch,) integers: 0 where the step was made; elsewhere
-        STATUS tells, and the state is as it was. u, params: as in `simulate_batch`.
+        STATUS[number] says why it was not, and the state is as it was. u, params: as in
+        `simulate_batch`.
         """
         if method not in self._batch_steps:
             self._method(method)  # raises, with those there are
@@ -158,7 +161,9 @@ class BatchModel(Model):
         for name, given in (("params", table), ("u", held)):
             if given is not None and len(given) not in (1, count):
                 raise ValueError(f"{name}: {len(given)} instances where q has {count}")
-        if count >= _WORTH or (threads is not None and threads < 1):
+        if threads is not None:
+            _count(threads, "threads", 1)
+        if count >= _WORTH:
             table, step = self._parameter_rows(params), self._stepper(method, "batch")
             work = _Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
             work.run(threads, None)
@@ -177,11 +182,19 @@ class BatchModel(Model):
 
     def _movable(self, x: Array, name: str) -> None:
         """A ValueError where C can't move these states in place."""
-        if type(x) is np.ndarray and x.dtype is self.dtype and x.shape[1:] == (self.nq,):
-            flags = x.flags
-            if flags.c_contiguous and flags.writeable:
+        told = f"a {type(x).__name__}"
+        if isinstance(_unmasked(x, name), np.ndarray):
+            right, flags = x.dtype == self.dtype and x.shape[1:] == (self.nq,), x.flags
+            if right and flags.c_contiguous and flags.writeable:
                 return
-        self._out(x, (len(x), self.nq), name)
+            order = "" if flags.c_contiguous else ", not C-contiguous"
+            order += "" if flags.writeable else ", read-only"
+            told = f"an array of {x.dtype}, shape {x.shape}{order}"
+        raise ValueError(
+            f"{name}: {told}; moved in place, it has to be a writeable, C-contiguous array of "
+            f"{self.dtype}, shape (n, {self.nq}): make it one with numpy.ascontiguousarray, or "
+            "give out=, a pair of such arrays for the result"
+        )
 
     def _instances(
         self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int
@@ -201,12 +214,13 @@ class BatchModel(Model):
             "params": len(table),
             "u": 1 if held is None else len(held),
         }
-        count = max(sizes.values())
         if empty := [name for name, size in sizes.items() if not size]:
             raise ValueError(f"{empty[0]}: no instances")
+        whose, count = next((x for x in sizes.items() if x[1] > 1), ("q0", 1))
         for name, size in sizes.items():
             if size not in (1, count):
-                raise ValueError(f"{name}: {size} instances where others have {count}")
+                hint = ": a table over time for all is (1, steps, nu)" if name == "u" else ""
+                raise ValueError(f"{name}: {size} instances where {whose} has {count}{hint}")
 
         whole = (count, self.nq)  # broadcast_to takes a while even where nothing is to be done
         q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
@@ -224,7 +238,7 @@ class BatchModel(Model):
         if params is None or isinstance(params, Params):
             return self._parameters(params)[None]
         if not isinstance(params, Mapping):
-            array = np.ascontiguousarray(_unmasked(params, "params"), self.dtype)
+            array = self._numbers(params, "params")
             if array.ndim == 2 and array.shape[1] == len(self.parameters):
                 if not np.isfinite(array).all():
                     raise ValueError("params: not all numbers are finite")
@@ -234,10 +248,10 @@ class BatchModel(Model):
         count = max(sizes.values(), default=1)
         table = np.tile(self._p0, (count, 1))
         for name, value in params.items():
-            column = np.asarray(_unmasked(value, f"params: {name}"), self.dtype)
             if name not in self.parameters:
                 self._parameters({name: 0.0})  # raises, with the names there are
-            if column.ndim > 1 or (column.ndim and len(column) != count):
+            column = self._numbers(value, f"params: {name}")
+            if np.ndim(value) > 1 or (np.ndim(value) and len(column) != count):
                 raise ValueError(f"params: {name} has shape {column.shape}, expected ({count},)")
             if not np.isfinite(column).all():
                 raise ValueError(f"params: {name} is not finite everywhere")
@@ -255,7 +269,7 @@ class BatchModel(Model):
         if type(u) is np.ndarray and u.dtype is self.dtype and u.flags.c_contiguous:
             array = u
         else:
-            array = np.ascontiguousarray(_unmasked(u, "u"), self.dtype)
+            array = self._numbers(u, "u")
         if array.ndim < 3:
             array = array[:, None] if array.ndim == 2 else array.reshape(1, 1, -1)
         if array.ndim != 3 or array.shape[2] != self.nu or array.shape[1] not in (1, steps):
@@ -300,8 +314,7 @@ class _Work:
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
         count = len(self.q)
-        if threads is not None and threads < 1:
-            raise ValueError(f"threads: {threads} is not a positive number")
+        threads = None if threads is None else _count(threads, "threads", 1)
         if count * self.steps < _WORTH:
             threads = 1
         elif threads is None:

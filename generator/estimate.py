@@ -86,7 +86,7 @@ def estimate(run: Run, progress: Callable[[int, int], None] | None = None) -> Es
 
     names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
     with np.errstate(divide="ignore"):
-        digits = np.clip(-np.log10(error[-1] / scale), 0.0, -math.log10(eps))
+        digits = np.clip(-np.log10(error[-1] / scale), 0.0, -math.log10(eps)) + 0.0  # no -0
     words = _verdict(
         run, names, error / scale, walk / scale, observed, order, amplification, stopped
     )
@@ -203,10 +203,12 @@ def _counts(run: Run, every: int, rows: int) -> Array:
 
 
 def _scale(x: Array) -> Array:
-    """The largest value of each column; those that only rounding moves count as a millionth."""
+    """The largest value of each column; those that only rounding moves count as a millionth of the
+    largest position, or velocity, or of the state where all of these are 0."""
     largest = np.max(np.abs(x), axis=0)
-    whole = float(np.max(largest))
-    scale: Array = np.maximum(largest, 1e-6 * whole if whole else 1.0)
+    halves = np.repeat(np.max(largest.reshape(2, -1), axis=1), len(largest) // 2)
+    whole = np.where(halves > 0, halves, np.max(largest))
+    scale: Array = np.maximum(largest, np.where(whole > 0, 1e-6 * whole, 1.0))
     return scale
 
 

@@ -62,13 +62,20 @@ _Methods = Annotated[
 ]
 
 
+def _linearized(value: object) -> bool | str:
+    """Whether derivatives are wanted, those along the parameters too."""
+    if isinstance(value, bool) or value == "parameters":
+        return value
+    raise ValueError(f'must be true, false or "parameters", here {_toml(value)}')
+
+
 class _Run(_Table):
     h: _Positive = 0.001
     duration: _Positive = 10.0
     method: _Methods = ("rk4",)
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
-    linearize: pydantic.StrictBool | Literal["parameters"] = False
+    linearize: Annotated[bool | str, pydantic.PlainValidator(_linearized)] = False
 
 
 def _spelled_out(value: object) -> object:

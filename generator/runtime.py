@@ -338,10 +338,10 @@ class Model:
         if array.size <= _FEW and isfinite(sum(array.ravel().tolist())):
             return array
         if not np.isfinite(array).all():
-            if array.size <= _FEW:
-                raise ValueError(f"{name}: {array} is not finite")
+            if array.ndim == 1:
+                raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
             place = np.argwhere(~np.isfinite(array))[0].tolist()
-            raise ValueError(f"{name}{place} is {array[tuple(place)]}, not finite")
+            raise ValueError(f"{name}{place}: {array[tuple(place)]} in {self.dtype} is not finite")
         return array
 
     def _state(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
@@ -919,7 +919,7 @@ def _count(value: Any, name: str, least: int) -> int:
         return value
     number = _number(value, name)
     if number != int(number) or number < least:
-        raise ValueError(f"{name}: {value!r} is not a whole number of steps, {least} or more")
+        raise ValueError(f"{name}: {value!r} is not a whole number, {least} or more")
     return int(number)
 
 

@@ -261,7 +261,7 @@ def test_starts_that_are_not_finite_are_refused_before_any_moves(real: str, thre
         given[name][row, column] = number
         for order in ("C", "F"):
             given[name] = np.array(given[name], order=order)  # type: ignore[call-overload]
-            with pytest.raises(ValueError, match=rf"^{name}\[{row}, {column}\] is .*, not finite"):
+            with pytest.raises(ValueError, match=rf"^{name}\[{row}, {column}\]: .* is not finite"):
                 m.simulate_batch(
                     **given,
                     steps=STEPS,
@@ -447,6 +447,21 @@ def test_tables_that_do_not_fit_are_refused_by_name() -> None:
         "u: 4 instances where q has 5": lambda: m.step_batch(q0, qd0, u=np.zeros((4, 1))),
         "params: not all numbers are": lambda: m.step_batch(q0, qd0, params=wrong),
         "u: not all numbers are finite": lambda: m.step_batch(q0, qd0, u=[nan]),
+        "u: 'push' is not an array of": lambda: m.step_batch(q0, qd0, u="push"),
+        "u: {'force': 1} is not an array": lambda: m.step_batch(q0, qd0, u={"force": 1}),
+        "u: 20 instances where q0 has 5: a table over time": lambda: m.simulate_batch(
+            q0, qd0, steps=20, u=np.zeros((20, 1))
+        ),
+        "q: an array of float32, shape (5, 2); moved in place": lambda: m.step_batch(
+            q0.astype(np.float32), qd0
+        ),
+        "qd: an array of float64, shape (5, 2), not C-contiguous; moved": lambda: m.step_batch(
+            q0, np.asfortranarray(qd0)
+        ),
+        "q: an array of float64, shape (2,); moved in place, it has": lambda: m.step_batch(
+            q0[0], qd0[0]
+        ),
+        "q: a list; moved in place": lambda: m.step_batch(q0.tolist(), qd0),
         "u: shape (5, 3, 1), expected": lambda: m.simulate_batch(
             q0, qd0, steps=4, u=np.zeros((5, 3, 1))
         ),
@@ -518,8 +533,13 @@ def test_progress_reaches_the_end() -> None:
         ({"q0": np.zeros((2, 3))}, "q0"),
         ({"q0": np.zeros((3, 2)), "params": {"m_c": [1.0, 2.0]}}, "params: 2 instances"),
         ({"q0": np.zeros((0, 2)), "qd0": np.zeros((0, 2))}, "q0: no instances"),
+        ({"q0": np.zeros((3, 2)), "qd0": np.zeros((4, 2))}, "qd0: 4 instances where q0 has 3"),
+        ({"params": {"m_c": "1"}}, "params: m_c: '1' is not an array of numbers"),
+        ({"params": [{"m_c": 1}] * 2}, "params: [{'m_c': 1}, {'m_c': 1}] is not an array"),
         ({"every": 0}, "every"),
-        ({"threads": 0}, "threads"),
+        ({"threads": 0}, "threads: 0 is not a whole number, 1 or more"),
+        ({"threads": 1.5}, "threads: 1.5 is not"),
+        ({"progress": 3}, "progress: 3 is not a function"),
         ({"method": "euler"}, "method"),
     ],
 )

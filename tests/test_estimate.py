@@ -14,6 +14,7 @@ from conftest import ROOT, Modules
 
 import eomc
 from cases import SCENES, case_system, cases, error_of
+from eomc import estimate
 
 SPRING = """
 eomc = 1
@@ -285,3 +286,19 @@ def test_linearize_is_the_slope_of_the_acceleration(modules: Modules) -> None:
     np.testing.assert_allclose(np.hstack([A, B]), np.transpose(slopes), rtol=1e-7, atol=1e-7)
     with pytest.raises(ValueError, match="expected"):
         module.linearize(q[None], qd[None], u)
+
+
+@pytest.mark.parametrize(
+    ("ends", "scale"),
+    [
+        ([2.0, 0.0, -1e76, 3.0], [2.0, 2e-6, 1e76, 1e70]),
+        ([0.0, 0.0, 4.0, 0.0], [4e-6, 4e-6, 4.0, 4e-6]),
+        ([0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]),
+    ],
+)
+def test_velocities_that_run_away_are_no_scale_of_positions(
+    ends: list[float], scale: list[float]
+) -> None:
+    """Where positions are 1e40 times smaller their errors would look like nothing."""
+    found = estimate._scale(np.array([[0.0, 0.0, 0.0, 0.0], ends]))
+    np.testing.assert_allclose(found, scale, rtol=1e-15)

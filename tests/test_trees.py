@@ -273,6 +273,16 @@ def test_a_joint_that_nothing_resists_is_refused_by_name() -> None:
         program.inertia(built(made))
 
 
+def test_a_coordinate_that_no_joint_has_is_refused_at_its_line() -> None:
+    bodies = [{"name": "b0", "joint": "revolute", "coordinates": "turn", "mass": 1.0, "inertia": 1}]
+    text = trees.text(bodies, [0, "-g"], trees.PARAMETERS)
+    text = text.replace("[coordinates]\n", "[coordinates]\nidle = {}\n")
+    with pytest.raises(EomcError, match=r"coordinates\.idle: .*name it in a body's joint") as fault:
+        program.inertia(built(made_of(text)))
+    line = text.splitlines().index("idle = {}") + 1
+    assert f":{line}:1: error" in str(fault.value)
+
+
 # --- chains, by their closed form -----------------------------------------------------------------
 
 
