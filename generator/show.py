@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sympy
 from sympy import Expr
+from sympy.printing.str import StrPrinter
 
 from eomc import ccode, mechanics, program, reference
 from eomc.problems import EomcError
@@ -114,6 +115,15 @@ def _latex(system: System, values: dict[str, Expr]) -> str:
     return "\n".join([r"\begin{align*}", *lines, r"\end{align*}"])
 
 
+class _Exact(StrPrinter):  # type: ignore[misc]
+    """Fractions that stand alone as Rational(1, 10): for Python 1/10 is 0.1."""
+
+    def _print_Rational(self, value: sympy.Rational) -> str:
+        return str(value) if value.is_Integer else f"Rational({value.p}, {value.q})"
+
+    _print_Half = _print_Rational
+
+
 def _python(system: System, values: dict[str, Expr]) -> str:
     symbols = [*system.q, *system.qd, *system.u, *(p.symbol for p in system.parameters), t]
     names = ", ".join(s.name for s in symbols)
@@ -125,7 +135,9 @@ def _python(system: System, values: dict[str, Expr]) -> str:
         f'{names} = symbols("{names}", real=True)',
     ]
     for name, value in values.items():
-        text = f"Matrix({value.tolist()})" if isinstance(value, sympy.MatrixBase) else str(value)
+        is_matrix = isinstance(value, sympy.MatrixBase)
+        text = _Exact().doprint(value.tolist() if is_matrix else value)
+        text = f"Matrix({text})" if is_matrix else text
         lines.append(f"{name + '_' if name in {s.name for s in symbols} else name} = {text}")
     return "\n".join(lines)
 

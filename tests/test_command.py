@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy
 from click.testing import CliRunner, Result
 
 from eomc.cli import main
@@ -104,6 +105,18 @@ def test_show(here: Path) -> None:
     exec(eomc("show", "cartpole.toml", "--python").output, space)  # it is Python
     assert str(space["D"]).count("m_p") >= 3
     assert "1 division, 1 sincos" in eomc("show", "cartpole.toml", "--cost").output
+
+
+def test_fractions_stay_exact_in_python(here: Path) -> None:
+    """What would be divided by Python itself: a number of a sum, an exponent."""
+    text = (here / "cartpole.toml").read_text(encoding="utf-8")
+    text = text.replace('kinetic   = "', 'kinetic   = "x_dot**2/20 + ')
+    text = text.replace('potential = "', 'potential = "m_p*(1 + x**2)**(3/10) + ')
+    (here / "odd.toml").write_text(text, encoding="utf-8")
+    space: dict[str, Any] = {}
+    exec(eomc("show", "odd.toml", "--python").output, space)
+    assert not any(x.has(sympy.Float) for x in (space["D"], space["g_"], space["potential"]))
+    assert space["D"][0].subs({space["m_c"]: 0, space["m_p"]: 0}) == sympy.Rational(1, 10)
 
 
 SLANTED = """
