@@ -72,6 +72,12 @@ class Point:
     evaluations: int
 
 
+EXPLAINED = """\
+Usable h: the largest measured with an error below 1 all along. Stable to: by the eigenvalues of
+the linearised motion; steps up to it let no difference grow, though their errors may add up to
+more than the motion. Rounding from: the h below which finer steps don't help."""
+
+
 @dataclass(frozen=True)
 class Line:
     """One stepper: its runs from coarse to fine, and what follows from them.
@@ -213,7 +219,7 @@ class Report:
 
         title = f"{self.scene}: up to t = {self.duration:g} s, against {self.digits:.0f} digits"
         table = Table(box=SIMPLE_HEAD, title=title, title_justify="left")
-        for head in ("stepper", "order", "observed", "usable h", "advised", "smallest error",
+        for head in ("stepper", "order", "observed", "usable h", "stable to", "smallest error",
                      "at h", "computing", "rounding from"):  # fmt: skip
             table.add_column(head, justify="left" if head == "stepper" else "right")
         for row in self.rows():
@@ -221,7 +227,7 @@ class Report:
         text = io.StringIO()
         Console(file=text, width=110).print(table)
         lines = [line.rstrip() for line in text.getvalue().splitlines()]
-        told = [*self.recommendations(), "", *self.remarks()]
+        told = [EXPLAINED, "", *self.recommendations(), "", *self.remarks()]
         return "\n".join([*lines, *told]).strip("\n")
 
     def rows(self) -> list[tuple[str, ...]]:
@@ -594,6 +600,7 @@ def page(report: Report) -> str:
         .render(
             report=report,
             rows=report.rows(),
+            explained=EXPLAINED,
             runs=runs,
             work=_svg(lambda axes: _work(axes, report), (8.6, 5.0)),
             energy=_svg(lambda axes: _energy(axes, report, shown), (8.6, 3.6)),

@@ -426,6 +426,7 @@ def test_a_step_of_very_many_is_that_of_few() -> None:
     q, qd = q0.copy(), qd0.copy()
     status = m.step_batch(q, qd, t=0.5, params={"m_c": masses})
     assert status.nonzero()[0].tolist() == [12_345]
+    assert m.STATUS[status[12_345]] == "singular" and m.STATUS[0] == "ok"
     assert np.array_equal(q[12_345], q0[12_345]) and np.array_equal(qd[12_345], qd0[12_345])
     few = slice(12_300, 12_400)
     some, moving = q0[few].copy(), qd0[few].copy()
