@@ -379,18 +379,10 @@ class _Work:
         q, qd, q_rows, qd_rows = self._places(at)
         names = ("q0", q, q_rows), ("qd0", qd, qd_rows)
         for start, (name, x, rows) in zip(self.starts, names, strict=True):
-            (next_one, across), first = start.strides, start.__array_interface__["data"][0]
-            if not self.model._lib.batch_start(
-                count,
-                first + at * next_one,
-                start.dtype.itemsize == 8,
-                next_one,
-                across,
-                x,
-                rows,
-                self.rows,
-            ):
-                self.model._array(start, name, self.model.nq)  # raises, and shows them
+            (far, across), wide = start.strides, start.dtype.itemsize == 8
+            first = start.__array_interface__["data"][0] + at * far
+            if not self.model._lib.batch_start(count, first, wide, far, across, x, rows, self.rows):
+                self.model._array(start, name, self.model.nq)  # raises, and says where
 
     def _group(self, at: int, count: int, told: Callable[[], object] = lambda: None) -> None:
         """Instances at, ..., at + count - 1 through all steps, a piece of some time at once."""
