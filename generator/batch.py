@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number, _size, _unmasked
 
-_GROUP = 128  # instances in a tile, or a multiple of those in one
+_GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
 _TILES = 64  # at most in a group: threads ask for the next one seldom
 _SHARES = 8  # groups of a thread, so that all end together
 _WORTH = 20_000  # steps in all from which threads pay
@@ -153,7 +153,8 @@ class BatchModel(Model):
         count = len(q)
         if count != len(qd):
             raise ValueError(f"qd: {len(qd)} instances where q has {count}")
-        if count and not (q.base is qd.base is None and q is not qd) and np.may_share_memory(q, qd):
+        views = q.base is not None or qd.base is not None
+        if count and (q is qd or (views and np.may_share_memory(q, qd))):
             raise ValueError("qd: lies in the memory of q, where q is to be written")
         h, t = self.h if h is None else _size(h), _number(t, "t")
         held = None if u is None else self._input_rows(u, 1)
@@ -290,12 +291,12 @@ class _Work:
         steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None,
         qd_rows: Array | None, starts: tuple[Array, Array] | None = None,
     ) -> None:  # fmt: skip
-        self.model, self.step, self.q, self.qd = model, step, q, qd
+        self.model, self.step, self.count = model, step, len(q)
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
         self.held, self.table = held, table
         self.starts = starts
         self.rows = 0 if q_rows is None else q_rows.shape[1]
-        self.done, self.status = np.zeros(len(q), "l"), np.zeros(len(q), "i")
+        self.done, self.status = np.zeros(self.count, "l"), np.zeros(self.count, "i")
         address, (long, integer) = model._c[0], model._whole
         self.ends = address(long, self.done), address(integer, self.status)
         self.at = tuple(model._pointer(x) for x in (q, qd, q_rows, qd_rows))
@@ -313,7 +314,7 @@ class _Work:
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
-        count = len(self.q)
+        count = self.count
         threads = None if threads is None else _count(threads, "threads", 1)
         if count * self.steps < _WORTH:
             threads = 1
@@ -331,7 +332,7 @@ class _Work:
         threads: int,
         progress: Callable[[int, int], None] | None,
     ) -> bool:
-        total = len(self.q) * self.steps
+        total = self.count * self.steps
         if threads == 1 or len(groups) == 1:
             try:
                 for group in groups:
@@ -365,9 +366,8 @@ class _Work:
         """
         if self.starts is None:
             return
-        count = len(self.q)
-        share = -(-count // threads)
-        parts = [(at, min(share, count - at)) for at in range(0, count, share)]
+        share = -(-self.count // threads)
+        parts = [(at, min(share, self.count - at)) for at in range(0, self.count, share)]
         if len(parts) == 1:
             self._begin(*parts[0])
         else:

@@ -375,14 +375,18 @@ def _no_inertia(system: System, name: str) -> NoReturn:
             f"coordinate '{name}' has no inertia: nothing that the joint moves resists it, such as "
             "a point mass on its axis; give the body inertia about it, or fix the joint"
         )
-    else:
-        key = f"coordinates.{name}" if links else "energy.kinetic"
-        energy = "neither a body nor the" if links else "the"
-        does = "depends" if links else "does not depend"
+    elif links:
+        key = f"coordinates.{name}"
         message = (
-            f"coordinate '{name}' has no inertia: {energy} kinetic energy {does} on {name}_dot, so "
-            "nothing can be solved for its acceleration; give it a mass, "
-            + ("name it in a body's joint, or take it out" if links else "or make it an input")
+            f"coordinate '{name}' has no inertia: neither a joint nor the kinetic energy has it; "
+            "name it in a body's joint, or take it out"
+        )
+    else:
+        key = "energy.kinetic"
+        message = (
+            f"coordinate '{name}' has no inertia: the kinetic energy does not depend on "
+            f"{name}_dot, so nothing can be solved for its acceleration; "
+            "give it a mass, or make it an input"
         )
     raise SceneError([system.problem(key, message)])
 

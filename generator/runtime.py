@@ -230,7 +230,7 @@ class Model:
         timed: Sequence[str], methods: Mapping[str, tuple[int, int, float, float]], digest: str,
     ) -> None:  # fmt: skip
         """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
-        # fewer than thirty attributes: beside more of them CPython 3.11 looks up each the slow way
+        # thirty attributes at most: beside more of them CPython 3.11 looks up each the slow way
         self._ffi, self._lib = extension.ffi, extension.lib
         real = self._ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype])
         # what any call needs: address(real, array), and the address of nothing
@@ -914,7 +914,7 @@ def _size(h: Any) -> float:
 
 
 def _count(value: Any, name: str, least: int) -> int:
-    """A whole number of steps, or a ValueError that names the argument."""
+    """A whole number, `least` or more, or a ValueError that names the argument."""
     if type(value) is int and value >= least:
         return value
     number = _number(value, name)

@@ -22,6 +22,13 @@ _OURS = frozenset(
     "moving prepared along column slopes wide troubles".split()
 )
 
+# macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
+# that is called so has another name in C
+OWN = frozenset(
+    "ALIGNED ALONE BLOCK FAST_FMA FAST_FMAF H INLINE LANE NOT_FINITE NO_CONVERGENCE NQ NU OK PIECE "
+    "ROLLED SINGULAR STAMP TILE".split()
+)
+
 TROUBLE = "*trouble"  # what a lane notes its failure in, as a name that an argument brings
 WIDE = "*wide"  # how many instances of a tile are to be taken, likewise
 
@@ -62,23 +69,7 @@ class Target:
     @cached_property
     def enum(self) -> dict[str, str]:
         """The enumerator of every coordinate and input."""
-        own = (
-            "NO_CONVERGENCE",
-            "RESTART",
-            "H",
-            "NQ",
-            "NU",
-            "OK",
-            "SINGULAR",
-            "NOT_FINITE",
-            "STAMP",
-            "TILE",
-            "BLOCK",
-            "LANE",
-            "ALONE",
-            "PIECE",
-        )
-        taken = {f"{self.PREFIX}_{w}" for w in own} | {*names.MACROS}
+        taken = {f"{self.PREFIX}_{w}" for w in OWN} | {*names.MACROS}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         wishes = [f"{self.PREFIX}_{name}" for name in indexed]
         return dict(zip(indexed, _unique(wishes, taken), strict=True))

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import EVERYTHING, MODULES, needs
+from conftest import EVERYTHING, MODULES, ROOT, needs
 
 import eomc
 from cases import scene_system
-from eomc import scene, system
+from eomc import reference, scene, system, target
 from eomc.render import Sources
 from eomc.system import System
 
@@ -243,6 +243,39 @@ kinetic = "E_dot**2/2"
     for file, content in eomc.sources(system.from_scene(scene.parse(text))).files.items():
         (tmp_path / file).write_text(content, encoding="utf-8")
     compiled("cc", "-std=gnu99", "-include", "math.h", "-c", "m.c", cwd=tmp_path)
+
+
+def test_enumerators_are_none_of_our_own_macros() -> None:
+    """Whatever follows the prefix in templates and csrc: x of a coordinate fast_fma would be q[1]."""
+    texts = [p.read_text(encoding="utf-8") for p in (ROOT / "templates").glob("*.jinja")]
+    texts += [p.read_text(encoding="utf-8") for p in (ROOT / "csrc").glob("*.h")]
+    texts += [p.read_text(encoding="utf-8") for p in (ROOT / "generator").glob("*.py")]
+    pattern = r'(?:\{\{ PREFIX \}\}|PREFIX\}|PREFIX ~ "|\bEOMC)_([A-Z][A-Z_]*[A-Z]|H\b)'
+    found = {name for text in texts for name in re.findall(pattern, text)} - {"CFLAGS"}
+    assert found == target.OWN
+
+
+@pytest.mark.parametrize("name", ["rolled", "aligned", "fast_fma", "block"])
+def test_coordinates_may_be_called_like_our_own_macros(name: str, tmp_path: Path) -> None:
+    text = (ROOT / "scenes" / "cartpole.toml").read_text(encoding="utf-8")
+    text = re.sub(r"\bx(?=\b|_dot)", name, text).replace("[run]\n", "[run]\nbatch = true\n")
+    for file, content in eomc.sources(system.from_scene(scene.parse(text))).files.items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    program = f"""
+        #include <stdio.h>
+        #include "cartpole.h"
+        int main(void) {{
+            double q[CARTPOLE_NQ] = {{ 0.0, 0.5 }}, qd[CARTPOLE_NQ] = {{ 0.25, 0.0 }};
+            cartpole_rk4_step(q, qd, 0.5, &cartpole_defaults);
+            printf("%.17g", q[CARTPOLE_{name.upper()}_]);
+            return 0;
+        }}"""
+    (tmp_path / "told.c").write_text(program, encoding="utf-8")
+    compiled("cc", "-std=gnu99", "told.c", "cartpole.c", "-lm", "-o", "told", cwd=tmp_path)
+    told = subprocess.run([str(tmp_path / "told")], capture_output=True, text=True, check=True)
+    trusted = reference.of(scene_system("cartpole"))
+    _, q, _ = trusted.simulate([0.0, 0.5], [0.25, 0.0], h=0.5, steps=1)
+    assert float(told.stdout) == pytest.approx(q[-1][0], rel=1e-12)
 
 
 @kits
