@@ -99,7 +99,7 @@ def lane(
 def _each_of_tile(target: Target, lines: Sequence[str]) -> list[str]:
     """Statements for every coordinate of every instance."""
     inside = [line.replace("$", "x[j][i]") for line in lines]
-    return vectors.loop("j", f"{target.PREFIX}_NQ", vectors.loop("i", target.tile_end, inside))
+    return vectors.loop("j", f"{target.PREFIX}_NQ", vectors.loop("i", "wide", inside))
 
 
 def _lane_small(
@@ -343,7 +343,7 @@ def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
     )  # fmt: skip
 
 
-def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> dict[str, Any]:
+def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> dict[str, int]:
     """Instances side by side: as many as stay near with what belongs to them, and no row of their
     numbers above 512 bytes. A tile that is not full is taken by blocks: rows of 64 bytes."""
     s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
@@ -354,5 +354,4 @@ def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> dict[str, Any]:
         numbers += max(METHODS[name].stages for name in s.run.methods) * n
         numbers += 3 * len(lane["angles"]["members"]) if lane["angles"] else 0
     block, near = 64 // size, NEAR // (size * numbers)
-    many = max(block, min(512 // size, near // block * block))
-    return {"tile": many, "block": block, "tile_end": target.tile_end}
+    return {"tile": max(block, min(512 // size, near // block * block)), "block": block}

@@ -131,11 +131,6 @@ class Target:
         return f"(const {self.prefix}_params *)p" if self.needs_p else ""
 
     @property
-    def tile_end(self) -> str:
-        """Where loops over the instances of a tile end; compilers see that it is a multiple."""
-        return f"(wide & -{self.PREFIX}_BLOCK)"
-
-    @property
     def zero(self) -> str:
         """The number 0."""
         return "0.0" + self.real.suffix
@@ -230,7 +225,7 @@ class Target:
         small = pieces.LANE_PIECE if lane else pieces.PIECE
         piece = small if pieces.is_large(function) else pieces.LARGE
         parts = pieces.split(function, piece)
-        end = self.tile_end if lane else "2" if pair else ""
+        end = "wide" if lane else "2" if pair else ""
         size = f"{self.PREFIX}_TILE" if lane else end
         at = "[i]" if end else ""
         values = f"{self.prefix}_{what}_values"

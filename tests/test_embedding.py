@@ -246,7 +246,7 @@ kinetic = "E_dot**2/2"
 
 
 def test_enumerators_are_none_of_our_own_macros() -> None:
-    """Whatever follows the prefix in templates and csrc: x of a coordinate fast_fma would be q[1]."""
+    """Whatever follows the prefix in templates and csrc: fast_fma would have 1 for its place."""
     texts = [p.read_text(encoding="utf-8") for p in (ROOT / "templates").glob("*.jinja")]
     texts += [p.read_text(encoding="utf-8") for p in (ROOT / "csrc").glob("*.h")]
     texts += [p.read_text(encoding="utf-8") for p in (ROOT / "generator").glob("*.py")]
