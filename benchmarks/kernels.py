@@ -184,19 +184,19 @@ def panda_body(function: Function) -> str:
 # --- ours, and the comparison ---------------------------------------------------------------------
 
 
-def alone(module: ModuleType) -> Run:
+def alone(module: ModuleType, method: str = "rk4") -> Run:
     def run(x: Array, h: float, steps: int) -> Array:
         n = len(x) // 2
-        done = module.simulate(x[:n], x[n:], h=h, steps=steps, every=steps)
+        done = module.simulate(x[:n], x[n:], h=h, steps=steps, every=steps, method=method)
         return np.concatenate([done.q[-1], done.qd[-1]])
 
     return run
 
 
-def together(module: ModuleType) -> Run:
+def together(module: ModuleType, threads: int = 1) -> Run:
     def run(x: Array, h: float, steps: int) -> Callable[[], Array]:
         n = len(x) // 2
-        done = module.simulate_batch(x[:n].T, x[n:].T, h, steps=steps, every=steps, threads=1)
+        done = module.simulate_batch(x[:n].T, x[n:].T, h, steps=steps, every=steps, threads=threads)
         return lambda: np.hstack([done.q[:, -1], done.qd[:, -1]]).T
 
     return run

@@ -1,11 +1,12 @@
 """Who runs in benchmarks/peers.py: each is a function (x0, h, steps) -> last state.
 
 x0 is [q; qd], (2 nq,), or (2 nq, batch). Who leaves the last state otherwise gives a function that
-puts it so, which is not timed.
+puts it so, which is not timed. Our own, `ours` and `ours_batch`, are those of kernels.py.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import importlib
 import math
@@ -14,7 +15,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -23,34 +23,23 @@ from typing import Any
 
 import casadi
 import heyoka
+import kernels
 import numba
 import numpy as np
 import physics
+from kernels import Array, Run
+from kernels import alone as ours
+from kernels import together as ours_batch
 from numba.np.unsafe.ndarray import to_fixed_tuple
 from physics import Matrices
 
 from eomc import compile as compiler
 
-Array = np.ndarray
-Run = Callable[[Array, float, int], Array | Callable[[], Array]]
-
 
 def timed(run: Run, x: Array, h: float, steps: int) -> tuple[float, Array]:
     """Seconds, and the last state as columns."""
-    begun = time.perf_counter()
-    last = run(x, h, steps)
-    spent = time.perf_counter() - begun
-    last = last() if callable(last) else last
+    spent, last = kernels.timed(run, x, h, steps)
     return spent, last.reshape(len(last), -1)
-
-
-def ours(module: ModuleType, method: str = "rk4") -> Run:
-    def run(x: Array, h: float, steps: int) -> Array:
-        q, qd = x.reshape(2, -1)
-        done = module.simulate(q, qd, h=h, steps=steps, every=steps, method=method)
-        return np.concatenate([done.q[-1], done.qd[-1]])
-
-    return run
 
 
 def relative(module: ModuleType) -> Run:
@@ -62,15 +51,6 @@ def relative(module: ModuleType) -> Run:
         return np.cumsum(last.reshape(2, -1), axis=1).ravel()
 
     return absolute
-
-
-def ours_batch(module: ModuleType, threads: int = 1) -> Run:
-    def run(x: Array, h: float, steps: int) -> Callable[[], Array]:
-        n = len(x) // 2
-        done = module.simulate_batch(x[:n].T, x[n:].T, h, steps=steps, every=steps, threads=threads)
-        return lambda: np.hstack([done.q[:, -1], done.qd[:, -1]]).T
-
-    return run
 
 
 def ours_in_processes(module: ModuleType, x: Array, cores: Sequence[int]) -> Run:
@@ -103,10 +83,11 @@ def _share(file: str, x: Array, core: int, pipe: Connection, last: Any) -> None:
     os.sched_setaffinity(0, {core})
     run = ours_batch(importlib.import_module(folder.name))
     out = np.frombuffer(last).reshape(x.shape)
-    while True:
-        h, steps = pipe.recv()
-        out[:] = run(x, h, steps)()
-        pipe.send(None)
+    with contextlib.suppress(EOFError):  # nobody is there to tell any more
+        while True:
+            h, steps = pipe.recv()
+            out[:] = run(x, h, steps)()
+            pipe.send(None)
 
 
 def numba_loop(matrices: Matrices, n: int) -> Callable[..., Any]:
