@@ -24,40 +24,14 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class Joint:
-    """What a kind of joint has: one "r" (turns) or "t" (slides) a coordinate, in its order.
-
-    axes: how many axes the scene gives it (0, 1 or 2); plane: whether a plane scene may have it.
-    """
-
-    motions: str
-    axes: int
-    plane: bool
-
-
-# the coordinates act one after the other, each on the frame that those before it have moved:
-# free and spherical turn about z, then y, then x (yaw, pitch, roll), singular at a pitch of pi/2
-JOINTS = {
-    "fixed": Joint("", 0, True),
-    "revolute": Joint("r", 1, True),
-    "prismatic": Joint("t", 1, True),
-    "planar": Joint("ttr", 0, True),  # along x and y, about z
-    "cylindrical": Joint("tr", 1, False),
-    "universal": Joint("rr", 2, False),
-    "spherical": Joint("rrr", 0, False),
-    "free": Joint("tttrrr", 0, False),
-}
-
-
-@dataclass(frozen=True)
 class Body:
     """A rigid body, held by a joint in a tree or placed by formulas.
 
-    parent: a body's name or "world". joint: a key of JOINTS, with `coordinates` in its order and
-    unit `axes` in the joint's frame, which stands at `offset` (m) in the parent's frame, turned by
-    `rotation`. The body's frame is the joint's frame, moved by the coordinates. A body placed by
-    formulas has joint "", no parent, the `position` (m) of its centre of mass in the world and
-    the `rotation` of its frame there; these hang on coordinates, t and definitions too.
+    parent: a body's name or "world". joint: a key of joints.JOINTS, with `coordinates` in its
+    order and unit `axes` in the joint's frame, which stands at `offset` (m) in the parent's frame,
+    turned by `rotation`. The body's frame is the joint's frame, moved by the coordinates. A body
+    placed by formulas has joint "", no parent, the `position` (m) of its centre of mass in the
+    world and the `rotation` of its frame there; these depend on coordinates, t and definitions too.
 
     mass: kg. center: the centre of mass in the body's frame, m; zero where placed by formulas.
     inertia: Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass along the body's axes, kg m^2;

@@ -14,8 +14,9 @@ import mpmath
 import sympy
 from sympy import Add, Expr, Rational, S, Symbol
 
-from eomc.assembly import JOINTS, WORLD, Assembly, Body, Damper, Spring
+from eomc.assembly import WORLD, Assembly, Body, Damper, Spring
 from eomc.formulas import Formula
+from eomc.joints import JOINTS
 from eomc.symbols import dot, symbol
 
 Vector = tuple[Expr, Expr, Expr]
@@ -390,15 +391,8 @@ def _rate(e: Expr) -> Expr:
 
 def _motions(body: Body) -> list[tuple[str, Sequence[float], str]]:
     """The elementary joints of a body: (motion, axis, coordinate), the outermost last."""
-    motions = JOINTS[body.joint].motions
-    x, y, z = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    axes: Sequence[Sequence[float]] = {
-        "planar": (x, y, z),
-        "cylindrical": body.axes * 2,
-        "spherical": (z, y, x),
-        "free": (x, y, z, z, y, x),
-    }.get(body.joint, body.axes)
-    return list(zip(motions, axes, body.coordinates, strict=True))
+    joint = JOINTS[body.joint]
+    return list(zip(joint.motions, joint.along(body.axes), body.coordinates, strict=True))
 
 
 # --- numbers, vectors and matrices ---------------------------------------------------------------

@@ -11,7 +11,6 @@ from mpmath import mp
 
 from eomc import formulas, names
 from eomc.assembly import (
-    JOINTS,
     WORLD,
     Assembly,
     Body,
@@ -22,6 +21,7 @@ from eomc.assembly import (
 )
 from eomc.checker import INPUT, VELOCITY, Checker, Path
 from eomc.formulas import Formula, nearest, suggest
+from eomc.joints import JOINTS, MEANT, Z
 from eomc.layout import BodyTable, DamperTable, Document, SpringTable
 
 ROUNDING = 1e-6  # relative, of principal moments: files have them with six digits and more
@@ -34,22 +34,6 @@ _OF_JOINTS = (
     "parent", "coordinates", "axis", "offset", "center", "armature", "damping", "friction",
     "friction_width", "actuator",
 )  # fmt: skip
-
-# what people call our joints
-_JOINTS_MEANT = {
-    "hinge": "revolute", "pin": "revolute", "rotational": "revolute", "continuous": "revolute",
-    "slider": "prismatic", "slide": "prismatic", "translational": "prismatic",
-    "linear": "prismatic", "ball": "spherical", "weld": "fixed", "rigid": "fixed",
-    "floating": "free", "plane": "planar", "cardan": "universal", "hooke": "universal",
-}  # fmt: skip
-
-_COORDINATES = {
-    "planar": "along x, along y and about z",
-    "cylindrical": "along the axis and about it",
-    "universal": "about each axis",
-    "spherical": "about z, then y, then x",
-    "free": "along x, y and z, then about z, y and x",
-}
 
 
 def centers(doc: Document) -> set[str]:
@@ -400,7 +384,7 @@ class _Bodies:
             )
             return ""
         if joint not in JOINTS:
-            near = _JOINTS_MEANT.get(joint.lower(), "") or nearest(joint, JOINTS)
+            near = MEANT.get(joint.lower(), "") or nearest(joint, JOINTS)
             remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(known)}"
             check.say((*path, "joint"), f"there is no joint '{joint}'{remedy}", text=joint)
             return ""
@@ -442,7 +426,7 @@ class _Bodies:
             return None
         if len(given) != wanted:
             count = "one coordinate" if wanted == 1 else f"{wanted or 'no'} coordinates"
-            order = f" ({_COORDINATES[joint]})" if joint in _COORDINATES else ""
+            order = f" ({JOINTS[joint].order})" if JOINTS[joint].order else ""
             here = ", ".join(given) or "none"
             listed = ", ".join(f'"q{k}"' for k in range(1, wanted + 1))
             example = listed if wanted == 1 else f"[{listed}]"
@@ -475,17 +459,17 @@ class _Bodies:
     def _axes(
         self, path: Path, joint: str, entry: BodyTable
     ) -> tuple[tuple[float, float, float], ...]:
-        """Unit axes; what is not written is z, and x and y for two."""
-        check, wanted = self.check, JOINTS[joint].axes
+        """Unit axes; the joint's own where none are written."""
+        check, wanted = self.check, JOINTS[joint].given
         if path in check.mended or self.wide is None:
             return ()
-        z = (0.0, 0.0, 1.0)
         given = entry.axis
         if given is None:
-            if joint == "prismatic":
+            if wanted and not JOINTS[joint].defaults:
                 example = "[1, 0]" if self.wide == 2 else "[1, 0, 0]"
-                check.say(path, f"missing: a prismatic joint slides along one, axis = {example}")
-            return {0: (), 1: (z,), 2: ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))}[wanted]
+                check.say(path, f"missing: a {joint} joint slides along one, axis = {example}")
+                return (Z,) * wanted
+            return JOINTS[joint].defaults
         if not wanted:
             check.say(path, f"a {joint} joint has no axis to choose: remove it")
             return ()

@@ -94,7 +94,7 @@ def read(path: str | Path, include: bool = False) -> Robot:
 
 
 class Found(NamedTuple):
-    """A joint as it is read. kind: as in assembly.JOINTS. type: as in MJCF.
+    """A joint as it is read. kind: as in joints.JOINTS. type: as in MJCF.
 
     anchor: where it stands in the body's frame. zero: from the body's frame there to the frame in
     which the joint's coordinates are zero. armature: of all turns of a free or ball joint.

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eomc import formulas
-from eomc.assembly import JOINTS, WORLD, Assembly, Body, Damper, Spring, Turn
+from eomc.assembly import WORLD, Assembly, Body, Damper, Spring, Turn
 from eomc.formulas import Formula
+from eomc.joints import JOINTS
 from eomc.problems import EomcError, Problem
 
 if TYPE_CHECKING:
@@ -515,16 +516,8 @@ class _Kinematics:
 
     def axes(self, body: Body) -> list[Array]:
         """The axis of each coordinate of a joint, in the frame that those before it moved."""
-        x, y, z = np.eye(3)
-        by_joint = {
-            "planar": [x, y, z],
-            "spherical": [z, y, x],
-            "free": [x, y, z, z, y, x],
-        }
-        given = [np.array(axis) / np.linalg.norm(axis) for axis in body.axes]
-        if body.joint == "revolute" and not given:
-            given = [z]  # of a plane scene
-        return by_joint.get(body.joint) or given * (len(body.coordinates) // max(len(given), 1))
+        axes = map(np.array, JOINTS[body.joint].along(body.axes))
+        return [axis / np.linalg.norm(axis) for axis in axes]
 
     def _roots(self, body: Body) -> tuple[float, Array]:
         """The root of the mass, and of the inertia: 2 K = |root_m v|^2 + |root_I omega|^2."""

@@ -13,8 +13,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from eomc import names
-from eomc.assembly import JOINTS, WORLD
+from eomc.assembly import WORLD
 from eomc.formulas import suggest
+from eomc.joints import JOINTS
 from eomc.problems import EomcError
 
 Vector = tuple[float, float, float]
@@ -55,7 +56,7 @@ class Motion:
 class RobotBody:
     """A body and the joint that holds it; `assembly.Body` in numbers.
 
-    parent: a body above, or "world". joint: a key of assembly.JOINTS, with a motion for each of
+    parent: a body above, or "world". joint: a key of joints.JOINTS, with a motion for each of
     its coordinates and its unit `axes` in the joint's frame. offset (m) and rotation: the joint's
     frame in the parent's, v_parent = offset + rotation v_joint. mass: kg. center: m, in the
     body's frame. inertia: kg m^2, of the centre of mass, along the body's axes.
@@ -337,14 +338,7 @@ def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
 
 def motion_axes(body: RobotBody) -> tuple[Vector, ...]:
     """The axis of each coordinate of the joint, in the frame that those before it have moved."""
-    x, y, z = IDENTITY
-    by_joint: Mapping[str, tuple[Vector, ...]] = {
-        "cylindrical": body.axes * 2,
-        "planar": (x, y, z),
-        "spherical": (z, y, x),
-        "free": (x, y, z, z, y, x),
-    }
-    return by_joint.get(body.joint, body.axes)
+    return JOINTS[body.joint].along(body.axes)
 
 
 def free_motions(of: str = "") -> tuple[Motion, ...]:
@@ -759,7 +753,7 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
     if turns := turns_of(body.rotation):
         shown = (f'["{axis}", {angle(by)}]' for axis, by in turns)
         entry["rotation"] = f"[{', '.join(shown)}]"
-    if body.axes and body.axes != _DEFAULT_AXES.get(body.joint):
+    if body.axes and body.axes != JOINTS[body.joint].defaults:
         entry["axis"] = _each([vector(axis) for axis in body.axes])
     if body.mass:
         entry["mass"] = number(body.mass)
@@ -778,13 +772,6 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
     if body.note:
         entry["note"] = text(body.note)
     return entry
-
-
-_DEFAULT_AXES = {
-    "revolute": ((0.0, 0.0, 1.0),),
-    "cylindrical": ((0.0, 0.0, 1.0),),
-    "universal": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
-}
 
 
 def _force(coordinate: str, drives: Sequence[Drive]) -> str:

@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from eomc import mjcf
-from eomc.assembly import JOINTS, WORLD
+from eomc.assembly import WORLD
+from eomc.joints import JOINTS
 from eomc.robots import Robot, RobotBody
 
 WANTED = "MuJoCo is what these tests compare with: pip install eomc[robots]"

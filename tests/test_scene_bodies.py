@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from eomc import formulas, scene
-from eomc.assembly import JOINTS, Turn
+from eomc.assembly import Turn
 from eomc.bodycheck import ROUNDING
+from eomc.joints import JOINTS
 from eomc.problems import SceneError
 
 SCENES = Path(__file__).parents[1] / "scenes"
@@ -44,7 +45,7 @@ def test_each_joint_in_space(kind):
     assert body.joint == kind
     assert body.parent == "world"
     assert body.coordinates == NAMES[: len(JOINTS[kind].motions)]
-    assert len(body.axes) == JOINTS[kind].axes
+    assert len(body.axes) == JOINTS[kind].given
     x, y, z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
     default = {"revolute": (z,), "cylindrical": (z,), "universal": (x, y)}
     assert body.axes == (((0, 0.6, 0.8),) if kind == "prismatic" else default.get(kind, ()))
