@@ -13,9 +13,9 @@ from importlib.resources import files
 from typing import Any
 
 from eomc import __version__, ccode, selftest
-from eomc.ccode import DOUBLE, indent
+from eomc.ccode import indent
 from eomc.dynamics import dynamics
-from eomc.evaluations import KINDS, functions, linearization, takes_t
+from eomc.evaluations import functions, linearization, takes_t
 from eomc.target import Target, after, arguments
 from eomc.tensions import is_prompt
 

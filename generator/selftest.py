@@ -16,7 +16,8 @@ from eomc.evaluations import KINDS, takes_t
 from eomc.program import matrix, nearby
 from eomc.target import Target, arguments
 
-LIMIT = {True: 2.0**20, False: 2.0**13}  # of |x| in sincos.h, sincosf.h, where double is true, false
+# by whether numbers are doubles: the limit of |x| in sincos.h, sincosf.h
+LIMIT = {True: 2.0**20, False: 2.0**13}
 USUAL = {True: 1e-9, False: 1e-3}  # what may be off, of the largest entry
 # the same where angles are large: sines are off by more where a multiply-add rounds twice
 LARGE = {True: 1e-12, False: 1e-5}
@@ -82,15 +83,13 @@ def _off(found: list[float], exact: list[float]) -> float:
 
 
 def _large(target: Target) -> Iterator[dict[str, float]]:
-    """States in which every angle of the coordinates alone is large, up to the limit of sincos.h."""
+    """States in which every angle of coordinates alone is large, up to the limit of sincos.h."""
     program, limit = target.program, LIMIT[target.real is DOUBLE]
     coordinates = {c.name: i for i, c in enumerate(program.system.coordinates)}
     found = chain.from_iterable(
         apart(program[name], coordinates)[0] for name in ("bias", "acceleration")
     )
-    angles = [
-        a for a in found if a.offset == 0 and all((GRID * c).is_integer for c, _ in a.terms)
-    ]
+    angles = [a for a in found if a.offset == 0 and all((GRID * c).is_integer for c, _ in a.terms)]
     if not angles:
         return
     most = limit / max(float(sum(abs(c) for c, _ in a.terms)) for a in angles)

@@ -1,4 +1,4 @@
-"""Which processors' multiply-add the sines use, and what they are on one that has none in double."""
+"""Whose multiply-add the sines use, and how exact they are where none is in double."""
 
 from __future__ import annotations
 
