@@ -62,7 +62,7 @@ class Work:
 
 
 def libraries(source: str, folder: Path) -> list[ctypes.CDLL]:
-    """A kernel by each compiler that is there; the cart-pole's is one of a batch too, as ours is."""
+    """A kernel by each compiler that is there; the cart-pole's has batches, as ours has."""
     made = []
     for name in ("gcc", "clang"):
         if shutil.which(name) is None:

@@ -28,7 +28,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from eomc import __version__
-from eomc.problems import EomcError
+from eomc.problems import EomcError, FolderError
 
 if TYPE_CHECKING:
     from eomc.render import Sources
@@ -183,9 +183,8 @@ def build(
             with tempfile.TemporaryDirectory(dir=root, prefix=f".{name}.build-") as beside:
                 _build(name, wanted, sources, folder, Path(beside))
     except OSError as fault:
-        raise EomcError(
-            f"{fault.filename or folder}: can't be written ({fault.strerror}): "
-            "choose another place with --build DIR"
+        raise FolderError(
+            f"{fault.filename or folder}: can't be written ({fault.strerror})"
         ) from None
     return Built(name, folder, True)
 

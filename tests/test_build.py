@@ -364,7 +364,9 @@ def test_two_scenes_of_one_name_built_at_once(scene: Path, root: Path, tmp_path:
 
 def test_a_place_that_cannot_be_written(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
-    with pytest.raises(eomc.EomcError, match=r"file.*can't be written .*--build DIR"):
+    with pytest.raises(
+        eomc.EomcError, match=r"file.*can't be written .*: choose another folder, root="
+    ):
         eomc.build(scene, tmp_path / "file" / "build")
 
 
