@@ -5,7 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from eomc.checker import Checker
+
+LONGEST = 60  # characters of a text that may be a number with its unit
 
 # --- tables ---------------------------------------------------------------------------------------
 
@@ -67,6 +72,25 @@ def one_table(name: str, meant: str) -> str:
     return f"{start}write [{meant}] once, and a line such as {_ONE_TABLE[meant]} for each entry"
 
 
+def tables(tree: dict[str, Any], check: Checker) -> None:
+    """Tell of tables that scenes do not have, once each; take them out, or put them in place."""
+    for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
+        if found := array(name, tree[name]):
+            meant, entries = found
+            check.say((name,), one_table(name, meant))
+            check.mended |= {(meant,), *((meant, key) for key in entries)}
+            del tree[name]
+            there = tree.get(meant)
+            tree[meant] = {**entries, **(there if isinstance(there, dict) else {})}
+            check.places.rename((name,), (meant,))
+        elif name in TABLES:
+            check.say((name,), f"there is no [{name}] in a scene: {TABLES[name]}")
+            del tree[name]
+            if TABLES[name] == _ENERGY:
+                tree.setdefault("energy", {"kinetic": "0"})
+                check.mended.add(("energy",))
+
+
 # --- numbers with units ---------------------------------------------------------------------------
 
 _DEGREES = ("deg", "degs", "degree", "degrees", "°", "grad")
@@ -89,7 +113,7 @@ def quantity(text: str, declared: Collection[str] = ()) -> str | None:
 
     declared: names that a letter behind a number may mean: `2 m` is a product where there is an m.
     """
-    found = _QUANTITY.fullmatch(text)
+    found = _QUANTITY.fullmatch(text) if len(text) <= LONGEST else None
     if found is None or found[2] in declared:
         return None
     number, unit = found[1].replace("−", "-").replace(" ", ""), found[2]
@@ -129,7 +153,8 @@ def _shifted(number: str, power: int) -> str:
 
 def bare(line: str) -> str | None:
     """The remedy for a line of TOML with a number and what numbers do not have there."""
-    if found := re.search(r"[=,[]\s*−", line):
+    line = line[:200]
+    if re.search(r"[=,[]\s*−", line):
         return "this dash is not a minus sign: write '-'"
     if re.match(r"\s*[\w.]+\s*:", line):
         return "entries are written name = value"

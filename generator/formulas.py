@@ -157,16 +157,8 @@ def parse(text: str) -> Formula:
     if not line:
         raise FormulaError("the formula is empty: write 0 if nothing is meant")
     for at, c in enumerate(line):
-        if c == "°" and (number := re.search(r"(?<![\w.])[\d.]+(?= *$)", line[:at])):
-            message = f"angles are in radians: write {number[0]}*pi/180"
-            raise FormulaError(message, number.start(), at + 1 - number.start())
-        if c == "^" and (squared := re.search(r"(\w+)\^(\w+)(?=\()", line)):
-            if squared[1] in FUNCTIONS:
-                message = f"write powers behind the function: {squared[1]}(...)**{squared[2]}"
-                raise FormulaError(message, squared.start(), len(squared[0]))
         if c in _CHARACTERS:
-            before = re.search(r"([A-Za-z_]\w*)$", line[:at])
-            raise FormulaError(_CHARACTERS[c].format(before[1] if before else "theta"), at)
+            raise _character(line, at)
         if not " " <= c <= "~":
             raise FormulaError(f"'{c}' is not used in formulas: only {_ALLOWED}", at)
     try:
@@ -180,6 +172,22 @@ def parse(text: str) -> Formula:
     formula = Formula(line, tree)
     _check(formula, tree, 0)
     return formula
+
+
+def _character(line: str, at: int) -> FormulaError:
+    """What to write instead of the character at `at`, by what stands before it."""
+    before = line[max(at - 40, 0) : at]
+    if line[at] == "°" and (number := re.search(r"(?<![\w.])[\d.]+(?= *$)", before)):
+        start = at - len(before) + number.start()
+        message = f"angles are in radians: write {number[0]}*pi/180"
+        return FormulaError(message, start, at + 1 - start)
+    word = re.search(r"[A-Za-z_]\w*$", before)
+    name = word[0] if word else "theta"
+    power = re.match(r"\^(\d)\(", line[at : at + 3])
+    if power and name in FUNCTIONS:
+        message = f"write powers behind the function: {name}(...)**{power[1]}"
+        return FormulaError(message, at - len(name), len(name) + 2)
+    return FormulaError(_CHARACTERS[line[at]].format(name), at)
 
 
 # 2m, then m g, then )m
@@ -238,9 +246,11 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
             _check(formula, operand, depth + 1, power)
         case ast.BinOp(
-            left=ast.Name(id=name), op=ast.Pow(), right=ast.Call(func=ast.Constant(value=power))
+            left=ast.Name(id=name),
+            op=ast.Pow(),
+            right=ast.Call(func=ast.Constant(value=int(raised))),
         ) if name in FUNCTIONS:
-            raise _fault(node, f"write powers behind the function: {name}(...)**{power}")
+            raise _fault(node, f"write powers behind the function: {name}(...)**{raised}")
         case ast.BinOp(left=left, op=ast.Pow(), right=right):
             _check(formula, right, depth + 1)
             exponent = _number(formula, right)

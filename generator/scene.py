@@ -247,7 +247,7 @@ class _Check(Checker):
     ) -> None:
         super().__init__(places)
         self.values = parameters
-        self._tables(tree)
+        advice.tables(tree, self)
         if not repeat.expand(tree, self):
             raise SceneError(self.problems)
         self.bodies = bool(tree.get("body"))
@@ -305,24 +305,6 @@ class _Check(Checker):
         )
 
     # layout and names
-
-    def _tables(self, tree: dict[str, Any]) -> None:
-        """Tables that scenes do not have: told once, taken out or put where they belong."""
-        for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
-            found = advice.array(name, tree[name])
-            if found:
-                meant, entries = found
-                self.say((name,), advice.one_table(name, meant))
-                self.mended |= {(meant,), *((meant, key) for key in entries)}
-                tree.pop(name)
-                tree[meant] = {**entries, **layout.table_at(tree, (meant,))}
-                self.places.rename((name,), (meant,))
-            elif name in advice.TABLES:
-                self.say((name,), f"there is no [{name}] in a scene: {advice.TABLES[name]}")
-                tree.pop(name)
-                if advice.TABLES[name] == advice.TABLES["lagrangian"]:
-                    tree.setdefault("energy", {"kinetic": "0"})
-                    self.mended.add(("energy",))
 
     def _layout(self, tree: dict[str, Any]) -> layout.Document:
         """The document; faulty entries are told, taken out or mended, and the rest checked on."""
