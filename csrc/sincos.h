@@ -28,7 +28,9 @@
 #error "needs sums rounded to double, not to long double: on 32-bit x86 use -msse2 -mfpmath=sse"
 #endif
 
-#if defined __FMA__ || defined FP_FAST_FMA || defined __ARM_FEATURE_FMA
+/* ARM's macro means single precision alone on Cortex-M4F and M33; __ARM_FP has 8 for double. */
+#if defined __FMA__ || defined __FP_FAST_FMA || defined FP_FAST_FMA \
+    || (defined __ARM_FEATURE_FMA && (__ARM_FP & 8))
 #define EOMC_FAST_FMA 1
 #else
 #define EOMC_FAST_FMA 0

@@ -29,7 +29,9 @@
 #error "needs sums rounded to float, nothing wider: on 32-bit x86 use -msse2 -mfpmath=sse"
 #endif
 
-#if defined __FMA__ || defined FP_FAST_FMAF || defined __ARM_FEATURE_FMA
+/* ARM's macro is for the precisions of __ARM_FP, in which 4 means single. */
+#if defined __FMA__ || defined __FP_FAST_FMAF || defined FP_FAST_FMAF \
+    || (defined __ARM_FEATURE_FMA && (__ARM_FP & 4))
 #define EOMC_FAST_FMAF 1
 #else
 #define EOMC_FAST_FMAF 0

@@ -60,6 +60,9 @@ def read(scene: ScenePath) -> System:
     from eomc import scene as scenes
     from eomc.system import from_scene
 
+    _refuse_other(scene, "")
+    if not isinstance(scene, (str, os.PathLike)):
+        raise EomcError(f"give the path of a scene, here {scene!r}")
     return from_scene(scenes.read(scene))
 
 
@@ -73,6 +76,8 @@ def sources(
     """The generated files of a system, as text. warn is called with each warning."""
     from eomc import mechanics, program, render
 
+    if isinstance(system, (str, os.PathLike)):
+        raise EomcError(f"give a System, such as eomc.read({str(system)!r})")
     derived = program.build(mechanics.derive(system))
     for problem in (*system.warnings, *program.inertia(derived)):
         if warn is not None:
@@ -93,6 +98,7 @@ def build(
     """
     from eomc import compile as compiler
 
+    _refuse_other(scene, root)
     if not isinstance(scene, (str, os.PathLike)):
         made, name, digest = scene, scene.name, scene.digest
     else:
@@ -109,6 +115,17 @@ def build(
         return sources(made, extension, warn=warn)
 
     return compiler.build(made.name, wanted, texts, Path(root))
+
+
+def _refuse_other(scene: object, root: object) -> None:
+    """Raise EomcError where one is neither a path nor a System."""
+    paths = (str, os.PathLike)
+    if not isinstance(root, paths):
+        raise EomcError(f"root: give the path of a folder, here {root!r}")
+    if not isinstance(scene, paths) and not (hasattr(scene, "digest") and hasattr(scene, "q")):
+        raise EomcError(f"give the path of a scene, or a System, here {scene!r}")
+    if isinstance(scene, str) and (not scene or "\n" in scene):
+        raise EomcError("give the path of a scene, not its text: write the text to a file")
 
 
 def load(

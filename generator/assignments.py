@@ -195,19 +195,19 @@ def _many_digits() -> Mapping[str, Callable[..., Any]]:
 
 
 def evaluate(
-    function: Function, values: Mapping[str, float], exact: bool = False
+    function: Function, values: Mapping[str, float], exact: bool = False, unit: float = 2.0**-52
 ) -> tuple[list[float], bool]:
-    """The results of a function, and whether every pivot is positive.
+    """The results of a function, and whether every pivot is positive, beyond rounding by `unit`.
 
     values: coordinates, velocities, parameters, inputs and t by name. In Python floats, or in 40
     digits and then rounded where `exact`. Raises ArithmeticError or ValueError where a result is
     not a finite, real number.
     """
-    return evaluator(function, exact)(values)
+    return evaluator(function, exact, unit)(values)
 
 
 def evaluator(
-    function: Function, exact: bool = False
+    function: Function, exact: bool = False, unit: float = 2.0**-52
 ) -> Callable[[Mapping[str, float]], tuple[list[float], bool]]:
     """`evaluate` of one function for many states: its numbers are converted once."""
     of = _many_digits() if exact else _DOUBLES
@@ -228,7 +228,7 @@ def evaluator(
             steps.append((a.name, _called, of[v.function], [atom(o) for o in v.args]))
     outputs = [atom(o) for o in function.outputs]
     checks = [(atom(pivot), atom(diagonal)) for pivot, diagonal in function.checks]
-    tolerance = 8 * 2.0**-52 * max(1, len(checks))
+    tolerance = 8 * unit * max(1, len(checks))
 
     def evaluated(values: Mapping[str, float]) -> tuple[list[float], bool]:
         known: dict[str, Any] = {"": 1, **values}  # a number alone has no name

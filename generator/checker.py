@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Collection, Mapping
 
-from eomc import formulas
+from eomc import advice, formulas
 from eomc.formulas import Formula, FormulaError, suggest
 from eomc.places import Places
 from eomc.problems import Problem
@@ -84,7 +84,11 @@ class Checker:
             return None
         try:
             return formulas.parse(text)
-        except FormulaError as fault:
+        except FormulaError as found:
+            # a parameter is no product of others: "2 m" is a length
+            declared = () if path[0] in ("parameters", "constants") else {*self.tables, *self.kinds}
+            told = advice.quantity(text, declared)
+            fault = FormulaError(told, 0, len(text)) if told else found
             self.say(path, fault.message, fault, text)
             return None
 
@@ -143,6 +147,11 @@ class Checker:
                 return f"{start}: nobody knows the rate of an input; add it as a further input"
             case "parameters" | "constants" as table:
                 return f"{start}: '{owner}' stands in [{table}], so it doesn't move"
+        coordinates = [n for n, table in self.tables.items() if table == "coordinates"]
+        if meant := advice.velocity(name, coordinates):
+            return f"{start}; did you mean '{meant}'?"
+        if name == "time":
+            return f"{start}; did you mean 't'?"
         if near := suggest(name, self.kinds):
             return start + near
         if name in ("e", "E"):

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 import eomc
-from eomc.problems import EomcError, SceneError
+from eomc.problems import EomcError, FolderError, SceneError
 
 if TYPE_CHECKING:
     from eomc.estimate import Estimate
@@ -46,6 +46,8 @@ class _Group(click.Group):
             count = sum(p.severity == "error" for p in fault.problems)
             click.echo(str(fault), err=True)
             _fail(f"eomc: {count} error{'s' if count != 1 else ''}, nothing was built or changed")
+        except FolderError as fault:
+            _fail(f"eomc: {fault.what}: choose another place with --build DIR")
         except EomcError as fault:
             _fail(f"eomc: {fault}")
         except KeyboardInterrupt:

@@ -10,15 +10,12 @@ from __future__ import annotations
 import math
 import textwrap
 from importlib.resources import files
-from itertools import chain
 from typing import Any
 
-from eomc import __version__, ccode
-from eomc.assignments import evaluate
-from eomc.ccode import DOUBLE, indent
+from eomc import __version__, ccode, selftest
+from eomc.ccode import indent
 from eomc.dynamics import dynamics
-from eomc.evaluations import KINDS, functions, linearization, takes_t
-from eomc.program import matrix, nearby
+from eomc.evaluations import functions, linearization, takes_t
 from eomc.target import Target, after, arguments
 from eomc.tensions import is_prompt
 
@@ -86,7 +83,7 @@ def values(target: Target) -> dict[str, Any]:
         or bool(slopes and slopes["inner"]["pieces"]),
         **moved,
         **_example(target),
-        **_selftest(target),
+        **selftest.values(target),
         **_face(target),
     }  # fmt: skip
 
@@ -130,59 +127,6 @@ def _example(target: Target) -> dict[str, Any]:
         "energy_call": call.format("q, qd, t" if timed else "q, qd"),
         "energy_call_end": call.format(f"q, qd, ({target.real.name})steps*h" if timed else "q, qd"),
     }
-
-
-def _selftest(target: Target) -> dict[str, Any]:
-    """States near the start and what the program gives there, computed in Python."""
-    s = target.system
-    states: list[dict[str, list[str]]] = []
-    for k in range(6):
-        if len(states) == 3:
-            break
-        known = nearby(s, k)
-        x = [known[name.name] for name in (*s.q, *s.qd)]
-        try:
-            if "signal" in target.program:
-                u, _ = evaluate(target.program["signal"], known)
-                known |= {i.name: x for i, x in zip(s.inputs, u, strict=True)}
-            qdd, regular = evaluate(target.program["acceleration"], known)
-            if not regular or max(map(abs, qdd)) >= 1e8:
-                continue
-            bias, _ = evaluate(target.program["bias"], known)
-            D = chain.from_iterable(matrix(target.program, "D", known))
-        except (ArithmeticError, ValueError):
-            continue
-        states.append(
-            {
-                "x": [target.literal(value) for value in x],
-                "expected": [target.literal(value) for value in (*D, *bias, *qdd)],
-            }
-        )
-    state = arguments("q", "qd")
-
-    def call(name: str) -> str:
-        kind = KINDS[name]
-        given = arguments(
-            name, "q", "qd" if kind.qd else "", target.zero if takes_t(target, name) else "",
-            "NULL" if kind.u and s.inputs else "", "&" + target.prefix + "_defaults"
-            if target.needs_p else "",
-        )  # fmt: skip
-        return f"{target.prefix}_{name}({given});"
-
-    return {
-        "states": states,
-        "tolerance": 1e-9 if target.real is DOUBLE else 1e-3,
-        "calls": {
-            "D": call("D"),
-            "bias": call("bias"),
-            "tau": call("tau") if "tau" in target.program else "",
-            "acceleration": f"{target.prefix}_acceleration("
-            + arguments(
-                "qdd", state, target.zero if target.driven else "",
-                "NULL" if s.inputs else "", f"&{target.prefix}_defaults" if target.needs_p else "",
-            ) + ")",
-        },
-    }  # fmt: skip
 
 
 def _solved(target: Target) -> list[str]:

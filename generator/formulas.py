@@ -46,7 +46,7 @@ _OPERATORS: Mapping[type, Callable[..., Any]] = {
 }
 
 # what people write instead, and the remedy: characters, then functions, then syntax
-_QUOTE = "quotes and primes are not used here: write theta_dot for a velocity, dot(e) for de/dt"
+_QUOTE = "quotes and primes are not used here: write {}_dot for a velocity, dot(e) for de/dt"
 _ORDER = "comparisons are not used in formulas: write heaviside(a - b), min or max"
 _CHARACTERS: Mapping[str, str] = {
     **dict.fromkeys("'\"`", _QUOTE),
@@ -57,7 +57,7 @@ _CHARACTERS: Mapping[str, str] = {
     **dict.fromkeys("[{", "lists and indices are not used: give each quantity a name of its own"),
     "^": "'^' is not a power here: write '**'",
     "=": "'=' is not used inside a formula: write only what stands right of it",
-    "°": "angles are in radians: write 90*pi/180",
+    "°": "angles are in radians: write 90 degrees as 90*pi/180",
     "#": "a comment can't stand inside a formula: put it after the closing quotes",
     "%": "'%' is not used in formulas: comments stand after the closing quotes, with '#'",
     **{c: f"'{c}' is not ASCII: write {names.plain(c)}" for c in names.GREEK},
@@ -66,6 +66,8 @@ _CHARACTERS: Mapping[str, str] = {
     **dict.fromkeys("−–—", "this dash is not a minus sign: write '-'"),
     **dict.fromkeys("′’‘″“”", _QUOTE),
     **{c: f"'{c}' is not ASCII: write **{n}" for n, c in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")},
+    "|": "bars are not used here: write abs(...)",
+    "½": "'½' is not ASCII: write 1/2",
     "√": "'√' is not ASCII: write sqrt(...)",
 }
 
@@ -84,6 +86,15 @@ _FOREIGN: Mapping[type, str] = {
     ast.Compare: _ORDER,
     ast.Attribute: "'.' is not used in formulas: names are plain, velocities end in _dot",
     ast.Lambda: "'lambda' is not used in formulas",
+}
+
+_INSTEAD: Mapping[str, str] = {
+    "pow": "write a**b",
+    **dict.fromkeys(("radians", "deg2rad", "deg", "degrees"), "write 30 degrees as 30*pi/180"),
+    **{name: f"write 1/{of}(...)" for name, of in (("sec", "cos"), ("csc", "sin"), ("cot", "tan"))},
+    "cbrt": "write x**(1/3) where x is positive",
+    "Piecewise": "write heaviside(a - b), min or max",
+    **dict.fromkeys(("erf", "erfc", "gamma"), "take a function that there is, such as tanh"),
 }
 
 _ALLOWED = "numbers, names, + - * / **, parentheses and functions"
@@ -121,11 +132,11 @@ class Formula:
                     yield node
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """The known name that `name` may have been meant for, or the empty string."""
     known = list(known)
     same = [k for k in known if k.lower() == name.lower()]
-    return next(iter(same or difflib.get_close_matches(name, known, n=1, cutoff=0.6)), "")
+    return next(iter(same or difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), "")
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
@@ -147,7 +158,7 @@ def parse(text: str) -> Formula:
         raise FormulaError("the formula is empty: write 0 if nothing is meant")
     for at, c in enumerate(line):
         if c in _CHARACTERS:
-            raise FormulaError(_CHARACTERS[c], at)
+            raise _character(line, at)
         if not " " <= c <= "~":
             raise FormulaError(f"'{c}' is not used in formulas: only {_ALLOWED}", at)
     try:
@@ -161,6 +172,22 @@ def parse(text: str) -> Formula:
     formula = Formula(line, tree)
     _check(formula, tree, 0)
     return formula
+
+
+def _character(line: str, at: int) -> FormulaError:
+    """What to write instead of the character at `at`, by what stands before it."""
+    before = line[max(at - 40, 0) : at]
+    if line[at] == "°" and (number := re.search(r"(?<![\w.])[\d.]+(?= *$)", before)):
+        start = at - len(before) + number.start()
+        message = f"angles are in radians: write {number[0]}*pi/180"
+        return FormulaError(message, start, at + 1 - start)
+    word = re.search(r"[A-Za-z_]\w*$", before)
+    name = word[0] if word else "theta"
+    power = re.match(r"\^(\d)\(", line[at : at + 3])
+    if power and name in FUNCTIONS:
+        message = f"write powers behind the function: {name}(...)**{power[1]}"
+        return FormulaError(message, at - len(name), len(name) + 2)
+    return FormulaError(_CHARACTERS[line[at]].format(name), at)
 
 
 # 2m, then m g, then )m
@@ -179,10 +206,13 @@ def _explain_syntax(text: str, fault: SyntaxError) -> FormulaError:
     product = _PRODUCT.search(text)
     if product and not {"if", "else", "and", "or", "not", "in", "is"} & set(product.groups()):
         left, right = (group for group in product.groups() if group)
+        place = product.start(), len(product[0])
+        if right in ("deg", "degree", "degrees") and left[:1].isdigit():
+            return FormulaError(f"angles are in radians: write {left}*pi/180", *place)
+        if left in FUNCTIONS:
+            return FormulaError(f"'{left}' is a function: write {left}({right})", *place)
         return FormulaError(
-            f"write products with '*': '{left}*{right}', not '{product[0]}'",
-            product.start(),
-            len(product[0]),
+            f"write products with '*': '{left}*{right}', not '{product[0]}'", *place
         )
     at = min(max((fault.offset or 1) - 1, 0), len(text) - 1)
     around = text[max(at - 12, 0) : at + 12].strip()
@@ -215,6 +245,12 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
                 raise _fault(node, f"'{name}' is a function: write {name}(...)")
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
             _check(formula, operand, depth + 1, power)
+        case ast.BinOp(
+            left=ast.Name(id=name),
+            op=ast.Pow(),
+            right=ast.Call(func=ast.Constant(value=int(raised))),
+        ) if name in FUNCTIONS:
+            raise _fault(node, f"write powers behind the function: {name}(...)**{raised}")
         case ast.BinOp(left=left, op=ast.Pow(), right=right):
             _check(formula, right, depth + 1)
             exponent = _number(formula, right)
@@ -252,8 +288,8 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
 
 def _check_call(func: ast.Name, call: ast.Call) -> None:
     name, given = func.id, len(call.args)
-    if name == "pow":
-        raise _fault(func, "'pow' is not used in formulas: write a**b")
+    if name in _INSTEAD:
+        raise _fault(func, f"'{name}' is not used in formulas: {_INSTEAD[name]}")
     if name not in FUNCTIONS:
         near = _ELSEWHERE.get(name)
         raise _fault(

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
+from eomc import advice
 from eomc.formulas import nearest
 
 METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "gauss16", "euler", "verlet")
@@ -278,7 +279,11 @@ _MODELS: Mapping[str, type[_Table]] = {
 _ALIASES = {
     "dt": "h", "step": "h", "time": "duration", "tend": "duration", "t_end": "duration",
     "initial": "start", "init": "start", "velocity": "rate", "units": "unit", "val": "value",
-    "variables": "coordinates", "params": "parameters", "T": "kinetic", "K": "kinetic",
+    "variables": "coordinates", "params": "parameters", "const": "constants", "x0": "start",
+    "q0": "start", "v0": "rate", "qd0": "rate", "speed": "rate", "t_final": "duration",
+    "tf": "duration", "T_end": "duration", "tmax": "duration", "stepsize": "h", "step_size": "h",
+    "integrator": "method", "solver": "method", "dofs": "coordinates",
+    "T": "kinetic", "K": "kinetic",
     "V": "potential", "U": "potential", "P": "potential", "R": "dissipation",
 }  # fmt: skip
 _ALIASES_OF = {
@@ -340,7 +345,10 @@ def meant(path: tuple[str, ...]) -> str:
     known, last = _keys(path), path[-1]
     alias = _ALIASES_OF.get(path[0], {}).get(last, "") if len(path) > 2 else ""
     alias = alias or _ALIASES.get(last, "")
-    return alias if alias in known else nearest(path[-1], known)
+    near = alias if alias in known else nearest(path[-1], known)
+    # a table's entries are judged by what it is taken for: 'damping' is no 'spring'
+    far = len(path) == 1 and near != alias and not nearest(path[-1], [near], 0.7)
+    return "" if far else near
 
 
 def _toml(value: object) -> str:
@@ -388,7 +396,7 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
     if kind == "bool_type":
         return f"must be true or false, here {here}"
     if path[0] == "run":
-        return f"must be a number, here {here}"
+        return f"must be a number, here {here}{advice.number(given)}"
     if last in ("unit", "note", "name", "title", "parent", "joint", "coordinate"):
         return f"must be text in quotes, here {here}"
     return f"must be a number or a formula in quotes, here {here}"

@@ -13,6 +13,18 @@ class EomcError(Exception):
     """An error that is the user's to mend; its text is meant to be read as it stands."""
 
 
+class FolderError(EomcError):
+    """A folder of builds that can't be written; the remedy is Python's, the command has its own."""
+
+    def __str__(self) -> str:
+        return f"{super().__str__()}: choose another folder, root=..."
+
+    @property
+    def what(self) -> str:
+        """The fault alone."""
+        return super().__str__()
+
+
 @dataclass(frozen=True)
 class Problem:
     """One fault. `column` counts from 0; `line` from 1, 0 where there is no line to show."""

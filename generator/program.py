@@ -281,6 +281,14 @@ def inertia(program: Program) -> list[Problem]:
             f"D is not positive definite: '{weak}' has no inertia of its own. Give it a mass, "
             "or leave out a coordinate that others determine"
         )
+        read = program["D" if "D" in program else "D_column"].uses
+        if wrong := [
+            f"{p.name} = {p.value:g}" for p in s.parameters if p.value <= 0 and p.name in read
+        ]:
+            message = (
+                f"D is not positive definite, '{weak}' has no inertia, at {', '.join(wrong)}: "
+                "masses and moments of inertia are positive"
+            )
         raise SceneError([s.problem("energy.kinetic", message)])
     message = (
         f"D is not positive definite at the start, '{weak}' has no inertia there: "

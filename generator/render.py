@@ -19,6 +19,7 @@ from eomc.ccode import REALS
 from eomc.context import resource, values
 from eomc.pieces import weight
 from eomc.program import Program
+from eomc.steppers import METHODS
 from eomc.target import Target
 
 
@@ -27,7 +28,8 @@ class Sources:
     """The text of the generated files by name, and what the extension is made of besides.
 
     binding: C between the scene's functions and Python, with its cdef. operations: how many all
-    functions have together, which tells how long a compiler takes.
+    functions have together, which tells how long a compiler takes. wide: whether there are loops
+    over instances or stages, for the widest vector registers.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Sources:
     binding: str
     cdef: str
     operations: int
+    wide: bool = False
 
 
 def environment() -> jinja2.Environment:
@@ -67,11 +70,12 @@ def render(program: Program, extension: str) -> Sources:
 
     Same program, same text.
     """
-    target = Target(program, REALS[program.system.run.real])
+    run = program.system.run
+    target = Target(program, REALS[run.real])
     context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name
-    parts = ["runtime.py", "estimate.py", *(["batch.py"] if program.system.run.batch else [])]
+    parts = ["runtime.py", "estimate.py", *(["batch.py"] if run.batch else [])]
 
     def text(template: str) -> str:
         return jinja.get_template(template + ".jinja").render(context)
@@ -89,4 +93,5 @@ def render(program: Program, extension: str) -> Sources:
         binding=text("binding.c"),
         cdef=text("binding.cdef"),
         operations=sum(map(weight, program.functions.values())),
+        wide=run.batch or any(METHODS[method].sweeps for method in run.methods),
     )

@@ -52,7 +52,7 @@ class _Expansion:
 
     def run(self) -> bool:
         for given, meant in _ARRAYS_MEANT.items():
-            if _is_array(self.tree.get(given)) and meant not in self.tree:
+            if isinstance(self.tree.get(given), (dict, list)) and meant not in self.tree:
                 self.check.say((given,), f"unknown table '{given}': write [[{meant}]]")
                 self.tree[meant] = self.tree.pop(given)
                 self.check.places.rename((given,), (meant,))
@@ -111,7 +111,14 @@ class _Expansion:
 
     def _array(self, array: str, entries: Any) -> dict[str, Any]:
         if not _is_array(entries):
-            self._fault((array,), f"each {array} has a table of its own: write [[{array}]]")
+            inner = isinstance(entries, dict) and all(isinstance(e, dict) for e in entries.values())
+            named = (
+                f' and name = "{next(iter(entries))}"'
+                if inner and entries and array == "body"
+                else ""
+            )
+            message = f"each {array} has a table of its own: write [[{array}]]{named}"
+            self._fault((array,), message)
             return {}
         out: dict[str, Any] = {}
         places = self.check.places

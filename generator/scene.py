@@ -15,7 +15,7 @@ from typing import Any
 
 import pydantic
 
-from eomc import bodycheck, formulas, layout, names, repeat
+from eomc import advice, bodycheck, formulas, layout, names, repeat
 from eomc.assembly import Assembly
 from eomc.checker import (
     DOUBT,
@@ -155,8 +155,11 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
             data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
         others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
-        near = suggest(path.name, others)
+        meant = advice.file(path)
+        near = f"; did you mean '{meant}'?" if meant else suggest(path.name, others)
         raise EomcError(f"{file}: there is no such file{near}") from None
+    except IsADirectoryError:
+        raise EomcError(f"{file}: is a folder: name a scene, such as scenes/NAME.toml") from None
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
         raise EomcError(f"{file}: can't be read ({why})") from None
@@ -221,7 +224,9 @@ def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
         remedy = ": a [table] stands once, put its entries together"
         column, width = 0, len(source)
     else:
+        told = advice.bare(source)
         remedy = next((r for m, r in _TOML_REMEDIES.items() if m in message), "")
+        remedy = f": {told}" if told else remedy
     return Problem(f"not TOML: {message}{remedy}", "", file, line, column, width, source)
 
 
@@ -242,6 +247,7 @@ class _Check(Checker):
     ) -> None:
         super().__init__(places)
         self.values = parameters
+        advice.tables(tree, self)
         if not repeat.expand(tree, self):
             raise SceneError(self.problems)
         self.bodies = bool(tree.get("body"))
@@ -361,14 +367,15 @@ class _Check(Checker):
                 )
         for table in ("coordinates", "parameters", "constants", "inputs"):
             for name, entry in getattr(doc, table).items():
-                self._unit((table, name), entry.unit)
+                self._unit((table, name), entry.unit, getattr(entry, "start", 0))
         return seen
 
-    def _unit(self, path: tuple[str, ...], unit: str) -> None:
+    def _unit(self, path: tuple[str, ...], unit: str, start: float | str = 0) -> None:
         """Units are texts; those that show that something was meant to be converted are told."""
         plain = unit.strip().lower()
         if plain in ("deg", "degree", "degrees", "°", "deg/s", "°/s"):
-            remedy = 'write 30 degrees as "30*pi/180", with unit = "rad"'
+            number = f"{start:g}" if isinstance(start, float) and start else "30"
+            remedy = f'write {number} degrees as {advice.radians(number)}, with unit = "rad"'
             self.say((*path, "unit"), f"angles are in radians, nothing is converted: {remedy}")
         elif plain in (
             "mm",
@@ -497,10 +504,10 @@ class _Check(Checker):
             )
         if key == "kinetic" and VELOCITY not in kinds and sure and not self.bodies:
             velocities = " or ".join(f"{c}_dot" for c in self.doc.coordinates)
-            fault(
-                "the kinetic energy has no velocities, so nothing has inertia: "
-                f"use {velocities}, or dot(...) of a definition",
-            )
+            remedy = f"use {velocities}, or dot(...) of a definition"
+            if any(f"{c}_dot" in str(self.doc.energy.potential) for c in self.doc.coordinates):
+                remedy = "are kinetic and potential swapped?"
+            fault(f"the kinetic energy has no velocities, so nothing has inertia: {remedy}")
         if key == "dissipation" and VELOCITY not in kinds and sure and any(formula.names()):
             fault(
                 "the dissipation has no velocities, so it gives no force -dR/dq_dot: "

@@ -15,7 +15,7 @@ import sympy
 from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
-from eomc import formulas, names
+from eomc import formulas, given, names
 from eomc.bodies import Builder, Terms, Tree
 from eomc.formulas import FormulaError
 from eomc.problems import EomcError, Problem, SceneError
@@ -170,7 +170,7 @@ class System:
         return _Maker(name).make(
             coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
             inputs, definitions or {}, units or {}, title,
-            Run(h, duration, tuple(methods), real, batch, linearize),
+            given.run(h, duration, methods, real, batch, linearize),
         )  # fmt: skip
 
 
@@ -297,6 +297,8 @@ class _Maker:
     """Turns a user's symbols, of whatever assumptions and spelling, into ours."""
 
     def __init__(self, name: str) -> None:
+        if not isinstance(name, str):
+            raise given.fault("name", f"must be text, here {name!r}")
         if why := names.module_fault(name):
             raise EomcError(f"System.make: name: {why}")
         self.name = name
@@ -304,23 +306,20 @@ class _Maker:
         self.taken: dict[str, Any] = {}
         self.renamed: list[tuple[str, str]] = []
 
-    def name_of(self, given: Any, role: str) -> str:
-        text = given.func.__name__ if isinstance(given, AppliedUndef) else str(given)
+    def name_of(self, one: Any, role: str) -> str:
+        if not given.is_symbol(one):
+            raise given.fault(role, f"{one!r} is not a symbol")
+        text = one.func.__name__ if isinstance(one, AppliedUndef) else str(one)
         used = names.plain(text) if names.fault(text) else text
         if used in self.taken:
             raise EomcError(f"System.make: {role} '{text}': the name '{used}' is taken already")
         if used != text:
             self.renamed.append((text, used))
-        self.taken[used] = given
+        self.taken[used] = one
         return used
 
-    def expression(self, given: Any, role: str) -> Expr:
-        try:
-            expr = sympy.sympify(given)
-        except sympy.SympifyError:
-            raise EomcError(f"System.make: {role}: {given!r} is not an expression") from None
-        if isinstance(given, str):
-            raise EomcError(f"System.make: {role}: give a SymPy expression, not the text {given!r}")
+    def expression(self, value: Any, role: str) -> Expr:
+        expr = given.expression(value, role)
         expr = expr.replace(
             lambda e: isinstance(e, sympy.Derivative), lambda e: self.map.get(e, e)
         ).xreplace(self.map)
@@ -329,6 +328,17 @@ class _Maker:
             if expr.has(AppliedUndef, sympy.Derivative)
             else []
         ) + sorted(s.name for s in expr.free_symbols if s not in self.known)
+        if any(
+            isinstance(d, sympy.Derivative) and d.derivative_count > 1
+            for d in expr.atoms(sympy.Derivative)
+        ):
+            raise given.fault(role, "accelerations are what is solved for, none can be used")
+        if strange == ["t"]:
+            raise given.fault(
+                role,
+                "this t is not the time: write eomc.system.t, or "
+                "dynamicsymbols._t where coordinates are dynamicsymbols",
+            )
         if strange:
             raise EomcError(
                 f"System.make: {role}: {', '.join(strange)} not declared: "
@@ -336,6 +346,7 @@ class _Maker:
             )
         if expr.has(*_UNDEFINED, sympy.I):
             raise EomcError(f"System.make: {role}: {expr} is not a real, finite expression")
+        given.check_functions(expr, role)
         return expr
 
     def make(
@@ -343,39 +354,39 @@ class _Maker:
         dissipation: Any, forces: Mapping[Any, Any], inputs: Any, definitions: Mapping[Any, Any],
         units: Mapping[Any, str], title: str, run: Run,
     ) -> System:  # fmt: skip
-        starts = (
-            dict(coordinates)
-            if isinstance(coordinates, Mapping)
-            else dict.fromkeys(coordinates, 0.0)
-        )
+        starts = given.symbols(coordinates, "coordinates", 0.0)
+        parameters = given.mapping(parameters, "parameters", "{m: 2.0}")
+        forces = given.mapping(forces, "forces", "{x: F}")
+        definitions = given.mapping(definitions, "definitions", "{y: l*cos(theta)}")
+        units = given.mapping(units, "units", '{m: "kg"}')
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
         made = []
-        for given, start in starts.items():
-            q0, qd0 = start if isinstance(start, tuple) else (start, 0.0)
-            c = Coordinate(
-                self.name_of(given, "coordinate"), units.get(given, ""), float(q0), float(qd0)
-            )
-            self.map[given] = c.q
-            if isinstance(given, AppliedUndef):
-                time = given.args[0]
-                self.map[sympy.Derivative(given, time)] = c.qd
+        for one, start in starts.items():
+            name = self.name_of(one, "coordinate")
+            c = Coordinate(name, units.get(one, ""), *given.start(start, f"start of {name}"))
+            self.map[one] = c.q
+            if isinstance(one, AppliedUndef):
+                time = one.args[0]
+                self.map[sympy.Derivative(one, time)] = c.qd
                 self.map[time] = t
             else:
-                self.map[Symbol(f"{given}_dot", **given.assumptions0)] = c.qd
+                self.map[Symbol(f"{one}_dot", **one.assumptions0)] = c.qd
             made.append(c)
         declared = [
-            Parameter(self.declare(p, "parameter"), float(v), units.get(p, ""))
+            Parameter(
+                self.declare(p, "parameter"), given.number(v, f"parameter {p}"), units.get(p, "")
+            )
             for p, v in parameters.items()
         ]
-        pending = dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(inputs, 0)
+        pending = given.symbols(inputs, "inputs", 0)
         given_inputs = [(i, self.declare(i, "input")) for i in pending]
         self.known = {c.q for c in made} | {c.qd for c in made} | {t}
         self.known |= {symbol(n) for n in self.taken}
         ordered = []
-        for given, body in definitions.items():
-            expr = self.expression(body, f"definition {given}")
-            defined = symbol(self.declare(given, "definition"))
+        for one, body in definitions.items():
+            expr = self.expression(body, f"definition {one}")
+            defined = symbol(self.declare(one, "definition"))
             self.known.add(defined)
             ordered.append((defined, expr))
         unknown = [str(f) for f in forces if f not in starts]
@@ -391,8 +402,8 @@ class _Maker:
             "forces": tuple(expression(forces.get(c, 0), f"force on {c}") for c in starts),
             "parameters": tuple(declared),
             "inputs": tuple(
-                Input(used, units.get(given, ""), expression(pending[given], f"signal of {given}"))
-                for given, used in given_inputs
+                Input(used, units.get(one, ""), expression(pending[one], f"signal of {one}"))
+                for one, used in given_inputs
             ),
             "definitions": tuple(ordered),
             "run": run,
@@ -401,7 +412,7 @@ class _Maker:
         digest = hashlib.sha256(sympy.srepr(sorted(made_of.items())).encode()).hexdigest()
         return System(**made_of, digest=digest, renamed=tuple(self.renamed))
 
-    def declare(self, given: Any, role: str) -> str:
-        used = self.name_of(given, role)
-        self.map[given] = symbol(used)
+    def declare(self, one: Any, role: str) -> str:
+        used = self.name_of(one, role)
+        self.map[one] = symbol(used)
         return used

@@ -33,7 +33,7 @@ from eomc import mechanics, program, reference
 from eomc.answer import Vector
 from eomc.ccode import QUAD
 from eomc.context import values
-from eomc.problems import EomcError
+from eomc.problems import EomcError, FolderError
 from eomc.render import environment
 from eomc.system import System
 from eomc.system import t as time_symbol
@@ -126,9 +126,7 @@ def of(
         beside.write_text(json.dumps(kept) + "\n", encoding="utf-8")
         os.replace(beside, file)
     except OSError as fault:
-        raise EomcError(
-            f"{file}: can't be written ({fault.strerror}): choose another place with --build DIR"
-        ) from None
+        raise FolderError(f"{file}: can't be written ({fault.strerror})") from None
     return truth
 
 

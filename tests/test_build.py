@@ -20,6 +20,8 @@ from conftest import needs
 import eomc
 from cases import SCENES
 from eomc import compile as compiler
+from eomc.scene import parse
+from eomc.system import from_scene
 
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
 CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
@@ -362,7 +364,9 @@ def test_two_scenes_of_one_name_built_at_once(scene: Path, root: Path, tmp_path:
 
 def test_a_place_that_cannot_be_written(scene: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
-    with pytest.raises(eomc.EomcError, match=r"file.*can't be written .*--build DIR"):
+    with pytest.raises(
+        eomc.EomcError, match=r"file.*can't be written .*: choose another folder, root="
+    ):
         eomc.build(scene, tmp_path / "file" / "build")
 
 
@@ -415,3 +419,18 @@ def test_a_faulty_scene_is_not_built(scene: Path, root: Path) -> None:
     with pytest.raises(eomc.SceneError, match="'gg'"):
         eomc.build(scene, root)
     assert marks(root / "simple_pendulum") == before
+
+
+@pytest.mark.parametrize(
+    ("run", "width"), [("", 256), ("batch = true", 512), ('method = ["rk4", "gauss16"]', 512)]
+)
+def test_registers_are_as_wide_as_loops_have_use_for(
+    run: str, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """512 bits for loops over instances or stages; straight-line code is faster in 256."""
+    monkeypatch.delenv("EOMC_CFLAGS", raising=False)
+    made = eomc.sources(from_scene(parse(TEXT + f"{run}\n")))
+    monkeypatch.setattr(compiler, "_processor", lambda: "flags : fma avx2 avx512f")
+    assert compiler.flags(made.wide)[-1] == f"-mprefer-vector-width={width}"
+    monkeypatch.setattr(compiler, "_processor", lambda: "flags : fma avx2")
+    assert compiler.flags(made.wide) == compiler.FLAGS

@@ -155,3 +155,16 @@ def test_fractions_of_slanted_axes_are_shown_as_decimals(here: Path) -> None:
 @pytest.mark.parametrize("command", ["new", "build", "check", "run", "show", "list"])
 def test_help_has_an_example(command: str) -> None:
     assert f"eomc {command}" in eomc(command, "--help").output
+
+
+def test_a_name_without_its_file_is_answered_by_the_file(here: Path) -> None:
+    done = eomc("run", "cartpole")
+    assert done.exit_code == 2
+    assert "cartpole: there is no such file; did you mean 'cartpole.toml'?" in done.output
+
+
+def test_a_folder_that_is_none_is_answered_with_the_option(here: Path) -> None:
+    (here / "file").write_text("", encoding="utf-8")
+    done = eomc("build", "cartpole.toml", "--build", "file")
+    assert done.exit_code == 2
+    assert "choose another place with --build DIR" in done.output and "root=" not in done.output

@@ -89,6 +89,37 @@ x, x_dot, u = sympy.symbols("x x_dot u")
         (("a", [x], x_dot**2), {"parameters": {x: 1.0}}, "'x' is taken already"),
         (("a", [x], x_dot**2), {"forces": {u: 1}}, "not among the coordinates"),
         (("a", [x], sympy.I * x_dot**2), {}, "not a real, finite expression"),
+        ((3, [x], x_dot**2), {}, "name: must be text"),
+        (("a", ["x"], x_dot**2), {}, r"give a symbol, sympy\.Symbol\('x'\)"),
+        (("a", x, x_dot**2), {}, "coordinates: give a list or dict"),
+        (("a", [x**2], x_dot**2), {}, r"x\*\*2 is not a symbol"),
+        (("a", {x: "pi/2"}, x_dot**2), {}, "start of x: must be a number, here 'pi/2'"),
+        (("a", {x: (1, 2, 3)}, x_dot**2), {}, r"pair \(start, rate\)"),
+        (("a", {x: np.nan}, x_dot**2), {}, "start of x: must be a finite number"),
+        (("a", [x], None), {}, "kinetic: None is not an expression"),
+        (("a", [x], x_dot**2, x > 0), {}, "potential: x > 0 is not an expression"),
+        (("a", [x], x_dot**2, sympy.erf(x)), {}, "potential: erf can't be used: write tanh"),
+        (("a", [x], x_dot**2, sympy.sec(x)), {}, r"sec can't be used: write 1/cos\(x\)"),
+        (("a", [x], x_dot**2, sympy.besselj(0, x)), {}, "besselj can't be used; functions are sin"),
+        (
+            ("a", [x], x_dot**2, sympy.Piecewise((x, x > 0), (0, True))),
+            {},
+            "Piecewise can't be used: write Heaviside",
+        ),
+        (("a", [x], x_dot**2), {"forces": {x: sympy.ceiling(x)}}, "force on x: ceiling can't"),
+        (("a", [x], x_dot**2), {"forces": {"x": 1}}, "forces: give a symbol"),
+        (("a", [x], x_dot**2), {"forces": {x: sympy.Symbol("t")}}, r"not the time: write eomc\."),
+        (("a", [x], x_dot**2), {"parameters": [u]}, "parameters: give a dict"),
+        (("a", [x], x_dot**2), {"parameters": {"u": 1}}, r"give a symbol, sympy\.Symbol\('u'\)"),
+        (("a", [x], x_dot**2), {"parameters": {u: "1"}}, "parameter u: must be a number, here '1'"),
+        (("a", [x], x_dot**2), {"parameters": {u: x}}, "parameter u: must be a number, here x"),
+        (("a", [x], x_dot**2), {"inputs": "u"}, "inputs: give a list or dict of symbols"),
+        (("a", [x], x_dot**2), {"definitions": {u: "x"}}, "definition u: give a SymPy expression"),
+        (("a", [x], x_dot**2), {"h": -0.1}, "h: must be greater than zero"),
+        (("a", [x], x_dot**2), {"methods": ["ode45"]}, "methods: known are rk4"),
+        (("a", [x], x_dot**2), {"real": "quad"}, "real: known are double, float"),
+        (("a", [x], x_dot**2), {"batch": "yes"}, "batch: must be True or False"),
+        (("a", [x], x_dot**2), {"linearize": "all"}, "linearize: must be True"),
     ],
 )
 def test_what_is_wrong_is_said(
@@ -116,3 +147,45 @@ def test_a_kinetic_energy_that_is_not_quadratic_is_named(more: sympy.Expr) -> No
     system = System.make("a", [x], x_dot**2 / 2 + more)
     with pytest.raises(EomcError, match=r"energy\.kinetic: .* (quadratic|jumps)"):
         eomc.sources(system)
+
+
+def test_a_method_may_be_named_alone() -> None:
+    assert System.make("a", [x], x_dot**2 / 2, methods="dp8").run.methods == ("dp8",)
+    assert System.make("a", {x: [0.1, 0.2]}, x_dot**2 / 2).coordinates[0].rate == 0.2
+
+
+@pytest.mark.parametrize("given", [3, None, {}, b"scene.toml", ["scene.toml"]])
+def test_what_is_no_scene_is_refused(given: object) -> None:
+    for function in (eomc.load, eomc.build, eomc.read):
+        with pytest.raises(EomcError, match="give the path of a scene"):
+            function(given)  # type: ignore[operator]
+
+
+def test_texts_and_paths_for_something_else_are_refused() -> None:
+    with pytest.raises(EomcError, match="not its text"):
+        eomc.load((SCENES / "cartpole.toml").read_text(encoding="utf-8"))
+    with pytest.raises(EomcError, match="root: give the path of a folder, here 3"):
+        eomc.load(SCENES / "cartpole.toml", 3)  # type: ignore[arg-type]
+    with pytest.raises(EomcError, match=r"give a System, such as eomc\.read\('a\.toml'\)"):
+        eomc.sources("a.toml")  # type: ignore[arg-type]
+    with pytest.raises(EomcError, match="is a folder: name a scene"):
+        eomc.read(SCENES)
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0])
+def test_a_mass_that_is_not_positive_is_named(value: float) -> None:
+    m = sympy.Symbol("m")
+    system = System.make("a", [x], m * x_dot**2 / 2, x**2, parameters={m: value})
+    with pytest.raises(EomcError, match=rf"'x' has no inertia, at m = {value:g}: masses"):
+        eomc.sources(system)
+
+
+def test_a_scene_named_without_its_folder_is_suggested(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "crane.toml").write_text("", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for given in ("crane", "crane.toml", "scenes/crane"):
+        with pytest.raises(EomcError, match=r"did you mean 'scenes/crane\.toml'\?"):
+            eomc.read(given)
