@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from copy import deepcopy
 from functools import cached_property
 from time import perf_counter
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .package import reduced
 from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number, _size, _unmasked
 
 _GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
@@ -32,7 +34,7 @@ class BatchRun:
 
     status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the
     rows behind the last good one of an instance that could not go on are nan. steps: how many each
-    has made.
+    has made. Equal where all of these are, bit by bit; a pickled one keeps all of them.
     """
 
     def __init__(
@@ -62,6 +64,28 @@ class BatchRun:
         done = int(self.steps.sum())
         wanted = len(self) * self._wanted
         return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {told}"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("batch.BatchRun", *self._all())
+
+    def _all(self) -> tuple[Any, ...]:
+        return (
+            self.t0, self.q, self.qd, self.h, self.steps, self._codes, self.every, self._wanted
+        )  # fmt: skip
+
+    def __copy__(self) -> BatchRun:
+        return BatchRun(*self._all())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> BatchRun:
+        return BatchRun(*deepcopy(self._all(), memo))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, BatchRun):
+            return NotImplemented
+        both = zip(self._all(), other._all(), strict=True)
+        return all(np.array_equal(a, b, equal_nan=True) for a, b in both)
+
+    __hash__ = None  # type: ignore[assignment]  # rows may be changed
 
     def __len__(self) -> int:
         return len(self._codes)
@@ -418,6 +442,8 @@ class _Work:
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}
+if hasattr(os, "register_at_fork"):  # a fork has the pools but none of their threads
+    os.register_at_fork(after_in_child=_pools.clear)
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:

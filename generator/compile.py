@@ -304,11 +304,43 @@ def _compile(made: Sources, extension: str, folder: Path, library: str, compiler
     _finish(name, link, _start(link, folder))
 
 
+# imports an extension from a file, with nothing of Python's own start-up but cffi's backend
+_TRIAL = """
+import sys
+sys.path.append(sys.argv[1])
+from importlib.machinery import ExtensionFileLoader, ModuleSpec
+loader = ExtensionFileLoader(sys.argv[2], sys.argv[3])
+loader.exec_module(loader.create_module(ModuleSpec(sys.argv[2], loader, origin=sys.argv[3])))
+"""
+
+
+def _try(name: str, extension: str, library: Path, compiler: Compiler) -> None:
+    """Load a new extension in a process of its own (some 10 ms), before it replaces another.
+
+    Raises EomcError where it can't be loaded, or ends that process.
+    """
+    backend = importlib.util.find_spec("_cffi_backend")
+    assert backend is not None and backend.origin is not None
+    where = os.path.dirname(backend.origin)
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", _TRIAL, where, extension, str(library.resolve())],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="backslashreplace",
+    )  # fmt: skip
+    if done.returncode:
+        lines = done.stderr.strip().splitlines()
+        said = lines[-1] if lines else f"status {done.returncode}"
+        raise EomcError(
+            f"{name}: the C compiler {shlex.join(compiler.command)} returned 0, but what it made "
+            f"can't be loaded: correct CC and EOMC_CFLAGS; the last build stays\n  {said}"
+        )
+
+
 def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
     try:
         return subprocess.Popen(
-            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="backslashreplace",
+        )  # fmt: skip
     except OSError as fault:
         raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
 
@@ -339,4 +371,27 @@ def load(built: Built) -> ModuleType:
     except BaseException:
         del sys.modules[alias]
         raise
+    # another process can't import the alias; what is pickled here is found by its place there
+    place = (built.name, str(built.folder.resolve()), alias)
+    sys.modules[f"{alias}.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
     return module
+
+
+def unpickled(name: str, folder: str, alias: str, path: str, arguments: tuple[Any, ...]) -> Any:
+    """A value pickled by a module that `load` had loaded; pickle calls this.
+
+    Raises EomcError where the module is no longer there; a MotionError is made all the same, since
+    pools of processes wait for ever for what can't be read.
+    """
+    try:
+        if alias not in sys.modules:
+            alias = load(Built(name, Path(folder), False)).__name__
+    except (OSError, ValueError, KeyError, ImportError):
+        if path == "runtime.MotionError":
+            from eomc.runtime import MotionError
+
+            return MotionError(*arguments)
+        raise EomcError(
+            f"{folder}: the module that pickled this is not there: build the scene again"
+        ) from None
+    return importlib.import_module(f"{alias}.package").made(path, arguments)

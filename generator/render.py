@@ -71,7 +71,12 @@ def render(program: Program, extension: str) -> Sources:
     context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name
-    parts = ["runtime.py", "estimate.py", *(["batch.py"] if program.system.run.batch else [])]
+    parts = [
+        "runtime.py",
+        "estimate.py",
+        "package.py",
+        *(["batch.py"] if program.system.run.batch else []),
+    ]
 
     def text(template: str) -> str:
         return jinja.get_template(template + ".jinja").render(context)

@@ -12,6 +12,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from functools import cached_property
 from math import ceil, isfinite
 from time import perf_counter
@@ -22,6 +23,7 @@ from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
 from .estimate import Estimate, advice, estimate
+from .package import Defaults, reduced
 
 Array = NDArray[Any]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -35,6 +37,7 @@ _SAID = {
     "no convergence": "the iteration for the step does not converge: take a smaller h",
     "interrupted": "interrupted",
 }
+_LEFT_OUT = "u was a function, which a pickled run doesn't keep: simulate again"
 _OF_POSITION = ("D", "g", "potential_energy")
 _MANY = 1000  # steps from which a look at the stability limit is worth its time
 _LARGE = 2**24  # positions from which a look at the memory is worth its time
@@ -50,6 +53,9 @@ class MotionError(ArithmeticError):
         super().__init__(message)
         self.status = status
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("runtime.MotionError", str(self), self.status)
+
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C during a simulation; `run` holds what was done until then."""
@@ -57,6 +63,9 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, run: Any) -> None:
         super().__init__(run.message)
         self.run = run
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("runtime.Interrupted", self.run)
 
 
 class _Half:
@@ -83,6 +92,10 @@ class Run:
     ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
     when it is asked for; `steps` were done by `method`, of size h, and a row kept of `every` so
     many. evaluations: of accelerations. error: an Estimate, where it was asked for.
+
+    Runs are equal where their scene, settings and rows are, bit by bit. A pickled run keeps all of
+    that, its parameters and its inputs, but not a u that is a function: estimate() is refused then.
+    Where it is read again, it finds the built module as it was found here.
     """
 
     q, qd = _Half(0), _Half(1)
@@ -135,7 +148,10 @@ class Run:
         """The run's own error, by doing it again in shorter steps; kept in `error`.
 
         Where u is a function, it is called again, as often as in the run for each finer one.
+        Raises ValueError where the run was pickled and lost that function.
         """
+        if isinstance(self._u, str):
+            raise ValueError(f"estimate: {self._u}")
         try:
             self.error = estimate(self, progress)
         except KeyboardInterrupt:
@@ -160,6 +176,44 @@ class Run:
             model._pointer(x[model.nq :]), self.h / parts, self.steps * parts, every, u,
             self._params, model._pointer(self._params), self.method, float(self.t[0]), None,
             progress,
+        )  # fmt: skip
+
+    def _state(self) -> dict[str, Any]:
+        """All but what is made when it is asked for."""
+        made = ("t", "q", "qd")
+        return {name: value for name, value in self.__dict__.items() if name not in made}
+
+    @classmethod
+    def _of_state(cls, state: dict[str, Any]) -> Run:
+        run = cls.__new__(cls)
+        run.__dict__.update(state)
+        return run
+
+    def __copy__(self) -> Run:
+        return self._of_state(self._state())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Run:
+        return self._of_state(deepcopy(self._state(), memo))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = self._state()
+        if callable(self._u):
+            state["_u"] = _LEFT_OUT
+        return reduced("runtime.Run._of_state", state)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Run):
+            return NotImplemented
+        alike = self._settings() == other._settings()
+        return alike and np.array_equal(self.q, other.q) and np.array_equal(self.qd, other.qd)
+
+    __hash__ = None  # type: ignore[assignment]  # rows may be changed
+
+    def _settings(self) -> tuple[Any, ...]:
+        model = self._model
+        return (
+            model.name, model.digest, self.t0, self.h, self.steps, self.status, self.every,
+            self.method, self._params.tolist(),
         )  # fmt: skip
 
     @property
@@ -214,6 +268,21 @@ class Params:
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # a copy too goes this way
+        return reduced("_model._made_params", dict(zip(self._names, self._values(), strict=True)))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Params):
+            return NotImplemented
+        return self._names == other._names and self._values() == other._values()
+
+    __hash__ = None  # type: ignore[assignment]  # values may be changed
+
+    def _values(self) -> list[float]:
+        values: list[float] = self._array.tolist()
+        return values
+
     def __repr__(self) -> str:
         inside = ", ".join(f"{n}={v:g}" for n, v in zip(self._names, self._array, strict=True))
         return f"Params({inside})"
@@ -239,7 +308,7 @@ class Model:
         self.dtype = np.dtype(dtype)
         self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
         self.parameters = tuple(parameters)
-        self.defaults = dict(parameters)
+        self.defaults = Defaults(parameters)
         self.units = dict(units)
         self.nq, self.nu = len(self.coordinates), len(self.inputs)
         self._shape = (self.nq,) if self.nq <= _FEW else None  # of a state that is soon looked at
@@ -259,6 +328,23 @@ class Model:
             "_dtype": dtype,
         }
         self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("_model._again", self.digest)
+
+    def _again(self, digest: str) -> Model:
+        """Itself, found by a value that was pickled; a warning where the scene was another then."""
+        if digest != self.digest:
+            warnings.warn(
+                f"{self.name}: this was pickled from another version of the scene; what is "
+                "computed from it now is of the present version",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return self
+
+    def _made_params(self, values: Mapping[str, float]) -> Any:
+        return self.Params(**values)
 
     @property
     def start(self) -> tuple[Array, Array]:
