@@ -71,12 +71,8 @@ def render(program: Program, extension: str) -> Sources:
     context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name
-    parts = [
-        "runtime.py",
-        "estimate.py",
-        "package.py",
-        *(["batch.py"] if program.system.run.batch else []),
-    ]
+    copied = ["runtime", "estimate", "package", "slices"]
+    parts = [f"{part}.py" for part in copied + (["batch"] if program.system.run.batch else [])]
 
     def text(template: str) -> str:
         return jinja.get_template(template + ".jinja").render(context)

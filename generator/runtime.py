@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .estimate import Estimate, advice, estimate
 from .package import Defaults, reduced
+from .slices import longer, slices
 
 Array = NDArray[Any]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -43,7 +44,8 @@ _MANY = 1000  # steps from which a look at the stability limit is worth its time
 _LARGE = 2**24  # positions from which a look at the memory is worth its time
 _FEW = 32  # numbers that Python looks at sooner than NumPy
 _CHUNK = 16_384  # steps times coordinates before the first look, some ms
-_CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
+_ROWS = 20_000  # rows times coordinates squared in one call, some ms at most
+_MOST = 2**60  # steps, so that C can return four times as many
 
 
 class MotionError(ArithmeticError):
@@ -397,21 +399,21 @@ class Model:
         return self._pointer(at), self._pointer(moving), at, moving
 
     def _numbers(self, value: ArrayLike, name: str) -> Array:
-        """A C-contiguous array of the module's numbers, of any shape."""
+        """A C-contiguous, aligned array of the module's numbers, of any shape."""
         if not isinstance(value, list):
             _unmasked(value, name)
         try:
             array = np.asarray(value)
             if array.dtype.kind in "cUSmM":  # text that looks like a number is none
                 raise TypeError
-            return np.ascontiguousarray(array, self.dtype)
-        except (TypeError, ValueError):
+            return _aligned(np.ascontiguousarray(array, self.dtype))
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:
         """Finite numbers, (width,) or (n, width)."""
-        if type(value) is ndarray and value.dtype is self.dtype and value.flags.c_contiguous:
-            array = value
+        if type(value) is ndarray and value.dtype is self.dtype and value.flags.carray:
+            array = value  # C-contiguous, aligned and, which need not be, writeable
         else:
             array = self._numbers(value, name)
         if array.ndim == 1 and array.size == width <= _FEW and isfinite(sum(array.tolist())):
@@ -457,8 +459,8 @@ class Model:
             return np.asarray(given._array)
         _unmasked(params, "params")
         try:
-            array = np.ascontiguousarray(params, self.dtype)
-        except (TypeError, ValueError):
+            array = _aligned(np.ascontiguousarray(params, self.dtype))
+        except (TypeError, ValueError, OverflowError):
             array = empty(0, self.dtype)
         if array.shape != self._p0.shape or not np.isfinite(array).all():
             raise ValueError(
@@ -481,10 +483,11 @@ class Model:
         if out is None:
             return empty(shape, self.dtype)
         _unmasked(out, name)
-        good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.c_contiguous
-        if not good or out.shape != shape or not out.flags.writeable:
+        good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.carray
+        if not good or out.shape != shape:
             raise ValueError(
-                f"{name}: expected a writeable, C-contiguous array of {self.dtype}, shape {shape}"
+                f"{name}: expected a writeable, aligned, C-contiguous array of {self.dtype}, "
+                f"shape {shape}"
             )
         array: Array = out
         return array
@@ -527,6 +530,12 @@ class Model:
         function = getattr(self._lib, name, None)
         if function is None:  # no forces, no power
             result[...] = 0
+        elif rows and rows[0] * self.nq**2 > _ROWS:
+            to, size = address(real, result), result[:1].size
+            for k, many in slices(rows[0], _ROWS // self.nq**2 + 1):
+                here = self.nq * k
+                moving_here = from_qd + here if moving is not None else null
+                function(many, to + size * k, from_q + here, moving_here, time, inputs, p)
         else:
             function(
                 rows[0] if rows else 1, address(real, result), from_q, from_qd, time, inputs, p
@@ -624,12 +633,20 @@ class Model:
         if out is not None:
             result = self._out(out, at.shape)
         inputs, p = self._given(u, params)
-        found = self._lib.acceleration(
-            1 if at.ndim == 1 else len(at), self._pointer(made), from_q, from_qd,
-            _number(t, "t"), inputs, p,
-        )  # fmt: skip
+        to, time, first = self._pointer(made), _number(t, "t"), 0
+        count = 1 if at.ndim == 1 else len(at)
+        if count * self.nq**2 <= _ROWS:
+            found = self._lib.acceleration(count, to, from_q, from_qd, time, inputs, p)
+        else:
+            for first, many in slices(count, _ROWS // self.nq**2 + 1):
+                k = self.nq * first
+                found = self._lib.acceleration(
+                    many, to + k, from_q + k, from_qd + k, time, inputs, p
+                )
+                if found & 3:
+                    break
         if found & 3:
-            done, said = found >> 2, STATUS[found & 3]
+            done, said = first + (found >> 2), STATUS[found & 3]
             where = _state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
             what = _SAID[said] if said == "singular" else "the acceleration is not finite there"
             raise MotionError(f"at {where}: {what}", said)
@@ -719,7 +736,7 @@ class Model:
         from_q, from_qd, at, moving = self._read(q, qd)
         if at.ndim != 1:
             self._one(q, qd)
-        h = self.h if h is None else _size(h)
+        h = self.h if h is None else _size(h, self.dtype)
         inputs, p = self._given(u, params)
         address, real, null = self._c
         if out is None:
@@ -756,12 +773,20 @@ class Model:
         if steps is not None:
             if duration is not None:
                 raise ValueError("steps: give steps or duration, not both")
-            return _count(steps, "steps", 0)
+            count = _count(steps, "steps", 0)
+            if count > _MOST:
+                raise ValueError(f"steps: {count:.3g} are more than a run can count, {_MOST:.3g}")
+            return count
         time = self.duration if duration is None else _number(duration, "duration")
         if time < 0:
             raise ValueError(f"duration: {duration} is not a time in s")
+        if time / h > _MOST:
+            raise ValueError(
+                f"duration: {time:g} s are more steps of h = {h:g} s than a run can count, "
+                f"{_MOST:.3g}: take a larger h, or a shorter duration"
+            )
         # the first multiple of h that is not before the duration, rounding aside
-        return ceil(time / abs(h) * (1 - 1e-12))
+        return ceil(time / h * (1 - 1e-12))
 
     def simulate(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
@@ -790,15 +815,15 @@ class Model:
             q, from_q = self._from(q0, "q0")
         if qd0 is not None:
             qd, from_qd = self._from(qd0, "qd0")
-        h = self.h if h is None else _size(h)
+        h = self.h if h is None else _size(h, self.dtype)
         p = self._p0
         if params is not None:
             p = self._parameters(params).copy()
             at_p = self._pointer(p)
         if (
             type(steps) is int and type(every) is int and type(t0) is float and isfinite(t0)
-            and u is None and duration is None and out is None and progress is None and every > 0
-            and not estimate
+            and u is None and duration is None and out is None and progress is None
+            and 0 < every < _MOST and not estimate
         ):  # fmt: skip
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
@@ -814,7 +839,7 @@ class Model:
                     )
         t0 = _number(t0, "t0")
         steps = self._steps(h, duration, steps)
-        every = _count(every, "every", 1)
+        every = min(_count(every, "every", 1), max(1, steps))
         if steps >= _MANY and (method, h) not in self._warned:
             self._warned.add((method, h))
             first = self._table(u, steps)[1]
@@ -843,7 +868,7 @@ class Model:
         if q0 is not None or qd0 is not None:
             q, qd = self._state(q if q0 is None else q0, qd if qd0 is None else qd0)
         given, method = self._parameters(params), self._method(method)
-        h = self.h if h is None else _size(h)
+        h = self.h if h is None else _size(h, self.dtype)
         return advice(self, q, qd, h, _number(t0, "t0"), u, given, method)
 
     def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
@@ -880,7 +905,8 @@ class Model:
         q_rows, qd_rows = both[0], both[1]
         to_q, to_qd = address(real, q_rows), address(real, qd_rows)
         at_u = null if held is None else address(real, held)
-        done, chunk = 0, 1 if law else _CHUNK // nq or 1
+        # a step of an implicit method may solve for all its stages
+        done, chunk = 0, 1 if law else _CHUNK // (nq**3 if counted else nq) or 1
         # what goes from one call to the next, and what is counted; a single call may do without
         single = steps <= chunk and counted is None
         work = null if single else self._ffi.new(work_type)
@@ -908,8 +934,7 @@ class Model:
                 if done == steps:
                     break
                 if not law:
-                    spent = perf_counter() - begun
-                    chunk = int(count * min(16.0, max(0.25, _CHUNK_SECONDS / (spent + 1e-9)))) + 1
+                    chunk = longer(count, perf_counter() - begun)
         except KeyboardInterrupt:
             done, said = work.done if work else done, "interrupted"
             if not done:
@@ -986,17 +1011,30 @@ def _number(value: Any, name: str) -> float:
         number = float("x" if isinstance(value, (str, bytes)) else value)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: {value!r} is not a number") from None
+    except OverflowError:  # a whole number
+        number = float("inf")
     if not isfinite(number):
         raise ValueError(f"{name}: {value!r} is not a finite number")
     return number
 
 
-def _size(h: Any) -> float:
-    """A step size, or a ValueError."""
+def _size(h: Any, dtype: np.dtype[Any]) -> float:
+    """A step size in the module's numbers, or a ValueError."""
+    if type(h) is float and 1e-37 < h < 1e37:  # in single precision too
+        return h
     size = _number(h, "h")
-    if size == 0:
-        raise ValueError("h: 0 is not a step size: give a number of seconds")
+    limits = np.finfo(dtype)
+    if not limits.smallest_subnormal <= size <= limits.max:
+        why = "" if size <= 0 else f" in {dtype}"
+        raise ValueError(
+            f"h: {h!r} is not a step size{why}: give a number of seconds greater than 0"
+        )
     return size
+
+
+def _aligned(array: Array) -> Array:
+    """The array, copied where its numbers lie at addresses that C can't read them from."""
+    return array if array.flags.aligned else array.copy()
 
 
 def _count(value: Any, name: str, least: int) -> int:
