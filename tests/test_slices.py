@@ -55,7 +55,9 @@ def test_ctrl_c_in_a_batch_of_one_after_a_quick_one(batch: ModuleType) -> None:
     """A large batch takes some ns a step of an instance; one alone as long as eight."""
     q0 = np.tile(batch.start[0], (4096, 1))
     batch.simulate_batch(q0, steps=2000, every=2000)
-    stop: Any = soon(lambda: batch.simulate_batch(q0[:1], steps=10**9, every=10**8))
+    stop: Any = soon(
+        lambda: batch.simulate_batch(q0[:1], steps=10**9, every=10**8), before=0.1, after=0.25
+    )
     run = stop.run
     assert run.status[0] == "interrupted" and 0 < run.steps[0] < 10**9
     steps = int(run.steps[0])
@@ -104,7 +106,10 @@ def test_ctrl_c_in_one_call_for_long_rows() -> None:
 def test_ctrl_c_in_an_implicit_method_and_in_its_estimate() -> None:
     """A step of gauss8 of a chain of twenty may take milliseconds."""
     m = loaded("chain", STIFF, repeat=20)
-    stop: Any = soon(lambda: m.simulate(h=0.01, steps=10**7, every=10**5, params={"b": 5.0}))
+    stop: Any = soon(
+        lambda: m.simulate(h=0.01, steps=10**7, every=10**5, params={"b": 5.0}),
+        before=0.05, after=0.2,
+    )  # fmt: skip
     assert stop.run.steps > 0
     run = m.simulate(h=0.005, steps=800, params={"b": 5.0})
     soon(lambda: run.estimate())
