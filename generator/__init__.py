@@ -152,7 +152,7 @@ def name_and_digest(path: Path) -> tuple[str, str]:
     try:
         data = path.read_bytes()
         name = tomllib.loads(data.decode()).get("name", "")
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return "", ""  # the reader tells what is wrong
     return name if isinstance(name, str) and name.isidentifier() else "", hashlib.sha256(
         data

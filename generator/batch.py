@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from copy import deepcopy
 from functools import cached_property
 from time import perf_counter
 from typing import Any
@@ -16,7 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .runtime import STATUS, Array, Interrupted, Model, Params, _count, _number, _size, _unmasked
+from .package import reduced
+from .runtime import (
+    _LARGE,
+    STATUS,
+    Array,
+    Interrupted,
+    Model,
+    Params,
+    _count,
+    _memory,
+    _number,
+    _size,
+    _unmasked,
+)  # fmt: skip
+from .slices import longer
 
 _GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
 _TILES = 64  # at most in a group: threads ask for the next one seldom
@@ -25,6 +40,7 @@ _WORTH = 20_000  # steps in all from which threads pay
 _NAMES = np.array([*STATUS, "interrupted"])
 _SLOWEST = 1.5e-6  # seconds a step of an instance and coordinate: assumed until one was timed
 _SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
+_FIRST = 0.02  # seconds before the first look
 
 
 class BatchRun:
@@ -32,7 +48,7 @@ class BatchRun:
 
     status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the
     rows behind the last good one of an instance that could not go on are nan. steps: how many each
-    has made.
+    has made. Equal where all of these are, bit by bit; a pickled one keeps all of them.
     """
 
     def __init__(
@@ -63,6 +79,28 @@ class BatchRun:
         wanted = len(self) * self._wanted
         return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {told}"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("batch.BatchRun", *self._all())
+
+    def _all(self) -> tuple[Any, ...]:
+        return (
+            self.t0, self.q, self.qd, self.h, self.steps, self._codes, self.every, self._wanted
+        )  # fmt: skip
+
+    def __copy__(self) -> BatchRun:
+        return BatchRun(*self._all())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> BatchRun:
+        return BatchRun(*deepcopy(self._all(), memo))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, BatchRun):
+            return NotImplemented
+        both = zip(self._all(), other._all(), strict=True)
+        return all(np.array_equal(a, b, equal_nan=True) for a, b in both)
+
+    __hash__ = None  # type: ignore[assignment]  # rows may be changed
+
     def __len__(self) -> int:
         return len(self._codes)
 
@@ -78,7 +116,8 @@ class BatchModel(Model):
         self._whole = (self._ffi.typeof("long[]"), self._ffi.typeof("int[]"))  # done, status
         # what takes a step of many, by the method
         self._batch_steps = {x: self._stepper(x, "batch_step") for x in (None, *self.methods)}
-        # seconds a step of an instance, by the function that makes it; they only cut work up
+        # seconds a step of an instance, by the function that makes it and how many they are, to a
+        # power of two (few fill no register); they only cut work up
         self._paces: dict[Any, float] = {}
 
     def simulate_batch(
@@ -99,12 +138,14 @@ class BatchModel(Model):
         step = self._stepper(method, "batch")
         if progress is not None and not callable(progress):
             raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
-        h, t0 = self.h if h is None else _size(h), _number(t0, "t0")
+        h, t0 = self.h if h is None else _size(h, self.dtype), _number(t0, "t0")
         steps = self._steps(h, duration, steps)
-        every = _count(every, "every", 1)
+        every = min(_count(every, "every", 1), max(1, steps))
         starts, table, held, count = self._instances(q0, qd0, params, u, steps)
         rows = 1 + steps // every + (steps % every > 0)
         try:
+            if count * rows * self.nq > _LARGE and self._bytes(count * rows) > _memory():
+                raise MemoryError
             q, qd = (np.empty((count, self.nq), self.dtype) for _ in range(2))
             q_rows, qd_rows = (np.empty((count, rows, self.nq), self.dtype) for _ in range(2))
         except MemoryError:
@@ -156,7 +197,7 @@ class BatchModel(Model):
         views = q.base is not None or qd.base is not None
         if count and (q is qd or (views and np.may_share_memory(q, qd))):
             raise ValueError("qd: lies in the memory of q, where q is to be written")
-        h, t = self.h if h is None else _size(h), _number(t, "t")
+        h, t = self.h if h is None else _size(h, self.dtype), _number(t, "t")
         held = None if u is None else self._input_rows(u, 1)
         table = None if params is None else self._parameter_rows(params)
         for name, given in (("params", table), ("u", held)):
@@ -164,7 +205,7 @@ class BatchModel(Model):
                 raise ValueError(f"{name}: {len(given)} instances where q has {count}")
         if threads is not None:
             _count(threads, "threads", 1)
-        if count >= _WORTH:
+        if count >= _WORTH or count * self.nq > 8 * _WORTH:
             table, step = self._parameter_rows(params), self._stepper(method, "batch")
             work = _Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
             work.run(threads, None)
@@ -186,15 +227,16 @@ class BatchModel(Model):
         told = f"a {type(x).__name__}"
         if isinstance(_unmasked(x, name), np.ndarray):
             right, flags = x.dtype == self.dtype and x.shape[1:] == (self.nq,), x.flags
-            if right and flags.c_contiguous and flags.writeable:
+            if right and flags.carray:
                 return
             order = "" if flags.c_contiguous else ", not C-contiguous"
+            order += "" if flags.aligned else ", not aligned"
             order += "" if flags.writeable else ", read-only"
             told = f"an array of {x.dtype}, shape {x.shape}{order}"
         raise ValueError(
             f"{name}: {told}; moved in place, it has to be a writeable, C-contiguous array of "
-            f"{self.dtype}, shape (n, {self.nq}): make it one with numpy.ascontiguousarray, or "
-            "give out=, a pair of such arrays for the result"
+            f"{self.dtype}, shape (n, {self.nq}): make it one with numpy.require(x, "
+            f"'{self.dtype}', 'CAW'), or give out=, a pair of such arrays for the result"
         )
 
     def _instances(
@@ -267,7 +309,7 @@ class BatchModel(Model):
             raise ValueError("u: this scene has no inputs")
         if callable(u):
             raise ValueError("u: a Python function can't be called for many at once: give a table")
-        if type(u) is np.ndarray and u.dtype is self.dtype and u.flags.c_contiguous:
+        if type(u) is np.ndarray and u.dtype is self.dtype and u.flags.carray:
             array = u
         else:
             array = self._numbers(u, "u")
@@ -278,8 +320,10 @@ class BatchModel(Model):
                 f"u: shape {np.shape(u)}, expected ({self.nu},), (batch, {self.nu}) or "
                 f"(batch, {steps}, {self.nu})"
             )
-        if not self._lib.all_finite(array.size, self._pointer(array)):
-            raise ValueError("u: not all numbers are finite")
+        at = self._pointer(array)
+        for k in range(0, array.size, _LARGE):
+            if not self._lib.all_finite(min(_LARGE, array.size - k), at + k):
+                raise ValueError("u: not all numbers are finite")
         return array
 
 
@@ -399,10 +443,11 @@ class _Work:
             u = pointer(self.held[at:end] if len(self.held) > 1 else self.held)
             u_instance = many * width if len(self.held) > 1 else 0
             u_step = width if many > 1 else 0
-        first = 0
+        first, kind = 0, (self.step, count.bit_length())
+        # the first piece is short: another batch may have been quicker
+        many = max(1, int(_FIRST / (model._paces.get(kind, _SLOWEST * model.nq) * count)))
         while first < self.steps and not self.stop:
-            pace = model._paces.get(self.step, _SLOWEST * model.nq)
-            many = min(max(1, int(_SECONDS / (pace * count))), self.steps - first)
+            many = min(many, self.steps - first)
             begun = perf_counter()
             failed = self.step(
                 count, q, qd, self.t0, self.h, first, many, u + first * u_step if u_step else u,
@@ -413,11 +458,14 @@ class _Work:
             self.failed |= failed
             first += many
             self.moved += many * count  # a figure for the bar; threads may lose one another's
-            model._paces[self.step] = max(1e-10, spent / (many * count))
+            model._paces[kind] = max(1e-10, spent / (many * count))
+            many = longer(many, spent, _SECONDS)
             told()
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}
+if hasattr(os, "register_at_fork"):  # a fork has the pools but none of their threads
+    os.register_at_fork(after_in_child=_pools.clear)
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:

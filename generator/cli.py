@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 import eomc
+from eomc import terminal
 from eomc.problems import EomcError, FolderError, SceneError
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ _QUIET = click.option("--quiet", "-q", is_flag=True, help="Print errors only.")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-class _Group(click.Group):
+class _Group(terminal.Group):
     """Errors that are the user's to mend are printed as they are, with status 2."""
 
     def invoke(self, context: click.Context) -> Any:
@@ -50,6 +51,8 @@ class _Group(click.Group):
             _fail(f"eomc: {fault.what}: choose another place with --build DIR")
         except EomcError as fault:
             _fail(f"eomc: {fault}")
+        except MemoryError as fault:
+            _fail(f"eomc: {fault}" if str(fault) else "eomc: not enough memory")
         except KeyboardInterrupt:
             click.echo("eomc: interrupted", err=True)
             sys.exit(130)
@@ -103,12 +106,16 @@ def _scene_path(name: str) -> Path:
 
 def _write_new(path: Path, text: str) -> None:
     """Write a file that must not be there yet."""
+    made = False
     try:
         with path.open("x", encoding="utf-8") as file:
+            made = True
             file.write(text)
     except FileExistsError:
         raise EomcError(f"{path}: is there already, and stays as it is") from None
     except OSError as fault:
+        if made:  # and not whole
+            path.unlink(missing_ok=True)
         raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
 
 
@@ -243,7 +250,9 @@ def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> Non
 @main.command()
 @_SCENES
 @_BUILD
-@click.option("--seed", default=0, show_default=True, help="Of the random states.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random states."
+)
 @_QUIET
 @_JSON
 def check(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: bool) -> None:
@@ -423,7 +432,7 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
         for path in sorted(folder.glob("*.toml")):
             try:
                 text = tomllib.loads(path.read_text(encoding="utf-8"))
-            except (OSError, ValueError):
+            except (OSError, ValueError, RecursionError):
                 text = {"eomc": 0, "name": path.stem, "title": "(can't be read: eomc build tells)"}
             if "eomc" not in text or not isinstance(text.get("name"), str):
                 continue
@@ -431,8 +440,8 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
             built = bool(name) and compiler.found(root / name, compiler.key(digest))
             rows.append(
                 {"scene": str(path), "name": text["name"], "title": str(text.get("title", "")),
-                 "coordinates": list(text.get("coordinates", {})),
-                 "inputs": list(text.get("inputs", {})), "built": built}
+                 "coordinates": _keys(text, "coordinates"), "inputs": _keys(text, "inputs"),
+                 "built": built}
             )  # fmt: skip
     if as_json:
         click.echo(json.dumps(rows, indent=1))
@@ -448,6 +457,12 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
             f"{row['scene']:{wide}}  {row['title']:{titles}}  "
             f"{mark}  {', '.join(row['coordinates'])} {moved}".rstrip()
         )
+
+
+def _keys(text: Mapping[str, Any], table: str) -> list[str]:
+    """The names in a table of a scene that nobody has checked."""
+    found = text.get(table)
+    return list(found) if isinstance(found, dict) else []
 
 
 # --- pieces ---------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ was there before stays whole. A file lock keeps builds of one scene apart.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import importlib.util
@@ -15,6 +16,7 @@ import os
 import platform
 import shlex
 import shutil
+import stat
 import subprocess
 import sys
 import sysconfig
@@ -25,7 +27,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from eomc import __version__
 from eomc.problems import EomcError, FolderError
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize")
 STANDARD = "-std=gnu99"  # c99 would forbid the contraction to FMA
 MANIFEST = "build.json"
+_NO_LOCK = "{}: is no file, and builds of a scene lock one there: remove it"
 # operations over which gcc takes some twenty seconds (0.3 ms each, in pieces) and clang two thirds
 MANY = 60_000
 
@@ -62,7 +65,7 @@ def find_compiler() -> Compiler:
     """$CC, cc, gcc, clang or the pip-installable ziglang, in this order. Raises EomcError."""
     wish = os.environ.get("CC")
     for candidate in [wish] if wish else ["cc", "gcc", "clang"]:
-        words = shlex.split(candidate)
+        words = _words("CC", candidate)
         if words and (path := shutil.which(words[0])):
             return Compiler((path, *words[1:]), _identity(path) + " ".join(words[1:]))
     if wish:
@@ -75,6 +78,15 @@ def find_compiler() -> Compiler:
         "no C compiler found: install gcc or clang (Debian: apt install gcc), "
         "or 'pip install ziglang', which brings one"
     )
+
+
+def _words(variable: str, text: str) -> list[str]:
+    """The words of a variable of the environment, as a shell divides them. Raises EomcError."""
+    try:
+        return shlex.split(text)
+    except ValueError as fault:  # an open quote, a backslash at the end
+        said = str(fault).lower()
+        raise EomcError(f"{variable}={text!r}: {said}: close it, or unset {variable}") from None
 
 
 def compiler_for(operations: int) -> Compiler:
@@ -90,8 +102,8 @@ def compiler_for(operations: int) -> Compiler:
 
 def _identity(path: str) -> str:
     real = Path(path).resolve()
-    stat = real.stat()
-    return f"{real} {stat.st_size} {stat.st_mtime_ns}"
+    state = real.stat()
+    return f"{real} {state.st_size} {state.st_mtime_ns}"
 
 
 def flags(wide: bool = False) -> tuple[str, ...]:
@@ -103,7 +115,7 @@ def flags(wide: bool = False) -> tuple[str, ...]:
     """
     given = os.environ.get("EOMC_CFLAGS")
     if given is not None:
-        return tuple(shlex.split(given))
+        return tuple(_words("EOMC_CFLAGS", given))
     if "avx512f" not in _processor():
         return FLAGS
     return (*FLAGS, f"-mprefer-vector-width={512 if wide else 256}")
@@ -144,18 +156,27 @@ def key(scene_digest: str, options: str = "") -> str:
         scene_digest, options, _generator_digest(), small.identity, large.identity,
         STANDARD, *flags(), _processor(), sys.version, str(sysconfig.get_config_var("EXT_SUFFIX")),
     )  # fmt: skip
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    # a variable of the environment may hold bytes that are no text
+    return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()
 
 
 def found(folder: Path, wanted: str) -> bool:
-    """Whether `folder` holds a whole build of this key."""
+    """Whether `folder` holds a whole build of this key, each file with its digest.
+
+    A single bit that has changed in an extension may end the process that loads it.
+    """
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         return manifest["key"] == wanted and all(
-            (folder / name).stat().st_size == size for name, size in manifest["files"].items()
+            _digest(folder / name) == digest for name, digest in manifest["files"].items()
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return False
+
+
+def _digest(file: Path) -> str:
+    """SHA-256; some 0.3 ms for a small scene."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def build(
@@ -178,6 +199,7 @@ def build(
         with _locked(root / f".{name}.lock"):
             if found(folder, wanted):  # by another process, meanwhile
                 return Built(name, folder, False)
+            _free(folder)
             for left in root.glob(f".{name}.build-*"):  # by a build that was killed
                 shutil.rmtree(left, ignore_errors=True)
             with tempfile.TemporaryDirectory(dir=root, prefix=f".{name}.build-") as beside:
@@ -191,9 +213,36 @@ def build(
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    with path.open("w") as lock:
+    """A lock on a file that is made where it isn't there; nothing is written to it.
+
+    Raises EomcError where something else lies there: no link is followed, no pipe waited for.
+    """
+    try:
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        lock = os.open(path, flags, 0o666)
+    except OSError as fault:
+        if fault.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV):
+            raise
+        raise EomcError(_NO_LOCK.format(path)) from None
+    try:
+        if not stat.S_ISREG(os.fstat(lock).st_mode):
+            raise EomcError(_NO_LOCK.format(path))
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
+    finally:
+        os.close(lock)
+
+
+def _free(folder: Path) -> None:
+    """An EomcError where a folder holds a package that no build made, or is none."""
+    if folder.is_symlink() or folder.exists():
+        if not folder.is_dir():
+            raise EomcError(f"{folder}: is in the way of the module: remove it, or use --build DIR")
+        if (folder / "__init__.py").exists() and not (folder / "runtime.py").exists():
+            raise EomcError(
+                f"{folder}: is a package that eomc did not build, and stays as it is: "
+                "rename the scene, or use --build DIR"
+            )
 
 
 def _build(
@@ -210,6 +259,7 @@ def _build(
     library = extension + str(sysconfig.get_config_var("EXT_SUFFIX"))
     compiler = compiler_for(made.operations)
     _compile(made, extension, beside, library, compiler)
+    _try(name, extension, beside / library, compiler)
     kept = [library, *made.files]
     manifest = {
         "key": wanted,
@@ -217,7 +267,7 @@ def _build(
         "eomc": __version__,
         "compiler": " ".join(compiler.command),
         "flags": " ".join((STANDARD, *flags(made.wide))),
-        "files": {file: (beside / file).stat().st_size for file in kept},
+        "files": {file: _digest(beside / file) for file in kept},
     }
     (beside / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     folder.mkdir(exist_ok=True)
@@ -259,11 +309,43 @@ def _compile(made: Sources, extension: str, folder: Path, library: str, compiler
     _finish(name, link, _start(link, folder))
 
 
+# imports an extension from a file, with nothing of Python's own start-up but cffi's backend
+_TRIAL = """
+import sys
+sys.path.append(sys.argv[1])
+from importlib.machinery import ExtensionFileLoader, ModuleSpec
+loader = ExtensionFileLoader(sys.argv[2], sys.argv[3])
+loader.exec_module(loader.create_module(ModuleSpec(sys.argv[2], loader, origin=sys.argv[3])))
+"""
+
+
+def _try(name: str, extension: str, library: Path, compiler: Compiler) -> None:
+    """Load a new extension in a process of its own (some 10 ms), before it replaces another.
+
+    Raises EomcError where it can't be loaded, or ends that process.
+    """
+    backend = importlib.util.find_spec("_cffi_backend")
+    assert backend is not None and backend.origin is not None
+    where = os.path.dirname(backend.origin)
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", _TRIAL, where, extension, str(library.resolve())],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="backslashreplace",
+    )  # fmt: skip
+    if done.returncode:
+        lines = done.stderr.strip().splitlines()
+        said = lines[-1] if lines else f"status {done.returncode}"
+        raise EomcError(
+            f"{name}: the C compiler {shlex.join(compiler.command)} returned 0, but what it made "
+            f"can't be loaded: correct CC and EOMC_CFLAGS; the last build stays\n  {said}"
+        )
+
+
 def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
     try:
         return subprocess.Popen(
-            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="backslashreplace",
+        )  # fmt: skip
     except OSError as fault:
         raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
 
@@ -294,4 +376,27 @@ def load(built: Built) -> ModuleType:
     except BaseException:
         del sys.modules[alias]
         raise
+    # another process can't import the alias; what is pickled here is found by its place there
+    place = (built.name, str(built.folder.resolve()), alias)
+    sys.modules[f"{alias}.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
     return module
+
+
+def unpickled(name: str, folder: str, alias: str, path: str, arguments: tuple[Any, ...]) -> Any:
+    """A value pickled by a module that `load` had loaded; pickle calls this.
+
+    Raises EomcError where the module is no longer there; a MotionError is made all the same, since
+    pools of processes wait for ever for what can't be read.
+    """
+    try:
+        if alias not in sys.modules:
+            alias = load(Built(name, Path(folder), False)).__name__
+    except (OSError, ValueError, KeyError, ImportError):
+        if path == "runtime.MotionError":
+            from eomc.runtime import MotionError
+
+            return MotionError(*arguments)
+        raise EomcError(
+            f"{folder}: the module that pickled this is not there: build the scene again"
+        ) from None
+    return importlib.import_module(f"{alias}.package").made(path, arguments)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .package import reduced
+
 if TYPE_CHECKING:
     from .runtime import Model, Run
 
@@ -53,6 +55,9 @@ class Estimate:
     def resolved(self) -> bool:
         """Whether nothing speaks against the figures."""
         return not self.verdict
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("estimate.Estimate", *self.__dict__.values())
 
 
 def estimate(run: Run, progress: Callable[[int, int], None] | None = None) -> Estimate:

@@ -76,3 +76,6 @@ class SceneError(EomcError):
         if len(self.problems) > MOST:
             told.append(f"... and {len(self.problems) - MOST} more")
         super().__init__("\n".join(told))
+
+    def __reduce__(self) -> tuple[type[SceneError], tuple[Sequence[Problem]]]:
+        return type(self), (self.problems,)

@@ -75,7 +75,8 @@ def render(program: Program, extension: str) -> Sources:
     context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name
-    parts = ["runtime.py", "estimate.py", *(["batch.py"] if run.batch else [])]
+    copied = ["runtime", "estimate", "package", "slices"]
+    parts = [f"{part}.py" for part in copied + (["batch"] if run.batch else [])]
 
     def text(template: str) -> str:
         return jinja.get_template(template + ".jinja").render(context)

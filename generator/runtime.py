@@ -12,6 +12,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from functools import cached_property
 from math import ceil, isfinite
 from time import perf_counter
@@ -22,6 +23,8 @@ from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
 from .estimate import Estimate, advice, estimate
+from .package import Defaults, reduced
+from .slices import longer, slices
 
 Array = NDArray[Any]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -35,12 +38,14 @@ _SAID = {
     "no convergence": "the iteration for the step does not converge: take a smaller h",
     "interrupted": "interrupted",
 }
+_LEFT_OUT = "u was a function, which a pickled run doesn't keep: simulate again"
 _OF_POSITION = ("D", "g", "potential_energy")
 _MANY = 1000  # steps from which a look at the stability limit is worth its time
 _LARGE = 2**24  # positions from which a look at the memory is worth its time
 _FEW = 32  # numbers that Python looks at sooner than NumPy
 _CHUNK = 16_384  # steps times coordinates before the first look, some ms
-_CHUNK_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
+_ROWS = 20_000  # rows times coordinates squared in one call, some ms at most
+_MOST = 2**60  # steps, so that C can return four times as many
 
 
 class MotionError(ArithmeticError):
@@ -50,6 +55,9 @@ class MotionError(ArithmeticError):
         super().__init__(message)
         self.status = status
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("runtime.MotionError", str(self), self.status)
+
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C during a simulation; `run` holds what was done until then."""
@@ -57,6 +65,9 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, run: Any) -> None:
         super().__init__(run.message)
         self.run = run
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("runtime.Interrupted", self.run)
 
 
 class _Half:
@@ -83,6 +94,10 @@ class Run:
     ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
     when it is asked for; `steps` were done by `method`, of size h, and a row kept of `every` so
     many. evaluations: of accelerations. error: an Estimate, where it was asked for.
+
+    Runs are equal where their scene, settings and rows are, bit by bit. A pickled run keeps all of
+    that, its parameters and its inputs, but not a u that is a function: estimate() is refused then.
+    Where it is read again, it finds the built module as it was found here.
     """
 
     q, qd = _Half(0), _Half(1)
@@ -135,7 +150,10 @@ class Run:
         """The run's own error, by doing it again in shorter steps; kept in `error`.
 
         Where u is a function, it is called again, as often as in the run for each finer one.
+        Raises ValueError where the run was pickled and lost that function.
         """
+        if isinstance(self._u, str):
+            raise ValueError(f"estimate: {self._u}")
         try:
             self.error = estimate(self, progress)
         except KeyboardInterrupt:
@@ -160,6 +178,44 @@ class Run:
             model._pointer(x[model.nq :]), self.h / parts, self.steps * parts, every, u,
             self._params, model._pointer(self._params), self.method, float(self.t[0]), None,
             progress,
+        )  # fmt: skip
+
+    def _state(self) -> dict[str, Any]:
+        """All but what is made when it is asked for."""
+        made = ("t", "q", "qd")
+        return {name: value for name, value in self.__dict__.items() if name not in made}
+
+    @classmethod
+    def _of_state(cls, state: dict[str, Any]) -> Run:
+        run = cls.__new__(cls)
+        run.__dict__.update(state)
+        return run
+
+    def __copy__(self) -> Run:
+        return self._of_state(self._state())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Run:
+        return self._of_state(deepcopy(self._state(), memo))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = self._state()
+        if callable(self._u):
+            state["_u"] = _LEFT_OUT
+        return reduced("runtime.Run._of_state", state)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Run):
+            return NotImplemented
+        alike = self._settings() == other._settings()
+        return alike and np.array_equal(self.q, other.q) and np.array_equal(self.qd, other.qd)
+
+    __hash__ = None  # type: ignore[assignment]  # rows may be changed
+
+    def _settings(self) -> tuple[Any, ...]:
+        model = self._model
+        return (
+            model.name, model.digest, self.t0, self.h, self.steps, self.status, self.every,
+            self.method, self._params.tolist(),
         )  # fmt: skip
 
     @property
@@ -214,6 +270,21 @@ class Params:
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # a copy too goes this way
+        return reduced("_model._made_params", dict(zip(self._names, self._values(), strict=True)))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Params):
+            return NotImplemented
+        return self._names == other._names and self._values() == other._values()
+
+    __hash__ = None  # type: ignore[assignment]  # values may be changed
+
+    def _values(self) -> list[float]:
+        values: list[float] = self._array.tolist()
+        return values
+
     def __repr__(self) -> str:
         inside = ", ".join(f"{n}={v:g}" for n, v in zip(self._names, self._array, strict=True))
         return f"Params({inside})"
@@ -239,7 +310,7 @@ class Model:
         self.dtype = np.dtype(dtype)
         self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
         self.parameters = tuple(parameters)
-        self.defaults = dict(parameters)
+        self.defaults = Defaults(parameters)
         self.units = dict(units)
         self.nq, self.nu = len(self.coordinates), len(self.inputs)
         self._shape = (self.nq,) if self.nq <= _FEW else None  # of a state that is soon looked at
@@ -259,6 +330,23 @@ class Model:
             "_dtype": dtype,
         }
         self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("_model._again", self.digest)
+
+    def _again(self, digest: str) -> Model:
+        """Itself, found by a value that was pickled; a warning where the scene was another then."""
+        if digest != self.digest:
+            warnings.warn(
+                f"{self.name}: this was pickled from another version of the scene; what is "
+                "computed from it now is of the present version",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return self
+
+    def _made_params(self, values: Mapping[str, float]) -> Any:
+        return self.Params(**values)
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -311,21 +399,21 @@ class Model:
         return self._pointer(at), self._pointer(moving), at, moving
 
     def _numbers(self, value: ArrayLike, name: str) -> Array:
-        """A C-contiguous array of the module's numbers, of any shape."""
+        """A C-contiguous, aligned array of the module's numbers, of any shape."""
         if not isinstance(value, list):
             _unmasked(value, name)
         try:
             array = np.asarray(value)
             if array.dtype.kind in "cUSmM":  # text that looks like a number is none
                 raise TypeError
-            return np.ascontiguousarray(array, self.dtype)
-        except (TypeError, ValueError):
+            return _aligned(np.ascontiguousarray(array, self.dtype))
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:
         """Finite numbers, (width,) or (n, width)."""
-        if type(value) is ndarray and value.dtype is self.dtype and value.flags.c_contiguous:
-            array = value
+        if type(value) is ndarray and value.dtype is self.dtype and value.flags.carray:
+            array = value  # C-contiguous, aligned and, which need not be, writeable
         else:
             array = self._numbers(value, name)
         if array.ndim == 1 and array.size == width <= _FEW and isfinite(sum(array.tolist())):
@@ -371,8 +459,8 @@ class Model:
             return np.asarray(given._array)
         _unmasked(params, "params")
         try:
-            array = np.ascontiguousarray(params, self.dtype)
-        except (TypeError, ValueError):
+            array = _aligned(np.ascontiguousarray(params, self.dtype))
+        except (TypeError, ValueError, OverflowError):
             array = empty(0, self.dtype)
         if array.shape != self._p0.shape or not np.isfinite(array).all():
             raise ValueError(
@@ -395,10 +483,11 @@ class Model:
         if out is None:
             return empty(shape, self.dtype)
         _unmasked(out, name)
-        good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.c_contiguous
-        if not good or out.shape != shape or not out.flags.writeable:
+        good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.carray
+        if not good or out.shape != shape:
             raise ValueError(
-                f"{name}: expected a writeable, C-contiguous array of {self.dtype}, shape {shape}"
+                f"{name}: expected a writeable, aligned, C-contiguous array of {self.dtype}, "
+                f"shape {shape}"
             )
         array: Array = out
         return array
@@ -441,6 +530,12 @@ class Model:
         function = getattr(self._lib, name, None)
         if function is None:  # no forces, no power
             result[...] = 0
+        elif rows and rows[0] * self.nq**2 > _ROWS:
+            to, size = address(real, result), result[:1].size
+            for k, many in slices(rows[0], _ROWS // self.nq**2 + 1):
+                here = self.nq * k
+                moving_here = from_qd + here if moving is not None else null
+                function(many, to + size * k, from_q + here, moving_here, time, inputs, p)
         else:
             function(
                 rows[0] if rows else 1, address(real, result), from_q, from_qd, time, inputs, p
@@ -538,12 +633,20 @@ class Model:
         if out is not None:
             result = self._out(out, at.shape)
         inputs, p = self._given(u, params)
-        found = self._lib.acceleration(
-            1 if at.ndim == 1 else len(at), self._pointer(made), from_q, from_qd,
-            _number(t, "t"), inputs, p,
-        )  # fmt: skip
+        to, time, first = self._pointer(made), _number(t, "t"), 0
+        count = 1 if at.ndim == 1 else len(at)
+        if count * self.nq**2 <= _ROWS:
+            found = self._lib.acceleration(count, to, from_q, from_qd, time, inputs, p)
+        else:
+            for first, many in slices(count, _ROWS // self.nq**2 + 1):
+                k = self.nq * first
+                found = self._lib.acceleration(
+                    many, to + k, from_q + k, from_qd + k, time, inputs, p
+                )
+                if found & 3:
+                    break
         if found & 3:
-            done, said = found >> 2, STATUS[found & 3]
+            done, said = first + (found >> 2), STATUS[found & 3]
             where = _state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
             what = _SAID[said] if said == "singular" else "the acceleration is not finite there"
             raise MotionError(f"at {where}: {what}", said)
@@ -633,7 +736,7 @@ class Model:
         from_q, from_qd, at, moving = self._read(q, qd)
         if at.ndim != 1:
             self._one(q, qd)
-        h = self.h if h is None else _size(h)
+        h = self.h if h is None else _size(h, self.dtype)
         inputs, p = self._given(u, params)
         address, real, null = self._c
         if out is None:
@@ -670,12 +773,20 @@ class Model:
         if steps is not None:
             if duration is not None:
                 raise ValueError("steps: give steps or duration, not both")
-            return _count(steps, "steps", 0)
+            count = _count(steps, "steps", 0)
+            if count > _MOST:
+                raise ValueError(f"steps: {count:.3g} are more than a run can count, {_MOST:.3g}")
+            return count
         time = self.duration if duration is None else _number(duration, "duration")
         if time < 0:
             raise ValueError(f"duration: {duration} is not a time in s")
+        if time / h > _MOST:
+            raise ValueError(
+                f"duration: {time:g} s are more steps of h = {h:g} s than a run can count, "
+                f"{_MOST:.3g}: take a larger h, or a shorter duration"
+            )
         # the first multiple of h that is not before the duration, rounding aside
-        return ceil(time / abs(h) * (1 - 1e-12))
+        return ceil(time / h * (1 - 1e-12))
 
     def simulate(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
@@ -704,15 +815,15 @@ class Model:
             q, from_q = self._from(q0, "q0")
         if qd0 is not None:
             qd, from_qd = self._from(qd0, "qd0")
-        h = self.h if h is None else _size(h)
+        h = self.h if h is None else _size(h, self.dtype)
         p = self._p0
         if params is not None:
             p = self._parameters(params).copy()
             at_p = self._pointer(p)
         if (
             type(steps) is int and type(every) is int and type(t0) is float and isfinite(t0)
-            and u is None and duration is None and out is None and progress is None and every > 0
-            and not estimate
+            and u is None and duration is None and out is None and progress is None
+            and 0 < every < _MOST and not estimate
         ):  # fmt: skip
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
@@ -728,7 +839,7 @@ class Model:
                     )
         t0 = _number(t0, "t0")
         steps = self._steps(h, duration, steps)
-        every = _count(every, "every", 1)
+        every = min(_count(every, "every", 1), max(1, steps))
         if steps >= _MANY and (method, h) not in self._warned:
             self._warned.add((method, h))
             first = self._table(u, steps)[1]
@@ -757,7 +868,7 @@ class Model:
         if q0 is not None or qd0 is not None:
             q, qd = self._state(q if q0 is None else q0, qd if qd0 is None else qd0)
         given, method = self._parameters(params), self._method(method)
-        h = self.h if h is None else _size(h)
+        h = self.h if h is None else _size(h, self.dtype)
         return advice(self, q, qd, h, _number(t0, "t0"), u, given, method)
 
     def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
@@ -794,7 +905,8 @@ class Model:
         q_rows, qd_rows = both[0], both[1]
         to_q, to_qd = address(real, q_rows), address(real, qd_rows)
         at_u = null if held is None else address(real, held)
-        done, chunk = 0, 1 if law else _CHUNK // nq or 1
+        # a step of an implicit method may solve for all its stages
+        done, chunk = 0, 1 if law else _CHUNK // (nq**3 if counted else nq) or 1
         # what goes from one call to the next, and what is counted; a single call may do without
         single = steps <= chunk and counted is None
         work = null if single else self._ffi.new(work_type)
@@ -822,8 +934,7 @@ class Model:
                 if done == steps:
                     break
                 if not law:
-                    spent = perf_counter() - begun
-                    chunk = int(count * min(16.0, max(0.25, _CHUNK_SECONDS / (spent + 1e-9)))) + 1
+                    chunk = longer(count, perf_counter() - begun)
         except KeyboardInterrupt:
             done, said = work.done if work else done, "interrupted"
             if not done:
@@ -900,17 +1011,30 @@ def _number(value: Any, name: str) -> float:
         number = float("x" if isinstance(value, (str, bytes)) else value)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: {value!r} is not a number") from None
+    except OverflowError:  # a whole number
+        number = float("inf")
     if not isfinite(number):
         raise ValueError(f"{name}: {value!r} is not a finite number")
     return number
 
 
-def _size(h: Any) -> float:
-    """A step size, or a ValueError."""
+def _size(h: Any, dtype: np.dtype[Any]) -> float:
+    """A step size in the module's numbers, or a ValueError."""
+    if type(h) is float and 1e-37 < h < 1e37:  # in single precision too
+        return h
     size = _number(h, "h")
-    if size == 0:
-        raise ValueError("h: 0 is not a step size: give a number of seconds")
+    limits = np.finfo(dtype)
+    if not limits.smallest_subnormal <= size <= limits.max:
+        why = "" if size <= 0 else f" in {dtype}"
+        raise ValueError(
+            f"h: {h!r} is not a step size{why}: give a number of seconds greater than 0"
+        )
     return size
+
+
+def _aligned(array: Array) -> Array:
+    """The array, copied where its numbers lie at addresses that C can't read them from."""
+    return array if array.flags.aligned else array.copy()
 
 
 def _count(value: Any, name: str, least: int) -> int:

@@ -188,6 +188,8 @@ def parse(
         raise SceneError([_toml_problem(fault, text, file)]) from None
     except RecursionError:
         raise SceneError([Problem("the TOML is nested too deeply", file=file)]) from None
+    if _has_huge(tree):
+        raise SceneError([_huge_problem(text, file)])
     check = _Check(tree, Places(text, file), parameters or {})
     return check.scene(hashlib.sha256(data).hexdigest())
 
@@ -202,12 +204,32 @@ def _encoding_problem(data: bytes, at: int, file: str) -> Problem:
     )
 
 
+def _has_huge(tree: dict[str, Any]) -> bool:
+    """Whether there is a whole number beyond all doubles; Python may not even print one."""
+    left: list[Any] = [tree]
+    while left:
+        value = left.pop()
+        if isinstance(value, dict):
+            left += value.values()
+        elif isinstance(value, list):
+            left += value
+        elif isinstance(value, int) and value.bit_length() > 1024:
+            return True
+    return False
+
+
+def _huge_problem(text: str, file: str) -> Problem:
+    long = re.search(r"(?i)=[^\"'\n]*?\b(0x[\da-f_]{250}|[\d_]{300}|0o[\d_]{300})", text)
+    line = text.count("\n", 0, long.start(1)) + 1 if long else 0
+    return Problem(
+        "a number has hundreds of digits, more than any double: shorten it", "", file, line
+    )
+
+
 def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
     """tomllib's message, its place, and what is mostly meant by it."""
     if not isinstance(fault, tomllib.TOMLDecodeError):  # an int beyond Python's 4,300 digits
-        long = re.search(r"\d[\d_]{4000}", text)
-        line = text.count("\n", 0, long.start()) + 1 if long else 0
-        return Problem("a number has thousands of digits", "", file, line)
+        return _huge_problem(text, file)
     lines = text.split("\n")
     found = re.search(r" \(at line (\d+), column (\d+)\)", str(fault))
     line, column = (int(found[1]), int(found[2]) - 1) if found else (len(lines), -1)

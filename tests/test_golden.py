@@ -27,7 +27,7 @@ from pathlib import Path
 out = {}
 for path in map(Path, sys.argv[1:]):
     files = eomc.sources(eomc.read(path), f"_{path.stem}_extension").files
-    copied = ("runtime.py", "estimate.py", "batch.py")
+    copied = ("runtime.py", "estimate.py", "package.py", "slices.py", "batch.py")
     out[path.stem] = {n: t for n, t in files.items() if n not in copied}
 print(json.dumps(out))
 """

@@ -1,0 +1,78 @@
+"""A built package as a value: it can be pickled with all it makes, and refuses assignments.
+
+Copied beside each compiled extension like runtime.py. Functions are called with parameters; a
+parameter that is assigned to the module would change nothing there, or replace a function.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from importlib import import_module
+from types import ModuleType
+from typing import Any, NoReturn
+
+# How another process finds this package where its name can't be imported, (function, arguments),
+# set by whoever loaded it under that name.
+found_by: tuple[Callable[..., Any], tuple[Any, ...]] | None = None
+
+
+def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
+    """What __reduce__ returns of a value that `made` makes again from a path and arguments."""
+    if found_by is None:
+        return made, (path, arguments)
+    function, where = found_by
+    return function, (*where, path, arguments)
+
+
+def made(path: str, arguments: tuple[Any, ...]) -> Any:
+    """What lies at a path in this package, such as "runtime.MotionError", called."""
+    package: Any = import_module(str(__package__))
+    return functools.reduce(getattr, path.split("."), package)(*arguments)
+
+
+class Package(ModuleType):
+    """The class of a built package."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not name.startswith("_") and (why := self._why_not(name, value)):
+            raise AttributeError(f"{name}: {why}")
+        super().__setattr__(name, value)
+
+    def _why_not(self, name: str, value: Any) -> str:
+        """Why a name can't be assigned to and what serves instead; "" where nothing speaks."""
+        model, call = self._model, f"{self._model.name}.simulate"
+        if name in model.parameters:
+            return (
+                "a parameter is given to a call, not assigned to the module: "
+                f'{call}(params={{"{name}": {value!r}}}), or eomc run --set {name}={value!r}; '
+                "its default is in the scene"
+            )
+        if name in ("h", "duration"):
+            return f"is given to a call, {call}({name}={value!r}), or eomc run --{name} {value!r}"
+        if name in model.inputs:
+            return f"an input is given to a call: {call}(u=...)"
+        if name in model.coordinates or name == "start":
+            return f"a start is given to a call: {call}(q0=..., qd0=...), or eomc run --start"
+        return "belongs to the module and stays as it is" if name in self.__all__ else ""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("_self")
+
+    def _self(self) -> Package:
+        return self
+
+
+class Defaults(dict[str, float]):
+    """The scene's values of its parameters: to be read only, since no change reaches the C."""
+
+    def _refused(self, *_: Any, **__: Any) -> NoReturn:
+        raise TypeError(
+            "defaults are the scene's and stay: give params={...} to a call, or eomc run --set"
+        )
+
+    __setitem__ = __delitem__ = __ior__ = _refused
+    update = setdefault = pop = popitem = clear = _refused
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (dict(self),)
