@@ -20,6 +20,7 @@ from eomc.context import resource, values
 from eomc.pieces import weight
 from eomc.program import Program
 from eomc.target import Target
+from eomc.texts import docstring
 
 
 @dataclass(frozen=True)
@@ -38,17 +39,22 @@ class Sources:
 
 
 def environment() -> jinja2.Environment:
-    """Jinja as it is used here: a missing variable stops the build."""
+    """Jinja as it is used here: a missing variable stops the build, free text as it stands too.
+
+    Pages are escaped by themselves; a Python face escapes its docstring as a whole.
+    """
     loader = jinja2.FunctionLoader(lambda name: resource("templates", name))
-    return jinja2.Environment(
+    made = jinja2.Environment(
         loader=loader,
         bytecode_cache=_bytecode(),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-        autoescape=False,  # the output is C and Python, no HTML
+        autoescape=lambda name: (name or "").endswith(".html.jinja"),
     )
+    made.filters["docstring"] = docstring
+    return made
 
 
 def _bytecode() -> jinja2.BytecodeCache | None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pydantic
 
-from eomc import bodycheck, formulas, layout, names, repeat
+from eomc import bodycheck, formulas, layout, names, repeat, texts
 from eomc.assembly import Assembly
 from eomc.checker import (
     DOUBT,
@@ -156,11 +156,11 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
     except FileNotFoundError:
         others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
         near = suggest(path.name, others)
-        raise EomcError(f"{file}: there is no such file{near}") from None
+        raise EomcError(f"{texts.line(str(file))}: there is no such file{near}") from None
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
-        raise EomcError(f"{file}: can't be read ({why})") from None
-    return parse(data, str(file), parameters)
+        raise EomcError(f"{texts.line(str(file))}: can't be read ({why})") from None
+    return parse(data, texts.line(str(file)), parameters)
 
 
 def parse(
@@ -170,7 +170,8 @@ def parse(
     if isinstance(data, str):
         data = data.encode(errors="surrogatepass")
     if len(data) > MAX_BYTES:
-        raise EomcError(f"{file}: it has more than the {MAX_BYTES} bytes a scene may have")
+        shown = texts.line(file)
+        raise EomcError(f"{shown}: it has more than the {MAX_BYTES} bytes a scene may have")
     try:
         text = data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as fault:

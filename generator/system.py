@@ -343,6 +343,9 @@ class _Maker:
         dissipation: Any, forces: Mapping[Any, Any], inputs: Any, definitions: Mapping[Any, Any],
         units: Mapping[Any, str], title: str, run: Run,
     ) -> System:  # fmt: skip
+        for text in (title, *units.values()):
+            if not isinstance(text, str):
+                raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
         starts = (
             dict(coordinates)
             if isinstance(coordinates, Mapping)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eomc import robots, xmlfile
+from eomc import robots, texts, xmlfile
 from eomc.assembly import WORLD
 from eomc.formulas import suggest
 from eomc.problems import EomcError, Problem, SceneError
@@ -51,10 +51,11 @@ def read(file: str | os.PathLike[str]) -> Robot:
     """
     root = xmlfile.root(file)
     if any(_is_xacro(e) for e in root.iter()):
-        raise EomcError(f"{file}: {xmlfile.RUN_XACRO}")
+        raise EomcError(f"{texts.line(str(file))}: {xmlfile.RUN_XACRO}")
     if root.tag != "robot":
-        raise EomcError(f"{file}: not a URDF: its root element is <{root.tag}>, not <robot>")
-    return _Reader(root, Path(file), str(file)).robot()
+        shown = texts.line(str(file))
+        raise EomcError(f"{shown}: not a URDF: its root element is <{root.tag}>, not <robot>")
+    return _Reader(root, Path(file), texts.line(str(file))).robot()
 
 
 def _is_xacro(element: Element) -> bool:
