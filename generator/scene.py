@@ -149,18 +149,18 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
 
     Raises SceneError with every fault, EomcError if unreadable.
     """
-    path = Path(file)
+    path, shown = Path(file), texts.line(str(file))
     try:
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
         others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
         near = suggest(path.name, others)
-        raise EomcError(f"{texts.line(str(file))}: there is no such file{near}") from None
+        raise EomcError(f"{shown}: there is no such file{near}") from None
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
-        raise EomcError(f"{texts.line(str(file))}: can't be read ({why})") from None
-    return parse(data, texts.line(str(file)), parameters)
+        raise EomcError(f"{shown}: can't be read ({why})") from None
+    return parse(data, shown, parameters)
 
 
 def parse(

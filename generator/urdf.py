@@ -49,13 +49,12 @@ def read(file: str | os.PathLike[str]) -> Robot:
 
     Raises SceneError with every fault of the robot, EomcError for what is not a URDF.
     """
-    root = xmlfile.root(file)
+    root, shown = xmlfile.root(file), texts.line(str(file))
     if any(_is_xacro(e) for e in root.iter()):
-        raise EomcError(f"{texts.line(str(file))}: {xmlfile.RUN_XACRO}")
+        raise EomcError(f"{shown}: {xmlfile.RUN_XACRO}")
     if root.tag != "robot":
-        shown = texts.line(str(file))
         raise EomcError(f"{shown}: not a URDF: its root element is <{root.tag}>, not <robot>")
-    return _Reader(root, Path(file), texts.line(str(file))).robot()
+    return _Reader(root, Path(file), shown).robot()
 
 
 def _is_xacro(element: Element) -> bool:
