@@ -21,6 +21,7 @@ from eomc.pieces import weight
 from eomc.program import Program
 from eomc.target import Target
 from eomc.texts import docstring
+from eomc.texts import name as plain
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,10 @@ def render(program: Program, extension: str) -> Sources:
 
     Same program, same text.
     """
-    target = Target(program, REALS[program.system.run.real])
+    s = program.system
+    for given in (*s.coordinates, *s.parameters, *s.inputs, *(d for d, _ in s.definitions), s):
+        plain(given.name)
+    target = Target(program, REALS[s.run.real])
     context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name

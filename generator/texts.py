@@ -2,8 +2,8 @@ r"""Free text at the border: titles, units, notes, names of files, names in robo
 
 Free text is data. It is printed into C, Python, HTML, TOML, figures and terminals, and for each of
 these there is one function here that makes it harmless. Code and docstrings hold free text as an
-escaped literal or not at all. CSV, LaTeX and what is compiled need no function: they are given
-names only, and names.py lets only plain ones pass.
+escaped literal or not at all. CSV, LaTeX and what is compiled are given names only: names.py lets
+no others than plain ones pass, and `name` refuses those of a system made without it.
 
 A character that could steer a terminal, break a line or reorder what is read is *hidden*. The
 reader of scenes refuses it (`checked_line`); where it can't be refused it is shown escaped: \x1b.
@@ -53,10 +53,10 @@ def _fault(text: str, found: re.Match[str]) -> str:
     elif re.match(f"[{_HALVES}]", c):
         kind = "no character"
     before = f" after '{line(text[: found.start()][-20:])}'" if found.start() else " at its start"
-    remedy = "write a blank" if c == "\t" else "remove it, texts are printed as they stand"
-    latex = c in "\t\x08\x0c\r" and text[found.end() : found.end() + 1].isalpha()
-    hint = "; LaTeX is not read, or needs single quotes" if latex else ""
-    return f"holds U+{ord(c):04X}, {kind},{before}: {remedy}{hint}"
+    remedy = "write a space" if c == "\t" else "remove it"
+    if c in "\t\x08\x0c\r" and text[found.end() : found.end() + 1].isalpha():  # "\theta"
+        remedy = 'a backslash in "..." begins an escape, write the text in single quotes'
+    return f"holds U+{ord(c):04X}, {kind},{before}: {remedy}"
 
 
 def line(text: str) -> str:
@@ -123,6 +123,13 @@ def toml(text: str) -> str:
 def figure(text: str) -> str:
     """A text in a figure, where a dollar would begin mathematics."""
     return line(text).replace("$", r"\$")
+
+
+def name(given: str) -> str:
+    """What stands in code as it is: a plain name, or ValueError. Readers let no other pass."""
+    if not re.fullmatch(r"[A-Za-z_][0-9A-Za-z_]*", given):
+        raise ValueError(f"{given!r} is not a plain name and can't stand in code")
+    return given
 
 
 def command(file: str) -> str:
