@@ -75,7 +75,7 @@ def figure(
 ) -> Figure:
     """The figure of a run. t: (n,), s; q, qd: (n, nq); energy: (n,)."""
     try:
-        import matplotlib
+        import matplotlib.figure
     except ImportError:
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
