@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 import eomc
-from eomc import terminal
+from eomc import terminal, texts
 from eomc.problems import EomcError, FolderError, SceneError
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class _Group(terminal.Group):
             return super().invoke(context)
         except SceneError as fault:
             count = sum(p.severity == "error" for p in fault.problems)
-            click.echo(str(fault), err=True)
+            _say(str(fault), err=True)
             _fail(f"eomc: {count} error{'s' if count != 1 else ''}, nothing was built or changed")
         except FolderError as fault:
             _fail(f"eomc: {fault.what}: choose another place with --build DIR")
@@ -54,13 +54,23 @@ class _Group(terminal.Group):
         except MemoryError as fault:
             _fail(f"eomc: {fault}" if str(fault) else "eomc: not enough memory")
         except KeyboardInterrupt:
-            click.echo("eomc: interrupted", err=True)
+            _say("eomc: interrupted", err=True)
             sys.exit(130)
 
 
 def _fail(message: str) -> NoReturn:
-    click.echo(message, err=True)
+    _say(message, err=True)
     sys.exit(2)
+
+
+def _say(words: str = "", err: bool = False) -> None:
+    """Print; what a terminal would take for a command is shown escaped."""
+    click.echo(texts.lines(words), err=err)
+
+
+def _shown(path: object) -> str:
+    """The name of a file in one line."""
+    return texts.line(str(path))
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -96,7 +106,7 @@ def new(name: str) -> None:
     )
     path = _scene_path(name)
     _write_new(path, text)
-    click.echo(f"wrote {path}; try: eomc run {path}")
+    _say(f"wrote {_shown(path)}; try: eomc run {texts.command(str(path))}")
 
 
 def _scene_path(name: str) -> Path:
@@ -112,11 +122,11 @@ def _write_new(path: Path, text: str) -> None:
             made = True
             file.write(text)
     except FileExistsError:
-        raise EomcError(f"{path}: is there already, and stays as it is") from None
+        raise EomcError(f"{_shown(path)}: is there already, and stays as it is") from None
     except OSError as fault:
         if made:  # and not whole
             path.unlink(missing_ok=True)
-        raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
+        raise EomcError(f"{_shown(path)}: can't be written ({fault.strerror})") from None
 
 
 @main.command("import")
@@ -157,7 +167,7 @@ def import_(
     if element == "mujoco":
         robot = mjcf.read(file, include)
     elif include:
-        raise EomcError(f"--include is for MJCF files, and {file} is none")
+        raise EomcError(f"--include is for MJCF files, and {_shown(file)} is none")
     else:
         robot = urdf.read(file)
     robot = robots.lock(robot, dict(_pairs(locks, "--lock", {})))
@@ -177,20 +187,21 @@ def import_(
     text = robots.scene_text(robot)
     if len(text.encode()) > MAX_BYTES:
         raise EomcError(
-            f"{file}: its scene would have {len(text.encode())} bytes, and a scene has at most "
-            f"{MAX_BYTES}: cut out a part with --root and --tip"
+            f"{_shown(file)}: its scene would have {len(text.encode())} bytes, and a scene has at "
+            f"most {MAX_BYTES}: cut out a part with --root and --tip"
         )
     _write_new(path, text)
     called = "" if path.stem == robot.name else f"; its module is called {robot.name}"
-    click.echo(
-        f"wrote {path}: bodies {len(robot.bodies)}, coordinates {len(robot.motions)}, "
+    _say(
+        f"wrote {_shown(path)}: bodies {len(robot.bodies)}, coordinates {len(robot.motions)}, "
         f"inputs {len(robot.drives)}{called}"
     )
     if robot.left_out:
-        click.echo("not modelled, or to be looked at:")
+        _say("not modelled, or to be looked at:")
         for words in robot.left_out:
-            click.echo(f"  - {words}")
-    click.echo(f"try: eomc dof {path}; eomc run {path}")
+            _say(f"  - {_shown(words)}")
+    typed = texts.command(str(path))
+    _say(f"try: eomc dof {typed}; eomc run {typed}")
 
 
 @main.command()
@@ -206,7 +217,7 @@ def dof(scene: Path, as_json: bool) -> None:
     from eomc import scene as scenes
 
     counted = mobility.count(scenes.read(scene))
-    click.echo(json.dumps(counted.as_dict(), indent=1) if as_json else counted.table())
+    _say(json.dumps(counted.as_dict(), indent=1) if as_json else counted.table())
 
 
 @main.command()
@@ -227,7 +238,8 @@ def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> Non
         name = eomc.name_and_digest(scene)[0]
         if name and (other := named.setdefault(name, scene)) != scene:
             raise EomcError(
-                f"{other} and {scene} are both named '{name}': one would replace the other"
+                f"{_shown(other)} and {_shown(scene)} are both named '{name}': one would replace "
+                "the other"
             )
     told = []
     with _progress("building", quiet or as_json) as progress:
@@ -242,9 +254,9 @@ def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> Non
             )  # fmt: skip
             if not quiet and not as_json:
                 done = f"built in {spent:.1f} s" if built.fresh else "is up to date"
-                click.echo(f"{built.folder}/: {done}")
+                _say(f"{_shown(built.folder)}/: {done}")
     if as_json:
-        click.echo(json.dumps(told, indent=1))
+        _say(json.dumps(told, indent=1))
 
 
 @main.command()
@@ -271,15 +283,15 @@ def check(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: b
             progress(k + 1, len(scenes))
             reports.append(report)
             if not as_json and not (quiet and report.passed):
-                click.echo(report.table())
-                click.echo()
+                _say(report.table())
+                _say()
     failed = [r.scene for r in reports if not r.passed]
     if as_json:
-        click.echo(json.dumps([r.as_dict() for r in reports], indent=1))
+        _say(json.dumps([r.as_dict() for r in reports], indent=1))
     elif failed:
-        click.echo(f"FAILED: {', '.join(failed)}")
+        _say(f"FAILED: {', '.join(failed)}")
     elif not quiet:
-        click.echo(f"all {len(reports)} passed" if len(reports) > 1 else "passed")
+        _say(f"all {len(reports)} passed" if len(reports) > 1 else "passed")
     sys.exit(1 if failed else 0)
 
 
@@ -340,11 +352,11 @@ def run(
         plots.draw(eomc.read(scene).at(values), done.t, done.q, done.qd, done.energy, plot)
     summary = _summary(module, done, seconds, unstable, plot=plot, out=out)
     if as_json:
-        click.echo(json.dumps(summary, indent=1))
+        _say(json.dumps(summary, indent=1))
     elif not quiet:
         _print_summary(module, done, summary)
     if done.status != "ok":
-        click.echo(f"eomc: {done.message}", err=True)
+        _say(f"eomc: {done.message}", err=True)
     if stopped or done.status != "ok":
         sys.exit(130 if stopped else 1)
 
@@ -374,14 +386,14 @@ def report(
             made = reports.report(scene, root, progress=progress)
         told.append(made.as_dict())
         if digits is not None:
-            click.echo(f"{made.scene}: {made.recommendation(digits)}")
+            _say(f"{made.scene}: {made.recommendation(digits)}")
             continue
         if not quiet:
-            click.echo(made.table())
+            _say(made.table())
         page = root / made.scene / "report.html"
         _write_text(page, reports.page(made))
         if not quiet:
-            click.echo(f"\nwrote {page}\n")
+            _say(f"\nwrote {_shown(page)}\n")
     if file is not None:
         _write_text(file, json.dumps(told, indent=1) + "\n")
 
@@ -407,7 +419,7 @@ def show(scene: Path, form: str | None) -> None:
         _warn(problem)
     with _status("deriving", False):
         text = shown.cost(system) if form == "cost" else shown.equations(system, form or "text")
-    click.echo(text)
+    _say(text)
 
 
 @main.command("list")
@@ -428,7 +440,7 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
     default = Path("scenes") if Path("scenes").is_dir() else Path()
     for folder in folders or [default]:
         if not folder.is_dir():
-            raise EomcError(f"{folder}: is not a folder")
+            raise EomcError(f"{_shown(folder)}: is not a folder")
         for path in sorted(folder.glob("*.toml")):
             try:
                 text = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -444,16 +456,19 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
                  "built": built}
             )  # fmt: skip
     if as_json:
-        click.echo(json.dumps(rows, indent=1))
+        _say(json.dumps(rows, indent=1))
         return
     if not rows:
-        click.echo("no scenes here: 'eomc new NAME' writes one")
+        _say("no scenes here: 'eomc new NAME' writes one")
+    for row in rows:
+        row |= {key: _shown(row[key]) for key in ("scene", "title")}
+        row |= {key: list(map(_shown, row[key])) for key in ("coordinates", "inputs")}
     wide = max((len(row["scene"]) for row in rows), default=0)
     titles = max((len(row["title"]) for row in rows), default=0)
     for row in rows:
         moved = f"({', '.join(row['inputs'])})" if row["inputs"] else ""
         mark = "built" if row["built"] else "     "
-        click.echo(
+        _say(
             f"{row['scene']:{wide}}  {row['title']:{titles}}  "
             f"{mark}  {', '.join(row['coordinates'])} {moved}".rstrip()
         )
@@ -469,12 +484,12 @@ def _keys(text: Mapping[str, Any], table: str) -> list[str]:
 
 
 def _warn(problem: Problem) -> None:
-    click.echo(str(problem), err=True)
+    _say(str(problem), err=True)
 
 
 def _known_suffix(path: Path | None, known: Sequence[str], option: str) -> None:
     if path is not None and path.suffix not in known:
-        raise EomcError(f"{option} {path}: give a name that ends in {' or '.join(known)}")
+        raise EomcError(f"{option} {_shown(path)}: give a name that ends in {' or '.join(known)}")
 
 
 def _overrides(
@@ -597,27 +612,27 @@ def _summary(
 
 
 def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
-    click.echo(
-        f"{module.title}: {done.steps} steps of {summary['method']}, h = {done.h:g} s, "
+    _say(
+        f"{_shown(module.title)}: {done.steps} steps of {summary['method']}, h = {done.h:g} s, "
         f"to t = {done.t[-1]:g} s"
     )
     wide = max(map(len, module.coordinates))
     for name, q, qd in zip(module.coordinates, done.q[-1], done.qd[-1], strict=True):
-        unit = module.units.get(name, "")
+        unit = texts.line(module.units.get(name, ""))
         rate = f"{unit}/s" if unit else ""
-        click.echo(f"  {name:{wide}} {q: .9g} {unit}   {name}_dot {qd: .9g} {rate}".rstrip())
+        _say(f"  {name:{wide}} {q: .9g} {unit}   {name}_dot {qd: .9g} {rate}".rstrip())
     change, jacobi = summary["energy"]["largest_change"], summary["jacobi_change"]
     beside = "" if jacobi is None else f"; Jacobi's integral by {jacobi:.2g} J"
     end = summary["energy"]["end"]
-    click.echo(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J{beside}")
+    _say(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J{beside}")
     if summary["beyond_stability"]:
-        click.echo(f"  {summary['beyond_stability']}")
+        _say(f"  {summary['beyond_stability']}")
     if done.error is not None:
         _print_error(module, done.error)
     speed = summary["steps_per_second"] or 0.0
-    click.echo(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
+    _say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
     for file in summary["files"]:
-        click.echo(f"  wrote {file}")
+        _say(f"  wrote {_shown(file)}")
 
 
 def _print_error(module: Any, error: Estimate) -> None:
@@ -625,17 +640,17 @@ def _print_error(module: Any, error: Estimate) -> None:
 
     q, qd = float(error.q[-1].max()), float(error.qd[-1].max())
     seen = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
-    click.echo(
+    _say(
         f"  error at the end about {q:.1g} in q, {qd:.1g} in qd "
         f"(from the same run in shorter steps; order {error.order}, {seen})"
     )
     digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
-    click.echo(
+    _say(
         f"  right digits: {digits}; a difference at the start has become "
         f"{error.amplification:.2g} times as large"
     )
     if not error.resolved:
-        click.echo(f"  this motion is not resolved: {error.verdict}")
+        _say(f"  this motion is not resolved: {error.verdict}")
 
 
 def _write(path: Path, module: Any, done: Run) -> None:
@@ -658,14 +673,14 @@ def _write(path: Path, module: Any, done: Run) -> None:
                 for row in np.column_stack([done.t, done.q, done.qd, done.energy])
             )
     except OSError as fault:
-        raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
+        raise EomcError(f"{_shown(path)}: can't be written ({fault.strerror})") from None
 
 
 def _write_text(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as fault:
-        raise EomcError(f"{path}: can't be written ({fault.strerror})") from None
+        raise EomcError(f"{_shown(path)}: can't be written ({fault.strerror})") from None
 
 
 def _watched(silent: bool) -> bool:
@@ -684,11 +699,13 @@ def _progress(what: str, silent: bool) -> Iterator[Callable[[int, int], None]]:
     def update(done: int, total: int) -> None:
         if not bar and time.monotonic() - begun > 1 and done < total:
             from rich.console import Console
-            from rich.progress import Progress
+            from rich.progress import Progress, TextColumn
 
-            progress = Progress(console=Console(stderr=True), transient=True)
+            said = TextColumn("{task.description}", markup=False)
+            columns = (said, *Progress.get_default_columns()[1:])
+            progress = Progress(*columns, console=Console(stderr=True), transient=True)
             progress.start()
-            bar.extend([progress, progress.add_task(what, total=total)])
+            bar.extend([progress, progress.add_task(_shown(what), total=total)])
         if bar:
             bar[0].update(bar[1], completed=done)
 
@@ -706,8 +723,9 @@ def _status(what: str, silent: bool) -> Iterator[None]:
         yield
         return
     from rich.console import Console
+    from rich.text import Text
 
-    with Console(stderr=True).status(f"{what} ..."):
+    with Console(stderr=True).status(Text(f"{_shown(what)} ...")):  # no str, which has markup
         yield
 
 

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from eomc import names
+from eomc import names, texts
 
 MAX_LENGTH = 10_000
 MAX_DEPTH = 150
@@ -142,7 +142,7 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
 def suggest(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'm_c'?"` where a known name is close, else the empty string."""
     near = nearest(name, known)
-    return f"; did you mean '{near}'?" if near else ""
+    return f"; did you mean '{texts.line(near)}'?" if near else ""
 
 
 def parse(text: str) -> Formula:
@@ -296,7 +296,7 @@ def _check_call(func: ast.Name, call: ast.Call) -> None:
             func,
             f"'{name}' is not a function"
             + (
-                (f"; did you mean '{near}'?" if near else suggest(name, FUNCTIONS))
+                (f"; did you mean '{texts.line(near)}'?" if near else suggest(name, FUNCTIONS))
                 or f": write {name}*(...) for a product; functions are {', '.join(FUNCTIONS)}"
             ),
         )

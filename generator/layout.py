@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from eomc import advice
+from eomc import advice, texts
 from eomc.formulas import nearest
 
 METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "gauss16", "euler", "verlet")
@@ -16,6 +16,9 @@ REALS = ("double", "float")
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
 _Value = _Number | pydantic.StrictStr
+
+_Line = Annotated[pydantic.StrictStr, pydantic.AfterValidator(texts.checked_line)]
+_Note = Annotated[pydantic.StrictStr, pydantic.AfterValidator(texts.checked_lines)]
 _Positive = Annotated[float, pydantic.Field(strict=True, gt=0, allow_inf_nan=False)]
 
 
@@ -24,24 +27,24 @@ class _Table(pydantic.BaseModel):
 
 
 class _Coordinate(_Table):
-    unit: pydantic.StrictStr = ""
+    unit: _Line = ""
     start: _Value = 0.0
     rate: _Value = 0.0
-    note: pydantic.StrictStr = ""
+    note: _Note = ""
 
 
 class QuantityTable(_Table):
     """A parameter or constant as it is written."""
 
     value: _Value
-    unit: pydantic.StrictStr = ""
-    note: pydantic.StrictStr = ""
+    unit: _Line = ""
+    note: _Note = ""
 
 
 class _Input(_Table):
-    unit: pydantic.StrictStr = ""
+    unit: _Line = ""
     signal: _Value = 0.0
-    note: pydantic.StrictStr = ""
+    note: _Note = ""
 
 
 class _Energy(_Table):
@@ -184,7 +187,7 @@ class BodyTable(_Table):
     """A [[body]] as it is written; None where a key is not there."""
 
     name: pydantic.StrictStr
-    note: pydantic.StrictStr = ""
+    note: _Note = ""
     parent: pydantic.StrictStr | None = None
     joint: pydantic.StrictStr | None = None
     coordinates: _Names | None = None
@@ -209,7 +212,7 @@ class _Between(_Table):
     bodies: _TwoNames | None = None
     points: _Points | None = None
     turning: pydantic.StrictBool = False
-    note: pydantic.StrictStr = ""
+    note: _Note = ""
 
 
 class SpringTable(_Between):
@@ -230,8 +233,8 @@ class Document(_Table):
 
     eomc: Literal[1]
     name: pydantic.StrictStr
-    title: pydantic.StrictStr = ""
-    note: pydantic.StrictStr = ""
+    title: _Line = ""
+    note: _Note = ""
     gravity: _Vector | None = None
     coordinates: dict[str, _Coordinate] = pydantic.Field(min_length=1)
     parameters: dict[str, _Short] = {}

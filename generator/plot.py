@@ -15,7 +15,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from eomc import names
+from eomc import names, texts
 from eomc.problems import EomcError
 from eomc.system import Coordinate, System, dot, t
 
@@ -59,7 +59,7 @@ def draw(
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
     try:
-        with matplotlib.rc_context({"svg.hashsalt": "eomc"}):
+        with matplotlib.rc_context({"svg.hashsalt": "eomc", "text.usetex": False}):
             made.savefig(path, dpi=150, metadata=undated)
     except OSError as fault:
         raise EomcError(f"{path}: can't be written ({fault.strerror or fault})") from None
@@ -75,9 +75,18 @@ def figure(
 ) -> Figure:
     """The figure of a run. t: (n,), s; q, qd: (n, nq); energy: (n,)."""
     try:
-        from matplotlib.figure import Figure
+        import matplotlib.figure
     except ImportError:
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
+    with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
+        return _figure(system, t, q, qd, energy, title)
+
+
+def _figure(
+    system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None
+) -> Figure:
+    from matplotlib.figure import Figure
+
     every = max(len(t) // SAMPLES, 1)
     t, q, qd, energy = (np.asarray(a, dtype=float)[::every] for a in (t, q, qd, energy))
 
@@ -85,7 +94,8 @@ def figure(
     picture = _picture(system, t, q, qd)
     rows = len(groups) + 1
     made = Figure(figsize=(12, min(2.1 * rows + 0.5, 9)), layout="constrained")
-    made.suptitle(title or system.title or system.name, fontsize=13, color=INK)
+    shown = texts.figure(title or system.title or system.name)
+    made.suptitle(shown, fontsize=13, color=INK)
     widths = [1, 1, 1.35] if picture else [1, 1]
     grid = made.add_gridspec(rows, len(widths), width_ratios=widths)
 
@@ -145,7 +155,7 @@ def _unit(unit: str, rate: bool) -> str:
 
 
 def _with_unit(text: str, unit: str) -> str:
-    return f"{text} ({unit})" if unit else text
+    return f"{text} ({texts.figure(unit)})" if unit else text
 
 
 # --- against time ---------------------------------------------------------------------------------
@@ -211,7 +221,7 @@ def _quantity(value: float, unit: str, digits: int = 4) -> str:
     if "e" in text:
         mantissa, exponent = f"{value:.{digits}g}".split("e")
         text = rf"${mantissa}\times10^{{{int(exponent)}}}$"
-    return f"{text} {unit}".rstrip()
+    return f"{text} {texts.figure(unit)}".rstrip()
 
 
 def _colours(n: int) -> list[Any]:

@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from eomc import texts
+
 WIDTH = 100  # characters of a source line shown, at most
 MOST = 50  # problems shown, at most
 
 
 class EomcError(Exception):
     """An error that is the user's to mend; its text is meant to be read as it stands."""
+
+    def __str__(self) -> str:
+        return texts.lines(super().__str__())
 
 
 class FolderError(EomcError):
@@ -45,7 +50,7 @@ class Problem:
             if self.column >= 0:
                 place += f":{self.column + 1}"
         parts = (place, self.severity, self.key, self.message)
-        text = ": ".join(_shown(part) for part in parts if part)
+        text = ": ".join(texts.line(part) for part in parts if part)
         if not self.source:
             return text
         # of a long line, the part around the fault

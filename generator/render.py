@@ -21,6 +21,8 @@ from eomc.pieces import weight
 from eomc.program import Program
 from eomc.steppers import METHODS
 from eomc.target import Target
+from eomc.texts import docstring
+from eomc.texts import name as plain
 
 
 @dataclass(frozen=True)
@@ -41,17 +43,22 @@ class Sources:
 
 
 def environment() -> jinja2.Environment:
-    """Jinja as it is used here: a missing variable stops the build."""
+    """Jinja as it is used here: a missing variable stops the build, free text as it stands too.
+
+    Pages are escaped by themselves; a Python face escapes its docstring as a whole.
+    """
     loader = jinja2.FunctionLoader(lambda name: resource("templates", name))
-    return jinja2.Environment(
+    made = jinja2.Environment(
         loader=loader,
         bytecode_cache=_bytecode(),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-        autoescape=False,  # the output is C and Python, no HTML
+        autoescape=lambda name: (name or "").endswith(".html.jinja"),
     )
+    made.filters["docstring"] = docstring
+    return made
 
 
 def _bytecode() -> jinja2.BytecodeCache | None:
@@ -70,7 +77,10 @@ def render(program: Program, extension: str) -> Sources:
 
     Same program, same text.
     """
-    run = program.system.run
+    s = program.system
+    for given in (*s.coordinates, *s.parameters, *s.inputs, *(d for d, _ in s.definitions), s):
+        plain(given.name)
+    run = s.run
     target = Target(program, REALS[run.real])
     context = {**values(target), "extension": extension}
     jinja = environment()

@@ -24,9 +24,11 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 import eomc
+from eomc import texts
 from eomc import truth as truths
 from eomc.answer import Vector
 from eomc.problems import EomcError, SceneError
@@ -599,6 +601,7 @@ def page(report: Report) -> str:
         .get_template("report.html.jinja")
         .render(
             report=report,
+            title=texts.html(report.title),
             rows=report.rows(),
             explained=EXPLAINED,
             runs=runs,
@@ -612,7 +615,7 @@ def page(report: Report) -> str:
     )
 
 
-def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> str:
+def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
     """A picture as text of SVG, the same for the same report."""
     try:
         import matplotlib
@@ -627,7 +630,7 @@ def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> str:
         draw(axes)
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
-    return text.getvalue()[text.getvalue().index("<svg") :]
+    return Markup(text.getvalue()[text.getvalue().index("<svg") :])
 
 
 def _styles(report: Report) -> dict[str, tuple[str, str]]:

@@ -6,7 +6,6 @@ change it as the user asks; `finished` makes it fit for a scene, `scene_text` wr
 
 from __future__ import annotations
 
-import json
 import math
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
@@ -17,6 +16,7 @@ from eomc.assembly import WORLD
 from eomc.formulas import suggest
 from eomc.joints import JOINTS
 from eomc.problems import EomcError
+from eomc.texts import line, toml
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -659,16 +659,16 @@ def scene_text(robot: Robot) -> str:
     written as such, so that their sines are exact.
     """
     robot = finished(robot)
-    head = [f"# {_one_line(robot.title)}"]
+    head = [f"# {line(robot.title)}"]
     if robot.left_out:
         head += ["#", "# Not modelled, or to be looked at:"]
-        head += [line for words in robot.left_out for line in _bullet(words)]
+        head += [each for words in robot.left_out for each in _bullet(words)]
     gravity = ", ".join(map(number, robot.gravity))
     parts = [
         "\n".join(head),
         "\n".join(
             _aligned(
-                {"eomc": "1", "name": text(robot.name), "title": text(robot.title),
+                {"eomc": "1", "name": toml(robot.name), "title": toml(robot.title),
                  "gravity": f"[{gravity}]"}
             )
         ),
@@ -682,7 +682,7 @@ def scene_text(robot: Robot) -> str:
     parts += ["\n".join(["[[body]]", *_aligned(_entry(body, robot))]) for body in robot.bodies]
     for motion in robot.motions:
         if motion.stiffness:
-            spring = {"coordinate": text(motion.name), "stiffness": number(motion.stiffness)}
+            spring = {"coordinate": toml(motion.name), "stiffness": number(motion.stiffness)}
             if motion.rest:
                 spring["length"] = _length(motion.rest, motion.unit)
             parts.append("\n".join(["[[spring]]", *_aligned(spring)]))
@@ -717,37 +717,32 @@ def _shortest(x: float) -> str:
     return number(x)
 
 
-def text(words: str) -> str:
-    """A text in quotes, as TOML has it."""
-    return json.dumps(words, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def _length(x: float, of: str) -> str:
     return angle(x) if of == "rad" else number(x)
 
 
 def _coordinate(m: Motion) -> str:
     start = f", start = {_length(m.start, m.unit)}" if m.start else ""
-    note = f", note = {text(m.note)}" if m.note else ""
-    return f"{{ unit = {text(m.unit)}{start}{note} }}"
+    note = f", note = {toml(m.note)}" if m.note else ""
+    return f"{{ unit = {toml(m.unit)}{start}{note} }}"
 
 
 def _input(drive: Drive, units: Mapping[str, str]) -> str:
     force = "N m" if units[drive.coordinate] == "rad" else "N"
     if drive.gear != 1:
         force = ""  # a signal, which the gear makes a force
-    of = f"unit = {text(force)}, " if force else ""
-    return f"{{ {of}note = {text(drive.note or 'along ' + drive.coordinate)} }}"
+    of = f"unit = {toml(force)}, " if force else ""
+    return f"{{ {of}note = {toml(drive.note or 'along ' + drive.coordinate)} }}"
 
 
 def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
     """The keys of a [[body]] that differ from their defaults."""
-    entry = {"name": text(body.name)}
+    entry = {"name": toml(body.name)}
     if body.parent != WORLD:
-        entry["parent"] = text(body.parent)
-    entry["joint"] = text(body.joint)
+        entry["parent"] = toml(body.parent)
+    entry["joint"] = toml(body.joint)
     if body.motions:
-        entry["coordinates"] = _each([text(m.name) for m in body.motions])
+        entry["coordinates"] = _each([toml(m.name) for m in body.motions])
     if any(body.offset):
         entry["offset"] = vector(body.offset)
     if turns := turns_of(body.rotation):
@@ -768,9 +763,9 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
             entry[key] = values[0] if len(set(values)) == 1 else _each(values)
     forces = [_force(m.name, robot.drives) for m in body.motions]
     if any(force != "0" for force in forces):
-        entry["actuator"] = _each([f if f == "0" else text(f) for f in forces])
+        entry["actuator"] = _each([f if f == "0" else toml(f) for f in forces])
     if body.note:
-        entry["note"] = text(body.note)
+        entry["note"] = toml(body.note)
     return entry
 
 
@@ -796,11 +791,6 @@ def _aligned(entries: Mapping[str, str]) -> list[str]:
 
 def _bullet(words: str) -> list[str]:
     return textwrap.wrap(
-        _one_line(words), 98, initial_indent="# - ", subsequent_indent="#   ",
+        line(words), 98, initial_indent="# - ", subsequent_indent="#   ",
         break_on_hyphens=False,
     )  # fmt: skip
-
-
-def _one_line(words: str) -> str:
-    """For a comment: a line break in it would begin something else."""
-    return "".join(c if c.isprintable() else " " for c in words)

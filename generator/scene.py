@@ -15,7 +15,7 @@ from typing import Any
 
 import pydantic
 
-from eomc import advice, bodycheck, formulas, layout, names, repeat
+from eomc import advice, bodycheck, formulas, layout, names, repeat, texts
 from eomc.assembly import Assembly
 from eomc.checker import (
     DOUBT,
@@ -149,21 +149,21 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
 
     Raises SceneError with every fault, EomcError if unreadable.
     """
-    path = Path(file)
+    path, shown = Path(file), texts.line(str(file))
     try:
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
         others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
         meant = advice.file(path)
-        near = f"; did you mean '{meant}'?" if meant else suggest(path.name, others)
-        raise EomcError(f"{file}: there is no such file{near}") from None
+        near = f"; did you mean '{texts.line(meant)}'?" if meant else suggest(path.name, others)
+        raise EomcError(f"{shown}: there is no such file{near}") from None
     except IsADirectoryError:
-        raise EomcError(f"{file}: is a folder: name a scene, such as scenes/NAME.toml") from None
+        raise EomcError(f"{shown}: is a folder: name a scene, such as scenes/NAME.toml") from None
     except (OSError, ValueError) as fault:
         why = getattr(fault, "strerror", None) or fault
-        raise EomcError(f"{file}: can't be read ({why})") from None
-    return parse(data, str(file), parameters)
+        raise EomcError(f"{shown}: can't be read ({why})") from None
+    return parse(data, shown, parameters)
 
 
 def parse(
@@ -173,7 +173,8 @@ def parse(
     if isinstance(data, str):
         data = data.encode(errors="surrogatepass")
     if len(data) > MAX_BYTES:
-        raise EomcError(f"{file}: it has more than the {MAX_BYTES} bytes a scene may have")
+        shown = texts.line(file)
+        raise EomcError(f"{shown}: it has more than the {MAX_BYTES} bytes a scene may have")
     try:
         text = data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as fault:

@@ -6,7 +6,7 @@ import sympy
 from sympy import Expr
 from sympy.printing.str import StrPrinter
 
-from eomc import ccode, mechanics, program, reference
+from eomc import ccode, mechanics, program, reference, texts
 from eomc.problems import EomcError
 from eomc.symbols import ALONG
 from eomc.system import System, t
@@ -91,7 +91,8 @@ def _nothing(value: Expr | sympy.MatrixBase) -> bool:
 def _text(system: System, values: dict[str, Expr]) -> str:
     names = {c.qd: sympy.Symbol(_dotted(c.name)) for c in system.coordinates}
     order = ", ".join(c.name for c in system.coordinates)
-    parts = [f"{system.title}: D q̈ + C q̇ + g = {'τ' if 'tau' in values else '0'},  q = ({order})"]
+    title = texts.line(system.title)
+    parts = [f"{title}: D q̈ + C q̇ + g = {'τ' if 'tau' in values else '0'},  q = ({order})"]
     for name, value in values.items():
         shown = sympy.pretty(value.xreplace(names), use_unicode=True, wrap_line=False)
         head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}:"
@@ -127,8 +128,9 @@ class _Exact(StrPrinter):  # type: ignore[misc]
 def _python(system: System, values: dict[str, Expr]) -> str:
     symbols = [*system.q, *system.qd, *system.u, *(p.symbol for p in system.parameters), t]
     names = ", ".join(s.name for s in symbols)
+    title = texts.docstring(texts.line(system.title))
     lines = [
-        f'"""{system.title}: D qdd + C qd + g = tau, as SymPy matrices."""',
+        f'"""{title}: D qdd + C qd + g = tau, as SymPy matrices."""',
         "",
         "from sympy import *",
         "",
@@ -145,7 +147,7 @@ def _python(system: System, values: dict[str, Expr]) -> str:
 def _assignments(made: program.Program) -> str:
     """D, C, g and tau as short lists of assignments, the form in which they are computed."""
     names = [c.name for c in made.system.coordinates]
-    parts = [f"{made.system.title}: D qdd + C qd + g = tau, q = ({', '.join(names)})"]
+    parts = [f"{texts.line(made.system.title)}: D qdd + C qd + g = tau, q = ({', '.join(names)})"]
     for name in (n for whole in _MATRICES for n in (whole, f"{whole}_column") if n in made):
         body = ccode.body(made[name], made.system.name, {})
         lines = [line.removeprefix("const double ").rstrip(";") for line in body.lines]
@@ -172,7 +174,10 @@ _ROUTES = {
 def cost(system: System) -> str:
     """The operations of each generated function, by each route, and why one was taken."""
     made = program.build(mechanics.derive(system))
-    lines = [f"{system.title}: operations of one call, those on parameters alone left out", ""]
+    lines = [
+        f"{texts.line(system.title)}: operations of one call, those on parameters alone left out",
+        "",
+    ]
     wide = max(map(len, made.functions))
     told: dict[str, None] = {}
     for name, function in made.functions.items():

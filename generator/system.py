@@ -359,6 +359,9 @@ class _Maker:
         forces = given.mapping(forces, "forces", "{x: F}")
         definitions = given.mapping(definitions, "definitions", "{y: l*cos(theta)}")
         units = given.mapping(units, "units", '{m: "kg"}')
+        for text in (title, *units.values()):
+            if not isinstance(text, str):
+                raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
         made = []

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eomc import robots, xmlfile
+from eomc import robots, texts, xmlfile
 from eomc.assembly import WORLD
 from eomc.formulas import suggest
 from eomc.problems import EomcError, Problem, SceneError
@@ -49,12 +49,12 @@ def read(file: str | os.PathLike[str]) -> Robot:
 
     Raises SceneError with every fault of the robot, EomcError for what is not a URDF.
     """
-    root = xmlfile.root(file)
+    root, shown = xmlfile.root(file), texts.line(str(file))
     if any(_is_xacro(e) for e in root.iter()):
-        raise EomcError(f"{file}: {xmlfile.RUN_XACRO}")
+        raise EomcError(f"{shown}: {xmlfile.RUN_XACRO}")
     if root.tag != "robot":
-        raise EomcError(f"{file}: not a URDF: its root element is <{root.tag}>, not <robot>")
-    return _Reader(root, Path(file), str(file)).robot()
+        raise EomcError(f"{shown}: not a URDF: its root element is <{root.tag}>, not <robot>")
+    return _Reader(root, Path(file), shown).robot()
 
 
 def _is_xacro(element: Element) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree.ElementTree import ParseError
 
+from eomc import texts
 from eomc.formulas import suggest
 from eomc.problems import EomcError
 
@@ -24,24 +25,25 @@ def root(file: str | os.PathLike[str]) -> Element:
     from defusedxml import DefusedXmlException
     from defusedxml.ElementTree import fromstring
 
-    data = _bytes(Path(file), str(file))
+    shown = texts.line(str(file))
+    data = _bytes(Path(file), shown)
     if not data.strip():
-        raise EomcError(f"{file}: the file is empty")
+        raise EomcError(f"{shown}: the file is empty")
     try:
         found: Element = fromstring(data, forbid_dtd=True)
     except ParseError as fault:
         if b"xacro:" in data and "unbound prefix" in str(fault):
-            raise EomcError(f"{file}: {RUN_XACRO}") from None
+            raise EomcError(f"{shown}: {RUN_XACRO}") from None
         line, column = fault.position
         why = re.sub(r": line \d+, column \d+$", "", str(fault))
-        raise EomcError(f"{file}:{line}:{column + 1}: not XML: {why}") from None
+        raise EomcError(f"{shown}:{line}:{column + 1}: not XML: {why}") from None
     except DefusedXmlException:
         raise EomcError(
-            f"{file}: it declares a document type or entities, which are not read: robot files "
+            f"{shown}: it declares a document type or entities, which are not read: robot files "
             "need none, remove <!DOCTYPE ...> and write out what its entities stand for"
         ) from None
     except (ValueError, LookupError) as fault:  # of the encoding that it claims
-        raise EomcError(f"{file}: not XML: {fault}") from None
+        raise EomcError(f"{shown}: not XML: {fault}") from None
     return found
 
 

