@@ -16,6 +16,7 @@ from pathlib import Path
 import jinja2
 
 from eomc.ccode import REALS
+from eomc.cnames import borne
 from eomc.context import resource, values
 from eomc.pieces import weight
 from eomc.program import Program
@@ -67,7 +68,8 @@ def render(program: Program, extension: str) -> Sources:
 
     Same program, same text.
     """
-    target = Target(program, REALS[program.system.run.real])
+    program, written = borne(program)
+    target = Target(program, REALS[program.system.run.real], written)
     context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name

@@ -447,7 +447,7 @@ class _Check(Checker):
                 self.kinds[name] = frozenset({DOUBT})
 
     def _circular(self, definitions: Mapping[str, Formula]) -> set[str]:
-        """The names that hang on themselves, each ring told once; beyond MOST, what hangs on any."""
+        """The names that hang on themselves, each ring told once; beyond MOST, all."""
         graph = {
             name: [n.id for n in formula.names() if n.id in definitions]
             for name, formula in definitions.items()
