@@ -308,7 +308,7 @@ def _check_value(formula: Formula, node: ast.expr) -> None:
 def _number(formula: Formula, node: ast.expr) -> float | None:
     """The value of a subtree, nan where it is not real and finite, None where it has names."""
     found = (n.id for n in ast.walk(node) if isinstance(n, ast.Name))
-    if any(name not in NUMERIC for name in found):
+    if any(name not in FUNCTIONS and name != "pi" for name in found):
         return None
     try:
         value = _walk(formula, node, NUMERIC, NUMERIC.__getitem__)
