@@ -146,14 +146,11 @@ def load(
 
 def name_and_digest(path: Path) -> tuple[str, str]:
     """What a scene is called and the digest of its text, without checking it; no SymPy."""
-    import hashlib
-    import tomllib
+    from eomc.tomltext import tree_and_digest
 
     try:
-        data = path.read_bytes()
-        name = tomllib.loads(data.decode()).get("name", "")
-    except (OSError, ValueError, RecursionError):
+        tree, digest = tree_and_digest(path)
+    except (OSError, ValueError):
         return "", ""  # the reader tells what is wrong
-    return name if isinstance(name, str) and name.isidentifier() else "", hashlib.sha256(
-        data
-    ).hexdigest()
+    name = tree.get("name", "")
+    return name if isinstance(name, str) and name.isidentifier() else "", digest

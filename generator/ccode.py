@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from sympy import Expr, S
 
 from eomc.angles import pair_of
 from eomc.assignments import Call, Function, Operand, Product, Sum, Value, rename
+from eomc.problems import EomcError
 from eomc.tape import Stage, is_negative
 
 MOST_INLINE = 5  # operations; longer expressions get a name of their own
@@ -70,14 +72,28 @@ def number(value: Expr, real: Real = DOUBLE) -> str:
     if real is QUAD:
         return _quad(value)
     if value.is_Rational:
-        nearest = float(value)
+        nearest = _nearest(value)
         text = _decimal(nearest)
         if sympy.Rational(text) != value and max(abs(value.p), value.q) < 2**24:
             return (
                 f"({_decimal(float(value.p))}{real.suffix}/{_decimal(float(value.q))}{real.suffix})"
             )
         return text + real.suffix
-    return _decimal(float(value.evalf(25))) + real.suffix
+    return _decimal(_nearest(value.evalf(25))) + real.suffix
+
+
+def _nearest(value: Expr) -> float:
+    """The nearest double. Raises EomcError where there is none."""
+    try:
+        nearest = float(value)
+    except OverflowError:
+        nearest = math.inf
+    if not math.isfinite(nearest):
+        raise EomcError(
+            f"the equations hold a number of {value.evalf(2)}, more than a double can be: "
+            "choose units in which numbers are nearer to 1"
+        )
+    return nearest
 
 
 def _quad(value: Expr) -> str:

@@ -18,6 +18,8 @@ DOUBT = "something faulty"
 
 NOTHING: frozenset[str] = frozenset()
 
+SUGGESTED = 20  # faults, the first, for which near names are looked for
+
 Path = tuple[str, ...]
 
 
@@ -36,7 +38,7 @@ def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
         fault = "has no real value"
     given = {n.id: known[n.id] for n in formula.names()}
     where = ", ".join(f"{name} = {value:g}" for name, value in given.items())
-    return math.nan, f"'{formula.text}' {fault}" + (f" at {where}" if where else "")
+    return math.nan, f"'{formula.shown}' {fault}" + (f" at {where}" if where else "")
 
 
 class Checker:
@@ -152,7 +154,7 @@ class Checker:
             return f"{start}; did you mean '{meant}'?"
         if name == "time":
             return f"{start}; did you mean 't'?"
-        if near := suggest(name, self.kinds):
+        if self.faults < SUGGESTED and (near := suggest(name, self.kinds)):
             return start + near
         if name in ("e", "E"):
             return f"{start}: write exp(1), or declare it in [constants]"

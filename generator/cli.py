@@ -161,7 +161,7 @@ def import_(
     from dataclasses import replace
 
     from eomc import mjcf, names, robots, urdf, xmlfile
-    from eomc.scene import MAX_BYTES
+    from eomc.tomltext import MAX_BYTES
 
     element = xmlfile.root(file).tag
     if element == "mujoco":
@@ -432,9 +432,8 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
     \b
     eomc list
     """
-    import tomllib
-
     from eomc import compile as compiler
+    from eomc.tomltext import tree_and_digest
 
     rows = []
     default = Path("scenes") if Path("scenes").is_dir() else Path()
@@ -443,8 +442,8 @@ def list_(folders: Sequence[Path], root: Path, as_json: bool) -> None:
             raise EomcError(f"{_shown(folder)}: is not a folder")
         for path in sorted(folder.glob("*.toml")):
             try:
-                text = tomllib.loads(path.read_text(encoding="utf-8"))
-            except (OSError, ValueError, RecursionError):
+                text, _ = tree_and_digest(path)
+            except (OSError, ValueError):
                 text = {"eomc": 0, "name": path.stem, "title": "(can't be read: eomc build tells)"}
             if "eomc" not in text or not isinstance(text.get("name"), str):
                 continue

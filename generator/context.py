@@ -44,15 +44,18 @@ def values(target: Target) -> dict[str, Any]:
         "notes": [line for note in target.program.notes for line in textwrap.wrap(note, 92)],
         "description": _description(target),
         "coordinates": [
-            {"name": c.name, "enum": enum[c.name], "words": _words(c.unit, c.note)}
+            {"written": target.as_written(c.name), "enum": enum[c.name],
+             "words": _words(c.unit, c.note)}
             for c in s.coordinates
         ],
         "inputs": [
-            {"name": i.name, "enum": enum[i.name], "words": _words(i.unit, i.note)}
+            {"written": target.as_written(i.name), "enum": enum[i.name],
+             "words": _words(i.unit, i.note)}
             for i in s.inputs
         ],
         "parameters": [
-            {"name": p.name, "words": _words(p.unit, p.note), "value": target.literal(p.value),
+            {"name": p.name, "written": target.as_written(p.name),
+             "words": _words(p.unit, p.note), "value": target.literal(p.value),
              "number": repr(p.value), "named": f"/* {p.name} */"}
             for p in s.parameters
         ],
@@ -121,7 +124,7 @@ def _example(target: Target) -> dict[str, Any]:
     steps = max(1, math.ceil(run.duration / run.h * (1 - 1e-12)))
     timed = takes_t(target, "energy")
     call = f"{target.prefix}_energy(" + "{}" + after(target.p_call) + ")"
-    names = [c.name for c in s.coordinates]
+    names = [target.as_written(c.name) for c in s.coordinates]
     return {
         "h": target.literal(run.h),
         "steps": steps,
@@ -154,12 +157,12 @@ def _face(target: Target) -> dict[str, Any]:
     s = target.system
     NQ = f"{target.PREFIX}_NQ"
     t, u = "t" if target.driven else "", "u" if s.inputs else ""
-    units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
-    units |= {i.name: i.unit for i in s.inputs}
+    given = target.as_written
+    units = {given(x.name): x.unit for x in (*s.coordinates, *s.parameters, *s.inputs)}
     return {
-        "coordinate_units": FreeText({c.name: c.unit for c in s.coordinates}),
-        "parameter_values": repr({p.name: p.value for p in s.parameters}),
-        "input_units": FreeText({i.name: i.unit for i in s.inputs}),
+        "coordinate_units": FreeText({given(c.name): c.unit for c in s.coordinates}),
+        "parameter_values": repr({given(p.name): p.value for p in s.parameters}),
+        "input_units": FreeText({given(i.name): i.unit for i in s.inputs}),
         "units": FreeText({name: unit for name, unit in units.items() if unit}),
         "timed": repr(
             tuple(n for n in ("energy", "jacobi") if n in target.program and takes_t(target, n))

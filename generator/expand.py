@@ -20,6 +20,9 @@ Polynomial = dict[Monomial, Expr]
 
 MOST_TERMS = 64  # of one polynomial
 MOST_IN_ALL = 160  # of the outputs of one function
+MOST_EXPONENT = 2**20
+MOST_BITS = 900  # of a coefficient: a double holds it
+MOST_ON_THE_WAY = 8 * MOST_TERMS  # before terms have cancelled
 
 _ZERO, _ONE = Fraction(0), Fraction(1)
 
@@ -101,7 +104,9 @@ class Expander:
                 out = {m: c * factor for m, c in out.items()}
             elif not (base.is_Symbol and exponent.is_number):
                 return self._whole(name)
-            elif exponent.is_Integer and exponent > 0:
+            elif exponent.is_Integer and exponent > 0 and len(self.symbol(base)) != 1:
+                if exponent > MOST_TERMS:
+                    raise TooLargeError
                 for _ in range(int(exponent)):
                     out = self._times(out, self.symbol(base))
             else:
@@ -116,12 +121,13 @@ class Expander:
             raise TooLargeError
         if len(inner) == 1 and power.denominator == 1:
             ((monomial, coefficient),) = inner.items()
-            return {tuple((n, e * power) for n, e in monomial): coefficient**exponent}
+            _short(coefficient, abs(power))
+            return _bounded({tuple((n, e * power) for n, e in monomial): coefficient**exponent})
         self.symbols[base.name] = base
         return {((base.name, power),): S.One}
 
     def _times(self, one: Polynomial, other: Polynomial) -> Polynomial:
-        if len(one) * len(other) > 8 * MOST_TERMS:
+        if len(one) * len(other) > MOST_ON_THE_WAY:
             raise TooLargeError
         out: Polynomial = {}
         for m1, c1 in one.items():
@@ -131,7 +137,7 @@ class Expander:
                     powers[n] = powers.get(n, _ZERO) + e
                 key = _monomial(powers)
                 out[key] = out.get(key, S.Zero) + c1 * c2
-        return {m: c for m, c in out.items() if c != 0}
+        return _bounded({m: c for m, c in out.items() if c != 0})
 
     def _reduced(self, polynomial: Polynomial) -> Polynomial:
         """With sin^2 = 1 - cos^2, and back again where that leaves a - a cos^2."""
@@ -181,6 +187,21 @@ class Expander:
         return self.tape.define(product + self._factored(outside)) if outside else product
 
 
+def _bounded(polynomial: Polynomial) -> Polynomial:
+    """The polynomial. Raises TooLargeError where numbers or exponents have grown long."""
+    for monomial, c in polynomial.items():
+        _short(c)
+        if any(abs(e.numerator) > MOST_EXPONENT for _, e in monomial):
+            raise TooLargeError
+    return polynomial
+
+
+def _short(number: Expr, power: Fraction = _ONE) -> None:
+    """Raises TooLargeError where a power of the number would be long."""
+    if number.is_Rational and (number.p.bit_length() + number.q.bit_length()) * power > MOST_BITS:
+        raise TooLargeError
+
+
 def _shifted(monomial: Monomial, by: Mapping[str, int]) -> Monomial:
     """The monomial with other exponents."""
     powers = dict(monomial)
@@ -194,7 +215,7 @@ def _monomial(powers: Mapping[str, Fraction]) -> Monomial:
 
 
 def _without_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomial:
-    """sin^2 -> 1 - cos^2"""
+    """sin^2 -> 1 - cos^2. Raises TooLargeError: each pair of powers may double what is there."""
     while True:
         out: Polynomial = {}
         changed = False
@@ -211,6 +232,8 @@ def _without_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomia
         polynomial = {m: c for m, c in out.items() if c != 0}
         if not changed:
             return polynomial
+        if len(polynomial) > MOST_ON_THE_WAY:
+            raise TooLargeError
 
 
 def _with_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomial:

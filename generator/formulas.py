@@ -23,6 +23,8 @@ from eomc import names, texts
 MAX_LENGTH = 10_000
 MAX_DEPTH = 150
 MAX_EXPONENT = 64
+MAX_DIGITS = 1_000  # of a number as it is written
+MANY = 1_000  # names, among which near ones are looked for
 MAX_LOG10 = 300  # no number in a formula, folded or written, may pass 1e300
 
 # name -> (fewest, most) arguments
@@ -98,6 +100,7 @@ _INSTEAD: Mapping[str, str] = {
 }
 
 _ALLOWED = "numbers, names, + - * / **, parentheses and functions"
+_ENOUGH = "17 are all that a double holds"
 _TOO_DEEP = "the formula is nested too deeply: split it with [definitions]"
 
 
@@ -118,6 +121,11 @@ class Formula:
     text: str
     tree: ast.expr
 
+    @property
+    def shown(self) -> str:
+        """The text, of a long one the beginning."""
+        return self.text if len(self.text) <= 80 else self.text[:79] + "…"
+
     def names(self) -> Iterator[ast.Name]:
         """The names used as values (not functions, not pi), in reading order."""
         called = {id(n.func) for n in ast.walk(self.tree) if isinstance(n, ast.Call)}
@@ -136,6 +144,8 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """The known name that `name` may have been meant for, or the empty string."""
     known = list(known)
     same = [k for k in known if k.lower() == name.lower()]
+    if len(known) > MANY:  # difflib takes a tenth of a millisecond each
+        known = [k for k in known if k[:1] == name[:1] and abs(len(k) - len(name)) < 2][:MANY]
     return next(iter(same or difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), "")
 
 
@@ -199,6 +209,9 @@ _PRODUCT = re.compile(
 def _explain_syntax(text: str, fault: SyntaxError) -> FormulaError:
     if "too many nested" in fault.msg:
         return FormulaError(_TOO_DEEP)
+    if long := re.search(rf"\d{{{MAX_DIGITS},}}", text):
+        message = f"a number has more than {MAX_DIGITS:,} digits: {_ENOUGH}"
+        return FormulaError(message, long.start(), len(long[0]))
     for word in re.finditer(r"[A-Za-z_]\w*", text):
         if keyword.iskeyword(word[0]) and word[0] not in ("if", "else", "and", "or", "not"):
             why = names.fault(word[0]) or ""
@@ -235,6 +248,8 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
     match node:
         case ast.Constant(value=bool() | complex() as value):
             raise _fault(node, f"'{value}' is not a real number")
+        case ast.Constant(value=int() | float()) if len(_literal_of(formula, node)) > MAX_DIGITS:
+            raise _fault(node, f"a number has more than {MAX_DIGITS:,} digits: {_ENOUGH}")
         case ast.Constant(value=int() | float() as value):
             written = re.fullmatch(r"[\d.]+e([+-]?\d+)", _literal_of(formula, node))
             # 0e999999999 too, whose exact value costs what it says
@@ -329,7 +344,7 @@ def _check_value(formula: Formula, node: ast.expr) -> None:
 def _number(formula: Formula, node: ast.expr) -> float | None:
     """The value of a subtree, nan where it is not real and finite, None where it has names."""
     found = (n.id for n in ast.walk(node) if isinstance(n, ast.Name))
-    if any(name not in NUMERIC for name in found):
+    if any(name not in FUNCTIONS and name != "pi" for name in found):
         return None
     try:
         value = _walk(formula, node, NUMERIC, NUMERIC.__getitem__)

@@ -159,6 +159,7 @@ def _implicit(
         "call_more": after(own_p, "m"),
         "angles": False,
         "factor_arguments": given,
+        "factor_unread": [name for name in slopes["unread"] if name != "p" or p],
         "factor_now": now("at_now", "moving_now", "t"),
         "factor_mid": now("mid_q", "mid_qd", f"t + {_number(Fraction(1, 2), real)}*h"),
         "eps": repr(real.epsilon) + real.suffix,

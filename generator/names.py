@@ -20,24 +20,23 @@ template this thread_local throw true try typeid typename using virtual wchar_t 
 xor_eq""".split()
 
 # functions and macros of math.h, and macros that compilers define without an underscore
-_MATH = """acos asin atan atan2 ceil cos cosh exp fabs floor fmod frexp ldexp log log10 modf pow
-sin sinh sqrt tan tanh acosh asinh atanh cbrt copysign erf erfc exp2 expm1 fdim fma fmax fmin hypot
-ilogb lgamma llrint llround log1p log2 logb lrint lround nan nearbyint nextafter nexttoward
+MATHEMATICS = """acos asin atan atan2 ceil cos cosh exp fabs floor fmod frexp ldexp log log10 modf
+pow sin sinh sqrt tan tanh acosh asinh atanh cbrt copysign erf erfc exp2 expm1 fdim fma fmax fmin
+hypot ilogb lgamma llrint llround log1p log2 logb lrint lround nan nearbyint nextafter nexttoward
 remainder remquo rint round scalbln scalbn tgamma trunc sincos fpclassify isfinite isinf isnan
 isnormal signbit isgreater isgreaterequal isless islessequal islessgreater isunordered
 float_t double_t linux unix i386""".split()
 
-# macros of the C library, in headers that come along with ours, that could be a scene's enumerator
-MACROS = """M_E M_PI M_LN2 M_LN10 M_SQRT2 M_LOG2E M_LOG10E FP_NAN FP_ZERO FP_NORMAL FP_INFINITE
-FP_SUBNORMAL FD_SET FD_CLR FD_ZERO F_LOCK F_TEST F_TLOCK F_ULOCK L_SET L_INCR L_XTND S_IREAD
-S_IWRITE S_IEXEC SEEK_SET SEEK_CUR SEEK_END PY_VERSION CO_NESTED""".split()
+# scenes that would be files of a build beside theirs, and those whose functions would be macros
+_FILES = frozenset("main selftest binding".split())
+_MACROS = re.compile(r"U?INT(8|16|32|64|MAX)|Py_\w+|(?i:SIG|PYMACCONFIG)")
 
 _FORMULA = "abs sign heaviside dot min max pi t".split()
 
 _WHY = {
     **dict.fromkeys(_CPP, "a C++ keyword, and the generated header serves C++ too"),
     **dict.fromkeys(keyword.kwlist, "a Python keyword"),
-    **dict.fromkeys(_MATH, "taken by the C mathematics library"),
+    **dict.fromkeys(MATHEMATICS, "taken by the C mathematics library"),
     **dict.fromkeys(_C, "a C keyword"),
     **dict.fromkeys(_FORMULA, "taken by the formula language"),
     "t": "the time",
@@ -96,7 +95,11 @@ def module_fault(name: str) -> str | None:
         return why
     if name in sys.stdlib_module_names or name in ("numpy", "cffi", "eomc", "sympy", "test"):
         return f"'{name}' is the name of a Python module, which it would hide: use {name}_scene"
+    if name.lower() in _FILES:
+        return f"'{name}' is the name of another file of a build, {name}.c: use {name}_scene"
     if name.upper() in ("F", "R", "W", "X"):
         macro = f"{name.upper()}_OK"
         return f"'{name}' would make a name {macro}, a macro of unistd.h: use {name}_scene"
+    if _MACROS.fullmatch(name):
+        return f"'{name}' would make names that are macros of C or Python: use {name}_scene"
     return None

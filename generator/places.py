@@ -12,6 +12,8 @@ from eomc.formulas import FormulaError
 from eomc.problems import Problem
 
 MAX_STATEMENT = 500  # lines
+MAX_TRIED = 4_000_000  # characters given to tomllib, some seconds
+MAX_SEARCHED = 20_000_000  # characters searched for the columns of faults; then lines do
 
 ARRAYS = ("body", "spring", "damper")  # tables that may stand many times, in [[two brackets]]
 
@@ -29,6 +31,7 @@ class Places:
         self._key: dict[Path, str] = {}  # how the last key is written, where it is otherwise
         self._text: dict[str, str] = {}  # how a text is written, where it is otherwise
         self._from: dict[Path, Path] = {}  # what was repeated: the entry it came from
+        self._tried = self._searched = 0
         prefix: Path = ()
         counts = dict.fromkeys(ARRAYS, 0)
         start = 0
@@ -36,15 +39,14 @@ class Places:
             if self.lines[start].strip().startswith("#") or not self.lines[start].strip():
                 start += 1
                 continue
-            end = self._end(start)
+            end, tree = self._end(start)
             if end == start:
                 break  # hundreds of lines in one statement: no scene; the rest keeps no places
-            statement = "\n".join(self.lines[start:end])
-            header = statement.lstrip().startswith("[")
-            if header and statement.lstrip().startswith("[["):
+            header = self.lines[start].lstrip().startswith("[")
+            if header and self.lines[start].lstrip().startswith("[["):
                 for array in ARRAYS:
-                    counts[array] += array in tomllib.loads(statement)
-            paths = list(_paths(tomllib.loads(statement)))
+                    counts[array] += array in tree
+            paths = list(_paths(tree))
             if header:
                 paths = [_numbered(path, counts) for path in paths]
             for path in paths:
@@ -60,15 +62,21 @@ class Places:
                 if len(path) >= length:
                     self._under.setdefault(path[:length], []).append(path)
 
-    def _end(self, start: int) -> int:
-        """The line after the statement that begins at `start`; `start` where none is found."""
+    def _end(self, start: int) -> tuple[int, dict[str, Any]]:
+        """The line after the statement that begins at `start`, and its tree.
+
+        `start` itself where none is found.
+        """
         for end in range(start + 1, min(start + MAX_STATEMENT, len(self.lines)) + 1):
+            statement = "\n".join(self.lines[start:end])
+            self._tried += len(statement)
+            if end > start + 1 and self._tried > MAX_TRIED:
+                break
             try:
-                tomllib.loads("\n".join(self.lines[start:end]))
+                return end, tomllib.loads(statement)
             except ValueError:
                 continue
-            return end
-        return start
+        return start, {}
 
     def rename(self, given: Path, meant: Path) -> None:
         """Let `meant` and what is under it stand where the misspelt `given` stands."""
@@ -125,7 +133,10 @@ class Places:
             return Problem(message, key, self.file, severity=severity)
         source = self.source(known)
         key_written = self._key.get(known, known[-1])
-        offset, width = _spot(source, key_written, at, text, self._text.get(text or ""))
+        self._searched += len(source) + 20_000  # a thousand faults at most
+        offset, width = -1, 1
+        if self._searched < MAX_SEARCHED:
+            offset, width = _spot(source, key_written, at, text, self._text.get(text or ""))
         line = self._line[known][0] + source.count("\n", 0, max(offset, 0))
         column = offset - source.rfind("\n", 0, offset) - 1 if offset >= 0 else -1
         return Problem(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from eomc import texts
 
 WIDTH = 100  # characters of a source line shown, at most
+LONGEST = 1_000  # characters of a message shown, at most
 MOST = 50  # problems shown, at most
 
 
@@ -49,7 +50,7 @@ class Problem:
             place += f":{self.line}"
             if self.column >= 0:
                 place += f":{self.column + 1}"
-        parts = (place, self.severity, self.key, self.message)
+        parts = (place, self.severity, _cut(self.key, WIDTH), _cut(self.message, LONGEST))
         text = ": ".join(texts.line(part) for part in parts if part)
         if not self.source:
             return text
@@ -65,6 +66,10 @@ class Problem:
             width = max(min(self.width, len(before) + len(shown) - left), 1)
             text += "\n" + " " * (len(gutter) - 2) + "| " + " " * left + "^" * width
         return text
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def _shown(text: str) -> str:

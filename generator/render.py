@@ -16,6 +16,7 @@ from pathlib import Path
 import jinja2
 
 from eomc.ccode import REALS
+from eomc.cnames import borne
 from eomc.context import resource, values
 from eomc.pieces import weight
 from eomc.program import Program
@@ -80,8 +81,9 @@ def render(program: Program, extension: str) -> Sources:
     s = program.system
     for given in (*s.coordinates, *s.parameters, *s.inputs, *(d for d, _ in s.definitions), s):
         plain(given.name)
+    program, written = borne(program)
     run = s.run
-    target = Target(program, REALS[run.real])
+    target = Target(program, REALS[run.real], written)
     context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name

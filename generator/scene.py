@@ -29,9 +29,8 @@ from eomc.checker import (
 )
 from eomc.formulas import Formula, suggest
 from eomc.places import Places
-from eomc.problems import EomcError, Problem, SceneError
-
-MAX_BYTES = 1_000_000
+from eomc.problems import MOST, EomcError, Problem, SceneError
+from eomc.tomltext import MAX_BYTES, MOST_PARTS, long_key
 
 # --- what a checked scene is ------------------------------------------------------------------
 
@@ -183,6 +182,10 @@ def parse(
         raise SceneError(
             [Problem("the file is empty: 'eomc new NAME' writes a scene to start from", file=file)]
         )
+    if line := long_key(text):
+        message = f"a key has more than {MOST_PARTS} parts: a scene's have three, a.b.c, at most"
+        source = text.split("\n")[line - 1].rstrip()
+        raise SceneError([Problem(message, "", file, line, 0, len(source), source)])
     try:
         tree = tomllib.loads(text)
     except ValueError as fault:
@@ -474,26 +477,28 @@ class _Check(Checker):
                 self.kinds[name] = frozenset({DOUBT})
 
     def _circular(self, definitions: Mapping[str, Formula]) -> set[str]:
-        """The names that hang on themselves, each ring told once."""
+        """The names that hang on themselves, each ring told once; beyond MOST, all."""
         graph = {
             name: [n.id for n in formula.names() if n.id in definitions]
             for name, formula in definitions.items()
         }
         lost: set[str] = set()
-        while True:
+        for _ in range(MOST):
             try:
                 TopologicalSorter(graph).prepare()
                 return lost
             except CycleError as cycle:
                 ring = list(reversed(cycle.args[1]))
+                shown = ring if len(ring) <= 20 else [*ring[:10], "...", *ring[-9:]]
                 self.say(
                     ("definitions", ring[0]),
-                    f"circular definition: {' -> '.join(ring)}; one of them must stand on its own",
+                    f"circular definition: {' -> '.join(shown)}; one of them must stand on its own",
                     next(n for n in definitions[ring[0]].names() if n.id == ring[1]),
                     definitions[ring[0]].text,
                 )
                 lost.update(ring)
                 graph |= {name: [] for name in ring}
+        return set(definitions)
 
     def _inputs(self) -> list[Input]:
         allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]

@@ -15,7 +15,7 @@ import sympy
 from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
-from eomc import formulas, given, names
+from eomc import formulas, given, growth, names
 from eomc.bodies import Builder, Terms, Tree
 from eomc.formulas import FormulaError
 from eomc.problems import EomcError, Problem, SceneError
@@ -208,16 +208,20 @@ def from_scene(scene: Scene) -> System:
     names_given = [*(p.name for p in scene.parameters), *(i.name for i in scene.inputs)]
     known |= {name: symbol(name) for name in names_given}
     problems: list[Problem] = []
+    sizes: dict[str, growth.Size] = {}  # of constants and definitions
 
     def value(key: str, formula: formulas.Formula) -> Expr:
+        name = key.partition(".")[2] if key.startswith(("constants.", "definitions.")) else ""
         try:
+            sizes[name] = growth.VARIES
+            sizes[name] = growth.size(formula, sizes)
             found = sympy.sympify(formulas.evaluate(formula, _ALGEBRA, known.__getitem__))
             if found.has(*_UNDEFINED):
                 raise FormulaError("divides by zero")
             if found.has(sympy.I):
                 raise FormulaError("has no real value")
         except (FormulaError, ArithmeticError, ValueError, TypeError) as fault:
-            problems.append(scene.problem(key, f"'{formula.text}' {fault}", formula))
+            problems.append(scene.problem(key, f"'{formula.shown}' {fault}", formula))
             return sympy.S.Zero
         return found
 

@@ -248,11 +248,12 @@ class Tape:
             return constant if not weights else self.scaled(*weights.popitem()[::-1])
         if self._can_gather(weights, constant):
             terms = [constant, *(self.scaled(w, x) for x, w in weights.items())]
-            total = self._gather(Add(*terms))
-            if not total.is_Add:
-                return total
-            return self._of_terms(total)
+            return self._of_total(self._gather(Add(*terms)))
         return self._of_weights(weights, constant)
+
+    def _of_total(self, total: Expr) -> Expr:
+        """The same of what may be something else: 1 + sqrt(2) is an Add to SymPy, and a number."""
+        return self._of_terms(total) if total.is_Add and not total.is_number else total
 
     def _of_terms(self, total: Expr) -> Expr:
         """What stands for a sum of atoms as SymPy has it."""
@@ -312,7 +313,7 @@ class Tape:
         weights = {
             late: self.define(parts[0])
             if len(parts) == 1
-            else self._sum_of_parameters(self.define(part) for part in parts)
+            else self._of_total(Add(*map(self.define, parts)))
             for late, parts in groups.items()
         }
         merged = self._pythagoras(weights)
@@ -324,10 +325,6 @@ class Tape:
                 for late, weight in merged.items()
             )
         )
-
-    def _sum_of_parameters(self, atoms: Iterable[Expr]) -> Expr:
-        total = Add(*atoms)
-        return self._of_terms(total) if total.is_Add else total
 
     def _pythagoras(self, weights: dict[_Late, Expr]) -> dict[_Late, Expr]:
         again = True
@@ -344,7 +341,7 @@ class Tape:
                     if twin != late and weights.get(twin) == weight:
                         del weights[late], weights[twin]
                         sum_ = Add(weight, weights.get(rest, S.Zero))
-                        weights[rest] = self._sum_of_parameters([sum_]) if sum_.is_Add else sum_
+                        weights[rest] = self._of_total(sum_)
                         again = True
         return {late: weight for late, weight in weights.items() if weight != 0}
 

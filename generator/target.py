@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from eomc import ccode, names, pieces
+from eomc import ccode, pieces
 from eomc.assignments import Call, Function, rename
 from eomc.ccode import Body, Real
+from eomc.cnames import may_be_enumerator_of_others
 from eomc.program import TIME, Program
 from eomc.symbols import ALONG
 from eomc.system import System
@@ -19,7 +20,7 @@ from eomc.system import System
 _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 trouble held at "
-    "moving prepared along column slopes wide troubles".split()
+    "moving prepared along column slopes wide troubles E".split()
 )
 
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
@@ -46,10 +47,18 @@ class Argument:
 
 @dataclass(frozen=True)
 class Target:
-    """A program that is to become C with numbers of one type."""
+    """A program that is to become C with numbers of one type.
+
+    written: the author's names, where C has others.
+    """
 
     program: Program
     real: Real
+    written: Mapping[str, str] = field(default_factory=dict)
+
+    def as_written(self, name: str) -> str:
+        """The author's name of a coordinate, parameter or input."""
+        return self.written.get(name, name)
 
     @property
     def system(self) -> System:
@@ -69,7 +78,7 @@ class Target:
     @cached_property
     def enum(self) -> dict[str, str]:
         """The enumerator of every coordinate and input."""
-        taken = {f"{self.PREFIX}_{w}" for w in OWN} | {*names.MACROS}
+        taken = {f"{self.PREFIX}_{w}" for w in OWN}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         wishes = [f"{self.PREFIX}_{name}" for name in indexed]
         return dict(zip(indexed, _unique(wishes, taken), strict=True))
@@ -348,7 +357,7 @@ def _unique(wishes: Iterable[str], taken: set[str]) -> list[str]:
     uppers = [w.upper() for w in wishes]
     for wish, upper in zip(wishes, uppers, strict=True):
         used = upper if uppers.count(upper) == 1 else wish
-        while used in taken:
+        while used in taken or may_be_enumerator_of_others(used):
             used += "_"
         taken.add(used)
         out.append(used)

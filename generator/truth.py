@@ -32,6 +32,7 @@ from eomc import compile as compiler
 from eomc import mechanics, program, reference
 from eomc.answer import Vector
 from eomc.ccode import QUAD
+from eomc.cnames import borne
 from eomc.context import values
 from eomc.problems import EomcError, FolderError
 from eomc.render import environment
@@ -161,7 +162,7 @@ def _computed(system: System, span: float, rows: int) -> Truth:
 def _compiled(system: System, folder: Path) -> Path:
     """The program in __float128 with its integrator, as an executable."""
     system = replace(system, run=replace(system.run, methods=("rk4",), batch=False, real="double"))
-    target = Target(program.build(mechanics.derive(system)), QUAD)
+    target = Target(borne(program.build(mechanics.derive(system)))[0], QUAD)
     call = arguments(
         "a", "q", "qd", "t" if target.driven else "", "NULL" if system.inputs else "",
         f"(const {target.prefix}_params *)p" if target.needs_p else "",
