@@ -25,6 +25,7 @@ import numpy as np
 import sympy
 
 from eomc.answer import Answer, Vector
+from eomc.check_bodies import Bodies
 from eomc.check_compiled import compiled_rows
 from eomc.jets import Jets
 from eomc.reference import of
@@ -430,6 +431,9 @@ class _Check:
                         self.advice_row(method)
             if hasattr(self.module, "_model"):  # what is compiled has several ways to one answer
                 compiled_rows(self)
+            scene = self.system.scene
+            if scene is not None and scene.assembly is not None:
+                Bodies(self, scene).report()
         else:
             self.row("states", 1, "states with a regular D", lambda: 0.0, least=True)
         kind = "Taylor arithmetic" if self.large else "equations written out"

@@ -243,7 +243,7 @@ class Refusals:
         ended = []
         for power in (4, 8, 16, 40, 100, 160, 300):
             h = self.check.system.run.h * 10.0**power
-            if h > np.finfo(self.model.dtype).max:
+            if h > float(np.finfo(self.model.dtype).max):
                 break
             run = drive(self.model, method, s, h, 12)
             kept = run.rows[:, : run.done + 1]

@@ -26,6 +26,9 @@ EVERY = 3  # no divisor of STEPS
 # The largest move of a step that is long, in parts of how far things go (half a turn): too far for
 # an angle to be predicted, and then too far for its sine to be rotated.
 LONG = (0.02, 0.2, 0.7)
+LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by all they may be
+ANGLES = 48  # around the circle, at which sines are looked at
+SINES = 100.0  # units: their last terms make more
 FEW = 6  # long steps, or steps with a row of u each
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
@@ -105,6 +108,8 @@ class Runs:
         row, rounding = self.check.row, "units of rounding"
         if self.check.methods[0] == "rk4":
             row("long steps", self.limit, rounding + ", times steps and growth", self.long)
+        if np.any(self.sampler.angles):
+            row("sines around the circle", SINES, rounding, self.sines)
         if np.any(self.sampler.angles) or self.model._timed:
             row("angles far out", self.limit, f"units, of angles of {TURNS:.3g}", self.far)
         if self.model.nu and self.check.methods[0] == "rk4":
@@ -129,9 +134,38 @@ class Runs:
         found = [
             self.check._run(s, h=self.large_step(s, part), steps=FEW)
             for s in self.states
-            for part in LONG
+            for part in LADDER
         ]
         return float(np.max(found))
+
+    def sines(self) -> float:
+        """D, g and bias all around the circle, where sines need all of their terms."""
+        e = self.check._few(2)[-1]
+        s, n = e.state, len(e.state.q)
+        around = np.linspace(-np.pi, np.pi, ANGLES, endpoint=False)[:, None] + 0.01
+        steps = self.random.permutation(n)  # so that angles are not all alike
+        q = np.where(self.sampler.angles, s.q + around * (1 + steps % 3), s.q)
+        worst = 0.0
+        size: dict[str, Vector] = {}
+        states = [replace(s, q=row) for row in q]
+        with np.errstate(all="ignore"):
+            expected = self.expected(states)
+        for name in ("D", "g", "bias"):
+            known = [x[name] for x in expected if np.all(np.isfinite(x[name]))]
+            size[name] = e.size[name] + np.max(np.abs(known), axis=0, initial=0)
+        for at, values in zip(states, expected, strict=True):
+            for name, width in size.items():
+                if np.all(np.isfinite(values[name])):
+                    found = self.check.ask(name, at)
+                    worst = max(worst, self.check.units(found, values[name], width))
+        return worst
+
+    def expected(self, states: Sequence[State]) -> list[dict[str, Vector]]:
+        """The reference's D, g and bias at states that differ in q alone."""
+        s, ask = states[0], self.sampler.reference.evaluate
+        q, qd = (np.array([getattr(at, x) for at in states]) for x in ("q", "qd"))
+        found = {name: ask(name, q, qd, s.t, None, s.params) for name in ("D", "g", "bias")}
+        return [{name: values[k] for name, values in found.items()} for k in range(len(states))]
 
     def far(self) -> float:
         """Values, accelerations and steps at angles and times that sines are too small for.

@@ -58,7 +58,7 @@ class Shipped:
     def load(self) -> ModuleType:
         """Import what was compiled; once in a process."""
         spec = spec_from_file_location(
-            f"tried_{self.name}",
+            f"tried_{self.folder.name}",
             self.folder / "__init__.py",
             submodule_search_locations=[str(self.folder)],
         )
