@@ -131,10 +131,11 @@ class Runs:
 
     def long(self) -> float:
         """Long steps beside the reference's."""
+        parts = (LONG, LONG) if self.check.large else (LONG, LADDER)
         found = [
             self.check._run(s, h=self.large_step(s, part), steps=FEW)
-            for s in self.states
-            for part in LADDER
+            for s, some in zip(self.states, parts, strict=False)
+            for part in some
         ]
         return float(np.max(found))
 
