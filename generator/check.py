@@ -25,6 +25,8 @@ import numpy as np
 import sympy
 
 from eomc.answer import Answer, Vector
+from eomc.check_bodies import Bodies
+from eomc.check_compiled import compiled_rows
 from eomc.jets import Jets
 from eomc.reference import of
 from eomc.steppers import METHODS
@@ -427,6 +429,11 @@ class _Check:
                 for method in self.methods:
                     if math.isfinite(min(METHODS[method].limits)):
                         self.advice_row(method)
+            if hasattr(self.module, "_model"):  # what is compiled has several ways to one answer
+                compiled_rows(self)
+            scene = self.system.scene
+            if scene is not None and scene.assembly is not None:
+                Bodies(self, scene).report()
         else:
             self.row("states", 1, "states with a regular D", lambda: 0.0, least=True)
         kind = "Taylor arithmetic" if self.large else "equations written out"
@@ -527,25 +534,26 @@ class _Check:
         """A short run from the start, and one from a random state with random parameters."""
         return float(np.max([self._run(e.state) for e in self._few(2)]))
 
-    def _run(self, s: State) -> float:
+    def _run(self, s: State, h: float = 0.0, steps: int = 0) -> float:
         """As far as a difference at the start, in units of the spread, grows by GROWTH_LIMIT."""
-        steps = min(self.effort.run, max(1, round(self.system.run.duration / self.system.run.h)))
+        h = h or self.system.run.h
+        steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
         spread = np.array([self.sampler.spread, self.sampler.speed])
 
         q, qd = (np.array([x, x + NUDGE * by]) for x, by in zip((s.q, s.qd), spread, strict=True))
         u = None if s.u is None else np.array([s.u, s.u])
         with np.errstate(all="ignore"):
-            t, *found = self.reference.simulate(q, qd, steps=steps, u=u, params=s.params)
+            t, *found = self.reference.simulate(q, qd, h=h, steps=steps, u=u, params=s.params)
             x, y = np.moveaxis(np.stack(found, axis=1), 2, 0)
             growth = np.max(np.abs(y - x) / spread, axis=(1, 2)) / NUDGE
         growth = np.maximum.accumulate(growth)
         honest = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
         t, x, growth = t[:honest], x[:honest], growth[:honest, None, None]
-        run = self._simulate(s, steps=honest - 1)
+        run = self._simulate(s, h=h, steps=honest - 1)
         size = np.arange(1, honest + 1)[:, None, None] * (growth * spread + np.abs(x))
         if str(getattr(run.status, "value", run.status)) != "ok":
             raise RuntimeError(f"the run ended with status {run.status}")
-        off_time = self.units(run.t, t, np.abs(t) + self.system.run.h)
+        off_time = self.units(run.t, t, np.abs(t) + h)
         return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
 
     def _simulate(self, s: State, method: str = "", **how: Any) -> Any:
@@ -565,6 +573,10 @@ class _Check:
             if np.isfinite(energy):
                 errors.append(self.units(found, energy, size))
         return float(np.max(errors, initial=0))
+
+    def ask(self, name: str, s: State) -> Vector:
+        """The module's value of that name."""
+        return _ask(self.module, name, s)
 
     def _few(self, count: int) -> list[_Expected]:
         """Some of the states: the first ones and the last ones."""

@@ -76,7 +76,6 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "stepper_call": after(t, "h", u, c, p),
         "methods": chosen,
         "tile_rates": any(m.get("by_rates") for m in chosen),
-        "finite": s.run.batch or not all(m["pairs"] for m in chosen),
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
         "newton": any(METHODS[name].newton for name in s.run.methods),
         "angles": turning.scalar(target, turned),

@@ -83,7 +83,8 @@ class System:
     `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
     `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate. `tree`: the bodies
     that hang on joints, whose energies are part of K and P. `digest` names what the system was
-    made from; `renamed` says which names C could not bear: (given, used) pairs.
+    made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
+    was read from, where it was.
     """
 
     name: str
@@ -104,6 +105,7 @@ class System:
     renamed: tuple[tuple[str, str], ...] = ()
     warnings: tuple[Problem, ...] = field(default=(), compare=False)
     place: Callable[..., Problem] | None = field(default=None, compare=False, repr=False)
+    scene: Scene | None = field(default=None, compare=False, repr=False)
 
     @property
     def q(self) -> tuple[Symbol, ...]:
@@ -278,6 +280,7 @@ def from_scene(scene: Scene) -> System:
         digest=scene.digest,
         warnings=(*scene.warnings, *_at_the_start(scene)),
         place=scene.problem,
+        scene=scene,
     )
     if problems:
         raise SceneError(problems)

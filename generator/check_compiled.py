@@ -1,0 +1,26 @@
+"""The rows of `check` that look into a compiled module, beyond what its values say."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eomc.check_batch import Batches
+from eomc.check_refusals import Refusals
+from eomc.check_runs import Runs
+from eomc.check_slopes import Slopes
+
+if TYPE_CHECKING:
+    from eomc.check import _Check
+
+
+def compiled_rows(check: _Check) -> None:
+    """Add the rows about runs, refusals and, where the module has them, batches."""
+    runs, refusals = Runs(check), Refusals(check)
+    runs.report()
+    refusals.report()
+    if hasattr(check.module, "simulate_batch"):
+        Batches(runs, refusals.singular).report()
+    if check.module._model.has_slopes and check.dtype == np.float64:
+        Slopes(check).report()

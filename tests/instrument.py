@@ -1,0 +1,177 @@
+"""A scene's C compiled with other flags, or changed, and its check in a process of its own."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Callable, Iterator, Sequence
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+import cffi
+
+import eomc
+from eomc import compile as compiling
+from eomc.system import System
+
+COVERAGE = ("-O0", "--coverage", "-march=native", "-fno-math-errno", "-fno-trapping-math")
+
+
+class Shipped:
+    """The files of a scene in a folder, to be compiled as often as one likes."""
+
+    def __init__(self, system: System, folder: Path) -> None:
+        self.name, self.folder = system.name, folder
+        self.extension = f"_{self.name}_tried"
+        self.compiler = compiling.find_compiler().command
+        made = eomc.sources(system, self.extension)
+        folder.mkdir(parents=True, exist_ok=True)
+        for file, text in made.files.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        self.source = made.files[f"{self.name}.c"]
+        ffi = cffi.FFI()
+        ffi.cdef(made.cdef)
+        ffi.set_source(self.extension, made.binding)
+        ffi.emit_c_code(str(folder / "binding.c"))
+        include = {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}
+        self._run("-fPIC", "-O1", *(f"-I{p}" for p in include), "-c", "binding.c")
+
+    def compile(self, flags: Sequence[str], source: str | None = None) -> str | None:
+        """Compile and link, `source` in place of the shipped text; the compiler's words if not."""
+        text = self.source if source is None else source
+        (self.folder / f"{self.name}.c").write_text(text, encoding="utf-8")
+        library = self.extension + str(sysconfig.get_config_var("EXT_SUFFIX"))
+        (self.folder / library).unlink(missing_ok=True)  # never write into a mapped file
+        linked = [flag for flag in flags if flag == "--coverage"]
+        try:
+            self._run(compiling.STANDARD, "-fPIC", *flags, "-c", f"{self.name}.c", "-o", "scene.o")
+            self._run(*linked, "-shared", "scene.o", "binding.o", "-lm", "-o", library)
+        except subprocess.CalledProcessError as fault:
+            return str(fault.stderr)
+        return None
+
+    def load(self) -> ModuleType:
+        """Import what was compiled; once in a process."""
+        spec = spec_from_file_location(
+            f"tried_{self.folder.name}",
+            self.folder / "__init__.py",
+            submodule_search_locations=[str(self.folder)],
+        )
+        assert spec is not None and spec.loader is not None
+        module = module_from_spec(spec)
+        sys.modules[spec.name] = module
+        spec.loader.exec_module(module)
+        return module
+
+    def _run(self, *words: str) -> None:
+        subprocess.run(
+            [*self.compiler, *words], cwd=self.folder, check=True, capture_output=True, text=True
+        )
+
+
+def in_a_fork(work: Callable[[], object], seconds: float) -> tuple[str, object]:
+    """What `work` returns, as JSON tells it, from a process of its own.
+
+    ("done", value), ("raised", its words), ("killed", the signal) or ("late", None).
+    """
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        try:
+            told: tuple[str, object] = ("done", work())
+        except BaseException as fault:
+            told = ("raised", f"{type(fault).__name__}: {fault}")
+        with os.fdopen(writing, "w") as pipe:
+            json.dump(told, pipe)
+        _flush_and_leave()
+    os.close(writing)
+    return _told(child, reading, seconds)
+
+
+def _flush_and_leave() -> None:
+    sys.stdout.flush()
+    os._exit(0)
+
+
+def _told(child: int, reading: int, seconds: float) -> tuple[str, object]:
+    import select
+    import signal
+    import time
+
+    end, text = time.monotonic() + seconds, b""
+    with os.fdopen(reading, "rb", buffering=0) as pipe:
+        while select.select([pipe], [], [], max(0.0, end - time.monotonic()))[0]:
+            part = pipe.read(65536)
+            if not part:
+                break
+            text += part
+        else:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            return "late", None
+    _, status = os.waitpid(child, 0)
+    if os.WIFSIGNALED(status) or not text:
+        return "killed", os.WTERMSIG(status) if os.WIFSIGNALED(status) else status
+    kind, value = json.loads(text)
+    return str(kind), value
+
+
+# --- lines ----------------------------------------------------------------------------------------
+
+CHECK = """
+import sys, tomllib
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from eomc import check, scene, system
+from instrument import Shipped
+made = system.from_scene(scene.parse(Path({scene!r}).read_text(), "scene.toml"))
+shipped = Shipped(made, Path({folder!r}))
+said = shipped.compile({flags!r})
+assert said is None, said
+report = check.check(made, shipped.load())
+print(report.table())
+sys.exit(0 if report.passed else 1)
+"""
+
+
+def missed(scene_text: str, folder: Path) -> tuple[str, list[tuple[int, str]]]:
+    """The table of a scene's check, and the lines of its NAME.c that were not executed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "scene.toml").write_text(scene_text, encoding="utf-8")
+    here = str(Path(__file__).parent)
+    code = CHECK.format(
+        tests=here, scene=str(folder / "scene.toml"), folder=str(folder), flags=COVERAGE
+    )
+    for old in folder.glob("*.gcda"):
+        old.unlink()
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    if ran.returncode:
+        raise AssertionError(ran.stdout + ran.stderr)
+    return ran.stdout, list(_unexecuted(folder))
+
+
+def _unexecuted(folder: Path) -> Iterator[tuple[int, str]]:
+    told = subprocess.run(
+        ["gcov", "--json-format", "--stdout", "scene.gcda"],
+        cwd=folder, check=True, capture_output=True,
+    ).stdout  # fmt: skip
+    if told[:2] == b"\x1f\x8b":
+        told = gzip.decompress(told)
+    counts: dict[int, int] = {}
+    for line in told.splitlines():
+        for file in json.loads(line)["files"]:
+            if not file["file"].endswith(".c"):
+                continue
+            text = (folder / file["file"]).read_text().splitlines()
+            for entry in file["lines"]:
+                number = entry["line_number"]
+                counts[number] = max(counts.get(number, 0), entry["count"])
+    for number, count in sorted(counts.items()):
+        if count == 0:
+            yield number, text[number - 1].strip()

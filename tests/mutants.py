@@ -1,0 +1,305 @@
+"""Mutants of the generated C: each changed in one place, compiled, imported and checked.
+
+    python tests/mutants.py                     the sample of the slow tests
+    python tests/mutants.py --count 200 chain   so many of one scene or VARIANTS
+    python tests/mutants.py --all --count 60
+
+Signs, operators, comparisons, factors, constants and indices are changed, at most one at once. A
+mutant is killed where it does not compile, crashes, hangs or fails a row of `eomc check`. Of those
+that pass, equivalent ones compute the same as the original, to the bit, in RUNS random runs and in
+all else that `outcomes` tries, rounding ones the same within ROUNDING of its size; the rest have
+survived, and are printed with their place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import re
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from instrument import Shipped, in_a_fork
+
+from cases import SCENES
+from eomc import check as checking
+from eomc import scene, system
+from eomc.answer import Vector
+from eomc.check_runs import drive
+from eomc.system import System
+
+FLAGS = ("-O1", "-march=native", "-fno-math-errno", "-fno-trapping-math")
+SECONDS = 60.0
+RUNS = 60
+ROUNDING = 1e-11  # what random runs make of a last digit
+
+# a scene of its own name, or one with other lines under [run]
+VARIANTS: Mapping[str, tuple[str, str]] = {
+    "pendulum_dp8_gauss8": ("double_pendulum", 'method = ["rk4", "dp8", "gauss8"]\n'),
+    "cartpole_batch": ("cartpole", "batch = true\n"),
+    "driven_batch": ("cartpole_driven", "batch = true\n"),
+    "pendulum_gauss16": ("double_pendulum", 'method = ["rk4", "gauss16"]\n'),
+    "chain_batch": ("chain", "batch = true\n"),
+}
+DIVERSE = (
+    "cartpole", "pendulum_dp8_gauss8", "cartpole_batch", "chain", "tumbling_box", "cartpole_driven",
+)  # fmt: skip
+
+# what is found, and what it may become
+CHANGES: Sequence[tuple[str, Sequence[str]]] = (
+    (r"(?<=[\w)\]]) \+ (?=[\w(-])", (" - ", " * ")),
+    (r"(?<=[\w)\]]) - (?=[\w(])", (" + ",)),
+    (r"(?<=[\w)\]])\*(?=[\w(])", (" + ", "/")),
+    (r"(?<== )-(?=[\w(])", ("",)),
+    (r"(?<=return )-(?=[\w(])", ("",)),
+    (r"\+=", ("-=", "=")),
+    (r"-=", ("+=",)),
+    (r"&=", ("|=", "=")),
+    (r" <= ", (" > ", " < ")),
+    (r" >= ", (" < ", " > ")),
+    (r" < ", (" <= ", " >= ")),
+    (r" > ", (" <= ", " >= ")),
+    (r" == ", (" != ",)),
+    (r" != ", (" == ",)),
+    (r" && ", (" || ",)),
+    (r" \|\| ", (" && ",)),
+    (r"(?<=[(\s])!(?=[\w(])", ("",)),
+    (r"(?<![\w.])\d+\.\d+(?:e[+-]?\d+)?(?![\w.])", ("number",)),
+    (r"(?<=\[)\d+(?=\])", ("index",)),
+    (r"(?<![\w.\[{])\d+(?![\w.\]}])", ("whole",)),
+    (r"\bsin_(?=\w)", ("cos_",)),
+    (r"\bcos_(?=\w)", ("sin_",)),
+    (r"\+\+|--", ("other",)),
+)
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A change of a source: the characters from `at` to `end` become `new`."""
+
+    at: int
+    end: int
+    new: str
+
+    def of(self, source: str) -> str:
+        """The changed source."""
+        return source[: self.at] + self.new + source[self.end :]
+
+
+def variant(name: str) -> System:
+    """A scene, or one of VARIANTS, as a system."""
+    base, more = VARIANTS.get(name, (name, ""))
+    text = (SCENES / f"{base}.toml").read_text(encoding="utf-8")
+    return system.from_scene(scene.parse(text.replace("[run]\n", "[run]\n" + more), f"{name}.toml"))
+
+
+def mutants(source: str) -> list[Mutant]:
+    """All of them, in the code alone: no comments, no #if, no prototypes, no declared sizes."""
+    found = []
+    for start, line in _code(source):
+        for pattern, changes in CHANGES:
+            for match in re.finditer(pattern, line):
+                for change in changes:
+                    new = _changed(match[0], change)
+                    if new != match[0]:
+                        found.append(Mutant(start + match.start(), start + match.end(), new))
+    return found
+
+
+def _changed(old: str, change: str) -> str:
+    if change == "number":
+        return repr(float(old) * 1.5 if float(old) else 1.0)
+    if change in ("index", "whole"):
+        return str(int(old) + 1 if int(old) == 0 else int(old) - 1)
+    if change == "other":
+        return "--" if old == "++" else "++"
+    return change
+
+
+def _code(source: str) -> Iterator[tuple[int, str]]:
+    """Lines inside functions, comments blanked, each with its place."""
+    blank = re.sub(r"/\*.*?\*/", lambda m: re.sub(r"[^\n]", " ", m[0]), source, flags=re.S)
+    inside, at, skipped, depth = False, 0, False, 0
+    for line in blank.splitlines(keepends=True):
+        if line.startswith("#"):
+            # what is left out for this compiler
+            if line.startswith(("#if", "#ifdef", "#ifndef")):
+                depth += 1
+            elif line.startswith("#endif"):
+                depth -= 1
+            skipped = (depth > 0 and line.startswith("#else")) or (skipped and depth > 0)
+        elif line.startswith("{"):
+            inside = True
+        elif line.startswith("}"):
+            inside = False
+        elif inside and not skipped:
+            yield at, line
+        at += len(line)
+
+
+# --- what a module computes -----------------------------------------------------------------------
+
+
+def outcomes(module: Any, check: Any) -> Vector:
+    """What the module gives in RUNS random runs, at their states, and in a batch."""
+    found: list[Vector] = []
+    model = module._model
+    draw = np.random.default_rng(99)
+    names = ("D", "C", "g", "bias", "tau", "kinetic_energy", "potential_energy", "energy", "jacobi",
+             "power")  # fmt: skip
+    states = check.expected
+    for n in range(RUNS):
+        s = states[n % len(states)].state
+        near = 1 + 0.3 * draw.standard_normal((2, len(s.q)))
+        at = checking.State(s.q * near[0], s.qd * near[1], s.t, s.u, s.params)
+        for name in names:
+            found.append(check.ask(name, at))
+        for method in module.methods:
+            h = check.system.run.h * float(np.exp(draw.uniform(-3, 4)))
+            for cuts in ((3, 17), ()):
+                run = drive(model, method, at, h, 30, cuts=cuts, every=1 + n % 3)
+                found += [run.rows, np.array([run.status, run.done])]
+    if hasattr(module, "simulate_batch"):
+        q, qd = (np.array([getattr(e.state, x) for e in states] * 9) for x in ("q", "qd"))
+        qd = qd * np.exp(draw.uniform(-2, 6, (len(q), 1)))
+        for method in module.methods:
+            runs = module.simulate_batch(q, qd, steps=30, every=7, method=method, threads=1)
+            found += [runs.q, runs.qd, runs._codes]
+    return np.concatenate([np.asarray(x, float).ravel() for x in found])
+
+
+class Bench:
+    """One scene whose reference is made once; mutants are checked in forks of this process."""
+
+    def __init__(self, name: str, folder: Path, made: System | None = None) -> None:
+        self.system = variant(name) if made is None else made
+        self.shipped = Shipped(self.system, folder / name)
+        self.reference = checking.of(self.system)
+        checking.of = lambda made: self.reference
+        self.mutants = mutants(self.shipped.source)
+        # What the reference compiles for itself is there in all forks then. A library that was
+        # loaded once is not loaded again, so that the original has a place of its own.
+        own = Shipped(self.system, folder / f"{name}_original")
+        assert own.compile(FLAGS) is None and self.shipped.compile(FLAGS) is None
+        original = own.load()
+        report = checking.check(self.system, original)
+        assert report.passed, report.table()
+        self.states = checking._Check(self.system, original, np.random.default_rng(5), None)
+        self._right: Vector | None = None
+
+    @property
+    def right(self) -> Vector:
+        """What the original computes."""
+        if self._right is None:
+            assert self.shipped.compile(FLAGS) is None
+            self._right = self.outcome()
+        return self._right
+
+    def outcome(self) -> Vector:
+        """What is now compiled computes; nothing where it ends otherwise."""
+        file = self.shipped.folder / "outcome.npy"
+        file.unlink(missing_ok=True)
+        in_a_fork(lambda: np.save(file, self._outcome()), SECONDS)
+        return np.load(file) if file.exists() else np.zeros(0)
+
+    def _outcome(self) -> Vector:
+        module = self.shipped.load()
+        self.states.module = module
+        return outcomes(module, self.states)
+
+    def _passed(self) -> str:
+        """What a mutant is that passes the check."""
+        found = self.outcome()
+        right = self.right
+        if np.array_equal(found, right, equal_nan=True):
+            return "equivalent"
+        if found.shape != right.shape:
+            return "survived"
+        with np.errstate(all="ignore"):
+            same = (found == right) | (np.isnan(found) & np.isnan(right))
+            near = np.abs(found - right) <= ROUNDING * (1 + np.abs(right))
+        return "rounding" if np.all(same | near) else "survived"
+
+    def _check(self) -> list[str]:
+        report = checking.check(self.system, self.shipped.load())
+        return [row.name for row in report.rows if not row.passed]
+
+    def judge(self, mutant: Mutant) -> tuple[str, str]:
+        """killed, survived or equivalent, and by what."""
+        said = self.shipped.compile(FLAGS, mutant.of(self.shipped.source))
+        if said is not None:
+            return "no C", ""
+        kind, value = in_a_fork(self._check, SECONDS)
+        if kind != "done":
+            return "killed", f"{kind}: {value}"
+        if value:
+            assert isinstance(value, list)
+            return "killed", ", ".join(map(str, value))
+        return self._passed(), ""
+
+    def place(self, mutant: Mutant) -> str:
+        """Where, and what."""
+        source = self.shipped.source
+        line = source.count("\n", 0, mutant.at) + 1
+        start = source.rfind("\n", 0, mutant.at) + 1
+        end = source.find("\n", mutant.at)
+        old = source[mutant.at : mutant.end]
+        text = mutant.of(source)[start : end + len(mutant.new) - len(old)].strip()
+        return f"{line}: {old!r} -> {mutant.new!r}: {text}"
+
+
+def tried(
+    name: str, count: int, seed: int, folder: Path, loud: bool = True
+) -> tuple[dict[str, int], list[str]]:
+    """How many of a sample were killed and so on, and the places of those that have survived."""
+    bench = Bench(name, folder)
+    sample = random.Random(seed).sample(bench.mutants, min(count, len(bench.mutants)))
+    counts = dict.fromkeys(("killed", "survived", "equivalent", "rounding", "no C"), 0)
+    survived = []
+    for mutant in sample:
+        verdict, _ = bench.judge(mutant)
+        counts[verdict] += 1
+        if verdict not in ("killed", "no C") and loud:
+            print(f"  {verdict} {bench.place(mutant)}", flush=True)
+        if verdict == "survived":
+            survived.append(bench.place(mutant))
+    if loud:
+        told = ", ".join(f"{n} {what}" for what, n in counts.items())
+        print(f"{name}: {len(bench.mutants)} mutants, of {len(sample)} {told}", flush=True)
+    return counts, survived
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description="Mutants of the generated C, checked.")
+    parser.add_argument("scenes", nargs="*", help="of scenes/, or of VARIANTS")
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--all", action="store_true", help=" ".join(DIVERSE))
+    given = parser.parse_args(arguments)
+    names = DIVERSE if given.all else given.scenes or ["cartpole", "chain"]
+    total: dict[str, int] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            # each in a process of its own: modules of one name, references of another
+            one = partial(tried, name, given.count, given.seed, Path(folder))
+            kind, value = in_a_fork(one, 36_000)
+            if kind != "done":
+                print(f"{name}: {kind}: {value}")
+                return 2
+            assert isinstance(value, list)
+            for what, n in value[0].items():
+                total[what] = total.get(what, 0) + n
+    live = total["killed"] + total["survived"]
+    print(f"in all {total}: {total['killed'] / max(1, live):.1%} of {live} that change a result")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
