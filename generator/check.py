@@ -438,6 +438,10 @@ class _Check:
             self.rows.append(Row(name, math.nan, limit, False, f"{type(fault).__name__}: {fault}"))
             return
         error, why = (found.value, found.why) if isinstance(found, Finding) else (found, "")
+        if isinstance(found, Finding) and found.unit:
+            passed = error <= found.limit
+            self.rows.append(Row(name, error, found.limit, passed, found.unit))
+            return
         if why:
             idle = math.isinf(error)
             unit = ("no limit to test: " if idle else "not judged: ") + why
@@ -475,7 +479,7 @@ class _Check:
         return Convergence(
             self.module,
             self.methods,
-            [Place(e.state, e.size["acceleration"], float(e.size["jacobi"])) for e in usual],
+            [Place(e.state, float(e.size["jacobi"])) for e in usual],
             self.expected[0].state,
             np.array([self.sampler.spread, self.sampler.speed]),
             self.system.run.h,

@@ -10,8 +10,8 @@ seen, and a wrong one is wherever it can be:
   rounding and a hundredth of the motion, as of high orders in a stiff motion, are not judged.
 - A balance of power closes at the order of the method and of Simpson's rule, or down to rounding. A
   wrong power leaves a rest that no halving changes.
-- Advice on h is held against runs first; where runs leave the place that it is about, against
-  the eigenvalues of differences of accelerations.
+- An advised h is compared with runs; where these leave the place that it is about, as stiff
+  friction near rest, with the eigenvalues of differences of the accelerations.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ SMALL = 1e-2  # of the motion: differences below are in proportion to a power of
 CLEAR = 30.0  # times what rounding does to a run: differences above are the method's own
 ALIKE = 0.3  # orders that differ by less are the same
 COUNTS = (6, 12, 24, 48, 96)  # steps of a span
-SPANS = (0, -2, 2, -4, 4, -6, 6, -8, 8, -10, -12, -14, -16, -18, -20)  # powers of 2, of 48 h
+SPANS = (0, *(k for n in range(1, 9) for k in (-n, n)), *range(-9, -21, -1))  # log2 of 48 h
 BALANCE_SPANS = range(-7, 12)  # powers of 2, of h
 CLOSED = 1e3  # roundings of the energy: a balance is closed
 RESOLVED = 1e-3  # of the motion: two methods are compared where halving h changes no more
 NUDGE = 1e-6  # relative change at the start, from which growth is estimated
 DRAWS = 3  # of starts moved by a rounding
 
-# An advised h is held against runs of SPAN times its length, in steps of these parts of it. The
+# An advised h is compared with runs of SPAN times its length, in steps of these parts of it. The
 # limit is that of the motion as it is linear at one place, and the motion goes on from there.
 FINE, PARTS, SPAN = 1 / 64, (1 / 8, 1 / 4, 1 / 2, 1, 2), 8
 BLOWN = 1e3  # times what a difference grows by in fine steps: unstable
@@ -59,18 +59,22 @@ AHEAD = 2000  # steps of the scene's h in which these lie
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found; inf where there is nothing to measure. why: nothing is judged, and why."""
+    """What was found; inf where there is nothing to measure. why: nothing is judged, and why.
+
+    unit, limit: of another measure than the row's own, at most the limit.
+    """
 
     value: float
     why: str = ""
+    unit: str = ""
+    limit: float = math.inf
 
 
 @dataclass(frozen=True)
 class Place:
-    """A state to run from, and the size of its acceleration and energy: rounding's unit is eps."""
+    """A state to run from, and the size of its energy, of which a rounding is eps."""
 
     state: State
-    acceleration: Vector
     energy: float
 
 
@@ -84,10 +88,13 @@ class _Ladder:
 
     @property
     def orders(self) -> Iterator[tuple[float, bool]]:
-        """Of each halving that is clear of rounding and small; whether it is far above rounding."""
+        """Of each halving of a small difference clear of rounding; whether its rest is clear too.
+
+        Where it is not, that is the least that the order may be.
+        """
         for a, b in pairwise(self.differences):
-            if a < SMALL and b > CLEAR * self.noise:
-                yield math.log2(a / b), b > CLEAR**2 * self.noise
+            if CLEAR * self.noise < a < SMALL:
+                yield math.log2(a / max(b, self.noise)), b > CLEAR * self.noise
 
     @property
     def exact(self) -> bool:
@@ -104,7 +111,7 @@ class _Ladder:
 
     @property
     def settled(self) -> float:
-        """The order where the last two halvings, far above rounding, agree on it; nan else."""
+        """The order that the last two halvings clear of rounding agree on; nan where they do not."""
         found = [p for p, clear in self.orders if clear]
         if len(found) < 2 or abs(found[-1] - found[-2]) > ALIKE:
             return math.nan
@@ -142,15 +149,15 @@ class Convergence:
 
     def noise(self, at: Place, method: str, span: float, steps: int, end: Vector) -> float:
         """What rounding does to the end: that of the sums on the way, and of the start, grown."""
-        s, size = at.state, at.acceleration
-        moved = np.array([np.abs(s.q) + span * np.abs(s.qd), np.abs(s.qd) + span * size])
-        least = float(np.max(EPS * (moved / self.scale + np.abs(end))))
+        s = at.state
+        size = np.abs(np.array([s.q, s.qd])) + np.abs(end) * self.scale
+        least = EPS * float(np.max(size / self.scale))
         random = np.random.default_rng(steps)
         for _ in range(DRAWS):
-            by = random.choice([-4 * EPS, 4 * EPS], self.scale.shape) * moved
+            by = random.choice([-EPS, EPS], size.shape) * size
             near = self.end(replace(s, q=s.q + by[0], qd=s.qd + by[1]), method, span, steps)
             if near is not None:
-                least = max(least, float(np.max(np.abs(near - end))) / 4)
+                least = max(least, float(np.max(np.abs(near - end))))
         return least
 
     # --- orders -----------------------------------------------------------------------------------
@@ -310,14 +317,21 @@ class Convergence:
 
         From where the start of the motion allows the shortest h. Lost: it stops, or a difference
         grows BLOWN times as much as in fine steps, or, in steps longer than advised, it ends OFF.
-        inf where there is nothing to test, with why. Where runs do not agree with the advice, but
-        eigenvalues do, the motion does not stay where it holds: not judged.
+        inf where there is nothing to test, with why. Where runs do not agree with the advice, or
+        it is longer than the motion, but eigenvalues agree, it is right, though the motion does not
+        stay where it holds: how far it is from the eigenvalues' then, times.
         """
         if method == "euler" and self._velocities_matter():
             return Finding(math.inf, "for forces of positions alone")
         longest = self._longest(method, self.stiff, 1e3 * self.duration)
         if math.isinf(longest):
             return Finding(math.inf, "no mode turns or decays")
+        eigen = self._by_eigenvalues(method)
+        apart = max(longest / eigen, eigen / longest)
+        unit = "times the eigenvalues' h; runs leave where it holds"
+        near = Finding(apart, unit=unit, limit=APART) if apart <= APART else None
+        if near and longest > self.duration:
+            return near
         fine, grown = self._ends(method, longest, FINE)
         if not math.isfinite(grown):
             return Finding(math.inf, "the motion does not go on")
@@ -328,10 +342,7 @@ class Convergence:
             if wrong or not growth <= BLOWN * max(1.0, grown):
                 lost = part
                 break
-        if not lost > PARTS[0] and longest / APART < self._by_eigenvalues(method) < APART * longest:
-            where = "lost sooner" if lost == PARTS[0] else "not lost, bounded by the forces"
-            return Finding(lost, f"runs leave the place it is about ({where})")
-        return Finding(lost)
+        return near if near and not lost > PARTS[0] else Finding(lost)
 
     @cached_property
     def stiff(self) -> State:
