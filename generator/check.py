@@ -15,18 +15,19 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import sympy
 
+from eomc import onestep
 from eomc.answer import Answer, Vector
 from eomc.check_bodies import Bodies
 from eomc.check_compiled import compiled_rows
+from eomc.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Finding, Place
 from eomc.jets import Jets
 from eomc.reference import of
 from eomc.steppers import METHODS
@@ -38,9 +39,6 @@ EPS = 2.0**-52
 # sign makes 1e15, and still 1e5 in a term that is a ten thousand millionth of the whole.
 LIMIT = 1e3
 SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
-ORDER_MARGIN = 0.5  # below the order of a method: half way to the next lower one
-SEEN = 8  # higher orders go from errors of a hundredth to rounding in two halvings of h
-CLOSING_LIMIT = 2.0  # of 4; a wrong power does not close at all: order 0
 CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
 
 NUDGE = 1e-6  # relative change of an input from which its influence is estimated
@@ -48,14 +46,7 @@ MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
-
-# An advised h is held against runs of SPAN times its length, in steps of these parts of it. The
-# limit is that of the motion as it is linear at one place, and the motion goes on from there.
-FINE, PARTS, SPAN = 1 / 64, (1 / 8, 1 / 4, 1 / 2, 1, 2), 8
-BLOWN = 1e3  # times what a difference grows by in fine steps: unstable
-OFF = 0.1  # of the motion: the end of a stable run with steps as long as its limit is no answer
-PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
-AHEAD = 2000  # steps of the scene's h in which these lie
+SHORTER = (1, 1 / 4, 1 / 16, 1 / 64)  # parts of the scene's h, until stages are found by sweeps
 
 
 @dataclass(frozen=True)
@@ -93,13 +84,18 @@ VALUES = {
 
 @dataclass(frozen=True)
 class Row:
-    """One thing that was tested: how far it was off, in what unit, and how far it may be."""
+    """One thing that was tested: how far it was off, in what unit, and how far it may be.
+
+    Where nothing could be judged, `judged` is false and `unit` says why; such a row counts as
+    passed.
+    """
 
     name: str
     error: float
     limit: float
     passed: bool
     unit: str
+    judged: bool = True
 
 
 @dataclass(frozen=True)
@@ -135,7 +131,7 @@ class Report:
         table.add_column("limit", justify="right")
         table.add_column("in")
         for row in self.rows:
-            mark = "ok" if row.passed else "FAILED"
+            mark = ("ok" if row.judged else "?") if row.passed else "FAILED"
             table.add_row(mark, row.name, f"{row.error:.3g}", f"{row.limit:g}", row.unit)
         text = io.StringIO()
         Console(file=text, width=100).print(table)
@@ -365,12 +361,6 @@ def _units(found: Any, expected: Any, size: Any, eps: float = EPS) -> float:
         return float(np.max(np.where(off == 0, 0, off / (eps * np.asarray(size))), initial=0))
 
 
-def _median(numbers: Iterable[float]) -> float:
-    """Of those that are numbers; nan if there are none."""
-    known = [x for x in numbers if not math.isnan(x)]
-    return float(np.median(known)) if known else math.nan
-
-
 def _rows(run: Any, s: State) -> list[State]:
     """The states that a run from `s` went through."""
     rows = zip(run.t, run.q, run.qd, strict=True)
@@ -407,6 +397,8 @@ class _Check:
             if self.methods[0] == "rk4":  # which is what the reference steps by
                 self.row("one step", LIMIT, rounding, self.steps)
                 self.row("run", LIMIT, rounding + ", times steps and growth", self.runs)
+            for method in self.methods[self.methods[0] == "rk4" :]:
+                self.row(f"one step of {method}", LIMIT, rounding, partial(self.step_by, method))
             self.row("run: its energy", LIMIT, rounding, self.run_energy)
             self.row("D = D^T", LIMIT, rounding, self.symmetry)
             self.row("D > 0", 0, "least eigenvalue of D, scaled", self.definiteness, least=True)
@@ -414,21 +406,7 @@ class _Check:
             self.row("D qdd + bias = tau", LIMIT, rounding, self.motion)
             if self.dtype == np.float64:  # single precision leaves differences too few digits
                 self.row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", self.skewness)
-                for method in self.methods:
-                    least = min(METHODS[method].order, SEEN) - ORDER_MARGIN
-                    find = partial(self.order, method)
-                    self.smooth_row(f"order of {method}", least, "order observed", find)
-                for method in self.methods[1:]:
-                    unit = "of the two methods' own errors"
-                    self.row(
-                        f"{method} beside {self.methods[0]}", 2, unit, partial(self.beside, method)
-                    )
-                self.smooth_row(
-                    "power balance", CLOSING_LIMIT, "order at which it closes", self.closing
-                )
-                for method in self.methods:
-                    if math.isfinite(min(METHODS[method].limits)):
-                        self.advice_row(method)
+                self.convergence_rows()
             if hasattr(self.module, "_model"):  # what is compiled has several ways to one answer
                 compiled_rows(self)
             scene = self.system.scene
@@ -440,36 +418,80 @@ class _Check:
         counts = len(self.expected), self.sampler.rejected
         return Report(self.system.name, tuple(self.rows), *counts, kind)
 
+    def convergence_rows(self) -> None:
+        """Orders, advised steps, the balance of power: see `convergence`."""
+        runs, methods = self.convergence, self.methods
+        for method in methods:
+            least = min(METHODS[method].order, SEEN) - ORDER_MARGIN
+            find = partial(runs.order, method)
+            self.smooth_row(f"order of {method}", least, "order observed", find)
+        for method in methods[1:]:
+            unit = "of the two methods' own errors"
+            self.row(f"{method} beside {methods[0]}", 2, unit, partial(runs.beside, method))
+        unit = "order at which it closes"
+        self.smooth_row("power balance", runs.closing_limit, unit, runs.closing)
+        for method in methods:
+            if math.isfinite(min(METHODS[method].limits)):
+                self.advice_row(method)
+
     def row(
-        self, name: str, limit: float, unit: str, measure: Callable[[], float], least: bool = False
-    ) -> None:
+        self, name: str, limit: float, unit: str, measure: Callable[[], float | Finding],
+        least: bool = False,
+    ) -> None:  # fmt: skip
         """Add what `measure` finds: at most the limit, or more than it where it is the least."""
         try:
-            error = measure()
+            found = measure()
         except Exception as fault:  # whatever the module raises is an outcome of the check
             self.rows.append(Row(name, math.nan, limit, False, f"{type(fault).__name__}: {fault}"))
             return
+        error, why = (found.value, found.why) if isinstance(found, Finding) else (found, "")
+        if isinstance(found, Finding) and found.unit:
+            passed = error <= found.limit
+            self.rows.append(Row(name, error, found.limit, passed, found.unit))
+            return
+        if why:
+            idle = math.isinf(error)
+            unit = ("no limit to test: " if idle else "not judged: ") + why
+            self.rows.append(Row(name, error, limit, True, unit, judged=idle))
+            return
         self.rows.append(Row(name, error, limit, error > limit if least else error <= limit, unit))
 
-    def smooth_row(self, name: str, limit: float, unit: str, measure: Callable[[], float]) -> None:
+    def smooth_row(
+        self, name: str, limit: float, unit: str, measure: Callable[[], Finding]
+    ) -> None:
         """A row about orders, which is not judged where the scene's functions have corners."""
         self.row(name, limit, unit, measure, least=True)
         row = self.rows[-1]
         if math.isinf(row.error):
             self.rows[-1] = replace(row, unit=unit + ": exact, no error to measure")
         elif not row.passed and self.corners and not math.isnan(row.error):
-            note = f"{unit}; not to be expected with {self.corners}"
-            self.rows[-1] = replace(row, passed=True, unit=note)
+            note = f"not judged: {unit} not to be expected with {self.corners}"
+            self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
 
     def advice_row(self, method: str) -> None:
-        """At which part of the advised h a run is lost: not at a quarter of it, but at twice it."""
+        """At which part of the advised h a run is lost: not at an eighth of it, but at twice it."""
         unit = "of the advised h, where runs are lost"
-        self.row(f"h of {method}", PARTS[0], unit, partial(self.advised, method), least=True)
+        find = partial(self.convergence.advised, method)
+        self.row(f"h of {method}", PARTS[0], unit, find, least=True)
         row = self.rows[-1]
-        if math.isinf(row.error):
-            self.rows[-1] = replace(row, unit="no limit to test: " + self.untested)
-        elif not row.passed and self.corners and not math.isnan(row.error):
-            self.rows[-1] = replace(row, passed=True, unit=f"{unit}; no matter with {self.corners}")
+        if not row.passed and self.corners:
+            note = f"not judged: no matter with {self.corners}"
+            self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
+
+    @cached_property
+    def convergence(self) -> Convergence:
+        """The rows that come from runs of several step sizes."""
+        own = [e for e in self.expected if e.state.params is None]
+        usual = own[1:4] or self.expected[:3]  # the scene's own parameters, away from its start
+        return Convergence(
+            self.module,
+            self.methods,
+            [Place(e.state, float(e.size["jacobi"])) for e in usual],
+            self.expected[0].state,
+            np.array([self.sampler.spread, self.sampler.speed]),
+            self.system.run.h,
+            self.system.run.duration,
+        )
 
     @cached_property
     def corners(self) -> str:
@@ -530,6 +552,40 @@ class _Check:
 
         return float(np.max([error(e) for e in self._few(self.effort.few)]))
 
+    def step_by(self, method: str) -> float | Finding:
+        """One step of a method from a few states, by its tableau on the reference's accelerations.
+
+        Shorter than the scene's h where the stages of an implicit one are else not found.
+        """
+        errors = [self._step_by(method, e) for e in self._few(self.effort.few)]
+        known = [x for x in errors if not math.isnan(x)]
+        if known:
+            return max(known)
+        return Finding(math.nan, "no step from any state is finite")
+
+    def _step_by(self, method: str, e: _Expected) -> float:
+        """nan where there is no such step, in the reference or in the module."""
+        s, gain = e.state, e.size["acceleration"]
+        for h in (part * self.system.run.h for part in SHORTER):
+
+            def reference(q: Vector, qd: Vector, t: Vector, h: float = h, **given: Any) -> Vector:
+                def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
+                    return self.reference.acceleration(q, qd, t, **given)
+
+                ends = onestep.step(METHODS[method], acceleration, q, qd, t, h)
+                return np.moveaxis(ends, 0, 1)
+
+            with np.errstate(all="ignore"):
+                try:
+                    expected, size = self.sampler.reach(reference, s)
+                except np.linalg.LinAlgError:
+                    continue
+            run = self._simulate(s, method=method, h=h, steps=1, t0=s.t)
+            if np.all(np.isfinite(expected)) and run.status == "ok":
+                size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain])
+                return self.units([run.q[-1], run.qd[-1]], expected, size)
+        return math.nan
+
     def runs(self) -> float:
         """A short run from the start, and one from a random state with random parameters."""
         return float(np.max([self._run(e.state) for e in self._few(2)]))
@@ -556,9 +612,7 @@ class _Check:
         off_time = self.units(run.t, t, np.abs(t) + h)
         return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
 
-    def _simulate(self, s: State, method: str = "", **how: Any) -> Any:
-        if method and method != self.methods[0]:
-            how["method"] = method
+    def _simulate(self, s: State, **how: Any) -> Any:
         with warnings.catch_warnings():  # a run that stops early is looked at here
             warnings.simplefilter("ignore", RuntimeWarning)
             return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
@@ -655,163 +709,3 @@ class _Check:
             return self.units(D @ qdd + bias, tau, e.size["motion"])
 
         return self.largest(error)
-
-    def beside(self, method: str) -> float:
-        """How far another method ends from the first, over what halving h changes in the two."""
-
-        def ratio(s: State) -> float:
-            span = 24 * self.system.run.h
-            one, two = (
-                _rows(self._simulate(s, h=span / n, steps=n, every=n), s)[-1] for n in (24, 48)
-            )
-            far, other = (
-                _rows(self._simulate(s, h=span / n, steps=n, every=n, method=method), s)[-1]
-                for n in (24, 48)
-            )
-            floor = LIMIT * self.eps * (1 + np.abs(np.array([two.q, two.qd])))
-            change = np.abs(np.array([two.q, two.qd]) - np.array([one.q, one.qd]))
-            change += np.abs(np.array([other.q, other.qd]) - np.array([far.q, far.qd]))
-            off = np.abs(np.array([two.q, two.qd]) - np.array([other.q, other.qd]))
-            return float(np.max(off) / np.max(change + floor))
-
-        return _median(ratio(e.state) for e in self._usual())
-
-    def order(self, method: str) -> float:
-        """Of convergence of the state, the median over some states; inf where it is exact."""
-        return _median(self._order(e.state, method) for e in self._usual())
-
-    def _order(self, s: State, method: str) -> float:
-        """log2 of the ratio of the differences between runs with h, h/2 and h/4.
-
-        h is moved by factors of 4 from the scene's until differences are small and clear of
-        rounding. The largest of successive orders counts: rounding spoils the finest, and the
-        coarsest are not small yet, but no step makes a wrong coefficient right.
-        """
-        spread = np.array([self.sampler.spread, self.sampler.speed])
-        best: list[float] = []
-        span, exact = 48 * self.system.run.h, True
-        far = 1e4 if METHODS[method].order <= SEEN else 1e1  # what falls so fast is soon there
-        for _ in range(8):
-            ends = []
-            for n in (6, 12, 24, 48, 96):
-                end = _rows(self._simulate(s, h=span / n, steps=n, every=n, method=method), s)[-1]
-                ends.append(np.array([end.q, end.qd]) / spread)
-            off = np.max(np.abs(np.diff(ends, axis=0)), axis=(1, 2))
-            floor = far * EPS * (1 + np.max(np.abs(ends[-1])))
-            clear = [float(x) for x in off if floor < x < 1e-2]
-            best = max(best, clear, key=len)
-            exact = exact and bool(off[0] < floor)
-            if len(best) > 2:
-                break
-            span *= 4 if off[-1] < 1e-8 else 1 / 4
-        if len(best) > 1:
-            return max(math.log2(a / b) for a, b in pairwise(best))
-        return math.inf if exact else math.nan
-
-    def closing(self) -> float:
-        """The order at which jacobi(T) - jacobi(0) - integral of power vanishes; inf: it is 0."""
-        return _median(self._closing(e.state) for e in self._usual())
-
-    def _closing(self, s: State) -> float:
-        """By RK4 and Simpson's rule with h, h/2 and h/4, for the shortest T that shows it."""
-        for span in (self.system.run.h * 2.0**k for k in range(1, 11, 2)):
-            gaps = []
-            for n in (16, 32, 64):
-                rows = _rows(self._simulate(s, h=span / n, steps=n), s)
-                if len(rows) <= n:  # it met a singular D, or left the finite numbers
-                    return math.nan
-                power = np.array([_ask(self.module, "power", row) for row in rows])
-                simpson = np.array([1, *(4, 2) * (n // 2 - 1), 4, 1]) * span / n / 3
-                after, before = (_ask(self.module, "jacobi", rows[i]) for i in (-1, 0))
-                gaps.append(abs(float(after - before - simpson @ power)))
-            energy = simpson @ np.abs(power) + sum(
-                np.abs(_ask(self.module, name, rows[i]))
-                for name in ("kinetic_energy", "potential_energy")
-                for i in (0, -1)
-            )
-            if not gaps[-1] <= 1e3 * EPS * energy:
-                return math.log2(gaps[0] / gaps[-1]) / 2
-        return math.inf
-
-    def advised(self, method: str) -> float:
-        """The least of PARTS of the advised h with which a run is lost; nan where none is.
-
-        From where the start of the motion allows the shortest h. Lost: it stops, or a difference
-        grows BLOWN times as much as in fine steps, or, in steps longer than advised, it ends OFF.
-        inf where there is nothing to test.
-        """
-        self.untested = "for forces of positions alone"
-        if method == "euler" and self._velocities_matter():
-            return math.inf
-        self.untested = "no mode turns or decays"
-        longest = self._longest(method, self.stiff, 1e3 * self.system.run.duration)
-        if math.isinf(longest):
-            return math.inf
-        fine, grown = self._ends(method, longest, FINE)
-        self.untested = "the motion does not go on"
-        if not math.isfinite(grown):
-            return math.inf
-        for part in PARTS:
-            end, growth = self._ends(method, longest, part)
-            wrong = part > 1 and not float(np.max(np.abs(end - fine))) <= OFF
-            if wrong or not growth <= BLOWN * max(1.0, grown):
-                return part
-        return math.nan
-
-    @cached_property
-    def stiff(self) -> State:
-        """Where, along the start of the motion, the shortest h is advised."""
-        start, run = self.expected[0].state, self.system.run
-        method = next(m for m in self.methods if math.isfinite(min(METHODS[m].limits)))
-        steps = min(AHEAD, math.ceil(run.duration / run.h))
-        every = max(1, steps * max(1, len(start.q) // 8) // PLACES)
-        found, longest = start, 1e3 * run.duration
-        for s in _rows(self._simulate(start, method, steps=steps, every=every), start):
-            if (here := self._longest(method, s, longest)) < longest:
-                found, longest = s, here
-        return found
-
-    def _longest(self, method: str, s: State, most: float) -> float:
-        """The longest h that the module does not advise against at a state, to 5 %; inf: `most`."""
-        low = most
-        while self._warns(method, s, low):
-            low /= 2
-        if low == most:
-            return math.inf
-        high = 2 * low
-        while high > 1.05 * low:
-            middle = math.sqrt(low * high)
-            low, high = (low, middle) if self._warns(method, s, middle) else (middle, high)
-        return high
-
-    def _velocities_matter(self) -> bool:
-        """Whether accelerations hang on velocities."""
-        s = self.expected[-1].state
-        still = replace(s, qd=0 * s.qd)
-        one, other = (_ask(self.module, "acceleration", x) for x in (s, still))
-        return not np.array_equal(one, other)
-
-    def _warns(self, method: str, s: State, h: float) -> bool:
-        """Whether the module advises against h at a state."""
-        told = self.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
-        return told is not None
-
-    def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
-        """The end of a run over SPAN times `longest`, scaled, and the growth of a difference."""
-        s = self.stiff
-        spread = np.array([self.sampler.spread, self.sampler.speed])
-        signs = np.random.default_rng(1).choice([-1.0, 1.0], spread.shape)
-        steps, ends = round(SPAN / part), []
-        for by in (0.0, NUDGE):
-            q, qd = np.array([s.q, s.qd]) + by * signs * spread
-            how = {"h": part * longest, "steps": steps, "every": steps, "t0": s.t}
-            run = self._simulate(replace(s, q=q, qd=qd), method, **how)
-            if run.status != "ok":
-                return np.full(spread.shape, math.inf), math.inf
-            ends.append(np.array([run.q[-1], run.qd[-1]]) / spread)
-        return ends[0], float(np.max(np.abs(ends[1] - ends[0]))) / NUDGE
-
-    def _usual(self) -> Sequence[_Expected]:
-        """Some states with the scene's own parameters and away from its start."""
-        own = [e for e in self.expected if e.state.params is None]
-        return own[1:4] or self.expected[:3]

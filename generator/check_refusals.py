@@ -159,7 +159,7 @@ class Refusals:
         step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **way)
         if not self.raises(step, status) or not np.all(np.array(out) == MARK):
             return False
-        run = self.check._simulate(s, method, steps=5)
+        run = self.check._simulate(s, method=method, steps=5)
         kept = np.array_equal(run.q, np.asarray([s.q], run.q.dtype))
         return bool(kept and run.status == status and run.steps == 0 and "stopped" in run.message)
 

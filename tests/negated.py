@@ -1,0 +1,205 @@
+"""Modules with one term negated, and whether that changes what they compute.
+
+Either a term of the program: in one assignment of one function (D, the acceleration, an energy, a
+signal, ...) one term of a sum, a product or an argument takes the other sign. Or a coefficient of
+a stepper: an entry of its tableau, and of rk4, which is written out by hand, one sign of its text.
+Changed is a module where a function or a step at random states differs by more than SEEN of its
+size from the right module's; what is changed by less, or where no state was finite, counts as not
+changed: no check can be asked to see it.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from eomc import mechanics, program, render
+from eomc.assignments import Assignment, Call, Function, Product, Sum
+from eomc.program import Program
+from eomc.render import Sources
+from eomc.steppers import METHODS, Method
+from eomc.system import System
+
+SEEN = 1e-7
+FUNCTIONS = (
+    "D C g bias tau kinetic_energy potential_energy energy jacobi power acceleration".split()
+)
+
+
+def negated_sources(system: System, extension: str, seed: int) -> tuple[Sources, str]:
+    """The sources with one term negated, and which one, in words."""
+    choice = random.Random(f"negate {seed}")
+    made = program.build(mechanics.derive(system))
+    method = choice.choice(system.run.methods)
+    if choice.random() < 0.35 and system.run.real == "double":
+        if method == "rk4":
+            return _text(render.render(made, extension), choice)
+        wrong, what = _coefficient(METHODS[method], choice)
+        with _as(wrong):
+            return render.render(made, extension), what
+    wrong_program, what = _term(made, choice)
+    return render.render(wrong_program, extension), what
+
+
+# --- a term of the program ------------------------------------------------------------------------
+
+
+def _term(made: Program, choice: random.Random) -> tuple[Program, str]:
+    """The program with one term negated; an acceleration's as often as all others' together."""
+    places = [
+        (name, part, k)
+        for name, f in made.functions.items()
+        for part in ("early", "body")
+        for k, a in enumerate(getattr(f, part))
+        if any(True for _ in _negations(a))
+    ]
+    first = [place for place in places if place[0] == "acceleration"]
+    if not places:
+        name = choice.choice(sorted(n for n, f in made.functions.items() if f.outputs))
+        f = made.functions[name]
+        k = choice.randrange(len(f.outputs))
+        outputs = tuple(
+            replace(o, coefficient=-o.coefficient) if i == k else o for i, o in enumerate(f.outputs)
+        )
+        return _with(made, replace(f, outputs=outputs)), f"output {k} of {name}"
+    name, part, k = choice.choice(first if first and choice.random() < 0.5 else places)
+    f = made.functions[name]
+    lines = list(getattr(f, part))
+    where, lines[k] = choice.choice(list(_negations(lines[k])))
+    changed: Function = replace(f, **{part: tuple(lines)})
+    return _with(made, changed), f"{where} of {lines[k].name} in {name}"
+
+
+def _with(made: Program, changed: Function) -> Program:
+    return replace(made, functions={**made.functions, changed.name: changed})
+
+
+def _negations(a: Assignment) -> Iterator[tuple[str, Assignment]]:
+    """Each way to negate one term of a right-hand side."""
+    v = a.value
+    if isinstance(v, Sum):
+        for i, (x, name) in enumerate(v.terms):
+            terms = (*v.terms[:i], (-x, name), *v.terms[i + 1 :])
+            yield f"term {i}", replace(a, value=replace(v, terms=terms))
+        if v.constant != 0:
+            yield "the constant", replace(a, value=replace(v, constant=-v.constant))
+    elif isinstance(v, Product):
+        yield "the sign", replace(a, value=replace(v, coefficient=-v.coefficient))
+    elif isinstance(v, Call) and v.function not in ("sqrt", "log", "pow"):
+        for i, o in enumerate(v.args):
+            args = (*v.args[:i], replace(o, coefficient=-o.coefficient), *v.args[i + 1 :])
+            yield f"argument {i}", replace(a, value=replace(v, args=args))
+
+
+# --- a coefficient of a stepper -------------------------------------------------------------------
+
+
+def _coefficient(m: Method, choice: random.Random) -> tuple[Method, str]:
+    """The method with one entry of A or b negated, the times of its stages unchanged."""
+    fields: dict[str, list[list[Fraction]]] = {
+        "a": [list(row) for row in m.a], "b": [list(m.b)], "end": [list(m.end)],
+    }  # fmt: skip
+    places = [
+        (name, i, k)
+        for name, rows in fields.items()
+        for i, row in enumerate(rows)
+        for k, x in enumerate(row)
+        if x
+    ]
+    name, i, k = choice.choice(places)
+    fields[name][i][k] *= -1
+    new = {
+        "a": tuple(map(tuple, fields["a"])), "b": tuple(fields["b"][0]),
+        "end": tuple(fields["end"][0]), "nodes": m.c,
+    }  # fmt: skip
+    return replace(m, **new), f"{name}[{i}][{k}] of {m.name}"  # type: ignore[arg-type]
+
+
+@contextmanager
+def _as(wrong: Method) -> Iterator[None]:
+    """While a source is printed, the method is the wrong one."""
+    right = METHODS[wrong.name]
+    METHODS[wrong.name] = wrong  # type: ignore[index]
+    try:
+        yield
+    finally:
+        METHODS[wrong.name] = right  # type: ignore[index]
+
+
+_SIGN = re.compile(r"(?<=[\w)]) ([+-]) (?=[\w(])")
+
+
+def _text(made: Sources, choice: random.Random) -> tuple[Sources, str]:
+    """One `+` or `-` in the lines of rk4's step that add up states and accelerations."""
+    name = f"{made.name}.c"
+    text = made.files[name]
+    begin = re.search(rf"^[^\n;]*{made.name}_rk4\([^;]*?\)\n\{{", text, re.M)
+    assert begin is not None
+    end = text.index("\n}\n", begin.end())
+    signs = [s for s in _SIGN.finditer(text, begin.end(), end) if _adds(text, s)]
+    sign = choice.choice(signs)
+    other = "-" if sign[1] == "+" else "+"
+    wrong = text[: sign.start(1)] + other + text[sign.end(1) :]
+    line = text[text.rindex("\n", 0, sign.start()) : text.index("\n", sign.end())].strip()
+    return replace(made, files={**made.files, name: wrong}), f"a sign of rk4: {line}"
+
+
+def _adds(text: str, sign: re.Match[str]) -> bool:
+    """Whether it stands in a sum of the method itself, not in what is left of rounding."""
+    line = text[text.rindex("\n", 0, sign.start()) : text.index("\n", sign.end())]
+    return "h_rest" not in line and "/*" not in line and "for" not in line
+
+
+# --- whether it matters ---------------------------------------------------------------------------
+
+
+def changes(right: Any, wrong: Any, seed: int) -> bool:
+    """Whether a function or a step of the two modules differs by more than SEEN at some state."""
+    draw = np.random.default_rng(seed)
+    q0, qd0 = right.start
+    for k in range(12):
+        spread = 0.0 if k == 0 else 0.7
+        q = q0 + spread * draw.uniform(-1, 1, q0.shape)
+        qd = qd0 + (spread or 0.1) * draw.uniform(-1, 1, q0.shape)
+        t = float(draw.uniform(0, 1))
+        for ask in (*map(_value, FUNCTIONS), *map(_step, right.methods)):
+            one, other = (_try(ask, m, q, qd, t) for m in (right, wrong))
+            if one is None or not np.all(np.isfinite(one)):
+                continue
+            if other is None or not np.all(np.isfinite(other)):
+                return True
+            if np.max(np.abs(one - other)) > SEEN * (np.max(np.abs(one)) + 1e-300):
+                return True
+    return False
+
+
+Ask = Callable[[Any, Any, Any, float], Any]
+
+
+def _try(ask: Ask, module: Any, q: Any, qd: Any, t: float) -> Any:
+    try:
+        return np.asarray(ask(module, q, qd, t), float)
+    except ArithmeticError:
+        return None
+
+
+def _value(name: str) -> Ask:
+    place = 1 if name in ("D", "g", "potential_energy") else 2
+    return lambda m, q, qd, t: getattr(m, name)(*(q, qd)[:place], t=t)
+
+
+def _step(method: str) -> Ask:
+    def step(m: Any, q: Any, qd: Any, t: float) -> Any:
+        run = m.simulate(q, qd, steps=1, t0=t, method=method)
+        if run.status != "ok":
+            raise ArithmeticError(run.status)
+        return np.array([run.q[-1] - q, run.qd[-1] - qd])
+
+    return step
