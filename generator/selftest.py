@@ -60,7 +60,10 @@ def _state(target: Target, x: Mapping[str, float], close: float) -> dict[str, An
         if close:
             exact, _ = evaluate(program["bias"], known, exact=True)
             exact_qdd, _ = evaluate(program["acceleration"], known, exact=True)
-            if 64 * _off(bias, exact) > close or 64 * _off(qdd, exact_qdd) > USUAL[True]:
+            # a float's rounding is 2^29 times a double's
+            room = 64 if target.real is DOUBLE else 4 * 2**29
+            usual = USUAL[target.real is DOUBLE]
+            if room * _off(bias, exact) > close or room * _off(qdd, exact_qdd) > usual:
                 return None
         D = [x for row in matrix(program, "D", known) for x in row]
     except (ArithmeticError, ValueError):
