@@ -1027,7 +1027,7 @@ def _size(h: Any, dtype: np.dtype[Any]) -> float:
     if not limits.smallest_subnormal <= size <= limits.max:
         why = "" if size <= 0 else f" in {dtype}"
         raise ValueError(
-            f"h: {h!r} is not a step size{why}: give a number of seconds greater than 0"
+            f"h: {size:g} is not a step size{why}: give a number of seconds greater than 0"
         )
     return size
 
