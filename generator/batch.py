@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from .package import reduced
 from .runtime import (
     _LARGE,
+    _RARELY,
     STATUS,
     Array,
     Interrupted,
@@ -140,7 +141,7 @@ class BatchModel(Model):
             raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
         h, t0 = self.h if h is None else _size(h, self.dtype), _number(t0, "t0")
         steps = self._steps(h, duration, steps)
-        every = min(_count(every, "every", 1), max(1, steps))
+        every = min(_count(every, "every", 1), _RARELY)
         starts, table, held, count = self._instances(q0, qd0, params, u, steps)
         rows = 1 + steps // every + (steps % every > 0)
         try:

@@ -255,7 +255,8 @@ def _build(
     extension = f"_{name}_{wanted[:12]}"
     made = sources(extension)
     for file, text in made.files.items():
-        (beside / file).write_text(text, encoding="utf-8")
+        # the name of a scene's file may be no text
+        (beside / file).write_text(text, encoding="utf-8", errors="backslashreplace")
     library = extension + str(sysconfig.get_config_var("EXT_SUFFIX"))
     compiler = compiler_for(made.operations)
     _compile(made, extension, beside, library, compiler)

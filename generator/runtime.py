@@ -45,6 +45,7 @@ _LARGE = 2**24  # positions from which a look at the memory is worth its time
 _FEW = 32  # numbers that Python looks at sooner than NumPy
 _CHUNK = 16_384  # steps times coordinates before the first look, some ms
 _ROWS = 20_000  # rows times coordinates squared in one call, some ms at most
+_RARELY = 2**48  # steps from row to row, more than any run makes
 _MOST = 2**60  # steps, so that C can return four times as many
 
 
@@ -823,7 +824,7 @@ class Model:
         if (
             type(steps) is int and type(every) is int and type(t0) is float and isfinite(t0)
             and u is None and duration is None and out is None and progress is None
-            and 0 < every < _MOST and not estimate
+            and 0 < every <= _RARELY and not estimate
         ):  # fmt: skip
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
@@ -839,7 +840,7 @@ class Model:
                     )
         t0 = _number(t0, "t0")
         steps = self._steps(h, duration, steps)
-        every = min(_count(every, "every", 1), max(1, steps))
+        every = min(_count(every, "every", 1), _RARELY)
         if steps >= _MANY and (method, h) not in self._warned:
             self._warned.add((method, h))
             first = self._table(u, steps)[1]
@@ -1027,7 +1028,7 @@ def _size(h: Any, dtype: np.dtype[Any]) -> float:
     if not limits.smallest_subnormal <= size <= limits.max:
         why = "" if size <= 0 else f" in {dtype}"
         raise ValueError(
-            f"h: {h!r} is not a step size{why}: give a number of seconds greater than 0"
+            f"h: {size:g} is not a step size{why}: give a number of seconds greater than 0"
         )
     return size
 

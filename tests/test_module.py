@@ -241,7 +241,7 @@ def test_out_is_written_to_and_returned(cartpole: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("steps", [0, 1, 9, 10])
-@pytest.mark.parametrize("how", [{}, {"q0": np.array(Q), "params": {"m_c": 3.0}, "h": -0.01}])
+@pytest.mark.parametrize("how", [{}, {"q0": np.array(Q), "params": {"m_c": 3.0}, "h": 0.01}])
 def test_a_few_steps_by_the_short_way_are_those_by_the_long(
     driven: ModuleType, monkeypatch: pytest.MonkeyPatch, how: Any, steps: int
 ) -> None:

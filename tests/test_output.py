@@ -41,7 +41,7 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
             ["run", "p.toml", "--h", "1e-300", "--duration", "1e300"],
             "take a larger h, or a shorter",
         ),
-        (["run", "p.toml", "--h", "-1"], "h: -1.0 is not a step size"),
+        (["run", "p.toml", "--h", "-1"], "h: -1 is not a step size"),
         (["run", "p.toml", "--h", "nan"], "h: nan is not a finite number"),
         (["run", "p.toml", "--duration", "-3"], "duration: -3.0 is not a time"),
         (["check", "p.toml", "--seed", "-5"], "-5 is not in the range x>=0"),
