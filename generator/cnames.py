@@ -61,8 +61,9 @@ def borne(program: Program) -> tuple[Program, Mapping[str, str]]:
     parameter and input that is called otherwise there.
     """
     system = program.system
-    declared = [*system.coordinates, *system.parameters, *system.inputs]
-    wishes = {x.name: in_c(x.name, system.name) for x in declared}
+    declared = [c.name for c in system.coordinates]
+    declared += [p.name for p in system.parameters] + [i.name for i in system.inputs]
+    wishes = {name: in_c(name, system.name) for name in declared}
     other = {name: used for name, used in wishes.items() if used != name}
     new = dict(_derived(other))
     for function in program.functions.values():

@@ -158,7 +158,9 @@ def _face(target: Target) -> dict[str, Any]:
     NQ = f"{target.PREFIX}_NQ"
     t, u = "t" if target.driven else "", "u" if s.inputs else ""
     given = target.as_written
-    units = {given(x.name): x.unit for x in (*s.coordinates, *s.parameters, *s.inputs)}
+    units = {given(c.name): c.unit for c in s.coordinates}
+    units |= {given(p.name): p.unit for p in s.parameters}
+    units |= {given(i.name): i.unit for i in s.inputs}
     return {
         "coordinate_units": FreeText({given(c.name): c.unit for c in s.coordinates}),
         "parameter_values": repr({given(p.name): p.value for p in s.parameters}),

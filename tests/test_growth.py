@@ -59,7 +59,7 @@ def chain(first: str, each: str, count: int) -> str:
     lines = [f'a0 = "{first}"']
     lines += [f'a{k} = "{each.replace("@", f"a{k - 1}")}"' for k in range(1, count + 1)]
     text = BASE.replace('a0 = "x"', "\n".join(lines))
-    return text.replace("+ a0", f"+ a{count}")
+    return text.replace("x**2/2 + a0", f"x**2/2 + a{count}")
 
 
 NESTED = {

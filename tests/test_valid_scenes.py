@@ -73,7 +73,7 @@ VALID = {
         "EOF*NULL + NAN**2 + errno**2",
         SENSITIVE,
     ),
-    "algebra": text("algebra", "number = { start = 1 }", kinetic="number_dot**2*cos(number)/2", potential="number**2"),
+    "algebra": text("algebra", "number = {}", kinetic="number_dot**2/2", potential="cos(number)"),
     "sinf": text("sinf_scene", "sinf = { start = 1 }", "fabsf = 1", "cosf = 'sin(sinf)*fabsf'",
                  "sinf_dot**2/2", "cos(sinf)*cosf", "real = 'float'"),
     "own": text("own", "own_D = { start = 1 }", "own_params = 1", "own_sincos = 'sin(own_D)*own_D'",
