@@ -211,7 +211,7 @@ def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> Non
     \b
     eomc build scenes/cartpole.toml
     PYTHONPATH=build python -c "import cartpole; print(cartpole.simulate())"
-    cd build/cartpole && cc -std=c99 -O2 main.c cartpole.c -lm && ./a.out
+    cd build/cartpole && cc -std=c99 -O2 -I. main.c cartpole.c -lm && ./a.out
     """
     named: dict[str, Path] = {}
     for scene in scenes:

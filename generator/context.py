@@ -40,24 +40,24 @@ def values(target: Target) -> dict[str, Any]:
         "real": real.name,
         "dtype": real.dtype,
         "lit": lambda text: text + real.suffix,
-        "stamp": _stamp(target),
+        "stamp": stamp(target),
         "handshake": f"0x{s.digest[:8]}u",
         "digest": s.digest,
-        "notes": [line for note in target.program.notes for line in textwrap.wrap(note, 92)],
-        "description": _description(target),
+        "notes": notes(target),
+        "description": description(target),
         "coordinates": [
             {"name": c.name, "enum": enum[c.name], "unit": c.unit, "note": c.note,
-             "comment": _comment(c.unit, c.note)}
+             "comment": comment(c.unit, c.note)}
             for c in s.coordinates
         ],
         "inputs": [
             {"name": i.name, "enum": enum[i.name], "unit": i.unit, "note": i.note,
-             "comment": _comment(i.unit, i.note)}
+             "comment": comment(i.unit, i.note)}
             for i in s.inputs
         ],
         "parameters": [
             {"name": p.name, "unit": p.unit, "note": p.note,
-             "comment": _comment(p.unit, p.note), "value": target.literal(p.value),
+             "comment": comment(p.unit, p.note), "value": target.literal(p.value),
              "number": repr(p.value), "named": f"/* {p.name} */"}
             for p in s.parameters
         ],
@@ -69,7 +69,7 @@ def values(target: Target) -> dict[str, Any]:
         "m": len(s.inputs),
         "functions": evaluations,
         "names": target.names,
-        "solved": _solved(target),
+        "solved": solved(target),
         "run": s.run,
         "indent": indent,
         "broken": lambda text: "\n".join(ccode.broken(text)),
@@ -91,7 +91,7 @@ def values(target: Target) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _stamp(target: Target) -> list[str]:
+def stamp(target: Target) -> list[str]:
     """What made the file from what, and the command; no date."""
     s = target.system
     source = s.file.replace("\\", "/").rsplit("/", 1)[-1]
@@ -104,7 +104,12 @@ def _stamp(target: Target) -> list[str]:
     ]
 
 
-def _description(target: Target) -> list[str]:
+def notes(target: Target) -> list[str]:
+    """Where unusual terms of K went, as lines of a comment."""
+    return [line for note in target.program.notes for line in textwrap.wrap(note, 92)]
+
+
+def description(target: Target) -> list[str]:
     s = target.system
     lines = textwrap.wrap(" ".join(s.note.split()), 92) if s.note else []
     if lines:
@@ -185,7 +190,7 @@ def _selftest(target: Target) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _solved(target: Target) -> list[str]:
+def solved(target: Target) -> list[str]:
     """How D qdd = tau - bias is solved, as lines of a comment."""
     program = target.program
     way = "D = L diag(d) L^T"
@@ -261,6 +266,6 @@ def _csrc(target: Target, turned: int, lanes: bool, pairs: bool) -> list[str]:
     ]
 
 
-def _comment(unit: str, note: str) -> str:
+def comment(unit: str, note: str) -> str:
     text = ", ".join(t for t in (unit, " ".join(note.split())) if t)
     return f"/* {text.replace('*/', '* /')} */" if text else ""
