@@ -167,5 +167,9 @@ def laid_out(text: str) -> str:
             out.append(line)
             continue
         width = len(line) - len(inside)
+        head, opened, rest = inside.partition("(")
+        if opened and ", " not in inside[: WIDTH - width] and len(head) < WIDTH - width:
+            out.append(" " * width + head + opened)
+            inside, width = rest, width + 4
         out += [" " * width + part for part in broken(inside, WIDTH - width)]
     return "\n".join(out)

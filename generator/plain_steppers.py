@@ -115,10 +115,10 @@ def source_view(plain: Plain, slopes: str, steppers: Sequence[str]) -> Source:
 
 
 def linearization(plain: Plain) -> Slopes | None:
-    """A_q, A_qd and B, where the scene asks for them."""
+    """A_q, A_qd and B, where the program has them."""
     target = plain.target
     function = source(target, "linearization")
-    if function is None or not target.system.run.linearize:
+    if function is None:
         return None
     NQ, inputs = plain.NQ, bool(target.system.inputs)
     width = f"2*{NQ} + {plain.NU}" if inputs else f"2*{NQ}"
@@ -130,15 +130,16 @@ def linearization(plain: Plain) -> Slopes | None:
         values, parts = "", ()
         if is_large(function):
             values, parts, blocks = plain.cut(function, "slopes", "slopes", every)
+            blocks = (blocks[0], Block("", (*blocks[1].lines, c.result(plain.ok))))
         else:
             blocks, body = plain.straight(function, "slopes")
             failures = (*body.early_failures, *body.failures)
-            blocks += (Block("", c.unless(failures, plain.singular)),)
+            blocks += (Block("", (*c.unless(failures, plain.singular), c.result(plain.ok))),)
         made = CFunction(
             f"{plain.prefix}_slopes",
             plain.status,
             (slopes, *plain.pointers(function, *every)),
-            (*blocks, Block("", (c.result(plain.ok),))),
+            blocks,
             plain.read(function, follows=False) | {"slopes"},
             "static",
             doc,
@@ -185,6 +186,11 @@ def linearization(plain: Plain) -> Slopes | None:
 # --- methods of integration -----------------------------------------------------------------------
 
 
+def _titled(m: Method) -> str:
+    """What a method is called, with its order."""
+    return m.title if "order" in m.title else f"{m.title}, order {m.order}"
+
+
 def _about(m: Method) -> tuple[str, ...]:
     """What a method is, where from, and up to which step: lines of a comment."""
     undamped, decay = m.limits
@@ -192,7 +198,7 @@ def _about(m: Method) -> tuple[str, ...]:
         f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."
     )
     return (
-        f"{m.title[0].upper()}{m.title[1:]}, order {m.order}",
+        f"{_titled(m)[0].upper()}{_titled(m)[1:]}",
         f"({m.source}).",
         *(() if m.sweeps else m.notes),
         *((f"Stability limits: {stable}",) if isfinite(undamped) else ()),
@@ -211,7 +217,7 @@ def step(plain: Plain, m: Method) -> CFunction:
             *plain.usual(*plain.state[2:], "h", "u", "p"),
         ),
         doc=(
-            f"One step of size h{' from t' if timed else ''} in place, by {m.title}, order {m.order}. "
+            f"One step of size h{' from t' if timed else ''} in place, by {_titled(m)}. "
             "Where the status is not OK, q and qd are untouched.",
             *((U_STEP,) if has_u else ()),
         ),
