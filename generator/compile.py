@@ -145,7 +145,8 @@ def key(scene_digest: str, form: str = "fast") -> str:
     small, large = compiler_for(0), compiler_for(MANY + 1)
     parts = (
         scene_digest, form, _generator_digest(), small.identity, large.identity,
-        STANDARD, *flags(form), _processor(), sys.version, str(sysconfig.get_config_var("EXT_SUFFIX")),
+        STANDARD, *flags(form), _processor(), sys.version,
+        str(sysconfig.get_config_var("EXT_SUFFIX")),
     )  # fmt: skip
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
@@ -196,7 +197,7 @@ def build(
 
 
 def place(name: str, root: Path, form: str = "fast") -> Path:
-    """The folder of a scene's module; inside it that of the plain form, which `eomc check` needs."""
+    """The folder of a scene's module; that of the plain form, for comparison, lies inside it."""
     return root / name if form == "fast" else root / name / ".plain"
 
 

@@ -110,6 +110,7 @@ def notes(target: Target) -> list[str]:
 
 
 def description(target: Target) -> list[str]:
+    """The scene's note and the names that were mapped, as lines of a comment."""
     s = target.system
     lines = textwrap.wrap(" ".join(s.note.split()), 92) if s.note else []
     if lines:
@@ -267,5 +268,6 @@ def _csrc(target: Target, turned: int, lanes: bool, pairs: bool) -> list[str]:
 
 
 def comment(unit: str, note: str) -> str:
+    """Unit and note of a coordinate, input or parameter, as a comment in C."""
     text = ", ".join(t for t in (unit, " ".join(note.split())) if t)
     return f"/* {text.replace('*/', '* /')} */" if text else ""

@@ -20,6 +20,7 @@ RK4_BY = {"angles": "rk4_angles.c.jinja", "pairs": "rk4_pairs.c.jinja"}  # what 
 
 
 def literal(x: Fraction, real: Real) -> str:
+    """A coefficient as it is written in C."""
     return ccode.number(Rational(x.numerator, x.denominator), real)
 
 

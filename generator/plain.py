@@ -1,7 +1,7 @@
 """The plain form of C: a program as the views that its templates print.
 
-Strict C99 with libm's sine and cosine, state in arrays, parameters in a struct: for embedding, audit
-and teaching. Every function of mechanics is straight-line code; what is above it calls it.
+Strict C99 with libm's sine and cosine, state in arrays, parameters in a struct: for embedding,
+audit and teaching. Every function of mechanics is straight-line code; what is above it calls it.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-
-from sympy import S
 
 from eomc import c_function as c
 from eomc import context, pieces
@@ -139,7 +137,9 @@ class Plain:
 
     def loads(self, function: Function) -> Block:
         """Locals for the coordinates, velocities, inputs and directions that are read."""
-        return Block("", tuple(self.target.loads(function, self.target.element, self.target.element)))
+        return Block(
+            "", tuple(self.target.loads(function, self.target.element, self.target.element))
+        )
 
     def straight(self, function: Function, out: str) -> tuple[tuple[Block, ...], Body]:
         """The statements of a function, its results in `out`, or returned where that is empty."""
@@ -165,7 +165,8 @@ class Plain:
         parts = pieces.split(function, pieces.PIECE)
         handed = {n: c.member("s", n) for part in parts for n in part.keeps}
         type = f"{self.prefix}_{what}_values"
-        made, calls = [], []
+        made: list[CFunction] = []
+        calls: list[str] = []
         for k, part in enumerate(parts, 1):
             f, P = part.function, f"{self.prefix}_{what}_{k}"
             body = self.target.body(
@@ -264,7 +265,7 @@ class Plain:
         self, function: Function, what: str, given: Sequence[str]
     ) -> tuple[str, tuple[CFunction, ...], CFunction]:
         """The struct, the pieces and the function that gives a matrix times `along`."""
-        values, parts, fails = "", (), bool(function.checks)
+        values, parts, fails = "", tuple[CFunction, ...](), bool(function.checks)
         if pieces.is_large(function):
             values, parts, blocks = self.cut(function, what, "column", ("along", *given))
         else:
@@ -294,7 +295,7 @@ class Plain:
         doc = ["qdd from D qdd + C qd + g = tau. Where the status is not OK, qdd is untouched."]
         if self.target.system.inputs:
             doc.append("u: the inputs; NULL for the scene's signals.")
-        values, parts = "", ()
+        values, parts = "", tuple[CFunction, ...]()
         unfinite = c.unless([f"!{self.prefix}_finite(a, {self.NQ})"], f"{self.PREFIX}_NOT_FINITE")
         if pieces.is_large(function):
             values, parts, blocks = self.cut(

@@ -34,17 +34,6 @@ from eomc.target import sentence
 
 Show = Callable[[View], str]  # a view by its template
 
-U = "u: the inputs; NULL for the values that the scene's signals have there."
-U_STEP = "u: the inputs, held over the step; NULL for the scene's signals, followed through it."
-U_RUN = (
-    "u: the inputs of the first of these steps, those of the next u_stride values on (0: constant); "
-    "NULL for the scene's signals."
-)
-U_BATCH = (
-    "u: NULL for the scene's signals, else those of instance k at u + k*u_instance, of the n-th of "
-    "these steps n*u_step further on."
-)
-P_BATCH = "The parameters of instance k are p[k*p_instance]: p_instance = 0 for one set for all."
 SWEEPS = {True: 50, False: 60}  # at most, with Newton's method and without
 
 
@@ -55,11 +44,14 @@ def files(program: Program, show: Show) -> dict[str, str]:
     methods = [METHODS[m] for m in plain.target.system.run.methods]
     loops = [loop(plain, m) for m in methods]
     views: list[View] = [implicit(plain, methods)] if any(m.implicit for m in methods) else []
-    views += [view for m, run in zip(methods, loops, strict=True) for view in (stepper(plain, m), run)]
+    views += [
+        view for m, run in zip(methods, loops, strict=True) for view in (stepper(plain, m), run)
+    ]
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
-    texts = show(header(plain, slopes, loops)), show(
-        source_view(plain, show(slopes).rstrip("\n") if slopes else "", steppers)
+    texts = (
+        show(header(plain, slopes, loops)),
+        show(source_view(plain, show(slopes).rstrip("\n") if slopes else "", steppers)),
     )
     return {f"{name}.{end}": c.laid_out(text) for end, text in zip("hc", texts, strict=True)}
 
@@ -68,7 +60,7 @@ def header(plain: Plain, slopes: Slopes | None, loops: Sequence[Loop]) -> Header
     """The header's view."""
     target, s = plain.target, plain.target.system
     found = [plain.evaluation(n).function for n in KINDS if source(target, n) is not None]
-    found += [plain.acceleration.function, *([slopes.linearization] if slopes else [])]
+    found.append(plain.acceleration.function)
     return Header(
         title=s.title,
         stamp=tuple(context.stamp(target)),
@@ -82,10 +74,12 @@ def header(plain: Plain, slopes: Slopes | None, loops: Sequence[Loop]) -> Header
         inputs=indexed(plain, inputs=True),
         parameters=parameters(plain),
         implicit=any(x.implicit for x in loops),
+        timed=target.driven,
         functions=tuple(found),
+        linearization=slopes.linearization if slopes else None,
         methods=tuple(
-            Declared(name, x.implicit, step(plain, METHODS[name]), x.run, x.batch)
-            for name, x in zip(s.run.methods, loops, strict=True)
+            Declared(m.name, _titled(m), m.implicit, step(plain, m), x.run, x.batch)
+            for m, x in zip(map(METHODS.__getitem__, s.run.methods), loops, strict=True)
         ),
     )
 
@@ -126,8 +120,8 @@ def linearization(plain: Plain) -> Slopes | None:
     told = sentence(function)
     doc = ("[da/dq, da/dqd, da/du] at held inputs, by rows.",)
     slopes = c.filled(plain.real, "slopes")
+    values, parts = "", tuple[CFunction, ...]()
     if "linearization" in target.program:
-        values, parts = "", ()
         if is_large(function):
             values, parts, blocks = plain.cut(function, "slopes", "slopes", every)
             blocks = (blocks[0], Block("", (*blocks[1].lines, c.result(plain.ok))))
@@ -169,13 +163,7 @@ def linearization(plain: Plain) -> Slopes | None:
             f"{plain.prefix}_linearization",
             plain.status,
             (*(c.filled(plain.real, n, f"{NQ}*{w}") for n, w in out), *arguments),
-            doc=(
-                f"A_q = da/dq, A_qd = da/dqd{', B = da/du' if inputs else ''} of the accelerations "
-                "a, exact, a row for each acceleration, inputs held. Where the status is not OK, all "
-                "are untouched.",
-                *([U] if inputs else []),
-                told,
-            ),
+            doc=(told,),
         ),
         unread=tuple(a.name for a in arguments if a.name not in read),
         signal_call=plain.signal.call(u="now") if reads_u and plain.signal else "",
@@ -207,7 +195,6 @@ def _about(m: Method) -> tuple[str, ...]:
 
 def step(plain: Plain, m: Method) -> CFunction:
     """The prototype of one step."""
-    has_u, timed = bool(plain.target.system.inputs), plain.target.driven
     return CFunction(
         f"{plain.prefix}_{m.name}_step",
         plain.status,
@@ -215,11 +202,6 @@ def step(plain: Plain, m: Method) -> CFunction:
             c.filled(plain.real, "q", plain.NQ),
             c.filled(plain.real, "qd", plain.NQ),
             *plain.usual(*plain.state[2:], "h", "u", "p"),
-        ),
-        doc=(
-            f"One step of size h{' from t' if timed else ''} in place, by {_titled(m)}. "
-            "Where the status is not OK, q and qd are untouched.",
-            *((U_STEP,) if has_u else ()),
         ),
     )
 
@@ -286,7 +268,7 @@ def implicit(plain: Plain, methods: Sequence[Method]) -> Implicit:
             qualifier="static",
         ),
         here=accelerate(qdd="here"),
-        near=accelerate(qdd="near", q="x", qd=f"x + NQ"),
+        near=accelerate(qdd="near", q="x", qd="x + NQ"),
     )
 
 
@@ -300,7 +282,7 @@ def _gauss(plain: Plain, m: Method) -> Gauss:
         f"{method}_stages",
         plain.status,
         (
-            c.filled(plain.real, "f"), c.filled(plain.real, "q_mid"), c.filled(plain.real, "qd_mid"),
+            *(c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid")),
             c.given(plain.real, "a"), *around,
         ),
         qualifier="static",
@@ -357,18 +339,23 @@ def loop(plain: Plain, m: Method) -> Loop:
     u, p = plain.usual("u"), plain.usual("p")
     strides = [CArgument("long", n) for n in ("u_stride", "u_instance", "u_step", "p_instance")]
     count, row_count = CArgument("long", "count"), CArgument("long", "row_count")
-    memory = (CArgument(f"{P}_{m.name}_memory *", "memory"), CArgument(f"{plain.status} *", "status"))
+    memory = CArgument(f"{P}_{m.name}_memory *", "memory")
+    status = CArgument(f"{plain.status} *", "status")
     run = CFunction(
         f"{P}_{m.name}_run",
         "long",
-        (*state, *t0, h, first, steps, *u, *(strides[:1] if has_u else []), *rows, *p, *memory),
-        doc=(
-            f"`steps` such steps in place{', the n-th from t0 + n h' if t0 else ''}, n = first, "
-            "first + 1, ... After each that makes n + 1 a multiple of `every` the state goes into the "
-            "next row of q_rows and qd_rows, NQ values each; every = 0 keeps none. Returns the steps "
-            "done: fewer where the status is not OK, and then q, qd are the last good state. memory: "
-            "NULL for a run in one call.",
-            *([U_RUN] if has_u else []),
+        (
+            *state,
+            *t0,
+            h,
+            first,
+            steps,
+            *u,
+            *(strides[:1] if has_u else []),
+            *rows,
+            *p,
+            memory,
+            status,
         ),
     )
     batch = CFunction(
@@ -379,14 +366,6 @@ def loop(plain: Plain, m: Method) -> Loop:
             *(strides[1:3] if has_u else []), *rows, row_count, *p,
             *(strides[3:] if target.needs_p else []),
             CArgument("long *", "done"), CArgument("int *", "status"),
-        ),
-        doc=(
-            "The same for `count` instances one after the other, q and qd (count, NQ) in place. Rows "
-            "of instance k: at q_rows + k*row_count*NQ, that of step n at (n + 1)/every there, row 0 "
-            "being left for the start. status[k] and done[k] come in as 0 and are handed on from call "
-            "to call: an instance with a status stays where it is; to done[k] its steps are added.",
-            *([P_BATCH] if target.needs_p else []),
-            *([U_BATCH] if has_u else []),
         ),
     )  # fmt: skip
     one = stepper(plain, m)

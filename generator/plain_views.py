@@ -46,6 +46,7 @@ class Declared:
     """A method of integration in the header: step, run and, where the scene wants it, batch."""
 
     name: str
+    title: str
     implicit: bool
     step: CFunction
     run: CFunction
@@ -54,7 +55,7 @@ class Declared:
 
 @dataclass(frozen=True)
 class Header:
-    """plain.h.jinja. functions: those of mechanics, in their order."""
+    """plain.h.jinja. functions: those of mechanics, in their order. timed: whether steps take t."""
 
     TEMPLATE: ClassVar[str] = "plain.h"
     title: str
@@ -69,7 +70,9 @@ class Header:
     inputs: tuple[Indexed, ...]
     parameters: tuple[Parameter, ...]
     implicit: bool
+    timed: bool
     functions: tuple[CFunction, ...]
+    linearization: CFunction | None
     methods: tuple[Declared, ...]
 
 
