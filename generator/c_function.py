@@ -170,6 +170,8 @@ def laid_out(text: str) -> str:
         head, opened, rest = inside.partition("(")
         if opened and ", " not in inside[: WIDTH - width] and len(head) < WIDTH - width:
             out.append(" " * width + head + opened)
-            inside, width = rest, width + 4
-        out += [" " * width + part for part in broken(inside, WIDTH - width)]
+            parts = [" " * 4 + part.lstrip() for part in broken(rest, WIDTH - width - 4)]
+        else:
+            parts = list(broken(inside, WIDTH - width))
+        out += [" " * width + part for part in parts]
     return "\n".join(out)
