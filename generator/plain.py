@@ -256,37 +256,35 @@ class Plain:
     def _by_columns(self, public: CFunction, function: Function, name: str) -> Computed:
         """A matrix as a loop over its columns, the matrix times each unit vector."""
         kind = KINDS[name]
-        values, parts, column = self.column(function, f"{name}_column", ("q", "qd", "t", "p"))
-        call = column.call()
-        parts = (*parts, replace(column, doc=(f"{kind.out} times along. {sentence(function)}",)))
-        return Computed(public, parts, values, call, kind.out, kind.symmetric)
+        doc = f"{kind.out} times along. {sentence(function)}"
+        made = self.static(function, f"{name}_column", "column", doc)
+        parts, call = (*made.parts, made.function), made.function.call()
+        return Computed(public, parts, made.values, call, kind.out, kind.symmetric)
 
-    def column(
-        self, function: Function, what: str, given: Sequence[str]
-    ) -> tuple[str, tuple[CFunction, ...], CFunction]:
-        """The struct, the pieces and the function that gives a matrix times `along`."""
-        values, parts, fails = "", tuple[CFunction, ...](), bool(function.checks)
+    def static(
+        self, function: Function, what: str, out: str, doc: str, fails: bool = False
+    ) -> Computed:
+        """A static function that fills `out`; one that `fails` has pivots, and returns a status."""
+        values, parts, usual = "", tuple[CFunction, ...](), ("q", "qd", "t", "u", "p")
+        failures: tuple[str, ...] = ()
         if pieces.is_large(function):
-            values, parts, blocks = self.cut(function, what, "column", ("along", *given))
+            values, parts, blocks = self.cut(function, what, out, ("along", *usual))
         else:
-            blocks, body = self.straight(function, "column")
-            failures = (*body.early_failures, *body.failures)
-            blocks += (Block("", c.unless(failures, self.singular)),)
+            blocks, body = self.straight(function, out)
+            failures = c.unless((*body.early_failures, *body.failures), self.singular)
         if fails:
-            blocks += (Block("", (c.result(self.ok),)),)
+            blocks += (Block("", (*failures, c.result(self.ok))),)
+        along = (c.given(self.real, "along"),) if out == "column" else ()
         made = CFunction(
             f"{self.prefix}_{what}",
             self.status if fails else "void",
-            (
-                c.filled(self.real, "column"),
-                c.given(self.real, "along"),
-                *self.pointers(function, *given),
-            ),
+            (c.filled(self.real, out), *along, *self.pointers(function, *usual)),
             blocks,
-            self.read(function, follows=False) | {"column"},
+            self.read(function, follows=False) | {out},
             "static",
+            (doc,),
         )
-        return values, parts, made
+        return Computed(made, parts, values)
 
     @cached_property
     def acceleration(self) -> Computed:

@@ -10,10 +10,8 @@ from math import isfinite, sqrt
 from eomc import c_function as c
 from eomc import context
 from eomc.c_function import CArgument, CFunction
-from eomc.ccode import Block
 from eomc.evaluations import KINDS, source
 from eomc.methods import literal, rounded
-from eomc.pieces import is_large
 from eomc.plain import Plain, handshake, indexed, of, parameters
 from eomc.plain_views import (
     Computed,
@@ -116,37 +114,19 @@ def linearization(plain: Plain) -> Slopes | None:
         return None
     NQ, inputs = plain.NQ, bool(target.system.inputs)
     width = f"2*{NQ} + {plain.NU}" if inputs else f"2*{NQ}"
-    every = ("q", "qd", "t", "u", "p")
-    told = sentence(function)
-    doc = ("[da/dq, da/dqd, da/du] at held inputs, by rows.",)
-    slopes = c.filled(plain.real, "slopes")
-    values, parts = "", tuple[CFunction, ...]()
+    told, doc = sentence(function), "[da/dq, da/dqd, da/du] at held inputs, by rows."
     if "linearization" in target.program:
-        if is_large(function):
-            values, parts, blocks = plain.cut(function, "slopes", "slopes", every)
-            blocks = (blocks[0], Block("", (*blocks[1].lines, c.result(plain.ok))))
-        else:
-            blocks, body = plain.straight(function, "slopes")
-            failures = (*body.early_failures, *body.failures)
-            blocks += (Block("", (*c.unless(failures, plain.singular), c.result(plain.ok))),)
-        made = CFunction(
-            f"{plain.prefix}_slopes",
-            plain.status,
-            (slopes, *plain.pointers(function, *every)),
-            blocks,
-            plain.read(function, follows=False) | {"slopes"},
-            "static",
-            doc,
-        )
-        computed = Computed(made, parts, values)
+        slopes = plain.static(function, "slopes", "slopes", doc, fails=True)
     else:
-        values, parts, column = plain.column(function, "slopes_column", every)
-        column = replace(column, doc=("[da/dq, da/dqd, da/du] times along.",))
-        made = CFunction(
-            f"{plain.prefix}_slopes", plain.status, (slopes, *plain.pointers(function, *every)),
-            qualifier="static", doc=doc,
+        column = "[da/dq, da/dqd, da/du] times along."
+        one = plain.static(function, "slopes_column", "column", column, fails=True)
+        along = ("column", "along")
+        rest = tuple(a for a in one.function.arguments if a.name not in along)
+        made = replace(
+            one.function, name=f"{plain.prefix}_slopes", result=plain.status, body=(), doc=(doc,),
+            arguments=(c.filled(plain.real, "slopes"), *rest),
         )  # fmt: skip
-        computed = Computed(made, (*parts, column), values, column.call())
+        slopes = Computed(made, (*one.parts, one.function), one.values, one.function.call())
         told = f"By {width} columns, each: {told[0].lower()}{told[1:]}"
     out = (("A_q", NQ), ("A_qd", NQ), *([("B", plain.NU)] if inputs else []))
     arguments = plain.usual(*plain.state, "u", "p")
@@ -158,7 +138,7 @@ def linearization(plain: Plain) -> Slopes | None:
         real=plain.real,
         inputs=inputs,
         width=width,
-        slopes=computed,
+        slopes=slopes,
         linearization=CFunction(
             f"{plain.prefix}_linearization",
             plain.status,
@@ -167,7 +147,7 @@ def linearization(plain: Plain) -> Slopes | None:
         ),
         unread=tuple(a.name for a in arguments if a.name not in read),
         signal_call=plain.signal.call(u="now") if reads_u and plain.signal else "",
-        slopes_call=made.call(),
+        slopes_call=slopes.function.call(),
     )
 
 
@@ -341,23 +321,11 @@ def loop(plain: Plain, m: Method) -> Loop:
     count, row_count = CArgument("long", "count"), CArgument("long", "row_count")
     memory = CArgument(f"{P}_{m.name}_memory *", "memory")
     status = CArgument(f"{plain.status} *", "status")
+    held = strides[:1] if has_u else []
     run = CFunction(
-        f"{P}_{m.name}_run",
-        "long",
-        (
-            *state,
-            *t0,
-            h,
-            first,
-            steps,
-            *u,
-            *(strides[:1] if has_u else []),
-            *rows,
-            *p,
-            memory,
-            status,
-        ),
-    )
+        f"{P}_{m.name}_run", "long",
+        (*state, *t0, h, first, steps, *u, *held, *rows, *p, memory, status),
+    )  # fmt: skip
     batch = CFunction(
         f"{P}_{m.name}_batch",
         "void",

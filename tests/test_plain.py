@@ -33,7 +33,7 @@ NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
 WISHES = {
     "steppers": ("cartpole", STEPPERS + 'linearize = "parameters"\n'),
     "driven": ("cartpole_driven", STEPPERS + "linearize = true\n"),
-    "verlet": ("double_pendulum", 'method = ["rk4", "dp8"]\nbatch = true\n'),
+    "verlet": ("kepler_orbit", 'method = ["rk4", "euler", "verlet"]\nbatch = true\n'),
     "many": ("cartpole_driven", 'batch = true\nmethod = ["rk4", "dp8"]\n'),
     "single": ("suspension", 'real = "float"\nlinearize = true\nmethod = ["rk4", "gauss4"]\n'),
     "everything": ("", 'method = ["rk4", "dp8", "euler"]\n'),
@@ -220,12 +220,11 @@ def test_a_run_is_its_steps_bit_by_bit_however_it_is_cut() -> None:
 def test_a_batch_is_a_loop_over_instances(name: str) -> None:
     fast, plain = both(name)
     random = np.random.default_rng(5)
-    q0, qd0 = random.standard_normal((2, 9, 2))
-    q0[4] = np.nan  # one that cannot go on, and leaves the others alone
+    q0, qd0 = (x + 0.1 * random.standard_normal((9, 2)) for x in fast.start)
+    qd0[4] = 1e300  # one that may not go on, and leaves the others alone
     for method in fast.methods:
         given: dict[str, Any] = {"steps": 30, "every": 10, "method": method}
-        q = np.where(np.isnan(q0), 1e300, q0)
-        one, other = (m.simulate_batch(q, qd0, **given) for m in (fast, plain))
+        one, other = (m.simulate_batch(q0, qd0, **given) for m in (fast, plain))
         good = np.arange(9) != 4
         np.testing.assert_allclose(other.q[good], one.q[good], rtol=1e-9, atol=1e-9)
         assert np.array_equal(one.status, other.status)
@@ -355,7 +354,7 @@ def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.slow
 def test_a_chain_of_thirty_links_by_columns(tmp_path: Path) -> None:
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
-    text = re.sub(r"^n *= .*", "n = 30", text, flags=re.MULTILINE)
+    text = text.replace("n = { value = 5,", "n = { value = 30,")
     text = re.sub(r"^name *= .*", 'name = "plain_links"', text, count=1, flags=re.MULTILINE)
     text = text.replace("[run]\n", "[run]\nlinearize = true\n")
     links = system.from_scene(scene.parse(text, "plain_links.toml"))
