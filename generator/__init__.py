@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from eomc.problems import EomcError, SceneError
 
@@ -89,11 +89,14 @@ def build(
     scene: ScenePath | System,
     root: ScenePath = "build",
     *,
+    form: Literal["fast", "plain"] = "fast",
     warn: Callable[[Problem], None] | None = None,
 ) -> Built:
     """The compiled module of a scene file or a System, in `root`/<name>/.
 
-    Nothing is derived or compiled where nothing has changed. warn is called with each warning.
+    Nothing is derived or compiled where nothing has changed. form: of the C that it is compiled
+    from; that from "plain" is for comparison and lies in `root`/<name>/.plain/. warn is called with
+    each warning.
     Raises SceneError for a faulty scene, EomcError for what else fails.
     """
     from eomc import compile as compiler
@@ -104,9 +107,9 @@ def build(
     else:
         made = None
         name, digest = name_and_digest(Path(scene))
-    wanted = compiler.key(digest)
-    if name and compiler.found(Path(root) / name, wanted):
-        return compiler.Built(name, Path(root) / name, False)
+    wanted = compiler.key(digest, form)
+    if name and compiler.found(folder := compiler.place(name, Path(root), form), wanted):
+        return compiler.Built(name, folder, False)
     if made is None:
         assert isinstance(scene, (str, os.PathLike))
         made = read(scene)
@@ -114,7 +117,7 @@ def build(
     def texts(extension: str) -> Sources:
         return sources(made, extension, warn=warn)
 
-    return compiler.build(made.name, wanted, texts, Path(root))
+    return compiler.build(made.name, wanted, texts, Path(root), form)
 
 
 def _refuse_other(scene: object, root: object) -> None:
@@ -132,16 +135,17 @@ def load(
     scene: ScenePath | System,
     root: ScenePath = "build",
     *,
+    form: Literal["fast", "plain"] = "fast",
     warn: Callable[[Problem], None] | None = None,
 ) -> ModuleType:
-    """The compiled module of a scene, built where it is not there yet, imported.
+    """The compiled module of a scene, built where it is not there yet, imported. As `build`.
 
     >>> cartpole = load("scenes/cartpole.toml")     # doctest: +SKIP
     >>> cartpole.simulate(duration=1.0).q[-1]       # doctest: +SKIP
     """
     from eomc import compile as compiler
 
-    return compiler.load(build(scene, root, warn=warn))
+    return compiler.load(build(scene, root, form=form, warn=warn))
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:

@@ -152,14 +152,24 @@ class Report:
         }
 
 
-def check(system: System, module: Any, *, seed: int = 0, states: int | None = None) -> Report:
+def check(
+    system: System, module: Any, *, plain: Any = None, seed: int = 0, states: int | None = None
+) -> Report:
     """Test the compiled `module` of `system` at random states and parameters.
 
+    plain: the same compiled from plain C, which is compared with the reference and with `module`.
     states: how many, by default as many as take seconds. Always the same states for the same
     seed. A module that raises fails the row, which shows its words. Raises EomcError where
     `reference.of` does.
     """
-    return _Check(system, module, np.random.default_rng(seed), states).report()
+    from eomc import check_plain
+
+    made = Comparison(system, module, np.random.default_rng(seed), states)
+    report = made.report()
+    if plain is None or not made.expected:
+        return report
+    check_plain.rows(made, plain)
+    return replace(report, rows=tuple(made.rows))
 
 
 # --- states ---------------------------------------------------------------------------------------
@@ -176,14 +186,14 @@ class State:
     params: Mapping[str, float] | None = None
 
 
-def _ask(module: Any, name: str, s: State) -> Vector:
+def ask(module: Any, name: str, s: State) -> Vector:
     """The module's value of that name."""
     place = (s.q,) if name in ("D", "g", "potential_energy") else (s.q, s.qd)
     inputs = {"u": s.u} if name in ("tau", "power", "acceleration") else {}
     return np.asarray(getattr(module, name)(*place, t=s.t, params=s.params, **inputs), float)
 
 
-def _nudged(s: State, defaults: Mapping[str, float]) -> list[State]:
+def nudged(s: State, defaults: Mapping[str, float]) -> list[State]:
     """The state with one input after the other changed by a small part of itself."""
     found = []
     for field in ("q", "qd", "u"):
@@ -224,7 +234,7 @@ def _stacked(states: Sequence[State], defaults: Mapping[str, float]) -> dict[str
 
 
 @dataclass(frozen=True)
-class _Expected:
+class Expected:
     """The reference's values at a state, and the sizes that errors are measured against."""
 
     state: State
@@ -253,9 +263,9 @@ class _Sampler:
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
         self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
 
-    def states(self, count: int) -> list[_Expected]:
+    def states(self, count: int) -> list[Expected]:
         """The start, some states with the parameters' defaults, then all at random."""
-        found: list[_Expected] = []
+        found: list[Expected] = []
         nearness = 1.0  # every rejection moves the next draw closer to the start
         for attempt in range(20 * count):
             if len(found) == count:
@@ -301,7 +311,7 @@ class _Sampler:
         least, most = np.min(np.abs(eigenvalues)), np.max(np.abs(eigenvalues))
         return bool(least * CONDITION_LIMIT > most and (s.params is None or eigenvalues[0] > 0))
 
-    def expected(self, s: State) -> _Expected | None:
+    def expected(self, s: State) -> Expected | None:
         """The reference's values and their sizes; None where something is not finite."""
         value: dict[str, Vector] = {}
         reach: dict[str, Vector] = {}
@@ -328,7 +338,7 @@ class _Sampler:
             "motion": inertia @ np.abs(qdd) + force,
         }
         size["acceleration"] = np.abs(np.linalg.inv(D)) @ size["motion"]
-        return _Expected(s, value, size)
+        return Expected(s, value, size)
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
         """K + P and its size."""
@@ -342,7 +352,7 @@ class _Sampler:
         Where there are many inputs the sum is the root of that of the squares, from DRAWS changes
         of all at once: no larger, and smaller by the root of their number at most.
         """
-        near = _nudged(s, self.defaults)
+        near = nudged(s, self.defaults)
         many = len(near) > MOST_NUDGES
         if many:
             near = [_shaken(s, self.defaults, self.random) for _ in range(DRAWS)]
@@ -370,7 +380,7 @@ def _rows(run: Any, s: State) -> list[State]:
 # --- rows -----------------------------------------------------------------------------------------
 
 
-class _Check:
+class Comparison:
     """All rows of one report."""
 
     def __init__(
@@ -506,7 +516,7 @@ class _Check:
         found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
         return ", ".join(sorted(found))
 
-    def largest(self, of: Callable[[_Expected], float]) -> float:
+    def largest(self, of: Callable[[Expected], float]) -> float:
         """The largest error over all states; nan wins."""
         return float(np.max([of(e) for e in self.expected]))
 
@@ -530,7 +540,7 @@ class _Check:
     def value(self, name: str) -> float:
         """One of VALUES or the acceleration."""
         return self.largest(
-            lambda e: self.units(_ask(self.module, name, e.state), e.value[name], e.size[name])
+            lambda e: self.units(ask(self.module, name, e.state), e.value[name], e.size[name])
         )
 
     def steps(self) -> float:
@@ -540,7 +550,7 @@ class _Check:
         def reference(**rows: Any) -> Vector:
             return np.stack(self.reference.step(h=h, **rows), axis=1)
 
-        def error(e: _Expected) -> float:
+        def error(e: Expected) -> float:
             s = e.state
             with np.errstate(all="ignore"):
                 expected, size = self.sampler.reach(reference, s)
@@ -550,20 +560,20 @@ class _Check:
             gain = h * e.size["acceleration"]
             return self.units(found, expected, size + np.array([h * (np.abs(s.qd) + gain), gain]))
 
-        return float(np.max([error(e) for e in self._few(self.effort.few)]))
+        return float(np.max([error(e) for e in self.few(self.effort.few)]))
 
     def step_by(self, method: str) -> float | Finding:
         """One step of a method from a few states, by its tableau on the reference's accelerations.
 
         Shorter than the scene's h where the stages of an implicit one are else not found.
         """
-        errors = [self._step_by(method, e) for e in self._few(self.effort.few)]
+        errors = [self._step_by(method, e) for e in self.few(self.effort.few)]
         known = [x for x in errors if not math.isnan(x)]
         if known:
             return max(known)
         return Finding(math.nan, "no step from any state is finite")
 
-    def _step_by(self, method: str, e: _Expected) -> float:
+    def _step_by(self, method: str, e: Expected) -> float:
         """nan where there is no such step, in the reference or in the module."""
         s, gain = e.state, e.size["acceleration"]
         for h in (part * self.system.run.h for part in SHORTER):
@@ -588,7 +598,7 @@ class _Check:
 
     def runs(self) -> float:
         """A short run from the start, and one from a random state with random parameters."""
-        return float(np.max([self._run(e.state) for e in self._few(2)]))
+        return float(np.max([self._run(e.state) for e in self.few(2)]))
 
     def _run(self, s: State, h: float = 0.0, steps: int = 0) -> float:
         """As far as a difference at the start, in units of the spread, grows by GROWTH_LIMIT."""
@@ -619,7 +629,7 @@ class _Check:
 
     def run_energy(self) -> float:
         """The energy that a run reports, at the states that it reports."""
-        s = self._few(2)[-1].state
+        s = self.few(2)[-1].state
         run = self._simulate(s, steps=2)
         errors = []
         for row, found in zip(_rows(run, s), run.energy, strict=True):
@@ -630,9 +640,9 @@ class _Check:
 
     def ask(self, name: str, s: State) -> Vector:
         """The module's value of that name."""
-        return _ask(self.module, name, s)
+        return ask(self.module, name, s)
 
-    def _few(self, count: int) -> list[_Expected]:
+    def few(self, count: int) -> list[Expected]:
         """Some of the states: the first ones and the last ones."""
         half = count // 2
         return self.expected[:half] + self.expected[half:][-half:]
@@ -646,8 +656,8 @@ class _Check:
     def symmetry(self) -> float:
         """D = D^T."""
 
-        def error(e: _Expected) -> float:
-            D = _ask(self.module, "D", e.state)
+        def error(e: Expected) -> float:
+            D = ask(self.module, "D", e.state)
             return self.units(D, D.T, e.size["D"])
 
         return self.largest(error)
@@ -655,8 +665,8 @@ class _Check:
     def definiteness(self) -> float:
         """The least eigenvalue of D_ij / sqrt(D_ii D_jj) over all states."""
 
-        def least(e: _Expected) -> float:
-            D = _ask(self.module, "D", e.state)
+        def least(e: Expected) -> float:
+            D = ask(self.module, "D", e.state)
             diagonal = np.diag(D)
             if np.any(diagonal <= 0):
                 return float(np.min(diagonal))
@@ -672,13 +682,13 @@ class _Check:
         """
         stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 
-        def error(e: _Expected) -> float:
+        def error(e: Expected) -> float:
             s = e.state
             rate = np.max(np.abs(s.qd) / self.sampler.spread) or 1.0
-            C = _ask(self.module, "C", s)
+            C = ask(self.module, "C", s)
 
             def along(qd: Vector, width: float) -> Vector:
-                at = (_ask(self.module, "D", replace(s, q=s.q + k * width * qd, t=s.t + k * width))
+                at = (ask(self.module, "D", replace(s, q=s.q + k * width * qd, t=s.t + k * width))
                       for n, _ in stencil for k in (n, -n))  # fmt: skip
                 return sum((w * (next(at) - next(at)) for _, w in stencil), 0 * C) / width
 
@@ -694,8 +704,8 @@ class _Check:
     def bias(self) -> float:
         """bias = C qd + g."""
 
-        def error(e: _Expected) -> float:
-            bias, C, g = (_ask(self.module, name, e.state) for name in ("bias", "C", "g"))
+        def error(e: Expected) -> float:
+            bias, C, g = (ask(self.module, name, e.state) for name in ("bias", "C", "g"))
             return self.units(C @ e.state.qd + g, bias, e.size["bias"])
 
         return self.largest(error)
@@ -703,9 +713,9 @@ class _Check:
     def motion(self) -> float:
         """D qdd + bias = tau."""
 
-        def error(e: _Expected) -> float:
+        def error(e: Expected) -> float:
             names = ("D", "acceleration", "bias", "tau")
-            D, qdd, bias, tau = (_ask(self.module, name, e.state) for name in names)
+            D, qdd, bias, tau = (ask(self.module, name, e.state) for name in names)
             return self.units(D @ qdd + bias, tau, e.size["motion"])
 
         return self.largest(error)

@@ -23,7 +23,7 @@ from eomc.assembly import WORLD, Assembly, Body, Damper, Spring
 from eomc.formulas import Formula
 
 if TYPE_CHECKING:
-    from eomc.check import State, _Check, _Expected
+    from eomc.check import Comparison, Expected, State
     from eomc.scene import Scene
 
 LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
@@ -49,7 +49,7 @@ _MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
 class Bodies:
     """The rows."""
 
-    def __init__(self, check: _Check, scene: Scene) -> None:
+    def __init__(self, check: Comparison, scene: Scene) -> None:
         self.check, self.scene = check, scene
 
     def report(self) -> None:
@@ -61,9 +61,9 @@ class Bodies:
 
     def compare(self, name: str) -> float:
         """The largest difference over the states, of each with the line that suits it best."""
-        return float(np.max([self.off(name, e) for e in self.check._few(STATES)]))
+        return float(np.max([self.off(name, e) for e in self.check.few(STATES)]))
 
-    def off(self, name: str, e: _Expected) -> float:
+    def off(self, name: str, e: Expected) -> float:
         """The difference at one state, in parts of its size; nan where nothing can be compared."""
         s, found = e.state, []
         rate = float(np.max(np.abs(s.qd) / self.check.sampler.spread)) or 1.0

@@ -12,10 +12,10 @@ from eomc.check_runs import Runs
 from eomc.check_slopes import Slopes
 
 if TYPE_CHECKING:
-    from eomc.check import _Check
+    from eomc.check import Comparison
 
 
-def compiled_rows(check: _Check) -> None:
+def compiled_rows(check: Comparison) -> None:
     """Add the rows about runs, refusals and, where the module has them, batches."""
     runs, refusals = Runs(check), Refusals(check)
     runs.report()

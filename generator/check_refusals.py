@@ -19,7 +19,7 @@ from eomc.check_runs import drive, parameters
 from eomc.steppers import METHODS
 
 if TYPE_CHECKING:
-    from eomc.check import State, _Check
+    from eomc.check import Comparison, State
 
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE = range(4)
 WORDS = ("ok", "singular", "not finite", "no convergence")
@@ -34,7 +34,7 @@ MARK = -7.0  # what is to be left alone
 class Refusals:
     """The rows."""
 
-    def __init__(self, check: _Check) -> None:
+    def __init__(self, check: Comparison) -> None:
         self.check, self.module, self.model = check, check.module, check.module._model
         self.random = np.random.default_rng(8)
         self.defaults = check.sampler.defaults
@@ -108,7 +108,7 @@ class Refusals:
     def places(self) -> list[State]:
         """Where a D may be singular: at the start, upright, level, and anywhere."""
         own = self.check.sampler.start
-        drawn = [e.state for e in self.check._few(4)[1:]]
+        drawn = [e.state for e in self.check.few(4)[1:]]
         states = [own, *drawn]
         for at in (0.0, math.pi / 2, math.pi):
             states.append(replace(own, q=np.full(len(own.q), at)))
@@ -197,7 +197,7 @@ class Refusals:
 
     def odd(self) -> float:
         """How many functions take a number for granted that is none, or infinite."""
-        s, wrong = self.check._few(2)[-1].state, 0
+        s, wrong = self.check.few(2)[-1].state, 0
         for field in ("q", "qd"):
             for i in range(len(s.q)):
                 for what in (math.nan, math.inf):
@@ -239,7 +239,7 @@ class Refusals:
 
     def overflow(self, method: str) -> float:
         """Steps so long that the state leaves the finite numbers, or no stages are found."""
-        s, wrong = self.check._few(2)[-1].state, 0
+        s, wrong = self.check.few(2)[-1].state, 0
         ended = []
         for power in (4, 8, 16, 40, 100, 160, 300):
             h = self.check.system.run.h * 10.0**power

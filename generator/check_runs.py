@@ -18,7 +18,7 @@ from eomc.answer import Vector
 from eomc.steppers import METHODS
 
 if TYPE_CHECKING:
-    from eomc.check import State, _Check
+    from eomc.check import Comparison, State
 
 STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps
 CUTS = (1, 2, 5, 38, 129, 130, 131, 177)
@@ -97,11 +97,11 @@ def drive(
 class Runs:
     """The rows."""
 
-    def __init__(self, check: _Check) -> None:
+    def __init__(self, check: Comparison) -> None:
         self.check, self.model = check, check.module._model
         self.h = check.system.run.h
         self.sampler, self.random = check.sampler, np.random.default_rng(7)
-        self.states = [e.state for e in check._few(2)]
+        self.states = [e.state for e in check.few(2)]
 
     def report(self) -> None:
         """Add them."""
@@ -141,7 +141,7 @@ class Runs:
 
     def sines(self) -> float:
         """D, g and bias all around the circle, where sines need all of their terms."""
-        e = self.check._few(2)[-1]
+        e = self.check.few(2)[-1]
         s, n = e.state, len(e.state.q)
         around = np.linspace(-np.pi, np.pi, ANGLES, endpoint=False)[:, None] + 0.01
         steps = self.random.permutation(n)  # so that angles are not all alike
@@ -174,7 +174,7 @@ class Runs:
         An angle is as exact as its last digit, so that a unit is that of the angle.
         """
         errors = []
-        for e in self.check._few(2):
+        for e in self.check.few(2):
             s = e.state
             turns = 2 * np.pi * np.round(TURNS / 2 / np.pi) * self.sampler.angles
             t = LATE if self.model._timed else 0.0
@@ -267,7 +267,7 @@ class Runs:
         alone. The median of some states: where a difference grows fast, rounding does too.
         """
         found, T = [], 2 * self.h
-        for e in self.check._few(4):
+        for e in self.check.few(4):
             s, gain = replace(e.state, u=None), T * e.size["acceleration"]
             one, other = (
                 drive(self.model, method, s, self.h / n, 2 * n, every=2 * n) for n in FINE

@@ -13,7 +13,7 @@ import numpy as np
 from eomc.answer import Vector
 
 if TYPE_CHECKING:
-    from eomc.check import State, _Check
+    from eomc.check import Comparison, State
 
 LIMIT = 1e-6  # of what changes by all of the spread would make; differences are good to 1e-9
 STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
@@ -23,7 +23,7 @@ WIDTHS = (0.03, 0.003, 3e-4)  # of the differences, in parts of the spread
 class Slopes:
     """The rows."""
 
-    def __init__(self, check: _Check) -> None:
+    def __init__(self, check: Comparison) -> None:
         self.check, self.module, self.model = check, check.module, check.module._model
 
     def report(self) -> None:
@@ -35,7 +35,7 @@ class Slopes:
 
     def largest(self, of: Callable[[State], float]) -> float:
         """The largest error over some states."""
-        return float(np.max([of(e.state) for e in self.check._few(6)]))
+        return float(np.max([of(e.state) for e in self.check.few(6)]))
 
     def held(self, s: State) -> State:
         """The state with its inputs held, as derivatives take them."""

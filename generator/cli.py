@@ -231,7 +231,7 @@ def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> Non
     \b
     eomc build scenes/cartpole.toml
     PYTHONPATH=build python -c "import cartpole; print(cartpole.simulate())"
-    cd build/cartpole && cc -std=c99 -O2 main.c cartpole.c -lm && ./a.out
+    cd build/cartpole && cc -std=c99 -O2 -I. main.c cartpole.c -lm && ./a.out
     """
     named: dict[str, Path] = {}
     for scene in scenes:
@@ -270,6 +270,8 @@ def build(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> Non
 def check(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: bool) -> None:
     """Compare the compiled module with the pure-Python reference, and test what must hold.
 
+    So too the plain form of C, compiled for this; the first time in some seconds.
+
     \b
     eomc check scenes/*.toml
     """
@@ -279,7 +281,8 @@ def check(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json: b
     with _progress("checking", quiet or as_json) as progress:
         for k, scene in enumerate(scenes):
             system = eomc.read(scene)
-            report = checked(system, eomc.load(scene, root, warn=_warn), seed=seed)
+            module, plain = eomc.load(scene, root, warn=_warn), eomc.load(scene, root, form="plain")
+            report = checked(system, module, plain=plain, seed=seed)
             progress(k + 1, len(scenes))
             reports.append(report)
             if not as_json and not (quiet and report.passed):

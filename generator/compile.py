@@ -40,6 +40,9 @@ FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-
 STANDARD = "-std=gnu99"  # c99 would forbid the contraction to FMA
 MANIFEST = "build.json"
 _NO_LOCK = "{}: is no file, and builds of a scene lock one there: remove it"
+FORMS = ("fast", "plain")  # of C; the fast one, what modules are compiled from, lies in fast/
+# the plain one as it is embedded: any compiler, no processor of its own
+PLAIN_STANDARD, PLAIN_FLAGS = "-std=c99", ("-O2",)
 # operations over which gcc takes some twenty seconds (0.3 ms each, in pieces) and clang two thirds
 MANY = 60_000
 
@@ -106,8 +109,8 @@ def _identity(path: str) -> str:
     return f"{real} {state.st_size} {state.st_mtime_ns}"
 
 
-def flags(wide: bool = False) -> tuple[str, ...]:
-    """The optimisation flags: $EOMC_CFLAGS where it is set, FLAGS otherwise.
+def flags(form: str = "fast", wide: bool = False) -> tuple[str, ...]:
+    """The optimisation flags: $EOMC_CFLAGS where it is set, else those of the form of C.
 
     wide: for batches and stage-parallel methods, which take 1.1 to 1.7 times as long in half of
     AVX-512's registers. Straight-line code is shorter there: a chain of five takes 0.85 of the
@@ -116,9 +119,15 @@ def flags(wide: bool = False) -> tuple[str, ...]:
     given = os.environ.get("EOMC_CFLAGS")
     if given is not None:
         return tuple(_words("EOMC_CFLAGS", given))
+    if form == "plain":
+        return PLAIN_FLAGS
     if "avx512f" not in _processor():
         return FLAGS
     return (*FLAGS, f"-mprefer-vector-width={512 if wide else 256}")
+
+
+def _standard(form: str) -> str:
+    return PLAIN_STANDARD if form == "plain" else STANDARD
 
 
 @lru_cache(maxsize=1)
@@ -149,12 +158,13 @@ def _generator_digest() -> str:
     return total.hexdigest()
 
 
-def key(scene_digest: str, options: str = "") -> str:
-    """The digest of all that a build hangs on: scene, generator, flags, compiler, processor."""
+def key(scene_digest: str, form: str = "fast") -> str:
+    """The digest of all that a build depends on: scene, generator, flags, compiler, processor."""
     small, large = compiler_for(0), compiler_for(MANY + 1)
     parts = (
-        scene_digest, options, _generator_digest(), small.identity, large.identity,
-        STANDARD, *flags(), _processor(), sys.version, str(sysconfig.get_config_var("EXT_SUFFIX")),
+        scene_digest, form, _generator_digest(), small.identity, large.identity,
+        STANDARD, *flags(form), _processor(), sys.version,
+        str(sysconfig.get_config_var("EXT_SUFFIX")),
     )  # fmt: skip
     # a variable of the environment may hold bytes that are no text
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()
@@ -184,31 +194,38 @@ def build(
     wanted: str,
     sources: Callable[[str], Sources],
     root: Path,
+    form: str = "fast",
 ) -> Built:
     """The module of one scene under `root`, built where it isn't there yet.
 
     wanted: the key. sources: makes the files, given the name of the extension; called only where
-    something is to be built.
+    something is to be built. form: of the C that it is compiled from.
     Raises EomcError where the compiler fails, with its own words, or the folder can't be written.
     """
-    folder = root / name
+    folder = place(name, root, form)
+    root = folder.parent
     if found(folder, wanted):
         return Built(name, folder, False)
     try:
         root.mkdir(parents=True, exist_ok=True)
-        with _locked(root / f".{name}.lock"):
+        with _locked(root / f".{folder.name}.lock"):
             if found(folder, wanted):  # by another process, meanwhile
                 return Built(name, folder, False)
             _free(folder)
-            for left in root.glob(f".{name}.build-*"):  # by a build that was killed
+            for left in root.glob(f".{folder.name}.build-*"):  # by a build that was killed
                 shutil.rmtree(left, ignore_errors=True)
-            with tempfile.TemporaryDirectory(dir=root, prefix=f".{name}.build-") as beside:
-                _build(name, wanted, sources, folder, Path(beside))
+            with tempfile.TemporaryDirectory(dir=root, prefix=f".{folder.name}.build-") as beside:
+                _build(name, wanted, sources, folder, Path(beside), form)
     except OSError as fault:
         raise FolderError(
             f"{fault.filename or folder}: can't be written ({fault.strerror})"
         ) from None
     return Built(name, folder, True)
+
+
+def place(name: str, root: Path, form: str = "fast") -> Path:
+    """The folder of a scene's module; that of the plain form, for comparison, lies inside it."""
+    return root / name if form == "fast" else root / name / ".plain"
 
 
 @contextmanager
@@ -251,27 +268,30 @@ def _build(
     sources: Callable[[str], Sources],
     folder: Path,
     beside: Path,
+    form: str,
 ) -> None:
     extension = f"_{name}_{wanted[:12]}"
     made = sources(extension)
     for file, text in made.files.items():
+        (beside / file).parent.mkdir(exist_ok=True)
         # the name of a scene's file may be no text
         (beside / file).write_text(text, encoding="utf-8", errors="backslashreplace")
     library = extension + str(sysconfig.get_config_var("EXT_SUFFIX"))
     compiler = compiler_for(made.operations)
-    _compile(made, extension, beside, library, compiler)
+    _compile(made, extension, beside, library, compiler, form)
     _try(name, extension, beside / library, compiler)
-    kept = [library, *made.files]
+    kept = [library, *(f for f in made.files if form == "fast" or f.endswith(".py"))]
     manifest = {
         "key": wanted,
         "name": name,
         "eomc": __version__,
         "compiler": " ".join(compiler.command),
-        "flags": " ".join((STANDARD, *flags(made.wide))),
+        "flags": " ".join((_standard(form), *flags(form, made.wide))),
         "files": {file: _digest(beside / file) for file in kept},
     }
     (beside / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    folder.mkdir(exist_ok=True)
+    for file in kept:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
     stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
     # the face last: until it is there, the old one is whole; the manifest after it
     for file in [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST]:
@@ -280,20 +300,23 @@ def _build(
         path.unlink(missing_ok=True)
 
 
-def _compile(made: Sources, extension: str, folder: Path, library: str, compiler: Compiler) -> None:
+def _compile(
+    made: Sources, extension: str, folder: Path, library: str, compiler: Compiler, form: str
+) -> None:
     import cffi
 
     name = made.name
     ffi = cffi.FFI()
     ffi.cdef(made.cdef)
     ffi.set_source(extension, made.binding, compiler_verbose=0)
-    ffi.emit_c_code(str(folder / "binding.c"))
+    at = "fast/" if form == "fast" else ""  # beside the header that the binding is to include
+    ffi.emit_c_code(str(folder / f"{at}binding.c"))
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
-    common = [*compiler.command, STANDARD, "-fPIC", "-fvisibility=hidden"]
+    common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
     jobs = [
-        [*common, *flags(made.wide), "-c", f"{name}.c", "-o", "scene.o"],
+        [*common, _standard(form), *flags(form, made.wide), "-c", f"{at}{name}.c", "-o", "scene.o"],
         # the wrapper's speed is that of the calls in it
-        [*common, "-O1", *include, "-c", "binding.c", "-o", "binding.o"],
+        [*common, STANDARD, "-O1", *include, "-c", f"{at}binding.c", "-o", "binding.o"],
     ]
     running = [(job, _start(job, folder)) for job in jobs]
     try:

@@ -38,24 +38,24 @@ def values(target: Target) -> dict[str, Any]:
         "real": real.name,
         "dtype": real.dtype,
         "lit": lambda text: text + real.suffix,
-        "stamp": _stamp(target),
+        "stamp": stamp(target),
         "handshake": f"0x{s.digest[:8]}u",
         "digest": s.digest,
-        "notes": [line for note in target.program.notes for line in textwrap.wrap(note, 92)],
-        "description": _description(target),
+        "notes": notes(target),
+        "description": description(target),
         "coordinates": [
             {"written": target.as_written(c.name), "enum": enum[c.name],
-             "words": _words(c.unit, c.note)}
+             "words": words(c.unit, c.note)}
             for c in s.coordinates
         ],
         "inputs": [
             {"written": target.as_written(i.name), "enum": enum[i.name],
-             "words": _words(i.unit, i.note)}
+             "words": words(i.unit, i.note)}
             for i in s.inputs
         ],
         "parameters": [
             {"name": p.name, "written": target.as_written(p.name),
-             "words": _words(p.unit, p.note), "value": target.literal(p.value),
+             "words": words(p.unit, p.note), "value": target.literal(p.value),
              "number": repr(p.value), "named": f"/* {p.name} */"}
             for p in s.parameters
         ],
@@ -67,7 +67,7 @@ def values(target: Target) -> dict[str, Any]:
         "m": len(s.inputs),
         "functions": evaluations,
         "names": target.names,
-        "solved": _solved(target),
+        "solved": solved(target),
         "run": s.run,
         "indent": indent,
         "broken": lambda text: "\n".join(ccode.broken(text)),
@@ -89,7 +89,7 @@ def values(target: Target) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _stamp(target: Target) -> list[FreeText]:
+def stamp(target: Target) -> list[FreeText]:
     """What made the file from what, and the command; no date."""
     s = target.system
     source = s.file.replace("\\", "/").rsplit("/", 1)[-1]
@@ -103,7 +103,13 @@ def _stamp(target: Target) -> list[FreeText]:
     ]
 
 
-def _description(target: Target) -> list[FreeText]:
+def notes(target: Target) -> list[str]:
+    """Where unusual terms of K went, as lines of a comment."""
+    return [line for note in target.program.notes for line in textwrap.wrap(note, 92)]
+
+
+def description(target: Target) -> list[FreeText]:
+    """The scene's note and the names that were mapped, as lines of a comment."""
     s = target.system
     lines = textwrap.wrap(flat(s.note), 92) if s.note else []
     if lines:
@@ -114,7 +120,8 @@ def _description(target: Target) -> list[FreeText]:
     return list(map(FreeText, lines))
 
 
-def _words(unit: str, note: str) -> FreeText:
+def words(unit: str, note: str) -> FreeText:
+    """Unit and note of a coordinate, input or parameter."""
     return FreeText(", ".join(t for t in (line(unit), flat(note)) if t))
 
 
@@ -135,7 +142,7 @@ def _example(target: Target) -> dict[str, Any]:
     }
 
 
-def _solved(target: Target) -> list[str]:
+def solved(target: Target) -> list[str]:
     """How D qdd = tau - bias is solved, as lines of a comment."""
     program = target.program
     way = "D = L diag(d) L^T"

@@ -111,7 +111,7 @@ class _Ladder:
 
     @property
     def settled(self) -> float:
-        """The order that the last two halvings clear of rounding agree on; nan where they do not."""
+        """The order that the last two halvings clear of rounding agree on, else nan."""
         found = [p for p, clear in self.orders if clear]
         if len(found) < 2 or abs(found[-1] - found[-2]) > ALIKE:
             return math.nan
@@ -290,21 +290,21 @@ class Convergence:
                 return [], 0.0
             rows = zip(run.t, run.q, run.qd, strict=True)
             states = [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
-            power = np.array([self._ask("power", row) for row in states])
+            power = np.array([self.ask("power", row) for row in states])
             simpson = np.array([1, *(4, 2) * (n // 2 - 1), 4, 1]) * span / n / 3
-            after, before = (self._ask("jacobi", states[i]) for i in (-1, 0))
+            after, before = (self.ask("jacobi", states[i]) for i in (-1, 0))
             gaps.append(float(after - before - simpson @ power))
             energy = at.energy + float(
                 simpson @ np.abs(power)
                 + sum(
-                    np.abs(self._ask(name, states[i]))
+                    np.abs(self.ask(name, states[i]))
                     for name in ("kinetic_energy", "potential_energy")
                     for i in (0, -1)
                 )
             )
         return (gaps if np.all(np.isfinite(gaps)) else []), energy
 
-    def _ask(self, name: str, s: State) -> Vector:
+    def ask(self, name: str, s: State) -> Vector:
         """The module's value of that name."""
         place = (s.q,) if name == "potential_energy" else (s.q, s.qd)
         inputs = {"u": s.u} if name in ("power", "acceleration") else {}
@@ -376,7 +376,7 @@ class Convergence:
         """Whether accelerations hang on velocities."""
         s = self.places[-1].state
         still = replace(s, qd=0 * s.qd)
-        one, other = (self._ask("acceleration", x) for x in (s, still))
+        one, other = (self.ask("acceleration", x) for x in (s, still))
         return not np.array_equal(one, other)
 
     def _warns(self, method: str, s: State, h: float) -> bool:
@@ -413,7 +413,7 @@ class Convergence:
             by = np.zeros(2 * n)
             by[k] = LINEAR**0.5 * 1e-2 * self.scale.flat[k]
             ends = [
-                self._ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
+                self.ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
                 for moved in (x + by.reshape(2, n), x - by.reshape(2, n))
             ]
             A[n:, k] = (ends[0] - ends[1]) / (2 * by[k])

@@ -19,7 +19,8 @@ from eomc.target import Target, after, arguments
 RK4_BY = {"angles": "rk4_angles.c.jinja", "pairs": "rk4_pairs.c.jinja"}  # what makes it faster
 
 
-def _number(x: Fraction, real: Real) -> str:
+def literal(x: Fraction, real: Real) -> str:
+    """A coefficient as it is written in C."""
     return ccode.number(Rational(x.numerator, x.denominator), real)
 
 
@@ -29,7 +30,7 @@ def _nearest(x: Fraction, real: Real) -> Fraction:
     return Fraction(*struct.unpack(form, struct.pack(form, float(x))))
 
 
-def _rounded(weights: Row, real: Real) -> Row:
+def rounded(weights: Row, real: Real) -> Row:
     """The weights as they are in C, with their sum as it is: what it lacks would add up over steps.
 
     The smallest one takes what rounding left of the sum; of a symmetric method both of a pair.
@@ -86,21 +87,21 @@ def _explicit(m: Method, real: Real, faster: str, lane: Mapping[str, Any] | None
 
     def total(row: Row) -> str:
         terms = [(x, k + 1) for k, x in enumerate(row) if x]
-        text = " + ".join(f"{_number(x, real)}*a{k}.$" for x, k in terms).replace("+ -", "- ")
-        return text or _number(Fraction(0), real)
+        text = " + ".join(f"{literal(x, real)}*a{k}.$" for x, k in terms).replace("+ -", "- ")
+        return text or literal(Fraction(0), real)
 
     def lines(c: Fraction, positions: Row, velocities: Row) -> list[str]:
-        step = "h" if c == 1 else f"{_number(c, real)}*h"
+        step = "h" if c == 1 else f"{literal(c, real)}*h"
         return [
             f"r->$ = q->$ + ({step}*qd->$ + hh*({total(positions)}));",
             f"v->$ = qd->$ + h*({total(velocities)});",
         ]
 
     def time(c: Fraction) -> str:
-        return "t + h" if c == 1 else f"t + {_number(c, real)}*h"
+        return "t + h" if c == 1 else f"t + {literal(c, real)}*h"
 
     stages = [] if m is RK4 else list(zip(m.c, m.a_squared, m.a, strict=True))[1:]
-    first, half = m.c[0], _number(m.c[0], real)
+    first, half = m.c[0], literal(m.c[0], real)
     faster = faster if m is RK4 else ""
     lane_template = "rk4.c.jinja" if m is RK4 else "explicit.c.jinja"
     by_stages = m is RK4 and bool(lane and lane["one"])
@@ -117,7 +118,7 @@ def _explicit(m: Method, real: Real, faster: str, lane: Mapping[str, Any] | None
         "body": [{"lines": lines(c, *rows), "time": time(c)} for c, *rows in stages],
         "end": [
             f"r->$ = h*qd->$ + hh*({total(m.b_a)});",
-            f"v->$ = h*({total(_rounded(m.b, real))});",
+            f"v->$ = h*({total(rounded(m.b, real))});",
         ],
     }
 
@@ -143,7 +144,7 @@ def _implicit(
     )  # fmt: skip
 
     def matrix(rows: Sequence[Row]) -> list[str]:
-        return ["{ " + ", ".join(_number(x, real) for x in row) + " }," for row in rows]
+        return ["{ " + ", ".join(literal(x, real) for x in row) + " }," for row in rows]
 
     def total(matrix: str, of: str = "#") -> str:
         return " + ".join(f"{matrix}[{j}]*a[{j}][{of}]" for j in range(s))
@@ -151,8 +152,8 @@ def _implicit(
     def now(at: str, moving: str, time: str) -> str:
         return arguments("m", "h", at, moving, t and time, u, p)
 
-    last = [" + ".join(f"{_number(x, real)}*a[{j}][#]" for j, x in enumerate(row))
-            for row in (m.b_a, _rounded(m.b, real))]  # fmt: skip
+    last = [" + ".join(f"{literal(x, real)}*a[{j}][#]" for j, x in enumerate(row))
+            for row in (m.b_a, rounded(m.b, real))]  # fmt: skip
     return _about(m) | {
         "template": "gauss.c.jinja",
         "arguments": arguments(scalar["stepper_arguments"], own_p and target.p_arg, memory),
@@ -161,10 +162,10 @@ def _implicit(
         "factor_arguments": given,
         "factor_unread": [name for name in slopes["unread"] if name != "p" or p],
         "factor_now": now("at_now", "moving_now", "t"),
-        "factor_mid": now("mid_q", "mid_qd", f"t + {_number(Fraction(1, 2), real)}*h"),
+        "factor_mid": now("mid_q", "mid_qd", f"t + {literal(Fraction(1, 2), real)}*h"),
         "eps": repr(real.epsilon) + real.suffix,
         "nudge": repr(sqrt(real.epsilon)) + real.suffix,
-        "c": [_number(x, real) for x in m.c],
+        "c": [literal(x, real) for x in m.c],
         "A": matrix(m.a),
         "AA": matrix(m.a_squared),
         "ahead": matrix(m.ahead),
@@ -196,7 +197,7 @@ def _side_by_side(
 
     def by_stage(rows: Sequence[Row]) -> list[str]:
         columns = zip(*rows, strict=True)
-        return ["{ " + ", ".join(_number(x, real) for x in column) + " }," for column in columns]
+        return ["{ " + ", ".join(literal(x, real) for x in column) + " }," for column in columns]
 
     def total(terms: Sequence[str]) -> str:
         """In pairs, since a sum in a row would wait for each of its terms."""
@@ -208,8 +209,8 @@ def _side_by_side(
     def held(given: str) -> str:
         return after(t and "t + c_[i]*h", "&given", given, c, "&bad")
 
-    last = [total([f"{_number(x, real)}*a.x[#][{k}]" for k, x in enumerate(row)])
-            for row in (m.b_a, _rounded(m.b, real))]  # fmt: skip
+    last = [total([f"{literal(x, real)}*a.x[#][{k}]" for k, x in enumerate(row)])
+            for row in (m.b_a, rounded(m.b, real))]  # fmt: skip
     inputs = ", ".join(f"u ? u[{target.enum[n]}] : {target.zero}" for n in target.input_names)
     return _about(m) | {
         "template": "picard.c.jinja",
@@ -219,7 +220,7 @@ def _side_by_side(
         "inline": f"{target.PREFIX}_LANE" if lane else "static inline",
         "side_by_side": lane is not None,
         "sum": total([f"w[{k}][i]*a[{k}]" for k in range(s)]),
-        "c": [_number(x, real) for x in m.c],
+        "c": [literal(x, real) for x in m.c],
         "A": by_stage(m.a),
         "AA": by_stage(m.a_squared),
         "A_ahead": by_stage(m.a_ahead),

@@ -8,22 +8,26 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.resources import files
 from importlib.util import cache_from_source
 from pathlib import Path
 
 import jinja2
 
+from eomc import plain_steppers
 from eomc.ccode import REALS
 from eomc.cnames import borne
 from eomc.context import resource, values
 from eomc.pieces import weight
+from eomc.plain_views import View
 from eomc.program import Program
 from eomc.steppers import METHODS
 from eomc.target import Target
 from eomc.texts import docstring
 from eomc.texts import name as plain
+
+FAST = "fast"  # the folder of the form of C that the Python module is compiled from
 
 
 @dataclass(frozen=True)
@@ -93,11 +97,16 @@ def render(program: Program, extension: str) -> Sources:
     def text(template: str) -> str:
         return jinja.get_template(template + ".jinja").render(context)
 
+    def show(view: View) -> str:
+        given = {field.name: getattr(view, field.name) for field in fields(view)}
+        return jinja.get_template(view.TEMPLATE + ".jinja").render(given)
+
     return Sources(
         name=name,
         files={
-            f"{name}.h": text("header.h"),
-            f"{name}.c": text("source.c"),
+            **plain_steppers.files(program, show),
+            f"{FAST}/{name}.h": text("header.h"),
+            f"{FAST}/{name}.c": text("source.c"),
             "main.c": text("main.c"),
             "selftest.c": text("selftest.c"),
             "__init__.py": text("face.py"),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from eomc import names, scene, system
+from eomc.render import Sources
 
 DATA = Path(__file__).parent / "data" / "cases.json"
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -34,6 +35,13 @@ ALIKE = {
     "kepler_orbit": "kepler_e0.9_cartesian",
     "heavy_top": "lagrange_top_nutation",
 }
+
+
+def fast_kit(made: Sources) -> dict[str, str]:
+    """The generated files, the fast form's header and source in the place of the plain ones."""
+    flat = {f: text for f, text in made.files.items() if "/" not in f}
+    fast = {f.removeprefix("fast/"): text for f, text in made.files.items() if "/" in f}
+    return flat | fast
 
 
 @cache

@@ -190,7 +190,7 @@ class Bench:
         original = own.load()
         report = checking.check(self.system, original)
         assert report.passed, report.table()
-        self.states = checking._Check(self.system, original, np.random.default_rng(5), None)
+        self.states = checking.Comparison(self.system, original, np.random.default_rng(5), None)
         self._right: Vector | None = None
 
     @property

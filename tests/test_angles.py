@@ -13,7 +13,7 @@ from conftest import MODULES, ROOT, needs
 from sympy import Rational, S
 
 import eomc
-from cases import SCENES
+from cases import SCENES, fast_kit
 from eomc import mechanics, program, scene, system
 from eomc.angles import apart
 from eomc.steppers import METHODS
@@ -293,7 +293,7 @@ def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
 )
 def test_a_run_cut_in_c_is_the_same_to_the_last_bit(name: str, h: float, tmp_path: Path) -> None:
     """With the memory handed on; without it, sums begin anew. Near what was foretold, and not."""
-    for file, text in eomc.sources(eomc.read(SCENES / f"{name}.toml")).files.items():
+    for file, text in fast_kit(eomc.sources(eomc.read(SCENES / f"{name}.toml"))).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     main = r"""
         #include "NAME.h"
@@ -338,7 +338,7 @@ def test_a_memory_of_another_state_is_not_believed(method: str, tmp_path: Path) 
     (tmp_path / "cartpole.toml").write_text(
         text.replace("[run]\n", f'[run]\nmethod = "{method}"\n'), encoding="utf-8"
     )
-    for file, made in eomc.sources(eomc.read(tmp_path / "cartpole.toml")).files.items():
+    for file, made in fast_kit(eomc.sources(eomc.read(tmp_path / "cartpole.toml"))).items():
         (tmp_path / file).write_text(made, encoding="utf-8")
     main = r"""
         #include "cartpole.h"

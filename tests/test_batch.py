@@ -20,6 +20,7 @@ import pytest
 from conftest import needs
 
 import eomc
+from cases import fast_kit
 
 SCENES = Path(__file__).parent.parent / "scenes"
 STEPS = 60
@@ -482,7 +483,7 @@ def test_no_instances_in_c_read_nothing(tmp_path: Path) -> None:
     (tmp_path / "cartpole.toml").write_text(
         text.replace("[run]\n", "[run]\nbatch = true\n"), encoding="utf-8"
     )
-    for file, made in eomc.sources(eomc.read(tmp_path / "cartpole.toml")).files.items():
+    for file, made in fast_kit(eomc.sources(eomc.read(tmp_path / "cartpole.toml"))).items():
         (tmp_path / file).write_text(made, encoding="utf-8")
     call = "cartpole_rk4_batch(0, 0, 0, 0.01, 0, 5, 0, 0, 0, 0, 0, 1, 0, 0);"
     (tmp_path / "none.c").write_text(
@@ -555,7 +556,7 @@ def test_wrong_arguments_are_named(given: dict[str, Any], named: str) -> None:
 
 def test_only_scenes_that_ask_have_it() -> None:
     plain = eomc.sources(eomc.read(SCENES / "cartpole.toml"))
-    assert "batch" not in plain.files["cartpole.c"] and "batch.py" not in plain.files
+    assert "batch" not in plain.files["fast/cartpole.c"] and "batch.py" not in plain.files
 
 
 def test_single_precision() -> None:
@@ -578,7 +579,7 @@ def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     file = tmp_path / "cartpole.toml"
     file.write_text(text.replace("[run]\n", '[run]\nreal = "float"\nbatch = true\n'))
-    for name, content in eomc.sources(eomc.read(file)).files.items():
+    for name, content in fast_kit(eomc.sources(eomc.read(file))).items():
         (tmp_path / name).write_text(content, encoding="utf-8")
     told = subprocess.run(
         ["gcc", "-std=c99", "-O3", "-mavx2", "-mfma", "-fno-math-errno", "-fno-trapping-math",
@@ -601,9 +602,9 @@ def test_no_loop_over_a_tile_has_a_rest(tmp_path: Path) -> None:
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     scene.write_text(text.replace("[run]\n", "[run]\nbatch = true\n"), encoding="utf-8")
     sources = eomc.sources(eomc.read(scene))
-    for file, content in sources.files.items():
+    for file, content in fast_kit(sources).items():
         (tmp_path / file).write_text(content, encoding="utf-8")
-    text = sources.files[f"{sources.name}.c"]
+    text = fast_kit(sources)[f"{sources.name}.c"]
     rounded = "wide = (int)(m + CARTPOLE_BLOCK - 1) & -CARTPOLE_BLOCK"
     assert rounded in text
     (tmp_path / "blind.c").write_text(text.replace(rounded, "wide = (int)m"), encoding="utf-8")
@@ -625,7 +626,7 @@ def test_strict_compilers_have_no_complaint(name: str, real: str, tmp_path: Path
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
     run = f'[run]\nreal = "{real}"\nbatch = true\nmethod = ["rk4", "dp8"]\n'
     (tmp_path / "strict.toml").write_text(text.replace("[run]\n", run), encoding="utf-8")
-    for file, content in eomc.sources(eomc.read(tmp_path / "strict.toml")).files.items():
+    for file, content in fast_kit(eomc.sources(eomc.read(tmp_path / "strict.toml"))).items():
         (tmp_path / file).write_text(content, encoding="utf-8")
     warnings = "-Wall -Wextra -Wpedantic -Wconversion -Wdouble-promotion -Werror".split()
     for compiler in filter(shutil.which, ("gcc", "clang")):

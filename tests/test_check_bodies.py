@@ -30,7 +30,7 @@ def compared(text: str, states: int = 4) -> dict[str, float]:
     made = system.from_scene(scene.parse(text, "test.toml"))
     assert made.scene is not None
     module = StandIn(Jets(made))  # type: ignore[arg-type]  # which answers alike
-    check = checking._Check(made, module, np.random.default_rng(0), states)
+    check = checking.Comparison(made, module, np.random.default_rng(0), states)
     assert check.expected
     return {name: Bodies(check, made.scene).compare(name) for name in NAMES}
 

@@ -12,7 +12,7 @@ import pytest
 from conftest import EVERYTHING, MODULES, ROOT, needs
 
 import eomc
-from cases import scene_system
+from cases import fast_kit, scene_system
 from eomc import reference, scene, system, target
 from eomc.render import Sources
 from eomc.system import System
@@ -43,8 +43,8 @@ def generated(name: str) -> Sources:
 
 @pytest.fixture
 def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A folder with the generated files of a scene, as `eomc build` writes them."""
-    for file, text in generated(request.param).files.items():
+    """A folder with the generated files of a scene, the fast form in the place of the plain one."""
+    for file, text in fast_kit(generated(request.param)).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     return tmp_path
 
@@ -90,7 +90,7 @@ def test_strict_compilers_have_nothing_to_say(
     """Source, header, example and self-test, alone and together."""
     (kit / "header.c").write_text(f'#include "{name}.h"\n#include "{name}.h"\n')
     files = [f"{name}.c", "main.c", "selftest.c", "header.c"]
-    compiled(needs(compiler), *STRICT, level, "-c", *files, cwd=kit)
+    compiled(needs(compiler), *STRICT, level, "-I.", "-c", *files, cwd=kit)
 
 
 @kits
@@ -125,7 +125,7 @@ int main() {{
 
 def step_of(name: str) -> str:
     """The arguments of rk4_step, in one line."""
-    header = " ".join(generated(name).files[f"{name}.h"].split())
+    header = " ".join(fast_kit(generated(name))[f"{name}.h"].split())
     match = re.search(rf"{name}_rk4_step\(([^)]*)\);", header)
     assert match
     return match[1]
@@ -142,7 +142,7 @@ def test_the_example_prints_what_the_module_computes(
 
     Without FMA, gnu99, with which a module is compiled, and c99 give the same arithmetic.
     """
-    compiled("cc", "-std=c99", "-O2", "main.c", f"{name}.c", "-lm", cwd=kit)
+    compiled("cc", "-std=c99", "-O2", "-I.", "main.c", f"{name}.c", "-lm", cwd=kit)
     done = run("./a.out", cwd=kit)
     assert (done.returncode, done.stderr) == (0, "")
     columns, printed = table(done.stdout)
@@ -159,8 +159,8 @@ def test_the_example_prints_what_the_module_computes(
 def test_compilers_agree_to_the_last_bit(kit: Path, compiler: str) -> None:
     """On a processor's baseline, where nothing is contracted."""
     command = compiler.split()
-    compiled("cc", "-std=c99", "-O2", "main.c", "cartpole.c", "-lm", "-o", "one", cwd=kit)
-    files = ["main.c", "cartpole.c", "-lm", "-o", "two"]
+    compiled("cc", "-std=c99", "-O2", "-I.", "main.c", "cartpole.c", "-lm", "-o", "one", cwd=kit)
+    files = ["-I.", "main.c", "cartpole.c", "-lm", "-o", "two"]
     compiled(needs(command[0]), "-std=c99", *command[1:], *files, cwd=kit)
     assert run("./one", cwd=kit).stdout == run("./two", cwd=kit).stdout
 
@@ -168,7 +168,7 @@ def test_compilers_agree_to_the_last_bit(kit: Path, compiler: str) -> None:
 @kits
 def test_the_self_test_passes_and_finds_a_wrong_number(kit: Path, name: str) -> None:
     def outcome() -> tuple[int, str]:
-        compiled("cc", "-std=c99", "-O1", "selftest.c", f"{name}.c", "-lm", cwd=kit)
+        compiled("cc", "-std=c99", "-O1", "-I.", "selftest.c", f"{name}.c", "-lm", cwd=kit)
         done = run("./a.out", cwd=kit)
         return done.returncode, done.stdout
 
@@ -241,7 +241,7 @@ E = { start = 1 }
 [energy]
 kinetic = "E_dot**2/2"
 """
-    for file, content in eomc.sources(system.from_scene(scene.parse(text))).files.items():
+    for file, content in fast_kit(eomc.sources(system.from_scene(scene.parse(text)))).items():
         (tmp_path / file).write_text(content, encoding="utf-8")
     compiled("cc", "-std=gnu99", "-include", "math.h", "-c", "m.c", cwd=tmp_path)
 
@@ -260,7 +260,7 @@ def test_enumerators_are_none_of_our_own_macros() -> None:
 def test_coordinates_may_be_called_like_our_own_macros(name: str, tmp_path: Path) -> None:
     text = (ROOT / "scenes" / "cartpole.toml").read_text(encoding="utf-8")
     text = re.sub(r"\bx(?=\b|_dot)", name, text).replace("[run]\n", "[run]\nbatch = true\n")
-    for file, content in eomc.sources(system.from_scene(scene.parse(text))).files.items():
+    for file, content in fast_kit(eomc.sources(system.from_scene(scene.parse(text)))).items():
         (tmp_path / file).write_text(content, encoding="utf-8")
     program = f"""
         #include <stdio.h>
@@ -300,7 +300,7 @@ def test_what_is_not_wanted_is_not_there(kit: Path, name: str) -> None:
 @driven
 def test_two_scenes_in_one_program(kit: Path) -> None:
     """Prefixes keep them apart, in one translation unit too."""
-    for file, text in generated("kapitza_pendulum").files.items():
+    for file, text in fast_kit(generated("kapitza_pendulum")).items():
         if file.startswith("kapitza"):
             (kit / file).write_text(text, encoding="utf-8")
     (kit / "both.c").write_text(
@@ -328,7 +328,7 @@ def test_nothing_is_printed_that_could_have_lost_digits(kit: Path, name: str) ->
 
 def test_a_misuse_is_told_by_the_compiler(tmp_path: Path) -> None:
     """-ffast-math breaks the reduction of angles: it is refused, not silently wrong."""
-    for file, text in generated("cartpole").files.items():
+    for file, text in fast_kit(generated("cartpole")).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     done = run("cc", "-std=c99", "-O2", "-ffast-math", "-c", "cartpole.c", cwd=tmp_path)
     assert done.returncode != 0

@@ -15,7 +15,7 @@ import sympy
 from test_linearization import MODULES, variant
 
 import eomc
-from cases import cases, scene_text
+from cases import cases, fast_kit, scene_text
 from eomc import steppers
 from eomc.check import check
 from eomc.steppers import METHODS
@@ -52,7 +52,7 @@ def counted(path: Path, method: str, h: float, steps: int) -> tuple[int, list[fl
     """(accelerations evaluated, q and qd at the end, status) of a run of the generated C."""
     system = eomc.read(path)
     name, n = system.name, len(system.coordinates)
-    files = eomc.sources(system).files
+    files = fast_kit(eomc.sources(system))
     source = re.sub(
         rf"((?:static|[A-Z_]+_INLINE) (?:inline )?int {name}_solve(?:_at)?\([^)]*\)\n{{)",
         r"long evaluations;\n\1\n    evaluations++;", files[f"{name}.c"], count=1,

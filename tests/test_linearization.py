@@ -97,7 +97,7 @@ def test_a_long_chain_goes_column_by_column() -> None:
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace("n = { value = 5,", "n = { value = 9,"), encoding="utf-8")
     m = eomc.load(path, MODULES)
-    source = (MODULES / "lin_long" / "lin_long.c").read_text(encoding="utf-8")
+    source = (MODULES / "lin_long" / "fast" / "lin_long.c").read_text(encoding="utf-8")
     assert "lin_long_slopes_column" in source
     q, qd = m.start
     exact, near = linearization(m, q, qd + 0.3), differences(m, q, qd + 0.3, 0.0, [])

@@ -15,6 +15,7 @@ from conftest import Modules, needs
 from sympy import S
 
 import eomc
+from cases import fast_kit
 from eomc import mechanics, pairs, program, reference, scene, system
 from eomc.assignments import Assignment, Operand, Product, Sum
 from eomc.ccode import DOUBLE
@@ -179,9 +180,13 @@ def test_more_angles_than_coordinates(modules: Modules) -> None:
 
 def test_few_angles_and_light_configurations_stay_whole(modules: Modules) -> None:
     for name in ("cartpole", "double_pendulum", "tumbling_box", "suspension"):
-        source = (Path(modules(name).__file__).parent / f"{name}.c").read_text(encoding="utf-8")
+        source = (Path(modules(name).__file__).parent / "fast" / f"{name}.c").read_text(
+            encoding="utf-8"
+        )
         assert "_pair;" not in source
-    source = (Path(modules("chain").__file__).parent / "chain.c").read_text(encoding="utf-8")
+    source = (Path(modules("chain").__file__).parent / "fast" / "chain.c").read_text(
+        encoding="utf-8"
+    )
     assert "} chain_pair;" in source
 
 
@@ -273,7 +278,7 @@ def test_all_that_shares_it_agrees(text: str, modules: Modules) -> None:
 def test_it_is_faster_where_it_is_taken(tmp_path: Path) -> None:
     """The file says so in its head, and keeps no sines from step to step."""
     (tmp_path / "links.toml").write_text(chain(10), encoding="utf-8")
-    files = eomc.sources(eomc.read(tmp_path / "links.toml")).files
+    files = fast_kit(eomc.sources(eomc.read(tmp_path / "links.toml")))
     assert "Places are taken in pairs" in files["links10.c"]
     assert "angles s;" not in files["links10.h"]
 
@@ -315,16 +320,17 @@ def test_compilers_without_vectors_compute_the_same(text: str, tmp_path: Path) -
     """To the last bit: what is stored four at once, or interleaved, is only moved."""
     run = with_run(text, "plain_", "h = 0.01\nduration = 0.3")
     sources = eomc.sources(system.from_scene(scene.parse(run, "plain.toml")))
-    name, told = sources.name, []
+    files, name, told = fast_kit(sources), sources.name, []
     for macro in ("__GNUC__", "NO_VECTORS"):
-        for file, content in sources.files.items():
+        for file in (f"{name}.h", f"{name}.c", "main.c"):
+            content = files[file]
             plain = content.replace("#ifdef __GNUC__", f"#ifdef {macro}")
             (tmp_path / file).write_text(plain, encoding="utf-8")
         subprocess.run(
-            [needs("gcc"), "-std=c99", "-O2", "main.c", f"{name}.c", "-o", "run", "-lm"],
+            [needs("gcc"), "-std=c99", "-O2", "-I.", "main.c", f"{name}.c", "-o", "run", "-lm"],
             cwd=tmp_path, check=True,
         )  # fmt: skip
         done = subprocess.run(["./run"], cwd=tmp_path, capture_output=True, text=True, check=True)
         told.append(done.stdout)
-    assert "#ifdef __GNUC__" in sources.files[f"{name}.c"] and told[0].count("\n") == 32
+    assert "#ifdef __GNUC__" in files[f"{name}.c"] and told[0].count("\n") == 32
     assert told[0] == told[1]

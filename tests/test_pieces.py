@@ -18,7 +18,7 @@ from sympy import S
 from test_embedding import STRICT, compiled
 
 import eomc
-from cases import SCENES, scene_system
+from cases import SCENES, fast_kit, scene_system
 from eomc import compile as compiler
 from eomc import mechanics, pieces, program, scene, system
 from eomc.assignments import (
@@ -158,7 +158,7 @@ def test_the_cut_is_where_few_values_cross() -> None:
 
 def written(made: Sources, folder: Path) -> str:
     folder.mkdir(exist_ok=True)
-    for file, text in made.files.items():
+    for file, text in fast_kit(made).items():
         (folder / file).write_text(text, encoding="utf-8")
     return f"{made.name}.c"
 
@@ -185,13 +185,25 @@ def test_pieces_are_clean_for_strict_compilers(
     source = written(made, tmp_path)
     paired = "float" not in run and run != 'method = "dp8"'
     parts = ("_configuration_2(", "_motion_2(") if paired else ("_solve_4(",)
-    assert all(part in made.files[source] for part in (*parts, "_C_4("))
-    assert ("_solve_lane_4(" in made.files[source]) == ("batch" in run)
+    assert all(part in fast_kit(made)[source] for part in (*parts, "_C_4("))
+    assert ("_solve_lane_4(" in fast_kit(made)[source]) == ("batch" in run)
     for command in ("gcc", "clang"):
-        compiled(needs(command), *STRICT, "-O2", "-c", source, "selftest.c", "main.c", cwd=tmp_path)
+        compiled(
+            needs(command),
+            *STRICT,
+            "-O2",
+            "-I.",
+            "-c",
+            source,
+            "selftest.c",
+            "main.c",
+            cwd=tmp_path,
+        )
     strict = ["-std=c++11", *STRICT[1:], "-fsyntax-only"]
     compiled(needs("g++"), *strict, "-x", "c++", source, cwd=tmp_path)
-    compiled("cc", "-std=c99", "-O1", "selftest.c", source, "-lm", "-o", "selftest", cwd=tmp_path)
+    compiled(
+        "cc", "-std=c99", "-O1", "-I.", "selftest.c", source, "-lm", "-o", "selftest", cwd=tmp_path
+    )
     assert subprocess.run(["./selftest"], cwd=tmp_path, stdout=subprocess.DEVNULL).returncode == 0
 
 
@@ -301,7 +313,8 @@ def test_signals_and_held_inputs_reach_a_batch_in_pieces(
 ) -> None:
     made = scene_system("cartpole_driven")
     m = module(derived(replace(made, run=replace(made.run, batch=True))), tmp_path)
-    assert "_solve_lane_2(" in (tmp_path / made.name / f"{made.name}.c").read_text(encoding="utf-8")
+    source = tmp_path / made.name / "fast" / f"{made.name}.c"
+    assert "_solve_lane_2(" in source.read_text(encoding="utf-8")
     q0, qd0 = (np.tile(x, (9, 1)) for x in m.start)
     q0[:, 1] += np.linspace(-1, 1, 9)
     for u in (None, [0.5]):
@@ -351,7 +364,7 @@ def test_matrices_by_columns_are_the_matrices(
     made = render(by_columns(plain), "_x")
     source = written(made, tmp_path)
     assert f"By {len(plain.system.q)} columns, each: " in made.files[f"{name}.h"]
-    compiled(needs("gcc"), *STRICT, "-O2", "-c", source, "selftest.c", cwd=tmp_path)
+    compiled(needs("gcc"), *STRICT, "-O2", "-I.", "-c", source, "selftest.c", cwd=tmp_path)
     columns = module(by_columns(plain), tmp_path / "columns")
     states = np.random.default_rng(4).standard_normal((2, 9, len(plain.system.q)))
     for found, expected in (
