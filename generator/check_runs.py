@@ -33,9 +33,9 @@ FEW = 6  # long steps, or steps with a row of u each
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
 FAR = ("D", "g", "bias", "tau", "kinetic_energy", "potential_energy", "acceleration")
-FINE = (256, 2048)  # parts of h, of runs that differ by rounding alone
+FINE = (1024, 8192)  # parts of h, of runs that differ by rounding alone
 EXACT = 4  # order from which on their steps are short enough
-ROUNDED = 4.0  # units: compensated sums lose 0 or 1, plain ones some ten
+ROUNDED = 8.0  # units: compensated sums lose 0 or 1, plain ones some forty
 
 
 @dataclass(frozen=True)
