@@ -35,7 +35,7 @@ def changes(source: str) -> Iterator[Mutant]:
     """Each pivot left out; and each beside the size of a mass or of nothing in its place."""
     for match in PIVOT.finditer(source):
         start, end = match.span()
-        if source[source.rfind("\n", 0, start) : start].lstrip().startswith(("*", "/*")):
+        if source[source.rfind("\n", 0, start) : start].lstrip().startswith(("* ", "/*")):
             continue
         yield Mutant(start, end, "0")
         if match[3]:  # what would do for a D of another unit
@@ -66,7 +66,7 @@ def test_pivots_of_scenes(name: str, least: int, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "links, run, least", [(2, "", 2), (3, "", 3), (6, "", 6), (4, "batch = true", 5)]
+    "links, run, least", [(2, "", 2), (3, "", 3), (6, "", 6), (4, "batch = true", 4)]
 )
 def test_pivots_of_trees(links: int, run: str, least: int, tmp_path: Path) -> None:
     assert unnoticed(chain(links, run), f"rods{links}", tmp_path, least) == []
