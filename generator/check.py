@@ -45,6 +45,7 @@ NUDGE = 1e-6  # relative change of an input from which its influence is estimate
 MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 DRAWS = 8  # how often: the influence is known to a quarter of itself
+FARTHEST = 100.0  # of the spread: how far long steps may lead
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
 SHORTER = (1, 1 / 4, 1 / 16, 1 / 64)  # parts of the scene's h, until stages are found by sweeps
 
@@ -602,16 +603,22 @@ class Comparison:
 
     def _run(self, s: State, h: float = 0.0, steps: int = 0) -> float:
         """As far as a difference at the start, in units of the spread, grows by GROWTH_LIMIT."""
-        h = h or self.system.run.h
+        own = self.system.run.h
+        h = h or own
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
         spread = np.array([self.sampler.spread, self.sampler.speed])
 
-        q, qd = (np.array([x, x + NUDGE * by]) for x, by in zip((s.q, s.qd), spread, strict=True))
+        # of alternating signs, as what is rounded excites the fastest modes too
+        by = NUDGE * spread * (np.where(np.arange(len(s.q)) % 2, -1, 1) if h > own else 1)
+        q, qd = (np.array([x, x + d]) for x, d in zip((s.q, s.qd), by, strict=True))
         u = None if s.u is None else np.array([s.u, s.u])
         with np.errstate(all="ignore"):
             t, *found = self.reference.simulate(q, qd, h=h, steps=steps, u=u, params=s.params)
             x, y = np.moveaxis(np.stack(found, axis=1), 2, 0)
             growth = np.max(np.abs(y - x) / spread, axis=(1, 2)) / NUDGE
+        if h > own:  # long steps may blow up, and say nothing then
+            far = np.max(np.abs(x - x[:1]) / spread, axis=(1, 2))
+            growth = np.where(far < FARTHEST, growth, math.inf)
         growth = np.maximum.accumulate(growth)
         honest = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
         t, x, growth = t[:honest], x[:honest], growth[:honest, None, None]

@@ -198,7 +198,10 @@ class Batches:
         kept = rows[:, : done + 1]
         if not np.all(np.isfinite(kept)) or not np.all(np.isnan(rows[:, done + 1 :])):
             return True
-        if (status == 0) != (done == STEPS):
+        start = np.array([s.q, s.qd], rows.dtype)
+        if (status == 0) != (done == STEPS) or not np.array_equal(rows[:, 0], start):
+            return True
+        if 0 < done <= alone.done and not np.allclose(kept[:, done], alone.rows[:, done], 1e-3):
             return True
         # rounding may decide a step that all but fails; a first step is clear
         return alone.done == 0 and not METHODS[method].implicit and (

@@ -211,8 +211,7 @@ class Refusals:
                         run = drive(self.model, method, at, self.check.system.run.h, 3)
                         wrong += run.done != 0 or run.status not in (SINGULAR, NOT_FINITE,
                                                                      NO_CONVERGENCE)  # fmt: skip
-                    if self.model.has_slopes and found:
-                        wrong += self.linearized(at) == OK
+                    wrong += self.model.has_slopes and not self.linearized(at)
         return float(wrong)
 
     def matters(self, s: State, field: str, i: int) -> bool:
@@ -222,8 +221,8 @@ class Refusals:
         one, other = (self.check.ask("acceleration", at) for at in (s, replace(s, **{field: x})))
         return not np.array_equal(one, other)
 
-    def linearized(self, s: State) -> int:
-        """The status of the derivatives."""
+    def linearized(self, s: State) -> bool:
+        """Whether the derivatives are finite, or were not written."""
         model, n = self.model, self.model.nq
         A_q, A_qd, B = (np.full((n, w), MARK, model.dtype) for w in (n, n, max(1, model.nu)))
         status = model._ffi.new("int *")
@@ -234,8 +233,8 @@ class Refusals:
             model._pointer(None if s.u is None else np.array(s.u, model.dtype)),
             model._pointer(p), status,
         )  # fmt: skip
-        untouched = bool(np.all(A_q == MARK) and np.all(A_qd == MARK))
-        return int(status[0]) if untouched or not status[0] else OK
+        written = np.hstack([A_q, A_qd, *([B] if model.nu else [])])
+        return bool(np.all(written == MARK) if status[0] else np.all(np.isfinite(written)))
 
     def overflow(self, method: str) -> float:
         """Steps so long that the state leaves the finite numbers, or no stages are found."""

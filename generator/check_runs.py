@@ -18,7 +18,7 @@ from eomc.answer import Vector
 from eomc.steppers import METHODS
 
 if TYPE_CHECKING:
-    from eomc.check import Comparison, State
+    from eomc.check import Comparison, Expected, State
 
 STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps
 CUTS = (1, 2, 5, 38, 129, 130, 131, 177)
@@ -28,14 +28,15 @@ EVERY = 3  # no divisor of STEPS
 LONG = (0.02, 0.2, 0.7)
 LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by all they may be
 ANGLES = 48  # around the circle, at which sines are looked at
-SINES = 100.0  # units: their last terms make more
+SINES = 20.0  # units; their last terms make hundreds
 FEW = 6  # long steps, or steps with a row of u each
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
 FAR = ("D", "g", "bias", "tau", "kinetic_energy", "potential_energy", "acceleration")
-FINE = (256, 2048)  # parts of h, of runs that differ by rounding alone
+# parts of h, of runs that differ by rounding alone; the second where the first are too long
+FINE = ((1024, 8192), (8192, 65536))
 EXACT = 4  # order from which on their steps are short enough
-ROUNDED = 4.0  # units: compensated sums lose 0 or 1, plain ones some ten
+ROUNDED = 8.0  # units: compensated sums lose 0 or 1, plain ones some forty
 
 
 @dataclass(frozen=True)
@@ -266,11 +267,19 @@ class Runs:
         Two runs over the same time in so short steps that the method is exact differ by rounding
         alone. The median of some states: where a difference grows fast, rounding does too.
         """
+        states = self.check.few(4)
+        found = [self.rounded(method, states, parts) for parts in FINE[:1]]
+        if found[0] > ROUNDED:
+            found.append(self.rounded(method, states, FINE[1]))
+        return min(found)
+
+    def rounded(self, method: str, states: Sequence[Expected], parts: Sequence[int]) -> float:
+        """The same with h in so many parts."""
         found, T = [], 2 * self.h
-        for e in self.check.few(4):
+        for e in states:
             s, gain = replace(e.state, u=None), T * e.size["acceleration"]
             one, other = (
-                drive(self.model, method, s, self.h / n, 2 * n, every=2 * n) for n in FINE
+                drive(self.model, method, s, self.h / n, 2 * n, every=2 * n) for n in parts
             )
             if not (one.status or other.status):
                 size = np.abs([s.q, s.qd]) + np.array([T * (np.abs(s.qd) + gain), gain])

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 LIMIT = 1e-6  # of what changes by all of the spread would make; differences are good to 1e-9
 STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
-WIDTHS = (0.03, 0.003, 3e-4)  # of the differences, in parts of the spread
+WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of the differences, in parts of the spread
 
 
 class Slopes:

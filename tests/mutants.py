@@ -161,7 +161,7 @@ def outcomes(module: Any, check: Any) -> Vector:
         for name in names:
             found.append(check.ask(name, at))
         for method in module.methods:
-            h = check.system.run.h * float(np.exp(draw.uniform(-3, 4)))
+            h = check.system.run.h * float(np.exp(draw.uniform(-3, 2)))
             for cuts in ((3, 17), ()):
                 run = drive(model, method, at, h, 30, cuts=cuts, every=1 + n % 3)
                 found += [run.rows, np.array([run.status, run.done])]

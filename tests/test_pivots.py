@@ -11,10 +11,11 @@ import trees
 from instrument import in_a_fork
 from mutants import Bench, Mutant, variant
 
-from eomc import mechanics, program, scene, system
+from eomc import scene, system
 from eomc.system import System
 
-PIVOT = re.compile(r"(-?[\w>.-]*\w) <= (0|[\d.]+e-\d+\*([\w>.-]*\w))(?=[;) ?|])")
+# a pivot, and what it is compared with: nothing, or rounding of the diagonal entry that it was
+PIVOT = re.compile(r"((?:\w+->)?[dD]_\w+|-?w\d+) <= (0|[\d.]+e-\d+\*([\w>.-]*\w))(?=[;) ?|])")
 
 
 def chain(links: int, run: str = "") -> System:
@@ -31,16 +32,15 @@ def chain(links: int, run: str = "") -> System:
 
 
 def changes(source: str) -> Iterator[Mutant]:
-    """Each pivot left out; and each beside every other size that stands in the same line."""
+    """Each pivot left out; and each beside the size of a mass or of nothing in its place."""
     for match in PIVOT.finditer(source):
         start, end = match.span()
-        if source[source.rfind("\n", 0, start) : start].lstrip().startswith(("*", "/*")):
+        if source[source.rfind("\n", 0, start) : start].lstrip().startswith(("* ", "/*")):
             continue
         yield Mutant(start, end, "0")
-        line = source[source.rfind("\n", 0, start) : source.find("\n", end)]
-        others = {m[3] for m in PIVOT.finditer(line) if m[3] and m[3] != match[3]}
-        for other in sorted(others) if match[3] else ():
-            yield Mutant(*match.span(3), other)
+        if match[3]:  # what would do for a D of another unit
+            yield Mutant(*match.span(3), f"1e20*{match[3]}")
+            yield Mutant(*match.span(3), f"-1e20*{match[3]}")
 
 
 def unnoticed(made: System, name: str, folder: Path, least: int) -> list[str]:
@@ -59,19 +59,14 @@ def unnoticed(made: System, name: str, folder: Path, least: int) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, least", [("cartpole", 2), ("cartpole_batch", 4), ("acrobot", 2)])
+@pytest.mark.parametrize("name, least", [("cartpole", 2), ("cartpole_batch", 3)])
 def test_pivots_of_scenes(name: str, least: int, tmp_path: Path) -> None:
     assert unnoticed(variant(name), name, tmp_path, least) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "links, run, least", [(2, "", 2), (3, "", 4), (6, "", 6), (4, "batch = true", 8)]
+    "links, run, least", [(2, "", 2), (3, "", 3), (6, "", 6), (4, "batch = true", 4)]
 )
 def test_pivots_of_trees(links: int, run: str, least: int, tmp_path: Path) -> None:
     assert unnoticed(chain(links, run), f"rods{links}", tmp_path, least) == []
-
-
-def test_the_long_tree_takes_the_articulated_route() -> None:
-    route = program.build(mechanics.derive(chain(6))).route
-    assert route == "articulated"
