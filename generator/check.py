@@ -44,7 +44,9 @@ MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
-SHORTER = (1, 1 / 4, 1 / 16, 1 / 64)  # parts of the scene's h, until stages are found by sweeps
+SHORTER = tuple(
+    4.0**-k for k in range(7)
+)  # parts of the scene's h, until stages are found by sweeps
 
 
 @dataclass(frozen=True)
