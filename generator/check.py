@@ -47,7 +47,9 @@ NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 FARTHEST = 100.0  # of the spread: how far long steps may lead
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
-SHORTER = (1, 1 / 4, 1 / 16, 1 / 64)  # parts of the scene's h, until stages are found by sweeps
+SHORTER = tuple(
+    4.0**-k for k in range(7)
+)  # parts of the scene's h, until stages are found by sweeps
 
 
 @dataclass(frozen=True)

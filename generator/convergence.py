@@ -39,12 +39,13 @@ SMALL = 1e-2  # of the motion: differences below are in proportion to a power of
 CLEAR = 30.0  # times what rounding does to a run: differences above are the method's own
 ALIKE = 0.3  # orders that differ by less are the same
 COUNTS = (6, 12, 24, 48, 96)  # steps of a span
-SPANS = (0, *(k for n in range(1, 9) for k in (-n, n)), *range(-9, -21, -1))  # log2 of 48 h
-BALANCE_SPANS = range(-7, 12)  # powers of 2, of h
+FIRST = (0, -1, 1, -2, 2)  # log2 of spans over 48 h that are looked at first
+LOWER, MOST = (-2, -4, -7, -10, -14, -20), 8  # then down to where all is rounding, and up
+BALANCE_SPANS = (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11)  # powers of 2, of h
 CLOSED = 1e3  # roundings of the energy: a balance is closed
 RESOLVED = 1e-3  # of the motion: two methods are compared where halving h changes no more
 NUDGE = 1e-6  # relative change at the start, from which growth is estimated
-DRAWS = 3  # of starts moved by a rounding
+DRAWS = 2  # of starts moved by a rounding
 
 # An advised h is compared with runs of SPAN times its length, in steps of these parts of it. The
 # limit is that of the motion as it is linear at one place, and the motion goes on from there.
@@ -111,7 +112,7 @@ class _Ladder:
 
     @property
     def settled(self) -> float:
-        """The order that the last two halvings clear of rounding agree on, else nan."""
+        """The order on which the last two halvings clear of rounding agree, or nan."""
         found = [p for p, clear in self.orders if clear]
         if len(found) < 2 or abs(found[-1] - found[-2]) > ALIKE:
             return math.nan
@@ -176,31 +177,42 @@ class Convergence:
         return _judged(found, max, "too few halvings between rounding and a hundredth")
 
     def _order(self, at: Place, method: str, least: float) -> float:
-        ladders: list[_Ladder] = []
-        for power in SPANS:
-            ladder = self._ladder(at, method, 48 * self.h * 2.0**power)
-            if ladder is None:
-                continue
-            if not math.isnan(best := ladder.best(least)):
+        """The best of a few spans; else of all from the shortest that shows a difference upwards.
+
+        There a low order counts where two spans in a row agree on it: longer ones may be of
+        order 1 with any method, where steps leap over a bend of the forces.
+        """
+        ladders: dict[int, _Ladder | None] = {}
+
+        def ladder(power: int) -> _Ladder | None:
+            if power not in ladders:
+                ladders[power] = self._ladder(at, method, 48 * self.h * 2.0**power)
+            return ladders[power]
+
+        for power in FIRST:
+            if (one := ladder(power)) and not math.isnan(best := one.best(least)):
                 return best
-            ladders.append(ladder)
-        if not ladders:
-            raise RuntimeError(f"no run by {method} gets to its end")
-        if all(ladder.exact for ladder in ladders):
-            return math.inf
-        ladders.sort(key=lambda ladder: ladder.span)
-        for one, two in pairwise(ladders):  # a low order is seen down to short spans
-            if abs(one.settled - two.settled) <= ALIKE:  # and nan is not
+        low = next((k for k in LOWER if (one := ladder(k)) and one.exact), LOWER[-1])
+        before, moved = math.nan, False
+        for power in range(low, MOST + 1):
+            if not (one := ladder(power)):
+                continue
+            if not math.isnan(best := one.best(least)):
+                return best
+            if abs(one.settled - before) <= ALIKE:  # and nan is not
                 return one.settled
-        return math.nan
+            before, moved = one.settled, moved or not one.exact
+        if not any(ladders.values()):
+            raise RuntimeError(f"no run by {method} gets to its end")
+        return math.nan if moved else math.inf
 
     def _ladder(self, at: Place, method: str, span: float) -> _Ladder | None:
         ends = [self.end(at.state, method, span, n) for n in COUNTS]
         known = [end for end in ends if end is not None]
-        if ends[-1] is None or len(known) < 3 or any(e is None for e in ends[-len(known) :]):
+        if ends[2] is None or any(e is None for e in ends[-len(known) :]):
             return None
         off = tuple(float(np.max(np.abs(b - a))) for a, b in pairwise(known))
-        return _Ladder(span, off, self.noise(at, method, span, COUNTS[-1], known[-1]))
+        return _Ladder(span, off, self.noise(at, method, span, COUNTS[2], ends[2]))
 
     # --- two methods ------------------------------------------------------------------------------
 
@@ -262,16 +274,14 @@ class Convergence:
         """
         rest, closed = 0.0, False
         for power in BALANCE_SPANS:
-            gaps, energy = self._gaps(at, self.h * 2.0**power)
-            if not gaps:
-                continue
-            floor = CLOSED * EPS * energy
-            if abs(gaps[-1]) <= floor:
+            gaps, exact = self._gaps(at, self.h * 2.0**power)
+            if exact:
                 closed, rest = True, 0.0
+            if exact or len(gaps) < 3:
                 continue
             a, b, c = gaps
             if abs(c - b) <= 0.1 * abs(c) and abs(b - a) <= 0.3 * abs(b):
-                if rest and 1.2 < c / rest < 5:  # it grows with the span, or with its square
+                if rest and 1.2 < c / rest < 20:  # it grows with the span, or with its square
                     return math.log2(abs(a / c)) / 2
                 rest = c
                 continue
@@ -281,28 +291,25 @@ class Convergence:
                 return order
         return math.inf if closed else math.nan
 
-    def _gaps(self, at: Place, span: float) -> tuple[list[float], float]:
-        """What is left of the balance with 16, 32 and 64 steps, and the size of the energies."""
-        s, gaps, energy = at.state, [], 0.0
+    def _gaps(self, at: Place, span: float) -> tuple[list[float], bool]:
+        """What is left of the balance with 16, 32 and 64 steps; whether one of them closes it."""
+        s, gaps = at.state, []
         for n in (16, 32, 64):
             run = self.run(s, self._best_method, h=span / n, steps=n)
             if str(run.status) != "ok":
-                return [], 0.0
+                return [], False
             rows = zip(run.t, run.q, run.qd, strict=True)
             states = [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
             power = np.array([self.ask("power", row) for row in states])
             simpson = np.array([1, *(4, 2) * (n // 2 - 1), 4, 1]) * span / n / 3
             after, before = (self.ask("jacobi", states[i]) for i in (-1, 0))
             gaps.append(float(after - before - simpson @ power))
-            energy = at.energy + float(
-                simpson @ np.abs(power)
-                + sum(
-                    np.abs(self.ask(name, states[i]))
-                    for name in ("kinetic_energy", "potential_energy")
-                    for i in (0, -1)
-                )
-            )
-        return (gaps if np.all(np.isfinite(gaps)) else []), energy
+            names = ("kinetic_energy", "potential_energy")
+            sizes = [np.abs(self.ask(name, states[i])) for name in names for i in (0, -1)]
+            energy = at.energy + float(simpson @ np.abs(power) + sum(sizes))
+            if abs(gaps[-1]) <= CLOSED * EPS * energy:
+                return gaps, True
+        return (gaps if np.all(np.isfinite(gaps)) else []), False
 
     def ask(self, name: str, s: State) -> Vector:
         """The module's value of that name."""

@@ -14,7 +14,7 @@ import numpy as np
 from eomc.answer import Vector
 from eomc.steppers import Method
 
-SWEEPS = 100  # over the stages of an implicit method
+SWEEPS = 20  # over the stages of an implicit method: they are to contract to a seventh
 SETTLED = 4 * 2.0**-52  # of a velocity: the stages are found
 
 Acceleration = Callable[[Vector, Vector, Any], Vector]

@@ -48,6 +48,7 @@ signal jacobi acceleration trouble lane method batch real result first last star
 exp1 log1 sqrt1 abs1 M_total mass_1 length stiffness l_0 Theta Phi Omega alpha_beta""".split()
 
 EXPLICIT, IMPLICIT = ("rk4", "dp8", "euler"), ("gauss4", "gauss6", "gauss8", "gauss16")
+STEPPERS = (*EXPLICIT, "verlet", *IMPLICIT)
 
 
 @dataclass

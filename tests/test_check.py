@@ -18,6 +18,7 @@ from cases import scene_system
 from eomc import check as checking
 from eomc import reference as references
 from eomc.check import Report, check
+from eomc.convergence import Convergence, Finding
 from eomc.reference import Reference, derive
 from eomc.system import System, symbol
 
@@ -280,11 +281,35 @@ def test_a_module_that_raises_fails_with_its_words() -> None:
 
 
 def test_friction_that_jumps_is_not_blamed_for_its_order() -> None:
+    """Spans between two jumps show it; before, the row was of any span."""
     x, v = symbol("x"), symbol("x_dot")
     system = System.make("dry", [x], v**2 / 2, x**2 / 2, forces={x: -sympy.sign(v)}, h=0.05)
     report = check(system, StandIn(derive(system)), states=8)
     assert report.passed, report.table()
-    assert "not to be expected with sign" in report.table()
+    order = next(row for row in report.rows if row.name == "order of rk4")
+    assert order.judged and order.error == pytest.approx(4, abs=0.2)
+
+
+def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says so, in the table and in JSON, and passes; without a jump it fails."""
+    x, v, low = symbol("x"), symbol("x_dot"), lambda *_: Finding(1.0)
+    monkeypatch.setattr(Convergence, "order", low)
+    for force, passed in ((sympy.sign(v), True), (sympy.tanh(v), False)):
+        system = System.make("dry", [x], v**2 / 2, 0, forces={x: -force}, h=0.05)
+        report = check(system, StandIn(derive(system)), states=4)
+        (row,) = (row for row in report.rows if row.name == "order of rk4")
+        assert row.passed == passed and row.judged != passed
+        assert ("not to be expected with sign" in report.table()) == passed
+
+
+def test_an_order_that_cannot_be_seen_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    unseen = Finding(math.nan, "too few halvings")
+    monkeypatch.setattr(Convergence, "order", lambda *_: unseen)
+    report = check(scene_system("mass_spring"), StandIn(reference("mass_spring")), states=4)
+    assert report.passed
+    assert "not judged: too few halvings" in " ".join(report.table().split())
+    (row,) = (row for row in report.as_dict()["rows"] if not row["judged"])
+    assert row["name"] == "order of rk4" and row["error"] is None and row["passed"]
 
 
 def test_a_singular_start_is_passed_over() -> None:
