@@ -36,12 +36,11 @@ test-slow: .venv/robots
 lint: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	@mkdir -p build/types && ln -sfn $(CURDIR)/generator build/types/eomc
-	MYPYPATH=build/types $(BIN)/mypy -p eomc --cache-dir build/mypy
+	$(BIN)/mypy -p eomc --cache-dir build/mypy
 
 golden: .venv/dev
-	$(BIN)/python tests/test_golden.py --accept
-	$(BIN)/python tests/test_bad_scenes.py
+	$(BIN)/python tests/c/test_golden.py --accept
+	$(BIN)/python tests/scene/test_bad_scenes.py
 
 bench: build/bench/done
 	build/bench/bin/python benchmarks/loop.py

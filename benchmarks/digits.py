@@ -34,12 +34,13 @@ from runners import Array
 from scipy.integrate import ode, odeint, solve_ivp
 
 import eomc
-from eomc import steppers, truth
+from eomc.integrators import tableaux
+from eomc.report import reference_solution
 
 END = 10.0  # s; 12 digits exist in doubles until then
 WANTED = (1e-6, 1e-9, 1e-12)
 NAMES = ("cart-pole", "double pendulum", "chain of 5")
-METHODS = [m for m in steppers.METHODS.values() if m.order >= 4]
+METHODS = [m for m in tableaux.METHODS.values() if m.order >= 4]
 BARS = {"heyoka": 0.8, "DOP853": 0.2, "LSODA": 0.2}
 MANY, SAMPLE = 4096, 32  # instances of a batch, and of how many the error is taken
 
@@ -86,8 +87,8 @@ def equations(matrices: Matrices, n: int) -> list[Any]:
 def trusted(case: Case) -> tuple[Error, float]:
     """The error of a run, and how far the trusted motion is from the generator's own.
 
-    heyoka in long double at its tightest, whose dense output has the state at any time; held at
-    17 times against `eomc.truth`, which is another program, arithmetic and method.
+    heyoka in long double at its tightest, whose dense output has the state at any time; compared
+    at 17 times with `eomc.report.reference_solution`: another program, arithmetic and method.
     """
     n = len(case.x0) // 2
     tight = heyoka.taylor_adaptive(
@@ -99,7 +100,7 @@ def trusted(case: Case) -> tuple[Error, float]:
         system = eomc.read(peers.write(case, Path(root)))
         given = zip(system.coordinates, case.x0[:n], case.x0[n:], strict=True)
         starts = tuple(replace(c, start=float(q), rate=float(v)) for c, q, v in given)
-        own = truth.of(replace(system, coordinates=starts), END, 16, root)
+        own = reference_solution.of(replace(system, coordinates=starts), END, 16, root)
     high, low = own.halves
     scale = np.abs(motion(np.linspace(0, END, 1000, dtype=np.longdouble))).max(axis=0)
 
@@ -165,7 +166,7 @@ def ours(module: ModuleType, case: Case, error: Error, wanted: float) -> Way:
 
         worth = partial(lambda limit, way, steps: quick(way(steps)) < limit, bound, way)
         if least := fewest(off, wanted, worth):
-            for more in (1.0, 1.12, 1.25, 1.5) if steppers.METHODS[method].implicit else (1.0,):
+            for more in (1.0, 1.12, 1.25, 1.5) if tableaux.METHODS[method].implicit else (1.0,):
                 steps = round(more * least)
                 if (reached := off(steps)) <= wanted:
                     found.append(Way("ours", f"{method}, {steps} steps", way(steps), reached))
@@ -464,8 +465,8 @@ value; of a batch, at the end, in its first {sample} instances.
 """
 TAIL = """
 - The trusted motion is heyoka's in long double at a tolerance of 1e-19, by its dense output; at 17
-  times it agrees to 1e-14 or better with `eomc.truth`, in `__float128` by Gauss's method of order
-  40.
+  times it agrees to 1e-14 or better with `eomc.report.reference_solution`, in `__float128` by
+  Gauss's method of order 40.
 - Ours: the quickest of {methods}, each at its longest step that reaches the error, to 2 %;
   `simulate` and `simulate_batch` with all checks.
 - heyoka: the adaptive Taylor integrator, parameters folded in as numbers, differences of angles as

@@ -23,8 +23,9 @@ import numpy as np
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-import eomc  # noqa: E402
 from cases import case_system, cases  # noqa: E402
+
+import eomc  # noqa: E402
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,12 @@ import work as cases
 from sympy import S
 
 import eomc
-from eomc import ccode, mechanics, program
-from eomc import compile as compiler
-from eomc.assignments import Call, Function, Operand
-from eomc.tape import Stage
+from eomc.derive import lagrange
+from eomc.derive.tape import Stage
+from eomc.emit import c_expression
+from eomc.program import program
+from eomc.program.ir import Call, Function, Operand
+from eomc.toolchain import compiler as compiler
 
 HERE = Path(__file__).resolve().parent
 BAR = 1.15
@@ -139,7 +141,7 @@ def panda_run(function: Function, x: Array, h: float, folder: Path) -> Run:
     return faster([in_place(f.kernel_run) for f in libraries("panda", folder)], x, h, 1000)
 
 
-PAIR = replace(ccode.DOUBLE, name="pair")
+PAIR = replace(c_expression.DOUBLE, name="pair")
 
 
 def panda_body(function: Function) -> str:
@@ -166,11 +168,11 @@ def panda_body(function: Function) -> str:
     kept = sorted({n for a in late for n in a.value.names} & known)
     ends = tuple(Operand(S.One, name) for name in kept)
     first = replace(function, body=early, outputs=ends, checks=())
-    configuration = ccode.body(first, "panda", where, PAIR)
+    configuration = c_expression.body(first, "panda", where, PAIR)
     outside = {name: f"kept[{2 * k}]" for k, name in enumerate(kept)}
     outside |= {f"{name}_dot": f"qd[{k - 1}]" for name, k in joints.items()}
     outside |= {f"{name}_torque": f"u[{k - 1}]" for name, k in joints.items()}
-    velocities = ccode.body(replace(function, body=late, checks=()), "panda", outside)
+    velocities = c_expression.body(replace(function, body=late, checks=()), "panda", outside)
     return "\n".join(
         [
             f"#define PANDA_KEPT {len(kept)}",
@@ -215,7 +217,7 @@ def works(folder: Path) -> list[Work]:
     case = cases.panda()  # as in peers.py
     panda.write_text(case.scene, encoding="utf-8")
     ours, arm = eomc.load(cartpole, folder), eomc.load(panda, folder)
-    function = program.build(mechanics.derive(eomc.read(panda)))["acceleration"]
+    function = program.build(lagrange.derive(eomc.read(panda)))["acceleration"]
     x = np.array([0.0, math.pi / 2, 0.0, 0.0])
     many = x[:, None] + 0.1 * np.random.default_rng(1).standard_normal((4, 4096))
     kernel = panda_run(function, case.x0, case.h, folder)

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import eomc
-from eomc import reference
+from eomc.verify import symbolic
 
 HERE = Path(__file__).resolve().parent.parent
 
@@ -27,7 +27,7 @@ HERE = Path(__file__).resolve().parent.parent
 def loop(scene: Path, root: str, rounds: int, steps: int) -> None:
     system = eomc.read(scene)
     module = eomc.load(scene, root)
-    plain = reference.derive(system)
+    plain = symbolic.derive(system)
     h = system.run.h
     many = 200 * steps
     best_c = best_python = float("inf")
@@ -49,7 +49,7 @@ def loop(scene: Path, root: str, rounds: int, steps: int) -> None:
 
 
 def builds(scene: Path, rounds: int) -> None:
-    command = [sys.executable, "-m", "eomc.cli", "build", str(scene), "--quiet", "--build"]
+    command = [sys.executable, "-m", "eomc.cli.main", "build", str(scene), "--quiet", "--build"]
     fresh, same = [], []
     for _ in range(rounds):
         with tempfile.TemporaryDirectory() as root:

@@ -38,8 +38,9 @@ from runners import Array, Run, timed
 from work import CASES, HERE, Case, load, write
 
 import eomc
-from eomc import compile as compiler
-from eomc import mechanics, program
+from eomc.derive import lagrange
+from eomc.program import program
+from eomc.toolchain import compiler as compiler
 
 CORES = os.sched_getaffinity(0)
 
@@ -115,7 +116,7 @@ def panda(_: str, root: Path, rounds: int) -> list[Row]:
     """The imported Panda alone, and 4,096 of it against one."""
     case = work.panda()
     one, module = runners.ours(load(case, root)), load(case, root, "batch = true\n")
-    made = program.build(mechanics.derive(eomc.read(write(case, root))))["acceleration"]
+    made = program.build(lagrange.derive(eomc.read(write(case, root))))["acceleration"]
     kernel = kernels.panda_run(made, case.x0, case.h, folder(root))
     peers = [
         Peer(KERNEL, kernel, bars("Panda", "kernel")),  # next to ours, so that both are as warm

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import sympy
 
-from eomc import reference
-from eomc.system import System
+from eomc.model.system import System
+from eomc.verify import symbolic
 
 Numbers = Sequence[Any]
 Function = Callable[[Any], Any]
@@ -47,7 +47,7 @@ def chain(q: Numbers, v: Numbers, sin: Function, cos: Function) -> tuple[Any, An
 
 def derived(system: System) -> Matrices:
     """The same from K and P of a scene by SymPy: plain Euler-Lagrange, then cse."""
-    made = reference.derive(system)
+    made = symbolic.derive(system)
     values = {p.symbol: sympy.Float(p.value) for p in system.parameters}
     n = len(system.q)
     wanted = [made.D[i, j].xreplace(values) for i in range(n) for j in range(i + 1)]

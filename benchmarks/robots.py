@@ -107,7 +107,8 @@ def chain(links: int) -> str:
 
 def robot(file: str, free: bool = False, locked: tuple[str, ...] = ()) -> str:
     """The scene that `eomc import` writes of a URDF of example-robot-data."""
-    from eomc import robots, urdf
+    from eomc.robots import robot as robots
+    from eomc.robots import urdf
 
     try:
         found = [f for f in files("example-robot-data") or () if str(f).endswith(file)]
@@ -144,9 +145,11 @@ def inside(path: Path, root: Path) -> None:
     import cffi  # noqa: F401 - so that no import is timed
 
     import eomc
-    from eomc import compile as compiler
-    from eomc import mechanics, program, render
-    from eomc.render import Sources
+    from eomc.derive import lagrange
+    from eomc.emit import render
+    from eomc.emit.render import Sources
+    from eomc.program import program
+    from eomc.toolchain import compiler as compiler
 
     gc.disable()  # as eomc.read and eomc.sources do
     begun = time.perf_counter()
@@ -157,7 +160,7 @@ def inside(path: Path, root: Path) -> None:
     def texts(extension: str) -> Sources:
         nonlocal spent
         begun = time.perf_counter()
-        derived = program.build(mechanics.derive(system))
+        derived = program.build(lagrange.derive(system))
         sources = render.render(derived, extension)
         spent += time.perf_counter() - begun
         a = derived["acceleration"]
@@ -187,7 +190,7 @@ FIRST_STEP = "import sys; sys.path[:0] = [sys.argv[1]]; import {} as m; m.step(*
 
 def cold(path: Path, name: str, root: str) -> float:
     """Seconds from `eomc build` to the first step."""
-    build = [sys.executable, "-m", "eomc.cli", "build", str(path), "--quiet", "--build", root]
+    build = [sys.executable, "-m", "eomc.cli.main", "build", str(path), "--quiet", "--build", root]
     begun = time.perf_counter()
     subprocess.run(build, check=True, env=ENVIRONMENT)
     first_step = [sys.executable, "-c", FIRST_STEP.format(name), root]
@@ -197,7 +200,7 @@ def cold(path: Path, name: str, root: str) -> float:
 
 def row(case: Case, rounds: int) -> str:
     """The scene's line of the table."""
-    from eomc import scene
+    from eomc.scene import scene
 
     rows, colds = [], []
     with tempfile.TemporaryDirectory() as folder:

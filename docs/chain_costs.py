@@ -17,8 +17,11 @@ import time
 
 import sympy
 
-from eomc import mechanics, program, reference, scene
-from eomc.system import System, from_scene
+from eomc.derive import lagrange
+from eomc.model.system import System, from_scene
+from eomc.program import program
+from eomc.scene import scene
+from eomc.verify import symbolic
 
 
 def chain(links: int) -> System:
@@ -40,7 +43,7 @@ def chain(links: int) -> System:
 
 def written_out(system: System) -> int:
     """Operations of D, C and g as expressions, after sympy.cse."""
-    plain = reference.derive(system)
+    plain = symbolic.derive(system)
     early = {p.symbol for p in system.parameters}
     shared, ends = sympy.cse([*plain.D, *plain.C, *plain.g])
     total = 0
@@ -67,7 +70,7 @@ def main() -> None:
     for links in options.links:
         system = chain(links)
         begun = time.perf_counter()
-        equations = mechanics.derive(system)
+        equations = lagrange.derive(system)
         derived = time.perf_counter()
         made = program.build(equations)
         ended = time.perf_counter()

@@ -18,11 +18,11 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
 import numpy as np  # noqa: E402
-
 from cases import case_system, cases  # noqa: E402
-from eomc import report  # noqa: E402
-from eomc.problems import EomcError  # noqa: E402
-from eomc.steppers import METHODS  # noqa: E402
+
+from eomc.base.errors import EomcError  # noqa: E402
+from eomc.integrators.tableaux import METHODS  # noqa: E402
+from eomc.report import report  # noqa: E402
 
 LONGEST = 0.5  # s of computing of one run
 LONG = 4  # times that, while fewer than six digits are found

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from eomc import names, scene, system
-from eomc.render import Sources
+from eomc.base import names
+from eomc.emit.render import Sources
+from eomc.model import system
+from eomc.scene import scene
 
 DATA = Path(__file__).parent / "data" / "cases.json"
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -96,3 +98,15 @@ def scene_system(name: str) -> system.System:
 def error_of(name: str, q: Any) -> float:
     """max_i |q_i - q_ref_i| at t_end."""
     return float(np.max(np.abs(np.asarray(q) - np.array(cases()[name]["q_ref"], float))))
+
+
+def variant(scene: str, name: str, **replaced: str) -> Path:
+    """A scene of scenes/ under another name, with lines more under [run]."""
+    text = (SCENES / f"{scene}.toml").read_text(encoding="utf-8")
+    lines = "\n".join(f"{key} = {value}" for key, value in replaced.items())
+    old = next(line for line in text.splitlines() if line.startswith("name "))
+    text = text.replace(old, f'name = "{name}"').replace("[run]", f"[run]\n{lines}")
+    path = Path("build/tests") / f"{name}.toml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path

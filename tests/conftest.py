@@ -11,10 +11,11 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from cases import SCENES
 
 import eomc
-from cases import SCENES
-from eomc import scene, system
+from eomc.model import system
+from eomc.scene import scene
 
 # in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

@@ -16,8 +16,8 @@ from types import ModuleType
 import cffi
 
 import eomc
-from eomc import compile as compiling
-from eomc.system import System
+from eomc.model.system import System
+from eomc.toolchain import compiler as compiling
 
 COVERAGE = ("-O0", "--coverage", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 
@@ -128,7 +128,9 @@ CHECK = """
 import sys, tomllib
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from eomc import check, scene, system
+from eomc.verify import check
+from eomc.scene import scene
+from eomc.model import system
 from instrument import Shipped
 made = system.from_scene(scene.parse(Path({scene!r}).read_text(), "scene.toml"))
 shipped = Shipped(made, Path({folder!r}))

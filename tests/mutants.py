@@ -25,14 +25,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cases import SCENES
 from instrument import Shipped, in_a_fork
 
-from cases import SCENES
-from eomc import check as checking
-from eomc import scene, system
-from eomc.answer import Vector
-from eomc.check_runs import drive
-from eomc.system import System
+from eomc.model import system
+from eomc.model.system import System
+from eomc.scene import scene
+from eomc.verify import check as checking
+from eomc.verify.oracle import Vector
+from eomc.verify.rows_runs import drive
 
 FLAGS = ("-O1", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 SECONDS = 60.0

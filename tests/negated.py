@@ -20,12 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from eomc import mechanics, program, render
-from eomc.assignments import Assignment, Call, Function, Product, Sum
-from eomc.program import Program
-from eomc.render import Sources
-from eomc.steppers import METHODS, Method
-from eomc.system import System
+from eomc.derive import lagrange
+from eomc.emit import render
+from eomc.emit.render import Sources
+from eomc.integrators.tableaux import METHODS, Method
+from eomc.model.system import System
+from eomc.program import program
+from eomc.program.ir import Assignment, Call, Function, Product, Sum
+from eomc.program.program import Program
 
 SEEN = 1e-7
 FUNCTIONS = (
@@ -36,7 +38,7 @@ FUNCTIONS = (
 def negated_sources(system: System, extension: str, seed: int) -> tuple[Sources, str]:
     """The sources with one term negated, and which one, in words."""
     choice = random.Random(f"negate {seed}")
-    made = program.build(mechanics.derive(system))
+    made = program.build(lagrange.derive(system))
     method = choice.choice(system.run.methods)
     if choice.random() < 0.35 and system.run.real == "double":
         if method == "rk4":

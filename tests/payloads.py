@@ -19,9 +19,13 @@ from pathlib import Path
 import pytest
 from conftest import needs
 
-from eomc import mechanics, program, render, scene, system
-from eomc.program import Program
-from eomc.system import System
+from eomc.derive import lagrange
+from eomc.emit import render
+from eomc.model import system
+from eomc.model.system import System
+from eomc.program import program
+from eomc.program.program import Program
+from eomc.scene import scene
 
 CANARY = Path(__file__).parent.parent / "build" / "tests" / f"canary{os.getpid()}"
 TOUCH = f"touch {CANARY}"
@@ -166,7 +170,7 @@ def filled(given: dict[int, str]) -> str:
 @cache
 def derived() -> Program:
     made = system.from_scene(scene.parse(SCENE.replace('"@"', '""'), "f.toml"))
-    return program.build(mechanics.derive(made))
+    return program.build(lagrange.derive(made))
 
 
 def with_texts(made: System, text: str, file: str | None = None) -> System:

@@ -29,12 +29,14 @@ from types import ModuleType
 import negated
 
 import eomc
-from eomc import compile as compiler
-from eomc import names, scene, system
-from eomc.check import check
-from eomc.problems import EomcError
-from eomc.render import Sources
-from eomc.system import System
+from eomc.base import names
+from eomc.base.errors import EomcError
+from eomc.emit.render import Sources
+from eomc.model import system
+from eomc.model.system import System
+from eomc.scene import scene
+from eomc.toolchain import compiler as compiler
+from eomc.verify.check import check
 
 ROOT = Path(__file__).parent.parent / "build" / "random"
 

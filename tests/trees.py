@@ -9,7 +9,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from eomc.joints import JOINTS
+from eomc.scene.joints import JOINTS
 
 Entry = Mapping[str, Any]
 

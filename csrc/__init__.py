@@ -1,1 +1,0 @@
-"""Hand-written C that generated code takes in."""

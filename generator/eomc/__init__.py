@@ -1,0 +1,23 @@
+"""eomc, the equations-of-motion compiler: from energies to fast, checked C.
+
+    scene.toml -> Scene -> System -> Equations -> Program -> Sources -> Module
+
+`load` goes the whole way, `sources` stops at the text; pipeline.py shows each step.
+"""
+
+from typing import Any
+
+from eomc.base.errors import EomcError, SceneError
+from eomc.base.version import __version__
+from eomc.pipeline import build, load, read, sources
+
+__all__ = ["EomcError", "SceneError", "System", "__version__", "build", "load", "read", "sources"]
+
+
+def __getattr__(name: str) -> Any:
+    """System, imported when it is asked for: SymPy takes half a second."""
+    if name == "System":
+        from eomc.model.system import System
+
+        return System
+    raise AttributeError(f"module 'eomc' has no attribute {name!r}")

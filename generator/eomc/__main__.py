@@ -1,0 +1,5 @@
+"""python -m eomc."""
+
+from eomc.cli.main import main
+
+main()

@@ -1,0 +1,35 @@
+"""Templates, hand-written C and runtime files: in the package in a wheel, above it in a clone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parent.parent
+
+
+def folder(kind: str) -> Path:
+    """The folder `templates` or `csrc`."""
+    installed = PACKAGE / kind
+    return installed if installed.is_dir() else PACKAGE.parent.parent / kind
+
+
+def text(kind: str, name: str) -> str:
+    """The text of one of its files."""
+    return (folder(kind) / name).read_text(encoding="utf-8")
+
+
+def runtime(name: str) -> str:
+    """The text of a file that is copied beside a built module."""
+    return (PACKAGE / "runtime" / name).read_text(encoding="utf-8")
+
+
+def parts() -> Iterator[tuple[str, Path]]:
+    """Every file that a build depends on: a name that is the same wherever eomc lies, its place."""
+    for kind, root, suffix in (
+        ("eomc", PACKAGE, ".py"),
+        ("templates", folder("templates"), ".jinja"),
+        ("csrc", folder("csrc"), ".h"),
+    ):
+        for file in sorted(root.rglob("*" + suffix)):
+            yield f"{kind}/{file.relative_to(root).as_posix()}", file

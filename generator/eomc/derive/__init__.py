@@ -1,0 +1,1 @@
+"""Euler and Lagrange, Newton and Euler over a tape of small definitions."""

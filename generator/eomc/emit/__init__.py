@@ -1,0 +1,1 @@
+"""Programs to text: C and the Python package around it."""

@@ -1,0 +1,365 @@
+"""How a program's names and functions are written in C: what all parts of the context share."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from eomc.emit import c_expression
+from eomc.emit.c_expression import Body, Real
+from eomc.emit.c_safe_names import may_be_enumerator_of_others
+from eomc.model.symbols import ALONG
+from eomc.model.system import System
+from eomc.program import outline
+from eomc.program.ir import Call, Function, rename
+from eomc.program.program import TIME, Program
+
+# names that the templates use inside functions; a user's name that is one of them gets a "_"
+_OURS = frozenset(
+    "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
+    "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 trouble held at "
+    "moving prepared along column slopes wide troubles E".split()
+)
+
+# macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
+# that is called so has another name in C
+OWN = frozenset(
+    "ALIGNED ALONE BLOCK FAST_FMA FAST_FMAF H INLINE LANE NOT_FINITE NO_CONVERGENCE NQ NU OK PIECE "
+    "ROLLED SINGULAR STAMP TILE".split()
+)
+
+TROUBLE = "*trouble"  # what a lane notes its failure in, as a name that an argument brings
+WIDE = "*wide"  # how many instances of a tile are to be taken, likewise
+
+Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C
+
+
+@dataclass(frozen=True)
+class Argument:
+    """One that a piece may need: its declaration, what is passed, the names that it brings."""
+
+    declared: str
+    passed: str
+    names: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A program that is to become C with numbers of one type.
+
+    written: the author's names, where C has others.
+    """
+
+    program: Program
+    real: Real
+    written: Mapping[str, str] = field(default_factory=dict)
+
+    def as_written(self, name: str) -> str:
+        """The author's name of a coordinate, parameter or input."""
+        return self.written.get(name, name)
+
+    @property
+    def system(self) -> System:
+        """The system of the program."""
+        return self.program.system
+
+    @property
+    def prefix(self) -> str:
+        """What every C name begins with."""
+        return self.system.name
+
+    @property
+    def PREFIX(self) -> str:
+        """What every macro and enumerator begins with."""
+        return self.prefix.upper()
+
+    @cached_property
+    def enum(self) -> dict[str, str]:
+        """The enumerator of every coordinate and input."""
+        taken = {f"{self.PREFIX}_{w}" for w in OWN}
+        indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
+        wishes = [f"{self.PREFIX}_{name}" for name in indexed]
+        return dict(zip(indexed, _unique(wishes, taken), strict=True))
+
+    @property
+    def input_names(self) -> list[str]:
+        """The inputs in the order of u."""
+        return [i.name for i in self.system.inputs]
+
+    @property
+    def names(self) -> list[str]:
+        """The coordinates in the order of q."""
+        return [c.name for c in self.system.coordinates]
+
+    @property
+    def needs_p(self) -> bool:
+        """Whether there are parameters."""
+        return bool(self.system.parameters)
+
+    @cached_property
+    def signal_state(self) -> bool:
+        """Whether the scene's signals hang on the state."""
+        signal = self.program.functions.get("signal")
+        state = {x.name for x in (*self.system.q, *self.system.qd)}
+        return signal is not None and bool(signal.uses & state)
+
+    @cached_property
+    def signal_t(self) -> bool:
+        """Whether the scene's signals hang on the time."""
+        return "signal" in self.program and TIME in self.program["signal"].uses
+
+    @cached_property
+    def driven(self) -> bool:
+        """Whether motion hangs on the time, by itself or by the signals."""
+        return TIME in self.program["acceleration"].uses or self.signal_t
+
+    @cached_property
+    def sincos(self) -> bool:
+        """Whether angles are reduced by our own code."""
+        return self.real.reach > 0 and any(
+            isinstance(a.value, Call) and a.value.function in ("sin", "cos")
+            for f in self.program.functions.values()
+            for a in f.body
+        )
+
+    @property
+    def p_arg(self) -> str:
+        """The parameters as an argument, where there are any."""
+        return f"const {self.prefix}_params *p" if self.needs_p else ""
+
+    @property
+    def p_call(self) -> str:
+        """The parameters as they are passed on."""
+        return "p" if self.needs_p else ""
+
+    @property
+    def p_cast(self) -> str:
+        """The parameters where they come as plain numbers."""
+        return f"(const {self.prefix}_params *)p" if self.needs_p else ""
+
+    @property
+    def zero(self) -> str:
+        """The number 0."""
+        return "0.0" + self.real.suffix
+
+    def literal(self, value: float) -> str:
+        """A number as the element type."""
+        text = repr(value)
+        return (
+            text if "." in text or "e" in text or "n" in text else text + ".0"
+        ) + self.real.suffix
+
+    def signal_call(self, out: str, q: str, qd: str) -> str:
+        """The call that computes the scene's own inputs."""
+        if "signal" not in self.program:
+            return ""
+        given = arguments(
+            out, "t" if self.signal_t else "", *((q, qd) if self.signal_state else ()), self.p_call
+        )
+        return f"{self.prefix}_signal({given});"
+
+    # bodies
+
+    def where(self) -> dict[str, str]:
+        """How names from outside are written: p->m_c for parameters, theta_ where theta is ours."""
+        s = self.system
+        out = {x.name: f"p->{x.name}" for x in s.parameters}
+        mine = [*(x.name for x in s.q), *(x.name for x in s.qd), *self.input_names]
+        return out | {n: local(n) for n in mine}
+
+    def body(
+        self, function: Function, where: Mapping[str, str] | None = None, **options: Any
+    ) -> Body:
+        """The statements of a function; see c_expression.body for the options."""
+        return c_expression.body(
+            unclashed(function), self.prefix, self.where() | dict(where or {}), self.real, **options
+        )
+
+    def loads(self, function: Function, state: Access, inputs: Access) -> list[str]:
+        """Locals for the coordinates, velocities, inputs and directions that are used."""
+        s, real, uses = self.system, self.real.name, function.uses
+        NQ = f"{self.PREFIX}_NQ"
+        read = [(c.q.name, state("q", c.name)) for c in s.coordinates]
+        read += [(c.qd.name, state("qd", c.name)) for c in s.coordinates]
+        read += [(name, inputs("u", name)) for name in self.input_names]
+        read += [(c.q.name + ALONG, state("along", c.name)) for c in s.coordinates]
+        read += [(c.qd.name + ALONG, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
+        read += [(name + ALONG, f"along[2*{NQ} + {self.enum[name]}]") for name in self.input_names]
+        return [
+            f"const {real} {local(name)} = {element};" for name, element in read if name in uses
+        ]
+
+    def element(self, array: str, name: str) -> str:
+        """q[CARTPOLE_THETA]."""
+        return f"{array}[{self.enum[name]}]"
+
+    def groups(self) -> dict[str, frozenset[str]]:
+        """The names that each argument brings: those of q, qd, t, u, p, along."""
+        s = self.system
+        return {
+            "q": frozenset(x.name for x in s.q),
+            "qd": frozenset(x.name for x in s.qd),
+            "t": frozenset({TIME}),
+            "u": frozenset(self.input_names),
+            "p": frozenset(p.name for p in s.parameters),
+            "along": frozenset(x.name + ALONG for x in (*s.q, *s.qd, *s.u)),
+        }
+
+    # functions in pieces
+
+    def in_pieces(
+        self,
+        function: Function,
+        what: str,
+        given: Sequence[Argument],
+        results: Sequence[str],
+        out: Argument,
+        loads: Callable[[Function], list[str]],
+        where: Mapping[str, str] | None = None,
+        lane: bool = False,
+        pair: bool = False,
+        inline: bool = False,
+        in_order: bool = False,
+    ) -> dict[str, Any]:
+        """A long function as several static ones, for pieces.c.jinja.
+
+        what: its name in C, behind the prefix. given: the arguments; a piece has those that it
+        reads, and `out` where results are ready, which go to the places `results`. lane, pair: each
+        piece is a loop over a tile, or over two. inline: no function of its own in the end.
+        in_order: terms of sums stay in their order.
+        """
+        function = unclashed(function)
+        small = outline.LANE_PIECE if lane else outline.PIECE
+        piece = small if outline.is_large(function) else outline.LARGE
+        parts = outline.split(function, piece)
+        end = "wide" if lane else "2" if pair else ""
+        size = f"{self.PREFIX}_TILE" if lane else end
+        at = "[i]" if end else ""
+        values = f"{self.prefix}_{what}_values"
+        crossing = [name for part in parts for name in part.keeps]
+        struct = Argument(
+            f"{values} *{self.PREFIX + '_ALONE ' if end else ''}s", "&s", frozenset(crossing)
+        )
+        handed = {name: f"s->{name}{at}" for name in crossing}
+        kind = "INLINE" if inline else "PIECE"
+        made, calls = [], []
+        pivots = len(function.checks)
+        for k, part in enumerate(parts, 1):
+            f = part.function
+            body = self.body(
+                f,
+                dict(where or {}) | {name: handed[name] for name in part.reads},
+                stored={name: handed[name] for name in part.keeps},
+                pivots=pivots,
+                lane=lane,
+                in_order=in_order,
+            )
+            failures = [*body.early_failures, *body.failures]
+            checks = bool(failures)
+            troubled = bool(end) and (checks or (lane and body.sincos))
+            read = f.uses | {WIDE, *([TROUBLE] if troubled else [])}
+            needed = [a for a in given if a.names & read]
+            if crossing and (part.reads or part.keeps):
+                needed.insert(0, struct)
+            if part.outputs:
+                needed.insert(0, out)
+            name = f"{self.prefix}_{what}_{k}"
+            call = f"{name}({arguments(*(a.passed for a in needed))});"
+            calls.append(f"good &= {call}" if checks and not end else call)
+            one = f"1.0{self.real.suffix}"
+            ends = [f"return {none_of(failures)};"] if checks else []
+            if end:
+                ends = [f"*trouble = {x} ? {one} : *trouble;" for x in failures]
+            found = dict(zip(part.outputs, body.results, strict=True))
+            made.append(
+                {
+                    "comment": _about(k, part, len(parts), what),
+                    "prototype": f"{self.PREFIX}_{kind} {'int' if checks and not end else 'void'} "
+                    f"{name}({arguments(*(a.declared for a in needed)) or 'void'})",
+                    "trouble": troubled,
+                    "loads": loads(f),
+                    "blocks": [*body.early, *body.blocks],
+                    "results": found,
+                    "stores": [f"{results[place]} = {text};" for place, text in found.items()],
+                    "ends": ends,
+                }
+            )
+        checked = any(call.startswith("good") for call in calls)
+        return {
+            "what": what,
+            "type": values,
+            "members": [name + (f"[{size}]" if end else "") for name in crossing],
+            "loop": end,
+            "width": 8 if end else 4,
+            "pieces": made,
+            "calls": calls,
+            "troubled": any(m["trouble"] for m in made),
+            "locals": [
+                *([f"{values} s;"] if crossing else []),
+                *(["int good = 1;"] if checked else []),
+            ],
+            "outcome": "good" if checked else "1",
+        }
+
+
+def _about(k: int, part: outline.Piece, count: int, what: str) -> str:
+    """What a piece computes from what, in a sentence, as lines of a comment."""
+    named = [n for n in part.keeps if not (n[0] == "w" and n[1:].isdigit())]
+    made = ", ".join(named[:8]) + (", ..." if len(part.keeps) > 8 else "")
+    told = [f"{what}, {k} of {count}: {outline.weight(part.function)} operations"]
+    if part.reads:
+        told.append(f"from {len(part.reads)} values of the pieces before")
+    if part.keeps:
+        told.append(f"{len(part.keeps)} for those behind" + (f" ({made})" if named else ""))
+    if part.outputs:
+        told.append(f"{len(part.outputs)} results")
+    return textwrap.fill(", ".join(told) + ".", 94, subsequent_indent=" * ")
+
+
+def unclashed(function: Function) -> Function:
+    """The function with other names for its values that are called like something of ours."""
+    clash = {a.name: a.name + "_" for a in (*function.early, *function.body) if a.name in _OURS}
+    return rename(function, clash) if clash else function
+
+
+def arguments(*parts: str) -> str:
+    """An argument list of those parts that are there."""
+    return ", ".join(p for p in parts if p)
+
+
+def after(*parts: str) -> str:
+    """What follows in an argument list, each part with its comma."""
+    return "".join(f", {part}" for part in parts if part)
+
+
+def none_of(conditions: Sequence[str]) -> str:
+    """That no condition holds."""
+    return f"!({' || '.join(conditions)})" if conditions else "1"
+
+
+def local(name: str) -> str:
+    """A coordinate, velocity or input as a local variable."""
+    return name + "_" if name in _OURS else name
+
+
+def sentence(function: Function) -> str:
+    """What one call costs."""
+    cost = str(function.cost)
+    return cost[0].upper() + cost[1:] + "."
+
+
+def _unique(wishes: Iterable[str], taken: set[str]) -> list[str]:
+    """Upper-case enumerators, in the author's own case where that would clash."""
+    out = []
+    wishes = list(wishes)
+    uppers = [w.upper() for w in wishes]
+    for wish, upper in zip(wishes, uppers, strict=True):
+        used = upper if uppers.count(upper) == 1 else wish
+        while used in taken or may_be_enumerator_of_others(used):
+            used += "_"
+        taken.add(used)
+        out.append(used)
+    return out

@@ -1,0 +1,1 @@
+"""The fast form of C: GNU C, vector registers, whatever was measured to pay."""

@@ -1,0 +1,358 @@
+"""Accelerations and steps of many instances at once, for the templates.
+
+Large: each piece is a loop over a tile. Small: what one instance needs is inlined into such loops,
+one for every stage of a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from typing import Any
+
+from eomc.emit import vectors
+from eomc.emit.c_expression import DOUBLE, indent
+from eomc.emit.c_names import TROUBLE, WIDE, Access, Argument, Target, after, arguments
+from eomc.emit.fast import rotations, stage_parallel
+from eomc.integrators.tableaux import METHODS
+from eomc.program.ir import Function
+from eomc.program.outline import is_large, staged
+from eomc.program.program import TIME
+from eomc.program.trig import Angle, apart
+
+KEPT = {"a1": "first", "a2": "second", "a3": "third", "a4": "fourth"}  # by the stages of RK4
+NEAR = 32_768  # bytes that a tile may have: a first-level cache
+
+
+def lane(
+    target: Target, function: Function, prepare: Mapping[str, Any], mode: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The same for a batch: no branches; what goes wrong is noted in trouble.
+
+    Accelerations and steppers of a whole tile. Large: each piece is a loop over it. Small: what one
+    instance needs is inlined into such loops, one for every stage of a step.
+    """
+    s, real, P = target.system, target.real.name, target.prefix
+    large, held = is_large(function), bool(s.inputs)
+    timed = TIME in function.uses
+    kept = prepare["prepared_members"]
+    alone = f"{target.PREFIX}_ALONE "
+    rest = f"int wide, {real} *{alone}troubles"  # how many to take, and what went wrong
+    u_arg = f"const {P}_inputs_lanes *u" if held else ""
+    c_arg = f"const {P}_prepared_lanes *c" if kept else ""
+    t_arg = f"{real} t" if target.driven else ""
+    state = f"const {P}_lanes *q, const {P}_lanes *qd"
+    c = "c" if kept else ""
+    own = bool(kept) and target.needs_p and not large
+
+    def rates(time: str) -> str:
+        if held:
+            return after(time if target.driven else "", "u", "held", c, "wide, troubles")
+        return after(time if timed else "", c, "wide, troubles")
+
+    made = dict(mode) | {
+        "head": "static void" if large else f"{target.PREFIX}_PIECE void",
+        "inline": f"{target.PREFIX}_{'INLINE' if large else 'LANE'}",
+        "vector": f"{P}_lanes",
+        "solve": "solve_lane",
+        "rates": ("rates_lane" if held else "solve_lane") if large else "rates_tile",
+        "suffix": "_lane",
+        "solve_arguments": arguments(
+            f"{P}_lanes *a", state, f"{real} t" if timed else "", u_arg, c_arg, rest
+        ),
+        "solve_u": after("t" if timed else "", "held ? u : &now", c, "wide, troubles"),
+        "rates_arguments": arguments(
+            f"{P}_lanes *{'' if large else alone}a", state, t_arg, u_arg,
+            "int held" if held else "", c_arg, rest,
+        ),
+        "inputs": f"{P}_inputs_lanes",
+        "stepper_arguments": arguments(
+            f"{P}_lanes *r, {P}_lanes *v" if large else f"{P}_lanes *{alone}r, {P}_lanes *{alone}v",
+            state, t_arg, f"{real} h", u_arg and f"{u_arg}, int held", c_arg, rest,
+        ),
+        "tile_prototype": lambda name: f"int {P}_{name}_tile_step("
+        + arguments(
+            f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
+            t_arg, f"{real} h", "int held" if held else "", "int own" if own else "",
+            "int wide",
+        ) + ")",
+        "own": own,
+        "stepper_call": lambda troubles: after(
+            "t" if target.driven else "", "h", "&s->u, held" if held else "",
+            "&s->c" if kept else "", "wide", troubles,
+        ),
+        "call": rates,
+        "compensated": False,
+        "first": "",
+        "and": "",
+        "last": "",
+        "each": lambda lines, width=4: indent(_each_of_tile(target, lines), width),
+        "angles": None,
+        "one": None,
+        "pieces": None,
+        "own_signal": _signal_lanes(target, kept, c_arg, rest) if large else None,
+    }  # fmt: skip
+    if not large:
+        return made | _lane_small(target, function, kept, mode["arrays"])
+    return made | _lane_large(target, function, kept, made)
+
+
+def _each_of_tile(target: Target, lines: Sequence[str]) -> list[str]:
+    """Statements for every coordinate of every instance."""
+    inside = [line.replace("$", "x[j][i]") for line in lines]
+    return vectors.loop("j", f"{target.PREFIX}_NQ", vectors.loop("i", "wide", inside))
+
+
+def _lane_small(
+    target: Target, function: Function, kept: Sequence[str], arrays: bool
+) -> dict[str, Any]:
+    """Accelerations of one instance, and how loops over a tile call them."""
+    s, real = target.system, target.real
+    held, timed = bool(s.inputs), TIME in function.uses
+    reach = real.reach and "rk4" in s.run.methods
+    turned, rest = apart(function, target.names) if reach else ((), function)
+
+    def call(angles: str, time: str, hold: str, trouble: str = "&trouble") -> str:
+        now = time if (target.driven if held else timed) else ""
+        return after(
+            angles if turned else "", now, f"&given, {hold}" if held else "",
+            "&here" if kept else "", trouble,
+        )  # fmt: skip
+
+    one = stage_parallel.lane(target, rest, kept, arrays, rotations.sines(turned))
+    angles = rotations.lane(target, turned, arrays)
+    own = bool(kept) and target.needs_p
+    k = "own ? i : 0" if own else "0"
+    return {
+        "one": one,
+        "angles": angles,
+        "rates_given": [
+            "const " + vectors.vector_of(target, arrays, "at", "q->x[#][i]"),
+            "const " + vectors.vector_of(target, arrays, "moving", "qd->x[#][i]"),
+            *_given(target, kept, "u->", "c->"),
+        ],
+        "rates_call": call("&s", "t", "held", "&troubles[i]"),
+        "rates_held": lambda hold: arguments(
+            "a, q, qd", "t" if target.driven else "", "u", hold, "c" if kept else "",
+            "wide, troubles",
+        ),
+        "stages": _stages(
+            target, arrays, turned, angles, own, _given(target, kept, "s->u.", "s->c.", k), call
+        ),
+    }  # fmt: skip
+
+
+def _given(target: Target, kept: Sequence[str], u: str, c: str, k: str = "i") -> list[str]:
+    """The inputs and the prepared values of one instance."""
+    lines = []
+    if target.system.inputs:
+        inside = ", ".join(f"{u}x[{target.enum[n]}][i]" for n in target.input_names)
+        lines.append(f"const {target.prefix}_inputs given = {{ {inside} }};")
+    if kept:
+        inside = ", ".join(f"{c}{n}[{k}]" for n in kept)
+        lines.append(f"const {target.prefix}_prepared here = {{ {inside} }};")
+    return lines
+
+
+def _each_known(names: Sequence[str], call: Callable[[list[str]], str]) -> list[str]:
+    """A call by what is zero and what is not, so that each can be compiled for its case."""
+    if not names:
+        return [call([])]
+    lines: list[str] = []
+    for case in product((1, 0), repeat=len(names)):
+        asked = " && ".join(n for n, one in zip(names, case, strict=True) if one)
+        lines += [f"{'else ' if lines else ''}{f'if ({asked})' if asked else ''}".rstrip()]
+        lines += ["    " + call([str(x) for x in case])]
+    return lines
+
+
+def _stages(
+    target: Target,
+    arrays: bool,
+    turned: Sequence[Angle],
+    angles: Mapping[str, Any] | None,
+    own: bool,
+    given: Sequence[str],
+    call: Callable[[str, str, str], str],
+) -> dict[str, Any]:
+    """The stages of RK4 as loops over a tile: what each reads, and what it leaves."""
+    P, real, members = target.prefix, target.real.name, rotations.sines(turned)
+    alone = f"{target.PREFIX}_ALONE "
+    t_arg, t = (f"{real} t", "t") if target.driven else ("", "")
+    plans = [
+        ("back", "t", []),
+        ("mid", "t + h_2", ["at.$ = q.$ + h_2*qd.$;", "moving.$ = qd.$ + h_2*a1.$;"]),
+        ("mid", "t + h_2", ["at.$ = (q.$ + h_2*qd.$) + hh_4*a1.$;", "moving.$ = qd.$ + h_2*a2.$;"]),
+        ("on", "t + h", ["at.$ = (q.$ + h*qd.$) + hh_2*a2.$;", "moving.$ = qd.$ + h*a3.$;"]),
+    ]
+    read: tuple[list[str], ...] = [], ["a1"], ["a1", "a2"], ["a2", "a3"]
+
+    def earlier(names: Sequence[str]) -> list[str]:
+        """The state, and accelerations of earlier stages."""
+        places = {"q": "from->q", "qd": "from->qd"} | {name: KEPT[name] for name in names}
+        return [
+            "const " + vectors.vector_of(target, arrays, name, of + ".x[#][i]")
+            for name, of in places.items()
+        ]
+
+    good = [*(angles["slowly"] + angles["narrow"] if angles else []), "sum - sum == 0"]
+    loops = []
+    for k, (near, time, lines) in enumerate(plans, 1):
+        sines = ", ".join(f"{near}.{n}[i]" for n in members)
+        first = vectors.member(target, arrays, target.names[0])
+        loops.append(
+            {
+                "given": [
+                    *earlier(read[k - 1]),
+                    *given,
+                    *([f"const {P}_angles s_at = {{ {sines} }};"] if turned else []),
+                ],
+                "vectors": ["at", "moving", f"a{k}"] if lines else ["a1"],
+                "lines": lines,
+                "call": f"(&a{k}, {'&at, &moving' if lines else '&q, &qd'}"
+                + call("&s_at", time, "held") + ");",
+                "spoilt": f"a{k}.{first} += trouble < 1 ? 0 : ({real})NAN;",
+                "kept": [f"{KEPT[f'a{k}']}.x[#][i] = a{k}.$;"],
+            }
+        )  # fmt: skip
+    ended = [
+        "const " + vectors.vector_of(target, arrays, name, f"to->{of}.x[#][i]")
+        for name, of in (("at", "q"), ("moving", "qd"))
+    ]
+    return {
+        "prototype": f"{target.PREFIX}_LANE int {P}_rk4_stages("
+        + arguments(
+            f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
+            t_arg, f"{real} h", "int held" if target.system.inputs else "",
+            "int own" if own else "", "int wide",
+        ) + ")",
+        "calls": _each_known(
+            ["held"] * bool(target.system.inputs) + ["own"] * own,
+            lambda known: (
+                f"odd = {P}_rk4_stages({arguments('to, from, s', t, 'h', *known, 'wide')});"
+            ),
+        ),
+        "before": loops[:2],
+        "after": loops[2:],
+        "all": earlier(list(KEPT)),
+        "ends": [
+            "at.$ = q.$ + (h*qd.$ + hh_6*(a1.$ + (a2.$ + a3.$)));",
+            "moving.$ = qd.$ + h_6*(((a1.$ + (a2.$ + a3.$)) + (a2.$ + a3.$)) + a4.$);",
+            "to->q.x[#][i] = at.$;",
+            "to->qd.x[#][i] = moving.$;",
+        ],
+        "sum": " + ".join(
+            f"{x}.{vectors.member(target, arrays, n)}"
+            for n in target.names
+            for x in ("at", "moving")
+        ),
+        "looked": [*(earlier(["a1", "a2"]) if angles else []), *ended],
+        "good": ["int good = 1;", *(f"good &= {x};" for x in good)],
+    }  # fmt: skip
+
+
+def _lane_large(
+    target: Target, function: Function, kept: Sequence[str], made: Mapping[str, Any]
+) -> dict[str, Any]:
+    s, P = target.system, target.prefix
+    _, rest = staged(function, [p.name for p in s.parameters])
+    cut = target.in_pieces(
+        rest,
+        "solve_lane",
+        _lane_arguments(target, kept),
+        [_in_lanes(target)("a", name) for name in target.names],
+        Argument(f"{P}_lanes *{target.PREFIX}_ALONE a", "a", frozenset()),
+        lambda f: target.loads(f, _in_lanes(target), _in_lanes(target)),
+        {n: f"c->{n}[i]" for n in kept},
+        lane=True,
+    )
+    return {
+        "pieces": cut,
+        "unused": [*made["unused"], *(["troubles"] if not cut["troubled"] else [])],
+        "loads": cut["locals"],
+        "blocks": [],
+        "results": cut["calls"],
+        "end": [],
+    }
+
+
+def _in_lanes(target: Target) -> Access:
+    return lambda array, name: f"{array}->x[{target.enum[name]}][i]"
+
+
+def _lane_arguments(target: Target, kept: Sequence[str]) -> list[Argument]:
+    """What a piece over a tile may read."""
+    P, groups, real = target.prefix, target.groups(), target.real.name
+    return [
+        Argument(f"const {P}_lanes *q", "q", groups["q"]),
+        Argument(f"const {P}_lanes *qd", "qd", groups["qd"]),
+        Argument(f"{real} t", "t", groups["t"]),
+        Argument(f"const {P}_inputs_lanes *u", "u", groups["u"]),
+        Argument(f"const {P}_prepared_lanes *c", "c", frozenset(kept)),
+        Argument("int wide", "wide", frozenset({WIDE})),
+        Argument(f"{real} *{target.PREFIX}_ALONE troubles", "troubles", frozenset({TROUBLE})),
+    ]
+
+
+def _signal_lanes(
+    target: Target, kept: Sequence[str], c_arg: str, trouble: str
+) -> dict[str, Any] | None:
+    """The scene's signals for a whole tile."""
+    if "signal" not in target.program:
+        return None
+    P, given = target.prefix, target.program["signal"]
+    own = {p.name for p in target.system.parameters}
+    cut = target.in_pieces(
+        given,
+        "signal_lane",
+        _lane_arguments(target, [n for n in kept if n in own]),
+        [f"u->x[{target.enum[name]}][i]" for name in target.input_names],
+        Argument(f"{P}_inputs_lanes *{target.PREFIX}_ALONE u", "u", frozenset()),
+        lambda f: target.loads(f, _in_lanes(target), _in_lanes(target)),
+        {n: f"c->{n}[i]" for n in own},
+        lane=True,
+    )
+    state = f"const {P}_lanes *q, const {P}_lanes *qd"
+    return {
+        "pieces": cut,
+        "arguments": arguments(
+            f"{P}_inputs_lanes *u", f"{target.real.name} t" if target.signal_t else "",
+            state if target.signal_state else "", c_arg, trouble,
+        ),
+        "unused": [
+            *([] if not c_arg or given.uses & own else ["c"]),
+            *([] if cut["troubled"] else ["troubles"]),
+            *_unread_state(target, given),
+        ],
+        "loads": cut["locals"],
+        "blocks": [],
+        "results": cut["calls"],
+        "call": _signal_lane_call(target, c_arg, "troubles"),
+    }  # fmt: skip
+
+
+def _unread_state(target: Target, given: Function) -> list[str]:
+    if not target.signal_state:
+        return []
+    return [name for name in ("q", "qd") if not given.uses & target.groups()[name]]
+
+
+def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
+    return arguments(
+        "&now", "t" if target.signal_t else "", "q, qd" if target.signal_state else "",
+        "c" if c_arg else "", "wide", trouble,
+    )  # fmt: skip
+
+
+def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> dict[str, int]:
+    """Instances side by side: as many as stay near with what belongs to them, and no row of their
+    numbers above 512 bytes. A tile that is not full is taken by blocks: rows of 64 bytes."""
+    s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
+    numbers = 4 * n + len(s.u) + kept + 1  # two states, and whether there was trouble
+    if lane["pieces"]:
+        numbers += len(lane["pieces"]["members"]) // 2 + 4 * n  # of those, not all live at once
+    else:
+        numbers += max(METHODS[name].stages for name in s.run.methods) * n
+        numbers += 3 * len(lane["angles"]["members"]) if lane["angles"] else 0
+    block, near = 64 // size, NEAR // (size * numbers)
+    return {"tile": max(block, min(512 // size, near // block * block)), "block": block}

@@ -1,0 +1,221 @@
+"""What the templates of the plain form of C ask for: one frozen view each, values only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from eomc.base.texts import FreeText
+from eomc.emit.c_function import CFunction
+
+
+@dataclass(frozen=True)
+class Indexed:
+    """A coordinate or an input: its enumerator, and unit and note."""
+
+    enum: str
+    words: FreeText
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter: name, the scene's value as a literal, unit and note."""
+
+    name: str
+    value: str
+    words: FreeText
+
+
+@dataclass(frozen=True)
+class Computed:
+    """A function that is computed from the program.
+
+    parts: the static functions that it calls: pieces of a long one, or one column of a matrix.
+    values: the struct in which pieces hand values on. column_call: where it is a loop over columns.
+    """
+
+    function: CFunction
+    parts: tuple[CFunction, ...] = ()
+    values: str = ""
+    column_call: str = ""
+    out: str = ""
+    symmetric: bool = False
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A method of integration in the header: step, run and, where the scene wants it, batch."""
+
+    name: str
+    title: str
+    implicit: bool
+    step: CFunction
+    run: CFunction
+    batch: CFunction | None
+
+
+@dataclass(frozen=True)
+class Header:
+    """c/plain/header.h.jinja. functions: those of mechanics. timed: whether steps take t."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/header.h"
+    title: FreeText
+    stamp: tuple[FreeText, ...]
+    notes: tuple[str, ...]
+    description: tuple[FreeText, ...]
+    prefix: str
+    PREFIX: str
+    real: str
+    handshake: str
+    coordinates: tuple[Indexed, ...]
+    inputs: tuple[Indexed, ...]
+    parameters: tuple[Parameter, ...]
+    implicit: bool
+    timed: bool
+    functions: tuple[CFunction, ...]
+    linearization: CFunction | None
+    methods: tuple[Declared, ...]
+
+
+@dataclass(frozen=True)
+class Source:
+    """c/plain/source.c.jinja. slopes, steppers: the finished texts of the views below."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/source.c"
+    title: FreeText
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    PREFIX: str
+    real: str
+    handshake: str
+    parameters: tuple[Parameter, ...]
+    q0: tuple[str, ...]
+    qd0: tuple[str, ...]
+    evaluations: tuple[Computed, ...]
+    acceleration: Computed
+    solved: tuple[str, ...]
+    slopes: str
+    steppers: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """c/plain/slopes.c.jinja. width: of a row [da/dq, da/dqd, da/du]. unread: unused arguments."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/slopes.c"
+    prefix: str
+    PREFIX: str
+    real: str
+    inputs: bool
+    width: str
+    slopes: Computed
+    linearization: CFunction
+    unread: tuple[str, ...]
+    signal_call: str
+    slopes_call: str
+
+
+@dataclass(frozen=True)
+class RungeKutta4:
+    """c/plain/rk4.c.jinja: the calls of the four accelerations."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/rk4.c"
+    prefix: str
+    PREFIX: str
+    real: str
+    about: tuple[str, ...]
+    step: CFunction
+    first: str
+    second: str
+    third: str
+    fourth: str
+
+
+@dataclass(frozen=True)
+class Explicit:
+    """c/plain/explicit.c.jinja: a tableau, and the call of a stage's accelerations."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/explicit.c"
+    prefix: str
+    PREFIX: str
+    real: str
+    about: tuple[str, ...]
+    step: CFunction
+    stages: int
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    stage: str
+
+
+@dataclass(frozen=True)
+class Implicit:
+    """c/plain/implicit.c.jinja: what implicit methods share. here, near: calls of accelerations."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/implicit.c"
+    prefix: str
+    PREFIX: str
+    real: str
+    fabs: str
+    fmax: str
+    tiny: str
+    nudge: str
+    newton: bool
+    slopes: CFunction
+    here: str
+    near: str
+
+
+@dataclass(frozen=True)
+class Gauss:
+    """c/plain/gauss.c.jinja: a tableau, functions, calls. method: what its C names begin with."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/gauss.c"
+    prefix: str
+    PREFIX: str
+    real: str
+    title: str
+    method: str
+    newton: bool
+    sweeps: int
+    stages: int
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    eps: str
+    tenth: str
+    half: str
+    stages_function: CFunction
+    matrix: CFunction
+    about: tuple[str, ...]
+    solve: CFunction
+    step: CFunction
+    stage: str
+    slopes_call: str
+    start: str
+    sweep: str
+    matrix_start: str
+    matrix_mid: str
+    solve_call: str
+
+
+@dataclass(frozen=True)
+class Loop:
+    """c/plain/run.c.jinja: run and batch of one method, and the calls in them."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/run.c"
+    PREFIX: str
+    prefix: str
+    real: str
+    implicit: bool
+    run: CFunction
+    batch: CFunction | None
+    one_step: str
+    run_one: str
+
+
+View = Header | Source | Slopes | RungeKutta4 | Explicit | Implicit | Gauss | Loop

@@ -1,0 +1,1 @@
+"""Tableaux: the methods of integration as exact coefficients."""

@@ -1,0 +1,1 @@
+"""A scene or SymPy expressions to a mechanical system in symbols."""

@@ -1,0 +1,134 @@
+"""What Python callers give to System.make: the same as scenes may say, and faults in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import sympy
+from sympy import Expr, Symbol
+from sympy.core.function import AppliedUndef
+
+from eomc.base.errors import EomcError
+from eomc.model.symbols import dot
+from eomc.scene.scene import Run
+from eomc.scene.schema import METHODS, REALS
+
+_FUNCTIONS = (
+    *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
+    *(sympy.sinh, sympy.cosh, sympy.tanh, sympy.exp, sympy.log, sympy.Abs, sympy.sign),
+    *(sympy.Heaviside, sympy.Min, sympy.Max, dot),
+)
+_KNOWN = (sympy.Add, sympy.Mul, sympy.Pow, Symbol, sympy.Number, sympy.NumberSymbol, *_FUNCTIONS)
+_INSTEAD = {
+    "sec": "1/cos(x)", "csc": "1/sin(x)", "cot": "1/tan(x)", "sech": "1/cosh(x)",
+    "csch": "1/sinh(x)", "coth": "1/tanh(x)", "asinh": "log(x + sqrt(x**2 + 1))",
+    "acosh": "log(x + sqrt(x**2 - 1))", "atanh": "log((1 + x)/(1 - x))/2", "acot": "atan(1/x)",
+    "Piecewise": "Heaviside(x), Min or Max", "ITE": "Heaviside(x), Min or Max", "erf": "tanh(x)",
+    "floor": "a smooth function", "ceiling": "a smooth function", "Mod": "a smooth function",
+    "Integral": "its value, by .doit()", "Sum": "its terms, by .doit()",
+    "Product": "its factors, by .doit()", "sinc": "sin(x)/x",
+}  # fmt: skip
+
+
+def fault(role: str, message: str) -> EomcError:
+    """The error to raise."""
+    return EomcError(f"System.make: {role}: {message}")
+
+
+def expression(given: Any, role: str) -> Expr:
+    """A SymPy expression, or a number as one. Raises EomcError for anything else."""
+    if isinstance(given, str):
+        raise fault(role, f"give a SymPy expression, not the text {given!r}")
+    try:
+        expr = sympy.sympify(given)
+    except (sympy.SympifyError, TypeError, AttributeError):
+        expr = None
+    if not isinstance(expr, Expr):
+        raise fault(role, f"{given!r} is not an expression")
+    return expr
+
+
+def check_functions(expr: Expr, role: str) -> None:
+    """Raise EomcError where `expr` has a function that C code is not made of."""
+    queue, seen = [expr], {expr}
+    while queue:
+        part = queue.pop()
+        if not isinstance(part, _KNOWN):
+            name = type(part).__name__
+            instead = f": write {_INSTEAD[name]}" if name in _INSTEAD else ""
+            known = ", ".join(f.__name__ for f in _FUNCTIONS)
+            raise fault(role, f"{name} can't be used{instead}; functions are {known}")
+        more = [arg for arg in part.args if arg not in seen]
+        seen.update(more)
+        queue += more
+
+
+def number(given: Any, role: str) -> float:
+    """A finite number. Raises EomcError."""
+    try:
+        if isinstance(given, str):
+            raise TypeError
+        value = float(given)
+    except (TypeError, ValueError, OverflowError):
+        raise fault(role, f"must be a number, here {given!r}") from None
+    if not math.isfinite(value):
+        raise fault(role, f"must be a finite number, here {value}")
+    return value
+
+
+def start(given: Any, role: str) -> tuple[float, float]:
+    """A start, or a (start, rate) pair."""
+    if not isinstance(given, (tuple, list)):
+        return number(given, role), 0.0
+    if len(given) != 2:
+        raise fault(role, f"give a start, or a pair (start, rate), here {given!r}")
+    return number(given[0], role), number(given[1], role)
+
+
+def mapping(given: Any, role: str, example: str) -> Mapping[Any, Any]:
+    """A mapping from symbols. Raises EomcError."""
+    if not isinstance(given, Mapping):
+        raise fault(role, f"give a dict, such as {example}, here {given!r}")
+    return {symbol_of(key, role): value for key, value in given.items()}
+
+
+def symbols(given: Any, role: str, default: Any) -> dict[Any, Any]:
+    """Symbols to what belongs to them; a list of symbols alone gives each the default."""
+    if isinstance(given, Mapping):
+        return dict(mapping(given, role, ""))
+    if isinstance(given, (str, sympy.Basic)) or not isinstance(given, Iterable):
+        raise fault(role, f"give a list or dict of symbols, here {given!r}")
+    return {symbol_of(one, role): default for one in given}
+
+
+def symbol_of(given: Any, role: str) -> Any:
+    """A symbol or a function of time, as dynamicsymbols makes them."""
+    if isinstance(given, str):
+        raise fault(role, f"give a symbol, sympy.Symbol({given!r}), not the text {given!r}")
+    return given
+
+
+def is_symbol(given: Any) -> bool:
+    """Whether it is a symbol or a function of time."""
+    return isinstance(given, (Symbol, AppliedUndef))
+
+
+def run(
+    h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any
+) -> Run:  # fmt: skip
+    """How the system is run. Raises EomcError where that is not possible."""
+    for name, value in (("h", h), ("duration", duration)):
+        if number(value, name) <= 0:
+            raise fault(name, f"must be greater than zero, here {value!r}")
+    methods = (methods,) if isinstance(methods, str) else tuple(methods)
+    if not methods or not all(method in METHODS for method in methods):
+        raise fault("methods", f"known are {', '.join(METHODS)}, here {methods!r}")
+    if real not in REALS:
+        raise fault("real", f"known are {', '.join(REALS)}, here {real!r}")
+    if not isinstance(batch, bool):
+        raise fault("batch", f"must be True or False, here {batch!r}")
+    if not isinstance(linearize, bool) and linearize != "parameters":
+        raise fault("linearize", f'must be True, False or "parameters", here {linearize!r}')
+    return Run(float(h), float(duration), methods, real, batch, linearize)

@@ -1,0 +1,544 @@
+"""From bodies and joints to energies, forces and a tree of elementary joints.
+
+Energies are written as a textbook does, over the world coordinates of centres of mass and the
+entries of rotation matrices: that is what the reference and the Lagrangian route start from. The
+tree says the same body by body, for the recursive routes (trees.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import mpmath
+import sympy
+from sympy import Add, Expr, Rational, S, Symbol
+
+from eomc.model.symbols import dot, symbol
+from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Spring
+from eomc.scene.formulas import Formula
+from eomc.scene.joints import JOINTS
+
+Vector = tuple[Expr, Expr, Expr]
+Matrix = tuple[Vector, Vector, Vector]
+Value = Callable[[str, Formula], Expr]  # the expression of a formula that stands at a key
+
+DIGITS = 50  # of numbers that are folded
+TINY = 10**40  # what is nearer than one part in that many to a whole number is it
+
+ZERO: Vector = (S.Zero, S.Zero, S.Zero)
+ONE: Matrix = ((S.One, S.Zero, S.Zero), (S.Zero, S.One, S.Zero), (S.Zero, S.Zero, S.One))
+
+
+@dataclass(frozen=True)
+class Link:
+    """An elementary joint and the mass that moves with it, in the frame that the joint moves.
+
+    The frame stands at `offset` in the parent's frame, turned by `rotation` (it takes vectors of
+    the joint's frame to the parent's), and then turns about (`turns`) or slides along its own
+    `axis` (0, 1, 2) by `q`. mass, moment (mass times centre of mass) and inertia (Ixx, Iyy, Izz,
+    Ixy, Ixz, Iyz) are about the frame's origin.
+    """
+
+    name: str
+    parent: int  # -1: the world
+    turns: bool
+    axis: int
+    q: Symbol
+    qd: Symbol
+    offset: Vector
+    rotation: Matrix
+    mass: Expr
+    moment: Vector
+    inertia: tuple[Expr, ...]
+    armature: Expr
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Links, parents first. beside_*: the energies that the tree does not account for.
+
+    still: the moment of the mass that does not move at all, which has potential energy.
+    """
+
+    links: tuple[Link, ...]
+    gravity: Vector
+    still: Vector
+    beside_kinetic: Expr = S.Zero
+    beside_potential: Expr = S.Zero
+
+
+@dataclass
+class Terms:
+    """What bodies, springs and dampers add to a system.
+
+    definitions: those that the user's formulas may use. later: those that use the user's.
+    """
+
+    definitions: list[tuple[Symbol, Expr]] = field(default_factory=list)
+    later: list[tuple[Symbol, Expr]] = field(default_factory=list)
+    tree_kinetic: list[Expr] = field(default_factory=list)  # to be added up
+    tree_potential: list[Expr] = field(default_factory=list)
+    kinetic: Expr = S.Zero  # of bodies placed by formulas
+    potential: Expr = S.Zero  # theirs and the springs'
+    dissipation: Expr = S.Zero
+    forces: dict[str, Expr] = field(default_factory=dict)
+    links: list[Link] = field(default_factory=list)
+    still: Vector = ZERO
+    gravity: Vector = ZERO
+
+    def tree(self, kinetic: Expr, potential: Expr) -> Tree | None:
+        """The tree, beside energies that were written by hand; None where nothing is in it."""
+        if not self.links:
+            return None
+        return Tree(
+            tuple(self.links),
+            self.gravity,
+            self.still,
+            kinetic + self.kinetic,
+            potential + self.potential,
+        )
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a body's frame is: fixed in a link's frame, and as expressions in the world."""
+
+    link: int
+    offset: Vector  # in the link's frame
+    rotation: Matrix
+    at: Vector  # in the world
+    turned: Matrix
+    angle: Expr = S.Zero  # in the plane
+
+
+class Builder:
+    """Puts bodies together, in the order in which a scene needs the pieces."""
+
+    def __init__(self, assembly: Assembly, value: Value, taken: Sequence[str]) -> None:
+        self.assembly = assembly
+        self.value = value
+        self.taken = set(taken)
+        self.terms = Terms()
+        self.places: dict[str, _Place] = {WORLD: _Place(-1, ZERO, ONE, ZERO, ONE)}
+        self.masses: dict[str, Expr] = {}
+        self.terms.gravity = self._vector("gravity", assembly.gravity)
+
+    # --- the tree --------------------------------------------------------------------------------
+
+    def build_tree(self) -> None:
+        """Every body that hangs on a joint."""
+        for body in self.assembly.bodies:
+            if body.joint:
+                self._hang(body)
+        self._collect_masses()
+
+    def _hang(self, body: Body) -> None:
+        key = f"body.{body.name}"
+        parent = self.places[body.parent]
+        offset = self._vector(f"{key}.offset", body.offset) if body.offset else ZERO
+        rotation = self._rotation(f"{key}.rotation", body)
+        angle = parent.angle
+        if self.assembly.plane:
+            angle += sum(self.value(f"{key}.rotation", turn.angle) for turn in body.rotation)
+        at = self._world(f"{body.name}_joint", plus(parent.at, apply(parent.turned, offset)))
+        turned = product(parent.turned, rotation)
+        place = _Place(
+            parent.link,
+            plus(parent.offset, apply(parent.rotation, numeric(offset))),
+            clean(product(parent.rotation, clean(rotation))),
+            at,
+            turned,
+            angle,
+        )
+        armature = [self.value(f"{key}.armature", a) for a in body.armature]
+        for k, (motion, axis, name) in enumerate(_motions(body)):
+            place = self._move(
+                body.name, place, motion, axis, name, armature[k] if armature else S.Zero
+            )
+        if not self.assembly.plane and body.joint != "fixed":
+            turned = self._entries(body.name, place.turned)
+            place = _Place(place.link, place.offset, place.rotation, place.at, turned)
+        self.places[body.name] = place
+        self._load(body, place)
+
+    def _move(
+        self, name: str, place: _Place, motion: str, axis: Sequence[float], coordinate: str,
+        armature: Expr,
+    ) -> _Place:  # fmt: skip
+        """The place behind one more elementary joint, which becomes a link."""
+        terms = self.terms
+        q, qd = symbol(coordinate), symbol(f"{coordinate}_dot")
+        k, aligned = _aligned(axis)
+        direction = tuple(S(x) for x in _unit(axis))
+        terms.links.append(
+            Link(
+                name, place.link, motion == "r", k, q, qd, place.offset,
+                clean(product(place.rotation, aligned)), S.Zero, ZERO, (S.Zero,) * 6, armature,
+            )
+        )  # fmt: skip
+        back = transposed(aligned)
+        if motion == "t":
+            way = scaled(apply(place.turned, direction), q)
+            at = self._world(f"{name}_joint", plus(place.at, way))
+            return _Place(len(terms.links) - 1, ZERO, back, at, place.turned, place.angle)
+        if self.assembly.plane:
+            angle = self._named(f"{name}_angle", place.angle + q)
+            turned = rotation_about(2, angle)
+            return _Place(len(terms.links) - 1, ZERO, back, place.at, turned, angle)
+        turn = product(product(aligned, rotation_about(k, q)), back)
+        turned = self._entries(name, product(place.turned, turn))
+        return _Place(len(terms.links) - 1, ZERO, back, place.at, turned)
+
+    def _load(self, body: Body, place: _Place) -> None:
+        """The body's mass, on its link and in the energies."""
+        key, terms = f"body.{body.name}", self.terms
+        mass = self.value(f"{key}.mass", body.mass)
+        inertia = [self.value(f"{key}.inertia", entry) for entry in body.inertia]
+        center = self._vector(f"{key}.center", body.center)
+        middle = plus(place.at, apply(place.turned, center))
+        position = self._position(body.name, middle)
+        m, c = numeric((mass, S.Zero, S.Zero))[0], numeric(center)
+        moment = scaled(plus(place.offset, apply(place.rotation, c)), m)
+        if place.link < 0:
+            terms.still = plus(terms.still, moment)
+        else:
+            about = rotated_inertia(place.rotation, [numeric_entry(x) for x in inertia])
+            arm = plus(place.offset, apply(place.rotation, c))
+            about = [a + b for a, b in zip(about, point_inertia(m, arm), strict=True)]
+            self._add_mass(place.link, m, moment, about)
+            terms.tree_kinetic += self._kinetic(mass, inertia, position, place)
+        terms.tree_potential.append(self._weight(mass, position))
+
+    def _add_mass(self, k: int, mass: Expr, moment: Vector, inertia: Sequence[Expr]) -> None:
+        link = self.terms.links[k]
+        self.terms.links[k] = Link(
+            link.name, link.parent, link.turns, link.axis, link.q, link.qd, link.offset,
+            link.rotation, link.mass + mass, plus(link.moment, moment),
+            tuple(a + b for a, b in zip(link.inertia, inertia, strict=True)), link.armature,
+        )  # fmt: skip
+
+    def _collect_masses(self) -> None:
+        """Armatures, which have kinetic energy of their own."""
+        for link in self.terms.links:
+            self.terms.tree_kinetic.append(link.armature * link.qd**2 / 2)
+
+    def add_forces(self) -> None:
+        """Damping, friction and actuators of the joints."""
+        for body in self.assembly.bodies:
+            self._joint_forces(body)
+
+    def _joint_forces(self, body: Body) -> None:
+        key, terms = f"body.{body.name}", self.terms
+        width = (
+            self.value(f"{key}.friction_width", body.friction_width)
+            if body.friction_width
+            else S.One
+        )
+        for k, name in enumerate(body.coordinates):
+            rate = symbol(f"{name}_dot")
+            if body.damping:
+                terms.dissipation += self.value(f"{key}.damping", body.damping[k]) * rate**2 / 2
+            force = S.Zero
+            if body.friction:
+                friction = self.value(f"{key}.friction", body.friction[k])
+                force -= friction * sympy.tanh(rate / width)
+            if body.actuator:
+                force += self.value(f"{key}.actuator", body.actuator[k])
+            if force != 0:
+                terms.forces[name] = terms.forces.get(name, S.Zero) + force
+
+    # --- bodies placed by formulas, springs and dampers ------------------------------------------
+
+    def build_rest(self) -> None:
+        """What may use the user's definitions."""
+        for body in self.assembly.bodies:
+            if not body.joint:
+                self._put(body)
+        for k, spring in enumerate(self.assembly.springs):
+            self._spring(f"spring.{k + 1}", spring)
+        for k, damper in enumerate(self.assembly.dampers):
+            self._damper(f"damper.{k + 1}", damper)
+
+    def _put(self, body: Body) -> None:
+        assert body.position is not None
+        key, terms = f"body.{body.name}", self.terms
+        mass = self.value(f"{key}.mass", body.mass)
+        inertia = [self.value(f"{key}.inertia", entry) for entry in body.inertia]
+        at = self._vector(f"{key}.position", body.position)
+        position = self._position(body.name, at, later=True)
+        turned, angle = self._rotation(f"{key}.rotation", body), S.Zero
+        if self.assembly.plane:
+            angle = sum((self.value(f"{key}.rotation", t.angle) for t in body.rotation), S.Zero)
+            angle = self._named(f"{body.name}_angle", angle, later=True)
+            turned = rotation_about(2, angle)
+        else:
+            turned = self._entries(body.name, turned, later=True)
+        place = _Place(-1, ZERO, ONE, position, turned, angle)
+        self.places[body.name] = place
+        terms.kinetic += Add(*self._kinetic(mass, inertia, position, place))
+        terms.potential += self._weight(mass, position)
+
+    def _spring(self, key: str, spring: Spring) -> None:
+        stiffness = self.value(f"{key}.stiffness", spring.stiffness)
+        rest = self.value(f"{key}.length", spring.length)
+        self.terms.potential += stiffness * (self._length(key, spring, rest == 0) - rest) ** 2 / 2
+
+    def _damper(self, key: str, damper: Damper) -> None:
+        damping = self.value(f"{key}.damping", damper.damping)
+        self.terms.dissipation += damping * dot(self._length(key, damper, False)) ** 2 / 2
+
+    def _length(self, key: str, end: Spring | Damper, square: bool) -> Expr:
+        """What a spring is stretched to. square: only its square is needed."""
+        if end.coordinate:
+            return symbol(end.coordinate)
+        assert end.bodies is not None
+        one, other = (self.places[name] for name in end.bodies)
+        name = f"{key.replace('.', '')}_length"
+        if end.turning:
+            return self._named(name, other.angle - one.angle, later=True)
+        assert end.points is not None
+        a, b = (
+            plus(place.at, apply(place.turned, self._vector(f"{key}.points", point)))
+            for place, point in zip((one, other), end.points, strict=True)
+        )
+        across = sum((x - y) ** 2 for x, y in zip(b, a, strict=True))
+        return (
+            self._named(name, sympy.sqrt(across), later=True) if not square else sympy.sqrt(across)
+        )
+
+    # --- pieces ----------------------------------------------------------------------------------
+
+    def _kinetic(
+        self, mass: Expr, inertia: Sequence[Expr], position: Vector, place: _Place
+    ) -> list[Expr]:
+        """m/2 |dc/dt|^2 + 1/2 sum_ab J_ab sum_k dR_ka/dt dR_kb/dt with J = tr(I)/2 - I; terms."""
+        energy = [mass * _rate(x) ** 2 / 2 for x in position]
+        if self.assembly.plane:
+            return [*energy, inertia[2] * _rate(place.angle) ** 2 / 2]
+        xx, yy, zz, xy, xz, yz = inertia
+        second = {
+            (0, 0): (yy + zz - xx) / 2, (1, 1): (xx + zz - yy) / 2, (2, 2): (xx + yy - zz) / 2,
+            (0, 1): -2 * xy, (0, 2): -2 * xz, (1, 2): -2 * yz,
+        }  # fmt: skip
+        rates = [[_rate(entry) for entry in row] for row in place.turned]
+        turning = [
+            J * row[a] * row[b] / 2 for (a, b), J in second.items() if J != 0 for row in rates
+        ]
+        return energy + turning
+
+    def _weight(self, mass: Expr, position: Vector) -> Expr:
+        return -mass * dot_product(self.terms.gravity, position)
+
+    def _vector(self, key: str, formulas: Sequence[Formula]) -> Vector:
+        x, y, z = (self.value(key, formula) for formula in formulas)
+        return (x, y, z)
+
+    def _rotation(self, key: str, body: Body) -> Matrix:
+        turned = ONE
+        for turn in body.rotation:
+            angle = self.value(key, turn.angle)
+            turned = product(turned, rotation_about("xyz".index(turn.axis), angle))
+        return turned
+
+    def _position(self, name: str, at: Vector, later: bool = False) -> Vector:
+        """The centre of mass, under the names that formulas may use."""
+        made = []
+        for letter, x in zip("xyz", at, strict=True):
+            if self.assembly.plane and letter == "z":
+                made.append(S.Zero)
+            elif later or not x.free_symbols:
+                made.append(self._named(f"{name}_{letter}", x, later))
+            else:
+                made.append(symbol(f"{name}_{letter}"))
+                self.terms.definitions.append((made[-1], x))
+        if not later:  # a name may be used even where it stands for a number
+            known = {s for s, _ in self.terms.definitions}
+            for letter, x in zip("xy" if self.assembly.plane else "xyz", at, strict=False):
+                if symbol(f"{name}_{letter}") not in known:
+                    self.terms.definitions.append((symbol(f"{name}_{letter}"), x))
+        x, y, z = made
+        return (x, y, z)
+
+    def _world(self, name: str, at: Vector) -> Vector:
+        x, y, z = (self._named(f"{name}_{letter}", e) for letter, e in zip("xyz", at, strict=True))
+        return (x, y, z)
+
+    def _entries(self, name: str, turned: Matrix, later: bool = False) -> Matrix:
+        return tuple(  # type: ignore[return-value]
+            tuple(
+                self._named(f"{name}_r{i}{j}", entry, later) for j, entry in enumerate(row, start=1)
+            )
+            for i, row in enumerate(turned, start=1)
+        )
+
+    def _named(self, wish: str, e: Expr, later: bool = False) -> Expr:
+        """A definition for `e`, unless it is a number, a name or its negative already."""
+        if e.is_number or e.is_Symbol or (-e).is_Symbol:
+            return e
+        name = wish
+        while name in self.taken:
+            name += "_"
+        self.taken.add(name)
+        where = self.terms.later if later else self.terms.definitions
+        where.append((symbol(name), e))
+        return symbol(name)
+
+
+def _rate(e: Expr) -> Expr:
+    return dot(e) if e.free_symbols else S.Zero
+
+
+def _motions(body: Body) -> list[tuple[str, Sequence[float], str]]:
+    """The elementary joints of a body: (motion, axis, coordinate), the outermost last."""
+    joint = JOINTS[body.joint]
+    return list(zip(joint.motions, joint.along(body.axes), body.coordinates, strict=True))
+
+
+# --- numbers, vectors and matrices ---------------------------------------------------------------
+
+
+def numeric_entry(e: Expr) -> Expr:
+    """Numbers as fractions of at most DIGITS digits; what is all but whole is whole."""
+    if not e.is_number:
+        return e
+    if not e.is_Rational:
+        e = Rational(str(e.evalf(DIGITS + 5)))
+    whole = (2 * e.p + e.q) // (2 * e.q)  # the nearest
+    if abs(e.p - whole * e.q) * TINY < e.q:
+        return S(whole)
+    if e.q > 10**DIGITS:
+        with mpmath.workdps(DIGITS):
+            e = Rational(mpmath.nstr(mpmath.mpf(e.p) / e.q, DIGITS))
+    return e
+
+
+def numeric(v: Vector) -> Vector:
+    """A vector with its numbers as fractions."""
+    x, y, z = map(numeric_entry, v)
+    return (x, y, z)
+
+
+def clean(matrix: Matrix) -> Matrix:
+    """A matrix with its numbers as fractions."""
+    one, two, three = map(numeric, matrix)
+    return (one, two, three)
+
+
+def plus(a: Vector, b: Vector) -> Vector:
+    """a + b"""
+    x, y, z = (p if q is S.Zero else q if p is S.Zero else p + q for p, q in zip(a, b, strict=True))
+    return (x, y, z)
+
+
+def scaled(a: Vector, factor: Expr) -> Vector:
+    """factor a"""
+    return (a[0] * factor, a[1] * factor, a[2] * factor)
+
+
+def dot_product(a: Vector, b: Vector) -> Expr:
+    """a . b"""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def apply(R: Matrix, v: Sequence[Expr]) -> Vector:
+    """R v"""
+    x, y, z = (
+        Add(*(e if r is S.One else r * e for r, e in zip(row, v, strict=True) if r is not S.Zero))
+        for row in R
+    )
+    return (x, y, z)
+
+
+def transposed(R: Matrix) -> Matrix:
+    """The transposed matrix: of a rotation, its inverse."""
+    one, two, three = zip(*R, strict=True)
+    return (one, two, three)
+
+
+def product(A: Matrix, B: Matrix) -> Matrix:
+    """A B"""
+    columns = [apply(A, column) for column in transposed(B)]
+    one, two, three = zip(*columns, strict=True)
+    return (one, two, three)
+
+
+def rotation_about(axis: int, angle: Expr) -> Matrix:
+    """The rotation about a coordinate axis: takes vectors of the turned frame to the old one."""
+    c, s = sympy.cos(angle), sympy.sin(angle)
+    a, b = ((1, 2), (2, 0), (0, 1))[axis]
+    rows = [list(row) for row in ONE]
+    rows[a][a], rows[a][b], rows[b][a], rows[b][b] = c, -s, s, c
+    one, two, three = map(tuple, rows)
+    return (one, two, three)
+
+
+def _unit(axis: Sequence[float]) -> list[Expr]:
+    """The axis as fractions, of length one in DIGITS digits."""
+    given = [Rational(str(x)) for x in axis]
+    with mpmath.workdps(DIGITS + 5):
+        long = [mpmath.mpf(x.p) / x.q for x in given]
+        size = mpmath.sqrt(sum(x * x for x in long))
+        return [numeric_entry(Rational(mpmath.nstr(x / size, DIGITS + 5))) for x in long]
+
+
+def _aligned(axis: Sequence[float]) -> tuple[int, Matrix]:
+    """(k, R) with R e_k = axis: frames are turned so that every joint has a coordinate axis."""
+    unit = _unit(axis)
+    for k, x in enumerate(unit):
+        if abs(x) == 1:
+            if x == 1:
+                return k, ONE
+            rows = [[S.Zero] * 3 for _ in range(3)]
+            for i in range(3):  # half a turn about another axis
+                rows[i][i] = S.One if i == (k + 1) % 3 else S.NegativeOne
+            one, two, three = map(tuple, rows)
+            return k, (one, two, three)
+    # Gram and Schmidt, from the coordinate axis that is farthest from it
+    far = min(range(3), key=lambda i: (abs(unit[i]), i))
+    first = [-unit[far] * x for x in unit]
+    first[far] += 1
+    size = sympy.sqrt(sum(x * x for x in first))
+    a = [numeric_entry((x / size).evalf(DIGITS + 5)) if x != 0 else S.Zero for x in first]
+    b = [
+        numeric_entry(unit[1] * a[2] - unit[2] * a[1]),
+        numeric_entry(unit[2] * a[0] - unit[0] * a[2]),
+        numeric_entry(unit[0] * a[1] - unit[1] * a[0]),
+    ]
+    return 2, transposed((tuple(a), tuple(b), tuple(unit)))
+
+
+def point_inertia(mass: Expr, at: Vector) -> list[Expr]:
+    """The inertia of a point mass: Ixx, Iyy, Izz, Ixy, Ixz, Iyz."""
+    x, y, z = at
+    return [
+        mass * (y**2 + z**2), mass * (x**2 + z**2), mass * (x**2 + y**2),
+        -mass * x * y, -mass * x * z, -mass * y * z,
+    ]  # fmt: skip
+
+
+def rotated_inertia(R: Matrix, inertia: Sequence[Expr]) -> list[Expr]:
+    """R I R^T as Ixx, Iyy, Izz, Ixy, Ixz, Iyz."""
+    if R == ONE:
+        return list(inertia)
+    xx, yy, zz, xy, xz, yz = inertia
+    I: Matrix = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))  # noqa: E741 - the field's name
+    turned = product(product(R, I), transposed(R))
+    return [
+        numeric_entry(turned[i][j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    ]
+
+
+def needed(
+    definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
+) -> list[tuple[Symbol, Expr]]:
+    """The definitions that `ends` hang on, in their order."""
+    known: Mapping[Symbol, Expr] = dict(definitions)
+    found: set[Symbol] = set()
+    queue = [s for end in ends for s in end.free_symbols]
+    while queue:
+        name = queue.pop()
+        if name in known and name not in found:
+            found.add(name)
+            queue.extend(known[name].free_symbols)
+    return [(name, e) for name, e in definitions if name in found]

@@ -1,0 +1,1 @@
+"""Equations to straight-line programs: ordered, shared, counted, each by its cheapest route."""

@@ -1,0 +1,372 @@
+"""The text of an MJCF file: elements with their lines, attributes, default classes, settings.
+
+What the elements mean is taken from the XML reference of MuJoCo's documentation and, where that
+leaves it open, from what MuJoCo 3 and 4 do. Nothing that a file names is opened, unless `load` is
+asked for included files; entities and document types are refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from eomc.base.errors import Problem
+from eomc.robots import xml
+from eomc.robots.robot import Vector
+
+SHOWN = 12  # names told in one line of what is left out
+
+ORIENTATION = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
+PLACE = {"name", "class", "pos", "user", "group", *ORIENTATION}
+CONTACT = set("solreflimit solimplimit solreffriction solimpfriction margin".split())
+
+# what a tag may have; an attribute not in here is told
+KNOWN = {
+    "body": PLACE | {"childclass", "mocap", "gravcomp", "sleep", "simple", "fuse"},
+    "frame": PLACE | {"childclass"},
+    "inertial": PLACE | {"mass", "diaginertia", "fullinertia"},
+    "freejoint": {"name", "group", "align"},
+    "joint": CONTACT
+    | set(
+        """name class type group pos axis springdamper limited actuatorfrclimited stiffness range
+        actuatorfrcrange actuatorgravcomp ref springref springyield armature damping frictionloss
+        user""".split()
+    ),
+    "geom": PLACE
+    | set(
+        """type contype conaffinity condim priority size material friction mass density
+        shellinertia solmix solref solimp margin gap surfacevel adhesion fromto hfield mesh
+        fitscale rgba castshadow fluidshape fluidcoef""".split()
+    ),
+}
+
+ACTUATORS = set(
+    """general motor position velocity intvelocity orientation pid damper cylinder muscle adhesion
+    dcmotor plugin""".split()
+)
+# arrays of which an element may give the first numbers and leave the rest to its class
+PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
+LAW = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}  # an actuator's force
+
+Attributes = dict[str, str]
+Classes = dict[str, dict[str, Attributes]]
+
+
+@dataclass(frozen=True, eq=False)
+class Tag:
+    """An element of the file: what it is, where it stands, what it has and holds."""
+
+    kind: str
+    attributes: Attributes
+    line: int
+    file: Path
+    children: list[Tag] = field(default_factory=list)
+
+    def each(self, kind: str) -> Iterator[Tag]:
+        """The children of a kind."""
+        return (child for child in self.children if child.kind == kind)
+
+
+@dataclass
+class Told:
+    """What reading has found: faults, and what is left out, by kind, in the order found."""
+
+    faults: list[Problem] = field(default_factory=list)
+    left: dict[str, list[str]] = field(default_factory=dict)
+
+    def fault(self, tag: Tag, message: str) -> None:
+        """Keep a fault, with the line it stands in; reading goes on to find the others."""
+        self.faults.append(Problem(message, key=called(tag), file=str(tag.file), line=tag.line))
+
+    def leave(self, kind: str, name: str = "") -> None:
+        """Keep that the thing `name`, of a kind, is left out."""
+        self.left.setdefault(kind, []).append(name)
+
+    def lines(self) -> tuple[str, ...]:
+        """What is left out, one line a kind."""
+        lines = []
+        for kind, those in self.left.items():
+            named = list(dict.fromkeys(name for name in those if name))[:SHOWN]
+            line = f"{kind} ({len(those)})" if len(those) > 1 else kind
+            if named:
+                more = len(those) - len(named)
+                line += f": {', '.join(named)}" + (f" and {more} more" if more else "")
+            lines.append(line)
+        return tuple(lines)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """<compiler> and <option>, as far as they bear on masses and motion."""
+
+    degrees: bool = True
+    eulerseq: str = "xyz"
+    autolimits: bool = True
+    inertia: str = "auto"  # from geoms: "true", "false", or "auto" where there is no <inertial>
+    groups: tuple[float, float] = (0, 5)
+    boundmass: float = 0.0
+    boundinertia: float = 0.0
+    totalmass: float = -1.0
+    balance: bool = False
+    alignfree: bool = False
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+
+    def angle(self, value: float) -> float:
+        """An angle of the file in rad."""
+        return math.radians(value) if self.degrees else value
+
+
+# ---- the file
+
+
+def load(path: Path, include: bool, told: Told) -> Tag:
+    """The file as tags, with what it includes in the place of <include>."""
+    root = _parse(path)
+    folder = path.resolve().parent
+    opened = {path.resolve()}
+    waiting = [root]
+    while waiting:
+        tag = waiting.pop()
+        children: list[Tag] = []
+        queue = tag.children[::-1]
+        while queue:
+            child = queue.pop()
+            if child.kind == "include":
+                queue += _included(child, folder, include, opened, told)[::-1]
+            else:
+                children.append(child)
+        tag.children[:] = children
+        waiting += children
+    return root
+
+
+def _included(tag: Tag, folder: Path, include: bool, opened: set[Path], told: Told) -> list[Tag]:
+    """What stands in the file that <include> names; it must lie in `folder`."""
+    name = tag.attributes.get("file", "")
+    if not include:
+        told.fault(
+            tag,
+            f'the file "{name}" is not opened: allow it with --include, '
+            "or put what it holds in the place of <include>",
+        )
+        return []
+    target = (folder / name).resolve()
+    if not target.is_relative_to(folder):
+        told.fault(tag, f'"{name}" lies outside the folder of the model; move it into the folder')
+    elif target in opened:
+        told.fault(tag, f'"{name}" is included a second time; MJCF allows it once')
+    elif not target.is_file():
+        told.fault(tag, f'there is no file "{name}" in the folder of the model')
+    else:
+        opened.add(target)
+        return _parse(target).children
+    return []
+
+
+def _parse(path: Path) -> Tag:
+    """The elements of one file, with their lines. Raises EomcError for what is not XML."""
+    from defusedxml.ElementTree import DefusedXMLParser
+
+    xml.root(path)  # tells whatever is wrong with the file; what follows adds the lines
+    roots: list[Tag] = []
+    stack: list[Tag] = []
+
+    class Builder:
+        def start(self, kind: str, attributes: Attributes) -> None:
+            tag = Tag(kind, dict(attributes), parser.parser.CurrentLineNumber, path)
+            (stack[-1].children if stack else roots).append(tag)
+            stack.append(tag)
+
+        def end(self, kind: str) -> None:
+            stack.pop()
+
+        def data(self, text: str) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    parser: Any = DefusedXMLParser(target=Builder(), forbid_dtd=True)
+    parser.feed(path.read_bytes())
+    parser.close()
+    return roots[0]
+
+
+def called(tag: Tag) -> str:
+    """A tag as errors call it."""
+    name = tag.attributes.get("name", "")
+    return f'{tag.kind} "{name}"' if name else tag.kind
+
+
+def numbers(
+    attributes: Attributes, key: str, tag: Tag, told: Told, most: int, least: int | None = None
+) -> tuple[float, ...] | None:
+    """The numbers of an attribute, `least` (by default `most`) to `most` of them.
+
+    None where there is no such attribute, or a fault, which is told.
+    """
+    text = attributes.get(key)
+    if text is None:
+        return None
+    least = most if least is None else least
+    try:
+        values = tuple(xml.number(word) for word in text.split())
+    except ValueError:
+        told.fault(tag, f'{key}="{text}" holds something that is not a number')
+        return None
+    if not all(math.isfinite(value) for value in values):
+        told.fault(tag, f'{key}="{text}" must be finite')
+        return None
+    if any(abs(value) > xml.LARGE for value in values):
+        told.fault(tag, f'{key}="{text}" is more than {xml.LARGE:g}, which can\'t be meant')
+        return None
+    if not least <= len(values) <= most:
+        wanted = str(most) if least == most else f"{least} to {most}"
+        told.fault(tag, f'{key}="{text}" has {len(values)} numbers; it takes {wanted}')
+        return None
+    return values
+
+
+def vector(attributes: Attributes, key: str, tag: Tag, told: Told) -> Vector | None:
+    """Three numbers; None as for _numbers."""
+    values = numbers(attributes, key, tag, told, 3)
+    return (values[0], values[1], values[2]) if values else None
+
+
+def number(attributes: Attributes, key: str, tag: Tag, told: Told, default: float = 0.0) -> float:
+    """One number."""
+    values = numbers(attributes, key, tag, told, 1)
+    return values[0] if values else default
+
+
+def choice(attributes: Attributes, key: str, tag: Tag, told: Told, choices: Sequence[str]) -> str:
+    """A word out of `choices`, of which the first is the default."""
+    word = attributes.get(key, choices[0])
+    if word in choices:
+        return word
+    told.fault(tag, f'{key}="{word}" is not one of {", ".join(choices)}')
+    return choices[0]
+
+
+def unknown(tag: Tag, told: Told) -> None:
+    """Tell the attributes of a tag that MJCF doesn't have."""
+    for key in tag.attributes:
+        if key not in KNOWN[tag.kind]:
+            told.leave("attributes that MJCF does not have", f"{key} of {called(tag)}")
+
+
+# ---- settings and defaults
+
+TRUTH = ("false", "true")
+
+
+def settings_of(root: Tag, told: Told) -> Settings:
+    """<compiler> and <option>; of what is said twice, the last holds."""
+    s = Settings()
+    for tag in root.each("compiler"):
+        a = tag.attributes
+
+        def truth(key: str, now: bool, a: Attributes = a, tag: Tag = tag) -> bool:
+            return choice(a, key, tag, told, TRUTH) == "true" if key in a else now
+
+        if a.get("coordinate", "local") != "local":
+            told.fault(
+                tag,
+                'coordinate="global" is not read, nor by MuJoCo since 2.3.4; '
+                "let an older MuJoCo save the model in local coordinates",
+            )
+        seq = a.get("eulerseq", s.eulerseq)
+        if len(seq) != 3 or set(seq.lower()) - set("xyz"):
+            told.fault(tag, f'eulerseq="{seq}" must be three of x, y, z, X, Y, Z')
+            seq = s.eulerseq
+        groups = numbers(a, "inertiagrouprange", tag, told, 2)
+        angle = choice(a, "angle", tag, told, ("degree", "radian"))
+        inertia = choice(a, "inertiafromgeom", tag, told, ("auto", *TRUTH))
+        s = replace(
+            s,
+            degrees=angle == "degree" if "angle" in a else s.degrees,
+            eulerseq=seq,
+            autolimits=truth("autolimits", s.autolimits),
+            inertia=inertia if "inertiafromgeom" in a else s.inertia,
+            groups=(groups[0], groups[1]) if groups else s.groups,
+            boundmass=number(a, "boundmass", tag, told, s.boundmass),
+            boundinertia=number(a, "boundinertia", tag, told, s.boundinertia),
+            totalmass=number(a, "settotalmass", tag, told, s.totalmass),
+            balance=truth("balanceinertia", s.balance),
+            alignfree=truth("alignfree", s.alignfree),
+        )
+    for tag in root.each("option"):
+        a = tag.attributes
+        s = replace(s, gravity=vector(a, "gravity", tag, told) or s.gravity)
+        for key in ("density", "viscosity", "wind"):
+            values = numbers(a, key, tag, told, 3, 1)
+            if values and any(values):
+                told.leave("forces of the surrounding fluid", key)
+        for key in a:
+            if key not in {"gravity", "density", "viscosity", "wind"}:
+                told.leave("options of MuJoCo's simulation", key)
+        for flag in tag.each("flag"):
+            for key, value in flag.attributes.items():
+                if key == "gravity" and value == "disable":
+                    s = replace(s, gravity=(0.0, 0.0, 0.0))
+                else:
+                    told.leave("flags of MuJoCo's simulation", f"{key}={value}")
+    return s
+
+
+def classes_of(root: Tag, told: Told) -> Classes:
+    """The default classes, each with the attributes of its kinds of elements, inherited too.
+
+    All actuators of a class share one entry, "actuator". Elements of a class hold for the classes
+    inside it wherever they stand there.
+    """
+    classes: Classes = {"main": {}}
+    for top in root.each("default"):
+        name = top.attributes.get("class", "main")
+        waiting = [(top, "main")]
+        if name != "main":
+            classes[name] = classes["main"]
+        while waiting:
+            tag, name = waiting.pop()
+            own = classes[name]
+            for child in tag.children:
+                kind = "actuator" if child.kind in ACTUATORS else child.kind
+                if kind != "default":
+                    own[kind] = merged(own.get(kind, {}), child)
+            for child in tag.each("default"):
+                inner = child.attributes.get("class", "")
+                if not inner:
+                    told.fault(child, 'a <default> inside another needs a name: class="..."')
+                elif inner in classes:
+                    told.fault(child, f'there are two default classes "{inner}"; rename one')
+                else:
+                    classes[inner] = dict(own)
+                    waiting.append((child, inner))
+    return classes
+
+
+def merged(base: Attributes, tag: Tag) -> Attributes:
+    """The attributes of a tag over those of its class.
+
+    An orientation replaces an inherited one of whatever kind, and fromto a whole inherited pose.
+    A shortcut of <general> starts from its own law of force, told under the key " law".
+    """
+    own = {k: v for k, v in tag.attributes.items() if k not in {"class", "childclass"}}
+    over = dict(base)
+    if own.keys() & ORIENTATION.keys() or "fromto" in own:
+        over = {k: v for k, v in over.items() if k not in ORIENTATION}
+    if "fromto" in own:
+        over.pop("pos", None)
+    if tag.kind in ACTUATORS and tag.kind != "general":
+        over = {k: v for k, v in over.items() if k not in LAW}
+        over[" law"] = tag.kind
+    for key, value in own.items():
+        words = value.split()
+        if key in PARTIAL and key in over:
+            words += over[key].split()[len(words) :]
+            value = " ".join(words)
+        over[key] = value
+    return over

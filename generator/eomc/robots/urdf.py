@@ -1,0 +1,418 @@
+"""URDF read into a Robot. The file is data: no mesh or other file that it names is opened.
+
+Source: the URDF specification of ROS (wiki.ros.org/urdf/XML). A link's frame is its joint's
+frame; axes stand in it; ixy and its like are entries of the tensor.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eomc.base import texts
+from eomc.base.errors import EomcError, Problem, SceneError
+from eomc.robots import robot as robots
+from eomc.robots import xml
+from eomc.robots.robot import Drive, Inertia, Matrix, Motion, Robot, RobotBody, Vector
+from eomc.scene.assembly import WORLD
+from eomc.scene.formulas import suggest
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
+
+_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+# what is read of a link and of a joint, each at most once, and the attributes that it may have
+_ATTRIBUTES = {
+    "inertial": set(),
+    "mass": {"value"},
+    "inertia": {"ixx", "iyy", "izz", "ixy", "ixz", "iyz"},
+    "origin": {"xyz", "rpy"},
+    "parent": {"link"},
+    "child": {"link"},
+    "axis": {"xyz"},
+    "dynamics": {"damping", "friction"},
+    "limit": {"lower", "upper", "effort", "velocity"},
+    "mimic": {"joint", "multiplier", "offset"},
+}
+_LINK_PARTS = ("inertial", "visual", "collision")
+_JOINT_PARTS = ("origin", "parent", "child", "axis", "dynamics", "limit", "mimic")
+_SHAPES = ("mesh", "box", "cylinder", "sphere", "capsule")
+
+
+def read(file: str | os.PathLike[str]) -> Robot:
+    """The robot of a URDF file, its root link fixed to the world.
+
+    Raises SceneError with every fault of the robot, EomcError for what is not a URDF.
+    """
+    root, shown = xml.root(file), texts.line(str(file))
+    if any(_is_xacro(e) for e in root.iter()):
+        raise EomcError(f"{shown}: {xml.RUN_XACRO}")
+    if root.tag != "robot":
+        raise EomcError(f"{shown}: not a URDF: its root element is <{root.tag}>, not <robot>")
+    return _Reader(root, Path(file), shown).robot()
+
+
+def _is_xacro(element: Element) -> bool:
+    return isinstance(element.tag, str) and "xacro}" in element.tag
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """A joint between two links; `motions` are for the scene, in the file's names."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    offset: Vector
+    rotation: Matrix
+    axis: Vector
+    motions: tuple[Motion, ...]
+    drive: Drive | None
+
+
+class _Reader:
+    """One file; faults collected on the way."""
+
+    def __init__(self, root: Element, path: Path, shown: str) -> None:
+        self.root = root
+        self.path = path
+        self.shown = shown
+        self.faults: list[Problem] = []
+        self.strange: dict[str, dict[str, None]] = {}  # attributes that are not read, by tag
+        self.places: dict[str, dict[str, None]] = {}  # and where they stand
+
+    def robot(self) -> Robot:
+        """The robot. Raises SceneError with every fault."""
+        links = self._named("link")
+        if not links and not self.faults:
+            self.say("", "the robot has no <link>: a URDF has one for each body")
+        bodies = {name: self._link(name, element) for name, element in links.items()}
+        joints = [self._joint(name, e, bodies) for name, e in self._named("joint").items()]
+        tree = self._tree(bodies, [j for j in joints if j])
+        if self.faults:
+            raise SceneError(self.faults)
+        name = self.root.get("name") or self.path.stem
+        return Robot(
+            name=name,
+            title=f"{name}, from {self.path.name}",
+            gravity=GRAVITY,
+            bodies=tuple(tree),
+            drives=tuple(j.drive for j in joints if j and j.drive),
+            left_out=tuple(self._besides()),
+        )
+
+    def say(self, key: str, message: str) -> None:
+        """Note a fault of a link or joint."""
+        self.faults.append(Problem(message, key, self.shown))
+
+    def _parts(self, element: Element, tags: Sequence[str], key: str) -> None:
+        """Tell parts that are there twice; attributes that they should not have are for later."""
+        for tag in tags:
+            parts = element.findall(tag)
+            if len(parts) > 1:
+                self.say(key, f"it has {len(parts)} <{tag}>: leave the one that is meant")
+            for attribute in (a for part in parts for a in part.attrib):
+                if attribute not in _ATTRIBUTES[tag]:
+                    self.strange.setdefault(tag, {})[attribute] = None
+                    self.places.setdefault(tag, {})[key] = None
+
+    # --- links
+
+    def _named(self, tag: str) -> dict[str, Element]:
+        """The elements of the robot with this tag, by name."""
+        out: dict[str, Element] = {}
+        for k, element in enumerate(self.root.findall(tag)):
+            name = element.get("name", "").strip()
+            if not name:
+                self.say(f"{tag} {k + 1}", f'it has no name: write <{tag} name="...">')
+            elif name in out:
+                self.say(f"{tag} {name}", f"a second {tag} has this name: rename one of the two")
+            else:
+                out[name] = element
+        return out
+
+    def _link(self, name: str, link: Element) -> RobotBody:
+        key = f"link {name}"
+        self._parts(link, ("inertial",), key)
+        inertial = link.find("inertial")
+        if inertial is None:
+            shapes = _shapes(link)
+            note = f"a {shapes[0]} only, no <inertial>" if shapes else "no <inertial>"
+            return RobotBody(name, note=note)
+        self._parts(inertial, ("origin", "mass", "inertia"), key)
+        mass, tensor = inertial.find("mass"), inertial.find("inertia")
+        if mass is None or tensor is None:
+            lacks = '<mass value="..."/>' if mass is None else '<inertia ixx="..." .../>'
+            self.say(key, f"its <inertial> has no mass or no inertia: add {lacks}")
+            return RobotBody(name)
+        kilograms = self._number(mass, "value", key, required=True)
+        if kilograms < 0:
+            self.say(key, f"its mass is negative ({kilograms:g} kg): masses are zero or more")
+        center, turn = self._origin(inertial, key)
+        moments = [self._number(tensor, ii, key, required=True) for ii in ("ixx", "iyy", "izz")]
+        products = [self._number(tensor, ij, key) for ij in ("ixy", "ixz", "iyz")]
+        a, b, c, d, e, f = (*moments, *products)
+        inertia: Inertia = robots.rotated_inertia((a, b, c, d, e, f), turn)
+        return RobotBody(name, mass=kilograms, center=center, inertia=inertia)
+
+    # --- joints
+
+    def _joint(self, name: str, joint: Element, bodies: dict[str, RobotBody]) -> _Joint | None:
+        key = f"joint {name}"
+        kind = joint.get("type", "")
+        if kind not in _TYPES:
+            known = f"known are {', '.join(_TYPES)}"
+            found = f"unknown type '{kind}'" if kind else "it has no type"
+            self.say(key, found + (suggest(kind, _TYPES) or f": {known}"))
+        self._parts(joint, _JOINT_PARTS, key)
+        ends = [self._end(joint, end, key, bodies) for end in ("parent", "child")]
+        offset, rotation = self._origin(joint, key)
+        axis: Vector = (1.0, 0.0, 0.0)
+        given = joint.find("axis")
+        if given is not None and kind not in ("fixed", "floating"):
+            axis = self._vector(given, "xyz", key, axis)
+            try:
+                axis = robots.unit(axis)
+            except ValueError:
+                self.say(key, 'its axis has length zero: give it a direction, <axis xyz="0 0 1"/>')
+        motions = self._motions(name, kind, joint, key)
+        if kind not in _TYPES or not all(ends):
+            return None
+        drive = None
+        if len(motions) == 1:
+            word, newton = ("torque", "N m") if motions[0].unit == "rad" else ("force", "N")
+            limit = joint.find("limit")
+            effort = 0.0 if limit is None else self._number(limit, "effort", key)
+            note = f"along {name}" + (f", at most {effort:g} {newton}" if effort > 0 else "")
+            drive = Drive(f"{name}_{word}", name, note=note)
+        return _Joint(name, kind, ends[0], ends[1], offset, rotation, axis, motions, drive)
+
+    def _end(self, joint: Element, end: str, key: str, bodies: dict[str, RobotBody]) -> str:
+        """The link at one end of a joint, or "" where it is at fault."""
+        found = joint.find(end)
+        link = "" if found is None else found.get("link", "").strip()
+        if not link:
+            self.say(key, f'it has no {end} link: add <{end} link="..."/>')
+        elif link not in bodies:
+            near = suggest(link, bodies) or f': add <link name="{link}">'
+            self.say(key, f"its {end} link '{link}' is not in the file{near}")
+            return ""
+        return link
+
+    def _motions(self, name: str, kind: str, joint: Element, key: str) -> tuple[Motion, ...]:
+        if kind == "floating":
+            return robots.free_motions(name)
+        if kind not in ("revolute", "continuous", "prismatic", "planar"):
+            return ()
+        damping = friction = 0.0
+        dynamics = joint.find("dynamics")
+        if dynamics is not None:
+            damping = self._number(dynamics, "damping", key)
+            friction = self._number(dynamics, "friction", key)
+            for what, value in (("damping", damping), ("friction", friction)):
+                if value < 0:
+                    self.say(key, f"its {what} is negative ({value:g}): it would drive the joint")
+        unit = "m" if kind == "prismatic" else "rad"
+        if kind == "planar":
+            slide = Motion(f"x_{name}", "m", damping=damping, friction=friction)
+            return slide, replace(slide, name=f"y_{name}"), Motion(f"turn_{name}", "rad")
+        start, note = 0.0, "turns without end" if kind == "continuous" else ""
+        limit = joint.find("limit")
+        if limit is not None and kind != "continuous":
+            lower, upper = (self._number(limit, end, key) for end in ("lower", "upper"))
+            if lower or upper:
+                note = f"{lower:g} to {upper:g}"
+                start = min(max(0.0, lower), upper) if lower <= upper else 0.0
+        if (mimic := joint.find("mimic")) is not None:
+            note = "; ".join(filter(None, (note, f"mimics {mimic.get('joint', '?')} in the file")))
+        return (Motion(name, unit, start, note, damping, friction),)
+
+    # --- the tree
+
+    def _tree(self, bodies: dict[str, RobotBody], joints: list[_Joint]) -> list[RobotBody]:
+        """The bodies, each chain in a row, parents first."""
+        holds: dict[str, _Joint] = {}
+        carries: dict[str, list[_Joint]] = {name: [] for name in bodies}
+        for joint in joints:
+            if other := holds.get(joint.child):
+                self.say(
+                    f"joint {joint.name}",
+                    f"its child link '{joint.child}' hangs on joint '{other.name}' already: a "
+                    "closed loop of bodies is not modelled, remove one of the two joints",
+                )
+            else:
+                holds[joint.child] = joint
+                carries[joint.parent].append(joint)
+        roots = [name for name in bodies if name not in holds]
+        if self.faults:
+            return []  # a joint at fault leaves its links alone, and they would seem roots
+        if len(roots) > 1:
+            self.say(
+                f"link {roots[1]}",
+                f"{len(roots)} links hang on nothing ({', '.join(roots[:8])}): a robot has one "
+                "root, connect the others to it by fixed joints",
+            )
+        out: list[RobotBody] = []
+        waiting = roots[:1]
+        seen = set(roots)
+        while waiting:
+            name = waiting.pop()
+            seen.add(name)
+            out += self._held(bodies[name], holds.get(name))
+            waiting += [joint.child for joint in reversed(carries[name])]
+        if not self.faults and len(seen) < len(bodies):
+            name = next(name for name in bodies if name not in seen)
+            way = [name]
+            while (name := holds[name].parent) not in way:
+                way.append(name)
+            loop = [*way[way.index(name) :], name]
+            self.say(
+                f"joint {holds[loop[0]].name}",
+                f"the links hang on one another in a loop ({' on '.join(loop)}): "
+                "one of them hangs on the root",
+            )
+        first = out[0] if out else None
+        if first and first.name == WORLD:  # many files call the ground so
+            out = out[1:]
+        return out
+
+    def _held(self, body: RobotBody, joint: _Joint | None) -> list[RobotBody]:
+        """The link on its joint; a planar joint needs a frame whose z is the plane's normal."""
+        if joint is None:
+            return [body]
+        kinds = {"continuous": "revolute", "floating": "free"}
+        held = replace(
+            body,
+            parent=joint.parent,
+            joint=kinds.get(joint.kind, joint.kind),
+            motions=joint.motions,
+            axes=(joint.axis,) if len(joint.motions) == 1 else (),
+            offset=joint.offset,
+            rotation=joint.rotation,
+        )
+        if joint.kind != "planar" or joint.axis == (0.0, 0.0, 1.0):
+            return [held]
+        turn = _to_axis(joint.axis)
+        frame = f"{joint.name}_frame"
+        rotation = robots.times(joint.rotation, turn)
+        note = "the joint's plane is its x and y"
+        between = replace(held, name=frame, mass=0.0, inertia=robots.NO_INERTIA,
+                          center=robots.ORIGIN, rotation=rotation, note=note)  # fmt: skip
+        return [between, replace(body, parent=frame, rotation=robots.transposed(turn))]
+
+    # --- what is not modelled
+
+    def _besides(self) -> list[str]:
+        """What the file has besides bodies and joints, in words."""
+        out = []
+        links, joints = self.root.findall("link"), self.root.findall("joint")
+        for use, what in (("visual", "shapes to be seen"), ("collision", "contact between shapes")):
+            parts = [shape for link in links for part in link.findall(use) for shape in part.iter()]
+            counts = Counter(str(shape.tag) for shape in parts if shape.tag in _SHAPES)
+            if counts:
+                told = ", ".join(f"{n} {_plural(shape, n)}" for shape, n in counts.items())
+                out.append(f"{what}: {told}" + (" (not opened)" if "mesh" in counts else ""))
+        bare = [x.get("name", "") for x in links if x.find("inertial") is None and _shapes(x)]
+        if bare:
+            out.append(
+                "links with a shape but without <inertial>, taken as massless: " + ", ".join(bare)
+            )
+        for joint in joints:
+            if (mimic := joint.find("mimic")) is not None:
+                gear, shift = mimic.get("multiplier", "1"), mimic.get("offset", "0")
+                out.append(
+                    f"joint {joint.get('name')} mimics {mimic.get('joint')} (times {gear}, plus "
+                    f"{shift}): it moves by itself here, --lock freezes it"
+                )
+        limited = [j for j in joints if j.find("limit") is not None and j.get("type") != "fixed"]
+        if limited:
+            out.append(f"limits of {len(limited)} joints: their values are in the notes")
+        rest = Counter(str(e.tag) for e in self.root if e.tag not in ("link", "joint"))
+        for parts, known in ((links, _LINK_PARTS), (joints, _JOINT_PARTS)):
+            rest.update(str(e.tag) for part in parts for e in part if e.tag not in known)
+        out += [f"<{tag}>, {n} {_plural('element', n)}" for tag, n in sorted(rest.items())]
+        for tag, those in self.strange.items():
+            first, *others = self.places[tag]
+            more = f" and {len(others)} more" if others else ""
+            what = f"attributes that URDF does not give <{tag}>: {', '.join(those)}"
+            out.append(f"{what} ({first}{more})")
+        floating = [j.get("name", "") for j in joints if j.get("type") == "floating"
+                    and j.find("dynamics") is not None]  # fmt: skip
+        if floating:
+            out.append(f"<dynamics> of floating joints: {', '.join(floating)}")
+        return out
+
+    # --- numbers
+
+    def _origin(self, element: Element, key: str) -> tuple[Vector, Matrix]:
+        origin = element.find("origin")
+        if origin is None:
+            return robots.ORIGIN, robots.IDENTITY
+        offset = self._vector(origin, "xyz", key, robots.ORIGIN)
+        return offset, robots.from_rpy(*self._vector(origin, "rpy", key, robots.ORIGIN))
+
+    def _vector(self, element: Element, attribute: str, key: str, default: Vector) -> Vector:
+        written = element.get(attribute)
+        if written is None:
+            return default
+        words = written.split()
+        if len(words) != 3:
+            what = f'{attribute}="{written}" of <{element.tag}> is not three numbers'
+            self.say(key, what + _macro(written))
+            return default
+        x, y, z = (self._value(word, f"{attribute} of <{element.tag}>", key) for word in words)
+        return x, y, z
+
+    def _number(self, element: Element, attribute: str, key: str, required: bool = False) -> float:
+        written = element.get(attribute)
+        if written is None:
+            if required:
+                self.say(key, f'<{element.tag}> has no {attribute}: add {attribute}="..."')
+            return 0.0
+        return self._value(written, f"{attribute} of <{element.tag}>", key)
+
+    def _value(self, word: str, what: str, key: str) -> float:
+        """The number; 0 where it is none, so that the rest is read too."""
+        try:
+            value = xml.number(word)
+        except ValueError:
+            self.say(key, f"{what}: '{word}' is not a number{_macro(word)}")
+            return 0.0
+        if not math.isfinite(value):
+            self.say(key, f"{what}: '{word}' is not a finite number")
+            return 0.0
+        large = xml.LARGE
+        if abs(value) > large:
+            self.say(key, f"{what}: '{word}' is more than {large:g}, which can't be meant")
+            return 0.0
+        return value if abs(value) > 1 / large else 0.0
+
+
+def _macro(written: str) -> str:
+    """The remedy where a number is one of xacro's, or ""."""
+    return "; " + xml.RUN_XACRO if "${" in written or "$(" in written else ""
+
+
+def _shapes(link: Element) -> list[str]:
+    return [str(shape.tag) for shape in link.iter() if shape.tag in _SHAPES]
+
+
+def _to_axis(axis: Vector) -> Matrix:
+    """The smallest rotation that takes z to `axis`."""
+    x, y, z = axis
+    across = math.hypot(x, y)
+    if not across:
+        return robots.from_axis_angle((1.0, 0.0, 0.0), math.acos(z))
+    return robots.from_axis_angle((-y / across, x / across, 0.0), math.atan2(across, z))
+
+
+def _plural(word: str, n: int) -> str:
+    return word if n == 1 else word + ("es" if word.endswith(("x", "sh")) else "s")

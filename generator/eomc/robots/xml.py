@@ -1,0 +1,78 @@
+"""XML of strangers, read as data: no entity is expanded, nothing that it names is opened."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree.ElementTree import ParseError
+
+from eomc.base import texts
+from eomc.base.errors import EomcError
+from eomc.scene.formulas import suggest
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+MAX_BYTES = 20_000_000  # the largest robot files without their meshes have one or two million
+LARGE = 1e100  # numbers beyond it, and sizes below 1/LARGE, overflow when they are multiplied
+
+
+def root(file: str | os.PathLike[str]) -> Element:
+    """The root element of an XML file. Raises EomcError with what is wrong and what to do."""
+    from defusedxml import DefusedXmlException
+    from defusedxml.ElementTree import fromstring
+
+    shown = texts.line(str(file))
+    data = _bytes(Path(file), shown)
+    if not data.strip():
+        raise EomcError(f"{shown}: the file is empty")
+    try:
+        found: Element = fromstring(data, forbid_dtd=True)
+    except ParseError as fault:
+        if b"xacro:" in data and "unbound prefix" in str(fault):
+            raise EomcError(f"{shown}: {RUN_XACRO}") from None
+        line, column = fault.position
+        why = re.sub(r": line \d+, column \d+$", "", str(fault))
+        raise EomcError(f"{shown}:{line}:{column + 1}: not XML: {why}") from None
+    except DefusedXmlException:
+        raise EomcError(
+            f"{shown}: it declares a document type or entities, which are not read: robot files "
+            "need none, remove <!DOCTYPE ...> and write out what its entities stand for"
+        ) from None
+    except (ValueError, LookupError) as fault:  # of the encoding that it claims
+        raise EomcError(f"{shown}: not XML: {fault}") from None
+    return found
+
+
+def number(word: str) -> float:
+    """The number that a word is; ValueError for what only Python takes for one, as 1_0."""
+    if "_" in word or not word.isascii():
+        raise ValueError(word)
+    return float(word)
+
+
+RUN_XACRO = "it holds xacro macros: run xacro first (xacro robot.urdf.xacro > robot.urdf)"
+
+
+def _bytes(path: Path, shown: str) -> bytes:
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):  # a pipe would be waited for
+            what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe or device"
+            raise EomcError(f"{shown}: can't be read (it is {what}, not a file)")
+        if found.st_size > MAX_BYTES:
+            raise EomcError(
+                f"{shown}: {found.st_size} bytes are more than the {MAX_BYTES} a robot file may "
+                "have"
+            )
+        with path.open("rb") as file:
+            return file.read(MAX_BYTES)
+    except FileNotFoundError:
+        near = suggest(path.name, (p.name for p in path.parent.glob("*.[ux]*") if p.exists()))
+        raise EomcError(f"{shown}: there is no such file{near}") from None
+    except (OSError, ValueError) as fault:
+        why = getattr(fault, "strerror", None) or fault
+        raise EomcError(f"{shown}: can't be read ({why})") from None

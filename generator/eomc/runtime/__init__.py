@@ -1,0 +1,1 @@
+"""What is copied beside a built module. Imports NumPy, and nothing of eomc."""

@@ -1,0 +1,1 @@
+"""Scene text to checked data. No SymPy, no C."""

@@ -1,0 +1,406 @@
+"""Formula text to a checked syntax tree, and a tree to a value in any algebra.
+
+Scene text is data: it is parsed with `ast`, every node is held against a whitelist, and the
+tree is walked by `evaluate`; nothing is ever executed. The same tree gives a float with
+`NUMERIC` and a SymPy expression with the table in `system.py`.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import keyword
+import math
+import operator
+import re
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from eomc.base import names, texts
+
+MAX_LENGTH = 10_000
+MAX_DEPTH = 150
+MAX_EXPONENT = 64
+MAX_DIGITS = 1_000  # of a number as it is written
+MANY = 1_000  # names, among which near ones are looked for
+MAX_LOG10 = 300  # no number in a formula, folded or written, may pass 1e300
+
+# name -> (fewest, most) arguments
+FUNCTIONS: Mapping[str, tuple[int, int]] = {
+    **dict.fromkeys(("sin", "cos", "tan", "asin", "acos", "atan"), (1, 1)),
+    **dict.fromkeys(("sinh", "cosh", "tanh", "exp", "log", "sqrt"), (1, 1)),
+    **dict.fromkeys(("abs", "sign", "heaviside", "dot"), (1, 1)),
+    "atan2": (2, 2),
+    "min": (2, 32),
+    "max": (2, 32),
+}
+
+_OPERATORS: Mapping[type, Callable[..., Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
+}
+
+# what people write instead, and the remedy: characters, then functions, then syntax
+_QUOTE = "quotes and primes are not used here: write {}_dot for a velocity, dot(e) for de/dt"
+_ORDER = "comparisons are not used in formulas: write heaviside(a - b), min or max"
+_CHARACTERS: Mapping[str, str] = {
+    **dict.fromkeys("'\"`", _QUOTE),
+    **dict.fromkeys("<>", _ORDER),
+    **dict.fromkeys(
+        "\\\b\f\v\a\r", "LaTeX is not read: write names without backslash (theta), powers as **"
+    ),
+    **dict.fromkeys("[{", "lists and indices are not used: give each quantity a name of its own"),
+    "^": "'^' is not a power here: write '**'",
+    "=": "'=' is not used inside a formula: write only what stands right of it",
+    "°": "angles are in radians: write 90 degrees as 90*pi/180",
+    "#": "a comment can't stand inside a formula: put it after the closing quotes",
+    "%": "'%' is not used in formulas: comments stand after the closing quotes, with '#'",
+    **{c: f"'{c}' is not ASCII: write {names.plain(c)}" for c in names.GREEK},
+    "π": "'π' is not ASCII: write pi",
+    **dict.fromkeys("·×⋅∙", "products are written with '*'"),
+    **dict.fromkeys("−–—", "this dash is not a minus sign: write '-'"),
+    **dict.fromkeys("′’‘″“”", _QUOTE),
+    **{c: f"'{c}' is not ASCII: write **{n}" for n, c in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")},
+    "|": "bars are not used here: write abs(...)",
+    "½": "'½' is not ASCII: write 1/2",
+    "√": "'√' is not ASCII: write sqrt(...)",
+}
+
+_ELSEWHERE: Mapping[str, str] = {
+    **{f"arc{f}": f"a{f}" for f in ("sin", "cos", "tan", "tan2")},
+    **{f.capitalize(): f for f in FUNCTIONS},
+    **{"ln": "log", "fabs": "abs", "sgn": "sign", "sine": "sin", "cosine": "cos"},
+    **{"Heaviside": "heaviside", "step": "heaviside", "tangent": "tan", "Derivative": "dot"},
+    **{"diff": "dot", "derivative": "dot", "ddt": "dot", "arctg": "atan", "tg": "tan"},
+}
+
+_FOREIGN: Mapping[type, str] = {
+    ast.FloorDiv: "'//' is not used in formulas: write '/'",
+    ast.IfExp: "'if' is not used in formulas: write heaviside(a - b), min or max",
+    ast.BoolOp: "'and' and 'or' are not used in formulas: write heaviside, min or max",
+    ast.Compare: _ORDER,
+    ast.Attribute: "'.' is not used in formulas: names are plain, velocities end in _dot",
+    ast.Lambda: "'lambda' is not used in formulas",
+}
+
+_INSTEAD: Mapping[str, str] = {
+    "pow": "write a**b",
+    **dict.fromkeys(("radians", "deg2rad", "deg", "degrees"), "write 30 degrees as 30*pi/180"),
+    **{name: f"write 1/{of}(...)" for name, of in (("sec", "cos"), ("csc", "sin"), ("cot", "tan"))},
+    "cbrt": "write x**(1/3) where x is positive",
+    "Piecewise": "write heaviside(a - b), min or max",
+    **dict.fromkeys(("erf", "erfc", "gamma"), "take a function that there is, such as tanh"),
+}
+
+_ALLOWED = "numbers, names, + - * / **, parentheses and functions"
+_ENOUGH = "17 are all that a double holds"
+_TOO_DEEP = "the formula is nested too deeply: split it with [definitions]"
+
+
+class FormulaError(ValueError):
+    """What is wrong with a formula, and where: `column` and `width` count its characters."""
+
+    def __init__(self, message: str, column: int = 0, width: int = 1) -> None:
+        super().__init__(message)
+        self.message = message
+        self.column = column
+        self.width = width
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A formula that has passed the whitelist. `tree` is never changed after it is made."""
+
+    text: str
+    tree: ast.expr
+
+    @property
+    def shown(self) -> str:
+        """The text, of a long one the beginning."""
+        return self.text if len(self.text) <= 80 else self.text[:79] + "…"
+
+    def names(self) -> Iterator[ast.Name]:
+        """The names used as values (not functions, not pi), in reading order."""
+        called = {id(n.func) for n in ast.walk(self.tree) if isinstance(n, ast.Call)}
+        found = [n for n in ast.walk(self.tree) if isinstance(n, ast.Name) and id(n) not in called]
+        yield from sorted((n for n in found if n.id != "pi"), key=lambda n: n.col_offset)
+
+    def calls(self, *functions: str) -> Iterator[ast.Call]:
+        """The calls of the given functions."""
+        for node in ast.walk(self.tree):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                if node.func.id in functions:
+                    yield node
+
+
+def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """The known name that `name` may have been meant for, or the empty string."""
+    known = list(known)
+    same = [k for k in known if k.lower() == name.lower()]
+    if len(known) > MANY:  # difflib takes a tenth of a millisecond each
+        known = [k for k in known if k[:1] == name[:1] and abs(len(k) - len(name)) < 2][:MANY]
+    return next(iter(same or difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), "")
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """`"; did you mean 'm_c'?"` where a known name is close, else the empty string."""
+    near = nearest(name, known)
+    return f"; did you mean '{texts.line(near)}'?" if near else ""
+
+
+def parse(text: str) -> Formula:
+    """Check `text`, blanks around it apart. Raises FormulaError with the place of a fault."""
+    # newlines are layout in a multi-line TOML string, as inside parentheses
+    line = text.replace("\n", " ").replace("\t", " ").strip(" ")
+    if len(line) > MAX_LENGTH:
+        raise FormulaError(
+            f"the formula has {len(line)} characters, more than {MAX_LENGTH}: "
+            "split it with [definitions]"
+        )
+    if not line:
+        raise FormulaError("the formula is empty: write 0 if nothing is meant")
+    for at, c in enumerate(line):
+        if c in _CHARACTERS:
+            raise _character(line, at)
+        if not " " <= c <= "~":
+            raise FormulaError(f"'{c}' is not used in formulas: only {_ALLOWED}", at)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python's remarks on odd literals, such as 1or 2
+            tree = ast.parse(line, mode="eval").body
+    except SyntaxError as fault:
+        raise _explain_syntax(line, fault) from None
+    except (RecursionError, MemoryError, ValueError):
+        raise FormulaError(_TOO_DEEP) from None
+    formula = Formula(line, tree)
+    _check(formula, tree, 0)
+    return formula
+
+
+def _character(line: str, at: int) -> FormulaError:
+    """What to write instead of the character at `at`, by what stands before it."""
+    before = line[max(at - 40, 0) : at]
+    if line[at] == "°" and (number := re.search(r"(?<![\w.])[\d.]+(?= *$)", before)):
+        start = at - len(before) + number.start()
+        message = f"angles are in radians: write {number[0]}*pi/180"
+        return FormulaError(message, start, at + 1 - start)
+    word = re.search(r"[A-Za-z_]\w*$", before)
+    name = word[0] if word else "theta"
+    power = re.match(r"\^(\d)\(", line[at : at + 3])
+    if power and name in FUNCTIONS:
+        message = f"write powers behind the function: {name}(...)**{power[1]}"
+        return FormulaError(message, at - len(name), len(name) + 2)
+    return FormulaError(_CHARACTERS[line[at]].format(name), at)
+
+
+# 2m, then m g, then )m
+_PRODUCT = re.compile(
+    r"(?<![\w.])(?!0[xob])(\d[\d.]*)(?![eE][+-]?\d)([A-Za-z_]\w*)|([\w.]+) +([\w.]+)|(\)) *([\w.]+)"
+)
+
+
+def _explain_syntax(text: str, fault: SyntaxError) -> FormulaError:
+    if "too many nested" in fault.msg:
+        return FormulaError(_TOO_DEEP)
+    if long := re.search(rf"\d{{{MAX_DIGITS},}}", text):
+        message = f"a number has more than {MAX_DIGITS:,} digits: {_ENOUGH}"
+        return FormulaError(message, long.start(), len(long[0]))
+    for word in re.finditer(r"[A-Za-z_]\w*", text):
+        if keyword.iskeyword(word[0]) and word[0] not in ("if", "else", "and", "or", "not"):
+            why = names.fault(word[0]) or ""
+            return FormulaError(why, word.start(), len(word[0]))
+    product = _PRODUCT.search(text)
+    if product and not {"if", "else", "and", "or", "not", "in", "is"} & set(product.groups()):
+        left, right = (group for group in product.groups() if group)
+        place = product.start(), len(product[0])
+        if right in ("deg", "degree", "degrees") and left[:1].isdigit():
+            return FormulaError(f"angles are in radians: write {left}*pi/180", *place)
+        if left in FUNCTIONS:
+            return FormulaError(f"'{left}' is a function: write {left}({right})", *place)
+        return FormulaError(
+            f"write products with '*': '{left}*{right}', not '{product[0]}'", *place
+        )
+    at = min(max((fault.offset or 1) - 1, 0), len(text) - 1)
+    around = text[max(at - 12, 0) : at + 12].strip()
+    return FormulaError(f"not a formula near '{around}' ({fault.msg.split(' (')[0]})", at)
+
+
+def _fault(node: ast.expr, message: str) -> FormulaError:
+    width = max((node.end_col_offset or 0) - node.col_offset, 1)
+    return FormulaError(message, node.col_offset, width)
+
+
+def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> None:
+    """Hold `node` against the whitelist; `power` is the product of the exponents around it."""
+    if depth > MAX_DEPTH:
+        raise FormulaError(
+            f"the formula is nested more than {MAX_DEPTH} deep, each term of a sum counted: "
+            "split it with [definitions]",
+            node.col_offset,
+        )
+    match node:
+        case ast.Constant(value=bool() | complex() as value):
+            raise _fault(node, f"'{value}' is not a real number")
+        case ast.Constant(value=int() | float()) if len(_literal_of(formula, node)) > MAX_DIGITS:
+            raise _fault(node, f"a number has more than {MAX_DIGITS:,} digits: {_ENOUGH}")
+        case ast.Constant(value=int() | float() as value):
+            written = re.fullmatch(r"[\d.]+e([+-]?\d+)", _literal_of(formula, node))
+            # 0e999999999 too, whose exact value costs what it says
+            if not _in_range(value) or (written and abs(float(written[1])) > MAX_LOG10):
+                raise _fault(node, f"numbers lie between 1e-{MAX_LOG10} and 1e{MAX_LOG10} in size")
+        case ast.Name(id=name):
+            if name in FUNCTIONS:
+                raise _fault(node, f"'{name}' is a function: write {name}(...)")
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
+            _check(formula, operand, depth + 1, power)
+        case ast.BinOp(
+            left=ast.Name(id=name),
+            op=ast.Pow(),
+            right=ast.Call(func=ast.Constant(value=int(raised))),
+        ) if name in FUNCTIONS:
+            raise _fault(node, f"write powers behind the function: {name}(...)**{raised}")
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
+            _check(formula, right, depth + 1)
+            exponent = _number(formula, right)
+            if exponent is not None:
+                power = _bounded(right, exponent, power)
+            _check(formula, left, depth + 1, power)
+            _check_value(formula, node)
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+            _check(formula, left, depth + 1, power)
+            _check(formula, right, depth + 1, power)
+            if isinstance(op, ast.Div) and _number(formula, right) == 0:
+                raise _fault(right, "divides by zero")
+            _check_value(formula, node)
+        case ast.Call(func=ast.Name(id=name) as func, args=args, keywords=[]):
+            _check_call(func, node)
+            for arg in args:
+                _check(formula, arg, depth + 1, power)
+            _check_value(formula, node)
+        case ast.Call(func=ast.Attribute(attr=name) as func) if name in FUNCTIONS:
+            raise _fault(func, f"functions stand by themselves: write {name}(...)")
+        case ast.Call(func=ast.Attribute() | ast.Lambda() as func):
+            raise _fault(func, _FOREIGN[type(func)])
+        case ast.Call(func=func) if not isinstance(func, ast.Name):
+            raise _fault(func, "write products with '*': a parenthesis follows without one")
+        case ast.Tuple(elts=[first, *_]):
+            raise FormulaError(
+                "a comma stands outside a function call: a decimal point is written '.'",
+                formula.text.index(",", first.end_col_offset),
+            )
+        case _:
+            kinds = (type(node), type(getattr(node, "op", None)))
+            told = next((_FOREIGN[k] for k in kinds if k in _FOREIGN), None)
+            raise _fault(node, told or f"only {_ALLOWED} are used here")
+
+
+def _check_call(func: ast.Name, call: ast.Call) -> None:
+    name, given = func.id, len(call.args)
+    if name in _INSTEAD:
+        raise _fault(func, f"'{name}' is not used in formulas: {_INSTEAD[name]}")
+    if name not in FUNCTIONS:
+        near = _ELSEWHERE.get(name)
+        raise _fault(
+            func,
+            f"'{name}' is not a function"
+            + (
+                (f"; did you mean '{texts.line(near)}'?" if near else suggest(name, FUNCTIONS))
+                or f": write {name}*(...) for a product; functions are {', '.join(FUNCTIONS)}"
+            ),
+        )
+    least, most = FUNCTIONS[name]
+    if not least <= given <= most:
+        wanted = str(least) if least == most else f"{least} to {most}"
+        plural = "" if wanted == "1" else "s"
+        raise _fault(call, f"{name}() takes {wanted} argument{plural}, here {given}")
+
+
+def _in_range(value: float) -> bool:
+    return value == 0 or (abs(value) < math.inf and abs(math.log10(abs(value))) < MAX_LOG10)
+
+
+def _bounded(node: ast.expr, exponent: float, power: float) -> float:
+    """The product of the exponents, within bounds."""
+    if not abs(exponent) <= MAX_EXPONENT:
+        raise _fault(node, f"an exponent lies between -{MAX_EXPONENT} and {MAX_EXPONENT}")
+    if abs(power * exponent) > MAX_EXPONENT:
+        raise _fault(node, f"the exponents of a power of a power pass {MAX_EXPONENT} together")
+    return power * max(abs(exponent), 1)
+
+
+def _check_value(formula: Formula, node: ast.expr) -> None:
+    value = _number(formula, node)
+    if value is not None and not abs(value) < math.inf:
+        raise _fault(node, "has no real, finite value")
+
+
+def _number(formula: Formula, node: ast.expr) -> float | None:
+    """The value of a subtree, nan where it is not real and finite, None where it has names."""
+    found = (n.id for n in ast.walk(node) if isinstance(n, ast.Name))
+    if any(name not in FUNCTIONS and name != "pi" for name in found):
+        return None
+    try:
+        value = _walk(formula, node, NUMERIC, NUMERIC.__getitem__)
+        return float(value) if isinstance(value, (int, float)) else math.nan
+    except (ArithmeticError, ValueError, TypeError):
+        return math.nan
+
+
+def evaluate(formula: Formula, algebra: Mapping[str, Any], lookup: Callable[[str], Any]) -> Any:
+    """The value of the formula.
+
+    `algebra` maps function names, "pi" and "number" (text of a literal -> value) to callables and
+    values; `lookup` gives the value of every other name. Raises what these raise.
+    """
+    return _walk(formula, formula.tree, algebra, lookup)
+
+
+def _walk(
+    formula: Formula, node: ast.expr, algebra: Mapping[str, Any], lookup: Callable[[str], Any]
+) -> Any:
+    match node:
+        case ast.Constant():
+            return algebra["number"](_literal_of(formula, node))
+        case ast.Name(id="pi"):
+            return algebra["pi"]
+        case ast.Name(id=name):
+            return lookup(name)
+        case ast.UnaryOp(op=op, operand=operand):
+            return _OPERATORS[type(op)](_walk(formula, operand, algebra, lookup))
+        case ast.BinOp(left=left, op=op, right=right):
+            return _OPERATORS[type(op)](
+                _walk(formula, left, algebra, lookup), _walk(formula, right, algebra, lookup)
+            )
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return algebra[name](*(_walk(formula, arg, algebra, lookup) for arg in args))
+    raise AssertionError(f"unchecked node {ast.dump(node)}")
+
+
+def _literal_of(formula: Formula, node: ast.Constant) -> str:
+    """A number as it was written, so that 0.1 may stay exact."""
+    return formula.text[node.col_offset : node.end_col_offset].replace("_", "").lower()
+
+
+def _literal(text: str) -> float:
+    return float(int(text, 0)) if text[:2] in ("0x", "0o", "0b") else float(text)
+
+
+NUMERIC: Mapping[str, Any] = {
+    "number": _literal,
+    "pi": math.pi,
+    **{name: getattr(math, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan")},
+    **{name: getattr(math, name) for name in ("sinh", "cosh", "tanh", "exp", "log", "sqrt")},
+    "atan2": math.atan2,
+    "abs": abs,
+    "sign": lambda x: float((x > 0) - (x < 0)),
+    "heaviside": lambda x: 0.5 * ((x > 0) - (x < 0)) + 0.5,
+    "min": min,
+    "max": max,
+}

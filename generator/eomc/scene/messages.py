@@ -1,0 +1,189 @@
+"""What newcomers write in a scene instead of our words, and the remedy that fits it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from eomc.scene.scope import Checker
+
+LONGEST = 60  # characters of a text that may be a number with its unit
+
+# --- tables ---------------------------------------------------------------------------------------
+
+_FREE = (
+    "its coordinates are independent. Choose as many as there are freedoms, or hold together by a "
+    "stiff [[spring]] what must not part"
+)
+_START = "starts stand beside their coordinates: theta = { start = 0.5, rate = 0 }"
+_RUN = "how a scene is run stands in [run]: h, duration, method"
+_LOSS = (
+    "friction is a force, -b*x_dot in [forces], or b*x_dot**2/2 as dissipation in [energy]; "
+    'a [[body]] has damping = "b" and friction = "c"'
+)
+_JOINT = 'a joint stands with the body that it moves, in [[body]]: joint = "revolute"'
+_ENERGY = "write [energy] with kinetic and potential, of which it is the difference"
+
+# by the name of a table that scenes do not have
+TABLES: Mapping[str, str] = {
+    **dict.fromkeys(("constraint", "constraints", "loop", "loops", "contact"), _FREE),
+    **dict.fromkeys(("initial", "initial_conditions", "start", "starts", "ic", "state"), _START),
+    **dict.fromkeys(("states", "velocities", "velocity", "rates", "rate"), _START),
+    **dict.fromkeys(("simulation", "sim", "solver", "settings", "options", "config"), _RUN),
+    **dict.fromkeys(("time", "integrator", "stepper", "simulate"), _RUN),
+    **dict.fromkeys(("friction", "damping", "dissipation", "drag"), _LOSS),
+    **dict.fromkeys(("joint", "joints"), _JOINT),
+    **dict.fromkeys(("lagrangian", "Lagrangian", "L", "hamiltonian"), _ENERGY),
+}
+# arrays of tables that are one table here: what an entry of each looks like
+_ONE_TABLE: Mapping[str, str] = {
+    "coordinates": 'x = { unit = "m", start = 0.0 }',
+    "parameters": "m = 1.0",
+    "constants": "n = 5",
+    "inputs": 'F = { unit = "N" }',
+    "definitions": 'y = "l*cos(theta)"',
+    "forces": 'x = "F - b*x_dot"',
+}
+
+
+def array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
+    """Of [[parameter]]: the table that is meant, and its entries; None of anything else."""
+    meant = next((t for t in _ONE_TABLE if name.lower() in (t, t.removesuffix("s"))), None)
+    if meant is None or not isinstance(entries, list) or not entries:
+        return None
+    merged: dict[str, Any] = {}
+    for entry in entries:
+        if not isinstance(entry, dict):
+            return None
+        called = entry.get("name")
+        if isinstance(called, str):
+            merged[called] = {key: value for key, value in entry.items() if key != "name"}
+        else:
+            merged |= entry
+    return meant, merged
+
+
+def one_table(name: str, meant: str) -> str:
+    """What to say of [[name]], which is one table."""
+    start = "" if name == meant else f"unknown table '{name}': "
+    return f"{start}write [{meant}] once, and a line such as {_ONE_TABLE[meant]} for each entry"
+
+
+def tables(tree: dict[str, Any], check: Checker) -> None:
+    """Tell of tables that scenes do not have, once each; take them out, or put them in place."""
+    for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
+        if found := array(name, tree[name]):
+            meant, entries = found
+            check.say((name,), one_table(name, meant))
+            check.mended |= {(meant,), *((meant, key) for key in entries)}
+            del tree[name]
+            there = tree.get(meant)
+            tree[meant] = {**entries, **(there if isinstance(there, dict) else {})}
+            check.places.rename((name,), (meant,))
+        elif name in TABLES:
+            check.say((name,), f"there is no [{name}] in a scene: {TABLES[name]}")
+            del tree[name]
+            if TABLES[name] == _ENERGY:
+                tree.setdefault("energy", {"kinetic": "0"})
+                check.mended.add(("energy",))
+
+
+# --- numbers with units ---------------------------------------------------------------------------
+
+_DEGREES = ("deg", "degs", "degree", "degrees", "°", "grad")
+# in SI: whole powers of ten only, so that the number advised has the digits that were written
+_POWERS = {"mm": -3, "cm": -2, "dm": -1, "km": 3, "g": -3, "gram": -3, "grams": -3, "mg": -6,
+           "t": 3, "ms": -3, "us": -6, "µs": -6, "kN": 3, "mN": -3, "kJ": 3, "kPa": 3}  # fmt: skip
+_SI = {"mm": "m", "cm": "m", "dm": "m", "km": "m", "g": "kg", "gram": "kg", "grams": "kg",
+       "mg": "kg", "t": "kg", "ms": "s", "us": "s", "µs": "s", "kN": "N", "mN": "N", "kJ": "J",
+       "kPa": "Pa", "meter": "m", "meters": "m", "metre": "m", "metres": "m", "second": "s",
+       "seconds": "s", "sec": "s", "radian": "rad", "radians": "rad"}  # fmt: skip
+_UNIT = r"(?:k?g|[kcdmµu]?m|m?s|sec|rad|k?N|m?N|k?J|W|Hz|k?Pa|A|V|T|K|C|mol)"
+_POWER = r"(?:(?:\^|\*\*)-?\d|[²³])?"
+_UNITS = re.compile(rf"{_UNIT}{_POWER}(?:\s*[*/· ]?\s*{_UNIT}{_POWER})*")
+_NUMBER = r"[+\-−]?\s*(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*([^\s\d.+\-−].*?)\s*")
+
+
+def quantity(text: str, declared: Collection[str] = ()) -> str | None:
+    """What to say of a number with its unit, such as `30 deg` or `1 kg`; None of anything else.
+
+    declared: names that a letter behind a number may mean: `2 m` is a product where there is an m.
+    """
+    found = _QUANTITY.fullmatch(text) if len(text) <= LONGEST else None
+    if found is None or found[2] in declared:
+        return None
+    number, unit = found[1].replace("−", "-").replace(" ", ""), found[2]
+    if unit in _DEGREES:
+        return f"angles are in radians, nothing is converted: write {radians(number)}"
+    if unit == "rpm":
+        return f'nothing is converted: write "{number}*2*pi/60", in rad/s'
+    if unit in _POWERS:
+        number, unit = _shifted(number, _POWERS[unit]), _SI[unit]
+    elif unit not in _SI and not _UNITS.fullmatch(unit):
+        return None
+    unit = _SI.get(unit, unit)
+    return f"a number stands without quotes and without its unit, {unit} in SI: write {number}"
+
+
+def radians(number: str) -> str:
+    """Degrees as the formula that gives them, in quotes."""
+    return f'"{number}*pi/180"'
+
+
+def number(text: object) -> str:
+    """The number in a text such as "1 ms", in SI, as `: write 0.001`; else the empty string."""
+    if not isinstance(text, str) or not (
+        found := re.fullmatch(rf"\s*({_NUMBER})\s*(\D*?)\s*", text)
+    ):
+        return ""
+    plain = found[1].replace("−", "-").replace(" ", "")
+    return f": write {_shifted(plain, _POWERS.get(found[2], 0))}, without quotes"
+
+
+def _shifted(number: str, power: int) -> str:
+    try:
+        return f"{float(f'{number}e{power}'):.15g}" if power else number
+    except ValueError:  # it has an exponent already
+        return f"{float(number) * 10.0**power:.15g}"
+
+
+def bare(line: str) -> str | None:
+    """The remedy for a line of TOML with a number and what numbers do not have there."""
+    line = line[:200]
+    if re.search(r"[=,[]\s*−", line):
+        return "this dash is not a minus sign: write '-'"
+    if re.match(r"\s*[\w.]+\s*:", line):
+        return "entries are written name = value"
+    found = re.search(rf"=\s*({_NUMBER})\s*([^\s,}}\]#=\d][^,}}\]#=]*)", line)
+    return quantity(f"{found[1]} {found[2]}") if found else None
+
+
+# --- names ----------------------------------------------------------------------------------------
+
+_VELOCITY = (
+    r"dot_?(\w+)", r"d_?(\w+?)_?dt", r"d_?(\w+)", r"[Dv]_?(\w+)", r"vel(?:ocity)?_(\w+)",
+    r"qd_(\w+)", r"(\w+?)_?dot", r"(\w+)_(?:d|v|t|p|prime|vel|velocity|rate|speed|diff)",
+    r"(\w+?)(?:p|d|prime)",
+)  # fmt: skip
+
+
+def velocity(name: str, coordinates: Collection[str]) -> str:
+    """The velocity that `dot_theta`, `dtheta`, `thetadot` may mean, or the empty string."""
+    found = (re.fullmatch(pattern, name) for pattern in _VELOCITY)
+    return next((f"{match[1]}_dot" for match in found if match and match[1] in coordinates), "")
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def file(path: Path) -> str:
+    """The scene that a path that is none may mean: `cartpole` is scenes/cartpole.toml."""
+    name = path.name if path.suffix == ".toml" else f"{path.name}.toml"
+    for folder in (path.parent, path.parent / "scenes", Path("scenes")):
+        if path.name and (folder / name).is_file():
+            return str(folder / name)
+    return ""

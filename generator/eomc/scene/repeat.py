@@ -1,0 +1,308 @@
+"""Repetition: `repeat = "i = 1..n"` and `theta[i]` written out, on the plain tree of a scene.
+
+Entries that repeat become entries of their own, and `name[index]` becomes the name with the number
+behind it. The arrays of tables [[body]], [[spring]] and [[damper]] become tables: of the bodies'
+names, and of numbers from 1.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from eomc.base import names
+from eomc.scene import formulas
+from eomc.scene.formulas import FormulaError, suggest
+from eomc.scene.scope import Checker, Path, value_of
+from eomc.scene.source_map import ARRAYS
+
+MAX_ENTRIES = 10_000  # that repetition makes
+MAX_TEXT = 5_000_000  # characters of these
+
+_TABLES = ("constants", "parameters", "coordinates", "inputs", "definitions", "forces")
+_PLAIN = ("definitions", "forces")  # whose entries are formulas, not tables
+_WORDS = ("unit", "note", "title", "repeat")  # keys whose texts are for people
+_NAMES = ("name", "parent", "joint", "coordinates", "coordinate", "bodies")  # no formulas
+_ARRAYS_MEANT = {
+    "bodies": "body", "Body": "body", "link": "body", "links": "body", "springs": "spring",
+    "Spring": "spring", "dampers": "damper", "Damper": "damper",
+}  # fmt: skip
+
+_INDEXED = re.compile(r"(?<!\w)([A-Za-z_]\w*)\s*\[([^\[\]]*)\]", re.ASCII)
+_TERM = r"(?:\d+|[A-Za-z_]\w*)"
+_SUM = re.compile(rf"\s*[+-]?\s*{_TERM}\s*(?:[+-]\s*{_TERM}\s*)*", re.ASCII)
+_REPEAT = re.compile(r"\s*([A-Za-z_]\w*)\s*=(.*?)\.\.(.*)", re.ASCII | re.DOTALL)
+_WRITTEN = 'is written repeat = "i = 1..n"'
+
+
+def expand(tree: dict[str, Any], check: Checker) -> bool:
+    """Write out all repetition in `tree`. Tells the faults; False where the rest hangs on them."""
+    return _Expansion(tree, check).run()
+
+
+class _Expansion:
+    def __init__(self, tree: dict[str, Any], check: Checker) -> None:
+        self.tree = tree
+        self.check = check
+        self.constants: dict[str, float] = {}  # those known so far
+        self.declared: dict[str, str] = {}
+        self.made = 0
+        self.characters = 0
+        self.sound = True
+
+    def run(self) -> bool:
+        for given, meant in _ARRAYS_MEANT.items():
+            if isinstance(self.tree.get(given), (dict, list)) and meant not in self.tree:
+                self.check.say((given,), f"unknown table '{given}': write [[{meant}]]")
+                self.tree[meant] = self.tree.pop(given)
+                self.check.places.rename((given,), (meant,))
+        for table in _TABLES:
+            if isinstance(self.tree.get(table), dict):
+                self.declared |= dict.fromkeys(self.tree[table], table)
+        for table in _TABLES:
+            if isinstance(self.tree.get(table), dict):
+                self.tree[table] = self._table(table, self.tree[table])
+        for array in ARRAYS:
+            if array in self.tree:
+                self.tree[array] = self._array(array, self.tree[array])
+        for key in ("energy", "gravity"):
+            if key in self.tree:
+                self.tree[key] = self._once((key,), self.tree[key])
+        return self.sound
+
+    def _fault(
+        self, path: Path, message: str, at: FormulaError | None = None, text: str = ""
+    ) -> None:
+        self.sound = False
+        self.check.say(path, message, at, text)
+
+    def _table(self, table: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for key, value in entries.items():
+            path = (table, key)
+            if not (isinstance(value, dict) and "repeat" in value):
+                name = self._once(path, key, bare=False)
+                made = [(name, self._once(path, value))]
+            else:
+                if table in _PLAIN and "value" not in value:
+                    self._fault(path, 'missing: add value = "..." beside repeat')
+                    continue
+                made = self._repeated(path, key, value)
+                if table in _PLAIN:
+                    made = [(name, entry["value"]) for name, entry in made]
+            self.check.places.repeat(path, [(table, name) for name, _ in made])
+            for name, entry in made:
+                if name in out:
+                    self._fault(path, f"'{name}' stands here a second time: remove one of the two")
+                out[name] = entry
+                if table == "constants":
+                    self._learn(name, entry)
+        return out
+
+    def _learn(self, name: str, entry: Any) -> None:
+        """Keep a constant's value; what has none is told later."""
+        value = entry.get("value") if isinstance(entry, dict) else entry
+        try:
+            formula = formulas.parse(value if isinstance(value, str) else repr(value))
+            if all(node.id in self.constants for node in formula.names()):
+                self.constants[name], _ = value_of(formula, self.constants)
+        except (FormulaError, KeyError):
+            return
+
+    def _array(self, array: str, entries: Any) -> dict[str, Any]:
+        if not _is_array(entries):
+            inner = isinstance(entries, dict) and all(isinstance(e, dict) for e in entries.values())
+            named = (
+                f' and name = "{next(iter(entries))}"'
+                if inner and entries and array == "body"
+                else ""
+            )
+            message = f"each {array} has a table of its own: write [[{array}]]{named}"
+            self._fault((array,), message)
+            return {}
+        out: dict[str, Any] = {}
+        places = self.check.places
+        for k, entry in enumerate(entries, start=1):
+            written = (array, f"#{k}")
+            name = entry.get("name") if array == "body" else None
+            shown = (array, name if isinstance(name, str) and name else str(len(out) + 1))
+            places.repeat(written, [shown])
+            if "repeat" in entry:
+                made = [e for _, e in self._repeated(shown, name, entry)]
+            else:
+                made = [self._once(shown, entry)]
+            labels = []
+            for each in made:
+                label = each.get("name") if array == "body" else None
+                if not isinstance(label, str) or not label or label in out:
+                    label = str(len(out) + 1)
+                out[label] = each
+                labels.append((array, label))
+            places.repeat(written, labels)
+        return out
+
+    def _repeated(self, path: Path, key: Any, entry: dict[str, Any]) -> list[tuple[str, Any]]:
+        """An entry with `repeat` written out: (name, entry) pairs."""
+        key = key if isinstance(key, str) else ""
+        where = (*path, "repeat")
+        text = entry["repeat"]
+        if not isinstance(text, str):
+            return self._none(where, f'must be text, such as "i = 1..n", here {text!r:.40}')
+        found = _REPEAT.fullmatch(text)
+        if not found:
+            return self._none(where, f"'{text}' is no repetition, which {_WRITTEN}", text=text)
+        index = found[1]
+        if why := self._index_fault(index):
+            return self._none(where, why, FormulaError("", found.start(1), len(index)), text)
+        try:
+            first, last = (self._whole(found[k].strip(), {}) for k in (2, 3))
+        except FormulaError as fault:
+            return self._none(where, fault.message, text=text)
+        if last < first - 1:
+            return self._none(
+                where,
+                f"runs from {first} to {last}, and counts up only: exchange the ends",
+                text=text,
+            )
+        self.made += last - first + 1
+        if self.made > MAX_ENTRIES:
+            return self._none(
+                where,
+                f"repetition makes {self.made} entries up to here, and {MAX_ENTRIES} are the most: "
+                "let it end sooner",
+                text=text,
+            )
+        kept = {k: v for k, v in entry.items() if k != "repeat"}
+        out = []
+        for number in range(first, last + 1):
+            made = self._written(path, kept, {index: number})
+            name = self._written(path, key, {index: number}, bare=False)
+            if made is None or name is None:
+                return []
+            out.append((name, made))
+        if len(out) > 1 and key and out[0][0] == out[-1][0]:
+            return self._none(
+                path, f"each repetition needs a name of its own: write {key}[{index}]"
+            )
+        return out
+
+    def _none(
+        self, path: Path, message: str, at: FormulaError | None = None, text: str = ""
+    ) -> list[tuple[str, Any]]:
+        self._fault(path, message, at, text)
+        return []
+
+    def _index_fault(self, index: str) -> str:
+        if index in self.declared:
+            return f"'{index}' stands in [{self.declared[index]}] too: use another index, such as k"
+        if names.fault(index) or index in ("x", "y", "z", *formulas.FUNCTIONS):
+            return f"'{index}' can't be an index: use another, such as i"
+        return ""
+
+    def _once(self, path: Path, value: Any, bare: bool = True) -> Any:
+        """A value outside of repetition, its indices written out."""
+        made = self._written(path, value, {}, bare)
+        return value if made is None else made
+
+    def _written(self, path: Path, value: Any, index: Mapping[str, int], bare: bool = True) -> Any:
+        """The value with its indices written out; None where that fails, which is told."""
+        if isinstance(value, str):
+            try:
+                text = self._text(value, index, bare)
+            except FormulaError as fault:
+                self._fault(path, fault.message, fault, value)
+                return None
+            if text != value:
+                self.check.places.rewrite(text, value)
+            return text
+        if isinstance(value, list):
+            inside = [self._written(path, each, index, bare) for each in value]
+            return None if None in inside else inside
+        if isinstance(value, dict):
+            out = {}
+            for key, each in value.items():
+                made = each
+                if key not in _WORDS:
+                    made = self._written((*path, key), each, index, bare and key not in _NAMES)
+                if made is None:
+                    return None
+                out[key] = made
+            return out
+        return value
+
+    def _text(self, text: str, index: Mapping[str, int], bare: bool) -> str:
+        """A formula or a name; raises FormulaError."""
+        if len(text) > formulas.MAX_LENGTH or not (index or "[" in text):
+            return text  # too long ones are told later
+
+        def number_behind(found: re.Match[str]) -> str:
+            name, inside = found[1], found[2]
+            at, width = found.start(), len(found[0])
+            try:
+                number = self._whole(inside, index)
+            except FormulaError as fault:
+                raise FormulaError(fault.message, at, width) from None
+            if name[-1].isdigit():
+                raise FormulaError(
+                    f"'{found[0]}' would be {name}{number}, as others may be: a name with an index "
+                    f"can't end in a digit, {name}_[{inside}] is {name}_{number}",
+                    at,
+                    width,
+                )
+            if number < 0:
+                raise FormulaError(
+                    f"the index of '{found[0]}' is {number}: it can't be negative", at, width
+                )
+            return f"{name}{number}"
+
+        out = _INDEXED.sub(number_behind, text)
+        for name, number in index.items() if bare else ():
+            shown = str(number) if number >= 0 else f"({number})"
+            out = re.sub(rf"(?<![\w.]){name}(?!\w)", shown, out, flags=re.ASCII)
+        self.characters += len(out) if index else 0
+        if self.characters > MAX_TEXT:
+            raise FormulaError(f"repetition makes more than {MAX_TEXT:,} characters of text")
+        return out
+
+    def _whole(self, text: str, index: Mapping[str, int]) -> int:
+        """The value of an index or an end: whole numbers, constants, the index, + and -."""
+        if not _SUM.fullmatch(text):
+            raise FormulaError(
+                f"'{text.strip()}' is no index: it is made of whole numbers, constants, + and -"
+            )
+        total = 0
+        for sign, term in re.findall(rf"([+-]?)\s*({_TERM})", text, re.ASCII):
+            total += self._term(term, index) * (-1 if sign == "-" else 1)
+        return total
+
+    def _term(self, term: str, index: Mapping[str, int]) -> int:
+        if term.isdigit():
+            if len(term) > 9:
+                raise FormulaError(f"{term:.12} is too large for an index")
+            return int(term)
+        if term in index:
+            return index[term]
+        if term in self.constants:
+            self.check.used.add(term)
+            value = self.constants[term]
+            if not value.is_integer() or abs(value) > 1e9:
+                raise FormulaError(f"'{term}' is {value:g}, and an index is a whole number")
+            return int(value)
+        table = self.declared.get(term)
+        if table == "constants":
+            raise FormulaError(f"'{term}' has no value here: move its line above this one")
+        if table:
+            raise FormulaError(
+                f"'{term}' stands in [{table}], and what is repeated is decided when the code is "
+                "made: only [constants] can count"
+            )
+        near = suggest(term, [*index, *self.constants])
+        remedy = ": declare it in [constants]"
+        if term != "n" and len(term) == 1 and not index:
+            remedy += f', or add repeat = "{term} = 1..n" to the entry'
+        raise FormulaError(f"'{term}' is not known in an index{near or remedy}")
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(v, dict) for v in value)

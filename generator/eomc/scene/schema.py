@@ -1,0 +1,446 @@
+"""The layout of a scene file: its tables and keys as pydantic models, and their faults in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import pydantic
+
+from eomc.base import texts
+from eomc.scene import messages
+from eomc.scene.formulas import nearest
+
+METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "gauss16", "euler", "verlet")
+REALS = ("double", "float")
+
+_Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
+_Value = _Number | pydantic.StrictStr
+
+_Line = Annotated[pydantic.StrictStr, pydantic.AfterValidator(texts.checked_line)]
+_Note = Annotated[pydantic.StrictStr, pydantic.AfterValidator(texts.checked_lines)]
+_Positive = Annotated[float, pydantic.Field(strict=True, gt=0, allow_inf_nan=False)]
+
+
+class _Table(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+class _Coordinate(_Table):
+    unit: _Line = ""
+    start: _Value = 0.0
+    rate: _Value = 0.0
+    note: _Note = ""
+
+
+class QuantityTable(_Table):
+    """A parameter or constant as it is written."""
+
+    value: _Value
+    unit: _Line = ""
+    note: _Note = ""
+
+
+class _Input(_Table):
+    unit: _Line = ""
+    signal: _Value = 0.0
+    note: _Note = ""
+
+
+class _Energy(_Table):
+    kinetic: _Value
+    potential: _Value = 0.0
+    dissipation: _Value = 0.0
+
+
+def _listed(value: object) -> object:
+    """`method = "rk4"` says the same as `method = ["rk4"]`; the first is what runs use."""
+    if isinstance(value, list) and value:
+        return tuple(dict.fromkeys(map(str, value)))
+    return (value,)
+
+
+_Methods = Annotated[
+    tuple[Literal[METHODS], ...],  # type: ignore[valid-type]
+    pydantic.BeforeValidator(_listed),
+]
+
+
+def _linearized(value: object) -> bool | str:
+    """Whether derivatives are wanted, those along the parameters too."""
+    if isinstance(value, bool) or value == "parameters":
+        return value
+    raise ValueError(f'must be true, false or "parameters", here {_toml(value)}')
+
+
+class _Run(_Table):
+    h: _Positive = 0.001
+    duration: _Positive = 10.0
+    method: _Methods = ("rk4",)
+    real: Literal[REALS] = "double"  # type: ignore[valid-type]
+    batch: pydantic.StrictBool = False
+    linearize: Annotated[bool | str, pydantic.PlainValidator(_linearized)] = False
+
+
+def _spelled_out(value: object) -> object:
+    """`m = 2.0` says the same as `m = { value = 2.0 }`."""
+    return value if isinstance(value, dict) else {"value": value}
+
+
+_Short = Annotated[QuantityTable, pydantic.BeforeValidator(_spelled_out)]
+
+
+# --- bodies: what may be written in several ways; ValueErrors say what is wrong ---
+
+
+def _entry(value: object) -> float | str:
+    """A number or a formula."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        try:
+            if math.isfinite(number := float(value)):
+                return number
+        except OverflowError:
+            pass
+        raise ValueError(f"must be a finite number, here {_toml(value)}")
+    raise ValueError(f"must be a number or a formula in quotes, here {_toml(value)}")
+
+
+def _vector(value: object) -> tuple[float | str, ...]:
+    if not isinstance(value, list) or not value:
+        raise ValueError(
+            f"must be a list of numbers and formulas, such as [0, 1.5], here {_toml(value)}"
+        )
+    return tuple(map(_entry, value))
+
+
+def _each(value: object) -> float | str | tuple[float | str, ...]:
+    """One for all, or a list of one each."""
+    return tuple(map(_entry, value)) if isinstance(value, list) else _entry(value)
+
+
+def _rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]:
+    """An angle, or a list of turns: an axis and an angle each."""
+    if not isinstance(value, list):
+        return _entry(value)
+    turns = []
+    for turn in value:
+        if not (isinstance(turn, list) and len(turn) == 2 and turn[0] in ("x", "y", "z")):
+            raise ValueError(
+                'must be a list of turns, each an axis and an angle, such as [["z", "pi/2"]], '
+                f"here {_toml(value)}"
+            )
+        turns.append((turn[0], _entry(turn[1])))
+    return tuple(turns)
+
+
+def _axes(value: object) -> tuple[tuple[float, ...], ...]:
+    """Axes; one may be written without the outer brackets."""
+    axes: list[Any] = [value]
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        axes = value
+    for axis in axes:
+        if not (isinstance(axis, list) and axis and all(map(_is_number, axis))):
+            raise ValueError(f"must be a list of numbers, such as [0, 0, 1], here {_toml(value)}")
+    return tuple(tuple(float(entry) for entry in axis) for axis in axes)
+
+
+def _is_number(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) < 1e100
+
+
+def _names(value: object) -> tuple[str, ...]:
+    given = value if isinstance(value, list) else [value]
+    if not all(isinstance(name, str) for name in given):
+        raise ValueError(f"must be a name in quotes, or a list of names, here {_toml(value)}")
+    return tuple(given)
+
+
+def _two_names(value: object) -> tuple[str, ...]:
+    names = _names(value)
+    if len(names) != 2:
+        raise ValueError(f'must name two bodies, such as ["world", "cart"], here {_toml(value)}')
+    return names
+
+
+def _points(value: object) -> tuple[tuple[float | str, ...], ...]:
+    if not (isinstance(value, list) and len(value) == 2):
+        raise ValueError(f'must be two points, such as [[0, 0], ["l", 0]], here {_toml(value)}')
+    return tuple(map(_vector, value))
+
+
+_Vector = Annotated[tuple[float | str, ...], pydantic.PlainValidator(_vector)]
+_Each = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(_each)]
+_Rotation = Annotated[
+    float | str | tuple[tuple[str, float | str], ...], pydantic.PlainValidator(_rotation)
+]
+_Axes = Annotated[tuple[tuple[float, ...], ...], pydantic.PlainValidator(_axes)]
+_Names = Annotated[tuple[str, ...], pydantic.PlainValidator(_names)]
+_TwoNames = Annotated[tuple[str, ...], pydantic.PlainValidator(_two_names)]
+_Points = Annotated[tuple[tuple[float | str, ...], ...], pydantic.PlainValidator(_points)]
+
+
+class BodyTable(_Table):
+    """A [[body]] as it is written; None where a key is not there."""
+
+    name: pydantic.StrictStr
+    note: _Note = ""
+    parent: pydantic.StrictStr | None = None
+    joint: pydantic.StrictStr | None = None
+    coordinates: _Names | None = None
+    axis: _Axes | None = None
+    offset: _Vector | None = None
+    position: _Vector | None = None
+    rotation: _Rotation | None = None
+    mass: _Value = 0.0
+    center: _Vector | None = None
+    inertia: _Each | None = None
+    armature: _Each | None = None
+    damping: _Each | None = None
+    friction: _Each | None = None
+    friction_width: _Value | None = None
+    actuator: _Each | None = None
+
+
+class _Between(_Table):
+    """What a spring and a damper have in common."""
+
+    coordinate: pydantic.StrictStr | None = None
+    bodies: _TwoNames | None = None
+    points: _Points | None = None
+    turning: pydantic.StrictBool = False
+    note: _Note = ""
+
+
+class SpringTable(_Between):
+    """A [[spring]] as it is written."""
+
+    stiffness: _Value
+    length: _Value = 0.0
+
+
+class DamperTable(_Between):
+    """A [[damper]] as it is written."""
+
+    damping: _Value
+
+
+class Document(_Table):
+    """A whole scene as it is written."""
+
+    eomc: Literal[1]
+    name: pydantic.StrictStr
+    title: _Line = ""
+    note: _Note = ""
+    gravity: _Vector | None = None
+    coordinates: dict[str, _Coordinate] = pydantic.Field(min_length=1)
+    parameters: dict[str, _Short] = {}
+    constants: dict[str, _Short] = {}
+    inputs: dict[str, _Input] = {}
+    definitions: dict[str, _Value] = {}
+    energy: _Energy
+    forces: dict[str, _Value] = {}
+    body: dict[str, BodyTable] = {}
+    spring: dict[str, SpringTable] = {}
+    damper: dict[str, DamperTable] = {}
+    run: _Run = _Run()
+
+
+class _EnergyBesides(_Energy):
+    kinetic: _Value = 0.0
+
+
+class _DocumentOfBodies(Document):
+    """Bodies have energies of their own: none need be written."""
+
+    energy: _EnergyBesides = _EnergyBesides()
+
+
+def read(tree: Mapping[str, Any]) -> Document:
+    """The scene as it is written; pydantic.ValidationError tells what is laid out otherwise."""
+    return (_DocumentOfBodies if tree.get("body") else Document).model_validate(tree)
+
+
+# --- faults in words ---
+
+_MODELS: Mapping[str, type[_Table]] = {
+    "coordinates": _Coordinate,
+    "parameters": QuantityTable,
+    "constants": QuantityTable,
+    "inputs": _Input,
+    "energy": _Energy,
+    "body": BodyTable,
+    "spring": SpringTable,
+    "damper": DamperTable,
+    "run": _Run,
+}
+
+# what people write instead of our keys
+_ALIASES = {
+    "dt": "h", "step": "h", "time": "duration", "tend": "duration", "t_end": "duration",
+    "initial": "start", "init": "start", "velocity": "rate", "units": "unit", "val": "value",
+    "variables": "coordinates", "params": "parameters", "const": "constants", "x0": "start",
+    "q0": "start", "v0": "rate", "qd0": "rate", "speed": "rate", "t_final": "duration",
+    "tf": "duration", "T_end": "duration", "tmax": "duration", "stepsize": "h", "step_size": "h",
+    "integrator": "method", "solver": "method", "dofs": "coordinates",
+    "T": "kinetic", "K": "kinetic",
+    "V": "potential", "U": "potential", "P": "potential", "R": "dissipation",
+}  # fmt: skip
+_ALIASES_OF = {
+    "body": {
+        "origin": "offset", "xyz": "offset", "translation": "offset", "at": "offset",
+        "pos": "position", "rpy": "rotation", "angle": "rotation", "orientation": "rotation",
+        "com": "center", "cog": "center", "centre": "center", "type": "joint", "kind": "joint",
+        "coordinate": "coordinates", "q": "coordinates", "m": "mass", "I": "inertia",
+        "J": "inertia", "moment": "inertia", "c": "damping", "b": "damping", "d": "damping",
+        "mu": "friction", "coulomb": "friction", "width": "friction_width", "motor": "actuator",
+        "torque": "actuator", "force": "actuator", "input": "actuator", "id": "name",
+    },
+    "spring": {
+        "k": "stiffness", "c": "stiffness", "constant": "stiffness", "rest": "length",
+        "l": "length", "l0": "length", "rest_length": "length", "free_length": "length",
+        "torsional": "turning", "angular": "turning", "rotational": "turning",
+        "between": "bodies", "joint": "coordinate", "ends": "points", "anchors": "points",
+    },
+    "damper": {
+        "c": "damping", "b": "damping", "d": "damping", "coefficient": "damping",
+        "torsional": "turning", "angular": "turning", "rotational": "turning",
+        "between": "bodies", "joint": "coordinate", "ends": "points", "anchors": "points",
+    },
+}  # fmt: skip
+
+
+def table_at(tree: Any, path: tuple[str, ...]) -> dict[str, Any]:
+    """The table at `path`; an empty one where there is none."""
+    for part in path:
+        tree = tree.get(part) if isinstance(tree, dict) else None
+    return tree if isinstance(tree, dict) else {}
+
+
+def has(tree: dict[str, Any], path: tuple[str, ...]) -> bool:
+    """Whether the entry at `path` is there."""
+    return path[-1] in table_at(tree, path[:-1])
+
+
+def place(error: Mapping[str, Any]) -> tuple[str, ...]:
+    """pydantic's place without the branch of a union."""
+    path = tuple(map(str, error["loc"]))
+    if path[:2] == ("run", "method"):  # whichever of a list
+        return path[:2]
+    branch = path[-1] in ("float", "str") and error["type"] in _OF_BRANCHES
+    return path[:-1] if branch else path
+
+
+_OF_BRANCHES = ("float_type", "string_type", "finite_number")
+
+
+def _keys(path: tuple[str, ...]) -> list[str]:
+    """The keys that may stand beside the last of `path`."""
+    model = _MODELS[path[0]] if len(path) > 1 else Document
+    return list(model.model_fields)
+
+
+def meant(path: tuple[str, ...]) -> str:
+    """The key that the last of `path` may have been meant for, or the empty string."""
+    known, last = _keys(path), path[-1]
+    alias = _ALIASES_OF.get(path[0], {}).get(last, "") if len(path) > 2 else ""
+    alias = alias or _ALIASES.get(last, "")
+    near = alias if alias in known else nearest(path[-1], known)
+    # a table's entries are judged by what it is taken for: 'damping' is no 'spring'
+    far = len(path) == 1 and near != alias and not nearest(path[-1], [near], 0.7)
+    return "" if far else near
+
+
+def _toml(value: object) -> str:
+    """A value as TOML writes it, shortened."""
+    if isinstance(value, bool):
+        text = str(value).lower()
+    elif isinstance(value, dict):
+        text = "a table"
+    else:
+        text = repr(value) if isinstance(value, (str, list, float, int)) else str(value)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
+    """One of pydantic's faults in our words, with the remedy."""
+    kind, given, last = str(error["type"]), error.get("input"), path[-1]
+    here = _toml(given)
+    if kind == "missing":
+        where = (path[0], last) if path[0] in _ALIASES_OF else path
+        return "missing: " + _MISSING.get(where, f"add {last} = ...")
+    if kind == "value_error":
+        return str(error["ctx"]["error"])
+    if kind == "extra_forbidden":
+        near = meant(path)
+        remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(_keys(path))}"
+        return f"unknown {'table' if isinstance(given, dict) else 'key'} '{last}'{remedy}"
+    if path == ("eomc",):
+        return f"format {here} is not known to this version, which reads eomc = 1"
+    if kind == "too_short":
+        return 'none is declared: add at least one, such as x = { unit = "m", start = 0.0 }'
+    if path[:2] == ("run", "method"):
+        return f"unknown method {here}: known are {', '.join(METHODS)}"
+    if path == ("run", "real"):
+        return f"unknown type {here}: known are {', '.join(REALS)}"
+    if kind == "greater_than":
+        return f"must be greater than zero, here {here}"
+    if kind == "finite_number":
+        return f"must be a finite number, here {here}"
+    if kind in ("dict_type", "model_type", "model_attributes_type"):
+        if len(path) == 1:
+            return f"'{last}' is a table: write [{last}] and its entries below"
+        key = {"coordinates": "start", "inputs": "signal"}.get(path[0], "value")
+        value = here if isinstance(given, (int, float, str)) else "..."
+        return f"'{last}' is a table: write {last} = {{ {key} = {value} }}"
+    if kind == "bool_type":
+        return f"must be true or false, here {here}"
+    if path[0] == "run":
+        return f"must be a number, here {here}{messages.number(given)}"
+    if last in ("unit", "note", "name", "title", "parent", "joint", "coordinate"):
+        return f"must be text in quotes, here {here}"
+    return f"must be a number or a formula in quotes, here {here}"
+
+
+_MISSING: Mapping[tuple[str, ...], str] = {
+    ("eomc",): "begin the scene with eomc = 1, its format",
+    ("name",): 'add name = "...", which names the module and begins every C symbol',
+    ("coordinates",): 'add [coordinates] with entries such as x = { unit = "m", start = 0.0 }',
+    ("energy",): 'add [energy] with kinetic = "..." and potential = "..."',
+    ("energy", "kinetic"): 'add kinetic = "..."',
+    ("body", "name"): 'give the body a name: name = "..."',
+    ("spring", "stiffness"): 'add stiffness = "..."',
+    ("damper", "damping"): 'add damping = "..."',
+}
+
+
+def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
+    """Put something harmless in a faulty entry's place, so that the rest can be checked."""
+    table, last = table_at(tree, path[:-1]), path[-1]
+    given = table.get(last)
+    if isinstance(given, list) and given and all(isinstance(g, dict) for g in given):
+        table[last] = {key: value for g in given for key, value in g.items()}  # [[parameters]]
+    elif path in _HARMLESS:
+        table[last] = _HARMLESS[path]
+    elif len(path) == 3 and path[0] in _ALIASES_OF and last in ("name", "stiffness", "damping"):
+        table[last] = f"body_{path[1]}" if last == "name" else 1.0
+    elif len(path) == 2 and path[0] in ("definitions", "forces"):
+        table[last] = "0"
+    elif len(path) == 2 and path[0] in ("coordinates", "inputs"):
+        table[last] = {}
+    elif last == "value":
+        table_at(tree, path[:1])[path[1]] = 1.0
+    else:
+        table.pop(last, None)
+
+
+_HARMLESS: Mapping[tuple[str, ...], Any] = {
+    ("eomc",): 1,
+    ("name",): "scene",
+    ("energy",): {"kinetic": "0"},
+    ("energy", "kinetic"): "0",
+}

@@ -1,0 +1,217 @@
+"""Formulas of a scene held against the names declared: what each may use, and faults in words."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from collections.abc import Collection, Mapping
+
+from eomc.base.errors import Problem
+from eomc.scene import formulas, messages
+from eomc.scene.formulas import Formula, FormulaError, suggest
+from eomc.scene.source_map import Places
+
+# the kinds of thing a formula can hang on; what hangs on something faulty is in doubt
+TIME, INPUT, POSITION, VELOCITY = "the time", "inputs", "coordinates", "velocities"
+DOUBT = "something faulty"
+
+NOTHING: frozenset[str] = frozenset()
+
+SUGGESTED = 20  # faults, the first, for which near names are looked for
+
+Path = tuple[str, ...]
+
+
+def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
+    """The value of a formula and "", or nan and why it has none."""
+    try:
+        value = formulas.evaluate(formula, formulas.NUMERIC, known.__getitem__)
+        if isinstance(value, (int, float)) and math.isfinite(value):
+            return float(value), ""
+        fault = "has no real, finite value"
+    except ZeroDivisionError:
+        fault = "divides by zero"
+    except OverflowError:
+        fault = "is too large for a double"
+    except (ValueError, TypeError):
+        fault = "has no real value"
+    given = {n.id: known[n.id] for n in formula.names()}
+    where = ", ".join(f"{name} = {value:g}" for name, value in given.items())
+    return math.nan, f"'{formula.shown}' {fault}" + (f" at {where}" if where else "")
+
+
+class Checker:
+    """The names of a scene, as they become known, and the faults found so far.
+
+    tables: every declared name and its table. kinds: what each name that may be used so far hangs
+    on. centers: the names made by bodies, link_x. mended: places that hold something harmless
+    instead of what is written.
+    """
+
+    def __init__(self, places: Places) -> None:
+        self.places = places
+        self.problems: list[Problem] = []
+        self.faults = 0  # told, each repetition of one counted
+        self.told: set[tuple[Path, str]] = set()
+        self.used: set[str] = set()
+        self.mended: set[Path] = set()
+        self.tables: dict[str, str] = {}
+        self.kinds: dict[str, frozenset[str]] = {}
+        self.centers: set[str] = set()
+        self.definitions: dict[str, Formula] = {}
+
+    def say(
+        self,
+        path: Path,
+        message: str,
+        at: FormulaError | ast.expr | None = None,
+        text: str | None = None,
+        severity: str = "error",
+    ) -> None:
+        """Note a problem, of repeated entries once; `at` is its place in the formula `text`."""
+        self.faults += severity == "error"
+        origin = self.places.origin(path)
+        same = (origin, re.sub(r"\d+", "", message))
+        if origin == path or same not in self.told:
+            self.told.add(same)
+            self.problems.append(self.places.problem(path, message, at, text, severity))
+
+    def parse(self, path: Path, value: float | str) -> Formula | None:
+        """A formula that has passed the whitelist; None where it has a fault, which is told."""
+        text = value if isinstance(value, str) else repr(value)
+        if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
+            # "\theta" is a tab and 'heta', "\nu" a line break and 'u'
+            self.say(path, "LaTeX is not read: write names without backslash (theta)")
+            return None
+        try:
+            return formulas.parse(text)
+        except FormulaError as found:
+            # a parameter is no product of others: "2 m" is a length
+            declared = () if path[0] in ("parameters", "constants") else {*self.tables, *self.kinds}
+            told = messages.quantity(text, declared)
+            fault = FormulaError(told, 0, len(text)) if told else found
+            self.say(path, fault.message, fault, text)
+            return None
+
+    def formula(
+        self,
+        path: Path,
+        value: float | str,
+        allowed: Collection[str] | None = None,
+        rule: str = "",
+    ) -> Formula | None:
+        """Parse a formula and check its names; None where it has a fault, which is told.
+
+        `rule` says in words which names are `allowed`, where not all are.
+        """
+        formula = self.parse(path, value)
+        return formula if formula and self.checked(path, formula, allowed, rule) else None
+
+    def checked(
+        self,
+        path: Path,
+        formula: Formula,
+        allowed: Collection[str] | None = None,
+        rule: str = "",
+    ) -> bool:
+        """Whether the formula uses only names that it may; what it may not is told."""
+        before = self.faults
+        for node in formula.names():
+            self.used.add(node.id)
+            if node.id not in (self.kinds if allowed is None else allowed):
+                self.say(path, self._refused(node.id, rule), node, formula.text)
+        if self.faults == before:
+            for call in formula.calls("dot"):
+                still = allowed is not None and not any(
+                    self.tables.get(name) == "coordinates" for name in allowed
+                )
+                if why := rule if still else self._no_rate(call.args[0]):
+                    self.say(path, f"dot(...) can't be used here: {why}", call, formula.text)
+        return self.faults == before
+
+    def _refused(self, name: str, rule: str) -> str:
+        """Why `name` can't be used."""
+        if rule and (name in self.tables or name in self.kinds):
+            return f"'{name}' can't be used here: {rule}"
+        if name in self.tables:
+            return f"'{name}' is defined further down: move its line above this one"
+        start = f"'{name}' is not declared"
+        if name.endswith(("_ddot", "_dot_dot")):
+            return f"{start}: accelerations are what is solved for, no formula can use them"
+        owner = name.removesuffix("_dot")
+        if owner != name and owner in self.centers:
+            return f"{start}: write dot({owner}) for the velocity of a body"
+        match self.tables.get(owner) if owner != name else None:
+            case "definitions":
+                return f"{start}: write dot({owner}) for the rate of a definition"
+            case "inputs":
+                return f"{start}: nobody knows the rate of an input; add it as a further input"
+            case "parameters" | "constants" as table:
+                return f"{start}: '{owner}' stands in [{table}], so it doesn't move"
+        coordinates = [n for n, table in self.tables.items() if table == "coordinates"]
+        if meant := messages.velocity(name, coordinates):
+            return f"{start}; did you mean '{meant}'?"
+        if name == "time":
+            return f"{start}; did you mean 't'?"
+        if self.faults < SUGGESTED and (near := suggest(name, self.kinds)):
+            return start + near
+        if name in ("e", "E"):
+            return f"{start}: write exp(1), or declare it in [constants]"
+        return f"{start}: add it to [parameters], [constants], [inputs] or [definitions]"
+
+    def _no_rate(self, inside: ast.expr) -> str:
+        """Why dot(inside) can't be had, or the empty string."""
+        kinds = self.kinds_of(inside)
+        if INPUT in kinds:
+            return "it holds inputs, whose rate nobody knows; add the rate as a further input"
+        if VELOCITY in kinds:
+            return "it holds velocities, and their rates are what is solved for"
+        return ""
+
+    def kinds_of(self, node: ast.AST) -> frozenset[str]:
+        """What the value hangs on; dot(e) brings velocities where e moves."""
+        if isinstance(node, ast.Name):
+            return self.kinds.get(node.id, NOTHING)
+        kinds = NOTHING.union(*map(self.kinds_of, ast.iter_child_nodes(node)))
+        dot = (
+            isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "dot"
+        )
+        return kinds | {VELOCITY} if dot and POSITION in kinds else kinds
+
+    def where(self, formula: Formula, kind: str) -> ast.expr:
+        """The first part of the formula that brings in `kind`."""
+        parts: list[ast.expr] = [*formula.calls("dot"), *formula.names()]
+        found = [part for part in parts if kind in self.kinds_of(part)]
+        return min(found, key=lambda part: part.col_offset, default=formula.tree)
+
+    def number(self, path: Path, formula: Formula | None, known: Mapping[str, float]) -> float:
+        """The formula's value; nan where it has none, which is told."""
+        if formula is None or any(math.isnan(known[n.id]) for n in formula.names()):
+            return math.nan  # told already
+        value, fault = value_of(formula, known)
+        if fault:
+            self.say(path, fault, text=formula.text)
+        return value
+
+    def smooth(self, path: Path, formula: Formula) -> None:
+        """What is differentiated may not jump, nor anything that it is made of."""
+        queue = [(path, formula)]
+        seen: set[str] = set()
+        while queue:
+            where, f = queue.pop()
+            for call in f.calls("sign", "heaviside"):
+                if {TIME, POSITION, VELOCITY} & self.kinds_of(call):
+                    function = ast.unparse(call.func)
+                    self.say(
+                        where,
+                        f"{function}(...) jumps, and {'.'.join(path)} that uses it is "
+                        "differentiated: use abs, min or max (max(x, 0)**2 for a stop), a smooth "
+                        "tanh(x/width), or give the force itself in [forces]",
+                        call,
+                        f.text,
+                    )
+            for node in f.names():
+                if node.id in self.definitions and node.id not in seen:
+                    seen.add(node.id)
+                    queue.append((("definitions", node.id), self.definitions[node.id]))

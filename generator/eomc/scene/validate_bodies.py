@@ -1,0 +1,646 @@
+"""Bodies, joints, springs and dampers of a scene: layout tables to a checked Assembly. No SymPy."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from mpmath import mp
+
+from eomc.base import names
+from eomc.scene import formulas
+from eomc.scene.assembly import (
+    WORLD,
+    Assembly,
+    Body,
+    Damper,
+    Spring,
+    Turn,
+    Vector,
+)
+from eomc.scene.formulas import Formula, nearest, suggest
+from eomc.scene.joints import JOINTS, MEANT, Z
+from eomc.scene.schema import BodyTable, DamperTable, Document, SpringTable
+from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
+
+ROUNDING = 1e-6  # relative, of principal moments: files have them with six digits and more
+
+ZERO = formulas.parse("0")
+ORIGIN: Vector = (ZERO, ZERO, ZERO)
+FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
+
+_OF_JOINTS = (
+    "parent", "coordinates", "axis", "offset", "center", "armature", "damping", "friction",
+    "friction_width", "actuator",
+)  # fmt: skip
+
+
+def centers(doc: Document) -> set[str]:
+    """The names that bodies on joints give to the position of their centres of mass."""
+    letters = "xy" if doc.gravity and len(doc.gravity) == 2 else "xyz"
+    return {
+        f"{body.name}_{letter}"
+        for body in doc.body.values()
+        if body.position is None
+        for letter in letters
+    }
+
+
+def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assembly | None:
+    """The bodies of a scene and what acts between them; None where there is nothing of it.
+
+    known: the values of constants and parameters. Faults are told to `check`; with faults the
+    assembly is not to be used.
+    """
+    if not (doc.body or doc.spring or doc.damper):
+        if doc.gravity is not None:
+            check.say(
+                ("gravity",),
+                "acts on bodies, and there is no [[body]]: remove it, or write the weight "
+                "into the potential energy",
+            )
+        return None
+    return _Bodies(check, doc, known).assembly()
+
+
+class _Bodies:
+    def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
+        self.check = check
+        self.doc = doc
+        self.known = known
+        self.names: dict[str, str] = {}  # of each body, and the label of its entry
+        self.moved_by: dict[str, str] = {}  # each coordinate and the body whose joint it moves
+        # entries of a vector; None where gravity doesn't tell whether the scene is plane
+        self.wide: int | None = 2
+        self.values: dict[float | str, tuple[Formula, float]] = {}  # sound formulas, by text
+        self.bodies: dict[str, Body] = {}
+        self.heavy: dict[str, bool] = {}
+
+    def assembly(self) -> Assembly:
+        gravity = self._gravity()
+        self._names()
+        labels = self.names.values()
+        for label in labels:
+            entry, path = self.doc.body[label], ("body", label)
+            if entry.position is None:
+                self._hung(path, entry)
+            else:
+                self._placed(path, entry)
+        ordered = self._ordered()
+        self._inertia_of_joints(ordered)
+        springs = [self._spring(("spring", k), e) for k, e in self.doc.spring.items()]
+        dampers = [self._damper(("damper", k), e) for k, e in self.doc.damper.items()]
+        return Assembly(
+            plane=self.wide == 2,
+            gravity=gravity,
+            bodies=tuple(ordered),
+            springs=tuple(springs),
+            dampers=tuple(dampers),
+        )
+
+    # --- the scene ------------------------------------------------------------------------------
+
+    def _gravity(self) -> Vector:
+        given = self.doc.gravity
+        if given is None:
+            if self.doc.body:
+                self.wide = None
+                if ("gravity",) not in self.check.mended:
+                    self.check.say(
+                        ("gravity",),
+                        'missing: add gravity = [0, "-9.81"] above the first [table] for a plane '
+                        'scene, [0, 0, "-9.81"] for one in space, [0, 0] or [0, 0, 0] for none',
+                    )
+            return ORIGIN
+        if len(given) not in (2, 3):
+            self.wide = None
+            self.check.say(
+                ("gravity",),
+                f"has two entries in a plane scene and three in space, here {len(given)}",
+            )
+            return ORIGIN
+        self.wide = len(given)
+        return self._vector(("gravity",), given)
+
+    def _names(self) -> None:
+        for label, entry in self.doc.body.items():
+            path, name = ("body", label, "name"), entry.name
+            if why := names.fault(name):
+                self.check.say(path, why)
+            elif name == WORLD:
+                self.check.say(
+                    path, "'world' is the frame that does not move: name the body otherwise"
+                )
+                continue
+            elif name in self.names:
+                self.check.say(path, f"'{name}' is the name of a body above: rename one of the two")
+                continue
+            self.names[name] = label
+        for name in sorted(self.check.centers & {*self.check.tables}):
+            body = name[:-2]
+            self.check.say(
+                (self.check.tables[name], name),
+                f"'{name}' is where the centre of mass of body '{body}' is: use that, or choose "
+                "another name",
+            )
+
+    # --- values ---------------------------------------------------------------------------------
+
+    def _value(self, path: Path, value: float | str) -> tuple[Formula, float]:
+        """A formula of parameters and its value at their defaults; 0 and nan where it is faulty."""
+        if value not in self.values:
+            rule = f"'{path[-1]}' is made of numbers, constants and parameters"
+            formula = self.check.formula(path, value, self.known, rule)
+            number = self.check.number(path, formula, self.known)
+            if formula is None or math.isnan(number):
+                return ZERO, math.nan
+            self.values[value] = formula, number
+        return self.values[value]
+
+    def _formula(self, path: Path, value: float | str) -> Formula:
+        return self._value(path, value)[0]
+
+    def _moving(self, path: Path, value: float | str) -> Formula:
+        """A formula of everything but inputs and velocities, without dot."""
+        check = self.check
+        formula = check.formula(path, value)
+        if formula is None:
+            return ZERO
+        kinds = check.kinds_of(formula.tree)
+        if INPUT in kinds:
+            check.say(
+                path,
+                f"'{path[-1]}' can't depend on inputs, whose rates nobody knows: "
+                "let them act through an actuator or [forces]",
+                check.where(formula, INPUT),
+                formula.text,
+            )
+        elif VELOCITY in kinds or any(formula.calls("dot")):
+            check.say(
+                path,
+                f"'{path[-1]}' can't depend on velocities: it is made of coordinates, "
+                "t, parameters, constants and definitions of these",
+                check.where(formula, VELOCITY),
+                formula.text,
+            )
+        check.smooth(path, formula)
+        return formula
+
+    def _vector(
+        self,
+        path: Path,
+        given: Sequence[float | str] | None,
+        formula: Callable[[Path, float | str], Formula] | None = None,
+    ) -> Vector:
+        if given is None or not self._fits(path, len(given)):
+            return ORIGIN
+        made = [(formula or self._formula)(path, entry) for entry in given]
+        x, y, z = (*made, ZERO, ZERO, ZERO)[:3]
+        return x, y, z
+
+    def _fits(self, path: Path, entries: int) -> bool:
+        if self.wide is None or entries == self.wide:
+            return self.wide is not None
+        scene = "a plane scene" if self.wide == 2 else "space"
+        words = {2: "two", 3: "three"}
+        self.check.say(
+            path,
+            f"vectors have {words[self.wide]} entries in {scene}, as gravity has, here {entries}",
+        )
+        return False
+
+    def _rotation(
+        self, path: Path, given: Any, formula: Callable[[Path, float | str], Formula]
+    ) -> tuple[Turn, ...]:
+        if given is None:
+            return ()
+        if not isinstance(given, tuple):
+            if self.wide == 3:
+                self.check.say(
+                    path, 'in space a rotation names its axis: write [["z", "pi/2"]], or more turns'
+                )
+            return (Turn("z", formula(path, given)),)
+        for axis, _ in given:
+            if axis != "z" and self.wide == 2:
+                self.check.say(path, f"a plane scene turns about z only, here about {axis}")
+                break
+        return tuple(Turn(axis, formula(path, angle)) for axis, angle in given)
+
+    # --- bodies -----------------------------------------------------------------------------------
+
+    def _mass(self, path: Path, entry: BodyTable) -> tuple[Formula, Any]:
+        """Mass and inertia."""
+        mass, value = self._value((*path, "mass"), entry.mass)
+        if value < 0:
+            self.check.say(
+                (*path, "mass"), f"is {value:g} kg, and no mass is negative", text=mass.text
+            )
+        inertia, moments = self._inertia((*path, "inertia"), entry.inertia)
+        self.heavy[entry.name] = value != 0 or any(m != 0 for m in moments)
+        return mass, inertia
+
+    def _inertia(self, path: Path, given: Any) -> tuple[tuple[Formula, ...], list[float]]:
+        nothing = (ZERO,) * 6
+        if given is None or self.wide is None:
+            return nothing, [math.nan] if self.wide is None else [0.0]
+        single = not isinstance(given, tuple)
+        entries = (given,) if single else given
+        if self.wide == 2 and not single:
+            self.check.say(path, "a plane scene has one number for it, about z: write it alone")
+            return nothing, [math.nan]
+        if self.wide == 3 and (single or len(entries) not in (3, 6)):
+            here = "one number" if single else str(len(entries))
+            self.check.say(
+                path,
+                "in space it has three entries, [Ixx, Iyy, Izz], or six, "
+                f"[Ixx, Iyy, Izz, Ixy, Ixz, Iyz], here {here}",
+            )
+            return nothing, [math.nan]
+        made = [self._value(path, entry) for entry in entries]
+        found, numbers = [f for f, _ in made], [v for _, v in made]
+        if self.wide == 2:
+            if numbers[0] < 0:
+                self.check.say(
+                    path,
+                    f"is {numbers[0]:g} kg m^2, and no inertia is negative",
+                    text=found[0].text,
+                )
+            return (ZERO, ZERO, found[0], ZERO, ZERO, ZERO), numbers
+        self._moments(path, [*numbers, 0.0, 0.0, 0.0][:6])
+        return (*found, ZERO, ZERO, ZERO)[:6], numbers
+
+    def _moments(self, path: Path, inertia: Sequence[float]) -> None:
+        """What no body can have: a negative principal moment, one above the sum of the others."""
+        if not all(abs(x) < 1e150 for x in inertia):
+            return
+        xx, yy, zz, xy, xz, yz = inertia
+        tensor = mp.matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # NumPy takes 0.1 s to load
+        small, middle, large = sorted(map(float, mp.eigsy(tensor, eigvals_only=True)))
+        tiny = ROUNDING * max(abs(small), abs(large))
+        shown = f"{small:.4g}, {middle:.4g} and {large:.4g} kg m^2"
+        if small < -tiny:
+            self.check.say(
+                path,
+                f"its principal moments are {shown}, and none can be negative: "
+                "check signs and order, [Ixx, Iyy, Izz, Ixy, Ixz, Iyz]",
+            )
+        elif large > small + middle + tiny:
+            self.check.say(
+                path,
+                f"its principal moments are {shown}, and one is larger than the two others "
+                "together, which no body has: check it, about the centre of mass",
+            )
+
+    def _placed(self, path: Path, entry: BodyTable) -> None:
+        """A body placed by formulas."""
+        if entry.joint is not None:
+            self.check.say(
+                (*path, "position"),
+                "a body hangs on a joint or is placed by 'position', not both: remove one of the "
+                "two (a joint's place in the parent's frame is 'offset')",
+            )
+            return
+        for key in _OF_JOINTS:
+            if getattr(entry, key) is not None:
+                why = (
+                    "'position' is the centre of mass already"
+                    if key == "center"
+                    else "the body is placed by 'position' and has no joint"
+                )
+                remedy = ", and let forces act through [forces]" if key == "actuator" else ""
+                self.check.say((*path, key), f"{why}: remove '{key}'{remedy}")
+        mass, inertia = self._mass(path, entry)
+        self.bodies[entry.name] = Body(
+            name=entry.name,
+            mass=mass,
+            inertia=inertia,
+            center=ORIGIN,
+            rotation=self._rotation((*path, "rotation"), entry.rotation, self._moving),
+            position=self._vector((*path, "position"), entry.position, self._moving),
+            note=entry.note,
+        )
+
+    def _hung(self, path: Path, entry: BodyTable) -> None:
+        """A body on a joint."""
+        check = self.check
+        joint = self._joint(path, entry)
+        parent = self._parent((*path, "parent"), entry)
+        mass, inertia = self._mass(path, entry)
+        center = self._vector((*path, "center"), entry.center)
+        offset = self._vector((*path, "offset"), entry.offset)
+        rotation = self._rotation((*path, "rotation"), entry.rotation, self._formula)
+        if not joint:
+            return
+        coordinates = self._coordinates((*path, "coordinates"), joint, entry)
+        axes = self._axes((*path, "axis"), joint, entry)
+        of_joint: dict[str, Any] = {
+            key: self._each((*path, key), joint, getattr(entry, key))
+            for key in ("armature", "damping", "friction", "actuator")
+        }
+        width = None
+        if of_joint["friction"]:
+            width = FRICTION_WIDTH
+        if entry.friction_width is not None:
+            width, value = self._value((*path, "friction_width"), entry.friction_width)
+            if value <= 0:
+                check.say(
+                    (*path, "friction_width"),
+                    f"is {value:g}, and must be greater than zero: the rate within which friction "
+                    "is smoothed",
+                    text=width.text,
+                )
+            if entry.friction is None:
+                check.say((*path, "friction_width"), "there is no 'friction' beside it: add it")
+        if parent is None or coordinates is None:
+            return
+        self.bodies[entry.name] = Body(
+            name=entry.name,
+            mass=mass,
+            inertia=inertia,
+            center=center,
+            rotation=rotation,
+            parent=parent,
+            joint=joint,
+            coordinates=coordinates,
+            axes=axes,
+            offset=offset,
+            friction_width=width,
+            note=entry.note,
+            **of_joint,
+        )
+
+    def _joint(self, path: Path, entry: BodyTable) -> str:
+        """The kind of joint, or the empty string where it is not known."""
+        check, joint = self.check, entry.joint
+        known = [k for k, kind in JOINTS.items() if kind.plane or self.wide != 2]
+        if joint is None:
+            if {(*path, "joint"), (*path, "position")} & check.mended:
+                return ""  # told already
+            check.say(
+                path,
+                'say how the body is held: joint = "revolute" or another, or position = [...] with '
+                "formulas in the coordinates",
+            )
+            return ""
+        if joint not in JOINTS:
+            near = MEANT.get(joint.lower(), "") or nearest(joint, JOINTS)
+            remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(known)}"
+            check.say((*path, "joint"), f"there is no joint '{joint}'{remedy}", text=joint)
+            return ""
+        if joint not in known:
+            check.say(
+                (*path, "joint"),
+                f"a {joint} joint moves in space, and gravity has two entries, so the scene is "
+                f"plane: give gravity a third, or use {', '.join(known)}",
+                text=joint,
+            )
+            return ""
+        return joint
+
+    def _parent(self, path: Path, entry: BodyTable) -> str | None:
+        parent = WORLD if entry.parent is None else entry.parent
+        if parent == WORLD:
+            return parent
+        if parent not in self.names:
+            remedy = suggest(parent, [WORLD, *self.names]) or ": declare it as a [[body]]"
+            self.check.say(path, f"there is no body '{parent}'{remedy}", text=parent)
+        elif parent == entry.name:
+            self.check.say(
+                path, f"'{parent}' hangs on itself: name another body, or world", text=parent
+            )
+        elif self.doc.body[self.names[parent]].position is not None:
+            self.check.say(
+                path,
+                f"'{parent}' is placed by formulas, and nothing can hang on it: give it a joint, "
+                "or place this body by formulas too",
+                text=parent,
+            )
+        else:
+            return parent
+        return None
+
+    def _coordinates(self, path: Path, joint: str, entry: BodyTable) -> tuple[str, ...] | None:
+        check, given, wanted = self.check, entry.coordinates or (), len(JOINTS[joint].motions)
+        if path in check.mended:
+            return None
+        if len(given) != wanted:
+            count = "one coordinate" if wanted == 1 else f"{wanted or 'no'} coordinates"
+            order = f" ({JOINTS[joint].order})" if JOINTS[joint].order else ""
+            here = ", ".join(given) or "none"
+            listed = ", ".join(f'"q{k}"' for k in range(1, wanted + 1))
+            example = listed if wanted == 1 else f"[{listed}]"
+            remedy = f": add coordinates = {example}" if not given else ""
+            remedy = remedy if wanted else ": remove it"
+            check.say(path, f"a {joint} joint has {count}{order}, here {here}{remedy}")
+            return None
+        sound = True
+        for name in given:
+            if name not in self.doc.coordinates:
+                sound = False
+                table = check.tables.get(name)
+                if table:
+                    why = f"'{name}' stands in [{table}]: a joint moves by what is in [coordinates]"
+                else:
+                    near = suggest(name, self.doc.coordinates) or ": add it to [coordinates]"
+                    why = f"'{name}' is not a coordinate{near}"
+                check.say(path, why, text=name)
+            elif name in self.moved_by:
+                sound = False
+                check.say(
+                    path,
+                    f"'{name}' moves the joint of '{self.moved_by[name]}' already: each joint has "
+                    "coordinates of its own",
+                    text=name,
+                )
+            self.moved_by.setdefault(name, entry.name)
+        return given if sound else None
+
+    def _axes(
+        self, path: Path, joint: str, entry: BodyTable
+    ) -> tuple[tuple[float, float, float], ...]:
+        """Unit axes; the joint's own where none are written."""
+        check, wanted = self.check, JOINTS[joint].given
+        if path in check.mended or self.wide is None:
+            return ()
+        given = entry.axis
+        if given is None:
+            if wanted and not JOINTS[joint].defaults:
+                example = "[1, 0]" if self.wide == 2 else "[1, 0, 0]"
+                check.say(path, f"missing: a {joint} joint slides along one, axis = {example}")
+                return (Z,) * wanted
+            return JOINTS[joint].defaults
+        if not wanted:
+            check.say(path, f"a {joint} joint has no axis to choose: remove it")
+            return ()
+        if joint == "revolute" and self.wide == 2:
+            check.say(path, "in a plane scene joints turn about z: remove it")
+            return ()
+        if len(given) != wanted:
+            count = "one axis" if wanted == 1 else "two axes, such as [[1, 0, 0], [0, 1, 0]]"
+            check.say(path, f"a {joint} joint has {count}, here {len(given)}")
+            return ()
+        axes: list[tuple[float, float, float]] = []
+        for axis in given:
+            if not self._fits(path, len(axis)):
+                return ()
+            size = math.hypot(*axis)
+            if size < 1e-9:
+                check.say(path, "the axis has no length, so no direction: give it one")
+                return ()
+            x, y, *third = (entry / size for entry in axis)
+            axes.append((x, y, third[0] if third else 0.0))
+        if len(axes) == 2 and abs(sum(a * b for a, b in zip(*axes, strict=True))) > 1 - 1e-9:
+            check.say(
+                path, "the two axes are parallel, so the two angles are one: turn one of them"
+            )
+        return tuple(axes)
+
+    def _each(self, path: Path, joint: str, given: Any) -> tuple[Formula, ...]:
+        """One formula for each coordinate of the joint."""
+        count, key = len(JOINTS[joint].motions), path[-1]
+        if given is None:
+            return ()
+        if not count:
+            self.check.say(path, f"a fixed joint does not move: remove '{key}'")
+            return ()
+        entries = given if isinstance(given, tuple) else (given,) * count
+        if len(entries) != count:
+            each = f", or a list of {count}, one for each coordinate" if count > 1 else ""
+            self.check.say(path, f"give one for the joint{each}, here {len(entries)}")
+            return ()
+        if key == "actuator":
+            return tuple(self.check.formula(path, entry) or ZERO for entry in entries)
+        made = [self._value(path, entry) for entry in entries]
+        for formula, value in made:
+            if value < 0 and key != "damping":
+                self.check.say(path, f"is {value:g}, and can't be negative", text=formula.text)
+                break
+        return tuple(formula for formula, _ in made)
+
+    # --- the tree ---------------------------------------------------------------------------------
+
+    def _ordered(self) -> list[Body]:
+        """Parents before children, else as written; rings of parents are told."""
+        hung = {name: body for name, body in self.bodies.items() if body.joint}
+        self._loops(hung)
+        children: dict[str, list[str]] = {}
+        for name, body in hung.items():
+            children.setdefault(body.parent, []).append(name)
+        rank = {name: k for k, name in enumerate(self.bodies)}
+        ready = [
+            rank[name]
+            for name, body in self.bodies.items()
+            if not body.joint or body.parent == WORLD
+        ]
+        heapq.heapify(ready)
+        bodies, out = list(self.bodies.values()), []
+        while ready:
+            body = bodies[heapq.heappop(ready)]
+            out.append(body)
+            for child in children.get(body.name, ()):
+                heapq.heappush(ready, rank[child])
+        return out
+
+    def _loops(self, hung: Mapping[str, Body]) -> None:
+        done: set[str] = set()
+        for name in hung:
+            way: dict[str, None] = {}
+            while name in hung and name not in done and name not in way:
+                way[name] = None
+                name = hung[name].parent
+            if name in way:
+                ring = list(way)
+                ring = [*ring[ring.index(name) :], name]
+                shown = ring if len(ring) < 8 else [*ring[:3], "...", *ring[-3:]]
+                self.check.say(
+                    ("body", self.names[name], "parent"),
+                    f"the parents form a loop: {' -> '.join(shown)}; let one of them hang on the "
+                    "world, and close the loop with stiff springs",
+                    text=hung[name].parent,
+                )
+            done |= {*way}
+
+    def _inertia_of_joints(self, ordered: Iterable[Body]) -> None:
+        """Every joint that moves needs something to move, unless energies are given besides."""
+        ordered = list(ordered)
+        kinetic = self.doc.energy.kinetic
+        if kinetic != 0.0 or any(body.position for body in ordered):
+            return
+        carries = dict(self.heavy)
+        for body in reversed(ordered):
+            if body.parent in carries:
+                carries[body.parent] |= carries[body.name]
+        told: set[str] = set()
+        for body in ordered:
+            if carries[body.name] or body.parent in told or not body.coordinates or body.armature:
+                continue
+            told.add(body.name)
+            self.check.say(
+                ("body", self.names[body.name]),
+                f"nothing that {' and '.join(body.coordinates)} would move has mass or inertia: "
+                f"give '{body.name}' a mass, or its joint an armature",
+            )
+
+    # --- springs and dampers ----------------------------------------------------------------------
+
+    def _spring(self, path: Path, entry: SpringTable) -> Spring:
+        return Spring(
+            stiffness=self._formula((*path, "stiffness"), entry.stiffness),
+            length=self._formula((*path, "length"), entry.length),
+            **self._between(path, entry),
+        )
+
+    def _damper(self, path: Path, entry: DamperTable) -> Damper:
+        return Damper(
+            damping=self._formula((*path, "damping"), entry.damping), **self._between(path, entry)
+        )
+
+    def _between(self, path: Path, entry: SpringTable | DamperTable) -> dict[str, Any]:
+        """What a spring or damper acts on."""
+        check, what = self.check, path[0]
+        if (entry.coordinate is None) == (entry.bodies is None):
+            if not {(*path, "coordinate"), (*path, "bodies")} & check.mended:
+                check.say(
+                    path,
+                    f"a {what} acts along a 'coordinate' or between two 'bodies': give "
+                    + ("one of the two" if entry.coordinate is None else "one of the two only"),
+                )
+            return {}
+        if entry.coordinate is not None:
+            for key in ("points", "turning"):
+                if getattr(entry, key):
+                    check.say((*path, key), f"belongs to a {what} between 'bodies': remove it")
+            if entry.coordinate not in self.doc.coordinates:
+                remedy = suggest(entry.coordinate, self.doc.coordinates)
+                remedy = remedy or f": known are {', '.join([*self.doc.coordinates][:9])}"
+                check.say(
+                    (*path, "coordinate"),
+                    f"'{entry.coordinate}' is not a coordinate{remedy}",
+                    text=entry.coordinate,
+                )
+            return {"coordinate": entry.coordinate}
+        assert entry.bodies is not None
+        for name in entry.bodies:
+            if name != WORLD and name not in self.names:
+                remedy = suggest(name, [WORLD, *self.names]) or ": declare it as a [[body]]"
+                check.say((*path, "bodies"), f"there is no body '{name}'{remedy}", text=name)
+        first, second = entry.bodies
+        if first == second:
+            check.say(
+                (*path, "bodies"), f"a {what} acts between two bodies, here both are '{first}'"
+            )
+        if entry.turning:
+            if self.wide == 3:
+                check.say(
+                    (*path, "turning"),
+                    f"a {what} turns in plane scenes only: in space let it act along the "
+                    "'coordinate' of a joint",
+                )
+            if entry.points:
+                check.say((*path, "points"), f"a turning {what} has no points: remove them")
+            return {"bodies": (first, second), "turning": True}
+        points = entry.points or (None, None)
+        one, other = (self._vector((*path, "points"), point) for point in points)
+        return {"bodies": (first, second), "points": (one, other)}

@@ -1,0 +1,1 @@
+"""Text to a compiled module: compiler, extension, cache."""

@@ -1,0 +1,440 @@
+"""What a module's runs say of its steppers: orders, balances of power, advice on h.
+
+Each finding is a number, or the reason why none can be had: `Finding.why`. A number is judged by
+the row that shows it. The rules are such that a right module is not blamed where nothing can be
+seen, and a wrong one is wherever it can be:
+
+- An order is that of the best of several halvings of h, over spans from short to long. A wrong
+  stepper converges slowly, to errors far above rounding, and the slower the more halvings show it;
+  so a low order is believed where two spans in a row agree on it, and too few halvings between
+  rounding and a hundredth of the motion, as of high orders in a stiff motion, are not judged.
+- A balance of power closes at the order of the method and of Simpson's rule, or down to rounding. A
+  wrong power leaves a rest that no halving changes.
+- An advised h is compared with runs; where these leave the place that it is about, as stiff
+  friction near rest, with the eigenvalues of differences of the accelerations.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.integrators.tableaux import METHODS
+from eomc.verify.oracle import Vector
+
+if TYPE_CHECKING:
+    from eomc.verify.check import State
+
+EPS = 2.0**-52
+SEEN = 8  # higher orders go from errors of a hundredth to rounding in two halvings of h
+ORDER_MARGIN = 0.5  # below the order of a method: half way to the next lower one
+SMALL = 1e-2  # of the motion: differences below are in proportion to a power of h
+CLEAR = 30.0  # times what rounding does to a run: differences above are the method's own
+ALIKE = 0.3  # orders that differ by less are the same
+COUNTS = (6, 12, 24, 48, 96)  # steps of a span
+FIRST = (0, -1, 1, -2, 2)  # log2 of spans over 48 h that are looked at first
+LOWER, MOST = (-2, -4, -7, -10, -14, -20), 8  # then down to where all is rounding, and up
+BALANCE_SPANS = (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11)  # powers of 2, of h
+CLOSED = 1e3  # roundings of the energy: a balance is closed
+RESOLVED = 1e-3  # of the motion: two methods are compared where halving h changes no more
+NUDGE = 1e-6  # relative change at the start, from which growth is estimated
+DRAWS = 2  # of starts moved by a rounding
+
+# An advised h is compared with runs of SPAN times its length, in steps of these parts of it. The
+# limit is that of the motion as it is linear at one place, and the motion goes on from there.
+FINE, PARTS, SPAN = 1 / 64, (1 / 8, 1 / 4, 1 / 2, 1, 2), 8
+BLOWN = 1e3  # times what a difference grows by in fine steps: unstable
+OFF = 0.1  # of the motion: the end of a stable run with steps as long as its limit is no answer
+LINEAR = 1e-9  # of the motion: a difference this small grows in proportion, where forces are stiff
+APART = 2.0  # times the limit of the eigenvalues: an advised h further off is wrong
+PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
+AHEAD = 2000  # steps of the scene's h in which these lie
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found; inf where there is nothing to measure. why: nothing is judged, and why.
+
+    unit, limit: of another measure than the row's own, at most the limit.
+    """
+
+    value: float
+    why: str = ""
+    unit: str = ""
+    limit: float = math.inf
+
+
+@dataclass(frozen=True)
+class Place:
+    """A state to run from, and the size of its energy, of which a rounding is eps."""
+
+    state: State
+    energy: float
+
+
+@dataclass(frozen=True)
+class _Ladder:
+    """Differences of ends of one span in more and more steps; `noise` of them is rounding."""
+
+    span: float
+    differences: tuple[float, ...]
+    noise: float
+
+    @property
+    def orders(self) -> Iterator[tuple[float, bool]]:
+        """Of each halving of a small difference clear of rounding; whether its rest is clear too.
+
+        Where it is not, that is the least that the order may be.
+        """
+        for a, b in pairwise(self.differences):
+            if CLEAR * self.noise < a < SMALL:
+                yield math.log2(a / max(b, self.noise)), b > CLEAR * self.noise
+
+    @property
+    def exact(self) -> bool:
+        """Whether all differences are rounding."""
+        return max(self.differences) <= CLEAR * self.noise
+
+    def best(self, least: float) -> float:
+        """The largest order, where it is at least so much and no finer halving tells otherwise."""
+        found = list(self.orders)
+        for k, (order, _) in enumerate(found):
+            if order >= least and all(p >= least / 2 for p, clear in found[k + 1 :] if clear):
+                return max(p for p, _ in found[k:])
+        return math.nan
+
+    @property
+    def settled(self) -> float:
+        """The order on which the last two halvings clear of rounding agree, or nan."""
+        found = [p for p, clear in self.orders if clear]
+        if len(found) < 2 or abs(found[-1] - found[-2]) > ALIKE:
+            return math.nan
+        return found[-1]
+
+
+class Convergence:
+    """The rows of one module that come from runs of several step sizes.
+
+    places: where to run from, with the scene's own parameters; start: where its motion starts.
+    scale: (2, nq), of q and qd. h, duration: the scene's, s.
+    """
+
+    def __init__(
+        self, module: Any, methods: Sequence[str], places: Sequence[Place], start: State,
+        scale: Vector, h: float, duration: float,
+    ) -> None:  # fmt: skip
+        self.module, self.methods, self.places, self.start = module, tuple(methods), places, start
+        self.scale, self.h, self.duration = scale, h, duration
+
+    def run(self, s: State, method: str, **how: Any) -> Any:
+        """A run from a state, whatever its status."""
+        if method != self.methods[0]:
+            how["method"] = method
+        with warnings.catch_warnings():  # a run that stops early is looked at here
+            warnings.simplefilter("ignore", RuntimeWarning)
+            return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
+
+    def end(self, s: State, method: str, span: float, steps: int) -> Vector | None:
+        """The scaled end of a run, (2, nq); None where it does not get there."""
+        run = self.run(s, method, h=span / steps, steps=steps, every=steps)
+        if str(run.status) != "ok":
+            return None
+        return np.array([run.q[-1], run.qd[-1]]) / self.scale
+
+    def noise(self, at: Place, method: str, span: float, steps: int, end: Vector) -> float:
+        """What rounding does to the end: that of the sums on the way, and of the start, grown."""
+        s = at.state
+        size = np.abs(np.array([s.q, s.qd])) + np.abs(end) * self.scale
+        least = EPS * float(np.max(size / self.scale))
+        random = np.random.default_rng(steps)
+        for _ in range(DRAWS):
+            by = random.choice([-EPS, EPS], size.shape) * size
+            near = self.end(replace(s, q=s.q + by[0], qd=s.qd + by[1]), method, span, steps)
+            if near is not None:
+                least = max(least, float(np.max(np.abs(near - end))))
+        return least
+
+    # --- orders -----------------------------------------------------------------------------------
+
+    def order(self, method: str) -> Finding:
+        """Of convergence of the state: the best found from any place; inf where runs are exact.
+
+        Raises RuntimeError where no run from any place gets to its end.
+        """
+        least = min(METHODS[method].order, SEEN) - ORDER_MARGIN
+        found = []
+        for at in self.places:
+            found.append(self._order(at, method, least))
+            if math.isfinite(found[-1]) and found[-1] >= least:
+                break  # a wrong stepper is nowhere right
+        return _judged(found, max, "too few halvings between rounding and a hundredth")
+
+    def _order(self, at: Place, method: str, least: float) -> float:
+        """The best of a few spans; else of all from the shortest that shows a difference upwards.
+
+        There a low order counts where two spans in a row agree on it: longer ones may be of
+        order 1 with any method, where steps leap over a bend of the forces.
+        """
+        ladders: dict[int, _Ladder | None] = {}
+
+        def ladder(power: int) -> _Ladder | None:
+            if power not in ladders:
+                ladders[power] = self._ladder(at, method, 48 * self.h * 2.0**power)
+            return ladders[power]
+
+        for power in FIRST:
+            if (one := ladder(power)) and not math.isnan(best := one.best(least)):
+                return best
+        low = next((k for k in LOWER if (one := ladder(k)) and one.exact), LOWER[-1])
+        before, moved = math.nan, False
+        for power in range(low, MOST + 1):
+            if not (one := ladder(power)):
+                continue
+            if not math.isnan(best := one.best(least)):
+                return best
+            if abs(one.settled - before) <= ALIKE:  # and nan is not
+                return one.settled
+            before, moved = one.settled, moved or not one.exact
+        if not any(ladders.values()):
+            raise RuntimeError(f"no run by {method} gets to its end")
+        return math.nan if moved else math.inf
+
+    def _ladder(self, at: Place, method: str, span: float) -> _Ladder | None:
+        ends = [self.end(at.state, method, span, n) for n in COUNTS]
+        known = [end for end in ends if end is not None]
+        if ends[2] is None or any(e is None for e in ends[-len(known) :]):
+            return None
+        off = tuple(float(np.max(np.abs(b - a))) for a, b in pairwise(known))
+        return _Ladder(span, off, self.noise(at, method, span, COUNTS[2], ends[2]))
+
+    # --- two methods ------------------------------------------------------------------------------
+
+    def beside(self, method: str) -> Finding:
+        """How far another method ends from the first, over what halving h changes in the two.
+
+        From each place the lesser of two spans: errors may meet by chance at one. The median of
+        the places.
+        """
+        found = [self._beside(at, method) for at in self.places]
+        known = [x for x in found if not math.isnan(x)]
+        if known:
+            return Finding(float(np.median(known)))
+        return Finding(math.nan, "no span is short enough for the two methods' steps")
+
+    def _beside(self, at: Place, method: str) -> float:
+        ratios: list[float] = []
+        for power in range(0, -20, -2):
+            span = 24 * self.h * 2.0**power
+            ends = [
+                self.end(at.state, name, span, n)
+                for name in (self.methods[0], method)
+                for n in (24, 48)
+            ]
+            if any(end is None for end in ends):
+                continue
+            one, two, far, other = (np.asarray(end) for end in ends)
+            change = np.abs(two - one) + np.abs(other - far)
+            if float(np.max(change)) > RESOLVED:
+                continue
+            noise = self.noise(at, method, span, 48, other)
+            ratios.append(float(np.max(np.abs(two - other)) / (np.max(change) + 2 * CLEAR * noise)))
+            if len(ratios) == 2 or ratios[-1] <= 1:
+                break
+        return min(ratios, default=math.nan)
+
+    # --- power ------------------------------------------------------------------------------------
+
+    @property
+    def _best_method(self) -> str:
+        """The one that balances are taken by: rk4, or the one of the highest order."""
+        names = self.methods
+        return "rk4" if "rk4" in names else max(names, key=lambda name: METHODS[name].order)
+
+    @property
+    def closing_limit(self) -> float:
+        """Half of the order of the method and Simpson's rule; a wrong power does not close: 0."""
+        return min(METHODS[self._best_method].order, 4) / 2
+
+    def closing(self) -> Finding:
+        """The order at which jacobi(T) - jacobi(0) - integral of power vanishes; inf: it is 0."""
+        found = [self._closing(at) for at in self.places]
+        return _judged(found, min, "the balance is neither closed nor left open")
+
+    def _closing(self, at: Place) -> float:
+        """From spans that are short enough upwards, until a rest of the balance shows.
+
+        A rest that two halvings leave as it is, in two spans in a row, is a wrong power: 0.
+        """
+        rest, closed = 0.0, False
+        for power in BALANCE_SPANS:
+            gaps, exact = self._gaps(at, self.h * 2.0**power)
+            if exact:
+                closed, rest = True, 0.0
+            if exact or len(gaps) < 3:
+                continue
+            a, b, c = gaps
+            if abs(c - b) <= 0.1 * abs(c) and abs(b - a) <= 0.3 * abs(b):
+                if rest and 1.2 < c / rest < 20:  # it grows with the span, or with its square
+                    return math.log2(abs(a / c)) / 2
+                rest = c
+                continue
+            rest = 0.0
+            order = math.log2(abs(a / c)) / 2 if a else math.nan
+            if order >= self.closing_limit and abs(b) < abs(a):
+                return order
+        return math.inf if closed else math.nan
+
+    def _gaps(self, at: Place, span: float) -> tuple[list[float], bool]:
+        """What is left of the balance with 16, 32 and 64 steps; whether one of them closes it."""
+        s, gaps = at.state, []
+        for n in (16, 32, 64):
+            run = self.run(s, self._best_method, h=span / n, steps=n)
+            if str(run.status) != "ok":
+                return [], False
+            rows = zip(run.t, run.q, run.qd, strict=True)
+            states = [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
+            power = np.array([self.ask("power", row) for row in states])
+            simpson = np.array([1, *(4, 2) * (n // 2 - 1), 4, 1]) * span / n / 3
+            after, before = (self.ask("jacobi", states[i]) for i in (-1, 0))
+            gaps.append(float(after - before - simpson @ power))
+            names = ("kinetic_energy", "potential_energy")
+            sizes = [np.abs(self.ask(name, states[i])) for name in names for i in (0, -1)]
+            energy = at.energy + float(simpson @ np.abs(power) + sum(sizes))
+            if abs(gaps[-1]) <= CLOSED * EPS * energy:
+                return gaps, True
+        return (gaps if np.all(np.isfinite(gaps)) else []), False
+
+    def ask(self, name: str, s: State) -> Vector:
+        """The module's value of that name."""
+        place = (s.q,) if name == "potential_energy" else (s.q, s.qd)
+        inputs = {"u": s.u} if name in ("power", "acceleration") else {}
+        return np.asarray(getattr(self.module, name)(*place, t=s.t, params=s.params, **inputs))
+
+    # --- advice -----------------------------------------------------------------------------------
+
+    def advised(self, method: str) -> Finding:
+        """The least of PARTS of the advised h with which a run is lost.
+
+        From where the start of the motion allows the shortest h. Lost: it stops, or a difference
+        grows BLOWN times as much as in fine steps, or, in steps longer than advised, it ends OFF.
+        inf where there is nothing to test, with why. Where runs do not agree with the advice, or
+        it is longer than the motion, but eigenvalues agree, it is right, though the motion does not
+        stay where it holds: how far it is from the eigenvalues' then, times.
+        """
+        if method == "euler" and self._velocities_matter():
+            return Finding(math.inf, "for forces of positions alone")
+        longest = self._longest(method, self.stiff, 1e3 * self.duration)
+        if math.isinf(longest):
+            return Finding(math.inf, "no mode turns or decays")
+        eigen = self._by_eigenvalues(method)
+        apart = max(longest / eigen, eigen / longest)
+        unit = "times the eigenvalues' h; runs leave where it holds"
+        near = Finding(apart, unit=unit, limit=APART) if apart <= APART else None
+        if near and longest > self.duration:
+            return near
+        fine, grown = self._ends(method, longest, FINE)
+        if not math.isfinite(grown):
+            return Finding(math.inf, "the motion does not go on")
+        lost = math.nan
+        for part in PARTS:
+            end, growth = self._ends(method, longest, part)
+            wrong = part > 1 and not float(np.max(np.abs(end - fine))) <= OFF
+            if wrong or not growth <= BLOWN * max(1.0, grown):
+                lost = part
+                break
+        return near if near and not lost > PARTS[0] else Finding(lost)
+
+    @cached_property
+    def stiff(self) -> State:
+        """Where, along the start of the motion, the shortest h is advised."""
+        start = self.start
+        method = next(m for m in self.methods if math.isfinite(min(METHODS[m].limits)))
+        steps = min(AHEAD, math.ceil(self.duration / self.h))
+        every = max(1, steps * max(1, len(start.q) // 8) // PLACES)
+        found, longest = start, 1e3 * self.duration
+        run = self.run(start, method, steps=steps, every=every)
+        for t, q, qd in zip(run.t, run.q, run.qd, strict=True):
+            s = replace(start, q=np.array(q), qd=np.array(qd), t=float(t))
+            if (here := self._longest(method, s, longest)) < longest:
+                found, longest = s, here
+        return found
+
+    def _longest(self, method: str, s: State, most: float) -> float:
+        """The longest h that the module does not advise against at a state, to 5 %; inf: `most`."""
+        low = most
+        while self._warns(method, s, low):
+            low /= 2
+        if low == most:
+            return math.inf
+        high = 2 * low
+        while high > 1.05 * low:
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if self._warns(method, s, middle) else (middle, high)
+        return high
+
+    def _velocities_matter(self) -> bool:
+        """Whether accelerations hang on velocities."""
+        s = self.places[-1].state
+        still = replace(s, qd=0 * s.qd)
+        one, other = (self.ask("acceleration", x) for x in (s, still))
+        return not np.array_equal(one, other)
+
+    def _warns(self, method: str, s: State, h: float) -> bool:
+        """Whether the module advises against h at a state."""
+        told = self.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
+        return told is not None
+
+    def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
+        """The end of a run over SPAN times `longest`, scaled, and the growth of a difference.
+
+        The larger of that of a small difference and of one so small that stiff forces, which are
+        soon at their bounds, are linear in it.
+        """
+        s = self.stiff
+        signs = np.random.default_rng(1).choice([-1.0, 1.0], self.scale.shape)
+        steps, ends = round(SPAN / part), []
+        for by in (0.0, NUDGE, LINEAR):
+            q, qd = np.array([s.q, s.qd]) + by * signs * self.scale
+            how = {"h": part * longest, "steps": steps, "every": steps, "t0": s.t}
+            run = self.run(replace(s, q=q, qd=qd), method, **how)
+            if str(run.status) != "ok":
+                return np.full(self.scale.shape, math.inf), math.inf
+            ends.append(np.array([run.q[-1], run.qd[-1]]) / self.scale)
+        grown = (np.max(np.abs(ends[k] - ends[0])) / by for k, by in ((1, NUDGE), (2, LINEAR)))
+        return ends[0], float(max(grown))
+
+    def _by_eigenvalues(self, method: str) -> float:
+        """The longest stable h of the motion linearised at `stiff`, by differences; s."""
+        s, n = self.stiff, self.scale.shape[1]
+        x = np.array([s.q, s.qd])
+        A = np.zeros((2 * n, 2 * n))
+        A[:n, n:] = np.eye(n)
+        for k in range(2 * n):
+            by = np.zeros(2 * n)
+            by[k] = LINEAR**0.5 * 1e-2 * self.scale.flat[k]
+            ends = [
+                self.ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
+                for moved in (x + by.reshape(2, n), x - by.reshape(2, n))
+            ]
+            A[n:, k] = (ends[0] - ends[1]) / (2 * by[k])
+        values = np.linalg.eigvals(A)
+        turning, decay = METHODS[method].limits
+        rates = np.max(np.abs(values.imag)) / turning, np.max(-values.real) / decay
+        fastest = float(max(rates))
+        return 1 / fastest if fastest > 0 else math.inf
+
+
+def _judged(found: Iterable[float], pick: Callable[[Iterable[float]], float], why: str) -> Finding:
+    """The one that `pick` takes of several places; inf where all that are known are exact."""
+    known = [x for x in found if not math.isnan(x)]
+    orders = [x for x in known if math.isfinite(x)]
+    if orders:
+        return Finding(pick(orders))
+    return Finding(math.inf) if known else Finding(math.nan, why)

@@ -1,0 +1,217 @@
+"""Rows of `check` about batches: places, counts, shared and own parameters, failing instances.
+
+No bit of an instance's motion depends on the others, so that the batch is compared with batches of
+one, and these with single runs, from which they differ by rounding.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.integrators.tableaux import METHODS
+from eomc.verify.oracle import Vector
+from eomc.verify.rows_runs import EVERY, LONG, TURNS, Runs, drive
+
+if TYPE_CHECKING:
+    from eomc.verify.check import State
+
+COUNT = 150  # instances: a whole tile or two, and one that is not full
+FEW = (1, 3, 9)  # the first so many of them, alone
+STEPS = 7
+ALIKE = 1e3  # units between a batch and single runs
+
+
+class Batches:
+    """The rows."""
+
+    def __init__(self, runs: Runs, singular: list[State]) -> None:
+        self.check, self.model, self.h = runs.check, runs.model, runs.h
+        self.module, self.runs = self.check.module, runs
+        self.random = np.random.default_rng(9)
+        self.singular = singular
+        self.instances = self.made()
+
+    def report(self) -> None:
+        """Add them."""
+        row = self.check.row
+        for method in self.check.methods:
+            row(f"batch of {method}", ALIKE, "units of rounding, from single runs",
+                partial(self.beside, method))  # fmt: skip
+            row(f"batch of {method}: places", 0, "batches with other bits",
+                partial(self.places, method))  # fmt: skip
+            row(f"batch of {method}: failures", 0, "instances that end otherwise",
+                partial(self.failures, method))  # fmt: skip
+
+    def made(self) -> list[State]:
+        """Random starts and parameters, some of them far out, some in haste, all regular."""
+        sampler, found = self.check.sampler, []
+        t = self.runs.states[-1].t
+        own = [e.state for e in self.check.expected]
+        for k in range(COUNT):
+            s = own[k % len(own)]
+            near = 1 + 1e-3 * self.random.standard_normal((2, len(s.q)))
+            x = np.array([s.q, s.qd]) * near
+            if k % 29 == 7:
+                x[0] += sampler.angles * 2 * np.pi * np.round(TURNS / 2 / np.pi)
+            if k % 7 == 3:  # steps in which angles move too far to be rotated
+                x[1] = x[1] + self.random.choice(LONG) * sampler.spread / self.h
+            params = s.params or sampler.defaults
+            found.append(replace(s, q=x[0], qd=x[1], t=t, u=None, params=params))
+        return found
+
+    def simulate(
+        self, method: str, states: list[State], u: Vector | None, *, own: bool = True,
+        every: int = 1, h: float = 0.0,
+    ) -> Any:  # fmt: skip
+        """The batch of these states; own: each with its own parameters."""
+        names = self.check.sampler.defaults
+        params: Any = states[0].params
+        if own:
+            params = {x: np.array([(s.params or names)[x] for s in states]) for x in names}
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            return self.module.simulate_batch(
+                np.array([s.q for s in states]), np.array([s.qd for s in states]), h or self.h,
+                steps=STEPS, every=every, params=params, u=u, threads=1, method=method,
+                t0=states[0].t,
+            )  # fmt: skip
+
+    def tables(self) -> list[Vector | None]:
+        """No inputs, constant ones, and a row a step, of every instance."""
+        if not self.model.nu:
+            return [None]
+        shape = (COUNT, STEPS, self.model.nu)
+        rows = self.random.normal(size=shape).astype(self.model.dtype)
+        return [None, rows[:, 0], rows]
+
+    def beside(self, method: str) -> float:
+        """Each instance beside a single run of it, as far as a difference does not grow."""
+        worst, nudge = 0.0, self.check.eps ** (1 / 3)
+        spread = np.array([self.runs.sampler.spread, self.runs.sampler.speed])
+        for u in self.tables():
+            runs = self.simulate(method, self.instances, u)
+            for k, s in enumerate(self.instances):
+                alone = replace(s, u=None if u is None else u[k])
+                run = drive(self.model, method, alone, self.h, STEPS)
+                x = np.array([s.q, s.qd]) + nudge * spread
+                moved = drive(self.model, method, replace(alone, q=x[0], qd=x[1]), self.h, STEPS)
+                if run.status or moved.status:
+                    continue
+                # what a change by all of the spread would make of each number
+                grown = np.max(np.abs(moved.rows - run.rows), axis=1) / nudge
+                wide = float(np.max(1 + np.abs(s.q) / spread[0]))  # of an angle, its last digit
+                size = STEPS * wide * (grown[:, None] + np.abs(run.rows))
+                found = np.stack([runs.q[k], runs.qd[k]])
+                worst = max(worst, self.check.units(found, run.rows, size))
+        return worst
+
+    def places(self, method: str) -> float:
+        """How many batches are not to the bit what their instances are elsewhere."""
+        wrong = 0
+        for u in self.tables():
+            whole = self.simulate(method, self.instances, u)
+            order = self.random.permutation(COUNT)
+            parts = [order, *(order[:n] for n in FEW)]
+            for part in parts:
+                other = self.simulate(
+                    method, [self.instances[k] for k in part], None if u is None else u[part]
+                )
+                wrong += not _same(other, whole, part)
+            sparse = self.simulate(method, self.instances, u, every=EVERY)
+            kept = np.minimum(EVERY * np.arange(sparse.q.shape[1]), STEPS)
+            good = whole._codes == 0
+            wrong += not np.array_equal(sparse.q[good], whole.q[good][:, kept])
+            wrong += not np.array_equal(sparse.qd[good], whole.qd[good][:, kept])
+            alike = [replace(s, params=self.instances[0].params) for s in self.instances]
+            one, other = (self.simulate(method, alike, u, own=own) for own in (False, True))
+            wrong += not _same(one, other, np.arange(COUNT))
+            wrong += not self.single(method, whole, u)
+        return float(wrong + sum(self.hasty(method, states, h) for states, h in self.in_haste()))
+
+    def in_haste(self) -> Iterator[tuple[list[State], float]]:
+        """Instances that all go too far in a step for sines to be rotated, by speed or by force."""
+        sampler, first = self.check.sampler, self.instances[0]
+        fast = [replace(s, qd=s.qd + 0.7 * sampler.spread / self.h) for s in self.instances]
+        yield fast, self.h
+        for part in LONG:
+            rest = [replace(s, qd=0 * s.qd) for s in self.instances]
+            yield rest, self.runs.large_step(replace(first, qd=0 * first.qd), part)
+
+    def hasty(self, method: str, states: list[State], h: float) -> int:
+        """Whether they go otherwise where they have others beside them."""
+        mixed = [s for pair in zip(states, self.instances, strict=True) for s in pair]
+        alone, other = (self.simulate(method, x, None, h=h) for x in (states, mixed))
+        return not _same(alone, other, 2 * np.arange(COUNT))
+
+    def single(self, method: str, whole: Any, u: Vector | None) -> bool:
+        """Whether one step of each in place is the first of the batch."""
+        q, qd = (np.array(x[:, 0]) for x in (whole.q, whole.qd))
+        names = self.check.sampler.defaults
+        params = {x: np.array([(s.params or names)[x] for s in self.instances]) for x in names}
+        given = None if u is None else np.ascontiguousarray(u[:, 0] if u.ndim == 3 else u)
+        failed = self.module.step_batch(
+            q, qd, self.h, t=self.instances[0].t, u=given, params=params, method=method
+        )
+        good = failed == 0
+        return bool(
+            np.array_equal(q[good], whole.q[good, 1])
+            and np.array_equal(qd[good], whole.qd[good, 1])
+        )
+
+    def failures(self, method: str) -> float:
+        """Among good instances some that fail: the others' bits, and how those end."""
+        states, bad = list(self.instances), [0, *range(5, COUNT, 11)]
+        fast = 1e-3 * float(np.finfo(self.model.dtype).max)
+        for n, k in enumerate(bad):
+            if n % 2 and self.singular:
+                s = self.singular[n % len(self.singular)]
+                states[k] = replace(states[k], q=s.q, qd=s.qd, params=s.params)
+            else:
+                states[k] = replace(states[k], qd=states[k].qd + (1 + n) * fast)
+        wrong = 0
+        good = np.setdiff1d(np.arange(COUNT), bad)
+        for u in self.tables():
+            for every in (1, EVERY):
+                whole = self.simulate(method, self.instances, u, every=every)
+                other = self.simulate(method, states, u, every=every)
+                wrong += not np.array_equal(other.q[good], whole.q[good], equal_nan=True)
+                wrong += not np.array_equal(other.qd[good], whole.qd[good], equal_nan=True)
+            whole = self.simulate(method, states, u)
+            for k in bad:
+                at = replace(states[k], u=None if u is None else u[k])
+                wrong += self.ends_otherwise(method, whole, k, at)
+            none = self.simulate(method, [states[k] for k in bad], None if u is None else u[bad])
+            wrong += not _same(none, whole, np.array(bad))
+        return float(wrong)
+
+    def ends_otherwise(self, method: str, whole: Any, k: int, s: State) -> bool:
+        """Whether a failing instance ends otherwise than a single run does."""
+        alone = drive(self.model, method, s, self.h, STEPS)
+        done, status = int(whole.steps[k]), int(whole._codes[k])
+        rows = np.stack([whole.q[k], whole.qd[k]])
+        kept = rows[:, : done + 1]
+        if not np.all(np.isfinite(kept)) or not np.all(np.isnan(rows[:, done + 1 :])):
+            return True
+        start = np.array([s.q, s.qd], rows.dtype)
+        if (status == 0) != (done == STEPS) or not np.array_equal(rows[:, 0], start):
+            return True
+        if 0 < done <= alone.done and not np.allclose(kept[:, done], alone.rows[:, done], 1e-3):
+            return True
+        # rounding may decide a step that all but fails; a first step is clear
+        return alone.done == 0 and not METHODS[method].implicit and (
+            done != 0 or status != alone.status
+        )  # fmt: skip
+
+
+def _same(one: Any, other: Any, order: Any) -> bool:
+    """Whether instance k of one is instance order[k] of the other."""
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name)[order], equal_nan=True)
+        for name in ("q", "qd", "steps", "_codes")
+    )

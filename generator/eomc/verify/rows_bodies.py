@@ -1,0 +1,343 @@
+"""Rows of `check` about bodies: their energies and forces once more, from the scene's own tables.
+
+The reference starts from K and P, which bodies.py makes of a scene. Here every body becomes point
+masses that have its mass, its centre and its inertia, frames are composed joint by joint with
+quaternions, and numbers are taken along a straight line through the state, q + s qd at the time
+t + s, so that rates are derivatives of interpolating polynomials. No SymPy, nothing of bodies.py.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from eomc.scene import formulas
+from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Spring
+from eomc.scene.formulas import Formula
+from eomc.verify.oracle import Vector
+
+if TYPE_CHECKING:
+    from eomc.scene.scene import Scene
+    from eomc.verify.check import Comparison, Expected, State
+
+LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
+STATES = 8  # at most
+NODES = 16  # of the interpolating polynomials
+WIDTHS = (0.1, 0.01, 1e-3)  # of the line, in parts of the time in which things go far
+
+_X, _Y, _Z = np.eye(3)
+
+# the elementary motions of a joint, "t" along an axis or "r" about it; None: the scene's axis
+_MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
+    "fixed": (),
+    "revolute": (("r", None),),
+    "prismatic": (("t", None),),
+    "planar": (("t", _X), ("t", _Y), ("r", _Z)),
+    "cylindrical": (("t", None), ("r", None)),
+    "universal": (("r", None), ("r", None)),
+    "spherical": (("r", _Z), ("r", _Y), ("r", _X)),
+    "free": (("t", _X), ("t", _Y), ("t", _Z), ("r", _Z), ("r", _Y), ("r", _X)),
+}
+
+
+class Bodies:
+    """The rows."""
+
+    def __init__(self, check: Comparison, scene: Scene) -> None:
+        self.check, self.scene = check, scene
+
+    def report(self) -> None:
+        """Add them."""
+        for name in ("kinetic_energy", "potential_energy", "power"):
+            label = "power of forces" if name == "power" else name
+            self.check.row(f"{label} of bodies", LIMIT, "of its size, from point masses",
+                           partial(self.compare, name))  # fmt: skip
+
+    def compare(self, name: str) -> float:
+        """The largest difference over the states, of each with the line that suits it best."""
+        return float(np.max([self.off(name, e) for e in self.check.few(STATES)]))
+
+    def off(self, name: str, e: Expected) -> float:
+        """The difference at one state, in parts of its size; nan where nothing can be compared."""
+        s, found = e.state, []
+        rate = float(np.max(np.abs(s.qd) / self.check.sampler.spread)) or 1.0
+        if name == "power":  # that of forces alone
+            value = float(self.check.ask("tau", s) @ s.qd)
+            size = float(e.size["tau"] @ np.abs(s.qd))
+        else:
+            value, size = float(self.check.ask(name, s)), float(e.size[name])
+        for width in WIDTHS:
+            with np.errstate(all="ignore"):
+                ours = Line(self.scene, s, width / rate).value(name)
+            if not math.isnan(ours):
+                found.append(abs(value - ours) / (size or 1.0))
+            if found and found[-1] < LIMIT / 10:
+                break
+        return min(found, default=math.nan)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A body's frame along the line: origin (n, 3), a quaternion (n, 4), the angle in the plane."""
+
+    at: Vector
+    turn: Vector
+    angle: Vector
+
+    def point(self, x: Vector) -> Vector:
+        """A point of the frame, (3,) or (n, 3), in the world."""
+        return self.at + rotated(self.turn, x)
+
+    def slid(self, by: Vector, axis: Vector) -> Frame:
+        """The frame moved along its own axis."""
+        return replace(self, at=self.point(by[:, None] * axis))
+
+    def turned(self, by: Vector, axis: Vector) -> Frame:
+        """The frame turned about its own axis."""
+        half = by[:, None] / 2
+        turn = np.hstack([np.cos(half), np.sin(half) * axis])
+        return Frame(self.at, multiplied(self.turn, turn), self.angle + by * axis[2])
+
+
+@dataclass
+class Line:
+    """A scene's bodies along q + s qd, t + s for |s| <= width, all numbers (n,)."""
+
+    scene: Scene
+    state: State
+    width: float
+    stretch: float = 1.0  # of the velocities
+    frames: dict[str, Frame] = field(default_factory=dict)
+    known: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        s, n = self.state, NODES
+        nodes = chebyshev.chebpts2(n + 1)
+        self.nodes = nodes * self.width
+        matrix = chebyshev.chebvander(nodes, n)
+        slopes = chebyshev.chebval(nodes, chebyshev.chebder(np.eye(n + 1))).T
+        self.rate = slopes @ np.linalg.inv(matrix) / self.width
+        zero = np.zeros(n + 1)
+        self.middle = n // 2
+        self.algebra = {**_ALGEBRA, "dot": lambda x: self.rate @ (x + zero)}
+        known = self.known = {"t": s.t + self.nodes}
+        for c, q, qd in zip(self.scene.coordinates, s.q, s.qd, strict=True):
+            qd = qd * self.stretch
+            known |= {c.name: q + qd * self.nodes, f"{c.name}_dot": qd + zero}
+        for constant in self.scene.constants:
+            known[constant.name] = self.of(constant.formula)
+        known |= {p.name: (s.params or {}).get(p.name, p.value) for p in self.scene.parameters}
+        self.frames[WORLD] = Frame(np.zeros((n + 1, 3)), np.tile([1.0, 0, 0, 0], (n + 1, 1)), zero)
+        for body in self.assembly.bodies:
+            if body.joint:
+                self.hang(body)
+        for k, i in enumerate(self.scene.inputs):
+            if s.u is not None:
+                known[i.name] = s.u[k] + zero
+        for name, formula in self.scene.definitions:
+            known[name] = self.of(formula)
+        for i in self.scene.inputs:
+            if s.u is None:
+                known[i.name] = self.of(i.signal)
+        for body in self.assembly.bodies:
+            if not body.joint:
+                assert body.position is not None
+                at = np.stack([self.of(x) + zero for x in body.position], axis=1)
+                frame = self.frames[WORLD]
+                self.frames[body.name] = replace(self.oriented(frame, body), at=at)
+
+    @property
+    def assembly(self) -> Assembly:
+        """The scene's bodies."""
+        assert self.scene.assembly is not None
+        return self.scene.assembly
+
+    def of(self, formula: Formula) -> Any:
+        """The value of a formula along the line."""
+        return formulas.evaluate(formula, self.algebra, self.known.__getitem__)
+
+    def vector(self, of: Sequence[Formula]) -> Vector:
+        """Three numbers that do not change."""
+        return np.array([float(self.of(x)) for x in of])
+
+    def oriented(self, frame: Frame, body: Body) -> Frame:
+        """The frame turned as the body's tables say."""
+        for turn in body.rotation:
+            axis = (_X, _Y, _Z)["xyz".index(turn.axis)]
+            frame = frame.turned(self.of(turn.angle) + 0 * self.nodes, axis)
+        return frame
+
+    def hang(self, body: Body) -> None:
+        """The frame of a body on its joint, and the names of its centre."""
+        frame = self.frames[body.parent]
+        if body.offset:
+            frame = replace(frame, at=frame.point(self.vector(body.offset)))
+        frame = self.oriented(frame, body)
+        given = list(body.axes)
+        for k, (motion, own) in enumerate(_MOTIONS[body.joint]):
+            # a joint with one axis slides along it and turns about it
+            axis = np.array(given[min(k, len(given) - 1)], float) if own is None else own
+            axis = axis / np.linalg.norm(axis)
+            by = self.known[body.coordinates[k]]
+            frame = frame.slid(by, axis) if motion == "t" else frame.turned(by, axis)
+        self.frames[body.name] = frame
+        centre = frame.point(self.vector(body.center))
+        for letter, x in zip("xyz", centre.T, strict=True):
+            self.known.setdefault(f"{body.name}_{letter}", x)
+
+    # --- energies --------------------------------------------------------------------------------
+
+    def value(self, name: str) -> float:
+        """What is compared, at the state itself."""
+        if name == "kinetic_energy":
+            return self.here(self.of(self.scene.kinetic) + sum(map(self.kinetic, self.bodies)))
+        if name == "potential_energy":
+            weights = sum(map(self.weight, self.assembly.bodies))
+            springs = sum(map(self.spring, self.assembly.springs))
+            return self.here(self.of(self.scene.potential) + weights + springs)
+        return self.here(self.forces()) - self.loss()
+
+    @property
+    def bodies(self) -> Sequence[Body]:
+        """Those that move."""
+        return [b for b in self.assembly.bodies if b.name not in self.still()]
+
+    def still(self) -> set[str]:
+        """The bodies that nothing moves."""
+        found = {WORLD}
+        for body in self.assembly.bodies:
+            if body.joint == "fixed" and body.parent in found:
+                found.add(body.name)
+        return found
+
+    def here(self, values: Any) -> float:
+        """The value in the middle of the line."""
+        return float((values + 0 * self.nodes)[self.middle])
+
+    def points(self, body: Body) -> list[tuple[float, Vector]]:
+        """Point masses with the body's mass, centre and inertia, some of them negative.
+
+        With J = tr(I)/2 - I, the second moments of the mass: two for each eigenvector of J at a
+        unit's distance from the centre, the rest in the centre.
+        """
+        m, centre = float(self.of(body.mass)), self.vector(body.center)
+        xx, yy, zz, xy, xz, yz = (float(self.of(entry)) for entry in body.inertia)
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        moments, axes = np.linalg.eigh(np.trace(tensor) / 2 * np.eye(3) - tensor)
+        found = [(m - float(np.sum(moments)), centre)]
+        for moment, axis in zip(moments.tolist(), axes.T, strict=True):
+            found += [(moment / 2, centre + axis), (moment / 2, centre - axis)]
+        return found
+
+    def kinetic(self, body: Body) -> Vector:
+        """Of a body's point masses, and of the rotors at its joint."""
+        frame, energy = self.frames[body.name], 0 * self.nodes
+        for m, x in self.points(body):
+            velocity = self.rate @ frame.point(x)
+            energy = energy + m / 2 * np.sum(velocity**2, axis=1)
+        for armature, name in zip(body.armature, body.coordinates, strict=False):
+            energy = energy + self.of(armature) / 2 * self.known[f"{name}_dot"] ** 2
+        return energy
+
+    def weight(self, body: Body) -> Vector:
+        """-m g.c"""
+        centre = self.frames[body.name].point(self.vector(body.center))
+        energy: Vector = -self.of(body.mass) * centre @ self.vector(self.assembly.gravity)
+        return energy
+
+    def length(self, line: Spring | Damper) -> Vector:
+        """What a spring is stretched to, or turned."""
+        if line.coordinate:
+            return np.asarray(self.known[line.coordinate])
+        assert line.bodies is not None
+        one, other = (self.frames[name] for name in line.bodies)
+        if line.turning:
+            return other.angle - one.angle
+        assert line.points is not None
+        a, b = (
+            frame.point(self.vector(x)) for frame, x in zip((one, other), line.points, strict=True)
+        )
+        return np.asarray(np.linalg.norm(b - a, axis=1))
+
+    def spring(self, spring: Spring) -> Vector:
+        """k/2 times the square of what it is longer than at rest."""
+        longer = self.length(spring) - self.of(spring.length)
+        energy: Vector = self.of(spring.stiffness) / 2 * longer**2
+        return energy
+
+    # --- forces ----------------------------------------------------------------------------------
+
+    def forces(self) -> Vector:
+        """The power of forces, friction and drives at joints, without that of dissipation."""
+        power = 0 * self.nodes
+        for name, formula in self.scene.forces.items():
+            power = power + self.of(formula) * self.known[f"{name}_dot"]
+        for body in self.assembly.bodies:
+            width = self.of(body.friction_width) if body.friction_width else 1.0
+            for k, name in enumerate(body.coordinates):
+                rate = self.known[f"{name}_dot"]
+                if body.friction:
+                    power = power - self.of(body.friction[k]) * np.tanh(rate / width) * rate
+                if body.actuator:
+                    power = power + self.of(body.actuator[k]) * rate
+        return power
+
+    def loss(self) -> float:
+        """dR/dqd . qd, by R at velocities that are a little larger and smaller."""
+        total = 0.0
+        if not self.loses():
+            return total
+        for n, weight in ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280)):
+            for sign in (1, -1):
+                by = 0.01 * n * sign
+                line = Line(self.scene, self.state, self.width, 1 + by)
+                total += sign * weight / 0.01 * line.here(line.dissipation())
+        return total
+
+    def loses(self) -> bool:
+        """Whether there is any R."""
+        joints = any(body.damping for body in self.assembly.bodies)
+        return bool(joints or self.assembly.dampers or self.scene.dissipation.text != "0")
+
+    def dissipation(self) -> Vector:
+        """R of the scene, of joints and of dampers."""
+        R: Vector = self.of(self.scene.dissipation) + 0 * self.nodes
+        for body in self.assembly.bodies:
+            for damping, name in zip(body.damping, body.coordinates, strict=False):
+                R = R + self.of(damping) / 2 * self.known[f"{name}_dot"] ** 2
+        for damper in self.assembly.dampers:
+            R = R + self.of(damper.damping) / 2 * (self.rate @ self.length(damper)) ** 2
+        return R
+
+
+def multiplied(a: Vector, b: Vector) -> Vector:
+    """The product of quaternions (n, 4), the real part first: b, then a."""
+    w, x = a[:, :1], a[:, 1:]
+    v, y = b[:, :1], b[:, 1:]
+    real = w * v - np.sum(x * y, axis=1, keepdims=True)
+    return np.hstack([real, w * y + v * x + np.cross(x, y)])
+
+
+def rotated(turn: Vector, x: Vector) -> Vector:
+    """A vector turned by a unit quaternion: x + 2 w (a x) + 2 a (a x), a its vector part."""
+    w, a = turn[:, :1], turn[:, 1:]
+    across = 2 * np.cross(a, np.broadcast_to(x, a.shape))
+    return np.asarray(x + w * across + np.cross(a, across))
+
+
+_ALGEBRA: Mapping[str, Any] = {
+    "number": formulas.NUMERIC["number"],
+    "pi": math.pi,
+    **{name: getattr(np, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{name: getattr(np, f"arc{name[1:]}") for name in ("asin", "acos", "atan", "atan2")},
+    **{name: getattr(np, name) for name in ("exp", "log", "sqrt", "abs", "sign")},
+    "heaviside": lambda x: np.heaviside(x, 0.5),
+    "min": lambda *x: np.minimum.reduce(np.broadcast_arrays(*x)),
+    "max": lambda *x: np.maximum.reduce(np.broadcast_arrays(*x)),
+}

@@ -1,0 +1,264 @@
+"""Rows of `check` about refusals: a singular D, states that are not finite, no convergence.
+
+For these, parameters and states are sought where the reference's D is not positive definite.
+Whatever is asked of the module there must say so and leave alone what it was to write.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.integrators.tableaux import METHODS
+from eomc.verify.oracle import Vector
+from eomc.verify.rows_runs import drive, parameters
+
+if TYPE_CHECKING:
+    from eomc.verify.check import Comparison, State
+
+OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE = range(4)
+WORDS = ("ok", "singular", "not finite", "no convergence")
+CLEAR = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
+FACTORS = (0.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
+MIXED = 24  # states with all parameters changed at random
+MOST = 240  # states that the reference is asked for; fewer where it takes long
+LARGE = 60
+MARK = -7.0  # what is to be left alone
+
+
+class Refusals:
+    """The rows."""
+
+    def __init__(self, check: Comparison) -> None:
+        self.check, self.module, self.model = check, check.module, check.module._model
+        self.random = np.random.default_rng(8)
+        self.defaults = check.sampler.defaults
+        self.singular: list[State] = []
+        self.regular: list[State] = []
+
+    def report(self) -> None:
+        """Add them."""
+        row = self.check.row
+        unit = "states judged wrongly"
+        row("singular D", 0, unit, self.definite)
+        if not self.singular:
+            last = self.check.rows[-1]
+            self.check.rows[-1] = replace(last, unit=unit + ": D is regular at all that were tried")
+        row("singular D: refusals", 0, "calls that do not refuse", self.refuse)
+        row("singular D in a run", 0, "runs that go on", self.run_into)
+        row("not finite", 0, "calls that do not refuse", self.odd)
+        for method in self.check.methods:
+            find = partial(self.overflow, method)
+            row(f"{method} too long", 0, "runs that end otherwise", find)
+
+    # where D is singular
+
+    def definite(self) -> float:
+        """How often the module finds D regular where it is not, or singular where it is regular."""
+        suspects = self.suspects()
+        stacked: dict[str, Any] = {
+            "q": np.array([s.q for s in suspects]),
+            "qd": np.array([s.qd for s in suspects]),
+            "params": {
+                name: np.array([(s.params or self.defaults)[name] for s in suspects])
+                for name in self.defaults
+            },
+        }
+        with np.errstate(all="ignore"):
+            found = np.asarray(self.check.reference.evaluate("D", t=0.0, u=None, **stacked))
+        wrong = 0
+        for s, D in zip(suspects, found, strict=True):
+            least = _least(D)
+            if least < -CLEAR or least == 0:
+                self.singular.append(s)
+                wrong += self.accelerate(s)[0] != SINGULAR
+            elif least > CLEAR:
+                self.regular.append(s)
+                wrong += self.accelerate(s)[0] == SINGULAR
+        return float(wrong)
+
+    def suspects(self) -> list[State]:
+        """The start and some other states with parameters changed in every way."""
+        states = self.places()
+        found = []
+        changes: list[dict[str, float]] = [{}]
+        for name, value in self.defaults.items():
+            changes += [{name: factor * (value or 1.0)} for factor in FACTORS]
+        for scale in (0.0, -1.0):
+            changes.append({name: scale * value for name, value in self.defaults.items()})
+        for _ in range(MIXED):
+            signs = self.random.choice([-1, 1, 1], len(self.defaults))
+            sizes = np.exp(self.random.uniform(-3, 3, len(self.defaults)))
+            changes.append({
+                name: (value or 1.0) * sign * size
+                for (name, value), sign, size in zip(
+                    self.defaults.items(), signs.tolist(), sizes.tolist(), strict=True)
+            })  # fmt: skip
+        for change in changes:
+            found += [replace(s, params={**self.defaults, **change}) for s in states]
+        most = LARGE if self.check.large else MOST
+        order = self.random.permutation(len(found))[:most]
+        return [found[k] for k in sorted(order)]
+
+    def places(self) -> list[State]:
+        """Where a D may be singular: at the start, upright, level, and anywhere."""
+        own = self.check.sampler.start
+        drawn = [e.state for e in self.check.few(4)[1:]]
+        states = [own, *drawn]
+        for at in (0.0, math.pi / 2, math.pi):
+            states.append(replace(own, q=np.full(len(own.q), at)))
+        return [replace(s, t=0.0, u=None) for s in states]
+
+    def accelerate(self, s: State) -> tuple[int, bool]:
+        """The status of the C function, and whether it has left alone what it was to leave."""
+        model = self.model
+        a = np.full(model.nq, MARK, model.dtype)
+        q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
+        u = None if s.u is None else np.array(s.u, model.dtype)
+        p = parameters(model, s)
+        found = model._lib.acceleration(
+            1, model._pointer(a), model._pointer(q), model._pointer(qd), s.t, model._pointer(u),
+            model._pointer(p),
+        ) & 3  # fmt: skip
+        clean = bool(np.all(a == MARK)) if found else bool(np.all(np.isfinite(a)))
+        return found, clean
+
+    def refuse(self) -> float:
+        """How many calls at singular states do not refuse, or write all the same."""
+        wrong = 0
+        for s in self.singular[:: max(1, len(self.singular) // 24)]:
+            wrong += not self.accelerate(s)[1]
+            wrong += not self.raises(partial(self.call, "acceleration", s), "singular")
+            for method in self.check.methods:
+                wrong += not self.stays(method, s, "singular")
+            if self.model.has_slopes:
+                wrong += not self.raises(partial(self.call, "linearize", s), "singular")
+        return float(wrong)
+
+    def call(self, name: str, s: State) -> Any:
+        """A function of the module at a state."""
+        return getattr(self.module, name)(s.q, s.qd, t=s.t, u=s.u, params=s.params)
+
+    def raises(self, call: Callable[[], Any], status: str) -> bool:
+        """Whether a call raises with this status and says where."""
+        try:
+            call()
+        except ArithmeticError as fault:
+            return getattr(fault, "status", "") == status and "q = " in str(fault)
+        return False
+
+    def stays(self, method: str, s: State, status: str) -> bool:
+        """Whether a step and a run refuse: where they were, with the words for it."""
+        out = tuple(np.full(len(s.q), MARK, self.model.dtype) for _ in range(2))
+        way = {"params": s.params, "u": s.u, "method": method}
+        step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **way)
+        if not self.raises(step, status) or not np.all(np.array(out) == MARK):
+            return False
+        run = self.check._simulate(s, method=method, steps=5)
+        kept = np.array_equal(run.q, np.asarray([s.q], run.q.dtype))
+        return bool(kept and run.status == status and run.steps == 0 and "stopped" in run.message)
+
+    def run_into(self) -> float:
+        """How many runs with a regular start go on where D is singular, or keep such a state."""
+        wrong = tried = 0
+        h = self.check.system.run.h
+        for s in self.singular:
+            starts = [r for r in self.regular if r.params == s.params]
+            for start in starts[:1]:
+                if tried == 24:
+                    break
+                tried += 1
+                for parts in (0.5, 20.5):
+                    at = replace(start, qd=(s.q - start.q) / (parts * h))
+                    for method in self.check.methods:
+                        wrong += self.goes_on(method, at, math.ceil(parts))
+        return float(wrong)
+
+    def goes_on(self, method: str, s: State, steps: int) -> bool:
+        """Whether a run has kept a state whose D is not positive definite."""
+        run = drive(self.model, method, s, self.check.system.run.h, steps + 3)
+        last = run.rows[:, : run.done + 1]
+        if not np.all(np.isfinite(last)):
+            return True
+        # the last state kept may be singular, but no step is made from it
+        for q, qd in np.moveaxis(last[:, :-1], 1, 0):
+            with np.errstate(all="ignore"):
+                D = self.check.reference.evaluate("D", q, qd, 0.0, None, s.params)
+            if _least(np.asarray(D)) < -CLEAR:
+                return True
+        return False
+
+    # what is not finite
+
+    def odd(self) -> float:
+        """How many functions take a number for granted that is none, or infinite."""
+        s, wrong = self.check.few(2)[-1].state, 0
+        for field in ("q", "qd"):
+            for i in range(len(s.q)):
+                for what in (math.nan, math.inf):
+                    x = getattr(s, field).copy()
+                    x[i] = what
+                    at = replace(s, **{field: x})
+                    found, clean = self.accelerate(at)
+                    wrong += not clean
+                    wrong += not found and self.matters(s, field, i)
+                    for method in self.check.methods:
+                        run = drive(self.model, method, at, self.check.system.run.h, 3)
+                        wrong += run.done != 0 or run.status not in (SINGULAR, NOT_FINITE,
+                                                                     NO_CONVERGENCE)  # fmt: skip
+                    wrong += self.model.has_slopes and not self.linearized(at)
+        return float(wrong)
+
+    def matters(self, s: State, field: str, i: int) -> bool:
+        """Whether accelerations depend on a coordinate or velocity."""
+        x = getattr(s, field).copy()
+        x[i] += 0.1 * (1 + abs(x[i]))
+        one, other = (self.check.ask("acceleration", at) for at in (s, replace(s, **{field: x})))
+        return not np.array_equal(one, other)
+
+    def linearized(self, s: State) -> bool:
+        """Whether the derivatives are finite, or were not written."""
+        model, n = self.model, self.model.nq
+        A_q, A_qd, B = (np.full((n, w), MARK, model.dtype) for w in (n, n, max(1, model.nu)))
+        status = model._ffi.new("int *")
+        q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
+        p = parameters(model, s)
+        model._lib.linearization(
+            1, *(model._pointer(x) for x in (A_q, A_qd, B, q, qd)), s.t,
+            model._pointer(None if s.u is None else np.array(s.u, model.dtype)),
+            model._pointer(p), status,
+        )  # fmt: skip
+        written = np.hstack([A_q, A_qd, *([B] if model.nu else [])])
+        return bool(np.all(written == MARK) if status[0] else np.all(np.isfinite(written)))
+
+    def overflow(self, method: str) -> float:
+        """Steps so long that the state leaves the finite numbers, or no stages are found."""
+        s, wrong = self.check.few(2)[-1].state, 0
+        ended = []
+        for power in (4, 8, 16, 40, 100, 160, 300):
+            h = self.check.system.run.h * 10.0**power
+            if h > float(np.finfo(self.model.dtype).max):
+                break
+            run = drive(self.model, method, s, h, 12)
+            kept = run.rows[:, : run.done + 1]
+            wrong += not np.all(np.isfinite(kept))
+            wrong += bool(run.status == OK) != (run.done == 12)
+            wrong += run.status == NO_CONVERGENCE and not METHODS[method].implicit
+            ended.append(run.status)
+        return float(wrong + (ended[-1] == OK))
+
+
+def _least(D: Vector) -> float:
+    """The least eigenvalue of D_ij / sqrt(|D_ii D_jj|); 0: a row is; nan: not to be judged."""
+    diagonal = np.abs(np.diag(D))
+    if not np.all(np.isfinite(D)):
+        return math.nan
+    if np.any(diagonal == 0):
+        return 0.0
+    scaled = D / np.sqrt(np.outer(diagonal, diagonal))
+    return float(np.linalg.eigvalsh(scaled)[0]) if np.all(np.isfinite(scaled)) else math.nan

@@ -1,0 +1,287 @@
+"""Rows of `check` about runs: long steps, cuts, kept rows, inputs row by row, angles far out.
+
+A run may take another way through the C than one step from the start does: sines and cosines are
+predicted while steps are short, Kahan remainders are kept, and a run that was cut goes on from its
+memory. All ways give the same motion, most of them the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.integrators.tableaux import METHODS
+from eomc.verify.oracle import Vector
+
+if TYPE_CHECKING:
+    from eomc.verify.check import Comparison, Expected, State
+
+STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps
+CUTS = (1, 2, 5, 38, 129, 130, 131, 177)
+EVERY = 3  # no divisor of STEPS
+# The largest move of a step that is long, in parts of how far things go (half a turn): too far for
+# an angle to be predicted, and then too far for its sine to be rotated.
+LONG = (0.02, 0.2, 0.7)
+LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by all they may be
+ANGLES = 48  # around the circle, at which sines are looked at
+SINES = 20.0  # units; their last terms make hundreds
+FEW = 6  # long steps, or steps with a row of u each
+TURNS = 2.0**22  # radians: beyond what the inlined sine takes
+LATE = 2.0**24  # seconds: the same, of signals and driven supports
+FAR = ("D", "g", "bias", "tau", "kinetic_energy", "potential_energy", "acceleration")
+# parts of h, of runs that differ by rounding alone; the second where the first are too long
+FINE = ((1024, 8192), (8192, 65536))
+EXACT = 4  # order from which on their steps are short enough
+ROUNDED = 8.0  # units: compensated sums lose 0 or 1, plain ones some forty
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What a run by the C function gave: rows (2, n, nq), how many steps, and the status."""
+
+    rows: Vector
+    done: int
+    status: int
+
+    def same(self, other: Driven) -> bool:
+        """To the last bit; a number that is not one is the same as another."""
+        return (
+            self.done == other.done
+            and self.status == other.status
+            and np.array_equal(self.rows, other.rows, equal_nan=True)
+        )
+
+
+def parameters(model: Any, s: State) -> Vector:
+    """The parameters of a state, (np,)."""
+    values = [(s.params or model.defaults)[name] for name in model.parameters]
+    return np.array(values, model.dtype)
+
+
+def drive(
+    model: Any, method: str, s: State, h: float, steps: int, *, cuts: Sequence[int] = (),
+    every: int = 1, moved: float = 0.0, anew: bool = False,
+) -> Driven:  # fmt: skip
+    """A run of the C function from s, in calls that end at `cuts`; s.u (nu,) or (steps, nu).
+
+    moved: what is added to the state's first number at every cut, as if it came from elsewhere.
+    anew: every call has a memory of its own.
+    """
+    _, run, _, _, work_type, _ = model._loops[method]
+    q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
+    rows = np.full((2, 1 - -steps // every, model.nq), np.nan, model.dtype)
+    u = None if s.u is None else np.array(s.u, model.dtype)
+    stride = 0 if u is None or u.ndim == 1 else model.nu
+    work = model._ffi.new(work_type) if cuts else model._c[2]
+    done, status, p = 0, 0, parameters(model, s)
+    for end in (*(c for c in cuts if c < steps), steps):
+        if moved and done:
+            rows[0, -(-done // every), 0] += moved
+        if anew and done:
+            work = model._ffi.new(work_type)
+            work.done = done
+        found = run(
+            model._pointer(rows[0]), model._pointer(rows[1]), model._pointer(q),
+            model._pointer(qd), s.t, h, end - done, model._pointer(u), stride, every,
+            model._pointer(p), work,
+        )  # fmt: skip
+        done, status = found >> 2, found & 3
+        if status:
+            break
+    return Driven(rows, done, status)
+
+
+class Runs:
+    """The rows."""
+
+    def __init__(self, check: Comparison) -> None:
+        self.check, self.model = check, check.module._model
+        self.h = check.system.run.h
+        self.sampler, self.random = check.sampler, np.random.default_rng(7)
+        self.states = [e.state for e in check.few(2)]
+
+    def report(self) -> None:
+        """Add them."""
+        row, rounding = self.check.row, "units of rounding"
+        if self.check.methods[0] == "rk4":
+            row("long steps", self.limit, rounding + ", times steps and growth", self.long)
+        if np.any(self.sampler.angles):
+            row("sines around the circle", SINES, rounding, self.sines)
+        if np.any(self.sampler.angles) or self.model._timed:
+            row("angles far out", self.limit, f"units, of angles of {TURNS:.3g}", self.far)
+        if self.model.nu and self.check.methods[0] == "rk4":
+            row("inputs row by row", self.limit, rounding, self.inputs)
+        for method in self.check.methods:
+            row(f"{method} cut anywhere", 0, "runs with other bits", partial(self.cut, method))
+            if self.check.dtype == np.float64 and METHODS[method].order >= EXACT:
+                row(f"{method} rounding", ROUNDED, "units of the state", partial(self.fine, method))
+
+    limit = 1e3
+
+    def large_step(self, s: State, part: float) -> float:
+        """An h in which some coordinate moves by about this part of how far it goes."""
+        spread = part * self.sampler.spread
+        a = np.asarray(self.check.module.acceleration(s.q, s.qd, s.t, s.u, s.params), float)
+        with np.errstate(divide="ignore"):
+            h = np.minimum(spread / np.abs(s.qd), np.sqrt(spread / np.abs(a)))
+        return float(min(np.min(h), 100 * self.h)) or self.h
+
+    def long(self) -> float:
+        """Long steps beside the reference's."""
+        parts = (LONG, LONG) if self.check.large else (LONG, LADDER)
+        found = [
+            self.check._run(s, h=self.large_step(s, part), steps=FEW)
+            for s, some in zip(self.states, parts, strict=False)
+            for part in some
+        ]
+        return float(np.max(found))
+
+    def sines(self) -> float:
+        """D, g and bias all around the circle, where sines need all of their terms."""
+        e = self.check.few(2)[-1]
+        s, n = e.state, len(e.state.q)
+        around = np.linspace(-np.pi, np.pi, ANGLES, endpoint=False)[:, None] + 0.01
+        steps = self.random.permutation(n)  # so that angles are not all alike
+        q = np.where(self.sampler.angles, s.q + around * (1 + steps % 3), s.q)
+        worst = 0.0
+        size: dict[str, Vector] = {}
+        states = [replace(s, q=row) for row in q]
+        with np.errstate(all="ignore"):
+            expected = self.expected(states)
+        for name in ("D", "g", "bias"):
+            known = [x[name] for x in expected if np.all(np.isfinite(x[name]))]
+            size[name] = e.size[name] + np.max(np.abs(known), axis=0, initial=0)
+        for at, values in zip(states, expected, strict=True):
+            for name, width in size.items():
+                if np.all(np.isfinite(values[name])):
+                    found = self.check.ask(name, at)
+                    worst = max(worst, self.check.units(found, values[name], width))
+        return worst
+
+    def expected(self, states: Sequence[State]) -> list[dict[str, Vector]]:
+        """The reference's D, g and bias at states that differ in q alone."""
+        s, ask = states[0], self.sampler.reference.evaluate
+        q, qd = (np.array([getattr(at, x) for at in states]) for x in ("q", "qd"))
+        found = {name: ask(name, q, qd, s.t, None, s.params) for name in ("D", "g", "bias")}
+        return [{name: values[k] for name, values in found.items()} for k in range(len(states))]
+
+    def far(self) -> float:
+        """Values, accelerations and steps at angles and times that sines are too small for.
+
+        An angle is as exact as its last digit, so that a unit is that of the angle.
+        """
+        errors = []
+        for e in self.check.few(2):
+            s = e.state
+            turns = 2 * np.pi * np.round(TURNS / 2 / np.pi) * self.sampler.angles
+            t = LATE if self.model._timed else 0.0
+            at = replace(s, q=s.q + turns * self.random.choice([-1, 1], len(s.q)), t=s.t + t)
+            with np.errstate(all="ignore"):
+                far = self.sampler.expected(at)
+            if far is None or not self.sampler.regular(at):
+                continue
+            # springs that are wound up by so many turns have no motion to compare
+            wound = 10 * np.max(e.size["acceleration"]) < np.max(np.abs(far.value["acceleration"]))
+            wide = max(TURNS, t)
+            for name in FAR:
+                size = wide * e.size[name] + far.size[name]
+                errors.append(self.check.units(self.check.ask(name, at), far.value[name], size))
+            if self.check.methods[0] == "rk4" and not wound:
+                gain = wide * e.size["acceleration"] + far.size["acceleration"]
+                errors.append(self.far_steps(at, gain))
+        return float(np.max(errors, initial=0))
+
+    def far_steps(self, s: State, acceleration: Vector) -> float:
+        """Some steps from there; acceleration: the size of what is rounded in one."""
+        h, x = self.h, (s.q, s.qd)
+        for n in range(FEW):
+            x = self.sampler.reference.step(*x, h=h, t=s.t + n * h, u=s.u, params=s.params)
+        gain = FEW * h * acceleration
+        size = np.abs([s.q, s.qd]) + np.array([FEW * h * (np.abs(s.qd) + gain), gain])
+        return self.check.units(drive(self.model, "rk4", s, h, FEW).rows[:, -1], np.array(x), size)
+
+    def inputs(self) -> float:
+        """A row of inputs each step beside the reference, and cut as one."""
+        errors = []
+        for s in self.states:
+            signals = np.abs(self.sampler.reference.evaluate("signals", s.q, s.qd, s.t))
+            scale = np.where(signals > 0, signals, 1)
+            u = self.random.normal(size=(FEW, self.model.nu)) * scale
+            at = replace(s, u=u)
+            x, p = (s.q, s.qd), s.params
+            for n in range(FEW):
+                x = self.sampler.reference.step(*x, h=self.h, t=s.t + n * self.h, u=u[n], params=p)
+            run = drive(self.model, self.check.methods[0], at, self.h, FEW)
+            size = np.abs(np.array([s.q, s.qd])) + np.abs(np.array(x))
+            size = FEW * (size + np.array([self.sampler.spread, self.sampler.speed]))
+            if np.all(np.isfinite(x)):
+                errors.append(self.check.units(run.rows[:, -1], np.array(x), size))
+                again = self.check.module.simulate(
+                    s.q, s.qd, self.h, steps=FEW, u=u.astype(self.model.dtype), params=p, t0=s.t
+                )
+                same = np.array_equal([again.q, again.qd], run.rows)
+                errors.append(0.0 if same else np.inf)
+        return float(np.max(errors, initial=0))
+
+    def cut(self, method: str) -> float:
+        """How many runs in several calls, or with fewer rows kept, are not the whole to the bit."""
+        wrong = 0
+        for s in self.states:
+            steps = [self.h, *(self.large_step(s, part) for part in LONG)]
+            for h in steps:
+                for at in (s, *([self.table(s)] if self.model.nu else [])):
+                    wrong += self.differ(method, at, h)
+        return float(wrong)
+
+    def table(self, s: State) -> State:
+        """The state with a row of inputs each step."""
+        u = self.random.normal(size=(STEPS, self.model.nu))
+        u[::2] = u[1::2]  # inputs that jump at some steps and not at others
+        return replace(s, u=u)
+
+    def differ(self, method: str, s: State, h: float) -> int:
+        """How many of the runs of one state and step differ."""
+        whole = drive(self.model, method, s, h, STEPS)
+        pieces = drive(self.model, method, s, h, STEPS, cuts=CUTS)
+        sparse = drive(self.model, method, s, h, STEPS, cuts=CUTS[::2], every=EVERY)
+        last = -(-whole.done // EVERY)
+        kept = whole.rows[:, np.minimum(EVERY * np.arange(last + 1), whole.done)]
+        rows = np.full_like(sparse.rows, np.nan)
+        rows[:, : last + 1] = kept
+        wrong = (not pieces.same(whole)) + (not sparse.same(replace(whole, rows=rows)))
+        # a state that is another than was left has no memory
+        by = 1e-3 * float(self.sampler.spread[0])
+        moved, anew = (
+            drive(self.model, method, s, h, CUTS[3], cuts=CUTS, moved=by, anew=anew)
+            for anew in (False, True)
+        )
+        return wrong + (not moved.same(anew))
+
+    def fine(self, method: str) -> float:
+        """How far rounding moves the end of a run of thousands of steps, in units of the state.
+
+        Two runs over the same time in so short steps that the method is exact differ by rounding
+        alone. The median of some states: where a difference grows fast, rounding does too.
+        """
+        states = self.check.few(4)
+        found = [self.rounded(method, states, parts) for parts in FINE[:1]]
+        if found[0] > ROUNDED:
+            found.append(self.rounded(method, states, FINE[1]))
+        return min(found)
+
+    def rounded(self, method: str, states: Sequence[Expected], parts: Sequence[int]) -> float:
+        """The same with h in so many parts."""
+        found, T = [], 2 * self.h
+        for e in states:
+            s, gain = replace(e.state, u=None), T * e.size["acceleration"]
+            one, other = (
+                drive(self.model, method, s, self.h / n, 2 * n, every=2 * n) for n in parts
+            )
+            if not (one.status or other.status):
+                size = np.abs([s.q, s.qd]) + np.array([T * (np.abs(s.qd) + gain), gain])
+                found.append(self.check.units(one.rows[:, -1], other.rows[:, -1], size))
+        return float(np.median(found)) if found else 0.0

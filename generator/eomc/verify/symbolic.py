@@ -1,0 +1,255 @@
+"""The independent answer: Euler-Lagrange as a textbook writes it, in SymPy, NumPy and plain Python.
+
+It starts from the `System` and shares nothing else with the compiled way: definitions are
+substituted, everything is differentiated as it stands, evaluated in doubles with `lambdify`,
+solved with NumPy and stepped in a Python loop. Slow, short, and meant to be believed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import sympy
+from numpy.typing import ArrayLike
+from sympy import Expr, ImmutableMatrix
+
+from eomc.base.errors import EomcError
+from eomc.model.system import System, dot, t
+from eomc.verify.oracle import MATRICES, SCALARS, Answer, Values, Vector
+from eomc.verify.taylor import Jets
+
+WRITTEN_OUT = 10_000  # some seconds of SymPy at five links
+SIMPLIFIED_WORK = 200_000  # squares of operations, added up: a few seconds of SymPy
+
+
+def derive(system: System) -> Reference:
+    """D qdd + C qd + g = tau from d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, plainly.
+
+    K is split by its degree in qd, K = K2 + a.qd + K0, and p = dK/dqd:
+
+    - D = d2K/dqd2, symmetric, others call it M;
+    - bias = (dp/dq) qd + dp/dt - dK/dq + dP/dq, and g = bias at qd = 0;
+    - C_ij = 1/2 sum_k (dD_ij/dq_k + dD_ik/dq_j - dD_jk/dq_i) qd_k (Christoffel; Spong, Hutchinson,
+      Vidyasagar, Robot Modeling and Control, 2006, eq. 7.60) + (da_i/dq_j - da_j/dq_i) + dD_ij/dt,
+      so that bias = C qd + g, and Ddot - 2C + dD/dt is skew-symmetric;
+    - tau = Q - dR/dqd;
+    - jacobi = p.qd - K + P, which is K + P where K is purely quadratic, and changes at the rate
+      power = tau.qd - dL/dt, L = K - P at fixed q and qd.
+
+    Raises EomcError where K is not quadratic in the velocities, or where a definition can't be
+    differentiated.
+    """
+    expand = _expander(system)
+    q, qd = system.q, ImmutableMatrix(system.qd)
+    K, P, R = (expand(e) for e in (system.kinetic, system.potential, system.dissipation))
+    rest = dict.fromkeys(system.qd, sympy.S.Zero)
+
+    def gradient(e: Expr, xs: Sequence[sympy.Symbol]) -> ImmutableMatrix:
+        return ImmutableMatrix([sympy.diff(e, x) for x in xs])
+
+    p = gradient(K, system.qd)
+    D = ImmutableMatrix(p.jacobian(qd)).applyfunc(lambda e: _free_of(e, system.qd))
+    a = p.xreplace(rest)
+    n = range(len(q))
+
+    def coriolis(i: int, j: int) -> Expr:
+        christoffel = [
+            (D[i, j].diff(q[k]) + D[i, k].diff(q[j]) - D[j, k].diff(q[i])) * qd[k] / 2 for k in n
+        ]
+        return sum(christoffel, a[i].diff(q[j]) - a[j].diff(q[i]) + D[i, j].diff(t))
+
+    bias = p.jacobian(q) * qd + p.diff(t) - gradient(K, q) + gradient(P, q)
+    forces = system.forces or (sympy.S.Zero,) * len(q)
+    tau = ImmutableMatrix([expand(e) for e in forces]) - gradient(R, system.qd)
+    return Reference(
+        system=system,
+        D=D,
+        C=ImmutableMatrix(len(q), len(q), coriolis),
+        g=bias.xreplace(rest),
+        bias=bias,
+        tau=tau,
+        kinetic=K,
+        potential=P,
+        energy=K + P,
+        jacobi=p.dot(qd) - K + P,
+        power=tau.dot(qd) - sympy.diff(K - P, t),
+        signals=ImmutableMatrix(len(system.u), 1, [expand(i.signal) for i in system.inputs]),
+    )
+
+
+def of(system: System) -> Reference | Jets:
+    """The independent answer: written out where that is small, else by Taylor arithmetic.
+
+    Raises EomcError as `derive` and `Jets` do.
+    """
+    return derive(system) if is_small(system) else Jets(system)
+
+
+def is_small(system: System) -> bool:
+    """Whether `derive` takes seconds at most."""
+    return _written_out(system) <= WRITTEN_OUT
+
+
+def _written_out(system: System) -> float:
+    """Roughly how many operations `derive` would have in hand: those of K, written out, nq^2 times.
+
+    What a definition hangs on is counted as often as it is named; dot(e) is e once a coordinate.
+    """
+    sizes: dict[Expr, float] = {}
+    reach: dict[Expr, frozenset[Expr]] = {q: frozenset([q]) for q in system.q}
+
+    def size(e: Expr) -> float:
+        if e not in sizes:
+            held = [reach.get(s, frozenset()) for s in e.free_symbols]
+            reach[e] = reach.get(e, frozenset()).union(*held)
+            inside = sum(size(a) for a in e.args)
+            sizes[e] = inside * max(1, len(reach[e])) if isinstance(e, dot) else inside + 1
+        return sizes[e]
+
+    for name, body in system.definitions:
+        sizes[name], reach[name] = size(body), reach[body]
+    return size(system.kinetic) * len(system.q) ** 2 + size(system.potential)
+
+
+def _expander(system: System) -> Callable[[Expr], Expr]:
+    """A function that puts definitions in and carries every dot(...) out."""
+    known: dict[Expr, Expr] = {}
+
+    def rate(e: Expr) -> Expr:
+        """de/dt = sum de/dq qd + de/dt."""
+        strange = e.free_symbols & {*system.qd, *system.u}
+        if strange:
+            raise EomcError(f"dot({e}): {', '.join(sorted(map(str, strange)))} has no known rate")
+        parts = (sympy.diff(e, x) * v for x, v in zip(system.q, system.qd, strict=True))
+        return sum(parts, sympy.diff(e, t))
+
+    def expand(e: Expr) -> Expr:
+        return sympy.sympify(e).xreplace(known).replace(dot, rate)
+
+    for name, body in system.definitions:
+        known[name] = expand(body)
+    return expand
+
+
+def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
+    """`e`, an entry of D, in a form without velocities. Raises EomcError where there is none."""
+    for attempt in (lambda x: x, sympy.expand, sympy.simplify):
+        e = attempt(e)
+        if not e.has(*velocities):
+            return e
+    raise EomcError(
+        "the kinetic energy is not quadratic in the velocities: the mass matrix d2K/dqd2 has "
+        f"the entry {e}. Friction belongs in 'dissipation' or [forces]"
+    )
+
+
+@dataclass(frozen=True)
+class Reference(Answer):
+    """The equations of `system` as expressions over q, qd, t, u and the parameters.
+
+    D, C: (nq, nq); g, bias, tau: (nq, 1); signals: (nu, 1), the inputs by default.
+    """
+
+    system: System
+    D: ImmutableMatrix
+    C: ImmutableMatrix
+    g: ImmutableMatrix
+    bias: ImmutableMatrix
+    tau: ImmutableMatrix
+    kinetic: Expr
+    potential: Expr
+    energy: Expr
+    jacobi: Expr
+    power: Expr
+    signals: ImmutableMatrix
+    _functions: dict[str, Callable[..., Any]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def simplified(self) -> Reference:
+        """The same in shorter forms, for people to read; what would take SymPy long stays."""
+        names = ("D", "C", "g", "tau")
+        entries = {e for name in names for e in getattr(self, name)}
+        entries |= {self.kinetic, self.potential, self.jacobi, self.power}
+        short: dict[Expr, Expr] = {}
+        left = SIMPLIFIED_WORK
+        for e in sorted(entries, key=lambda e: (e.count_ops(), str(e))):
+            left -= e.count_ops() ** 2
+            short[e] = _shorter(e) if left > 0 else e
+        D, C, g, tau = (getattr(self, name).applyfunc(short.__getitem__) for name in names)
+        K, P, jacobi, power = map(
+            short.__getitem__, (self.kinetic, self.potential, self.jacobi, self.power)
+        )
+        return replace(
+            self, D=D, C=C, g=g, bias=C * ImmutableMatrix(self.system.qd) + g, tau=tau,
+            kinetic=K, potential=P, energy=K + P, jacobi=jacobi, power=power,
+        )  # fmt: skip
+
+    def _value(
+        self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> Any:
+        if q.ndim == 1:
+            return self._one(name, q, qd, float(t), u, values)
+        rows = len(q)
+        times = np.broadcast_to(t, rows).tolist()
+        us: Any = [None] * rows if u is None else np.asarray(u, float)
+        each = np.array([np.broadcast_to(value, rows) for value in values]).reshape(-1, rows).T
+        found = [
+            self._one(name, q[i], qd[i], times[i], us[i], tuple(each[i].tolist()))
+            for i in range(rows)
+        ]
+        return np.array(found)
+
+    def _one(
+        self, name: str, q: Vector, qd: Vector, t: float, u: ArrayLike | None, values: Values
+    ) -> Any:
+        """The value at one state."""
+        if name == "signals" or not self.system.inputs:
+            u = np.zeros(len(self.system.inputs))
+        elif u is None:
+            u = self._one("signals", q, qd, t, None, values)
+        expr = getattr(self, name)
+        shape = () if name in SCALARS else expr.shape if name in MATRICES else (expr.rows,)
+        try:
+            found = self._function(name)(*q.tolist(), *qd.tolist(), t, *np.asarray(u), *values)
+        except (ArithmeticError, ValueError):
+            return np.full(shape, math.nan)[()]
+        if any(isinstance(each, complex) for each in found):  # Python's power of a negative number
+            return np.full(shape, math.nan)[()]
+        return np.array(found, float).reshape(shape)[()]
+
+    def _function(self, name: str) -> Callable[..., Any]:
+        if name not in self._functions:
+            system, expr = self.system, getattr(self, name)
+            symbols = (*system.q, *system.qd, t, *system.u, *(p.symbol for p in system.parameters))
+            entries = [expr] if name in SCALARS else expr.flat()
+            self._functions[name] = sympy.lambdify(
+                symbols, entries, modules=[_JUMPS, "math"], cse=True
+            )
+        return self._functions[name]
+
+
+def _sign(x: float) -> float:
+    return float((x > 0) - (x < 0))
+
+
+def _heaviside(x: float, at_zero: float = 0.5) -> float:
+    return at_zero if x == 0 else float(x > 0)
+
+
+def _dirac_delta(x: float, order: int = 0) -> float:
+    return math.inf if x == 0 else 0.0
+
+
+# what `math` has no name for
+_JUMPS = {"sign": _sign, "Heaviside": _heaviside, "DiracDelta": _dirac_delta}
+
+
+def _shorter(e: Expr) -> Expr:
+    """The shorter of `e` and its expanded, trigonometrically simplified, factored form."""
+    short = sympy.factor_terms(sympy.trigsimp(sympy.expand(e)))
+    return min((e, short), key=lambda form: form.count_ops())

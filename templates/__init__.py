@@ -1,1 +1,0 @@
-"""The Jinja templates of the generated files."""

@@ -1,0 +1,296 @@
+"""Free text is data: every field is crossed with every payload, and none is executed.
+
+What is shown on terminals, in pages and figures: test_texts_shown.py.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import unicodedata
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import pytest
+import sympy
+from conftest import needs
+from payloads import (
+    ORDINARY,
+    PAYLOADS,
+    RAW,
+    TOUCH,
+    derived,
+    fields,
+    filled,
+    generated,
+    nothing_ran,
+    payloads,
+    tokens,
+    with_texts,
+)
+
+import eomc
+from eomc.base import texts
+from eomc.base.errors import EomcError, SceneError
+from eomc.emit import render
+from eomc.emit.c_expression import DOUBLE
+from eomc.emit.c_names import Target
+from eomc.emit.fast import context
+from eomc.model import system
+from eomc.model.system import System
+from eomc.report import equations_text
+from eomc.scene import scene
+
+
+@pytest.fixture(autouse=True)
+def harmless() -> Iterator[None]:
+    with nothing_ran():
+        yield
+
+
+@pytest.mark.parametrize("name", ["docstring", "comment"])
+def test_these_payloads_run_where_they_are_pasted(name: str, tmp_path: Path) -> None:
+    """Else none of the tests below could fail."""
+    with pytest.raises(AssertionError, match="a text was executed"), nothing_ran():
+        if name == "docstring":
+            exec(f'"""{PAYLOADS[name]}"""')
+        else:
+            (tmp_path / "x.c").write_text(f"int main(void) {{ return 0; }} /* {PAYLOADS[name]} */")
+            subprocess.run([needs("gcc"), "x.c", "-o", "x"], cwd=tmp_path, check=True)
+            subprocess.run(["./x"], cwd=tmp_path, check=True)
+
+
+# --- the reader -----------------------------------------------------------------------------------
+
+
+def hidden(text: str, lines: bool) -> bool:
+    """Whether the reader should refuse a text, from the tables of Unicode."""
+    strange = ("Cc", "Zl", "Zp", "Cs")
+    marks = [unicodedata.lookup(f"{way} MARK") for way in ("LEFT-TO-RIGHT", "RIGHT-TO-LEFT")]
+    return any(
+        (unicodedata.category(c) in strange and not (lines and c in "\t\n"))
+        or (unicodedata.bidirectional(c) in "LRE RLE PDF LRO RLO LRI RLI FSI PDI".split())
+        or c in (*marks, unicodedata.lookup("ARABIC LETTER MARK"))
+        for c in text
+    )
+
+
+@pytest.mark.parametrize(("which", "key"), fields(), ids=[key for _, key in fields()])
+def test_the_reader_refuses_hidden_characters_and_names_line_and_key(which: int, key: str) -> None:
+    for name, given in PAYLOADS.items():
+        written = filled({which: given})
+        try:
+            scene.parse(written, "f.toml")
+            refused = False
+        except SceneError as fault:
+            refused = True
+            (problem,) = fault.problems
+            if name == "half a character":  # which TOML itself has no way to write
+                assert "not TOML" in problem.message
+            else:
+                assert problem.key == key
+                assert re.search(r"U\+[0-9A-F]{4}|line break", problem.message)
+                assert f"{key.split('.')[-1]} = " in written.splitlines()[problem.line - 1]
+            assert not RAW.search(str(fault))
+        assert refused == hidden(given, lines=key.endswith("note")), name
+
+
+def test_ordinary_texts_and_notes_of_several_lines_pass() -> None:
+    note = "first line\nsecond *line*,\n\n\tindented: θ"
+    for which, key in fields():
+        scene.parse(filled({which: ORDINARY}), "f.toml")
+        if key.endswith("note"):
+            scene.parse(filled({which: note}), "f.toml")
+    made = system.from_scene(scene.parse(filled({1: note, 3: note}), "f.toml"))
+    files = eomc.sources(made).files
+    assert " * first line second *line*, indented: θ\n" in files["fields.h"]
+    assert "/* plain, first line second *line*, indented: θ */" in files["fields.h"]
+    assert "x: plain, first line second *line*, indented: θ\n" in files["__init__.py"]
+
+
+# --- what is generated ----------------------------------------------------------------------------
+
+
+def code(face: str) -> str:
+    """The Python of a face without its literals."""
+    tree = ast.parse(face)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            node.value = ""
+    return ast.dump(tree)
+
+
+@cache
+def plain_files() -> dict[str, str]:
+    return generated("plain", "f.toml")
+
+
+@cache
+def plain_tokens(folder: Path) -> str:
+    return tokens(plain_files(), folder)
+
+
+@payloads
+def test_texts_change_no_code(given: str, tmp_path: Path, tmp_path_factory: Any) -> None:
+    files, folder = generated(given), tmp_path_factory.getbasetemp()
+    assert tokens(files, tmp_path) == plain_tokens(folder)
+    face = files["__init__.py"]
+    assert code(face) == code(plain_files()["__init__.py"])
+    assert repr(given) in face
+    for name, text in files.items():
+        assert not RAW.search(text), name
+        assert not re.search(r"(\\|\?\?/)$", text, re.M) or name.endswith(".py"), name
+    doc = ast.get_docstring(ast.parse(face), clean=False)
+    assert doc is not None and doc.startswith(texts.line(given) + ": compiled equations")
+
+
+def test_ordinary_text_stays_readable(tmp_path: Path) -> None:
+    files = generated(ORDINARY, "Καρό.toml")
+    tokens(files, tmp_path)
+    for name in ("fields.h", "fields.c", "main.c", "selftest.c", "__init__.py"):
+        shown = ORDINARY.replace("\\", "\\\\") if name == "__init__.py" else ORDINARY
+        assert shown in files[name], name
+        assert "eomc build Καρό.toml" in files[name] or "'Καρό.toml'" in files[name]
+    assert texts.line(ORDINARY) == ORDINARY and tomllib.loads(f"x = {texts.toml(ORDINARY)}") == {
+        "x": ORDINARY
+    }
+
+
+def strings(value: Any) -> Iterator[str]:
+    """All strings in what a template is given."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for key, each in value.items():
+            yield from strings(key)
+            yield from strings(each)
+    elif isinstance(value, (list, tuple, set)):
+        for each in value:
+            yield from strings(each)
+
+
+def test_templates_are_given_free_text_only_as_free_text() -> None:
+    whole = derived()
+    marked = replace(whole, system=with_texts(whole.system, "MARKED"))
+    given = context.values(Target(marked, DOUBLE))
+    assert not [s for s in strings(given) if "MARKED" in s]
+
+
+def test_free_text_is_not_printed_by_mistake() -> None:
+    text = texts.FreeText("*/")
+    for print_it in (str, "{}".format, lambda x: f"{x}", lambda x: "".join(map(str, [x]))):
+        with pytest.raises(TypeError, match="free text"):
+            print_it(text)
+    environment = render.environment()
+    for template in ("{{ x }}", "{{ 'a' ~ x }}", "{{ [x, x] | join }}"):
+        with pytest.raises(TypeError, match="free text"):
+            environment.from_string(template).render(x=text)
+    assert "*/" not in environment.from_string("{{ [x] }}{{ {'a': x} }}").render(x=text)
+    with pytest.raises(jinja2.UndefinedError):
+        environment.from_string("{{ x.coment }}").render(x=text)
+
+
+IMPORTED = """
+import importlib, json, sys
+m = importlib.import_module("fields")
+m.simulate(steps=3)
+print(json.dumps([m.title, m.units, m.__doc__]))
+"""
+
+
+def runs(made: System, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Build, import in another process, run; compile and run the C beside it too."""
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
+    built = eomc.build(made, folder)
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONIOENCODING": "utf-8"}
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTED], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    for file in ("main.c", "selftest.c"):
+        command = [needs("gcc"), "-std=c99", "-Wall", "-Wextra", "-Werror", "-o", file[:-2]]
+        subprocess.run([*command, file, "fields.c", "-lm"], cwd=built.folder, check=True)
+        printed = subprocess.run([f"./{file[:-2]}"], cwd=built.folder, capture_output=True)
+        assert printed.returncode == 0 and not RAW.search(printed.stdout.decode())
+    told: list[Any] = json.loads(done.stdout)
+    return told
+
+
+def test_all_payloads_at_once_build_import_and_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = " ".join(PAYLOADS.values())
+    made = replace(with_texts(derived().system, every), digest="0" * 64)
+    title, units, doc = runs(made, tmp_path, monkeypatch)
+    assert title == every and units == dict.fromkeys(("x", "m", "g", "u"), every)
+    assert texts.line(every) in doc
+
+
+@pytest.mark.slow
+@payloads
+def test_each_payload_builds_imports_and_runs(
+    given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = replace(with_texts(derived().system, given), digest="0" * 64)
+    title, units, _ = runs(made, tmp_path, monkeypatch)
+    assert title == given and units == dict.fromkeys(("x", "m", "g", "u"), given)
+
+
+@payloads
+def test_systems_made_in_python(given: str) -> None:
+    x, m = sympy.Symbol(given), sympy.Symbol(given + "m")
+    v = sympy.Symbol(f"{given}_dot")
+    made = System.make(
+        "made", {x: 1.0}, m * v**2 / 2, m * x**2, parameters={m: 1}, units={x: given, m: given},
+        title=given,
+    )  # fmt: skip
+    for name, text in eomc.sources(made).files.items():
+        assert not RAW.search(text), name
+        if name.endswith(".py"):
+            ast.parse(text)
+    namespace: dict[str, Any] = {}
+    exec(equations_text.equations(made, "python"), namespace)
+    assert namespace["__doc__"].startswith(texts.line(given) + ": D qdd")
+    latex = equations_text.equations(made, "latex")  # names only, and those are plain
+    ours = {"begin", "end", "dot", "frac", "left", "right"}
+    assert {*re.findall(r"\\([A-Za-z]+)", latex)} <= ours and not re.search("[$#%]", latex)
+    for form in ("text", "latex"):
+        assert not RAW.search(equations_text.equations(made, form)) and not RAW.search(
+            equations_text.cost(made)
+        )
+
+
+def test_names_that_no_reader_has_checked_stand_in_no_code() -> None:
+    whole = derived()
+    x = whole.system.coordinates[0]
+    for changed in (
+        replace(whole.system, name="a */ b"),
+        replace(whole.system, coordinates=(replace(x, name='x"'),)),
+        replace(whole.system, definitions=((sympy.Symbol("a\n"), sympy.S.One),)),
+    ):
+        with pytest.raises(ValueError, match="is not a plain name"):
+            render.render(replace(whole, system=changed), "_extension")
+
+
+def test_titles_and_units_are_texts() -> None:
+    x, v = sympy.symbols("x x_dot")
+
+    class Odd(str):
+        def __repr__(self) -> str:
+            return f"__import__('os').system({TOUCH!r})"
+
+    for wrong in (3, None, b"x", sympy.Symbol("x")):
+        with pytest.raises(EomcError, match="a title or unit is a text"):
+            System.make("made", [x], v**2, title="x", units={x: wrong})  # type: ignore[dict-item]
+    made = System.make("made", [x], v**2, title=Odd("x"), units={x: Odd("y")})
+    face = eomc.sources(made).files["__init__.py"]
+    assert "system(" not in face and "title='x'" in face

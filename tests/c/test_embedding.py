@@ -1,0 +1,327 @@
+"""The generated C is all that a C programmer needs, and no more than the scene needs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cases import fast_kit, scene_system
+from compilers import STRICT, compiled, run
+from conftest import EVERYTHING, MODULES, ROOT, needs
+
+import eomc
+from eomc.emit import c_names
+from eomc.emit.render import Sources
+from eomc.model import system
+from eomc.model.system import System
+from eomc.scene import scene
+from eomc.verify import symbolic
+
+NAMES = [
+    "cartpole",  # neither inputs nor time
+    "cartpole_driven",  # an input, its signal a function of time
+    "kapitza_pendulum",  # time in K
+    "foucault_pendulum",  # a part of K linear in the velocities
+    "mass_spring",  # no angle, and D constant
+    "everything",  # every function of the formula language, and awkward names
+]
+
+
+@cache
+def made(name: str) -> System:
+    if name == "everything":
+        return system.from_scene(scene.parse(EVERYTHING, "everything.toml"))
+    return scene_system(name)
+
+
+@cache
+def generated(name: str) -> Sources:
+    return eomc.sources(made(name))
+
+
+@pytest.fixture
+def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A folder with the generated files of a scene, the fast form in the place of the plain one."""
+    for file, text in fast_kit(generated(request.param)).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+kits = pytest.mark.parametrize(("kit", "name"), [(n, n) for n in NAMES], indirect=["kit"])
+driven = pytest.mark.parametrize("kit", ["cartpole_driven"], indirect=True)
+
+
+def table(text: str) -> tuple[list[str], np.ndarray]:
+    """The columns' names and the numbers of a CSV."""
+    head, *rows = text.splitlines()
+    return head.split(","), np.array([[float(x) for x in row.split(",")] for row in rows])
+
+
+def rows_of(name: str) -> np.ndarray:
+    """What the Python module has for the rows that main.c prints."""
+    module = eomc.load(made(name), MODULES)
+    s = made(name).run
+    steps = max(1, int(np.ceil(s.duration / s.h * (1 - 1e-12))))
+    found = module.simulate(steps=steps, every=max(1, steps // 200))
+    return np.column_stack([found.t, found.q, found.qd, found.energy])
+
+
+# --- compilers -----------------------------------------------------------------------------------
+
+
+@kits
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("level", [pytest.param("-O0", marks=pytest.mark.slow), "-O2"])
+def test_strict_compilers_have_nothing_to_say(
+    kit: Path, name: str, compiler: str, level: str
+) -> None:
+    """Source, header, example and self-test, alone and together."""
+    (kit / "header.c").write_text(f'#include "{name}.h"\n#include "{name}.h"\n')
+    files = [f"{name}.c", "main.c", "selftest.c", "header.c"]
+    compiled(needs(compiler), *STRICT, level, "-I.", "-c", *files, cwd=kit)
+
+
+@kits
+def test_the_source_is_cpp_too(kit: Path, name: str) -> None:
+    strict = ["-std=c++11", *STRICT[1:], "-fsyntax-only"]
+    compiled(needs("g++"), *strict, "-x", "c++", f"{name}.c", cwd=kit)
+
+
+@kits
+def test_a_cpp_program_links_the_same_object(kit: Path, name: str) -> None:
+    driven = "double t = 0;" if " double t" in step_of(name) else ""
+    arguments = ", ".join(
+        {"q": "q", "qd": "qd", "t": "t", "h": "0.001", "u": "nullptr", "p": "&p"}[a]
+        for a in re.findall(r"(\w+)(?:\[\w+\])?(?:,|$)", step_of(name))
+    )
+    params = f"{name}_params p = {name}_defaults;" if made(name).parameters else ""
+    (kit / "use.cpp").write_text(
+        f"""#include "{name}.h"
+int main() {{
+    double q[{name.upper()}_NQ], qd[{name.upper()}_NQ];
+    {params} {driven}
+    for (int i = 0; i < {name.upper()}_NQ; i++) {{ q[i] = {name}_q0[i]; qd[i] = {name}_qd0[i]; }}
+    return {name}_rk4_step({arguments}) != {name.upper()}_OK;
+}}
+""",
+        encoding="utf-8",
+    )
+    compiled(needs("gcc"), "-std=c99", "-O2", "-c", f"{name}.c", cwd=kit)
+    compiled(needs("g++"), "-Wall", "-Wextra", "-Werror", "use.cpp", f"{name}.o", "-lm", cwd=kit)
+    assert run("./a.out", cwd=kit).returncode == 0
+
+
+def step_of(name: str) -> str:
+    """The arguments of rk4_step, in one line."""
+    header = " ".join(fast_kit(generated(name))[f"{name}.h"].split())
+    match = re.search(rf"{name}_rk4_step\(([^)]*)\);", header)
+    assert match
+    return match[1]
+
+
+# --- what it computes --------------------------------------------------------------------------
+
+
+@kits
+def test_the_example_prints_what_the_module_computes(
+    kit: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the last bit under the same flags; to 1e-9 against the module as it is usually built.
+
+    Without FMA, gnu99, with which a module is compiled, and c99 give the same arithmetic.
+    """
+    compiled("cc", "-std=c99", "-O2", "-I.", "main.c", f"{name}.c", "-lm", cwd=kit)
+    done = run("./a.out", cwd=kit)
+    assert (done.returncode, done.stderr) == (0, "")
+    columns, printed = table(done.stdout)
+    names = [c.name for c in made(name).coordinates]
+    assert columns == ["t", *names, *(f"{n}_dot" for n in names), "energy"]
+    usual = rows_of(name)
+    np.testing.assert_allclose(printed, usual, rtol=0, atol=1e-9 * np.max(np.abs(usual)))
+    monkeypatch.setenv("EOMC_CFLAGS", "-O2")
+    assert np.array_equal(printed, rows_of(name))
+
+
+@pytest.mark.parametrize("kit", ["cartpole"], indirect=True)
+@pytest.mark.parametrize("compiler", ["gcc -O0", "gcc -O3", "clang -O2", "gcc -O2 -std=gnu99"])
+def test_compilers_agree_to_the_last_bit(kit: Path, compiler: str) -> None:
+    """On a processor's baseline, where nothing is contracted."""
+    command = compiler.split()
+    compiled("cc", "-std=c99", "-O2", "-I.", "main.c", "cartpole.c", "-lm", "-o", "one", cwd=kit)
+    files = ["-I.", "main.c", "cartpole.c", "-lm", "-o", "two"]
+    compiled(needs(command[0]), "-std=c99", *command[1:], *files, cwd=kit)
+    assert run("./one", cwd=kit).stdout == run("./two", cwd=kit).stdout
+
+
+@kits
+def test_the_self_test_passes_and_finds_a_wrong_number(kit: Path, name: str) -> None:
+    def outcome() -> tuple[int, str]:
+        compiled("cc", "-std=c99", "-O1", "-I.", "selftest.c", f"{name}.c", "-lm", cwd=kit)
+        done = run("./a.out", cwd=kit)
+        return done.returncode, done.stdout
+
+    status, words = outcome()
+    states = 3 if name in ("mass_spring", "foucault_pendulum") else 6  # with large angles
+    assert (status, words) == (0, f"{name}: right in {states} states\n")
+    source = (kit / f"{name}.c").read_text(encoding="utf-8")
+    right = f"    {made(name).parameters[0].value}, /* {made(name).parameters[0].name} */"
+    assert right in source
+    wrong = source.replace(right, right.replace(",", "*1.001,", 1))
+    (kit / f"{name}.c").write_text(wrong, encoding="utf-8")
+    status, words = outcome()
+    assert status == 1
+    assert "is off by" in words
+    assert words.endswith(f"{name}: WRONG in {states} states\n")
+
+
+@driven
+def test_header_and_source_of_two_builds_do_not_go_together(kit: Path) -> None:
+    header = kit / "cartpole_driven.h"
+    text = header.read_text(encoding="utf-8")
+    stamp = re.search(r"_STAMP (0x[0-9a-f]+)u", text)
+    assert stamp
+    header.write_text(text.replace(stamp[1], "0x12345678"), encoding="utf-8")
+    done = run("cc", "-std=c99", "-c", "cartpole_driven.c", cwd=kit)
+    assert done.returncode != 0
+    assert "#error" in done.stderr
+    assert "cartpole_driven.h is of another build than this file" in done.stderr
+
+
+# --- what is in it -------------------------------------------------------------------------------
+
+# of <math.h>, and GNU's sincos, into which gcc puts a sine and a cosine of one angle
+MATHEMATICS = set(
+    """sin cos sincos tan asin acos atan atan2 sinh cosh tanh exp log sqrt pow fabs fmin fmax
+    fma""".split()
+)
+
+
+def symbols(kit: Path, name: str, *flags: str) -> list[tuple[str, str]]:
+    """(kind, name) of every symbol in the object file; see nm(1)."""
+    compiled("cc", "-std=c99", *flags, "-c", f"{name}.c", cwd=kit)
+    lines = run(needs("nm"), "-P", f"{name}.o", cwd=kit).stdout.splitlines()
+    return [(line.split()[1], line.split()[0]) for line in lines]
+
+
+@kits
+def test_the_object_has_its_own_names_no_data_and_no_wishes(kit: Path, name: str) -> None:
+    """Every global begins with the scene's name; nothing changes; nothing but libm is called."""
+    found = symbols(kit, name, "-O2")
+    for kind, symbol in found:
+        if kind == "U":
+            assert symbol in MATHEMATICS, symbol
+        elif kind.isupper():
+            assert symbol.startswith(f"{name}_"), symbol
+    assert not [s for kind, s in found if kind in "BbDdCcSsGg"], "writable data"
+    assert {s for kind, s in found if kind == "R"} == {
+        f"{name}_{what}" for what in ("defaults", "q0", "qd0")
+    }
+    assert ("T", f"{name}_rk4_step") in found
+
+
+def test_enumerators_are_none_of_the_librarys_macros(tmp_path: Path) -> None:
+    """A coordinate E of a scene m: math.h has an M_E of its own."""
+    text = """
+eomc = 1
+name = "m"
+[coordinates]
+E = { start = 1 }
+[energy]
+kinetic = "E_dot**2/2"
+"""
+    for file, content in fast_kit(eomc.sources(system.from_scene(scene.parse(text)))).items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    compiled("cc", "-std=gnu99", "-include", "math.h", "-c", "m.c", cwd=tmp_path)
+
+
+def test_enumerators_are_none_of_our_own_macros() -> None:
+    """Whatever follows the prefix in templates and csrc: fast_fma would have 1 for its place."""
+    texts = [p.read_text(encoding="utf-8") for p in (ROOT / "templates").rglob("*.jinja")]
+    texts += [p.read_text(encoding="utf-8") for p in (ROOT / "csrc").rglob("*.h")]
+    texts += [p.read_text(encoding="utf-8") for p in (ROOT / "generator").rglob("*.py")]
+    pattern = r'(?:\{\{ PREFIX \}\}|PREFIX\}|PREFIX ~ "|\bEOMC)_([A-Z][A-Z_]*[A-Z]|H\b)'
+    found = {name for text in texts for name in re.findall(pattern, text)} - {"CFLAGS"}
+    assert found == c_names.OWN
+
+
+@pytest.mark.parametrize("name", ["rolled", "aligned", "fast_fma", "block"])
+def test_coordinates_may_be_called_like_our_own_macros(name: str, tmp_path: Path) -> None:
+    text = (ROOT / "scenes" / "cartpole.toml").read_text(encoding="utf-8")
+    text = re.sub(r"\bx(?=\b|_dot)", name, text).replace("[run]\n", "[run]\nbatch = true\n")
+    for file, content in fast_kit(eomc.sources(system.from_scene(scene.parse(text)))).items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    program = f"""
+        #include <stdio.h>
+        #include "cartpole.h"
+        int main(void) {{
+            double q[CARTPOLE_NQ] = {{ 0.0, 0.5 }}, qd[CARTPOLE_NQ] = {{ 0.25, 0.0 }};
+            cartpole_rk4_step(q, qd, 0.5, &cartpole_defaults);
+            printf("%.17g", q[CARTPOLE_{name.upper()}_]);
+            return 0;
+        }}"""
+    (tmp_path / "told.c").write_text(program, encoding="utf-8")
+    compiled("cc", "-std=gnu99", "told.c", "cartpole.c", "-lm", "-o", "told", cwd=tmp_path)
+    told = subprocess.run([str(tmp_path / "told")], capture_output=True, text=True, check=True)
+    trusted = symbolic.of(scene_system("cartpole"))
+    _, q, _ = trusted.simulate([0.0, 0.5], [0.25, 0.0], h=0.5, steps=1)
+    assert float(told.stdout) == pytest.approx(q[-1][0], rel=1e-12)
+
+
+@kits
+def test_what_is_not_wanted_is_not_there(kit: Path, name: str) -> None:
+    """No input, no signal and no u; no force, no tau; no time, no t; nothing of a batch."""
+    names = {symbol for _, symbol in symbols(kit, name, "-O0")}
+    inputs = name in ("cartpole_driven", "everything")
+    timed = inputs or name == "kapitza_pendulum"
+    assert (f"{name}_signal" in names) == inputs
+    assert (f"{name}_tau" in names) == inputs
+    assert (f"{name}_power" in names) == timed
+    assert (f"{name}_sincos" in names) == (name not in ("mass_spring", "foucault_pendulum"))
+    assert (" double t" in step_of(name)) == timed
+    assert ("*u" in step_of(name)) == inputs
+    assert not [n for n in names if "batch" in n or "dop" in n]
+    header = (kit / f"{name}.h").read_text(encoding="utf-8")
+    assert bool(re.search(r"\bdouble \*?u\b", header)) == inputs
+    assert bool(re.search(r"\bdouble t0?\b", header)) == timed
+
+
+@driven
+def test_two_scenes_in_one_program(kit: Path) -> None:
+    """Prefixes keep them apart, in one translation unit too."""
+    for file, text in fast_kit(generated("kapitza_pendulum")).items():
+        if file.startswith("kapitza"):
+            (kit / file).write_text(text, encoding="utf-8")
+    (kit / "both.c").write_text(
+        '#include "cartpole_driven.c"\n#include "kapitza_pendulum.c"\n'
+        "int main(void) { return CARTPOLE_DRIVEN_NQ + KAPITZA_PENDULUM_NQ - 3; }\n"
+    )
+    compiled("cc", *STRICT, "both.c", "-lm", cwd=kit)
+    assert run("./a.out", cwd=kit).returncode == 0
+
+
+@kits
+def test_nothing_is_printed_that_could_have_lost_digits(kit: Path, name: str) -> None:
+    """Parameters and start values come back from the C as the very same doubles."""
+    source = (kit / f"{name}.c").read_text(encoding="utf-8")
+    for p in made(name).parameters:
+        match = re.search(rf"^    (\S+), /\* {p.name} \*/$", source, re.MULTILINE)
+        assert match
+        assert float(match[1]) == p.value
+    for array, key in ((f"{name}_q0", "start"), (f"{name}_qd0", "rate")):
+        match = re.search(rf"{array}\[\w+\] = \{{ (.*) \}};", source)
+        assert match
+        numbers = [float(x) for x in match[1].split(", ")]
+        assert numbers == [getattr(c, key) for c in made(name).coordinates]
+
+
+def test_a_misuse_is_told_by_the_compiler(tmp_path: Path) -> None:
+    """-ffast-math breaks the reduction of angles: it is refused, not silently wrong."""
+    for file, text in fast_kit(generated("cartpole")).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    done = run("cc", "-std=c99", "-O2", "-ffast-math", "-c", "cartpole.c", cwd=tmp_path)
+    assert done.returncode != 0
+    assert "-ffast-math" in done.stderr

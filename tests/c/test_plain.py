@@ -1,0 +1,463 @@
+"""The plain form of C: what compilers say of it, what it computes and refuses, how it is made."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+import subprocess
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jinja2.meta
+import numpy as np
+import pytest
+from cases import SCENES, fast_kit
+from conftest import EVERYTHING, MODULES, ROOT, Modules, needs
+
+import eomc
+from eomc.base import resources
+from eomc.emit import c_function, render
+from eomc.emit.c_expression import Block
+from eomc.emit.c_function import CArgument, CFunction
+from eomc.emit.plain import views
+from eomc.emit.render import Sources
+from eomc.model import system
+from eomc.model.system import System
+from eomc.program import outline
+from eomc.scene import scene
+from eomc.verify.check import check
+
+STRICT = """-std=c99 -pedantic -Wall -Wextra -Wconversion -Wdouble-promotion -Wshadow
+-Werror""".split()
+STEPPERS = 'method = ["rk4", "dp8", "euler", "gauss4", "gauss6", "gauss8", "gauss16"]\n'
+NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
+# by name: the scene, and what it has under [run] besides
+WISHES = {
+    "steppers": ("cartpole", STEPPERS + 'linearize = "parameters"\n'),
+    "driven": ("cartpole_driven", STEPPERS + "linearize = true\n"),
+    "verlet": ("kepler_orbit", 'method = ["rk4", "euler", "verlet"]\nbatch = true\n'),
+    "many": ("cartpole_driven", 'batch = true\nmethod = ["rk4", "dp8"]\n'),
+    "single": ("suspension", 'real = "float"\nlinearize = true\nmethod = ["rk4", "gauss4"]\n'),
+    "everything": ("", 'method = ["rk4", "dp8", "euler"]\n'),
+}
+QUICK = ("cartpole_driven", "kapitza_pendulum", "steppers", "driven", "single", "everything")
+FEW = ("cartpole", "chain", "steppers", "driven", "many", "single", "everything")
+
+
+@cache
+def made(name: str) -> System:
+    """A scene of scenes/, or one of WISHES."""
+    source, run = WISHES.get(name, (name, ""))
+    path = SCENES / f"{source}.toml"
+    text = path.read_text(encoding="utf-8") if source else EVERYTHING
+    text = text.replace("[run]\n", "[run]\n" + run)
+    if name in WISHES:
+        text = re.sub(r"^name *= .*", f'name = "plain_{name}"', text, count=1, flags=re.MULTILINE)
+    return system.from_scene(scene.parse(text, f"{name}.toml"))
+
+
+@cache
+def generated(name: str) -> Sources:
+    return eomc.sources(made(name))
+
+
+def both(name: str) -> tuple[ModuleType, ModuleType]:
+    """The modules of the fast and of the plain form."""
+    return eomc.load(made(name), MODULES), eomc.load(made(name), MODULES, form="plain")
+
+
+def kit(name: str, folder: Path) -> str:
+    """The generated C as `eomc build` writes it; the name that it bears."""
+    (folder / "fast").mkdir()
+    for file, text in generated(name).files.items():
+        (folder / file).write_text(text, encoding="utf-8")
+    return generated(name).name
+
+
+def run(*command: str, cwd: Path) -> str:
+    """What a command prints; it has nothing to complain of."""
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+# --- compilers ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [*NAMES, *WISHES])
+def test_strict_gcc_has_nothing_to_say(name: str, tmp_path: Path) -> None:
+    name = kit(name, tmp_path)
+    (tmp_path / "twice.c").write_text(f'#include "{name}.h"\n#include "{name}.h"\n')
+    files = [f"{name}.c", "main.c", "selftest.c", "twice.c"]
+    run(needs("gcc"), *STRICT, "-O1", "-I.", "-c", *files, cwd=tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name", [*FEW, *(pytest.param(n, marks=pytest.mark.slow) for n in NAMES if n not in FEW)]
+)
+def test_strict_clang_and_cpp_have_nothing_to_say(name: str, tmp_path: Path) -> None:
+    name = kit(name, tmp_path)
+    run(needs("clang"), *STRICT, "-O1", "-c", f"{name}.c", cwd=tmp_path)
+    cpp = ["-std=c++11", *STRICT[1:], "-fsyntax-only", "-x", "c++"]
+    run(needs("g++"), *cpp, f"{name}.c", cwd=tmp_path)
+
+
+@pytest.mark.parametrize("name", [*NAMES, *WISHES])
+def test_both_forms_have_the_same_prototypes(name: str) -> None:
+    def prototypes(header: str) -> set[str]:
+        bare = re.sub(r"/\*.*?\*/", "", header, flags=re.DOTALL)
+        found = re.findall(r"^\w[\w *]*\b\w+\([^;{]*\);", bare, re.MULTILINE)
+        return {re.sub(r"\s+", "", p) for p in found}
+
+    files, title = generated(name).files, generated(name).name
+    plain, fast = prototypes(files[f"{title}.h"]), prototypes(files[f"fast/{title}.h"])
+    assert plain == fast
+    assert len(plain) > 8
+
+
+@pytest.mark.parametrize("name", ["cartpole", "driven", "everything"])
+def test_the_object_has_the_public_names_and_no_other(name: str, tmp_path: Path) -> None:
+    title = kit(name, tmp_path)
+    run("cc", "-std=c99", "-O2", "-c", f"{title}.c", cwd=tmp_path)
+    lines = run(needs("nm"), "-P", f"{title}.o", cwd=tmp_path).splitlines()
+    found = [(line.split()[1], line.split()[0]) for line in lines]
+    mathematics = """sin cos sincos tan asin acos atan atan2 sinh cosh tanh exp log sqrt pow fabs
+        fmin fmax""".split()
+    header = (tmp_path / f"{title}.h").read_text(encoding="utf-8")
+    assert not [s for kind, s in found if kind == "U" and s not in mathematics]
+    assert not [s for kind, s in found if kind in "BbDdCcSsGg"], "writable data"
+    public = {s for kind, s in found if kind in "TR"}
+    assert public == {s for s in public if re.search(rf"\b{s}[\[(;]|\b{s};", header)}
+    assert all(s.startswith(f"{title}_") for s in public)
+    assert {f"{title}_{what}" for what in ("D", "acceleration", "defaults", "q0", "qd0")} <= public
+
+
+@pytest.mark.parametrize("name", ["cartpole", "chain", "driven"])
+def test_it_is_smaller_than_the_fast_form(name: str, tmp_path: Path) -> None:
+    title = kit(name, tmp_path)
+    sizes = []
+    for file in (f"{title}.c", f"fast/{title}.c"):
+        run(needs("gcc"), "-std=c99", "-Os", "-c", file, "-o", "made.o", cwd=tmp_path)
+        sizes.append(int(run(needs("size"), "made.o", cwd=tmp_path).splitlines()[1].split()[0]))
+    assert sizes[0] < 0.7 * sizes[1]
+    if name == "cartpole":
+        assert sizes[0] < 3000
+
+
+def test_header_and_source_of_the_two_forms_do_not_go_together(tmp_path: Path) -> None:
+    """Their memories have different sizes."""
+    title = kit("cartpole", tmp_path)
+    (tmp_path / f"{title}.h").write_text(fast_kit(generated("cartpole"))[f"{title}.h"])
+    for flags in ([], ["-ffast-math"]):
+        command = ["cc", "-std=c99", *flags, "-c", f"{title}.c"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode != 0
+        assert ("is of another build or form" in done.stderr) == (not flags or True)
+    kit_of_plain = generated("cartpole").files
+    (tmp_path / f"{title}.h").write_text(kit_of_plain[f"{title}.h"])
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode != 0 and "with -ffast-math" in done.stderr
+
+
+# --- what it computes -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in NAMES if n not in QUICK)],
+)
+def test_it_agrees_with_the_reference_and_the_fast_form(name: str) -> None:
+    fast, plain = both(name)
+    report = check(made(name), fast, plain=plain, states=6)
+    rows = [row for row in report.rows if row.name.startswith("plain C")]
+    assert [row for row in rows if not row.passed] == []
+    assert {f"plain C beside fast: {method}" for method in fast.methods} < {r.name for r in rows}
+
+
+def test_a_wrong_weight_is_found_by_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    right = resources.text
+
+    def wrong(folder: str, name: str) -> str:
+        return right(folder, name).replace("2*(a2[i] + a3[i])", "(a2[i] + 3*a3[i])")
+
+    monkeypatch.setattr(resources, "text", wrong)
+    # by another name: within a process the same build is the same module
+    named = dataclasses.replace(made("cartpole"), name="plain_wrong")
+    plain = eomc.load(named, tmp_path, form="plain")
+    monkeypatch.undo()
+    report = check(made("cartpole"), both("cartpole")[0], plain=plain, states=4)
+    failed = {row.name for row in report.rows if not row.passed}
+    assert failed == {"plain C: one step", "plain C: run", "plain C beside fast: rk4"}
+
+
+@pytest.mark.parametrize("name", ["cartpole", "everything"])
+@pytest.mark.parametrize("form", ["plain", "fast"])
+def test_example_and_self_test_serve_both_forms(name: str, form: str, tmp_path: Path) -> None:
+    title = kit(name, tmp_path)
+    at = "." if form == "plain" else "fast"
+    source = f"{at}/{title}.c"
+    run("cc", "-std=c99", "-O1", f"-I{at}", "selftest.c", source, "-lm", cwd=tmp_path)
+    assert run("./a.out", cwd=tmp_path) == f"{title}: right in 6 states\n"
+    run("cc", "-std=c99", "-O1", f"-I{at}", "main.c", source, "-lm", "-o", "main", cwd=tmp_path)
+    _, *rows = run("./main", cwd=tmp_path).splitlines()
+    s, module = made(name).run, both(name)[form == "plain"]
+    steps = max(1, int(np.ceil(s.duration / s.h * (1 - 1e-12))))
+    wanted = module.simulate(steps=steps, every=max(1, steps // 200))
+    found = np.array([[float(x) for x in row.split(",")] for row in rows])
+    wanted = np.column_stack([wanted.t, wanted.q, wanted.qd, wanted.energy])
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * np.max(np.abs(wanted)))
+
+
+def test_a_run_is_its_steps_bit_by_bit_however_it_is_cut() -> None:
+    _, plain = both("driven")
+    for method in plain.methods:
+        whole = plain.simulate(steps=7, h=0.01, method=method)
+        q, qd = plain.start
+        for k in range(7):
+            q, qd = plain.step(q, qd, 0.01, t=k * 0.01, method=method)
+        assert np.array_equal(np.hstack([q, qd]), whole.x[-1]), method
+
+
+@pytest.mark.parametrize("name", ["many", "verlet"])
+def test_a_batch_is_a_loop_over_instances(name: str) -> None:
+    fast, plain = both(name)
+    random = np.random.default_rng(5)
+    q0, qd0 = (x + 0.1 * random.standard_normal((9, 2)) for x in fast.start)
+    qd0[4] = 1e300  # one that may not go on, and leaves the others alone
+    for method in fast.methods:
+        given: dict[str, Any] = {"steps": 30, "every": 10, "method": method}
+        one, other = (m.simulate_batch(q0, qd0, **given) for m in (fast, plain))
+        good = np.arange(9) != 4
+        np.testing.assert_allclose(other.q[good], one.q[good], rtol=1e-9, atol=1e-9)
+        assert np.array_equal(one.status, other.status)
+        single = plain.simulate(q0[0], qd0[0], steps=30, every=10, method=method)
+        assert np.array_equal(single.q, other.q[0])
+
+
+def test_a_stiff_motion_in_long_steps() -> None:
+    """A decay of 10,000 1/s in steps of 10 ms, and signals that answer the state as stiffly."""
+    text = """
+eomc = 1
+name = "plain_stiff"
+[coordinates]
+x = { start = 1.0 }
+[inputs]
+F = { signal = "-1e8*x - 2e4*x_dot" }
+[energy]
+kinetic = "x_dot**2/2"
+[forces]
+x = "F"
+[run]
+h = 0.01
+duration = 1.0
+method = ["gauss4", "gauss6", "gauss8"]
+"""
+    stiff = system.from_scene(scene.parse(text, "plain_stiff.toml"))
+    fast, plain = (eomc.load(stiff, MODULES, form=form) for form in ("fast", "plain"))
+    for method in plain.methods:
+        one, other = (m.simulate(steps=100, method=method) for m in (fast, plain))
+        assert str(other.status) == "ok"
+        assert np.max(np.abs(other.x)) < 1e5
+        np.testing.assert_allclose(other.q, one.q, rtol=1e-6, atol=1e-9)
+
+
+# --- what it refuses ------------------------------------------------------------------------------
+
+REFUSED = """
+#include <NAME.h>
+
+#include <math.h>
+#include <stdio.h>
+
+static void tell(const char *what, int status, const double *x, int n)
+{
+    int i, same = 1;
+
+    for (i = 0; i < n; i++)
+        same = same && x[i] == 7;
+    printf("%s %d %d\\n", what, status, same);
+}
+
+int main(void)
+{
+    const double far[2] = { 0.0, 1e300 }, still[2] = { 0.0, 0.0 }, fast[2] = { 0.0, 1e300 };
+    NAME_params p = NAME_defaults;
+    double qdd[2] = { 7, 7 }, A[8] = { 7, 7, 7, 7, 7, 7, 7, 7 };
+
+    tell("speed", NAME_acceleration(qdd, still, fast, &p), qdd, 2);
+    tell("slopes", NAME_linearization(A, A + 4, far, fast, &p), A, 8);
+    p.m_c = -2.0;
+    tell("mass", NAME_acceleration(qdd, still, still, &p), qdd, 2);
+    tell("slopes", NAME_linearization(A, A + 4, still, still, &p), A, 8);
+    p.m_c = NAN;
+    tell("nan", NAME_acceleration(qdd, still, still, &p), qdd, 2);
+STEPS
+    return 0;
+}
+"""
+STEP = """    {
+        double x[4] = { 7, 7, 7, 7 }, rows[4] = { 7, 7, 7, 7 };
+        NAME_status status = NAME_OK;
+        NAME_params bad = NAME_defaults;
+
+        bad.m_c = -2.0;
+        tell("METHOD", NAME_METHOD_step(x, x + 2, 0.01, &bad), x, 4);
+        tell("METHOD", (int)NAME_METHOD_run(x, x + 2, 0.01, 0, 3, 1, rows, rows + 2, &bad, NULL,
+            &status), rows, 4);
+        bad.m_c = 2.0, bad.g = 1e308, bad.l = 1e-300;
+        tell("METHOD", NAME_METHOD_step(x, x + 2, 0.01, &bad) != 0, x, 4);
+    }
+"""
+
+
+def test_what_is_refused_leaves_the_arguments_as_they_were(tmp_path: Path) -> None:
+    """1: D is not positive definite, 2: not finite; NULL is of <stdio.h>."""
+    title = kit("steppers", tmp_path)
+    methods = made("steppers").run.methods
+    steps = "".join(
+        STEP.replace("METHOD", m).replace("NAME_OK", f"{title.upper()}_OK") for m in methods
+    )
+    text = REFUSED.replace("STEPS", steps).replace("NAME", title)
+    (tmp_path / "refused.c").write_text(text, encoding="utf-8")
+    for at in (".", "fast"):
+        files = ["refused.c", f"{at}/{title}.c", "-lm", "-o", "refused"]
+        run("cc", "-std=c99", "-O1", f"-I{at}", *files, cwd=tmp_path)
+        told = run("./refused", cwd=tmp_path).splitlines()
+        assert told[:5] == ["speed 2 1", "slopes 2 1", "mass 1 1", "slopes 1 1", "nan 2 1"], at
+        expected = [line for m in methods for line in (f"{m} 1 1", f"{m} 0 1", f"{m} 1 1")]
+        assert told[5:] == expected, at
+
+
+# --- large systems --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["everything", "single", "driven"])
+def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Into static functions that hand values on in a struct; the self-test passes."""
+    monkeypatch.setattr(outline, "LARGE", 5)
+    monkeypatch.setattr(outline, "PIECE", 8)
+    small = eomc.sources(made(name))
+    title = small.name
+    for file in (f"{title}.h", f"{title}.c", "selftest.c"):
+        (tmp_path / file).write_text(small.files[file], encoding="utf-8")
+    text = small.files[f"{title}.c"]
+    assert f"{title}_acceleration_2(" in text
+    assert (f"{title}_slopes_2(" in text) == bool(made(name).run.linearize)
+    assert f"{title}_kinetic_energy_2(" in text
+    run(needs("gcc"), *STRICT, "-O1", "-I.", "-c", f"{title}.c", cwd=tmp_path)
+    run("cc", "-std=c99", "-I.", "selftest.c", f"{title}.c", "-lm", cwd=tmp_path)
+    assert run("./a.out", cwd=tmp_path) == f"{title}: right in 6 states\n"
+    fast, _ = both(name)
+    plain = eomc.load(made(name), tmp_path / "modules", form="plain")
+    for row in check(made(name), fast, plain=plain, states=3).rows:
+        assert row.passed or not row.name.startswith("plain C"), row
+
+
+@pytest.mark.slow
+def test_a_chain_of_thirty_links_by_columns(tmp_path: Path) -> None:
+    text = (SCENES / "chain.toml").read_text(encoding="utf-8")
+    text = text.replace("n = { value = 5,", "n = { value = 30,")
+    text = re.sub(r"^name *= .*", 'name = "plain_links"', text, count=1, flags=re.MULTILINE)
+    text = text.replace("[run]\n", "[run]\nlinearize = true\n")
+    links = system.from_scene(scene.parse(text, "plain_links.toml"))
+    fast, plain = (eomc.load(links, MODULES, form=form) for form in ("fast", "plain"))
+    source = eomc.sources(links).files["plain_links.c"]
+    assert "plain_links_D_column(" in source
+    q, qd = np.random.default_rng(3).standard_normal((2, len(links.q)))
+    for name, given in (("D", (q,)), ("C", (q, qd)), ("bias", (q, qd)), ("acceleration", (q, qd))):
+        one, other = (getattr(m, name)(*given) for m in (fast, plain))
+        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * np.max(np.abs(one)))
+    one, other = (m.linearize(q, qd)[0] for m in (fast, plain))
+    np.testing.assert_allclose(other, one, rtol=1e-7, atol=1e-9 * np.max(np.abs(one)))
+
+
+# --- how it is made -------------------------------------------------------------------------------
+
+VIEWS = [v for v in vars(views).values() if dataclasses.is_dataclass(v) and hasattr(v, "TEMPLATE")]
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_view_has_what_its_template_asks_for(view: Any) -> None:
+    source = resources.text("templates", f"{view.TEMPLATE}.jinja")
+    asked = jinja2.meta.find_undeclared_variables(render.environment().parse(source))
+    assert asked == {field.name for field in dataclasses.fields(view)}
+    assert view.__dataclass_params__.frozen
+
+
+def test_every_template_of_the_plain_form_has_a_view() -> None:
+    there = {p.name.removesuffix(".jinja") for p in (ROOT / "templates/c/plain").iterdir()}
+    assert {f"c/plain/{name}" for name in there} == {view.TEMPLATE for view in VIEWS}
+
+
+@pytest.mark.parametrize("module", ["functions", "steppers", "views"])
+def test_no_c_syntax_in_its_python(module: str) -> None:
+    """Semicolons, arrows, const: in c_function.py and c_expression.py alone."""
+    tree = ast.parse(
+        (ROOT / "generator/eomc/emit/plain" / f"{module}.py").read_text(encoding="utf-8")
+    )
+    prose = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))
+        and isinstance(node.body[0], ast.Expr)
+    }
+    texts = [
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose
+    ]
+    assert not [t for t in texts if re.search(r"->|\bconst\b|;$|\{$", t)]
+    assert [t for t in texts if ";" in t] in (
+        [],
+        2 * ["u: the inputs; NULL for the scene's signals."],
+    )
+
+
+def test_a_function_prints_itself() -> None:
+    given = (
+        c_function.filled("double", "x", "N"),
+        c_function.given("double", "y"),
+        CArgument("int", "n"),
+    )
+    f = CFunction(
+        "f", "void", given, (Block("", ("x[0] = n;",)),), frozenset("xn"), "static", ("x = n.",)
+    )
+    assert f.prototype == "static void f(double x[N], const double *y, int n)"
+    assert f.call(y="0", n="2*n") == "f(x, 0, 2*n)"
+    assert f.unused == ("y",)
+    assert f.definition == (
+        "/* x = n. */\nstatic void f(double x[N], const double *y, int n)\n{\n"
+        "    (void)y;\n\n    x[0] = n;\n}"
+    )
+    assert CFunction("g", "int", ()).prototype == "int g(void)"
+
+
+def test_long_lines_are_broken_and_comments_are_not() -> None:
+    call = "    *status = " + "long_name(" + ", ".join(f"argument_{k}" for k in range(12)) + ");"
+    text = c_function.laid_out(f"/* {'word ' * 30}*/\n{call}")
+    first, *rest = text.split("\n")
+    assert first == f"/* {'word ' * 30}*/"
+    assert len(rest) == 2 and all(len(line) <= 100 for line in rest)
+    assert rest[1].startswith("        argument_")
+
+
+def test_the_cart_pole_reads_at_a_sitting() -> None:
+    files = generated("cartpole").files
+    assert files["cartpole.c"].count("\n") < 260
+    assert files["cartpole.h"].count("\n") < 110
+    assert "__attribute__" not in files["cartpole.c"] and "#define" not in files["cartpole.c"]
+
+
+def test_a_plain_file_that_is_missing_is_built_again(tmp_path: Path, modules: Modules) -> None:
+    built = eomc.build(SCENES / "mass_spring.toml", tmp_path)
+    assert {"mass_spring.c", "fast/mass_spring.c"} <= {
+        str(p.relative_to(built.folder)) for p in built.folder.rglob("*.c")
+    }
+    assert not eomc.build(SCENES / "mass_spring.toml", tmp_path).fresh
+    for file in ("mass_spring.h", "fast/mass_spring.h"):
+        (built.folder / file).unlink()
+        assert eomc.build(SCENES / "mass_spring.toml", tmp_path).fresh
+        assert (built.folder / file).is_file()

@@ -1,0 +1,318 @@
+"""csrc/sincos.h, sincosf.h: error, special values, the same bits from scalar and vector code."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import math
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+from conftest import needs
+
+ROOT = Path(__file__).resolve().parents[2]
+LARGEST_ERROR = 1.6  # ulp
+
+
+def _benchmark() -> ModuleType:
+    """benchmarks/sincos.py, where the derivation and the harness are."""
+    path = ROOT / "benchmarks" / "sincos.py"
+    spec = importlib.util.spec_from_file_location("benchmark_sincos", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+bench = _benchmark()
+pytestmark = pytest.mark.skipif(shutil.which(bench.compiler()) is None, reason="no C compiler")
+
+
+@pytest.fixture(scope="module", params=["double", "float"])
+def of(request: pytest.FixtureRequest) -> Any:
+    """The precision, as the benchmark describes it."""
+    return {"double": bench.DOUBLE, "float": bench.SINGLE}[request.param]
+
+
+@pytest.fixture(scope="module")
+def made(of: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, ctypes.CDLL]:
+    return bench.builds(tmp_path_factory.mktemp("sincos"), of)
+
+
+@pytest.fixture(params=["vector", "vector, no FMA"])
+def library(request: pytest.FixtureRequest, made: dict[str, ctypes.CDLL]) -> ctypes.CDLL:
+    if request.param not in made:
+        pytest.skip(f"{bench.compiler()} does not build: {request.param}")
+    return made[request.param]
+
+
+def ulps(got: float, exact: mpmath.mpf, of: Any) -> float:
+    """|got - exact| in units of the last place of a number of exact's size."""
+    exponent = max(int(mpmath.frexp(exact)[1]) - of.bits, of.smallest)
+    return float(abs(mpmath.mpf(got) - exact) / mpmath.ldexp(1, exponent))
+
+
+def assert_accurate(library: ctypes.CDLL, x: np.ndarray, of: Any) -> None:
+    assert x.dtype == of.dtype
+    s, c = bench.sincos(library, "small", x)
+    with mpmath.workprec(200):
+        for argument, sine, cosine in zip(x.tolist(), s.tolist(), c.tolist(), strict=True):
+            exact_cosine, exact_sine = mpmath.cos_sin(mpmath.mpf(argument))
+            assert ulps(sine, exact_sine, of) <= LARGEST_ERROR, f"sin {argument!r}"
+            assert ulps(cosine, exact_cosine, of) <= LARGEST_ERROR, f"cos {argument!r}"
+
+
+def nearest_multiples(count: int, of: Any) -> list[int]:
+    """The n for which a number lies closest to n pi/2, measured in pi/2, from all up to the limit.
+
+    A number 2^e m is close to n pi/2 when m/n is close to 2^-e pi/2: a convergent of its
+    continued fraction.  Multiples k (m, n) of a convergent are the runners-up.
+    """
+    candidates: dict[int, mpmath.mpf] = {}
+    with mpmath.workprec(400):
+        for exponent in range(-of.bits, math.frexp(of.limit)[1] - of.bits + 1):
+            ratio = mpmath.ldexp(mpmath.pi / 2, -exponent)
+            whole = int(mpmath.floor(ratio))
+            rest = ratio - whole
+            before, n = 0, 1
+            while n <= of.last_multiple:
+                multiple = n * mpmath.pi / 2
+                if 1 <= mpmath.ldexp(multiple, 1 - of.bits - exponent) < 2:
+                    m = mpmath.nint(n * ratio)
+                    candidates[n] = abs(mpmath.ldexp(m, exponent) - multiple)
+                rest = 1 / rest
+                digit = int(mpmath.floor(rest))
+                rest -= digit
+                before, n = n, digit * n + before
+    return sorted(candidates, key=lambda n: candidates[n])[:count]
+
+
+@pytest.mark.parametrize(
+    ("precision", "sine", "cosine"), [("DOUBLE", "57.9", "63.9"), ("SINGLE", "27.9", "33.0")]
+)
+def test_header_has_the_derived_constants(precision: str, sine: str, cosine: str) -> None:
+    of = getattr(bench, precision)
+    text = of.header.read_text()
+    code = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    numbers = {float(x) for x in re.findall(r"(?<![\w.])\d+\.\d+(?:e-?\d+)?", code)}
+    told = re.sub(r"\s+\*?\s*", " ", text)
+    derived = bench.derive(of)
+    wanted = [float(2 / mpmath.pi), 1.5 * 2.0 ** (of.bits - 1), of.limit]
+    wanted += [part for parts in bench.parts_of_half_pi(of).values() for part in parts]
+    wanted += [abs(c) for polynomial in derived.values() for c in polynomial.coefficients]
+    assert {float(str(of.dtype(x))) for x in wanted} <= numbers
+    for name, letter, bits in (("sin", "p", sine), ("cos", "q", cosine)):
+        assert f"{-derived[name].log2_error:.1f}" == bits
+        assert f"2^-{bits} in the" in told
+        assert [float(str(of.dtype(c))) for c in derived[name].coefficients] == (
+            in_pairs(code, letter) if of is bench.DOUBLE else nested(code, letter)
+        )
+    assert f"|r| <= {of.radius}" in told
+    # the rounding of 2/pi, and of its product with x, moves r beyond pi/4 by no more than this
+    slack = abs(float(of.dtype(2 / math.pi)) - 2 / math.pi) * of.limit * math.pi / 2
+    slack += float(np.spacing(of.dtype(of.last_multiple))) / 2 * math.pi / 2
+    assert math.pi / 4 + slack < float(of.radius)
+
+
+def in_pairs(code: str, letter: str) -> list[float]:
+    """The coefficients where they are summed in pairs, from the lowest power up."""
+    pairs = re.findall(rf"{letter}(\d)\d = eomc_mul_add\(z, (\S+), (\S+)\);", code)
+    return [float(c) for _, second, first in sorted(pairs) for c in (first, second)]
+
+
+def nested(code: str, letter: str) -> list[float]:
+    """The coefficients of Horner's scheme, from the lowest power up."""
+    inner = re.search(rf"{letter}12 = eomc_mul_addf\(z, (\S+)f, (\S+)f\);", code)
+    outer = re.search(rf"{letter} = eomc_mul_addf\(z, {letter}12, (\S+)f\);", code)
+    assert inner is not None and outer is not None
+    return [float(outer[1]), float(inner[2]), float(inner[1])]
+
+
+def test_error_at_random_points(library: ctypes.CDLL, of: Any) -> None:
+    points = bench.random_points(1500, np.random.default_rng(2), of)
+    assert_accurate(library, np.concatenate(list(points.values())), of)
+
+
+def test_error_of_floats_at_large(tmp_path: Path) -> None:
+    """One in 307; `benchmarks/sincos.py --float` takes every one."""
+    bits = [int(np.float32(x).view(np.uint32)) for x in (bench.TINY, bench.SINGLE.limit)]
+    x = np.arange(bits[0], bits[1] + 1, 307, dtype=np.uint32).view(np.float32)
+    judge = bench.reference(tmp_path, bench.SINGLE)
+    for name, library in bench.builds(tmp_path, bench.SINGLE).items():
+        s, c = bench.sincos(library, "small", x)
+        worst = np.zeros(2)
+        arrays = (bench.pointer(y) for y in (s, c, worst))
+        judge.errors(ctypes.c_long(x.size), bench.pointer(x), ctypes.c_long(1), *arrays)
+        assert (worst > 1.3).all() and (worst <= LARGEST_ERROR).all(), (name, worst)
+
+
+def test_error_next_to_multiples_of_half_pi(library: ctypes.CDLL, of: Any) -> None:
+    hardest = nearest_multiples(40, of)
+    # 2^-60.3 and 2^-28.5 quadrants away: the closest of all
+    assert hardest[0] == (29 if of is bench.DOUBLE else 161)
+    some = np.random.default_rng(3).integers(1, of.last_multiple, 500).tolist()
+    last = [of.last_multiple - 1, of.last_multiple]
+    x = bench.neighbours_of_multiples([*hardest, *range(1, 100), *some, *last], of)
+    assert_accurate(library, np.concatenate([x, -x]), of)
+
+
+def test_error_between_quadrants(library: ctypes.CDLL, of: Any) -> None:
+    odd = (np.arange(1, 2000, 2) * (math.pi / 4)).astype(of.dtype)
+    ends = np.array([of.limit, -of.limit], of.dtype)
+    below, above = (np.nextafter(odd, of.dtype(x)) for x in (0.0, np.inf))
+    x = np.concatenate([odd, below, above])
+    assert_accurate(library, np.concatenate([x, -x, ends]), of)
+
+
+@pytest.mark.parametrize("function", ["small", "any"])
+def test_tiny_arguments_and_signed_zero(library: ctypes.CDLL, of: Any, function: str) -> None:
+    small = np.finfo(of.dtype)
+    # half the exponent of the smallest: its square is 0 or has few digits
+    tiny = [0.0, small.smallest_subnormal, 1000 * small.smallest_subnormal, small.tiny, 1e-20]
+    tiny = np.array([*tiny, 2.0 ** (of.smallest // 2)], of.dtype)
+    x = np.concatenate([tiny, -tiny])
+    s, c = bench.sincos(library, function, x)
+    assert s.tobytes() == x.tobytes()  # the sign of -0.0 as well
+    assert (c == 1.0).all()
+
+
+def test_libm_takes_over(library: ctypes.CDLL, of: Any) -> None:
+    beyond = float(np.nextafter(of.dtype(of.limit), of.dtype(np.inf)))
+    largest = float(np.finfo(of.dtype).max)
+    x = np.array([beyond, -beyond, 1e7, -1e22, largest], of.dtype)
+    x = np.concatenate([x, np.linspace(beyond, 2 * beyond, 1000, dtype=of.dtype)])
+    s, c = bench.sincos(library, "any", x)
+    if of is bench.DOUBLE:
+        assert s.tolist() == [math.sin(v) for v in x]
+        assert c.tolist() == [math.cos(v) for v in x]
+    else:  # Python has no sinf; C libraries' are good to 1 ulp
+        for got, exact in ((s, np.sin), (c, np.cos)):
+            error = np.abs(got - exact(x.astype(np.float64)))
+            assert (error <= np.spacing(np.abs(got))).all()
+    s, c = bench.sincos(library, "any", np.array([math.inf, -math.inf, math.nan], of.dtype))
+    assert np.isnan(s).all() and np.isnan(c).all()
+    inside = np.array([of.limit, -of.limit, 1.0], of.dtype)
+    assert_same_bits(bench.sincos(library, "any", inside), bench.sincos(library, "small", inside))
+
+
+def assert_same_bits(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> None:
+    for a, b in zip(one, other, strict=True):
+        assert a.dtype == b.dtype and a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("fma", ["", ", no FMA"])
+def test_vector_and_scalar_code_agree_bit_for_bit(
+    made: dict[str, ctypes.CDLL], of: Any, tmp_path: Path, fma: str
+) -> None:
+    if f"vector{fma}" not in made:
+        pytest.skip("the compiler does not take -mno-fma")
+    x = np.concatenate(list(bench.random_points(15_000, np.random.default_rng(4), of).values()))
+    expected = bench.sincos(made[f"vector{fma}"], "small", x)
+    assert_same_bits(expected, bench.sincos(made[f"scalar{fma}"], "small", x))
+    target = ["-march=native", *(bench.WITHOUT_FMA if fma else ())]
+    for optimisation in ("-O0", "-O2"):
+        for contraction in ("-ffp-contract=off", "-ffp-contract=fast"):
+            flags = [*target, optimisation, contraction, *of.flags]
+            plain = bench.build(bench.HARNESS, f"plain{optimisation}{contraction}", tmp_path, flags)
+            assert_same_bits(expected, bench.sincos(plain, "small", x))
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("fma", ["", ", no FMA"])
+def test_compilers_agree_bit_for_bit(
+    made: dict[str, ctypes.CDLL],
+    of: Any,
+    tmp_path: Path,
+    fma: str,
+    compiler: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if f"vector{fma}" not in made:
+        pytest.skip("the compiler does not take -mno-fma")
+    monkeypatch.setenv("CC", needs(compiler))
+    target = ["-march=native", *(bench.WITHOUT_FMA if fma else ())]
+    x = np.concatenate(list(bench.random_points(15_000, np.random.default_rng(5), of).values()))
+    expected = bench.sincos(made[f"vector{fma}"], "small", x)
+    for optimisation in ("-O0", "-O3"):
+        flags = [*target, optimisation, *of.flags]
+        other = bench.build(bench.HARNESS, compiler + optimisation, tmp_path, flags)
+        assert_same_bits(expected, bench.sincos(other, "small", x))
+
+
+def test_no_fma_means_none(made: dict[str, ctypes.CDLL]) -> None:
+    """Nor AVX-512's own, by which a compiler takes the other reduction of angles."""
+    if "vector, no FMA" not in made:
+        pytest.skip("the compiler does not take -mno-fma")
+    assert not made["vector, no FMA"].fast_fma() and not made["scalar, no FMA"].fast_fma()
+
+
+def test_gcc_vectorises(of: Any, tmp_path: Path) -> None:
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc")
+    source = tmp_path / "loop.c"
+    source.write_text(bench.HARNESS)
+    folder = of.header.parent
+    command = ["gcc", *bench.SPEED, *of.flags, "-fopt-info-vec-optimized", f"-I{folder}", "-c"]
+    done = subprocess.run(
+        [*command, str(source), "-o", str(tmp_path / "loop.o")],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    if "clang" not in subprocess.run(["gcc", "-v"], capture_output=True, text=True).stderr:
+        assert "loop vectorized" in done.stderr
+
+
+STRICT = (
+    *("-Wall", "-Wextra", "-Wpedantic", "-Wconversion"),
+    *("-Wdouble-promotion", "-Wshadow", "-Werror"),
+)
+
+
+@pytest.mark.parametrize(
+    "command", ["gcc -std=c99", "clang -std=c99", "g++ -std=c++11 -x c++", "clang++ -x c++"]
+)
+@pytest.mark.parametrize("target", [[], ["-march=native"]], ids=["baseline", "native"])
+def test_compiles_without_a_warning(
+    command: str, target: list[str], of: Any, tmp_path: Path
+) -> None:
+    name, *flags = command.split()
+    if shutil.which(name) is None:
+        pytest.skip(f"no {name}")
+    source = tmp_path / "use.c"
+    real = "float" if of.suffix else "double"
+    use = f"void use({real} x, {real} *s, {real} *c)"
+    body = f"{{ eomc_sincos{of.suffix}(x, s, c); }}"
+    source.write_text(f'#include "{of.header}"\n{use};\n{use} {body}\n')
+    out = ["-o", str(tmp_path / "use.o")]
+    done = subprocess.run(
+        [name, *flags, *STRICT, *target, "-O2", "-c", str(source), *out],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_prefix_can_be_replaced(of: Any, tmp_path: Path) -> None:
+    text = of.header.read_text().replace("eomc_", "cartpole_").replace("EOMC_", "CARTPOLE_")
+    real = "float" if of.suffix else "double"
+    call = f"{real} s, c; cartpole_sincos{of.suffix}(({real})x, &s, &c); return s + c;"
+    use = f"double f(double x) {{ {call} }}\n"
+    library = bench.build(text + use, "cartpole", tmp_path, ["-std=c99", *STRICT[:3]])
+    library.f.restype = ctypes.c_double
+    assert library.f(ctypes.c_double(0.0)) == 1.0
+
+
+def test_fast_math_is_refused(of: Any, tmp_path: Path) -> None:
+    with pytest.raises(subprocess.CalledProcessError) as failure:
+        bench.build(bench.HARNESS, "fast", tmp_path, ["-ffast-math", *of.flags])
+    assert "breaks the argument reduction" in failure.value.stderr

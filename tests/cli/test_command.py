@@ -1,0 +1,170 @@
+"""The command as a user calls it: what it prints, and its exit status."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy
+from click.testing import CliRunner, Result
+
+from eomc.cli.main import main
+
+SCENES = Path(__file__).parents[2] / "scenes"
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty directory with two scenes, in which the command is run."""
+    for name in ("cartpole", "kapitza_pendulum"):
+        shutil.copy(SCENES / f"{name}.toml", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def eomc(*words: str) -> Result:
+    return CliRunner().invoke(main, words)
+
+
+def test_a_new_scene_runs_as_it_is_written(here: Path) -> None:
+    assert eomc("new", "crane").exit_code == 0
+    ran = eomc("run", "crane.toml", "--out", "run.csv", "--plot", "run.png")
+    assert ran.exit_code == 0, ran.output
+    assert "error at the end about" in ran.output and "steps a second" in ran.output
+    rows = np.genfromtxt("run.csv", delimiter=",", names=True)
+    assert rows.dtype.names == ("t", "theta", "theta_dot", "energy") and len(rows) == 2001
+    assert (here / "run.png").read_bytes().startswith(b"\x89PNG")
+    again = eomc("new", "crane")
+    assert again.exit_code == 2 and "is there already" in again.output
+
+
+def test_build_check_and_list(here: Path) -> None:
+    assert "built in" in eomc("build", "cartpole.toml").output
+    assert "up to date" in eomc("build", "cartpole.toml").output
+    checked = eomc("check", "cartpole.toml", "--json")
+    assert checked.exit_code == 0 and json.loads(checked.output)[0]["passed"] is True
+    rows = {row["name"]: row["built"] for row in json.loads(eomc("list", "--json").output)}
+    assert rows == {"cartpole": True, "kapitza_pendulum": False}
+    scene = here / "cartpole.toml"
+    scene.write_text(scene.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
+    assert not json.loads(eomc("list", "--json").output)[0]["built"]
+
+
+def test_parameters_and_start_on_the_command_line(here: Path) -> None:
+    words = ["--set", "m_c=1+2", "--start", "theta=pi/3", "--start", "x_dot=-l", "--json"]
+    told = json.loads(eomc("run", "cartpole.toml", "--duration", "0", *words).output)
+    assert told["q"] == {"x": 0.0, "theta": pytest.approx(np.pi / 3)}
+    assert told["qd"] == {"x": -2.0, "theta": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "cartpole.toml", "--set", "mc=3"], "did you mean 'm_c'?"),
+        (["run", "cartpole.toml", "--set", "m_c"], "write --set NAME=VALUE"),
+        (["run", "cartpole_bodies.toml", "--set", "m_p=-1"], "body.pole.mass: is -1 kg"),
+        (["run", "cartpole.toml", "--start", "theta=1/0"], "divides by zero"),
+        (["run", "cartpole.toml", "--h", "0"], "h: 0 is not a step size"),
+        (["run", "cartpole.toml", "--method", "dp8"], "which has rk4"),
+        (["run", "cartpole.toml", "--out", "run.dat"], ".csv or .npz"),
+        (["build", "cartpol.toml"], "did you mean 'cartpole.toml'?"),
+        (["build", "cartpole.toml", "--build", "cartpole.toml/x"], "can't be written"),
+        (["new", "class"], "Python keyword"),
+        (["list", "nowhere"], "is not a folder"),
+    ],
+)
+def test_bad_input_is_status_2_and_says_what_to_do(here: Path, words: list[str], said: str) -> None:
+    shutil.copy(SCENES / "cartpole_bodies.toml", here)
+    done = eomc(*words)
+    assert done.exit_code == 2, done.output
+    assert said in done.output
+
+
+def test_two_scenes_of_one_name_do_not_replace_each_other(here: Path) -> None:
+    shutil.copy("cartpole.toml", "copy.toml")
+    done = eomc("build", "cartpole.toml", "copy.toml")
+    assert done.exit_code == 2 and "both named 'cartpole'" in done.output
+    assert not (here / "build").exists()
+
+
+def test_a_run_that_cannot_go_on_is_status_1(here: Path) -> None:
+    done = eomc("run", "cartpole.toml", "--h", "3", "--duration", "30")
+    assert done.exit_code == 1 and "would no longer be finite" in done.output
+
+
+def test_show(here: Path) -> None:
+    text = eomc("show", "kapitza_pendulum.toml").output
+    assert "mass matrix" in text and "Jacobi integral" in text
+    assert r"\begin{align*}" in eomc("show", "cartpole.toml", "--latex").output
+    space: dict[str, object] = {}
+    exec(eomc("show", "cartpole.toml", "--python").output, space)  # it is Python
+    assert str(space["D"]).count("m_p") >= 3
+    assert "1 division, 1 sincos" in eomc("show", "cartpole.toml", "--cost").output
+
+
+def test_fractions_stay_exact_in_python(here: Path) -> None:
+    """What would be divided by Python itself: a number of a sum, an exponent."""
+    text = (here / "cartpole.toml").read_text(encoding="utf-8")
+    text = text.replace('kinetic   = "', 'kinetic   = "x_dot**2/20 + ')
+    text = text.replace('potential = "', 'potential = "m_p*(1 + x**2)**(3/10) + ')
+    (here / "odd.toml").write_text(text, encoding="utf-8")
+    space: dict[str, Any] = {}
+    exec(eomc("show", "odd.toml", "--python").output, space)
+    assert not any(x.has(sympy.Float) for x in (space["D"], space["g_"], space["potential"]))
+    assert space["D"][0].subs({space["m_c"]: 0, space["m_p"]: 0}) == sympy.Rational(1, 10)
+
+
+SLANTED = """
+eomc = 1
+name = "slanted"
+gravity = [0, 0, -9.81]
+[coordinates]
+q = {}
+[parameters]
+m = 1
+[[body]]
+name = "flap"
+joint = "revolute"
+coordinates = "q"
+axis = [1, 2, 3]
+mass = "m"
+center = [0.1, 0.2, -0.1]
+inertia = [0.1, 0.2, 0.3]
+"""
+
+
+def test_fractions_of_slanted_axes_are_shown_as_decimals(here: Path) -> None:
+    """D = n.J n + m |n x c|^2 with n = (1, 2, 3)/sqrt(14), which has no short fraction."""
+    (here / "slanted.toml").write_text(SLANTED, encoding="utf-8")
+    for form in ([], ["--latex"], ["--python"]):
+        text = eomc("show", "slanted.toml", *form).output
+        assert "mass matrix" in text or form
+        assert not re.search(r"\d{18}", text), text
+    space: dict[str, Any] = {}
+    exec(text, space)
+    n, c = np.array([1, 2, 3]) / np.sqrt(14), np.array([0.1, 0.2, -0.1])
+    right = n**2 @ [0.1, 0.2, 0.3] + 2 * np.sum(np.cross(n, c) ** 2)
+    assert float(space["D"][0].subs(space["m"], 2)) == pytest.approx(right, rel=1e-13)  # 15 digits
+
+
+@pytest.mark.parametrize("command", ["new", "build", "check", "run", "show", "list"])
+def test_help_has_an_example(command: str) -> None:
+    assert f"eomc {command}" in eomc(command, "--help").output
+
+
+def test_a_name_without_its_file_is_answered_by_the_file(here: Path) -> None:
+    done = eomc("run", "cartpole")
+    assert done.exit_code == 2
+    assert "cartpole: there is no such file; did you mean 'cartpole.toml'?" in done.output
+
+
+def test_a_folder_that_is_none_is_answered_with_the_option(here: Path) -> None:
+    (here / "file").write_text("", encoding="utf-8")
+    done = eomc("build", "cartpole.toml", "--build", "file")
+    assert done.exit_code == 2
+    assert "choose another place with --build DIR" in done.output and "root=" not in done.output

@@ -1,0 +1,146 @@
+"""No command line ends in a traceback, wherever its output goes and whatever its numbers are."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cases import SCENES
+from click.testing import CliRunner, Result
+
+from eomc.cli.main import main
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty directory with a scene, in which the command is run."""
+    shutil.copy(SCENES / "simple_pendulum.toml", tmp_path / "p.toml")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
+    return tmp_path
+
+
+def eomc(*words: str) -> Result:
+    return CliRunner().invoke(main, words)
+
+
+def shell(line: str) -> subprocess.CompletedProcess[str]:
+    """A line of a shell, in which `eomc` is the command."""
+    command = f'eomc() {{ "{sys.executable}" -m eomc.cli "$@"; }}; {line}'
+    return subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["run", "p.toml", "--h", "1e-300", "--duration", "1e300"],
+            "take a larger h, or a shorter",
+        ),
+        (["run", "p.toml", "--h", "-1"], "h: -1 is not a step size"),
+        (["run", "p.toml", "--h", "nan"], "h: nan is not a finite number"),
+        (["run", "p.toml", "--duration", "-3"], "duration: -3.0 is not a time"),
+        (["check", "p.toml", "--seed", "-5"], "-5 is not in the range x>=0"),
+    ],
+)
+def test_numbers_that_make_no_run(here: Path, words: list[str], said: str) -> None:
+    done = eomc(*words)
+    assert (done.exit_code, said in done.output) == (2, True), done.output
+
+
+def test_fewer_rows_than_one_in_all_steps(here: Path) -> None:
+    done = eomc("run", "p.toml", "--every", "9" * 20, "--duration", "0.1", "--out", "run.csv")
+    assert done.exit_code == 0, done.output
+    assert len((here / "run.csv").read_text().splitlines()) == 3  # names, start and end
+
+
+@pytest.mark.parametrize("number", ["0x" + "f" * 6000, "9" * 6000, "9" * 400, "-0b" + "1" * 1100])
+@pytest.mark.parametrize("key", ["eomc  =", "start =", "m = { value =", "h        =", "batch ="])
+def test_huge_whole_numbers(here: Path, number: str, key: str) -> None:
+    text = (here / "p.toml").read_text(encoding="utf-8").replace("[run]\n", "[run]\nbatch = 1\n")
+    old = next(line for line in text.splitlines() if key in line)
+    start = old.index(key) + len(key)
+    new = old[:start] + " " + number.replace("-0b", "0b") + (" }" if "{" in old else "")
+    (here / "p.toml").write_text(text.replace(old, new), encoding="utf-8")
+    done = eomc("build", "p.toml")
+    assert done.exit_code == 2 and "a number has hundreds of digits" in done.output, done.output
+
+
+@pytest.mark.parametrize(
+    "value", ["[" * 20_000 + "]" * 20_000, "{a=" * 20_000 + "1" + "}" * 20_000]
+)
+def test_deep_nesting(here: Path, value: str) -> None:
+    with (here / "p.toml").open("a", encoding="utf-8") as file:
+        file.write(f"x = {value}\n")
+    done = eomc("build", "p.toml")
+    assert done.exit_code == 2 and "nested too deeply" in done.output
+    assert eomc("list").exit_code == 0
+
+
+def test_list_takes_whatever_calls_itself_a_scene(here: Path) -> None:
+    text = 'eomc = 1\nname = "odd"\ncoordinates = 3\ninputs = [1]\n'
+    (here / "odd.toml").write_text(text, encoding="utf-8")
+    done = eomc("list")
+    assert done.exit_code == 0 and "odd.toml" in done.output, done.output
+
+
+@pytest.mark.slow
+def test_a_full_output(here: Path) -> None:
+    """Every command that prints; in processes of their own, whose end would fail once more."""
+    assert eomc("build", "p.toml").exit_code == 0
+    shutil.copy(SCENES / "cartpole_bodies.toml", here / "b.toml")
+    for words in (
+        "--help", "--version", "run --help", "list", "list --json", "new a", "dof b.toml",
+        "dof b.toml --json", "show p.toml", "show p.toml --latex", "show p.toml --python",
+        "show p.toml --cost", "build p.toml", "build p.toml --json", "run p.toml",
+        "run p.toml --json", "check p.toml", "check p.toml --json",
+    ):  # fmt: skip
+        done = shell(f"eomc {words} >/dev/full")
+        assert done.returncode == 2, words
+        said = "eomc: the output: can't be written (No space left on device)\n"
+        assert done.stderr == said, (words, done.stderr)
+        assert shell(f"eomc {words} >/dev/full 2>/dev/full").returncode == 2, words
+
+
+@pytest.mark.slow
+def test_a_full_device_for_files(here: Path) -> None:
+    for name in ("f.csv", "f.npz", "f.png", "f.svg"):
+        (here / name).symlink_to("/dev/full")
+        option = "--plot" if name > "f.o" else "--out"
+        done = shell(f"eomc run p.toml {option} {name}")
+        assert done.returncode == 2, done.stderr
+        assert done.stderr == f"eomc: {name}: can't be written (No space left on device)\n"
+    done = shell("ulimit -f 0; eomc new b")
+    assert done.returncode == 2 and not (here / "b.toml").exists(), done.stderr
+    done = shell("ulimit -f 0; eomc build p.toml --build other")
+    assert done.returncode == 2 and "other" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_an_output_that_is_closed(here: Path) -> None:
+    assert eomc("build", "p.toml").exit_code == 0
+    for line, status in {
+        "eomc show p.toml >&-": 0,
+        "eomc show p.toml 2>&-": 0,
+        "eomc run p.toml <&- >&- 2>&-": 0,
+        "eomc build nowhere.toml 2>&-": 2,
+        "eomc build nowhere.toml 2>/dev/full": 2,
+        "eomc check p.toml | head -1": 0,
+        "eomc show p.toml | true": 0,
+    }.items():
+        done = shell(line)
+        assert (done.returncode, done.stderr) == (status, ""), (line, done.stderr)
+
+
+@pytest.mark.slow
+def test_letters_that_the_output_has_not(here: Path) -> None:
+    """In Latin-1, and of a file whose name is no text."""
+    shutil.copy("p.toml", os.fsdecode(b"\xff.toml"))
+    done = shell("PYTHONIOENCODING=latin-1 eomc show p.toml")
+    assert "Traceback" not in done.stderr and "\\u03b8" in done.stdout, done.stderr
+    done = shell(os.fsdecode(b"eomc build \xfe.toml; unset HOME; eomc run \xff.toml --plot x.png"))
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr

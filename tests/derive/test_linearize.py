@@ -1,0 +1,132 @@
+"""The exact derivatives of the accelerations against differences of the accelerations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from cases import SCENES, variant
+from conftest import MODULES
+
+import eomc
+
+
+def linearization(m: ModuleType, q: Any, qd: Any, t: float = 0.0, u: Any = None) -> list[Any]:
+    """[A_q, A_qd, B] of one state by the C function."""
+    model: Any = m._model
+    n, nu = len(m.coordinates), len(m.inputs)
+    made = [np.full((n, k), np.nan, m.dtype) for k in (n, n, nu)]
+    status = model._ffi.new("int *")
+    held = None if u is None else np.ascontiguousarray(u, m.dtype)
+    given = [np.ascontiguousarray(x, m.dtype) for x in (q, qd)]
+    done = model._lib.linearization(
+        1, *map(model._pointer, made), *map(model._pointer, given), t, model._pointer(held),
+        model._pointer(model._p0), status,
+    )  # fmt: skip
+    assert done == 1 - (status[0] != 0)
+    if status[0]:
+        raise ValueError(status[0])
+    return made
+
+
+def differences(m: ModuleType, q: Any, qd: Any, t: float, u: Any) -> list[Any]:
+    """The same by central differences of order 8: good to 1e-10 of a column or so."""
+    stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+    width = 4e-3
+
+    def column(which: int, i: int) -> Any:
+        def at(k: int) -> Any:
+            x = [np.array(q, float), np.array(qd, float), np.array(u, float)]
+            x[which][i] += k * width
+            return m.acceleration(x[0], x[1], t, x[2] if len(u) else None)
+
+        return sum(w * (at(k) - at(-k)) for k, w in stencil) / width
+
+    n = len(q)
+    sizes = (n, n, len(u))
+    return [
+        np.array([column(which, i) for i in range(k)]).T.reshape(n, k)
+        for which, k in enumerate(sizes)
+    ]
+
+
+@pytest.mark.parametrize(
+    "scene",
+    ["cartpole_driven", "kapitza_pendulum", "chain", "tumbling_box", "suspension", "acrobot"],
+)
+def test_against_differences(scene: str) -> None:
+    m = eomc.load(variant(scene, f"lin_{scene}", linearize="true"), MODULES)
+    rng = np.random.default_rng(3)
+    q0, qd0 = m.start
+    nu = len(m.inputs)
+    for _ in range(4):
+        q = q0 + 0.2 * rng.standard_normal(q0.shape)
+        qd = qd0 + 0.3 * rng.standard_normal(q0.shape)
+        u, t = rng.standard_normal(nu), 0.37
+        exact, near = linearization(m, q, qd, t, u), differences(m, q, qd, t, u)
+        for one, other in zip(exact, near, strict=True):
+            size = np.max(np.abs(other), initial=1.0)
+            assert np.max(np.abs(one - other), initial=0.0) < 1e-7 * size
+    if nu:
+        u = m.signal(q, qd, 0.37)
+        for one, other in zip(
+            linearization(m, q, qd, 0.37), linearization(m, q, qd, 0.37, u), strict=True
+        ):
+            assert np.array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_a_long_chain_goes_column_by_column() -> None:
+    path = variant("chain", "lin_long", method='["rk4", "dp8", "gauss8"]')
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("n = { value = 5,", "n = { value = 9,"), encoding="utf-8")
+    m = eomc.load(path, MODULES)
+    source = (MODULES / "lin_long" / "fast" / "lin_long.c").read_text(encoding="utf-8")
+    assert "lin_long_slopes_column" in source
+    q, qd = m.start
+    exact, near = linearization(m, q, qd + 0.3), differences(m, q, qd + 0.3, 0.0, [])
+    for one, other in zip(exact, near, strict=True):
+        assert np.max(np.abs(one - other), initial=0.0) < 1e-7 * np.max(np.abs(other), initial=1.0)
+    ends = [m.simulate(h=0.01, duration=0.5, method=name).q[-1] for name in ("dp8", "gauss8")]
+    assert np.max(np.abs(ends[0] - ends[1])) < 1e-9
+
+
+def test_nothing_is_emitted_unless_asked_for() -> None:
+    files = eomc.sources(eomc.read(SCENES / "cartpole.toml")).files
+    assert "slopes" not in files["cartpole.c"] and "linearization" not in files["cartpole.h"]
+
+
+def test_jumping_forces_are_refused() -> None:
+    path = variant("mass_spring", "lin_jump", linearize="true")
+    text = path.read_text(encoding="utf-8")
+    q = next(iter(eomc.read(path).coordinates)).name
+    path.write_text(f'{text}\n[forces]\n{q} = "-sign({q}_dot)"\n', encoding="utf-8")
+    with pytest.raises(eomc.SceneError, match="accelerations jump"):
+        eomc.sources(eomc.read(path))
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cartpole_driven", "heavy_top", "chain"])
+def test_derivatives_by_parameters(name: str, tmp_path: Path) -> None:
+    """Against central differences, whose own error is that of h^2 and of rounding over h."""
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    head, _, tail = text.partition("[run]\n")
+    path = tmp_path / f"{name}.toml"
+    path.write_text(f'{head}[run]\nlinearize = "parameters"\n{tail}', encoding="utf-8")
+    m = eomc.load(path, tmp_path)
+    random = np.random.default_rng(3)
+    q, qd = random.uniform(0.3, 1.0, (2, len(m.coordinates)))
+    u = random.standard_normal(len(m.inputs)) if m.inputs else None
+    E = m.sensitivity(q, qd, u)
+    assert E.shape == (len(q), len(m.parameters))
+    for k, (p, value) in enumerate(m.defaults.items()):
+        by = 1e-5 * max(1.0, abs(value))
+        up, down = (m.acceleration(q, qd, u=u, params={p: value + s * by}) for s in (1, -1))
+        size = max(1.0, np.abs(E).max())
+        np.testing.assert_allclose(E[:, k], (up - down) / (2 * by), rtol=1e-6, atol=1e-7 * size)
+    assert np.abs(E).max() > 0
+    plain = eomc.load(SCENES / f"{name}.toml", tmp_path / "plain")
+    with pytest.raises(ValueError, match='linearize = "parameters"'):
+        plain.sensitivity(q, qd, u)

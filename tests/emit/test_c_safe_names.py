@@ -1,0 +1,211 @@
+"""No name that the reader accepts breaks the C: neither a header's macros nor our own names.
+
+The macros are those of the compiler that runs the tests, for the headers that the generated files,
+cffi's binding and Python.h include, in the dialects that they are compiled as.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sysconfig
+from functools import cache
+from pathlib import Path
+
+import cffi
+import pytest
+from conftest import needs
+
+import eomc
+from eomc.base import names
+from eomc.emit import c_safe_names
+from eomc.model import system
+from eomc.scene import scene
+
+MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
+INCLUDE = f"-I{sysconfig.get_path('include')}"
+OUTSIDE = "#include <math.h>\n#include <stdio.h>\n#include <stddef.h>\n"
+
+
+def dumped(mode: str, text: str) -> set[str]:
+    """The macros that a text defines, those without arguments."""
+    command = [needs("cc"), *mode.split(), INCLUDE, "-dM", "-E", "-"]
+    done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+    return set(re.findall(r"^#define (\w+)(?!\S)", done.stdout, re.MULTILINE))
+
+
+@cache
+def macros() -> frozenset[str]:
+    """All macros that generated text may meet."""
+    ffi = cffi.FFI()
+    ffi.cdef("int nothing(void);")
+    ffi.set_source("binding", OUTSIDE, compiler_verbose=0)
+    target = Path(__file__).parents[2] / "build" / "tests" / "macros.c"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    ffi.emit_c_code(str(target))
+    binding = target.read_text(encoding="utf-8")
+    found = {m for mode in MODES for m in dumped(mode, OUTSIDE)}
+    return frozenset(found | {m for mode in MODES[:1] for m in dumped(mode, binding)})
+
+
+def test_the_compiler_has_told_its_macros() -> None:
+    assert len(macros()) > 1000
+    assert {"NAN", "EOF", "errno", "M_PI", "CHAR_BIT", "Py_None", "stdout"} <= macros()
+
+
+def test_no_name_of_a_scene_is_a_macro_in_c() -> None:
+    accepted = {m for m in macros() if not names.fault(m)}
+    assert len(accepted) > 1000
+    used = {m: c_safe_names.in_c(m, "scene") for m in accepted}
+    assert {m for m, c in used.items() if c in macros()} == set()
+    # and what is made of names
+    made = ("sin_{}", "cos_{}", "{}_dot", "{}_ddot", "d_{}", "D_{}", "inv_d_{}", "l_{}_{}")
+    derived = {m.format(c, c) for m in made for c in used.values()}
+    assert derived & macros() == set()
+
+
+def test_no_enumerator_is_a_macro() -> None:
+    """Every macro cut at every underscore: a scene and a coordinate of it."""
+    for macro in sorted(macros()):
+        for cut in [m.start() for m in re.finditer("_", macro)]:
+            name, coordinate = macro[:cut].lower(), macro[cut + 1 :].lower()
+            if macro.upper() != macro or names.fault(coordinate) or names.module_fault(name):
+                continue
+            assert c_safe_names.may_be_enumerator_of_others(macro), macro
+
+
+def made(text: str) -> dict[str, str]:
+    return dict(eomc.sources(system.from_scene(scene.parse(text, "names.toml"))).files)
+
+
+def whole(name: str, real: str = "double") -> str:
+    """A scene with all that gives names to C: batches, slopes, implicit methods, angles."""
+    return f"""eomc = 1
+name = "{name}"
+[coordinates]
+x = {{ start = 0.1 }}
+theta = {{ start = 0.2 }}
+[parameters]
+m = 1.5
+[inputs]
+push = {{ signal = "sin(t)*x" }}
+[definitions]
+y = "x*cos(theta) + m*t"
+[energy]
+kinetic = "m*(x_dot**2 + dot(y)**2 + (2 + cos(2*theta))*theta_dot**2)/2"
+potential = "m*x**2/2 + sin(theta)*y"
+[forces]
+x = "push"
+[run]
+real = "{real}"
+method = ["rk4", "dp8"]
+batch = true
+linearize = "parameters"
+"""
+
+
+def identifiers(text: str) -> set[str]:
+    text = re.sub(r"/\*.*?\*/|\"[^\"\n]*\"", " ", text, flags=re.DOTALL)
+    return set(re.findall(r"[A-Za-z_]\w*", text))
+
+
+def single(name: str) -> str:
+    """A scene of one trajectory with every implicit method."""
+    return (
+        whole(name).replace('["rk4", "dp8"]', '["rk4", "gauss8", "gauss16"]')
+        .replace("batch = true\n", "")
+    )  # fmt: skip
+
+
+def test_no_function_or_macro_of_a_scene_is_one_of_the_library() -> None:
+    """What follows a scene's name in files: a scene that it makes a macro of is refused."""
+    behind = set()
+    for text in (whole("scene"), whole("scene", "float"), single("scene")):
+        for file, content in made(text).items():
+            if file.endswith((".c", ".h")):
+                behind |= {i[5:] for i in identifiers(content) if i.lower().startswith("scene_")}
+    coordinates = {f"_{c}" for c in ("X", "THETA", "PUSH")}
+    assert {"_params", "_C", "_OK", "_NQ", "_H"} <= behind
+    for end in behind - coordinates:
+        for macro in macros():
+            if macro.endswith(end) and macro != end:
+                assert names.module_fault(macro[: -len(end)]), macro
+
+
+def compiled(folder: Path, name: str, *flags: str) -> None:
+    binding = f'#include <Python.h>\n#include "{name}.h"\n'
+    (folder / "binding_.c").write_text(binding, encoding="utf-8")
+    for mode, file in (("-std=gnu99", f"{name}.c"), ("-std=gnu99", "binding_.c"),
+                       ("-xc++", "binding_.c")):  # fmt: skip
+        done = subprocess.run(
+            [needs("cc"), *mode.split(), INCLUDE, *flags, "-fsyntax-only", file],
+            cwd=folder, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr[:3000]
+
+
+ROLES = ("coordinates", "parameters", "inputs", "definitions")
+
+
+def of_names(role: str, given: list[str], run: str) -> str:
+    """A scene in which the names have one role, each used in an angle and in a product."""
+    tables = dict.fromkeys(ROLES, "")
+    value = {"parameters": "1.5", "definitions": '"sin(zzz)*zzz"'}.get(role, "{}")
+    tables[role] = "".join(f"{n} = {value}\n" for n in given)
+    tables["coordinates"] += "zzz = {}\n"
+    total = " + ".join(f"({n}*zzz + sin({n})*{n})" for n in given)
+    moved = [*given, "zzz"] if role == "coordinates" else ["zzz"]
+    kinetic = " + ".join(f"{n}_dot**2*(2 + cos({n}))" for n in moved)
+    energy = f'kinetic = "{kinetic}"\npotential = "{"zzz**2" if role == "inputs" else total}"\n'
+    forces = f'zzz = "{total}"\n' if role == "inputs" else ""
+    text = "".join(f"[{r}]\n{t}" for r, t in tables.items())
+    return f'eomc = 1\nname = "scene"\n{text}[energy]\n{energy}[forces]\n{forces}[run]\n{run}\n'
+
+
+@cache
+def ours() -> frozenset[str]:
+    """Every identifier of generated text that could be a name of a scene."""
+    found: set[str] = set()
+    for text in (whole("scene"), whole("scene", "float"), single("scene")):
+        for file, content in made(text).items():
+            if file.endswith((".c", ".h")):
+                found |= identifiers(content)
+    gone = {"x", "theta", "zzz", "y", "m", "push"}
+    return frozenset(n for n in found if not names.fault(n) and not n.endswith("_dot")) - gone
+
+
+RUNS = {
+    "batch": 'batch = true\nmethod = ["rk4", "dp8"]\nlinearize = "parameters"',
+    "implicit": 'method = ["rk4", "gauss8", "gauss16"]\nlinearize = "parameters"',
+    "float": 'batch = true\nreal = "float"\nlinearize = "parameters"',
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("role", ROLES)
+def test_names_of_our_own_do_not_collide(role: str, run: str, tmp_path: Path) -> None:
+    """As coordinates, parameters, inputs and definitions; -Wshadow finds what hides another."""
+    every = sorted(ours())
+    assert len(every) > 100
+    step = 6 if role in ("coordinates", "inputs") else 30
+    for first in range(0, len(every), step):
+        for file, content in made(of_names(role, every[first : first + step], RUNS[run])).items():
+            (tmp_path / file).write_text(content, encoding="utf-8")
+        compiled(tmp_path, "scene", "-Werror=shadow")
+
+
+SOME = "NAN INFINITY HUGE_VAL EOF errno NULL M_PI FP_NAN CHAR_BIT LONG_MAX EIO stdin linux".split()
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_macros_as_names_compile(role: str, tmp_path: Path) -> None:
+    given = [n for n in SOME if not names.fault(n)]
+    assert len(given) >= 11
+    for file, content in made(of_names(role, given[:4], RUNS["batch"])).items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    for file, content in made(of_names(role, given[4:8], RUNS["implicit"])).items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+        if file == "scene.h" and role != "definitions":
+            assert f"{given[4]} is {given[4]}_" in content
+    compiled(tmp_path, "scene")

@@ -1,0 +1,374 @@
+"""Sines that are turned from stage to stage, sums that are compensated, runs that are cut."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from types import ModuleType
+
+import mpmath
+import numpy as np
+import pytest
+from cases import SCENES, fast_kit
+from conftest import MODULES, ROOT, needs
+from sympy import Rational, S
+
+import eomc
+from eomc.derive import lagrange
+from eomc.integrators.tableaux import METHODS
+from eomc.model import system
+from eomc.program import program
+from eomc.program.trig import apart
+from eomc.scene import scene
+
+ODD = """
+eomc = 1
+name = "odd"
+[coordinates]
+a = { start = 0.4 }
+b = { start = -0.7 }
+[parameters]
+phase = 0.3
+[energy]
+kinetic = "a_dot**2/2 + b_dot**2/2 + a_dot*b_dot*cos(a - b)/3"
+potential = "cos(2*a) + sin(b + 1/2) + cos(a + phase)/2 + sin(a*b)/4 + cos(a - b)/5"
+"""
+
+
+def odd() -> program.Program:
+    return program.build(lagrange.derive(system.from_scene(scene.parse(ODD, "odd.toml"))))
+
+
+def stepped(module: ModuleType, h: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """RK4 as a textbook has it, over the module's accelerations."""
+    q, v = module.start
+    a = module.acceleration
+    for _ in range(steps):
+        k1, w1 = v, a(q, v)
+        k2, w2 = v + h / 2 * w1, a(q + h / 2 * k1, v + h / 2 * w1)
+        k3, w3 = v + h / 2 * w2, a(q + h / 2 * k2, v + h / 2 * w2)
+        k4, w4 = v + h * w3, a(q + h * k3, v + h * w3)
+        q, v = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), v + h / 6 * (w1 + 2 * w2 + 2 * w3 + w4)
+    return q, v
+
+
+def test_angles_that_are_linear_in_coordinates_are_found() -> None:
+    made = odd()
+    angles, rest = apart(made["acceleration"], ["a", "b"])
+    found = {(frozenset(angle.terms), angle.offset) for angle in angles}
+    half = Rational(1, 2)
+    one, two = S.One, S(2)
+    differences = [frozenset({(one, "a"), (-one, "b")}), frozenset({(-one, "a"), (one, "b")})]
+    assert (frozenset({(two, "a")}), S.Zero) in found
+    assert (frozenset({(one, "b")}), half) in found
+    assert any((d, S.Zero) in found for d in differences)
+    assert len(found) == 3  # a + phase and a*b are computed where they are needed
+    assert {name for a in angles for name in (a.sine, a.cosine)} & rest.uses
+    names = {a.name for a in rest.body}
+    assert not names & {name for a in angles for name in (a.sine, a.cosine)}
+
+
+@pytest.mark.parametrize("h", [0.001, 0.02, 0.3])
+def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path) -> None:
+    """Turns of some 1e-6, 1e-4 and, beyond what is turned, 1e-1."""
+    (tmp_path / "odd.toml").write_text(ODD, encoding="utf-8")
+    links = range(1, 7)
+    coordinates = "".join(f"a{k} = {{ start = {0.3 * k} }}\n" for k in links)
+    energy = " + ".join(f"{k}*a{k}_dot**2/2" for k in links)
+    springs = " + ".join(f"cos(a{k} - a{k + 1})" for k in links[:-1])
+    many = f'eomc = 1\nname = "many"\n[coordinates]\n{coordinates}[energy]\n'
+    many += f'kinetic = "{energy} + a1_dot*a2_dot*sin(a1)/5"\npotential = "{springs}"\n'
+    (tmp_path / "many.toml").write_text(many, encoding="utf-8")
+    own = (tmp_path / "odd.toml", tmp_path / "many.toml")
+    for path in (*own, SCENES / "cartpole.toml", SCENES / "double_pendulum.toml"):
+        module = eomc.load(path, tmp_path)
+        run = module.simulate(h=h, steps=20)
+        for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, 20), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_steps_leave_what_was_foretold_and_come_back(tmp_path: Path) -> None:
+    """A pole that falls: it turns by h^2 a/8 from the angles foretold, up to 2^-12.5 is near."""
+    h, steps = 0.016, 800
+    module = eomc.load(SCENES / "cartpole.toml", tmp_path)
+    run = module.simulate(h=h, steps=steps)
+    turns = h**2 / 8 * np.abs(module.acceleration(run.q, run.qd)[:, 1])
+    assert turns.max() > 1.2 * 2.0**-12.5 and turns.min() < 0.5 * 2.0**-12.5
+    for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, steps), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("signal", ["2*sin(3*t)", "2*cos(t)*a - a_dot", "0.7"])
+def test_signals_and_held_inputs_reach_steps_near_what_was_foretold(
+    signal: str, tmp_path: Path
+) -> None:
+    """Signals of time, of the state and constant ones; and inputs held over a step each."""
+    scene = ODD.replace("[energy]", f'[inputs]\nu = {{ signal = "{signal}" }}\n[energy]')
+    text = scene.replace('name = "odd"', 'name = "pushed"') + '[forces]\nb = "u"\n'
+    (tmp_path / "pushed.toml").write_text(text, encoding="utf-8")
+    module = eomc.load(tmp_path / "pushed.toml", tmp_path)
+    h, steps, acceleration = 0.004, 60, module.acceleration
+
+    def textbook(u: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        q, v = module.start
+        for n in range(steps):
+            now = None if u is None else u[n]
+            t = n * h
+            k1, w1 = v, acceleration(q, v, t=t, u=now)
+            k2 = v + h / 2 * w1
+            w2 = acceleration(q + h / 2 * k1, k2, t=t + h / 2, u=now)
+            k3 = v + h / 2 * w2
+            w3 = acceleration(q + h / 2 * k2, k3, t=t + h / 2, u=now)
+            k4 = v + h * w3
+            w4 = acceleration(q + h * k3, k4, t=t + h, u=now)
+            q, v = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), v + h / 6 * (w1 + 2 * w2 + 2 * w3 + w4)
+        return q, v
+
+    for u in (None, np.random.default_rng(2).standard_normal((steps, 1))):
+        run = module.simulate(h=h, steps=steps, u=u)
+        for found, expected in zip((run.q[-1], run.qd[-1]), textbook(u), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+def test_a_wide_angle_goes_to_libm(tmp_path: Path) -> None:
+    """Two million turns on it is the same motion, but for what rounding leaves of the angle."""
+    module = eomc.load(SCENES / "simple_pendulum.toml", tmp_path)
+    q, qd = module.start
+    there = module.simulate(q + 2e6 * 2 * np.pi, qd, h=0.01, steps=200)
+    here = module.simulate(q, qd, h=0.01, steps=200)
+    apart = there.q[-1] - 2e6 * 2 * np.pi - here.q[-1]
+    assert np.abs(apart).max() < 1e-7
+
+
+def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
+    """near.h in units of rounding of 1, from exact sines, up to its bound and beyond."""
+    compiler = needs("gcc")
+    headers = [(ROOT / "csrc" / f).read_text(encoding="utf-8") for f in ("sincos.h", "near.h")]
+    main = r"""
+    #include <stdio.h>
+    int main(void)
+    {
+        double x, d, s0, c0, s, c;
+
+        while (scanf("%lf %lf %lf %lf", &x, &d, &s0, &c0) == 4) {
+            eomc_sincos_near(x, d, s0, c0, &s, &c);
+            printf("%.17g %.17g\n", s, c);
+        }
+        return 0;
+    }
+    """
+    (tmp_path / "near.c").write_text("\n".join([*headers, main]), encoding="utf-8")
+    subprocess.run(
+        [compiler, "-std=c99", "-O2", "near.c", "-o", "near", "-lm"], cwd=tmp_path, check=True
+    )
+    random = np.random.default_rng(8)
+    at = random.uniform(-10, 10, 4000)
+    turns = random.choice([-1, 1], 4000) * 2.0 ** random.uniform(-40, -4, 4000)
+    turns[:4] = 0.0, 2.0**-6, -(2.0**-6), 2.0**-6 * (1 + 2.0**-52)
+    x = at + turns
+    with mpmath.workdps(40):
+        lines, exact = [], []
+        for now, turn in zip(x, turns, strict=True):
+            begin = mpmath.mpf(now) - mpmath.mpf(turn)
+            s0, c0 = float(mpmath.sin(begin)), float(mpmath.cos(begin))
+            lines.append(
+                f"{now!r} {turn!r} {s0!r} {c0!r}".replace("np.float64(", "").replace(")", "")
+            )
+            exact.append((mpmath.sin(now), mpmath.cos(now)))
+        done = subprocess.run(
+            ["./near"], cwd=tmp_path, input="\n".join(lines), capture_output=True, text=True,
+            check=True,
+        )  # fmt: skip
+        found = [tuple(map(float, line.split())) for line in done.stdout.splitlines()]
+        worst = max(
+            abs(mpmath.mpf(a) - b)
+            for pair, sure in zip(found, exact, strict=True)
+            for a, b in zip(pair, sure, strict=True)
+        )
+    assert 2.0**-55 < worst < 1.5 * 2.0**-53  # what s0 or c0 bring is up to a half of 2^-53
+
+
+@pytest.mark.parametrize("vectors", [True, False])
+def test_sines_near_what_was_foretold_are_sines(vectors: bool, tmp_path: Path) -> None:
+    """foretold.h in units of rounding of 1, in vector registers and without, up to its bounds."""
+    compiler = needs("gcc")
+    names = "sincos.h", "foretold.h", "foretold_both.h"
+    text = "\n".join((ROOT / "csrc" / f).read_text(encoding="utf-8") for f in names)
+    if not vectors:
+        text = text.replace("#ifdef __GNUC__", "#if 0")
+    main = r"""
+    #include <stdio.h>
+    int main(void)
+    {
+        double x[2], d, s, c, far;
+        int wrong = 0;
+
+        while (scanf("%lf %lf %lf", &x[0], &x[1], &d) == 3) {
+            eomc_foretold f, g;
+            eomc_known k[2];
+
+            far = 0;
+            eomc_foretell(&f, x[0], 1.0, 0.0, 0.0, x[1] - x[0]);
+            g.x[0] = f.x[1], g.x[1] = f.x[0];
+            eomc_foretold_both(&f, &g);
+            for (int k = 0; k < 2; k++, eomc_foretold_at(&g))
+                for (int i = 0; i < 2; i++)
+                    wrong |= f.x[i] - f.x[i] == 0
+                        && (f.s[i] != g.s[1 - i] || f.c[i] != g.c[1 - i]);
+            eomc_know(&k[0], &k[1], &f, &far);
+            for (int i = 0; i < 2; i++) {
+                eomc_turn_on(d, &k[i], &s, &c, &far);
+                printf("%.17g %.17g %.17g ", f.x[i], s, c);
+            }
+            printf("%d\n", eomc_are_near(far));
+        }
+        return wrong;
+    }
+    """
+    (tmp_path / "foretold.c").write_text(text + main, encoding="utf-8")
+    subprocess.run(
+        [compiler, "-std=c99", "-O2", "foretold.c", "-o", "foretold", "-lm"],
+        cwd=tmp_path, check=True,
+    )  # fmt: skip
+    random = np.random.default_rng(9)
+    x = np.where(random.random((4000, 2)) < 0.5, 1, 1e4) * random.uniform(-10, 10, (4000, 2))
+    x[:40] = np.pi / 2 * np.arange(-40, 40).reshape(40, 2)
+    d = random.choice([-1, 1], 4000) * 2.0 ** random.uniform(-40, -12.51, 4000)  # two fit
+    beyond = [(0.1, 0.2, 2.0**-12), (2.0**20, 2.0**20 + 10, 0.0), (np.nan, 1.0, 0.0)]
+    beyond += [(np.inf, np.inf, 0.0), (1.0, 1.0, np.nan)]
+    rows = [*zip(*x.T, d, strict=True), *beyond]
+    lines = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
+    done = subprocess.run(
+        ["./foretold"], cwd=tmp_path, input=lines, capture_output=True, text=True, check=True
+    )
+    found = [[float(value) for value in line.split()] for line in done.stdout.splitlines()]
+    assert [row[-1] for row in found] == [1] * 4000 + [0] * len(beyond)
+    with mpmath.workdps(40):
+        worst = max(
+            abs(mpmath.mpf(value) - sure(mpmath.mpf(row[at]) + mpmath.mpf(turn)))
+            for row, turn in zip(found[:4000], d, strict=True)
+            for at in (0, 3)
+            for value, sure in ((row[at + 1], mpmath.sin), (row[at + 2], mpmath.cos))
+        )
+    assert 2.0**-55 < worst < 2 * 2.0**-53
+
+
+@pytest.mark.parametrize(
+    ("method", "power"), [("rk4", 20), ("dp8", 18), ("gauss8", 15), ("gauss16", 15)]
+)
+def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
+    """A step of an oscillator is a linear map R(h J): its power in 40 digits is the answer.
+
+    With plain sums 1e-13 and more, and nearly as much with weights as they are rounded.
+    """
+    text = (SCENES / "mass_spring.toml").read_text(encoding="utf-8")
+    names = '["rk4", "dp8", "gauss8", "gauss16"]'
+    (tmp_path / "mass_spring.toml").write_text(
+        text.replace("[run]\n", f"[run]\nmethod = {names}\n").replace('"mass_spring"', '"sums"'),
+        encoding="utf-8",
+    )
+    module = eomc.load(tmp_path / "mass_spring.toml", MODULES)
+    (x,), (v,) = module.start
+    m, h, steps = METHODS[method], 2.0 ** (10 - power), 2**power
+    with mpmath.workdps(50):
+        hj = mpmath.matrix([[0, 1], [-4, 0]]) * mpmath.mpf(h)
+        s, one = m.stages, mpmath.eye(2)
+        a = [[mpmath.mpf(c.numerator) / c.denominator for c in row] for row in m.a]
+        b = [mpmath.mpf(c.numerator) / c.denominator for c in m.b]
+        big, ones = mpmath.eye(2 * s), mpmath.zeros(2 * s, 2)
+        for i in range(s):
+            for k, c in enumerate(a[i]):
+                big[2 * i : 2 * i + 2, 2 * k : 2 * k + 2] -= c * hj
+            ones[2 * i : 2 * i + 2, :] = one
+        stages = big**-1 * ones
+        step = one + sum((b[i] * hj * stages[2 * i : 2 * i + 2, :] for i in range(s)), 0 * one)
+        exact = step**steps * mpmath.matrix([x, v])
+        run = module.simulate(
+            h=h, steps=steps, every=steps, params={"k": 4.0, "m": 1.0}, method=method
+        )
+        off = [abs(mpmath.mpf(float(a)) - b) for a, b in zip(run.x[-1], exact, strict=True)]
+    fma = "fma" in Path("/proc/cpuinfo").read_text(encoding="utf-8")  # for what h/6 lacks
+    assert max(off) < (5e-15 if fma or method != "rk4" else 2e-13)
+
+
+@pytest.mark.parametrize(
+    ("name", "h"), [("cartpole", 0.005), ("cartpole", 0.016), ("double_pendulum", 0.004)]
+)
+def test_a_run_cut_in_c_is_the_same_to_the_last_bit(name: str, h: float, tmp_path: Path) -> None:
+    """With the memory handed on; without it, sums begin anew. Near what was foretold, and not."""
+    for file, text in fast_kit(eomc.sources(eomc.read(SCENES / f"{name}.toml"))).items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    main = r"""
+        #include "NAME.h"
+        #include <stdio.h>
+
+        int main(void)
+        {
+            for (int way = 0; way < 3; way++) {
+                double q[2] = { 0.0, 1.5 }, qd[2] = { 0.0, 0.0 };
+                NAME_rk4_memory memory;
+                NAME_status status;
+                long part[3] = { 2000, 0, 0 };
+
+                if (way > 0)
+                    part[0] = 1, part[1] = 700, part[2] = 1299;
+                memory.warm = 0;
+                for (long k = 0, n = 0; k < 3; n += part[k++])
+                    NAME_rk4_run(q, qd, H, n, part[k], 0, 0, 0, &NAME_defaults,
+                        way < 2 ? &memory : 0, &status);
+                printf("%.17g %.17g %.17g %.17g\n", q[0], q[1], qd[0], qd[1]);
+            }
+            return 0;
+        }
+        """
+    (tmp_path / "cut.c").write_text(main.replace("NAME", name), encoding="utf-8")
+    subprocess.run(
+        [needs("gcc"), "-std=c99", "-O2", f"-DH={h}", "cut.c", f"{name}.c", "-o", "cut", "-lm"],
+        cwd=tmp_path, check=True,
+    )  # fmt: skip
+    done = subprocess.run(["./cut"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    whole, cut, forgotten = done.stdout.splitlines()
+    assert whole == cut
+    assert whole != forgotten
+    near = [np.array(line.split(), float) for line in (whole, forgotten)]
+    np.testing.assert_allclose(*near, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["rk4", "dp8", "gauss8", "gauss16"])
+def test_a_memory_of_another_state_is_not_believed(method: str, tmp_path: Path) -> None:
+    """A state changed by hand between two calls moves on as it would with no memory at all."""
+    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
+    (tmp_path / "cartpole.toml").write_text(
+        text.replace("[run]\n", f'[run]\nmethod = "{method}"\n'), encoding="utf-8"
+    )
+    for file, made in fast_kit(eomc.sources(eomc.read(tmp_path / "cartpole.toml"))).items():
+        (tmp_path / file).write_text(made, encoding="utf-8")
+    main = r"""
+        #include "cartpole.h"
+        #include <stdio.h>
+
+        int main(void)
+        {
+            for (int way = 0; way < 2; way++) {
+                double q[2] = { 0.0, 0.5 }, qd[2] = { 0.0, 0.0 };
+                cartpole_METHOD_memory memory = { 0 };
+                cartpole_status status;
+
+                cartpole_METHOD_run(q, qd, 0.005, 0, 17, 0, 0, 0, &cartpole_defaults, &memory,
+                    &status);
+                q[1] += 1e-5;
+                cartpole_METHOD_run(q, qd, 0.005, 17, 1, 0, 0, 0, &cartpole_defaults,
+                    way ? &memory : 0, &status);
+                printf("%.17g %.17g %.17g %.17g\n", q[0], q[1], qd[0], qd[1]);
+            }
+            return 0;
+        }
+        """
+    (tmp_path / "hand.c").write_text(main.replace("METHOD", method), encoding="utf-8")
+    subprocess.run(
+        ["cc", "-std=c99", "-O2", "hand.c", "cartpole.c", "-o", "hand", "-lm"],
+        cwd=tmp_path, check=True,
+    )  # fmt: skip
+    done = subprocess.run(["./hand"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    without, kept = done.stdout.splitlines()
+    assert kept == without

@@ -1,0 +1,191 @@
+"""Systems made in Python: plain symbols and dynamicsymbols give what a scene gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+from sympy.physics.mechanics import dynamicsymbols
+
+import eomc
+from eomc.base.errors import EomcError
+from eomc.model.system import System, dot
+
+SCENES = Path(__file__).parents[2] / "scenes"
+MODULES = Path("build/tests/modules")
+
+m_c, m_p, l, g = sympy.symbols("m_c m_p l g", positive=True)  # noqa: E741 - the scene's name
+VALUES = {m_c: 2.0, m_p: 2.0, l: 2.0, g: 9.8}
+
+
+def cartpole_by_dynamicsymbols() -> System:
+    x, theta = dynamicsymbols("x theta")
+    t = dynamicsymbols._t
+    x_p, y_p = x - l / 2 * sympy.sin(theta), l / 2 * sympy.cos(theta)
+    K = m_c * x.diff(t) ** 2 / 2 + m_p * (x_p.diff(t) ** 2 + y_p.diff(t) ** 2) / 2
+    K += m_p * l**2 / 12 * theta.diff(t) ** 2 / 2
+    start = {x: 0.0, theta: np.pi / 2}
+    return System.make("made_cartpole", start, K, m_p * g * y_p, parameters=VALUES)
+
+
+def cartpole_by_symbols() -> System:
+    x, theta, x_dot, theta_dot = sympy.symbols("x theta x_dot theta_dot")
+    x_p, y_p = sympy.symbols("x_p y_p")
+    K = m_c * x_dot**2 / 2 + m_p * (dot(x_p) ** 2 + dot(y_p) ** 2) / 2
+    K += m_p * l**2 / 12 * theta_dot**2 / 2
+    return System.make(
+        "named_cartpole", {x: 0.0, theta: np.pi / 2}, K, m_p * g * y_p, parameters=VALUES,
+        definitions={x_p: x - l / 2 * sympy.sin(theta), y_p: l / 2 * sympy.cos(theta)},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("make", [cartpole_by_dynamicsymbols, cartpole_by_symbols])
+def test_it_moves_as_the_scene_does(make: object) -> None:
+    assert callable(make)
+    made = eomc.load(make(), MODULES).simulate(h=0.005, duration=10.0)
+    scene = eomc.load(SCENES / "cartpole.toml", MODULES).simulate(h=0.005, duration=10.0)
+    assert np.max(np.abs(made.q - scene.q)) < 1e-12
+
+
+def test_inputs_forces_dissipation_and_units() -> None:
+    theta = dynamicsymbols("theta")
+    m, b, torque = sympy.symbols("m b torque")
+    system = System.make(
+        "wheel", {theta: (0.5, 1.0)}, m * theta.diff() ** 2 / 2, parameters={m: 2.0, b: 0.3},
+        dissipation=b * theta.diff() ** 2 / 2, inputs={torque: sympy.cos(dynamicsymbols._t)},
+        forces={theta: torque}, units={theta: "rad", m: "kg m^2"}, h=0.01, duration=1.0,
+    )  # fmt: skip
+    wheel = eomc.load(system, MODULES)
+    assert wheel.units == {"theta": "rad", "m": "kg m^2"}
+    assert wheel.acceleration([0.0], [2.0], t=0.0) == pytest.approx([(1.0 - 0.6) / 2])
+    assert wheel.acceleration([0.0], [2.0], u=[3.0]) == pytest.approx([(3.0 - 0.6) / 2])
+
+
+def test_names_that_c_cannot_bear_are_mapped_and_told() -> None:
+    theta = dynamicsymbols(r"\theta_{1}")
+    double = sympy.Symbol("lambda")
+    system = System.make("mapped", [theta], double * theta.diff() ** 2 / 2, parameters={double: 1})
+    assert dict(system.renamed) == {r"\theta_{1}": "theta_1", "lambda": "lambda_1"}
+    header = eomc.sources(system).files["mapped.h"]
+    assert r"\theta_{1} is theta_1" in header and "lambda is lambda_1" in header
+
+
+def test_the_same_system_is_not_built_twice() -> None:
+    assert eomc.load(cartpole_by_symbols(), MODULES) is eomc.load(cartpole_by_symbols(), MODULES)
+
+
+x, x_dot, u = sympy.symbols("x x_dot u")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "said"),
+    [
+        (("a", [x], sympy.Symbol("M") * x_dot**2), {}, "M not declared"),
+        (("a", [x], "x_dot**2"), {}, "SymPy expression, not the text"),
+        (("a", [], x_dot**2), {}, "at least one coordinate"),
+        (("class", [x], x_dot**2), {}, "class"),
+        (("a", [x], x_dot**2), {"parameters": {x: 1.0}}, "'x' is taken already"),
+        (("a", [x], x_dot**2), {"forces": {u: 1}}, "not among the coordinates"),
+        (("a", [x], sympy.I * x_dot**2), {}, "not a real, finite expression"),
+        ((3, [x], x_dot**2), {}, "name: must be text"),
+        (("a", ["x"], x_dot**2), {}, r"give a symbol, sympy\.Symbol\('x'\)"),
+        (("a", x, x_dot**2), {}, "coordinates: give a list or dict"),
+        (("a", [x**2], x_dot**2), {}, r"x\*\*2 is not a symbol"),
+        (("a", {x: "pi/2"}, x_dot**2), {}, "start of x: must be a number, here 'pi/2'"),
+        (("a", {x: (1, 2, 3)}, x_dot**2), {}, r"pair \(start, rate\)"),
+        (("a", {x: np.nan}, x_dot**2), {}, "start of x: must be a finite number"),
+        (("a", [x], None), {}, "kinetic: None is not an expression"),
+        (("a", [x], x_dot**2, x > 0), {}, "potential: x > 0 is not an expression"),
+        (("a", [x], x_dot**2, sympy.erf(x)), {}, "potential: erf can't be used: write tanh"),
+        (("a", [x], x_dot**2, sympy.sec(x)), {}, r"sec can't be used: write 1/cos\(x\)"),
+        (("a", [x], x_dot**2, sympy.besselj(0, x)), {}, "besselj can't be used; functions are sin"),
+        (
+            ("a", [x], x_dot**2, sympy.Piecewise((x, x > 0), (0, True))),
+            {},
+            "Piecewise can't be used: write Heaviside",
+        ),
+        (("a", [x], x_dot**2), {"forces": {x: sympy.ceiling(x)}}, "force on x: ceiling can't"),
+        (("a", [x], x_dot**2), {"forces": {"x": 1}}, "forces: give a symbol"),
+        (("a", [x], x_dot**2), {"forces": {x: sympy.Symbol("t")}}, r"not the time: write eomc\."),
+        (("a", [x], x_dot**2), {"parameters": [u]}, "parameters: give a dict"),
+        (("a", [x], x_dot**2), {"parameters": {"u": 1}}, r"give a symbol, sympy\.Symbol\('u'\)"),
+        (("a", [x], x_dot**2), {"parameters": {u: "1"}}, "parameter u: must be a number, here '1'"),
+        (("a", [x], x_dot**2), {"parameters": {u: x}}, "parameter u: must be a number, here x"),
+        (("a", [x], x_dot**2), {"inputs": "u"}, "inputs: give a list or dict of symbols"),
+        (("a", [x], x_dot**2), {"definitions": {u: "x"}}, "definition u: give a SymPy expression"),
+        (("a", [x], x_dot**2), {"h": -0.1}, "h: must be greater than zero"),
+        (("a", [x], x_dot**2), {"methods": ["ode45"]}, "methods: known are rk4"),
+        (("a", [x], x_dot**2), {"real": "quad"}, "real: known are double, float"),
+        (("a", [x], x_dot**2), {"batch": "yes"}, "batch: must be True or False"),
+        (("a", [x], x_dot**2), {"linearize": "all"}, "linearize: must be True"),
+    ],
+)
+def test_what_is_wrong_is_said(
+    arguments: tuple[object, ...], options: dict[str, object], said: str
+) -> None:
+    with pytest.raises(EomcError, match=said):
+        System.make(*arguments, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("inside", [x_dot, dot(x), u * x])
+def test_rates_that_nobody_knows_are_refused(inside: sympy.Expr) -> None:
+    system = System.make("a", [x], x_dot**2 / 2, inputs=[u], forces={x: dot(inside)})
+    with pytest.raises(EomcError, match=r"rate|accelerations"):
+        eomc.sources(system)
+
+
+def test_jumps_in_energies_are_refused() -> None:
+    system = System.make("a", [x], x_dot**2 / 2, x * sympy.sign(x))
+    with pytest.raises(EomcError, match="jumps"):
+        eomc.sources(system)
+
+
+@pytest.mark.parametrize("more", [sympy.Abs(x_dot) ** 3, sympy.sqrt(x_dot**2)])
+def test_a_kinetic_energy_that_is_not_quadratic_is_named(more: sympy.Expr) -> None:
+    system = System.make("a", [x], x_dot**2 / 2 + more)
+    with pytest.raises(EomcError, match=r"energy\.kinetic: .* (quadratic|jumps)"):
+        eomc.sources(system)
+
+
+def test_a_method_may_be_named_alone() -> None:
+    assert System.make("a", [x], x_dot**2 / 2, methods="dp8").run.methods == ("dp8",)
+    assert System.make("a", {x: [0.1, 0.2]}, x_dot**2 / 2).coordinates[0].rate == 0.2
+
+
+@pytest.mark.parametrize("given", [3, None, {}, b"scene.toml", ["scene.toml"]])
+def test_what_is_no_scene_is_refused(given: object) -> None:
+    for function in (eomc.load, eomc.build, eomc.read):
+        with pytest.raises(EomcError, match="give the path of a scene"):
+            function(given)  # type: ignore[operator]
+
+
+def test_texts_and_paths_for_something_else_are_refused() -> None:
+    with pytest.raises(EomcError, match="not its text"):
+        eomc.load((SCENES / "cartpole.toml").read_text(encoding="utf-8"))
+    with pytest.raises(EomcError, match="root: give the path of a folder, here 3"):
+        eomc.load(SCENES / "cartpole.toml", 3)  # type: ignore[arg-type]
+    with pytest.raises(EomcError, match=r"give a System, such as eomc\.read\('a\.toml'\)"):
+        eomc.sources("a.toml")  # type: ignore[arg-type]
+    with pytest.raises(EomcError, match="is a folder: name a scene"):
+        eomc.read(SCENES)
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0])
+def test_a_mass_that_is_not_positive_is_named(value: float) -> None:
+    m = sympy.Symbol("m")
+    system = System.make("a", [x], m * x_dot**2 / 2, x**2, parameters={m: value})
+    with pytest.raises(EomcError, match=rf"'x' has no inertia, at m = {value:g}: masses"):
+        eomc.sources(system)
+
+
+def test_a_scene_named_without_its_folder_is_suggested(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "crane.toml").write_text("", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for given in ("crane", "crane.toml", "scenes/crane"):
+        with pytest.raises(EomcError, match=r"did you mean 'scenes/crane\.toml'\?"):
+            eomc.read(given)

@@ -1,0 +1,141 @@
+"""The steppers' coefficients, and what dp8 reaches where RK4 can't."""
+
+from __future__ import annotations
+
+import dataclasses
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from cases import cases, scene_text
+
+import eomc
+from eomc.emit.c_expression import DOUBLE, FLOAT, Real
+from eomc.emit.fast import integrators
+from eomc.integrators import tableaux
+from eomc.integrators.tableaux import DP8, METHODS, RK4, Method
+from eomc.verify.check import check
+
+SCENES = Path(__file__).parents[2] / "scenes"
+MODULES = Path("build/tests/modules")
+
+
+def dot(x: tableaux.Row, y: tableaux.Row) -> Fraction:
+    return sum((a * b for a, b in zip(x, y, strict=False)), Fraction(0))
+
+
+@pytest.mark.parametrize("method", [RK4, DP8], ids=lambda m: m.name)
+def test_order_conditions(method: Method) -> None:
+    """Those of quadrature, and of the trees with one branching: b A c^k = 1/((k+1)(k+2))."""
+    exact = Fraction(1, 10**25)
+    powers = [tuple(c**k for c in method.c) for k in range(method.order)]
+    for k, power in enumerate(powers):
+        assert abs(dot(method.b, power) - Fraction(1, k + 1)) < exact
+        if k + 2 <= method.order:
+            inner = tuple(dot(row, power) for row in method.a)
+            assert abs(dot(method.b, inner) - Fraction(1, (k + 1) * (k + 2))) < exact
+            # the same through the matrices that the generated code uses
+            assert abs(dot(method.b_a, power) - Fraction(1, (k + 1) * (k + 2))) < exact
+    assert abs(dot(method.b, powers[-1]) - Fraction(1, method.order)) < exact
+    next_one = tuple(c**method.order for c in method.c)
+    assert abs(dot(method.b, next_one) - Fraction(1, method.order + 1)) > exact
+
+
+@pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda real: real.name)
+@pytest.mark.parametrize("method", METHODS.values(), ids=lambda m: m.name)
+def test_weights_as_they_are_in_c_add_up_to_one(method: Method, real: Real) -> None:
+    """Each a number of C's type, off by no more than all of them are if rounded one by one."""
+    found = integrators.rounded(method.b, real)
+    kind = np.dtype(real.dtype).type
+    assert [Fraction(float(kind(float(x)))) for x in found] == list(found)
+    assert sum(found) == 1
+    assert [x == 0 for x in found] == [x == 0 for x in method.b]
+    assert (found == found[::-1]) == (method.b == method.b[::-1])
+    most = Fraction(real.epsilon) / 2 * sum(map(abs, method.b))
+    assert all(abs(x - y) <= most for x, y in zip(found, method.b, strict=True))
+
+
+def case_module(name: str) -> tuple[ModuleType, dict]:
+    case = cases()[name]
+    path = Path("build/tests") / f"dp8_{name}.toml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = scene_text(name).replace("[run]", '[run]\nmethod = ["rk4", "dp8"]')
+    path.write_text(text.replace('name = "', 'name = "dp8_', 1), encoding="utf-8")
+    return eomc.load(path, MODULES), case
+
+
+# case: a step at which the method's own error has gone below that of rounding
+REACHED = {
+    "cartpole_drop_tutorialP": 0.01,
+    "cartpole_torque_physicalP": 0.05,
+    "double_pendulum_regular": 0.02,
+    "henon_heiles": 0.1,
+    "furuta_pendulum": 0.002,
+    "lagrange_top_nutation": 0.005,
+}
+
+
+@pytest.mark.parametrize(("name", "h"), REACHED.items())
+def test_dp8_reaches_what_doubles_allow(name: str, h: float) -> None:
+    m, case = case_module(name)
+    t_end = float(case["t_end"])
+    steps = round(t_end / h)
+    reference = np.array(case["q_ref"], float)
+    scale = max(1.0, float(np.max(np.abs(reference))))
+    error = {
+        method: np.max(
+            np.abs(m.simulate(h=t_end / steps, steps=steps, method=method).q[-1] - reference)
+        )
+        / scale
+        for method in m.methods
+    }
+    # the floor of the arithmetic, and the growth of one rounding a step
+    floor = max(float(case["double_floor"]), case["amplification"] * 2e-16 * np.sqrt(steps))
+    assert error["dp8"] < 20 * floor
+    assert error["rk4"] > 100 * error["dp8"]
+
+
+def test_a_wrong_coefficient_is_found_by_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = list(DP8.a[7])
+    row[3] += Fraction(1, 1000)
+    broken = dataclasses.replace(DP8, a=(*DP8.a[:7], tuple(row), *DP8.a[8:]))
+    monkeypatch.setitem(tableaux.METHODS, "dp8", broken)
+    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
+    path = tmp_path / "cartpole.toml"
+    path.write_text(text.replace("[run]", '[run]\nmethod = ["rk4", "dp8"]'), encoding="utf-8")
+    report = check(eomc.read(path), eomc.load(path, tmp_path))
+    assert {row.name for row in report.rows if not row.passed} >= {"order of dp8"}
+
+
+def test_a_method_that_is_not_there_is_refused_by_name() -> None:
+    m = eomc.load(SCENES / "cartpole.toml", MODULES)
+    assert m.methods == ("rk4",)
+    with pytest.raises(ValueError, match=r"method: 'dp8' is not in this module, which has rk4"):
+        m.simulate(method="dp8")
+    source = (MODULES / "cartpole" / "cartpole.c").read_text(encoding="utf-8")
+    assert "dp8" not in source
+
+
+def test_inputs_are_held_or_followed_by_each_method() -> None:
+    text = (SCENES / "cartpole_driven.toml").read_text(encoding="utf-8")
+    path = Path("build/tests/driven_dp8.toml")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(
+        text.replace("[run]", '[run]\nmethod = ["dp8", "rk4"]').replace(
+            'name  = "cartpole_driven"', 'name  = "driven_dp8"'
+        ),
+        encoding="utf-8",
+    )
+    m = eomc.load(path, MODULES)
+    assert m.methods == ("dp8", "rk4")
+    followed = [m.simulate(h=h, duration=2.0).q[-1] for h in (0.1, 0.05)]
+    assert np.max(np.abs(followed[0] - followed[1])) < 1e-11
+    held = [m.simulate(h=h, duration=2.0, u=[0.3], method="rk4").q[-1] for h in (0.02, 0.01, 0.005)]
+    exact = m.simulate(h=0.05, duration=2.0, u=[0.3]).q[-1]
+    errors = [np.max(np.abs(q - exact)) for q in held]
+    assert all(12 < a / b < 20 for a, b in pairwise(errors))

@@ -1,0 +1,425 @@
+"""Long functions come in pieces: the same values, bearable for compilers, clean."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from cases import SCENES, fast_kit, scene_system
+from compilers import STRICT, compiled
+from conftest import EVERYTHING, needs
+from sympy import S
+
+import eomc
+from eomc.derive import lagrange
+from eomc.derive.tape import Stage
+from eomc.emit.render import Sources, render
+from eomc.model import system
+from eomc.model.symbols import ALONG
+from eomc.model.system import System
+from eomc.program import outline, program
+from eomc.program.ir import (
+    Assignment,
+    Call,
+    Cost,
+    Function,
+    Operand,
+    Product,
+    Sum,
+    evaluate,
+    rename,
+)
+from eomc.program.program import Program
+from eomc.scene import scene
+from eomc.toolchain import compiler as compiler
+
+STEPS = 40
+
+
+def chain(links: int) -> System:
+    """A hanging chain of point masses in relative angles, its definitions one over the other."""
+    lines = ["eomc = 1", f'name = "chain_{links}"', "[coordinates]"]
+    lines += [f"q{k} = {{ start = 0.{k % 9 + 1} }}" for k in range(links)]
+    lines += ["[parameters]", "m = 1.2", "l = 0.7", "g = 9.81", "[definitions]"]
+    for k in range(links):
+        a, x, y = (f"{name}{k - 1} + " if k else "" for name in "axy")
+        lines += [f'a{k} = "{a}q{k}"', f'x{k} = "{x}l*sin(a{k})"', f'y{k} = "{y}-l*cos(a{k})"']
+    kinetic = " + ".join(f"m*(dot(x{k})**2 + dot(y{k})**2)/2" for k in range(links))
+    potential = " + ".join(f"m*g*y{k}" for k in range(links))
+    lines += ["[energy]", f'kinetic = "{kinetic}"', f'potential = "{potential}"']
+    return system.from_scene(scene.parse("\n".join(lines), "chain.toml"))
+
+
+def derived(made: System) -> Program:
+    return program.build(lagrange.derive(made))
+
+
+@pytest.fixture(scope="module")
+def chain_program() -> Program:
+    return derived(chain(5))
+
+
+@pytest.fixture
+def in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nearly every function is long."""
+    monkeypatch.setattr(outline, "LARGE", 20)
+    monkeypatch.setattr(outline, "PIECE", 25)
+    monkeypatch.setattr(outline, "LANE_PIECE", 25)
+
+
+# --- where functions are cut ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["acceleration", "C", "energy"])
+@pytest.mark.parametrize("size", [1, 20, 100, 10**6])
+def test_pieces_compute_what_the_whole_computes(
+    chain_program: Program, name: str, size: int
+) -> None:
+    """To the last bit, each from nothing but what it says that it reads."""
+    whole = chain_program[name]
+    state = program.nearby(chain_program.system, 1)
+    parts = outline.split(whole, size)
+    assert (len(parts) == 1) == (size == 10**6)
+    crossing: dict[str, float] = {}
+    found: dict[int, float] = {}
+    good = True
+    for part in parts:
+        kept = tuple(Operand(S.One, n) for n in part.keeps)
+        open_ended = replace(part.function, outputs=(*kept, *part.function.outputs))
+        read = {n: crossing[n] for n in part.reads}
+        values, regular = evaluate(open_ended, {**state, **read})
+        crossing |= dict(zip(part.keeps, values, strict=False))
+        found |= dict(zip(part.outputs, values[len(kept) :], strict=True))
+        good &= regular
+    expected, regular = evaluate(whole, state)
+    assert [found[k] for k in range(len(expected))] == expected
+    assert good == regular
+
+
+def test_only_what_is_read_further_on_crosses(chain_program: Program) -> None:
+    parts = outline.split(chain_program["acceleration"], 60)
+    for k, part in enumerate(parts):
+        made = {a.name for a in (*part.function.early, *part.function.body)}
+        behind = {n for later in parts[k + 1 :] for n in later.reads}
+        assert set(part.keeps) == made & behind
+        assert not made & set(part.reads)
+    total = sum(map(outline.weight, (part.function for part in parts)))
+    assert total == outline.weight(chain_program["acceleration"])
+    heaviest = max(outline.weight(part.function) for part in parts)
+    assert heaviest <= 60 * 4 // 3 + 15
+
+
+def test_sine_and_cosine_of_one_angle_stay_together(chain_program: Program) -> None:
+    for size in (1, 7, 30, 90):
+        where: dict[tuple[Operand, ...], set[int]] = {}
+        for k, part in enumerate(outline.split(chain_program["acceleration"], size)):
+            for a in part.function.body:
+                if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
+                    where.setdefault(a.value.args, set()).add(k)
+        assert len(where) == 5
+        assert all(len(places) == 1 for places in where.values())
+
+
+def straight(count: int, wide: int) -> Function:
+    """A function of `count` products and sums, each of two of the `wide` values before it."""
+    pick = random.Random(1)
+    names = ["x", "x_dot"]
+    body = []
+    for k in range(count):
+        one, other = pick.choice(names[-wide:]), pick.choice(names[-wide:])
+        value: Sum | Product = Product(S.Half, (one, other))
+        if k % 2:
+            value = Sum(((S.One, one), (S.NegativeOne, other)), S.Half)
+        names.append(f"w{k + 1}")
+        body.append(Assignment(names[-1], value, Stage.VELOCITY))
+    end = Operand(S.One, names[-1])
+    cost = Cost(adds=count // 2, multiplications=count // 2)
+    return Function("bias", (), tuple(body), (end,), (), cost, "program", ())
+
+
+def test_the_cut_is_where_few_values_cross() -> None:
+    """Two tangles joined by one value: at that value."""
+    one = straight(60, 20)
+    other = rename(
+        straight(60, 20), {"x": "w60", "x_dot": "w60"} | {f"w{k}": f"v{k}" for k in range(61)}
+    )
+    both = replace(one, body=one.body + other.body, outputs=other.outputs)
+    first, second = outline.split(both, 65)
+    assert first.keeps == second.reads == ("w60",)
+
+
+# --- what compilers say --------------------------------------------------------------------------
+
+
+def written(made: Sources, folder: Path) -> str:
+    folder.mkdir(exist_ok=True)
+    for file, text in fast_kit(made).items():
+        (folder / file).write_text(text, encoding="utf-8")
+    return f"{made.name}.c"
+
+
+def everything(run: str, name: str = "everything") -> System:
+    """The scene with all that a scene can say, with more under [run]."""
+    text = EVERYTHING.replace("[run]", f"[run]\n{run}").replace('"everything"', f'"{name}"')
+    return system.from_scene(scene.parse(text, "everything.toml"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "run",
+    ["", 'method = "dp8"', 'batch = true\nmethod = ["rk4", "dp8"]', 'real = "float"\nbatch = true'],
+)
+def test_pieces_are_clean_for_strict_compilers(
+    in_small_pieces: None, tmp_path: Path, run: str
+) -> None:
+    """As C with gcc and clang, and as C++; the self-test passes.
+
+    RK4 in doubles has its accelerations in two parts, places in pairs.
+    """
+    made = render(derived(everything(run)), "_everything")
+    source = written(made, tmp_path)
+    paired = "float" not in run and run != 'method = "dp8"'
+    parts = ("_configuration_2(", "_motion_2(") if paired else ("_solve_4(",)
+    assert all(part in fast_kit(made)[source] for part in (*parts, "_C_4("))
+    assert ("_solve_lane_4(" in fast_kit(made)[source]) == ("batch" in run)
+    for command in ("gcc", "clang"):
+        compiled(
+            needs(command),
+            *STRICT,
+            "-O2",
+            "-I.",
+            "-c",
+            source,
+            "selftest.c",
+            "main.c",
+            cwd=tmp_path,
+        )
+    strict = ["-std=c++11", *STRICT[1:], "-fsyntax-only"]
+    compiled(needs("g++"), *strict, "-x", "c++", source, cwd=tmp_path)
+    compiled(
+        "cc", "-std=c99", "-O1", "-I.", "selftest.c", source, "-lm", "-o", "selftest", cwd=tmp_path
+    )
+    assert subprocess.run(["./selftest"], cwd=tmp_path, stdout=subprocess.DEVNULL).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", ["1", "77"])
+def test_the_hash_seed_decides_nothing(tmp_path: Path, seed: str) -> None:
+    code = """
+import sys
+from eomc import read
+from eomc.derive import lagrange
+from eomc.program import outline
+from eomc.program import program
+from eomc.emit.render import render
+outline.LARGE, outline.PIECE, outline.LANE_PIECE = 20, 25, 25
+for name in sys.argv[1:]:
+    print(render(program.build(lagrange.derive(read(name))), "_x").files)
+"""
+    names = [str(SCENES / f"{name}.toml") for name in ("cartpole_driven", "furuta_pendulum")]
+    outcomes = [
+        subprocess.run(
+            [sys.executable, "-c", code, *names], capture_output=True, text=True, check=True,
+            env={**os.environ, "PYTHONHASHSEED": s},
+        ).stdout
+        for s in ("0", seed)
+    ]  # fmt: skip
+    assert "_motion_1(" in outcomes[0] and "_C_2(" in outcomes[0]
+    assert outcomes[0] == outcomes[1]
+
+
+@pytest.mark.slow
+def test_compile_time_grows_with_the_size_and_no_faster(tmp_path: Path) -> None:
+    """Eight times the operations, in pieces, take at most twice eight times as long."""
+    made = derived(eomc.read(SCENES / "mass_spring.toml"))
+
+    def seconds(count: int) -> float:
+        long = Program(made.system, {**made.functions, "bias": straight(count, 60)}, (), made.order)
+        source = written(render(long, "_x"), tmp_path)
+        least = float("inf")
+        for _ in range(3):
+            begun = os.times().children_user  # of the compiler alone, whoever else is at work
+            compiled(needs("gcc"), "-O3", "-c", source, cwd=tmp_path)
+            least = min(least, os.times().children_user - begun)
+        return least
+
+    nothing, small, large = seconds(1), seconds(1000), seconds(8000)
+    assert large - nothing < 16 * (small - nothing)
+
+
+# --- what they compute ---------------------------------------------------------------------------
+
+
+def module(made: Program, root: Path) -> ModuleType:
+    """A program compiled under `root`."""
+    name = made.system.name
+    key = compiler.key(made.system.digest, str(root))
+    return compiler.load(compiler.build(name, key, lambda extension: render(made, extension), root))
+
+
+@pytest.mark.slow
+def test_a_system_in_pieces_moves_as_it_does_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every function, single runs and batches; the operations are contracted in other places."""
+    run = 'batch = true\nmethod = ["rk4", "dp8"]'
+    plain = derived(everything(run))
+    whole = module(plain, tmp_path / "whole")
+    monkeypatch.setattr(outline, "LARGE", 20)
+    monkeypatch.setattr(outline, "PIECE", 25)
+    monkeypatch.setattr(outline, "LANE_PIECE", 25)
+    cut = module(plain, tmp_path / "cut")
+    random_state = np.random.default_rng(3)
+    q0, qd0 = (x + 0.1 * random_state.standard_normal((75, 3)) for x in whole.start)
+    for name in ("D", "g"):
+        np.testing.assert_allclose(
+            getattr(cut, name)(q0), getattr(whole, name)(q0), rtol=1e-12, atol=1e-13
+        )
+    for name in ("C", "bias", "tau", "energy", "power", "acceleration"):
+        found, expected = (getattr(m, name)(q0, qd0) for m in (cut, whole))
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
+    for method in ("rk4", "dp8"):
+        for u in (None, [0.3, -0.2]):
+            one, other = (
+                m.simulate(q0[0], qd0[0], steps=STEPS, method=method, u=u) for m in (cut, whole)
+            )
+            np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-11)
+            many = cut.simulate_batch(q0, qd0, steps=STEPS, every=4, method=method, u=u)
+            assert set(many.status) == {"ok"}
+            for k in (0, 63, 74):
+                alone = cut.simulate(q0[k], qd0[k], steps=STEPS, every=4, method=method, u=u)
+                np.testing.assert_allclose(many.q[k], alone.q, rtol=0, atol=1e-11)
+                np.testing.assert_allclose(many.qd[k], alone.qd, rtol=0, atol=1e-11)
+
+
+def test_a_bad_instance_leaves_the_others_alone_in_pieces_too(
+    in_small_pieces: None, tmp_path: Path
+) -> None:
+    made = eomc.read(SCENES / "kepler_orbit.toml")
+    m = module(derived(replace(made, run=replace(made.run, batch=True))), tmp_path)
+    q0, qd0 = np.tile(m.start[0], (70, 1)), np.tile(m.start[1], (70, 1))
+    good = m.simulate_batch(q0, qd0, steps=STEPS)
+    q0[41] = 0.0  # at the centre, where the force is infinite
+    runs = m.simulate_batch(q0, qd0, steps=STEPS)
+    assert runs.status[41] == "not finite" and runs.steps[41] == 0
+    others = np.arange(70) != 41
+    assert np.array_equal(runs.q[others], good.q[others])
+
+
+def test_signals_and_held_inputs_reach_a_batch_in_pieces(
+    in_small_pieces: None, tmp_path: Path
+) -> None:
+    made = scene_system("cartpole_driven")
+    m = module(derived(replace(made, run=replace(made.run, batch=True))), tmp_path)
+    source = tmp_path / made.name / "fast" / f"{made.name}.c"
+    assert "_solve_lane_2(" in source.read_text(encoding="utf-8")
+    q0, qd0 = (np.tile(x, (9, 1)) for x in m.start)
+    q0[:, 1] += np.linspace(-1, 1, 9)
+    for u in (None, [0.5]):
+        runs = m.simulate_batch(q0, qd0, steps=STEPS, u=u)
+        alone = m.simulate(q0[7], qd0[7], steps=STEPS, u=u)
+        # the same operations, contracted to FMA in other places
+        np.testing.assert_allclose(runs.q[7], alone.q, rtol=0, atol=1e-12)
+
+
+# --- matrices by columns -------------------------------------------------------------------------
+
+
+def by_columns(made: Program) -> Program:
+    """The program with D e and C e for a direction e in place of D and C."""
+    functions = dict(made.functions)
+    names = [c.name for c in made.system.coordinates]
+    for name in ("D", "C"):
+        whole = functions.pop(name)
+        body, outputs = list(whole.body), []
+        for i in range(len(names)):
+            terms = []
+            for j, c in enumerate(names):
+                o = whole.outputs[len(names) * i + j]
+                factors = (o.name, c + ALONG) if o.name else (c + ALONG,)
+                product = Product(abs(o.coefficient), factors)
+                body.append(Assignment(f"p_{i}_{j}", product, Stage.VELOCITY))
+                terms.append((S.NegativeOne if o.coefficient.is_negative else S.One, f"p_{i}_{j}"))
+            body.append(Assignment(f"row_{i}", Sum(tuple(terms)), Stage.VELOCITY))
+            outputs.append(Operand(S.One, f"row_{i}"))
+        functions[f"{name}_column"] = replace(
+            whole, name=f"{name}_column", body=tuple(body), outputs=tuple(outputs)
+        )
+    return replace(made, functions=functions)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "furuta_pendulum", "kapitza_pendulum"])
+@pytest.mark.parametrize("small", [False, True])
+def test_matrices_by_columns_are_the_matrices(
+    name: str, small: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = derived(eomc.read(SCENES / f"{name}.toml"))
+    whole = module(plain, tmp_path / "whole")
+    if small:
+        monkeypatch.setattr(outline, "LARGE", 5)
+        monkeypatch.setattr(outline, "PIECE", 8)
+        monkeypatch.setattr(outline, "LANE_PIECE", 8)
+    made = render(by_columns(plain), "_x")
+    source = written(made, tmp_path)
+    assert f"By {len(plain.system.q)} columns, each: " in made.files[f"{name}.h"]
+    compiled(needs("gcc"), *STRICT, "-O2", "-I.", "-c", source, "selftest.c", cwd=tmp_path)
+    columns = module(by_columns(plain), tmp_path / "columns")
+    states = np.random.default_rng(4).standard_normal((2, 9, len(plain.system.q)))
+    for found, expected in (
+        (columns.D(states[0]), whole.D(states[0])),
+        (columns.C(*states), whole.C(*states)),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+    values = program.nearby(plain.system, 2)
+    exact = program.matrix(by_columns(plain), "C", values)
+    expected, _ = evaluate(plain["C"], values)
+    np.testing.assert_allclose(np.ravel(exact), expected, rtol=1e-13, atol=1e-13)
+
+
+# --- names ---------------------------------------------------------------------------------------
+
+
+def test_parameters_may_be_called_like_directions(tmp_path: Path) -> None:
+    """The entries of a direction, for D and the Jacobian, have names that no scene can have."""
+    text = """
+        eomc = 1
+        name = "clash"
+        [coordinates]
+        x = { start = 1.0 }
+        y = {}
+        [parameters]
+        NAME = 2.0
+        [energy]
+        kinetic = "NAME*x_dot**2/2 + (1 + x**2)*y_dot**2/2"
+        [run]
+        linearize = true
+        """
+    q, qd = [0.3, 0.4], [0.2, -0.3]
+    found = []
+    for name in ("x_along", "m"):
+        made = system.from_scene(scene.parse(text.replace("NAME", name), "clash.toml"))
+        built = module(derived(made), tmp_path / name)
+        found.append((built.D(q), built.acceleration(q, qd), *built.linearize(q, qd)[:2]))
+    np.testing.assert_array_equal(found[0][0], np.diag([2.0, 1.09]))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_parameters_may_be_called_like_values(tmp_path: Path) -> None:
+    """w1 is a name of ours inside a function that does not read the parameter."""
+    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
+    awkward = re.sub(r"(?m)^g( +=)", r"w1\1", text).replace("m_p*g*y_p", "m_p*w1*y_p")
+    assert awkward.count("w1") == 2
+    found = module(derived(system.from_scene(scene.parse(awkward, "awkward.toml"))), tmp_path)
+    plain = eomc.load(SCENES / "cartpole.toml", tmp_path)
+    state = ([0.1, 0.4], [0.2, -0.3])
+    assert np.array_equal(found.acceleration(*state), plain.acceleration(*state))
+    assert np.array_equal(found.C(*state), plain.C(*state))

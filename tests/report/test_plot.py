@@ -1,0 +1,151 @@
+"""The figure of a run says what is drawn, in which unit, and shows the mechanism in the plane."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eomc.base.errors import EomcError
+from eomc.model import system
+from eomc.model.system import System, symbol
+from eomc.report import plot
+from eomc.scene import scene
+
+pytest.importorskip("matplotlib")
+
+SCENES = Path(__file__).parents[2] / "scenes"
+
+
+def cartpole():
+    made = system.from_scene(scene.read(SCENES / "cartpole.toml"))
+    t = np.linspace(0, 2, 201)
+    q = np.column_stack([0.1 * np.sin(t), np.pi / 2 + t])
+    return made, t, q, np.gradient(q, t, axis=0), 5 + 1e-6 * t
+
+
+def spring(n=1):
+    x = [symbol(f"x_{i + 1}") for i in range(n)]
+    v = [symbol(f"x_{i + 1}_dot") for i in range(n)]
+    made = System.make(
+        "spring",
+        dict.fromkeys(x, 1.0),
+        sum(w**2 for w in v) / 2,
+        sum(y**2 for y in x) / 2,
+        units=dict.fromkeys(x, "m"),
+    )
+    t = np.linspace(0, 6, 61)
+    q = np.column_stack([np.cos(t)] * n)
+    return made, t, q, np.gradient(q, t, axis=0), np.exp(-t)
+
+
+@pytest.mark.parametrize(
+    ("run", "suffix"),
+    [(cartpole, ".png"), (cartpole, ".svg"), (spring, ".png"), (spring, ".svg"), (spring, ".pdf")],
+)
+def test_files_are_written(tmp_path, run, suffix):
+    file = tmp_path / f"picture{suffix}"
+    plot.draw(*run(), file)
+    assert file.stat().st_size > 5_000
+
+
+def test_same_run_same_bytes(tmp_path):
+    for name in ("a.svg", "b.svg"):
+        plot.draw(*spring(), tmp_path / name)
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+
+
+def test_axes_say_what_they_show():
+    made = plot.figure(*cartpole())
+    *curves, energy, plane = made.axes
+    assert [a.get_ylabel() for a in curves] == [
+        "$x$ (m)",
+        r"$\dot{x}$ (m/s)",
+        r"$\theta$ (rad)",
+        r"$\dot{\theta}$ (rad/s)",
+    ]
+    assert energy.get_xlabel() == "$t$ (s)"
+    assert energy.get_ylabel() == "$E - E(0)$ (J)"
+    assert "max $|E - E(0)|$ = $2\\times10^{-6}$ J" in energy.get_title()
+    assert plane.get_xlabel() == r"$x_{\mathrm{p}}$ (m)"
+    assert plane.get_aspect() == 1
+    assert made.get_suptitle() == "Cart-pole"
+    assert plot.figure(*cartpole(), title="Mine").get_suptitle() == "Mine"
+
+
+def test_rods_join_the_cart_to_the_pole():
+    made, t, q, qd, energy = cartpole()
+    plane = plot.figure(made, t, q, qd, energy).axes[-1]
+    rods = [line.get_xydata() for line in plane.get_lines() if len(line.get_xydata()) == 2]
+    assert 12 <= len(rods) <= 20
+    assert np.allclose([np.linalg.norm(a - b) for a, b in rods], 1.0)  # l/2
+    assert np.allclose([a[1] for a, _ in rods], 0.0)
+    assert np.allclose(rods[0][0], q[0, 0] * np.array([1, 0]))
+
+
+def test_one_coordinate_has_a_phase_portrait_and_lost_energy_is_drawn_as_it_is():
+    *_, energy, phase = plot.figure(*spring()).axes
+    assert (phase.get_xlabel(), phase.get_ylabel()) == ("$x_{1}$ (m)", r"$\dot{x}_{1}$ (m/s)")
+    assert energy.get_ylabel() == "$E$ (J)"
+
+
+@pytest.mark.parametrize("n", [2, 5, 9, 30])
+def test_many_coordinates_share_axes_and_every_one_is_drawn(n):
+    made = plot.figure(*spring(n))
+    time = [a for a in made.axes if "plane" not in a.get_title() and "space" not in a.get_title()]
+    assert len(time) <= 2 * plot.ROWS + 1
+    assert sum(len(a.get_lines()) for a in time) == 2 * n + 1
+    assert made.get_size_inches()[1] <= 9
+
+
+def test_polar_coordinates_hang_where_gravity_pulls():
+    r, theta, g = symbol("r"), symbol("theta"), 9.81
+    kinetic = (symbol("r_dot") ** 2 + r**2 * symbol("theta_dot") ** 2) / 2
+    t = np.linspace(0, 1, 11)
+    q = np.column_stack([np.ones(11), np.zeros(11)])
+    for potential, end in ((-g * r * system.sympy.cos(theta), (0, -1)), (-1 / r, (1, 0))):
+        made = System.make("polar", [r, theta], kinetic, potential)
+        plane = plot.figure(made, t, q, 0 * q, 0 * t).axes[-1]
+        assert any(np.allclose(line.get_xydata()[-1], end) for line in plane.get_lines())
+
+
+@pytest.mark.parametrize(
+    ("name", "printed"),
+    [
+        ("x", "$x$"),
+        ("theta", r"$\theta$"),
+        ("theta_1", r"$\theta_{1}$"),
+        ("q10", "$q_{10}$"),
+        ("m_c", r"$m_{\mathrm{c}}$"),
+        ("arm", r"$\mathrm{arm}$"),
+        ("x_p_2", r"$x_{\mathrm{p},2}$"),
+    ],
+)
+def test_names_are_set_as_mathematics(name, printed):
+    assert plot.mathtext(name) == printed
+
+
+def test_every_greek_letter_can_be_set():
+    from matplotlib.mathtext import MathTextParser
+
+    for letter in plot.names.GREEK.values():
+        MathTextParser("agg").parse(plot.mathtext(f"{letter}_{letter}", rate=True))
+
+
+def test_without_matplotlib_one_sentence_says_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(EomcError, match="pip install matplotlib"):
+        plot.draw(*spring(), tmp_path / "a.png")
+
+
+def test_unknown_suffixes_and_folders_are_told(tmp_path):
+    with pytest.raises(EomcError, match=r"\.png, \.svg, \.pdf"):
+        plot.draw(*spring(), tmp_path / "a.jpg")
+    with pytest.raises(EomcError, match="can't be written"):
+        plot.draw(*spring(), tmp_path / "nowhere" / "a.png")
+
+
+def test_a_run_of_one_sample_can_be_drawn():
+    for run in (cartpole, spring):
+        made, *values = run()
+        plot.figure(made, *(v[:1] for v in values))

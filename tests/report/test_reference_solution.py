@@ -1,0 +1,192 @@
+"""The reference solution against answers of 30 digits, exact motions and its own promises."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import mpmath
+import numpy as np
+import pytest
+import sympy
+from cases import case_system, cases
+from conftest import ROOT, needs
+
+import eomc
+from eomc.base.errors import EomcError
+from eomc.emit import c_expression
+from eomc.model.system import System
+from eomc.report import reference_solution
+
+TRUTHS = ROOT / "build" / "tests" / "truths"
+
+
+@pytest.fixture(autouse=True)
+def gcc() -> None:
+    needs("gcc")
+
+
+def oscillator(duration: float = 2.0) -> System:
+    """x = cos(3 t), of one coordinate."""
+    x, k = sympy.symbols("x k")
+    v = sympy.Symbol("x_dot")
+    return System.make("oscillator", {x: 1.0}, v**2 / 2, k * x**2 / 2, parameters={k: 9.0},
+                       duration=duration)  # fmt: skip
+
+
+def digits_right(name: str, made: reference_solution.Truth) -> float:
+    """Digits in common with the case's answer, relative to the largest value on the way."""
+    case = cases()[name]
+    exact = [*case["q_ref"], *case["qd_ref"]]
+    found = [*made.q[-1], *made.qd[-1]]
+    off = [
+        abs(float(Fraction(str(a)) - Fraction(b))) / s
+        for a, b, s in zip(found, exact, made.scale, strict=True)
+    ]
+    return float(-np.log10(max(off)))
+
+
+def agrees(name: str) -> None:
+    made = reference_solution.of(case_system(name), root=TRUTHS)
+    assert made.digits[-1] >= 25
+    # what it promises is right, as far as the case's 30 digits tell
+    assert digits_right(name, made) > min(made.digits[-1], 29) - 0.5
+
+
+@pytest.mark.parametrize("name", ["cartpole_drop_physicalP", "double_pendulum_regular"])
+def test_a_case_has_25_digits(name: str) -> None:
+    agrees(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cartpole_torque_physicalP",
+        "pendulum_large_swing",
+        "kepler_e0.9_cartesian",
+        "lagrange_top_nutation",
+        "spring_pendulum_resonant",
+        "henon_heiles",
+        "kapitza_pendulum",
+    ],
+)
+def test_more_cases_have_25_digits(name: str) -> None:
+    agrees(name)
+
+
+def test_an_oscillator_is_cos_all_along(tmp_path: Path) -> None:
+    made = reference_solution.of(oscillator(), rows=8, root=tmp_path)
+    with mpmath.workdps(40):
+        for k, (q, qd) in enumerate(zip(made.q[:, 0], made.qd[:, 0], strict=True)):
+            t = mpmath.mpf(2) * k / 8
+            assert abs(mpmath.mpf(str(q)) - mpmath.cos(3 * t)) < 1e-31
+            assert abs(mpmath.mpf(str(qd)) + 3 * mpmath.sin(3 * t)) < 3e-31
+    assert made.digits[-1] > 30
+    assert made.plain is not None and min(made.plain[:2]) > 30 and made.plain[2] > 0
+    np.testing.assert_array_equal(made.t, np.arange(9) / 4)
+
+
+def test_differences_are_right_below_double_precision(tmp_path: Path) -> None:
+    made = reference_solution.of(oscillator(), rows=4, root=tmp_path)
+    nearest = made.q.astype(float)
+    off = made.off(nearest, made.qd.astype(float))[:, 0]
+    expected = [float(Fraction(float(x)) - Fraction(str(s))) for x, s in zip(
+        nearest[:, 0], made.q[:, 0], strict=True)]  # fmt: skip
+    np.testing.assert_allclose(off, expected, rtol=1e-9, atol=1e-33)
+    assert np.max(np.abs(off)) > 1e-18  # doubles can't say it
+
+
+def test_it_is_kept_until_start_or_parameters_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = oscillator()
+    first = reference_solution.of(system, rows=4, root=tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(reference_solution, "_computed", lambda *a: pytest.fail("computed again"))
+        again = reference_solution.of(system, rows=4, root=tmp_path)
+    np.testing.assert_array_equal(first.q, again.q)
+    np.testing.assert_array_equal(first.digits, again.digits)
+    other = reference_solution.of(system.at({"k": 4.0}), rows=4, root=tmp_path)
+    assert float(other.q[-1, 0]) == pytest.approx(np.cos(4.0), abs=1e-14)
+
+
+def test_accelerations_that_are_not_the_plain_ones_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = reference_solution._compiled
+    monkeypatch.setattr(reference_solution, "_compiled", lambda s, f: wrong(s.at({"k": 9.0}), f))
+    right = reference_solution._run
+    monkeypatch.setattr(
+        reference_solution, "_run", lambda e, s, *how: right(e, s.at({"k": 9.000000001}), *how)
+    )
+    with pytest.raises(EomcError, match="agree to 10 digits only"):
+        reference_solution.of(oscillator(), rows=4, root=tmp_path)
+
+
+def test_what_it_can_not_do_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(EomcError, match="power of two"):
+        reference_solution.of(oscillator(), rows=100, root=tmp_path)
+    with pytest.raises(EomcError, match="number of seconds"):
+        reference_solution.of(oscillator(), duration=-1.0, root=tmp_path)
+    with monkeypatch.context() as patch, pytest.raises(EomcError, match="shorter duration"):
+        patch.setattr(reference_solution, "SECONDS", 0.05)
+        reference_solution.of(oscillator(1e6), root=tmp_path)
+    monkeypatch.setattr(shutil, "which", lambda name: None if name == "gcc" else f"/bin/{name}")
+    monkeypatch.setattr(reference_solution.compiler, "key", lambda *a: "another")
+    with pytest.raises(EomcError, match="libquadmath"):
+        reference_solution.of(oscillator(), rows=4, root=tmp_path)
+
+
+def test_a_jump_costs_digits(tmp_path: Path) -> None:
+    """sign(x_dot) is not smooth where the block turns: both ways must not claim 25 digits."""
+    x, v = sympy.symbols("x x_dot")
+    rubbed = System.make("rubbed", {x: (1.0, 0.0)}, v**2 / 2, 9 * x**2 / 2,
+                         forces={x: -sympy.sign(v) / 2}, duration=2.0)  # fmt: skip
+    made = reference_solution.of(rubbed, rows=8, root=tmp_path)
+    assert reference_solution.corners(rubbed) == "sign"
+    assert made.digits[-1] < 20
+    # half a swing about x = 1/18 until pi/3, then about -1/18
+    turned = -1 + 2 / 18
+    exact = -1 / 18 + (turned + 1 / 18) * np.cos(3 * (2 - np.pi / 3))
+    assert abs(float(made.q[-1, 0]) - exact) < 10.0 ** -min(made.digits[-1], 14.0)
+
+
+def test_a_motion_that_sticks_at_a_jump_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(EomcError, match=r"a force that jumps \(sign\) holds the motion there"):
+        reference_solution.of(case_system("coulomb_friction"), rows=4, root=tmp_path)
+
+
+def test_quad_literals_hold_more_digits_than_a_double() -> None:
+    assert c_expression.number(sympy.Rational(1, 10), c_expression.QUAD) == "(1.0q/10.0q)"
+    assert c_expression.number(sympy.Integer(3), c_expression.QUAD) == "3.0q"
+    assert c_expression.number(sympy.pi, c_expression.QUAD).startswith(
+        "3.14159265358979323846264338327950288"
+    )
+    text = c_expression.number(sympy.Float(0.1), c_expression.QUAD)  # the double that it is
+    assert abs(Fraction(text[:-1]) - Fraction(0.1)) < Fraction(1, 10**38)
+
+
+def test_gauss_coefficients_integrate_polynomials() -> None:
+    """sum b c^k = 1/(k + 1) to order 2 s, sum_j a_ij c_j^k = c_i^(k+1)/(k + 1) to s."""
+    with mpmath.workdps(50):
+        s = 16
+        x = [mpmath.mpf(text) for text in reference_solution.gauss(s).split()]
+        c, A = x[1 : 1 + s], x[1 + s : 1 + s + s * s]
+        b = x[1 + s + 2 * s * s : 1 + 2 * s + 2 * s * s]
+        for k in range(2 * s):
+            assert abs(mpmath.fdot(b, [z**k for z in c]) - mpmath.mpf(1) / (k + 1)) < 1e-38
+        for k in range(s):
+            for i in range(s):
+                row = A[i * s : (i + 1) * s]
+                assert abs(mpmath.fdot(row, [z**k for z in c]) - c[i] ** (k + 1) / (k + 1)) < 1e-38
+
+
+def test_the_scene_file_itself_will_do(tmp_path: Path) -> None:
+    scene = ROOT / "scenes" / "mass_spring.toml"
+    made = reference_solution.of(scene, duration=1.0, rows=2, root=tmp_path)
+    system = replace(eomc.read(scene))
+    assert made.q.shape == (3, len(system.coordinates))
+    assert (tmp_path / "mass_spring" / "truth_1.0_2.json").exists()

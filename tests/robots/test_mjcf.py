@@ -1,0 +1,598 @@
+"""Reading MJCF: numbers worked out by hand, what is told, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from eomc.base.errors import EomcError, SceneError
+from eomc.robots.mjcf import read
+from eomc.robots.robot import IDENTITY, Motion, Robot
+
+CLOSE = 1e-14  # relative; the numbers below need a few operations each
+
+
+def model(tmp_path: Path, inside: str, before: str = "", after: str = "") -> Robot:
+    """The robot of a text: `inside` <worldbody>, `before` and `after` it."""
+    file = tmp_path / "model.xml"
+    file.write_text(f"<mujoco>{before}\n<worldbody>{inside}</worldbody>\n{after}</mujoco>")
+    return read.read(file)
+
+
+def refused(tmp_path: Path, inside: str, before: str = "", after: str = "") -> str:
+    with pytest.raises(SceneError) as fault:
+        model(tmp_path, inside, before, after)
+    return str(fault.value)
+
+
+BALL = '<geom size="0.1"/>'
+BODY = f'<body name="a"><joint name="j"/>{BALL}</body>'
+
+
+def told(robot: Robot, *words: str) -> bool:
+    """Whether one line of what is left out holds all the words."""
+    return any(all(word in line for word in words) for line in robot.left_out)
+
+
+# ---- masses
+
+R, H, M = 0.1, 0.2, 3.0  # a radius, half a length, a mass
+PI = math.pi
+
+
+@pytest.mark.parametrize(
+    ("geom", "mass", "inertia"),
+    [
+        ('size="0.1"', 4e3 / 3 * PI * R**3, None),
+        ('size="0.1" mass="3"', M, [0.4 * M * R**2] * 3),
+        ('size="0.1" mass="3" density="7"', M, [0.4 * M * R**2] * 3),
+        ('type="box" size="0.1 0.2 0.3" density="10"', 80 * 0.006, None),
+        ('type="box" size="0.1 0.2 0.3" mass="3"', M, [0.13, 0.10, 0.05]),
+        ('type="ellipsoid" size="0.1 0.2 0.3" mass="5"', 5.0, [0.13, 0.10, 0.05]),
+        ('type="cylinder" size="0.1 0.2" density="1"', PI * R**2 * 2 * H, None),
+        (
+            'type="cylinder" size="0.1 0.2" mass="3"',
+            M,
+            [M * (3 * R**2 + 4 * H**2) / 12] * 2 + [M * R**2 / 2],
+        ),
+        ('type="capsule" size="0.1 0.2" density="1"', PI * R**2 * (2 * H + 4 / 3 * R), None),
+        # shells: density is by area
+        ('size="0.1" shellinertia="true" density="1"', 4 * PI * R**2, None),
+        ('size="0.1" shellinertia="true" mass="3"', M, [2 / 3 * M * R**2] * 3),
+        (
+            'type="cylinder" size="0.1 0.2" shellinertia="true" density="1"',
+            4 * PI * R * H + 2 * PI * R**2,
+            None,
+        ),
+        ('type="box" size="1 1 1" shellinertia="true" mass="18"', 18.0, [20.0] * 3),
+    ],
+)
+def test_the_mass_of_a_geom(
+    tmp_path: Path, geom: str, mass: float, inertia: list[float] | None
+) -> None:
+    (body,) = model(tmp_path, f"<body><joint/><geom {geom}/></body>").bodies
+    assert body.mass == pytest.approx(mass, rel=CLOSE)
+    if inertia:
+        assert body.inertia[:3] == pytest.approx(inertia, rel=1e-13)
+        assert body.inertia[3:] == (0, 0, 0)
+
+
+def moments(shape: str, points: int = 400) -> list[float]:
+    """Ixx and Izz of a unit mass of the capsule of R and H, by summing thin slices along z."""
+    z = (np.arange(points * 10) + 0.5) / (points * 10) * 2 * (H + R) - (H + R)
+    beyond = np.maximum(np.abs(z) - H, 0.0)
+    radius = np.sqrt(R**2 - beyond**2)
+    if shape == "solid":
+        weight, across = radius**2, radius**2 / 4
+    else:  # the strip of a sphere is as wide as the slice is thick, times R/radius
+        weight, across = np.where(beyond > 0, R, radius), radius**2 / 2
+    weight = weight / weight.sum()
+    return [float((weight * (across + z**2)).sum()), float((weight * 2 * across).sum())]
+
+
+@pytest.mark.parametrize(("shape", "shell"), [("solid", "false"), ("shell", "true")])
+def test_the_inertia_of_a_capsule_is_that_of_its_slices(
+    tmp_path: Path, shape: str, shell: str
+) -> None:
+    geom = f'<geom type="capsule" size="0.1 0.2" mass="1" shellinertia="{shell}"/>'
+    (body,) = model(tmp_path, f"<body><joint/>{geom}</body>").bodies
+    # 4000 slices: the midpoint rule leaves some 1e-6, more at the edge between tube and cap
+    assert [body.inertia[0], body.inertia[2]] == pytest.approx(moments(shape), rel=1e-4)
+
+
+def test_geoms_add_up_about_their_common_centre(tmp_path: Path) -> None:
+    geoms = '<geom size="0.1" mass="1" pos="0 0 1"/><geom size="0.1" mass="3" pos="0 0 -1"/>'
+    (body,) = model(tmp_path, f"<body><joint/>{geoms}</body>").bodies
+    own = 0.4 * 4 * 0.01
+    assert body.mass == 4
+    assert body.center == (0, 0, -0.5)
+    steiner = 1 * 1.5**2 + 3 * 0.5**2
+    assert body.inertia == pytest.approx((own + steiner, own + steiner, own, 0, 0, 0), rel=CLOSE)
+
+
+def test_geoms_off_all_planes_have_products_of_inertia(tmp_path: Path) -> None:
+    places = np.array([[0.1, 0.2, 0.4], [-0.3, 0.5, 0.1], [0.2, -0.4, 0.6]])
+    m = np.array([1.0, 2.0, 0.5])
+    geoms = "".join(
+        f'<geom size="0.1" mass="{k}" pos="{x} {y} {z}"/>'
+        for k, (x, y, z) in zip(m, places, strict=True)
+    )
+    (body,) = model(tmp_path, f"<body><joint/>{geoms}</body>").bodies
+    x, y, z = (places - m @ places / m.sum()).T
+    own = 0.4 * m.sum() * 0.01
+    moments = [own + m @ (a * a + b * b) for a, b in ((y, z), (x, z), (x, y))]
+    products = [-m @ (a * b) for a, b in ((x, y), (x, z), (y, z))]
+    assert body.inertia == pytest.approx((*moments, *products), rel=1e-13)  # some roundings
+
+
+def test_a_capsule_from_one_point_to_another(tmp_path: Path) -> None:
+    geom = '<geom type="capsule" size="0.1" fromto="1 0 0 1 0.4 0" mass="2"/>'
+    upright = '<geom type="capsule" size="0.1 0.2" mass="2"/>'
+    (a, b) = model(tmp_path, f"<body><joint/>{geom}</body><body><joint/>{upright}</body>").bodies
+    assert a.center == (1, 0.2, 0)
+    assert a.inertia == (b.inertia[0], b.inertia[2], b.inertia[1], 0, 0, 0)  # along y, not z
+
+
+def test_full_inertia_is_in_mujocos_order(tmp_path: Path) -> None:
+    # a turn of the frame around it by a quarter about z: x is y there, y is -x
+    full = '<inertial pos="1 2 3" mass="2" fullinertia="4 5 6 0.1 0.2 0.3"/>'
+    bodies = f'<body><joint/>{full}</body><body><joint/><frame euler="0 0 90">{full}</frame></body>'
+    a, b = model(tmp_path, bodies).bodies
+    assert (a.center, a.inertia) == ((1, 2, 3), (4, 5, 6, 0.1, 0.2, 0.3))
+    assert b.center == (-2, 1, 3)
+    assert b.inertia == pytest.approx((5, 4, 6, -0.1, -0.3, 0.2), rel=CLOSE)
+
+
+def test_inertia_from_geoms_or_from_inertial(tmp_path: Path) -> None:
+    inertial = '<inertial pos="0 0 0" mass="7" diaginertia="1 1 1"/>'
+    body = f'<body><joint/>{inertial}<geom size="1" mass="2"/></body>'
+
+    def mass(how: str) -> float:
+        return model(tmp_path, body, f'<compiler inertiafromgeom="{how}"/>').bodies[0].mass
+
+    assert [mass("auto"), mass("true"), mass("false")] == [7, 2, 7]
+
+
+def test_geoms_of_groups_out_of_range_and_without_mass_do_not_count(tmp_path: Path) -> None:
+    geoms = (
+        '<geom size="1" mass="2" group="1"/><geom type="mesh" mesh="m" group="0"/>'
+        '<geom type="mesh" mesh="m" mass="0" group="1"/><geom type="plane" group="1"/>'
+        '<geom type="mesh" mesh="m" density="0" group="1"/>'
+    )
+    robot = model(tmp_path, f"<body><joint/>{geoms}</body>", '<compiler inertiagrouprange="1 3"/>')
+    assert robot.bodies[0].mass == 2
+
+
+def test_bounds_then_balance_then_the_total_mass(tmp_path: Path) -> None:
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 2 9"/>'
+    body = f"<body><joint/>{inertial}</body>"
+    compiler = '<compiler boundmass="3" boundinertia="2" balanceinertia="true" settotalmass="6"/>'
+    (a,) = model(tmp_path, body, compiler).bodies
+    assert a.mass == 6
+    assert a.inertia == pytest.approx([2 * (2 + 2 + 9) / 3] * 3 + [0] * 3, rel=CLOSE)
+
+
+# ---- frames and joints
+
+
+def test_angles_are_degrees_unless_the_compiler_says_radian(tmp_path: Path) -> None:
+    joint = '<joint range="-90 45" ref="30" springref="60" stiffness="2"/>'
+    body = f'<body euler="0 0 90">{joint}{BALL}</body>'
+    (a,) = model(tmp_path, body).bodies
+    assert a.motions[0].start == pytest.approx(PI / 6, rel=CLOSE)
+    assert a.motions[0].rest == pytest.approx(PI / 3, rel=CLOSE)
+    assert a.motions[0].stiffness == 2  # by rad, always
+    assert a.motions[0].note == "from -1.5708 to 0.785398 rad"
+    body = body.replace("90", "1").replace("30", "0.5")
+    (b,) = model(tmp_path, body, '<compiler angle="radian"/>').bodies
+    assert b.motions[0].start == 0.5
+    assert b.rotation[0][0] == pytest.approx(math.cos(0.5), rel=CLOSE)
+
+
+def test_orientations_say_the_same_in_five_ways(tmp_path: Path) -> None:
+    # a quarter turn about z, then one about the new x: x to y, y to z, z to x
+    ways = [
+        'quat="1 1 1 1"',
+        'euler="90 0 90"',
+        'axisangle="2 2 2 120"',
+        'xyaxes="0 1 0 0 5 1"',
+    ]
+    compiler = '<compiler eulerseq="zyx"/>'
+    for way in ways:
+        (a,) = model(tmp_path, f"<body {way}><joint/>{BALL}</body>", compiler).bodies
+        assert np.array(a.rotation) == pytest.approx(
+            np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), abs=1e-15
+        ), way
+    (a,) = model(tmp_path, f'<body zaxis="3 0 0"><joint/>{BALL}</body>').bodies
+    assert a.rotation == ((0, 0, 1), (0, 1, 0), (-1, 0, 0))
+
+
+def test_capitals_of_eulerseq_are_axes_that_stay(tmp_path: Path) -> None:
+    body = f'<body euler="10 20 30"><joint/>{BALL}</body>'
+    (a,) = model(tmp_path, body, '<compiler eulerseq="XYZ"/>').bodies
+    back = body.replace("10 20 30", "30 20 10")
+    (b,) = model(tmp_path, back, '<compiler eulerseq="zyx"/>').bodies
+    assert np.array(a.rotation) == pytest.approx(np.array(b.rotation), abs=1e-15)
+
+
+def test_a_joint_off_the_bodys_origin_takes_the_frame_with_it(tmp_path: Path) -> None:
+    child = f'<body name="b" pos="0 0 1">{BALL}</body>'
+    parts = '<joint pos="0 0 0.25"/><geom size="0.1" pos="0 0 0.5"/>'
+    a, b = model(tmp_path, f'<body name="a" pos="1 0 0">{parts}{child}</body>').bodies
+    assert a.offset == (1, 0, 0.25)
+    assert a.center == (0, 0, 0.25)
+    assert b.offset == (0, 0, 0.75)
+    assert "(0, 0, 0.25)" in a.note
+
+
+def test_ref_is_the_coordinate_in_the_pose_of_the_file(tmp_path: Path) -> None:
+    hinge = f'<body name="a"><joint name="j" axis="0 0 1" ref="90"/>{BALL}</body>'
+    slide = '<joint name="k" type="slide" axis="0 3 4" ref="5"/>'
+    a, b = model(tmp_path, f'{hinge}<body name="b" pos="1 0 0">{slide}{BALL}</body>').bodies
+    # at j = 0 the body is turned by -90 degrees; at k = 0 it lies 5 m behind along the axis
+    assert a.rotation == ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
+    assert a.motions[0].start == pytest.approx(PI / 2, rel=CLOSE)
+    assert b.offset == pytest.approx((1, -3, -4), rel=CLOSE)
+    assert b.axes == ((0, 0.6, 0.8),)
+    assert b.motions[0].start == 5
+
+
+def test_several_joints_of_a_body_become_a_chain_in_their_order(tmp_path: Path) -> None:
+    joints = (
+        '<joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>'
+        '<joint name="y" axis="0 1 0" pos="0 0 1"/>'
+    )
+    child = f'<body name="b"><joint name="k"/>{BALL}</body>'
+    robot = model(tmp_path, f'<body name="a" pos="0 0 3">{joints}{BALL}{child}</body>')
+    assert [(b.name, b.parent, b.joint) for b in robot.bodies] == [
+        ("a_x", "world", "prismatic"),
+        ("a_z", "a_x", "prismatic"),
+        ("a", "a_z", "revolute"),
+        ("b", "a", "revolute"),
+    ]
+    assert [b.mass > 0 for b in robot.bodies] == [False, False, True, True]
+    assert [b.offset for b in robot.bodies] == [(0, 0, 3), (0, 0, 0), (0, 0, 1), (0, 0, -1)]
+    assert [m.name for m in robot.motions] == ["x", "z", "y", "k"]
+
+
+def test_a_free_joint_starts_at_the_bodys_pose(tmp_path: Path) -> None:
+    text = f'<body pos="1 2 3" euler="0 0 30"><freejoint name="root"/>{BALL}</body>'
+    (a,) = model(tmp_path, text).bodies
+    assert (a.joint, a.offset, a.rotation) == ("free", (0, 0, 0), IDENTITY)
+    assert [m.name for m in a.motions] == ["x", "y", "z", "yaw", "pitch", "roll"]
+    starts = [m.start for m in a.motions]
+    assert starts == pytest.approx([1, 2, 3, PI / 6, 0, 0], abs=1e-15)
+
+
+def test_coordinates_of_several_free_and_ball_joints_carry_their_names(tmp_path: Path) -> None:
+    free = f'<body><freejoint name="p"/>{BALL}</body><body><freejoint name="q"/>{BALL}</body>'
+    ball = f'<body><joint name="b" type="ball" range="0 60"/>{BALL}</body>'
+    robot = model(tmp_path, free + ball)
+    assert [m.name for m in robot.motions][5:8] == ["roll_p", "x_q", "y_q"]
+    assert [m.name for m in robot.bodies[2].motions] == ["yaw_b", "pitch_b", "roll_b"]
+    assert "1.0472 rad at most" in robot.bodies[2].motions[0].note
+    assert len({m.name for m in robot.motions}) == 15
+
+
+def test_armature_of_a_free_joint_is_mass_along_and_inertia_about(tmp_path: Path) -> None:
+    text = '<body><joint type="free" armature="0.5"/><geom size="1" mass="5"/></body>'
+    (a,) = model(tmp_path, text).bodies
+    assert [m.armature for m in a.motions] == [0.5] * 3 + [0] * 3
+    assert a.inertia == pytest.approx((2.5, 2.5, 2.5, 0, 0, 0), rel=CLOSE)
+    assert "0.5" in a.note
+
+
+def test_what_acts_on_balls_that_is_not_the_same_is_told(tmp_path: Path) -> None:
+    ball = f'<body><joint name="b" type="ball" armature="2" damping="3"/>{BALL}</body>'
+    robot = model(tmp_path, f'<body name="a"><joint name="j"/>{BALL}{ball}</body>')
+    assert [(m.armature, m.damping) for m in robot.bodies[1].motions] == [(2, 3)] * 3
+    assert told(robot, "damping of whole turns", "b")
+    assert told(robot, "exact armature of ball joints", "b")
+    robot = model(tmp_path, ball)  # on the world: the armature is exact
+    assert not told(robot, "armature")
+    assert robot.bodies[0].inertia[0] > 2
+
+
+# ---- defaults
+
+
+DEFAULTS = """<default>
+  <joint damping="1" armature="2"/> <geom type="capsule" size="0.1 0.4" mass="1"/>
+  <default class="a"> <joint damping="3"/>
+    <default class="b"> <joint frictionloss="4"/> </default>
+  </default>
+</default>"""
+
+
+def test_classes_inherit_and_childclass_holds_for_all_below(tmp_path: Path) -> None:
+    geom = "<geom/>"
+    text = (
+        f"<body><joint/>{geom}</body>"
+        f'<body childclass="a"><joint/>{geom}'
+        f'<body><joint class="b"/>{geom}</body><body childclass="b"><joint damping="5"/>{geom}'
+        f'<frame childclass="main"><body><joint/>{geom}</body></frame></body></body>'
+        f"<body><freejoint/>{geom}</body>"
+    )
+    robot = model(tmp_path, text, DEFAULTS)
+    numbers = [(m.damping, m.armature, m.friction) for m in robot.motions]
+    assert numbers == [(1, 2, 0), (3, 2, 0), (3, 2, 4), (5, 2, 4), (1, 2, 0)] + [(0, 0, 0)] * 6
+
+
+def test_an_element_overrides_the_first_numbers_and_any_orientation(tmp_path: Path) -> None:
+    defaults = '<default><geom type="box" size="0.1 0.2 0.3" mass="3" euler="90 0 0"/></default>'
+    text = '<body><joint/><geom size="0.2"/></body><body><joint/><geom quat="1 0 0 0"/></body>'
+    a, b = model(tmp_path, text, defaults).bodies
+    assert a.inertia[:3] == pytest.approx((0.13, 0.08, 0.13), rel=CLOSE)  # turned: x, z, y
+    assert b.inertia[:3] == pytest.approx((0.13, 0.10, 0.05), rel=CLOSE)
+
+
+# ---- actuators, key frames, what is left out
+
+
+def test_motors_become_drives_with_their_gear(tmp_path: Path) -> None:
+    actuators = """<actuator>
+      <motor name="m" joint="j" gear="150" ctrlrange="-1 1"/> <motor joint="j"/>
+      <general name="g" joint="j" gear="2" gainprm="3"/>
+      <position name="p" joint="j" kp="10" gear="4"/> <motor name="t" tendon="t"/>
+    </actuator>"""
+    robot = model(tmp_path, BODY, after=actuators)
+    assert [(d.name, d.coordinate, d.gear) for d in robot.drives] == [
+        ("m", "j", 150),
+        ("j_motor", "j", 1),
+        ("g", "j", 6),
+        ("p", "j", 4),
+    ]
+    assert robot.drives[0].note == "input from -1 to 1"
+    assert told(robot, "laws of actuators", "p (position)")
+    assert told(robot, "actuators on tendons", ": t")
+
+
+def test_armature_and_damping_of_actuators_count_by_the_gear_squared(tmp_path: Path) -> None:
+    body = BODY.replace('name="j"', 'name="j" armature="1" damping="2"')
+    motor = '<actuator><motor joint="j" gear="-3" armature="0.1" damping="0.2"/></actuator>'
+    (motion,) = model(tmp_path, body, after=motor).motions
+    assert (motion.armature, motion.damping) == pytest.approx((1.9, 3.8), rel=CLOSE)
+
+
+def test_a_shortcut_does_not_inherit_the_law_of_another(tmp_path: Path) -> None:
+    defaults = '<default><position kp="7" gear="5"/></default>'
+    actuators = '<actuator><motor name="m" joint="j"/><general name="g" joint="j"/></actuator>'
+    robot = model(tmp_path, BODY, defaults, actuators)
+    assert [d.gear for d in robot.drives] == [5, 5]
+    assert told(robot, "laws of actuators", "g (position)")
+    assert not told(robot, "laws of actuators", "m (")
+
+
+HOME = """<keyframe> <key name="other" qpos="1"/>
+  <key name="home" qpos="0.1 0.2 0.3 1 0 0 1 0.5 1 0 1 0 -0.25"/> </keyframe>"""
+
+
+def test_the_key_frame_home_is_the_start(tmp_path: Path) -> None:
+    text = f"""<body name="a" pos="9 9 9"><freejoint/>{BALL}
+      <body><joint name="h"/>{BALL}<body><joint name="b" type="ball"/>{BALL}
+      <body><joint name="s" type="slide"/>{BALL}</body></body></body></body>"""
+    with_short = model(tmp_path, text, after=HOME.replace(" -0.25", ""))
+    assert told(with_short, "key frame home", "13 numbers")
+    assert with_short.motions[0].start == 9
+    robot = model(tmp_path, text, after=HOME)
+    starts = [m.start for m in robot.motions]
+    assert starts == pytest.approx(
+        [0.1, 0.2, 0.3, PI / 2, 0, 0, 0.5, 0, PI / 2, 0, -0.25], abs=1e-15
+    )
+    assert told(robot, "key frames", "other")
+    assert told(robot, "singular at the start", "b")
+
+
+def test_everything_that_is_not_read_is_told(tmp_path: Path) -> None:
+    inside = """<light/><camera name="cam"/><site name="s1"/><site name="s2"/>
+      <geom name="floor" type="plane" size="1 1 1"/>
+      <body name="a" gravcomp="1"><joint name="j" stiffness="1 2" springdamper="1 1" range="0 9"/>
+        <geom name="ball" size="0.1" contype="0" conaffinity="0" colour="red"/>
+        <composite type="cable"/><replicate count="2"><geom size="1"/></replicate><wheel/></body>
+      <body name="m" mocap="true"><geom size="0.1"/></body>"""
+    before = """<size nstack="3"/><option viscosity="1" timestep="0.1"><flag contact="disable"/>
+      </option><asset><mesh file="deep/hand.stl"/></asset><nonsense/>"""
+    after = """<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>
+      <equality><joint joint1="j" joint2="k"/></equality>
+      <contact><exclude body1="a" body2="m"/></contact><sensor><clock name="c"/></sensor>"""
+    robot = model(tmp_path, inside, before, after)
+    for words in (
+        ("lights",),
+        ("cameras", "cam"),
+        ("sites (2)", "s1, s2"),
+        ("contacts of geoms", "floor"),
+        ("shapes of geoms without contact", "ball"),
+        ("gravcomp", "a"),
+        ("stiffness in the square", "j"),
+        ("springdamper", "j"),
+        ("limits of joints", "j"),
+        ("attributes that MJCF does not have", 'colour of geom "ball"'),
+        ("<composite>",),
+        ("<replicate>",),
+        ("elements that MJCF does not have (2)", "wheel in a", "nonsense"),
+        ("mocap", "m"),
+        ("fluid", "viscosity"),
+        ("options", "timestep"),
+        ("flags", "contact=disable"),
+        ("assets", "mesh deep/hand.stl"),
+        ("tendons", "t"),
+        ("equality", "joint j and k"),
+        ("contact pairs", "exclude a and m"),
+        ("sensors", "c"),
+        ("settings", "size"),
+    ):
+        assert told(robot, *words), words
+
+
+def test_many_names_are_cut_and_counted(tmp_path: Path) -> None:
+    sites = "".join(f'<site name="s{i}"/>' for i in range(30))
+    robot = model(tmp_path, BODY + sites)
+    assert told(robot, "sites (30): s0, s1", "s11 and 18 more")
+
+
+def test_gravity(tmp_path: Path) -> None:
+    assert model(tmp_path, BODY).gravity == (0, 0, -9.81)
+    assert model(tmp_path, BODY, '<option gravity="1 2 3"/>').gravity == (1, 2, 3)
+    off = '<option gravity="1 2 3"><flag gravity="disable"/></option>'
+    assert model(tmp_path, BODY, off).gravity == (0, 0, 0)
+
+
+def test_names_come_from_the_file_or_from_the_place(tmp_path: Path) -> None:
+    text = f'<body><joint/>{BALL}</body><body name="body3"><joint/><joint/>{BALL}</body><body/>'
+    robot = model(tmp_path, text)
+    assert [b.name for b in robot.bodies] == ["body1", "body3_body3_joint", "body3", "body3_2"]
+    names = [m.name for m in robot.motions]
+    assert names == ["body1_joint", "body3_joint", "body3_joint_2"]
+
+
+def test_a_nest_of_a_thousand_bodies_is_read(tmp_path: Path) -> None:
+    deep = 1000
+    text = "<body pos='1 0 0'><joint/><geom size='1'/>" * deep + "</body>" * deep
+    assert len(model(tmp_path, text).bodies) == deep
+
+
+# ---- faults
+
+
+@pytest.mark.parametrize(
+    ("inside", "before", "words"),
+    [
+        (
+            '<body name="a"><joint/><geom name="g" type="mesh" mesh="m"/></body>',
+            "",
+            ['geom "g"', "a follows from a mesh", "<inertial>"],
+        ),
+        (
+            '<body name="a"><joint/><inertial pos="0 0 0" mass="1"/><geom type="mesh"/></body>',
+            '<compiler inertiafromgeom="true"/>',
+            ['inertiafromgeom="auto"'],
+        ),
+        ('<body><joint name="j" axis="0 0 0"/></body>', "", ['joint "j"', "length zero"]),
+        ('<body quat="0 0 0 0"/>', "", ["quat has the length zero", "1 0 0 0"]),
+        ('<body pos="1 2"/>', "", ['pos="1 2" has 2 numbers; it takes 3']),
+        ('<body pos="1 2 z"/>', "", ["not a number"]),
+        ('<body pos="1 2 nan"/>', "", ["finite"]),
+        ('<body pos="1 2 1e200"/>', "", ["more than 1e+100, which can't be meant"]),
+        ('<body pos="1 2 1_0"/>', "", ["not a number"]),
+        ('<body><geom size="1e90" density="1e90"/></body>', "", ["inertia overflows"]),
+        ('<body quat="1 0 0 0" euler="1 2 3"/>', "", ["given twice, by quat and euler"]),
+        (
+            '<body name="a"><inertial pos="0 0 0" mass="1" diaginertia="1 1 3"/></body>',
+            "",
+            ["triangle", "balanceinertia"],
+        ),
+        (
+            '<body><inertial pos="0 0 0" mass="1" fullinertia="1 1 1 2 0 0"/></body>',
+            "",
+            ["principal moment", "boundinertia"],
+        ),
+        ('<body name="a"><inertial pos="0 0 0" mass="-1"/></body>', "", ["mass of a", "negative"]),
+        ('<body name="a"><inertial mass="1"/></body>', "", ["needs pos and mass"]),
+        ('<body><geom size="0 1"/></body>', "", ["size of a sphere is 1 positive"]),
+        ('<body><geom type="box" size="1 1"/></body>', "", ["size of a box is 3 positive"]),
+        ('<body><geom type="capsule" fromto="0 0 0 0 0 1"/></body>', "", ["needs a size"]),
+        ('<body><geom type="cone" size="1"/></body>', "", ['type="cone" is not one of sphere']),
+        ('<body><geom size="1" density="-1"/></body>', "", ["not be negative"]),
+        ('<body><joint damping="-1"/></body>', "", ["damping must not be negative"]),
+        (
+            '<body><geom type="ellipsoid" size="1 2 3" shellinertia="true"/></body>',
+            "",
+            ["shell of an ellipsoid"],
+        ),
+        ('<body name="a"/><body name="a"/>', "", ["body", 'two called "a"', "rename"]),
+        ("<body><body><freejoint/></body></body>", "", ["only a body in <worldbody>"]),
+        ("<body><freejoint/><joint/></body>", "", ["no other joints"]),
+        ("<joint/>", "", ["the world can't have this"]),
+        ("", "", ["no <body>"]),
+        ('<body childclass="no"/>', "", ['no default class "no"']),
+        ("<body/>", '<compiler coordinate="global"/>', ["global", "older MuJoCo"]),
+        ("<body/>", '<compiler eulerseq="xyw"/>', ["three of x, y, z"]),
+        ("<body/>", "<default><default/></default>", ["needs a name"]),
+        ("<body/>", '<include file="part.xml"/>', ['"part.xml" is not opened', "--include"]),
+    ],
+)
+def test_faults_say_where_what_and_what_to_do(
+    tmp_path: Path, inside: str, before: str, words: list[str]
+) -> None:
+    text = refused(tmp_path, inside, before)
+    for word in [*words, "model.xml:"]:
+        assert word in text
+
+
+def test_faults_are_told_all_at_once_with_their_lines(tmp_path: Path) -> None:
+    text = refused(
+        tmp_path,
+        '\n<body name="a"><joint axis="0 0 0"/>\n<geom size="-1"/>\n</body>',
+        after='<actuator>\n<motor joint="nowhere"/></actuator>',
+    )
+    lines = [line.split("model.xml:")[1].split(":")[0] for line in text.splitlines()]
+    assert lines == ["3", "4", "7"]
+    assert 'no joint "nowhere"' in text
+
+
+def test_what_is_not_mjcf_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "model.xml"
+    for text, words in (
+        ('<robot name="r"/>', "URDF"),
+        ("<html/>", "not MJCF"),
+        ("<mujoco>", "not XML"),
+        ("", "empty"),
+        ('<!DOCTYPE m [<!ENTITY a "b">]><mujoco model="&a;"/>', "entities"),
+        ('<!DOCTYPE m SYSTEM "/etc/passwd"><mujoco/>', "document type"),
+    ):
+        file.write_text(text)
+        with pytest.raises(EomcError, match=words):
+            read.read(file)
+    with pytest.raises(EomcError, match="no such file"):
+        read.read(tmp_path / "none.xml")
+
+
+# ---- included files
+
+
+def write(folder: Path, **files: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (folder / f"{name}.xml").write_text(text)
+    return folder / "main.xml"
+
+
+def test_included_files_stand_in_the_place_of_include(tmp_path: Path) -> None:
+    main = write(
+        tmp_path,
+        main="""<mujoco><include file="set.xml"/>
+            <worldbody><include file="arm.xml"/></worldbody></mujoco>""",
+        set="""<x><compiler angle="radian"/>
+            <default><joint damping="2"/></default></x>""",
+        arm='<x><body name="a"><include file="joint.xml"/><geom size="0.1"/></body></x>',
+        joint='<x><joint ref="0.5"/></x>',
+    )
+    (motion,) = read.read(main, include=True).motions
+    assert motion == Motion("a_joint", "rad", start=0.5, damping=2)
+    with pytest.raises(SceneError, match="is not opened"):
+        read.read(main)
+
+
+def test_no_file_outside_the_models_folder_is_opened(tmp_path: Path) -> None:
+    secret = tmp_path / "secret.xml"
+    secret.write_text('<mujoco><worldbody><body name="x"/></worldbody></mujoco>')
+    folder = tmp_path / "model"
+    body = "<worldbody><body/></worldbody>"
+    for name in ("../secret.xml", str(secret), "link.xml"):
+        main = write(folder, main=f'<mujoco><include file="{name}"/>{body}</mujoco>')
+        if name == "link.xml":
+            (folder / name).symlink_to(secret)
+        with pytest.raises(SceneError, match="outside the folder"):
+            read.read(main, include=True)
+
+
+def test_a_file_that_is_missing_or_included_twice_is_told(tmp_path: Path) -> None:
+    main = write(tmp_path, main='<mujoco><include file="none.xml"/></mujoco>')
+    with pytest.raises(SceneError, match=r'no file "none.xml"'):
+        read.read(main, include=True)
+    main = write(tmp_path, main='<mujoco><include file="main.xml"/></mujoco>')
+    with pytest.raises(SceneError, match="a second time"):
+        read.read(main, include=True)

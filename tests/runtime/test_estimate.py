@@ -1,0 +1,304 @@
+"""What a run says of itself: its error, whether it is resolved, and h against the limits."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from cases import SCENES, case_system, cases, error_of
+from conftest import ROOT, Modules
+
+import eomc
+from eomc.runtime import estimate
+
+SPRING = """
+eomc = 1
+name = "{name}"
+[coordinates]
+x = {{ start = 1.0 }}
+[parameters]
+k = {k}
+[energy]
+kinetic = "x_dot**2/2"
+potential = "k*x**2/2"
+dissipation = "{dissipation}"
+[run]
+h = 0.01
+duration = 10.0
+"""
+JUMPING = """
+eomc = 1
+name = "jumping"
+[coordinates]
+x = { start = 1.0 }
+[energy]
+kinetic = "x_dot**2/2"
+potential = "x**2/2"
+[forces]
+x = "-0.2*sign(x_dot)"
+[run]
+h = 0.01
+duration = 10.0
+"""
+
+
+@cache
+def compiled(name: str) -> ModuleType:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EOMC_CFLAGS", "-O1")  # it is the compiling that takes the time here
+        return eomc.load(case_system(name), ROOT / "build" / "tests" / "cases")
+
+
+def spring(modules: Modules, k: float, dissipation: str = "0") -> Any:
+    name = f"spring_{k:g}_{len(dissipation)}".replace("+", "")
+    return modules.of_text(SPRING.format(name=name, k=k, dissipation=dissipation))
+
+
+def quiet(module: Any, **how: Any) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return module.simulate(**how)
+
+
+# --- the size of the error ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("every", [1, 7, 2000])
+def test_error_along_the_way_and_at_the_end(modules: Modules, every: int) -> None:
+    """x = cos t, v = -sin t: the estimate is the error to a hundredth, at every row."""
+    run = modules("mass_spring").simulate(h=0.01, steps=2000, every=every, estimate=True)
+    error = run.error
+    assert error.q.shape == run.q.shape and error.qd.shape == run.qd.shape
+    assert error.q[0] == error.qd[0] == 0
+    truth = np.abs(run.q[:, 0] - np.cos(run.t)), np.abs(run.qd[:, 0] + np.sin(run.t))
+    # h/4 is off by 1/256 itself, rounding by some 1e-15 times the root of the steps
+    np.testing.assert_allclose(error.q[:, 0], truth[0], rtol=0.01, atol=1e-13)
+    np.testing.assert_allclose(error.qd[:, 0], truth[1], rtol=0.01, atol=1e-13)
+    assert error.end == {"x": error.q[-1, 0], "x_dot": error.qd[-1, 0]}
+    assert error.digits["x"] == pytest.approx(-math.log10(error.end["x"]), abs=0.01)
+    assert error.order == 4 and error.observed == pytest.approx(4, abs=0.05)
+    assert error.amplification == pytest.approx(1.2, abs=0.3)  # a rotation of (1, 1) or (1, -1)
+    assert error.resolved and error.verdict == ""
+
+
+def test_rounding_is_no_zero(modules: Modules) -> None:
+    """Ten digits beyond what the method leaves: what is told is rounding, neither more nor less."""
+    run = modules("mass_spring").simulate(h=1e-4, steps=100_000, every=10_000, estimate=True)
+    assert run.error.resolved and math.isnan(run.error.observed)
+    truth = np.abs(run.q[1:, 0] - np.cos(run.t[1:]))
+    assert np.all(run.error.q[1:] > 0) and np.all(run.error.q < 1e-11)
+    assert np.max(truth) < 10 * np.max(run.error.q)
+
+
+def test_no_step_no_error(cartpole: ModuleType) -> None:
+    error = cartpole.simulate(steps=0, estimate=True).error
+    assert not error.q.any() and error.resolved
+
+
+QUICK = (
+    "pendulum_large_swing",
+    "double_pendulum_light_tip",
+    "spring_pendulum_stiff_1e6",
+    "cartpole_torque_physicalP",
+    "coulomb_friction",
+    "slider_crank_near_changepoint",
+)
+
+
+def judged(name: str, most: int) -> list[tuple[float, bool]]:
+    """(estimate over error, wrong by a tenth without a word), one pair a step size."""
+    out = []
+    for measured in cases()[name]["rk4_measured"]:
+        if (steps := measured["steps"]) > most:
+            continue
+        run = quiet(compiled(name), h=measured["h"], steps=steps, every=max(1, steps // 400))
+        if run.status == "ok":
+            run.estimate()
+            off = np.abs(run.q[-1] - np.array(cases()[name]["q_ref"], float))
+            size = np.maximum(np.max(np.abs(run.q), axis=0), 1e-6 * np.max(np.abs(run.q)))
+            wrong = bool((off / size > 0.1).any())
+            ratio = float(run.error.q[-1].max()) / error_of(name, run.q[-1])
+            out.append((ratio, wrong and run.error.resolved))
+    return out
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_estimate_is_within_a_factor_of_ten(name: str) -> None:
+    found = judged(name, 100_000)
+    assert len(found) >= 3
+    assert all(0.1 <= ratio <= 10 for ratio, _ in found)
+    assert not any(silent for _, silent in found)
+
+
+@pytest.mark.slow
+def test_estimates_of_the_library() -> None:
+    """Nine of ten within a factor of ten; nothing that is wrong by a tenth is silent."""
+    free = [name for name, case in cases().items() if not case["constraints"]]
+    found = [pair for name in free for pair in judged(name, 2_000_000)]
+    assert len(found) > 100
+    assert sum(0.1 <= ratio <= 10 for ratio, _ in found) >= 0.9 * len(found)
+    assert not any(silent for _, silent in found)
+
+
+# --- what is not resolved -------------------------------------------------------------------------
+
+
+def test_a_motion_beyond_doubles_is_told() -> None:
+    """Errors grow by 1.7e11 in 15 s."""
+    run = compiled("double_pendulum_chaotic").simulate(h=0.005, steps=3000, estimate=True)
+    assert not run.error.resolved and "exceeds a tenth" in run.error.verdict
+    assert run.error.amplification > 1e9
+    assert min(run.error.digits.values()) == 0
+    run = compiled("double_pendulum_chaotic").simulate(h=1e-3, steps=25_000, estimate=True)
+    assert "chaotic" in run.error.verdict and "no run in float64" in run.error.verdict
+
+
+def test_jumps_lower_the_observed_order(modules: Modules) -> None:
+    run = modules.of_text(JUMPING).simulate(estimate=True)
+    assert run.error.observed < 3 and "forces jump" in run.error.verdict
+
+
+def test_steps_that_damp_a_fast_mode_away_are_found_out(modules: Modules) -> None:
+    """h omega = 2: at h and at h/2 the oscillation dies alike, and alike is not right."""
+    run = quiet(spring(modules, 1e6), h=2e-3, duration=10.0, every=50)
+    assert np.abs(run.q[-1, 0]) < 1e-6  # where the exact one goes on with amplitude 1
+    assert run.estimate().q[-1, 0] == pytest.approx(abs(math.cos(1e4) - run.q[-1, 0]), rel=0.2)
+    assert not run.error.resolved
+
+
+def test_a_run_that_stopped_has_an_error_as_far_as_it_went(modules: Modules) -> None:
+    run = quiet(spring(modules, 1e6), h=0.01, duration=10.0)
+    assert run.status == "not finite"
+    error = run.estimate()
+    assert len(error.q) == len(run) and "the run stopped" in error.verdict
+
+
+def test_a_run_that_stopped_read_as_much_of_its_inputs(driven: ModuleType) -> None:
+    """Shorter steps hold each row as long as it was held, up to where the run ended."""
+    u = np.full((60, 1), 0.3)
+    u[33] = 1e300  # too much for the square of what it makes of theta_dot
+    run = quiet(driven, steps=60, u=u, estimate=True)
+    assert run.status == "not finite" and 33 <= run.steps < 60
+    before = quiet(driven, steps=run.steps, u=u[: run.steps], estimate=True)
+    assert np.array_equal(run.error.q, before.error.q)
+
+
+def test_no_convergence_is_told(modules: Modules) -> None:
+    """x'' = -4e4 x^3 in steps of 800 radians: no iteration finds the stages of an implicit step."""
+    text = SPRING.format(name="stiff_implicit", k=1e4, dissipation="0")
+    module: Any = modules.of_text(text.replace("k*x**2/2", "k*x**4") + 'method = ["gauss4"]\n')
+    with pytest.warns(RuntimeWarning, match="does not converge: take a smaller h"):
+        run = module.simulate(h=5.0, steps=10)
+    assert run.status == "no convergence" and run.q.tolist() == [[1.0]]
+    assert "t = 0 after 0 steps" in run.message and "q = [1.]" in run.message
+    with pytest.raises(module.MotionError, match="does not converge") as caught:
+        module.step([1.0], [0.0], h=5.0)
+    assert caught.value.status == "no convergence"
+    assert module.simulate(h=1e-3, steps=100, estimate=True).error.resolved
+    assert module.advice(h=5.0) is None  # no step is too long to be stable
+
+
+def test_held_inputs_are_held_in_shorter_steps_too(driven: ModuleType) -> None:
+    """A table or function says what u is between two of the run's own steps."""
+    table = np.sin(np.arange(100) * 0.7)[:, None]
+    run = driven.simulate(h=0.02, steps=100, u=table, estimate=True)
+    assert run.error.resolved and run.error.q.max() < 1e-4
+    seen: list[float] = []
+
+    def law(t: float, q: Any, qd: Any) -> list[float]:
+        seen.append(t)
+        return [float(table[round(t / 0.02), 0])]
+
+    again = quiet(driven, h=0.02, steps=100, u=law)
+    assert np.array_equal(again.q, run.q)
+    assert np.array_equal(again.estimate().q, run.error.q)
+    assert np.allclose(np.array(sorted(set(seen))) / 0.02, np.arange(100))
+
+
+# --- the stability limit --------------------------------------------------------------------------
+
+
+def test_a_step_beyond_the_limit_is_told_once(modules: Modules) -> None:
+    """RK4 of an undamped spring is stable up to h omega = 2.83; measured on both sides."""
+    module = spring(modules, 1e4)
+    words = r"h = 0.03 s is beyond rk4's stability limit of about 0.028 s here \(fastest mode 100"
+    with pytest.warns(RuntimeWarning, match=words):
+        run = module.simulate(h=0.03, steps=1000)
+    assert abs(run.q[-1, 0]) > 1e3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        module.simulate(h=0.03, steps=1000)  # told
+        module.simulate(h=0.031, steps=999)  # short
+        run = module.simulate(h=0.028, steps=1000)
+    assert abs(run.q[-1, 0]) < 1
+    assert "0.031 s" in module.advice(h=0.031) and module.advice(h=0.028) is None
+    assert module.advice(h=0.031, params={"k": 5e3}) is None
+
+
+def test_fast_decay_has_a_limit_too(modules: Modules) -> None:
+    """x'' = -k x - 1000 x': the fast eigenvalue is -1000 1/s, RK4's limit 2.79."""
+    module = spring(modules, 1.0, "500*x_dot**2")
+    assert "limit of about 0.0028 s here (fastest decay 1e+03 1/s" in module.advice(h=0.003)
+    assert module.advice(h=0.0027) is None
+    assert abs(quiet(module, h=0.003, qd0=[1.0], steps=1000).q[-1, 0]) > 10
+    assert abs(quiet(module, h=0.0027, qd0=[1.0], steps=1000).q[-1, 0]) < 2
+
+
+def test_a_jump_is_no_fast_mode(modules: Modules) -> None:
+    """sign(x_dot) at rest has a slope as steep as the difference is short."""
+    assert modules.of_text(JUMPING).advice(h=0.01) is None
+
+
+def test_the_scenes_start_within_their_limits() -> None:
+    path = SCENES / "cartpole.toml"
+    assert eomc.load(path, ROOT / "build" / "tests" / "modules").advice() is None
+
+
+# --- derivatives ----------------------------------------------------------------------------------
+
+
+def test_linearize_says_how_to_get_it(cartpole: ModuleType) -> None:
+    with pytest.raises(ValueError, match=r"a scene asks with \[run\] linearize = true"):
+        cartpole.linearize([0, 1], [0, 0])
+
+
+def test_linearize_is_the_slope_of_the_acceleration(modules: Modules) -> None:
+    text = (SCENES / "cartpole_driven.toml").read_text(encoding="utf-8")
+    text = text.replace("[run]", "[run]\nlinearize = true").replace(
+        'name = "cartpole_driven"', 'name = "cartpole_slopes"'
+    )
+    module: Any = modules.of_text(text)
+    q, qd, u, d = np.array([0.3, 1.1]), np.array([-0.4, 0.7]), np.array([2.0]), 1e-6
+    A, B = module.linearize(q, qd, u)
+    assert A.shape == (4, 4) and B.shape == (4, 1)
+    x = np.concatenate([q, qd, u])
+
+    def rate(x: Any) -> Any:
+        return module.rhs(0.0, x[:4], x[4:])
+
+    slopes = [(rate(x + e) - rate(x - e)) / (2 * d) for e in d * np.eye(5)]
+    # differences over 2e-6 of values below 100: off by d^2 and by rounding, 1e-16*100/1e-6
+    np.testing.assert_allclose(np.hstack([A, B]), np.transpose(slopes), rtol=1e-7, atol=1e-7)
+    with pytest.raises(ValueError, match="expected"):
+        module.linearize(q[None], qd[None], u)
+
+
+@pytest.mark.parametrize(
+    ("ends", "scale"),
+    [
+        ([2.0, 0.0, -1e76, 3.0], [2.0, 2e-6, 1e76, 1e70]),
+        ([0.0, 0.0, 4.0, 0.0], [4e-6, 4e-6, 4.0, 4e-6]),
+        ([0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]),
+    ],
+)
+def test_velocities_that_run_away_are_no_scale_of_positions(
+    ends: list[float], scale: list[float]
+) -> None:
+    """Where positions are 1e40 times smaller their errors would look like nothing."""
+    found = estimate._scale(np.array([[0.0, 0.0, 0.0, 0.0], ends]))
+    np.testing.assert_allclose(found, scale, rtol=1e-15)

@@ -1,0 +1,249 @@
+"""Ctrl-C is answered soon wherever C works long, and arrays are read wherever they lie."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from cases import SCENES
+from conftest import MODULES
+from test_module import ctrl_c_after
+
+import eomc
+from eomc.model import system
+from eomc.scene import scene
+
+MANY = 10_000_000  # rows
+STIFF = 'method = "gauss8"\n'
+
+
+def loaded(name: str, run: str = "", repeat: int = 0) -> ModuleType:
+    """A scene with more under [run], in so many links."""
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8").replace("[run]\n", "[run]\n" + run)
+    if repeat:
+        text = text.replace("n = { value = 5,", f"n = {{ value = {repeat},")
+    return eomc.load(system.from_scene(scene.parse(text, "test.toml")), MODULES)
+
+
+@pytest.fixture(scope="session")
+def batch() -> ModuleType:
+    return loaded("cartpole", "batch = true\n")
+
+
+def soon(work: Callable[[], Any], *, before: float = 0.4, after: float = 0.3) -> BaseException:
+    """What Ctrl-C raises in work that takes longer; it has to come soon after."""
+    with pytest.raises(KeyboardInterrupt) as stop, ctrl_c_after(before):
+        begun = time.perf_counter()
+        work()
+    late = time.perf_counter() - begun - before
+    assert late < after, f"{late:.2f} s"
+    return stop.value
+
+
+# --- Ctrl-C ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_a_batch_of_one_after_a_quick_one(batch: ModuleType) -> None:
+    """A large batch takes some ns a step of an instance; one alone as long as eight."""
+    q0 = np.tile(batch.start[0], (4096, 1))
+    batch.simulate_batch(q0, steps=2000, every=2000)
+    stop: Any = soon(
+        lambda: batch.simulate_batch(q0[:1], steps=10**9, every=10**8), before=0.1, after=0.25
+    )
+    run = stop.run
+    assert run.status[0] == "interrupted" and 0 < run.steps[0] < 10**9
+    steps = int(run.steps[0])
+    again = batch.simulate_batch(q0[:1], steps=steps, every=steps)
+    assert np.array_equal(run.q[0, -(-steps // 10**8)], again.q[0, -1])
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_a_batch_whose_angles_become_wide(batch: ModuleType) -> None:
+    """An instance that vectors can't serve is many times slower."""
+    q0 = np.tile(batch.start[0], (512, 1))
+    batch.simulate_batch(q0, steps=5000, every=5000)
+    q0[:, 1] = 1e9
+    soon(lambda: batch.simulate_batch(q0, steps=10**8, every=10**8, threads=1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["D", "energy", "acceleration", "bias", "C"])
+def test_ctrl_c_in_a_function_of_many_rows(name: str, batch: ModuleType) -> None:
+    q = np.zeros((MANY, 2))
+    out = np.empty((MANY, *np.shape(getattr(batch, name)(*(q[0],) * (1 if name == "D" else 2)))))
+    place = (q,) if name == "D" else (q, q)
+
+    def work() -> None:
+        for _ in range(50):
+            getattr(batch, name)(*place, out=out)
+
+    soon(work)
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_one_call_for_long_rows() -> None:
+    """Rows of a chain of twenty, tens of microseconds each."""
+    m = loaded("chain", repeat=20)
+    rows = np.tile(m.start[0], (80_000, 1))
+    out = np.empty((80_000, 20, 20))
+
+    def work() -> None:
+        for _ in range(50):
+            m.C(rows, rows, out=out)
+
+    soon(work, before=0.1)
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_an_implicit_method_and_in_its_estimate() -> None:
+    """A step of gauss8 of a chain of twenty may take milliseconds."""
+    m = loaded("chain", STIFF, repeat=20)
+    stop: Any = soon(
+        lambda: m.simulate(h=0.01, steps=10**7, every=10**5, params={"b": 5.0}),
+        before=0.05, after=0.2,
+    )  # fmt: skip
+    assert stop.run.steps > 0
+    run = m.simulate(h=0.005, steps=800, params={"b": 5.0})
+    soon(lambda: run.estimate())
+
+
+# --- slices change nothing ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["D", "C", "g", "bias", "energy", "potential_energy", "tau"])
+def test_rows_in_slices_are_rows(
+    name: str, driven: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(3)
+    q, qd = rng.standard_normal((2, 5003, 2))
+    place = (q,) if name in ("D", "g", "potential_energy") else (q, qd)
+    how = {"u": [0.3]} if name == "tau" else {}
+    whole = getattr(driven, name)(*place, t=0.2, **how)
+    rows = [getattr(driven, name)(*(x[k] for x in place), t=0.2, **how) for k in range(0, 5003, 7)]
+    assert np.array_equal(whole[::7], rows)
+    monkeypatch.setattr(sys.modules[f"{driven.__name__}.runtime"], "_ROWS", 100)
+    assert np.array_equal(getattr(driven, name)(*place, t=0.2, **how), whole)
+
+
+def test_accelerations_in_slices_are_rows_and_name_the_bad_one(
+    cartpole: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    q, qd = np.random.default_rng(3).standard_normal((2, 5003, 2))
+    whole = cartpole.acceleration(q, qd)
+    monkeypatch.setattr(sys.modules[f"{cartpole.__name__}.runtime"], "_ROWS", 100)
+    assert np.array_equal(cartpole.acceleration(q, qd), whole)
+    qd[3777] = [0, 1.25e200]
+    with pytest.raises(cartpole.MotionError, match=r"1\.25e\+200"):
+        cartpole.acceleration(q, qd)
+
+
+# --- arrays that are not aligned ------------------------------------------------------------------
+
+
+def crooked(array: Any) -> Any:
+    """The same numbers at an odd address, C-contiguous."""
+    array = np.asarray(array, float)
+    memory = bytearray(array.nbytes + 1)
+    other = np.frombuffer(memory, offset=1, dtype=float, count=array.size).reshape(array.shape)
+    other[...] = array
+    assert other.flags.c_contiguous and not other.flags.aligned
+    return other
+
+
+ENTRIES = """
+import sys
+import numpy as np
+import eomc
+sys.path.insert(0, {tests!r})
+from test_slices import crooked
+m = eomc.load({scene!r}, {root!r})
+
+rng = np.random.default_rng(1)
+n = {nq}
+q, qd = rng.standard_normal((2, n)) / 9
+Q, QD = rng.standard_normal((2, 40, n)) / 9
+p, u = list(m.defaults.values()), [0.3]
+U, P = rng.standard_normal((30, 1)), np.tile(p, (40, 1))
+record = np.zeros(1, np.dtype([("tag", "u1"), ("q", float, n), ("Q", float, (40, n))]))
+record["q"], record["Q"] = q, Q
+
+def calls(f, g, G):
+    "All entries; f makes an array of them, g is q and G is Q."
+    for name in ("D", "g", "potential_energy"):
+        yield getattr(m, name)(g), getattr(m, name)(G, params=f(p))
+    for name in ("C", "bias", "energy", "jacobi", "kinetic_energy"):
+        yield getattr(m, name)(g, f(qd), params=f(p)), getattr(m, name)(G, f(QD))
+    for name in ("tau", "power", "acceleration"):
+        yield getattr(m, name)(g, f(qd), u=f(u), params=f(p)), getattr(m, name)(G, f(QD), u=f(u))
+    yield m.signal(g, f(qd)), m.rhs(0.0, f([*q, *qd]), f(u), f(p))
+    yield m.linearize(g, f(qd), f(u), params=f(p))
+    yield m.step(g, f(qd), u=f(u), params=f(p))
+    yield (m.advice(g, f(qd), 5.0, f(u), f(p)),)
+    for t in (f(U), f(u)):
+        run = m.simulate(g, f(qd), steps=30, u=t, params=f(p))
+        yield run.q, run.qd, run.energy
+    law = m.simulate(g, f(qd), steps=30, u=lambda t, q, qd: f(u))
+    yield law.q, law.qd
+    if hasattr(m, "simulate_batch"):
+        for table in (f(P), {{"m_c": f(P[:, 0])}}):
+            for inputs in (f(np.ones((40, 1))), f(np.ones((40, 30, 1))), f(u)):
+                run = m.simulate_batch(G, f(QD), steps=30, params=table, u=inputs)
+                yield run.q, run.qd
+            to = np.array(Q), np.array(QD)
+            m.step_batch(G, f(QD), params=table, u=f(u), out=to)
+            yield to
+
+for name, bad in (("crooked", (crooked, crooked(q), crooked(Q))),
+                  ("record", (crooked, record[0]["q"], record[0]["Q"]))):
+    for good, other in zip(calls(np.array, q, Q), calls(*bad), strict=True):
+        for a, b in zip(good, other, strict=True):
+            assert np.array_equal(a, b), name
+
+wrong = [
+    ("out: .*aligned", lambda: m.D(q, out=crooked(np.zeros((n, n))))),
+    ("out.0.: .*aligned", lambda: m.step(q, qd, out=(crooked(q), crooked(q)))),
+    ("out.0.: .*aligned", lambda: m.simulate(q, qd, steps=0, out=(crooked([q]), crooked([q])))),
+]
+if hasattr(m, "simulate_batch"):
+    wrong.append(("q: .*not aligned", lambda: m.step_batch(crooked(Q), QD)))
+import re
+for words, call in wrong:
+    try:
+        call()
+    except ValueError as fault:
+        assert re.match(words, str(fault)), fault
+    else:
+        raise SystemExit("took an out= that is not aligned")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["cartpole_driven", "chain of 40"])
+def test_arrays_that_are_not_aligned(what: str, tmp_path: Path) -> None:
+    """In C that stops where a number is read from an odd address."""
+    name = what.split()[0]
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    if name == "chain":
+        text = text.replace("n = { value = 5,", "n = { value = 40,")
+        text += '\n[inputs]\npush = { unit = "N m" }\n[forces]\ntheta1 = "push"\n'
+    run = "[run]\nlinearize = true\n" + ("batch = true\n" if name != "chain" else "")
+    (tmp_path / "scene.toml").write_text(text.replace("[run]\n", run), encoding="utf-8")
+    code = ENTRIES.format(
+        tests=str(Path(__file__).parent), scene=str(tmp_path / "scene.toml"), root=str(tmp_path),
+        nq=2 if name != "chain" else 40,
+    )  # fmt: skip
+    checked = "-fsanitize=alignment -fsanitize-undefined-trap-on-error"
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True,
+        env={**os.environ, "CC": f"gcc {checked}", "EOMC_CFLAGS": "-O1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr or f"ended by signal {-done.returncode}"

@@ -1,0 +1,195 @@
+"""Small texts that would take gigabytes or hours: refused in words, or built in seconds.
+
+Each in a process of its own, with bounds on its CPU seconds and memory that a slow machine keeps.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+
+import pytest
+
+SECONDS = 20  # of CPU; the slowest takes three
+MEGABYTES = 1500  # of address space
+
+WORK = """
+import json, resource, sys
+resource.setrlimit(resource.RLIMIT_CPU, (%d, %d))
+resource.setrlimit(resource.RLIMIT_AS, (%d << 20, %d << 20))
+from eomc import EomcError
+from eomc.derive import lagrange
+from eomc.program import program
+from eomc.emit import render
+from eomc.scene import scene
+from eomc.model import system
+try:
+    made = system.from_scene(scene.parse(sys.stdin.buffer.read(), "growth.toml"))
+    if sys.argv[1] == "built":
+        render.render(program.build(lagrange.derive(made)), "_extension")
+    print("ok")
+except EomcError as fault:
+    print(fault)
+""" % (SECONDS, SECONDS + 2, MEGABYTES, MEGABYTES)  # noqa: UP031 - braces are few this way
+
+
+def outcome(text: str, built: bool = False) -> str:
+    """What is told of a scene; "ok" where it is sound. Fails beyond the bounds."""
+    done = subprocess.run(
+        [sys.executable, "-c", WORK, "built" if built else "read"],
+        input=text.encode(), capture_output=True,
+    )  # fmt: skip
+    assert done.returncode == 0, (done.returncode, done.stderr.decode()[-500:])
+    return done.stdout.decode().rstrip("\n")
+
+
+BASE = """eomc = 1
+name = "growth"
+[coordinates]
+x = { start = 0.3 }
+[parameters]
+m = 1.25
+[definitions]
+a0 = "x"
+[energy]
+kinetic = "m*x_dot**2/2"
+potential = "x**2/2 + a0"
+"""
+
+
+def chain(first: str, each: str, count: int) -> str:
+    """Definitions a0 = first, a1 = each of a0, ...: `a` stands for the one before."""
+    lines = [f'a0 = "{first}"']
+    lines += [f'a{k} = "{each.replace("@", f"a{k - 1}")}"' for k in range(1, count + 1)]
+    text = BASE.replace('a0 = "x"', "\n".join(lines))
+    return text.replace("x**2/2 + a0", f"x**2/2 + a{count}")
+
+
+NESTED = {
+    "sin(a)*a": ("x + 0.1", "sin(@)*@"),
+    "sin*cos": ("x", "sin(@)*cos(@)"),
+    "a*a": ("x", "@*@"),
+    "3x squared": ("3*x", "@**2"),
+    "2a*a": ("x", "@*@ + @*@"),
+    "a**2 + a": ("x", "@**2 + @"),
+    "a/(1 + a)": ("2 + x**2", "@/(1 + @) + x"),
+    "roots": ("2 + x**2", "@**0.3 + x"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NESTED)
+def test_nested_definitions_take_seconds(name: str) -> None:
+    first, each = NESTED[name]
+    assert outcome(chain(first, each, 30), built=True) == "ok"
+
+
+@pytest.mark.slow
+def test_powers_of_names_take_seconds() -> None:
+    assert outcome(BASE.replace('"x"', '"10**9"').replace("+ a0", "+ x**a0"), built=True) == "ok"
+
+
+NUMBERS = {
+    "squares": ("3", "@**2", "definitions.a10", "is not between 1e-300 and 1e300"),
+    "fractions": ("3", "@/2 + 1/@", "definitions.a12", "more than 10,000 digits"),
+    "roots": ("sqrt(2)/3", "@*(@ + 0.1)", "definitions.a9", "more than 10,000 digits"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NUMBERS)
+def test_exact_numbers_are_bounded_and_the_definition_is_named(name: str) -> None:
+    first, each, key, words = NUMBERS[name]
+    told = outcome(chain(first, each, 30))
+    assert told.startswith("growth.toml:") and told.count("error") == 1
+    assert f"error: {key}: " in told and words in told
+
+
+@pytest.mark.slow
+def test_exponents_by_name_are_bounded() -> None:
+    text = BASE.replace('a0 = "x"', 'c = "10**9"\nk = "1.0000000001"\na0 = "x*k**c"')
+    assert "error: definitions.a0: 'x*k**c' makes exact numbers of more" in outcome(text)
+
+
+def many(line: Callable[[int], str], count: int) -> str:
+    return "\n".join(line(k) for k in range(count))
+
+
+HOSTILE: dict[str, tuple[str, str]] = {
+    "unknown names": (
+        BASE.replace("[energy]", many(lambda k: f'd{k} = "x + theeta{k}"', 20_000) + "\n[energy]"),
+        "definitions.d0: 'theeta0' is not declared",
+    ),
+    "unknown keys": (
+        BASE + "[run]\n" + many(lambda k: f"durration{k} = 1", 20_000), "did you mean 'duration'?",
+    ),
+    "keys of one line": (
+        BASE.replace("1.25", "{ value = 1, " + ", ".join(f"d{k} = 1" for k in range(20_000)) + "}"),
+        "unknown key",
+    ),
+    "dots": (BASE.replace("m = 1.25", "a" + ".a" * 100_000 + " = 1"), "more than 20 parts"),
+    "dots in a header": (BASE + "[a" + ".a" * 100_000 + "]", "more than 20 parts"),
+    "dots in braces": (BASE.replace("1.25", "{a" + ".a" * 100_000 + " = 1}"), "than 20 parts"),
+    "quoted dots": (BASE.replace("m = 1.25", "m" + ".'a'" * 100_000 + " = 1"), "than 20 parts"),
+    "rings": (
+        BASE.replace("[energy]", many(lambda k: f'd{k} = "d{k ^ 1}"', 20_000) + "\n[energy]"),
+        "circular definition: d0 -> d1 -> d0",
+    ),
+    "a long ring": (
+        BASE.replace("[energy]", many(lambda k: f'd{k} = "d{(k + 1) % 20_000}"', 20_000)
+                     + "\n[energy]"),
+        "d8 -> d9 -> ... -> d19992",
+    ),
+    "a long array": (
+        BASE.replace("1.25", "[\n" + ("1," * 900 + "\n") * 480 + "]"), "must be a number",
+    ),
+    "a long key": (BASE.replace("m = ", "m" * 900_000 + " = "), "characters: 40 are the most"),
+    "a digit a million times": (BASE.replace("1.25", "1" * 900_000), "thousands of digits"),
+    "digits in a formula": (BASE.replace('"x"', f'"x*{"1" * 9000}"'), "more than 1,000 digits"),
+    "digits after a point": (BASE.replace('"x"', f'"x*0.{"1" * 9000}"'), "more than 1,000 digits"),
+    "10**10**10": (BASE.replace('"x"', '"10**10**10"'), "an exponent lies between -64 and 64"),
+    "1e400": (BASE.replace("1.25", "1e400"), "must be a finite number"),
+    "parentheses": (BASE.replace('"x"', f'"{"(" * 4000}x{")" * 4000}"'), "nested too deeply"),
+    "arrays": (BASE.replace("1.25", "[" * 100_000 + "]" * 100_000), "nested too deeply"),
+    "a long formula": (BASE.replace('"x"', '"x' + "+x" * 4900 + '"'), "nested too deeply"),
+    "a billion entries": (
+        BASE.replace("x = {", '"y[i]" = { repeat = "i = 1..1000000000" }\nx = {'),
+        "1000000000 is too large for an index",
+    ),
+    "100 megabytes": (BASE + "#" * 100_000_000, "more than the 1000000 bytes"),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_texts_are_refused_in_words(name: str) -> None:
+    text, words = HOSTILE[name]
+    told = outcome(text)
+    assert told.startswith("growth.toml") and words in told
+    assert len(told) < 30_000
+
+
+def test_a_key_of_many_dots_in_a_text_is_no_key() -> None:
+    from eomc.scene import scene
+
+    note = "see " + "a.b.c." * 20 + "d"
+    text = BASE.replace('name = "growth"', f'name = "growth"\nnote = "{note}"\ntitle = "..."')
+    assert scene.parse(text).note == note
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["build", "list"])
+def test_the_command_reads_no_more_than_a_scene(command: str, tmp_path) -> None:
+    """It looks for the name of a scene before it reads the whole: that has the same bounds."""
+    (tmp_path / "large.toml").write_text(HOSTILE["100 megabytes"][0], encoding="utf-8")
+    (tmp_path / "dots.toml").write_text(HOSTILE["dots"][0], encoding="utf-8")
+    code = WORK.partition("from eomc")[0] + "from eomc.cli.main import main; main()"
+    files = ["."] if command == "list" else ["large.toml", "dots.toml"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, command, *files], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == (0 if command == "list" else 2), done.stderr[-500:]
+    assert "Traceback" not in done.stderr
+    assert json.dumps(done.stdout)

@@ -1,0 +1,58 @@
+"""Numbers with units, velocities by other names, lines that are no TOML."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from eomc.scene import messages
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("30 deg", '"30*pi/180"'),
+        ("-7.5°", '"-7.5*pi/180"'),
+        ("−90 degrees", '"-90*pi/180"'),
+        ("60 rpm", '"60*2*pi/60", in rad/s'),
+        ("1 kg", "kg in SI: write 1"),
+        ("250 mm", "m in SI: write 0.25"),
+        ("1e3 mm", "m in SI: write 1"),
+        ("9.81 m/s^2", "m/s^2 in SI: write 9.81"),
+        ("0.7 kg m^2", "kg m^2 in SI: write 0.7"),
+        ("3 N*m", "N*m in SI: write 3"),
+        ("5 ms", "s in SI: write 0.005"),
+    ],
+)
+def test_numbers_with_units(text: str, wanted: str) -> None:
+    said = messages.quantity(text)
+    assert said is not None and said.endswith(wanted)
+
+
+@pytest.mark.parametrize(
+    "text", ["2*m", "2 x", "m g", "1/2", "pi/2", "2 m", "sin x", "1e", "°", ""]
+)
+def test_formulas_are_not_numbers_with_units(text: str) -> None:
+    assert messages.quantity(text, declared={"m"}) is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    """dot_theta dottheta dtheta d_theta dtheta_dt dthetadt v_theta vel_theta Dtheta qd_theta
+    thetadot thetap theta_d theta_v theta_prime theta_velocity""".split(),
+)
+def test_velocities_of_others(name: str) -> None:
+    assert messages.velocity(name, ["x", "theta"]) == "theta_dot"
+
+
+@pytest.mark.parametrize("name", ["theta", "omega", "dot", "d", "theta_0", "phi_dot"])
+def test_other_names_are_no_velocities(name: str) -> None:
+    assert messages.velocity(name, ["x", "theta"]) == ""
+
+
+def test_long_texts_cost_nothing() -> None:
+    begun = time.perf_counter()
+    for text in ("1 " + "m " * 500_000, "1" * 1_000_000, "=" + " " * 1_000_000, "m" * 1_000_000):
+        messages.quantity(text), messages.bare(text), messages.number(text)
+    assert time.perf_counter() - begun < 1

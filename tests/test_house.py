@@ -1,0 +1,101 @@
+"""The rules of the house: what may import what, how long a room may be."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "generator" / "eomc"
+
+# from the ground up; rooms on one storey do not import each other
+STOREYS = (
+    ("base", "integrators", "runtime"),
+    ("scene",),
+    ("model", "robots"),
+    ("derive", "verify"),
+    ("program",),
+    ("emit",),
+    ("toolchain", "pipeline"),
+    ("report",),
+    ("cli",),
+)
+DOORS = {"__init__", "__main__"}  # which nothing inside goes through
+ALONGSIDE = {("pipeline", "toolchain")}  # the last step of the way, on the same storey
+LEVEL = {room: level for level, rooms in enumerate(STOREYS) for room in rooms}
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module of the package by its dotted name below eomc."""
+    return {
+        ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
+        for path in sorted(PACKAGE.rglob("*.py"))
+    }
+
+
+def imports(name: str, types: bool = True) -> Iterator[str]:
+    """The modules of eomc that a module imports anywhere in its text; types: for types too."""
+    known = modules()
+    tree = ast.parse(known[name].read_text(encoding="utf-8"))
+    if not types:
+        tree.body = [n for n in tree.body if not ast.unparse(n).startswith("if TYPE_CHECKING:")]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            wanted = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level or name.startswith("runtime."), "imports are absolute"
+            if node.level:
+                continue
+            wanted = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for whole in wanted:
+            package, *parts = whole.split(".")
+            if package != "eomc":
+                continue
+            while parts and ".".join(parts) not in known:
+                parts = parts[:-1]
+            yield ".".join(parts) or "__init__"
+
+
+def room(name: str) -> str:
+    """The folder of a module, or the module itself where it lies at the top."""
+    return name.split(".")[0]
+
+
+@pytest.mark.parametrize("name", modules())
+def test_imports_go_down(name: str) -> None:
+    for other in imports(name):
+        assert other not in DOORS
+        pair = room(name), room(other)
+        if len({*pair}) == 2 and name not in DOORS and pair not in ALONGSIDE:
+            assert LEVEL[room(other)] < LEVEL[room(name)], f"{name} imports {other}"
+
+
+def test_no_circle() -> None:
+    tops = {n: set(imports(n, types=False)) - {n} for n in modules()}
+    assert len(list(TopologicalSorter(tops).static_order())) >= len(tops)
+
+
+def test_every_room_has_its_storey() -> None:
+    assert {room(name) for name in modules()} == set(LEVEL) | DOORS
+    assert len(STOREYS) <= 9
+
+
+def test_the_oracles_share_nothing_with_the_compiled_way() -> None:
+    """Agreement with them means something."""
+    for name in modules():
+        if room(name) == "verify":
+            used = {room(other) for other in imports(name)}
+            assert not used & {"derive", "program", "emit", "toolchain", "pipeline"}, name
+
+
+def test_what_lies_beside_a_built_module_needs_no_eomc() -> None:
+    for name in modules():
+        if room(name) == "runtime":
+            assert not list(imports(name)), name

@@ -1,0 +1,439 @@
+"""A build is done once, whole or not at all, and says what went wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cases import SCENES
+from conftest import needs
+
+import eomc
+from eomc.base import resources
+from eomc.model.system import from_scene
+from eomc.scene.scene import parse
+from eomc.toolchain import compiler as compiler
+
+TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
+CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
+
+
+@pytest.fixture(autouse=True)
+def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
+    monkeypatch.delenv("CC", raising=False)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A scene file that a test may change."""
+    file = tmp_path / "simple_pendulum.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return tmp_path / "build"
+
+
+def script(file: Path, text: str) -> str:
+    """An executable shell script; its path."""
+    file.write_text("#!/bin/sh\n" + text, encoding="utf-8")
+    file.chmod(file.stat().st_mode | stat.S_IXUSR)
+    return str(file)
+
+
+def marks(folder: Path) -> dict[str, tuple[int, int, int]]:
+    """What tells whether a file was touched, by name."""
+    return {
+        f.name: (f.stat().st_ino, f.stat().st_mtime_ns, f.stat().st_size)
+        for f in folder.iterdir()
+        if f.name != "__pycache__"
+    }
+
+
+def gravity(root: Path) -> float:
+    """g(1 rad) of the module that lies there, as a new process imports it."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import simple_pendulum as m; print(m.g([1.0])[0])"],
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return float(done.stdout)
+
+
+def started(scene: Path, root: Path, **environment: str) -> subprocess.Popen[str]:
+    """A process that builds."""
+    code = "import eomc, sys; print(eomc.build(*sys.argv[1:]).fresh)"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(scene), str(root)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+def leftovers(root: Path) -> list[str]:
+    """Whatever stands beside the module and its lock."""
+    expected = {"simple_pendulum", ".simple_pendulum.lock"}
+    return sorted(f.name for f in root.iterdir() if f.name not in expected)
+
+
+# --- when ----------------------------------------------------------------------------------------
+
+
+def test_nothing_is_built_where_nothing_has_changed(
+    scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = eomc.build(scene, root)
+    assert first.fresh
+    assert first.folder == root / "simple_pendulum"
+    before = marks(first.folder)
+    assert {"simple_pendulum.c", "simple_pendulum.h", "main.c", "__init__.py"} <= set(before)
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("nothing is to be read or derived")
+
+    monkeypatch.setattr(eomc, "read", never)
+    monkeypatch.setattr(eomc, "sources", never)
+    second = eomc.build(scene, root)
+    assert not second.fresh
+    assert marks(second.folder) == before
+
+
+def test_what_is_found_is_found_without_sympy(scene: Path, root: Path) -> None:
+    """That is what makes it take a tenth of a second."""
+    eomc.build(scene, root)
+    code = "import sys, eomc; eomc.load(*sys.argv[1:]).D([0.0]); sys.exit('sympy' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code, str(scene), str(root)], check=True)
+
+
+def test_templates_are_compiled_once_and_kept_with_pythons_bytecode(
+    scene: Path, tmp_path: Path
+) -> None:
+    kept, before = tmp_path / "kept", None
+    for k in range(3):
+        root = tmp_path / f"build{k}"
+        keeps = {"PYTHONPYCACHEPREFIX": str(kept), "PYTHONDONTWRITEBYTECODE": ""}
+        process = started(scene, root, **keeps)
+        assert process.communicate()[0].strip() == "True"
+        text = (root / "simple_pendulum" / "simple_pendulum.c").read_bytes()
+        assert text == (before or text)
+        before = text
+        files = list(kept.rglob("eomc-template-*.cache"))
+        assert len(files) > 5
+        for file in files:  # whatever happens to them
+            file.write_bytes(b"nonsense" if k else file.read_bytes()[:-40])
+
+
+def test_no_bytecode_is_written_where_python_may_write_none(scene: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    keeps = {"PYTHONPYCACHEPREFIX": str(kept), "PYTHONDONTWRITEBYTECODE": "1"}
+    assert started(scene, tmp_path / "build", **keeps).communicate()[0].strip() == "True"
+    assert not kept.exists()
+
+
+def test_garbage_is_collected_again(scene: Path, tmp_path: Path) -> None:
+    assert gc.isenabled()
+    eomc.sources(eomc.read(scene))
+    assert gc.isenabled()
+    scene.write_text("no scene", encoding="utf-8")
+    with pytest.raises(eomc.SceneError):
+        eomc.read(scene)
+    assert gc.isenabled()
+    gc.disable()  # somebody else's wish
+    try:
+        with pytest.raises(eomc.SceneError):
+            eomc.read(scene)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_what_a_build_hangs_on(
+    scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Scene, flags, compiler, generator: each of them changed gives a new build."""
+
+    def fresh() -> bool:
+        built = eomc.build(scene, root).fresh
+        assert not eomc.build(scene, root).fresh  # and that once
+        assert len(list((root / "simple_pendulum").glob("_simple_pendulum_*"))) == 1
+        return built
+
+    assert fresh()
+    scene.write_text(TEXT + "\n# a comment\n", encoding="utf-8")
+    assert fresh()
+    monkeypatch.setenv("EOMC_CFLAGS", "-O1")
+    assert fresh()
+    monkeypatch.setenv("CC", script(tmp_path / "mycc", 'exec cc "$@"\n'))
+    assert fresh()
+    generator = tmp_path / "clone" / "generator" / "eomc"
+    shutil.copytree(resources.PACKAGE, generator)
+    for part in ("templates", "csrc"):
+        shutil.copytree(resources.folder(part), tmp_path / "clone" / part)
+    monkeypatch.setattr(resources, "PACKAGE", generator)
+    compiler._generator_digest.cache_clear()
+    try:
+        assert not eomc.build(scene, root).fresh  # an exact copy
+        with (generator / "derive" / "tape.py").open("a") as file:
+            file.write("\n")
+        compiler._generator_digest.cache_clear()
+        assert fresh()
+    finally:
+        compiler._generator_digest.cache_clear()
+
+
+def test_a_damaged_build_is_mended(scene: Path, root: Path) -> None:
+    """A file that is empty or gone is noticed, be it the library or the header."""
+    folder = eomc.build(scene, root).folder
+    next(folder.glob("_simple_pendulum_*")).write_text("", encoding="utf-8")
+    assert eomc.build(scene, root).fresh
+    assert gravity(root) == pytest.approx(8.2548, abs=1e-3)
+    (folder / "simple_pendulum.h").unlink()
+    assert eomc.build(scene, root).fresh
+    assert not eomc.build(scene, root).fresh
+
+
+# --- what goes wrong -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def built(scene: Path, root: Path) -> float:
+    """A good build; its gravity. The scene is then changed, so that another build is due."""
+    eomc.build(scene, root)
+    before = gravity(root)
+    scene.write_text(CHANGED, encoding="utf-8")
+    return before
+
+
+def test_a_failing_compiler_is_heard(
+    scene: Path, root: Path, built: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In its own words, with the command; the old module stays, and nothing half-made."""
+    before = marks(root / "simple_pendulum")
+    failing = script(tmp_path / "failing", "echo 'out of cheese' >&2\nexit 3\n")
+    monkeypatch.setenv("CC", failing)
+    with pytest.raises(eomc.EomcError) as fault:
+        eomc.build(scene, root)
+    for words in ("simple_pendulum", "out of cheese", "status 3", failing, "simple_pendulum.c"):
+        assert words in str(fault.value)
+    assert marks(root / "simple_pendulum") == before
+    assert leftovers(root) == []
+    assert gravity(root) == built
+    monkeypatch.delenv("CC")
+    assert eomc.build(scene, root).fresh
+    assert gravity(root) == 2 * built
+
+
+def test_a_failing_linker_is_heard(
+    scene: Path, root: Path, built: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = 'case "$*" in *-shared*) echo "no such library"; exit 1;; esac\nexec cc "$@"\n'
+    monkeypatch.setenv("CC", script(tmp_path / "no_linker", text))
+    with pytest.raises(eomc.EomcError, match=r"(?s)-shared.*no such library"):
+        eomc.build(scene, root)
+    assert leftovers(root) == []
+    assert gravity(root) == built
+
+
+def test_no_compiler_is_left_running_after_a_failure(
+    scene: Path, root: Path, tmp_path: Path
+) -> None:
+    """Both compilations are over when the error comes, whichever of them failed."""
+    text = 'case "$*" in *binding.c*) exec sleep 3;; esac\necho "out of cheese"; exit 1\n'
+    cc = script(tmp_path / "failing", text)
+    code = """
+import os, sys, eomc
+try:
+    eomc.build(*sys.argv[1:])
+except eomc.EomcError as fault:
+    assert "out of cheese" in str(fault), fault
+try:
+    os.waitpid(-1, os.WNOHANG)
+except ChildProcessError:
+    sys.exit(0)
+sys.exit("a compiler is still running")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(scene), str(root)],
+        capture_output=True, text=True, env={**os.environ, "CC": cc},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+@contextlib.contextmanager
+def sleeping_compiler(folder: Path) -> Iterator[tuple[str, Path]]:
+    """A compiler that sleeps, and the file where it tells its process ids."""
+    pids = folder / "pids"
+    cc = script(folder / "sleeping", f"echo $$ >> {pids}\nexec sleep 60\n")
+    try:
+        yield cc, pids
+    finally:
+        for pid in pids.read_text().split() if pids.exists() else ():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(pid), signal.SIGKILL)
+
+
+def sleepers(pids: Path) -> list[int]:
+    """Those of the compilers that are still there."""
+    found = []
+    for pid in map(int, pids.read_text().split()):
+        with contextlib.suppress(OSError):
+            if "sleep" in Path(f"/proc/{pid}/cmdline").read_text():
+                found.append(pid)
+    return found
+
+
+def wait_for(file: Path, lines: int) -> None:
+    for _ in range(500):
+        if file.exists() and len(file.read_text().split()) >= lines:
+            return
+        time.sleep(0.02)
+    raise AssertionError("the compiler was never called")
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=lambda s: s.name)
+def test_a_build_that_is_killed_leaves_the_old_module(
+    scene: Path, root: Path, built: float, tmp_path: Path, how: signal.Signals
+) -> None:
+    with sleeping_compiler(tmp_path) as (cc, pids):
+        process = started(scene, root, CC=cc)
+        wait_for(pids, 2)
+        process.send_signal(how)
+        process.communicate(timeout=20)
+        assert process.returncode != 0
+        assert gravity(root) == built
+        if how is signal.SIGINT:
+            assert leftovers(root) == []
+    assert eomc.build(scene, root).fresh
+    assert gravity(root) == 2 * built
+
+
+def test_ctrl_c_ends_the_compilers_too(scene: Path, root: Path, tmp_path: Path) -> None:
+    """Even where they did not hear of it themselves."""
+    with sleeping_compiler(tmp_path) as (cc, pids):
+        process = started(scene, root, CC=cc)
+        wait_for(pids, 2)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+        time.sleep(0.1)
+        assert sleepers(pids) == []
+
+
+def test_what_a_killed_build_left_is_cleared_away_by_the_next(
+    scene: Path, root: Path, tmp_path: Path
+) -> None:
+    with sleeping_compiler(tmp_path) as (cc, pids):
+        process = started(scene, root, CC=cc)
+        wait_for(pids, 2)
+        process.kill()
+        process.communicate(timeout=20)
+    assert eomc.build(scene, root).fresh
+    assert leftovers(root) == []
+
+
+def test_two_builds_at_once_both_end_well(scene: Path, root: Path) -> None:
+    """One of them builds, the other waits and finds."""
+    both = [started(scene, root) for _ in range(2)]
+    ends = [process.communicate(timeout=60) for process in both]
+    assert [process.returncode for process in both] == [0, 0], ends
+    assert sorted(out.strip() for out, _ in ends) == ["False", "True"]
+    assert leftovers(root) == []
+    assert gravity(root) == pytest.approx(8.2548, abs=1e-3)
+
+
+def test_two_scenes_of_one_name_built_at_once(scene: Path, root: Path, tmp_path: Path) -> None:
+    """The last one stays, and it is whole."""
+    other = tmp_path / "other.toml"
+    other.write_text(CHANGED, encoding="utf-8")
+    both = [started(file, root) for file in (scene, other)]
+    for process in both:
+        process.communicate(timeout=60)
+    assert [process.returncode for process in both] == [0, 0]
+    assert round(gravity(root)) in (8, 17)
+    assert leftovers(root) == []
+
+
+def test_a_place_that_cannot_be_written(scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way", encoding="utf-8")
+    with pytest.raises(
+        eomc.EomcError, match=r"file.*can't be written .*: choose another folder, root="
+    ):
+        eomc.build(scene, tmp_path / "file" / "build")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_place(scene: Path, root: Path) -> None:
+    root.mkdir()
+    root.chmod(0o500)
+    with pytest.raises(eomc.EomcError, match=r"can't be written \(Permission denied\).*--build"):
+        eomc.build(scene, root)
+
+
+def test_no_compiler_at_all(scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One sentence, and the one thing that pip can install."""
+    monkeypatch.setenv("PATH", "")
+    real = compiler.importlib.util.find_spec
+    hidden = lambda name, *a: None if name == "ziglang" else real(name, *a)  # noqa: E731 - a stub
+    monkeypatch.setattr(compiler.importlib.util, "find_spec", hidden)
+    with pytest.raises(eomc.EomcError) as fault:
+        eomc.build(scene, root)
+    assert "\n" not in str(fault.value)
+    for words in ("no C compiler found", "gcc", "clang", "pip install"):
+        assert words in str(fault.value)
+    assert not root.exists()
+
+
+def test_a_compiler_that_is_not_there(
+    scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", "/nowhere/cc -m64")
+    with pytest.raises(eomc.EomcError, match="CC='/nowhere/cc -m64' is not there"):
+        eomc.build(scene, root)
+
+
+@pytest.mark.parametrize("cc", ["clang", "gcc -m64"])
+def test_the_compiler_that_was_asked_for(
+    scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch, cc: str
+) -> None:
+    needs(cc.split()[0])
+    monkeypatch.setenv("CC", cc)
+    monkeypatch.delenv("EOMC_CFLAGS")
+    module = eomc.load(scene, root)
+    assert module.simulate(steps=10).status == "ok"
+    assert cc.split()[-1] in (root / "simple_pendulum" / "build.json").read_text()
+
+
+def test_a_faulty_scene_is_not_built(scene: Path, root: Path) -> None:
+    eomc.build(scene, root)
+    before = marks(root / "simple_pendulum")
+    scene.write_text(TEXT.replace('"m*g*y"', '"m*gg*y"'), encoding="utf-8")
+    with pytest.raises(eomc.SceneError, match="'gg'"):
+        eomc.build(scene, root)
+    assert marks(root / "simple_pendulum") == before
+
+
+@pytest.mark.parametrize(
+    ("run", "width"), [("", 256), ("batch = true", 512), ('method = ["rk4", "gauss16"]', 512)]
+)
+def test_registers_are_as_wide_as_loops_have_use_for(
+    run: str, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """512 bits for loops over instances or stages; straight-line code is faster in 256."""
+    monkeypatch.delenv("EOMC_CFLAGS", raising=False)
+    made = eomc.sources(from_scene(parse(TEXT + f"{run}\n")))
+    monkeypatch.setattr(compiler, "_processor", lambda: "flags : fma avx2 avx512f")
+    assert compiler.flags(made.wide)[-1] == f"-mprefer-vector-width={width}"
+    monkeypatch.setattr(compiler, "_processor", lambda: "flags : fma avx2")
+    assert compiler.flags(made.wide) == compiler.FLAGS

@@ -1,0 +1,239 @@
+"""What lies in a build's way, damages it, or calls itself a compiler: said, and nothing is lost."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_build import CHANGED, TEXT, gravity, leftovers, script
+
+import eomc
+from eomc.toolchain import compiler as compiler
+
+
+@pytest.fixture(autouse=True)
+def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
+    monkeypatch.delenv("CC", raising=False)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A scene file that a test may change."""
+    file = tmp_path / "simple_pendulum.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return tmp_path / "build"
+
+
+@pytest.fixture
+def built(scene: Path, root: Path) -> float:
+    """A good build; its gravity. The scene is then changed, so that another build is due."""
+    eomc.build(scene, root)
+    before = gravity(root)
+    scene.write_text(CHANGED, encoding="utf-8")
+    return before
+
+
+# --- the lock -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", ["link", "dangling link", "FIFO", "folder", "device", "socket"])
+def test_only_a_file_is_locked(
+    what: str, scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a process of its own: a FIFO would wait for ever for somebody to read it."""
+    root.mkdir()
+    lock, precious = root / ".simple_pendulum.lock", tmp_path / "precious"
+    precious.write_text("my thesis", encoding="utf-8")
+    match what:
+        case "link":
+            lock.symlink_to(precious)
+        case "dangling link":
+            lock.symlink_to(tmp_path / "nowhere")
+        case "FIFO":
+            os.mkfifo(lock)
+        case "folder":
+            lock.mkdir()
+        case "socket":
+            import socket
+
+            with socket.socket(socket.AF_UNIX) as made:
+                monkeypatch.chdir(root)  # a socket's path is short
+                made.bind(lock.name)
+        case "device":
+            try:
+                os.mknod(lock, stat.S_IFCHR | 0o600, os.makedev(1, 3))
+            except PermissionError:
+                pytest.skip("only root makes devices")
+    code = "import eomc, sys; eomc.build(*sys.argv[1:])"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(scene), str(root)], capture_output=True, text=True,
+        timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert (
+        f"EomcError: {lock}: is no file, and builds" in done.stderr and "remove it" in done.stderr
+    )
+    assert precious.read_text(encoding="utf-8") == "my thesis"
+    assert not (tmp_path / "nowhere").exists() and not (root / "simple_pendulum").exists()
+
+
+def test_a_lock_is_not_emptied(scene: Path, root: Path) -> None:
+    root.mkdir()
+    lock = root / ".simple_pendulum.lock"
+    lock.write_text("a hard link to something", encoding="utf-8")
+    eomc.build(scene, root)
+    assert lock.read_text(encoding="utf-8") == "a hard link to something"
+
+
+# --- what lies there ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", ["file", "dangling link", "link to a file"])
+def test_something_else_where_the_module_would_lie(what: str, scene: Path, root: Path) -> None:
+    root.mkdir()
+    if what == "file":
+        (root / "simple_pendulum").write_text("mine", encoding="utf-8")
+    else:
+        target = root / "target"
+        if what == "link to a file":
+            target.write_text("mine", encoding="utf-8")
+        (root / "simple_pendulum").symlink_to(target)
+    with pytest.raises(eomc.EomcError, match=r"simple_pendulum: is in the way .*--build DIR"):
+        eomc.build(scene, root)
+    if what != "dangling link":
+        assert (root / "simple_pendulum").read_text(encoding="utf-8") == "mine"
+
+
+def test_a_package_of_somebody_else_is_not_replaced(scene: Path, root: Path) -> None:
+    folder = root / "simple_pendulum"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").write_text("mine = 1", encoding="utf-8")
+    with pytest.raises(eomc.EomcError, match="a package that eomc did not build"):
+        eomc.build(scene, root)
+    assert [f.name for f in folder.iterdir()] == ["__init__.py"]
+    assert (folder / "__init__.py").read_text(encoding="utf-8") == "mine = 1"
+
+
+def test_every_bit_of_a_build_is_looked_at(scene: Path, root: Path) -> None:
+    """A damaged extension of the right size would end the process that loads it."""
+    folder = eomc.build(scene, root).folder
+    files = [f for f in sorted(folder.iterdir()) if f.is_file() and f.name != "build.json"]
+    assert {".so", ".py", ".c", ".h"} <= {f.suffix for f in files}
+    for file in files:
+        good = file.read_bytes()
+        for at in (0, len(good) // 2, len(good) - 1):
+            bad = bytearray(good)
+            bad[at] ^= 4
+            file.write_bytes(bytes(bad))
+            assert not compiler.found(folder, _key(folder)), file
+        file.write_bytes(good)
+    assert compiler.found(folder, _key(folder))
+    assert not eomc.build(scene, root).fresh
+    library = next(folder.glob("_simple_pendulum_*"))
+    library.write_bytes(library.read_bytes()[:-1] + b"!")
+    assert eomc.build(scene, root).fresh
+    assert gravity(root) == pytest.approx(8.2548, abs=1e-3)
+
+
+def _key(folder: Path) -> str:
+    import json
+
+    key: str = json.loads((folder / "build.json").read_text(encoding="utf-8"))["key"]
+    return key
+
+
+# --- compilers ------------------------------------------------------------------------------------
+
+RUBBISH = {
+    "text": 'echo rubbish > "$out"',
+    "nothing": ":",
+    "an empty file": ': > "$out"',
+    "a program": 'case "$*" in *-shared*) printf "int main(void){return 0;}" > m.c; '
+    'cc m.c -o "$out";; *) cc "$@";; esac',
+    "half a library": 'cc "$@"; case "$*" in *-shared*) head -c 9000 "$out" > h; '
+    'cp h "$out";; esac',
+    "another library": 'case "$*" in *-shared*) printf "int f;" > m.c; '
+    'cc -shared -fPIC m.c -o "$out";; *) cc "$@";; esac',
+    "one that crashes": 'case "$*" in *-shared*) printf "__attribute__((constructor)) void f(void)'
+    '{*(volatile int *)0 = 0;}" > m.c; cc -fPIC -c m.c; cc "$@" m.o;; *) cc "$@";; esac',
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", RUBBISH)
+def test_a_compiler_that_writes_rubbish(
+    what: str, scene: Path, root: Path, built: float, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """It returns 0; what it made is tried before it takes the place of the old module."""
+    out = 'out=; for w in "$@"; do [ "$last" = -o ] && out="$w"; last="$w"; done\n'
+    cc = script(tmp_path / "odd", out + RUBBISH[what] + "\nexit 0\n")
+    monkeypatch.setenv("CC", cc)
+    words = rf"{re.escape(cc)} returned 0, but what it made can't be loaded: correct CC"
+    with pytest.raises(eomc.EomcError, match=words):
+        eomc.load(scene, root)
+    assert leftovers(root) == []
+    assert gravity(root) == built
+    monkeypatch.delenv("CC")
+    assert eomc.build(scene, root).fresh
+    assert gravity(root) == 2 * built
+
+
+def test_a_compilers_words_need_not_be_utf8(
+    scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", script(tmp_path / "latin", "printf 'err\\351 \\377'; exit 1\n"))
+    with pytest.raises(eomc.EomcError, match=r"(?s)C compiler failed \(status 1\).*err\\xe9 \\xff"):
+        eomc.build(scene, root)
+
+
+@pytest.mark.parametrize("variable", ["CC", "EOMC_CFLAGS"])
+@pytest.mark.parametrize("value", ["gcc '-O1", 'gcc "-O1', "gcc -O1\\"])
+def test_an_open_quote(
+    variable: str, value: str, scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(eomc.EomcError, match=rf"^{variable}=.*: no .*: close it, or unset"):
+        eomc.build(scene, root)
+
+
+@pytest.mark.parametrize("value", ["{root}", "{root}/scene.toml", "  ", "\udcff"])
+def test_what_is_no_compiler(
+    value: str, scene: Path, tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", value.format(root=tmp_path))
+    with pytest.raises(eomc.EomcError, match="is not there: correct or unset CC"):
+        eomc.build(scene, root)
+
+
+def test_flags_that_are_no_text(scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0 -DX=\udcff")
+    assert eomc.build(scene, root).fresh
+    assert not eomc.build(scene, root).fresh
+
+
+def test_a_full_device(scene: Path, root: Path, built: float) -> None:
+    """As `ulimit -f`: the old module stays."""
+    code = (
+        "import resource, signal, sys, eomc\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+        "try: eomc.build(*sys.argv[1:])\n"
+        "except eomc.EomcError as fault: print(fault)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", code, str(scene), str(root)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "can't be written (File too large)" in done.stdout
+    assert leftovers(root) == [] and gravity(root) == built

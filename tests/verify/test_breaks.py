@@ -1,0 +1,188 @@
+"""A wrong sign anywhere between the scene and the machine code makes the check fail.
+
+Each breakage changes one thing in the generator, builds the cart-pole with it and lets `check`
+look: it has to fail, and in the rows that are about what was broken.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cases import scene_system
+from conftest import ROOT
+
+import eomc
+from eomc.base import resources
+from eomc.derive import lagrange
+from eomc.derive.lagrange import Equations
+from eomc.emit import c_expression
+from eomc.program import program
+from eomc.program.ir import Sum
+from eomc.verify.check import Report, check
+
+Breakage = Callable[[pytest.MonkeyPatch], None]
+SCENE = "cartpole_driven"
+
+
+def checked(folder: Path, scene: str = SCENE) -> Report:
+    """The check of a scene built anew, under a digest of its own."""
+    digest = hashlib.sha256(str(folder).encode()).hexdigest()
+    made = replace(scene_system(scene), digest=digest)
+    return check(made, eomc.load(made, folder), states=8)
+
+
+def failed(report: Report) -> set[str]:
+    return {row.name for row in report.rows if not row.passed}
+
+
+@pytest.fixture(autouse=True)
+def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
+
+
+def derived(change: Callable[[Equations], Equations]) -> Breakage:
+    """The equations of motion are changed before they become a program."""
+
+    def breakage(patch: pytest.MonkeyPatch) -> None:
+        right = lagrange.derive
+        patch.setattr(
+            lagrange,
+            "derive",
+            lambda system: {route: change(e) for route, e in right(system).items()},
+        )
+
+    return breakage
+
+
+def negated(e: Equations, field: str, *at: int) -> Equations:
+    """One entry of a vector or matrix with the other sign."""
+    value = getattr(e, field)
+    if len(at) == 1:
+        return replace(e, **{field: tuple(-x if (i,) == at else x for i, x in enumerate(value))})
+    rows = (
+        tuple(-x if (i, j) == at else x for j, x in enumerate(row)) for i, row in enumerate(value)
+    )
+    return replace(e, **{field: tuple(rows)})
+
+
+def text(right: str, wrong: str) -> Breakage:
+    """Templates and hand-written C say something else."""
+
+    def breakage(patch: pytest.MonkeyPatch) -> None:
+        read = resources.text
+        places = [part for part in TEMPLATES if right in part.read_text(encoding="utf-8")]
+        assert places, f"{right!r} stands in no template any more"
+        patch.setattr(resources, "text", lambda *where: read(*where).replace(right, wrong))
+
+    return breakage
+
+
+def lowered(patch: pytest.MonkeyPatch) -> None:
+    """On its way to assignments the last sum of the acceleration loses a sign."""
+    right = program.lower
+
+    def wrong(name: str, *how: Any) -> Any:
+        made = right(name, *how)
+        if name != "acceleration":
+            return made
+        body = list(made.body)
+        k = max(k for k, a in enumerate(body) if isinstance(a.value, Sum))
+        (weight, first), *rest = body[k].value.terms
+        body[k] = replace(body[k], value=Sum(((-weight, first), *rest), body[k].value.constant))
+        return replace(made, body=tuple(body))
+
+    patch.setattr(program, "lower", wrong)
+
+
+def printed(patch: pytest.MonkeyPatch) -> None:
+    """Differences are written as sums."""
+    right = c_expression.Printer._sum
+    patch.setattr(c_expression.Printer, "_sum", lambda *a: right(*a).replace(" - ", " + "))
+
+
+def eliminated(patch: pytest.MonkeyPatch) -> None:
+    """The solver's last pivot is taken with the wrong sign, after D itself was right."""
+    right = program._cheapest
+
+    def wrong(name: str, *how: Any) -> Any:
+        made = right(name, *how)
+        if name != "acceleration":
+            return made
+        outputs = tuple(replace(o, coefficient=-o.coefficient) for o in made.outputs[:1])
+        return replace(made, outputs=(*outputs, *made.outputs[1:]))
+
+    patch.setattr(program, "_cheapest", wrong)
+
+
+MOTION = "D qdd + bias = tau"
+TEMPLATES = [*(ROOT / "templates").rglob("*.jinja"), *(ROOT / "csrc").rglob("*.h")]
+
+# what is broken, how, and rows that have to say so
+BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
+    "an entry of D": (derived(lambda e: negated(e, "D", 0, 1)), {"D", "D = D^T", MOTION}),
+    "both of D": (
+        derived(lambda e: negated(negated(e, "D", 0, 1), "D", 1, 0)),
+        {"D", "acceleration", "Ddot - 2C + dD/dt skew", "power balance"},
+    ),
+    "an entry of C": (
+        derived(lambda e: negated(e, "C", 0, 1)),
+        {"C", "Ddot - 2C + dD/dt skew", "bias = C qd + g"},
+    ),
+    "g": (derived(lambda e: negated(e, "g", 1)), {"g", "bias = C qd + g"}),
+    "the bias": (
+        derived(lambda e: negated(e, "bias", 1)),
+        {"bias", "bias = C qd + g", MOTION},
+    ),
+    "an acceleration": (eliminated, {"acceleration", MOTION, "one step", "run"}),
+    "lowering": (lowered, {"acceleration", MOTION, "run"}),
+    "printing": (printed, {"acceleration", "one step"}),
+    "a weight of the stepper": (
+        text('lit("2.0") ~ "*(a2', 'lit("1.0") ~ "*(a2'),
+        {"one step", "run", "order of rk4"},
+    ),
+    "a sign in the stepper": (
+        text("h_2*a1.$;", "-h_2*a1.$;"),
+        {"one step", "run", "order of rk4"},
+    ),
+    "the time in a stage": (
+        text('"t + h_2")', '"t - h_2")'),
+        {"one step", "run"},
+    ),
+    "the time of a step in a run": (
+        text("(first + n)*h", "(first - n)*h"),
+        {"run"},
+    ),
+    "the sine": (text("*s = ", "*s = -"), {"acceleration", "g"}),
+    "what Python asks for": (
+        text("{{ f.binding_call }}", "{ {{ f.binding_call }} out[0] = -out[0]; }"),
+        {"D", "D > 0"},
+    ),
+}
+
+
+@pytest.mark.parametrize("scene", [SCENE, "kapitza_pendulum"])
+def test_unbroken_it_passes(tmp_path: Path, scene: str) -> None:
+    report = checked(tmp_path, scene)
+    assert report.passed, report.table()
+
+
+@pytest.mark.parametrize("what", BREAKAGES)
+def test_broken_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    breakage, rows = BREAKAGES[what]
+    breakage(monkeypatch)
+    report = checked(tmp_path)
+    assert not report.passed
+    assert rows <= failed(report), report.table()
+
+
+def test_an_inertia_with_the_wrong_sign_is_not_even_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    derived(lambda e: negated(e, "D", 0, 0))(monkeypatch)
+    with pytest.raises(eomc.EomcError, match=r"D is not positive definite|has no inertia"):
+        checked(tmp_path)

@@ -1,0 +1,100 @@
+"""`eomc check` executes every line of the C that it ships: gcov counts them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from cases import SCENES
+from conftest import needs
+from instrument import missed
+
+QUICK = ("cartpole", "cartpole_driven")
+
+# other lines under [run], and scenes to have them
+VARIANTS = {
+    "dp8": ("cartpole_driven", 'method = ["rk4", "dp8"]'),
+    "gauss16": ("double_pendulum", 'method = ["rk4", "gauss16"]'),
+    "batch": ("cartpole", 'batch = true\nmethod = ["rk4", "dp8"]'),
+    "batch of a tree": ("chain", "batch = true"),
+    "float": ("cartpole", 'real = "float"\nbatch = true'),
+    "linearize": ("cartpole_driven", 'linearize = "parameters"'),
+}
+
+# lines that nothing reaches, by scene, and why
+UNREACHABLE = {
+    "chain": (
+        r"return CHAIN_SINGULAR;|\*status = CHAIN_SINGULAR;",
+        "its pivots are positive multiples of what chain_prepare has looked at: equal uniform rods",
+    ),
+}
+
+
+def text_of(name: str, more: str = "") -> str:
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    return text.replace("[run]\n", f"[run]\n{more}\n")
+
+
+def unexplained(name: str, text: str, folder: Path) -> list[str]:
+    """The lines that the check of a scene leaves out, without those that nothing reaches."""
+    needs("gcov")
+    _, lines = missed(text, folder)
+    source = (folder / f"{name}.c").read_text(encoding="utf-8")
+    excused, _ = UNREACHABLE.get(name, ("(?!)", ""))
+    left = [(number, line) for number, line in lines if not re.fullmatch(excused, line)]
+    if never_singular(name, source):
+        left = [(n, line) for n, line in left if n not in after_solve(name, source)]
+    return [f"{number}: {line}" for number, line in left]
+
+
+def never_singular(name: str, source: str) -> bool:
+    """Whether D is decided by the parameters alone: the function of a state returns 1."""
+    solve = re.findall(rf"int {name}_solve(?:_at)?\([^;{{]*\)\n{{.*?\n}}", source, re.DOTALL)
+    return bool(solve) and solve[0].rstrip().endswith("return 1;\n}")
+
+
+def after_solve(name: str, source: str) -> set[int]:
+    """The lines behind the question whether that function has returned 0."""
+    found: set[int] = set()
+    lines = source.splitlines()
+    for number, line in enumerate(lines, start=1):
+        if re.search(rf"if \(!{name}_(solve|rates|rk4)\w*\(", line):
+            end = next(k for k in range(number, len(lines) + 1) if "SINGULAR" in lines[k - 1])
+            found |= {end, end + 1} if "break;" in lines[end] else {end}
+    return found
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_every_line_is_executed(name: str, tmp_path: Path) -> None:
+    assert unexplained(name, text_of(name), tmp_path) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [p.stem for p in sorted(SCENES.glob("*.toml")) if p.stem not in QUICK]
+)
+def test_every_line_of_every_scene_is_executed(name: str, tmp_path: Path) -> None:
+    assert unexplained(name, text_of(name), tmp_path) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", VARIANTS)
+def test_every_line_of_other_steppers_is_executed(what: str, tmp_path: Path) -> None:
+    name, more = VARIANTS[what]
+    assert unexplained(name, text_of(name, more), tmp_path) == []
+
+
+def test_lines_that_are_not_executed_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the rows about refusals, these are left out."""
+    import instrument
+
+    needs("gcov")
+    without = "check.compiled_rows = lambda made: None\nreport = check.check"
+    monkeypatch.setattr(
+        instrument, "CHECK", instrument.CHECK.replace("report = check.check", without)
+    )
+    left = unexplained("mass_spring", text_of("mass_spring"), tmp_path)
+    assert any("MASS_SPRING_SINGULAR" in line for line in left)

@@ -1,0 +1,73 @@
+"""Pivots that are not looked at, or beside the wrong size, on every route to accelerations."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import trees
+from instrument import in_a_fork
+from mutants import Bench, Mutant, variant
+
+from eomc.model import system
+from eomc.model.system import System
+from eomc.scene import scene
+
+# a pivot, and what it is compared with: nothing, or rounding of the diagonal entry that it was
+PIVOT = re.compile(r"((?:\w+->)?[dD]_\w+|-?w\d+) <= (0|[\d.]+e-\d+\*([\w>.-]*\w))(?=[;) ?|])")
+
+
+def chain(links: int, run: str = "") -> System:
+    """Rods in a row, each with a mass of its own, so that each pivot can fail by itself."""
+    bodies = [
+        {"name": f"link{k}", "joint": "revolute", "coordinates": f"q{k}", "mass": f"m{k}",
+         "center": ["l/2", 0], "inertia": f"m{k}*l**2/12",
+         **({"parent": f"link{k - 1}", "offset": ["l", 0]} if k > 1 else {})}
+        for k in range(1, links + 1)
+    ]  # fmt: skip
+    masses = {f"m{k}": 1 + k / 10 for k in range(1, links + 1)}
+    text = trees.text(bodies, [0, "-g"], {**masses, "l": 0.7, "g": 9.81}, start=0.1)
+    return system.from_scene(scene.parse(f"{text}\n[run]\nh = 0.001\n{run}", "rods.toml"))
+
+
+def changes(source: str) -> Iterator[Mutant]:
+    """Each pivot left out; and each beside the size of a mass or of nothing in its place."""
+    for match in PIVOT.finditer(source):
+        start, end = match.span()
+        if source[source.rfind("\n", 0, start) : start].lstrip().startswith(("* ", "/*")):
+            continue
+        yield Mutant(start, end, "0")
+        if match[3]:  # what would do for a D of another unit
+            yield Mutant(*match.span(3), f"1e20*{match[3]}")
+            yield Mutant(*match.span(3), f"-1e20*{match[3]}")
+
+
+def unnoticed(made: System, name: str, folder: Path, least: int) -> list[str]:
+    """The changes of pivots that pass the check."""
+
+    def all_of() -> list[str]:
+        bench = Bench(name, folder, made)
+        tried = list(changes(bench.shipped.source))
+        assert len(tried) >= least, len(tried)
+        return [bench.place(m) for m in tried if bench.judge(m)[0] not in ("killed", "no C")]
+
+    kind, value = in_a_fork(all_of, 1200)
+    assert kind == "done", value
+    assert isinstance(value, list)
+    return value
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, least", [("cartpole", 2), ("cartpole_batch", 3)])
+def test_pivots_of_scenes(name: str, least: int, tmp_path: Path) -> None:
+    assert unnoticed(variant(name), name, tmp_path, least) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "links, run, least", [(2, "", 2), (3, "", 3), (6, "", 6), (4, "batch = true", 4)]
+)
+def test_pivots_of_trees(links: int, run: str, least: int, tmp_path: Path) -> None:
+    assert unnoticed(chain(links, run), f"rods{links}", tmp_path, least) == []

@@ -1,0 +1,165 @@
+"""Random valid scenes pass the check, and with one term negated they do not.
+
+Many more of both: python tests/random_scenes.py --count 2000 [--negate].
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import random_scenes
+from random_scenes import outcome, scene_text
+
+import eomc
+from eomc.model import system
+from eomc.scene import scene
+from eomc.verify.check import Report, check
+
+# Right modules of which a row about orders, advised steps or balances once said FAILED.
+DRAG = """eomc = 1
+name = "drag"
+gravity = [0, "-9.81"]
+[coordinates]
+theta = { unit = "rad", start = 0.5 }
+[[body]]
+name = "bob"
+joint = "revolute"
+coordinates = "theta"
+mass = 1
+center = [0.5, 0]
+inertia = 0.1
+friction = 0.1
+"""
+COASTING = """eomc = 1
+name = "coasting"
+gravity = [0, 0]
+[coordinates]
+theta = { unit = "rad", start = 0.5, rate = 0.3 }
+[[body]]
+name = "wheel"
+joint = "revolute"
+coordinates = "theta"
+mass = 1
+inertia = 0.8
+friction = 0.1
+"""
+STIFF = """eomc = 1
+name = "stiff"
+[coordinates]
+x = { start = 0.5, rate = 0.6 }
+y = { start = 0.3 }
+[parameters]
+k = 5.0
+[energy]
+kinetic = "x_dot**2/2 + y_dot**2/2 + dot(sin(x)*y)**2/2"
+potential = "-k*cos(x) + k*log(1 + y**2)"
+[forces]
+x = "-tanh(x_dot/0.02)/2"
+y = "-atan(y_dot/0.01)/3"
+[run]
+method = ["rk4", "gauss16", "dp8", "gauss8", "gauss6", "euler"]
+h = 0.02
+"""
+ORDER_1 = """eomc = 1
+name = "first_order"
+[coordinates]
+x = { start = 0.5 }
+[energy]
+kinetic = "x_dot**2/2"
+potential = "x**4/4 + x**2"
+dissipation = "x_dot**2/9"
+[run]
+method = ["euler", "dp8"]
+"""
+WELL = """eomc = 1
+name = "well"
+[coordinates]
+x = { start = -0.8 }
+[parameters]
+depth = 2e4
+[energy]
+kinetic = "0.75*x_dot**2"
+potential = "-depth*exp(-x**2)"
+[run]
+method = ["rk4", "gauss8", "gauss16"]
+h = 0.02
+"""
+REGRESSIONS = {
+    "friction of a body": DRAG,
+    "stiff friction and high orders": STIFF,
+    "the first stepper of order 1": ORDER_1,
+    "friction alone": COASTING,
+    "implicit steps as long as the fastest motion": WELL,
+}
+
+
+@pytest.fixture(autouse=True)
+def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
+
+
+def checked(text: str, root: Path) -> Report:
+    made = system.from_scene(scene.parse(text, "test.toml"))
+    return check(made, eomc.load(made, root))
+
+
+@pytest.mark.parametrize("what", REGRESSIONS)
+def test_right_modules_pass(tmp_path: Path, what: str) -> None:
+    report = checked(REGRESSIONS[what], tmp_path)
+    assert report.passed, report.table()
+    assert all(row.judged for row in report.rows), report.table()
+
+
+def test_advice_near_stiff_friction_is_judged_by_eigenvalues(tmp_path: Path) -> None:
+    (row,) = (r for r in checked(DRAG, tmp_path).rows if r.name == "h of rk4")
+    assert row.passed and row.limit == 2 and 1 <= row.error < 1.1
+    assert "eigenvalues" in row.unit
+
+
+def test_a_method_of_order_1_balances_power_at_order_1(tmp_path: Path) -> None:
+    text = ORDER_1.replace('["euler", "dp8"]', '"euler"')
+    (row,) = (r for r in checked(text, tmp_path).rows if r.name == "power balance")
+    assert row.error == pytest.approx(1, abs=0.1) and row.limit == 0.5
+
+
+def assert_right(seed: int, root: Path) -> None:
+    found = outcome(seed, False, root)
+    assert found.outcome == "passed", (found, scene_text(seed))
+
+
+def assert_caught(seed: int, root: Path) -> None:
+    """Unless what was negated changes no value, or is refused at once."""
+    found = outcome(seed, True, root)
+    assert found.outcome in ("caught", "unchanged", "refused"), (found, scene_text(seed))
+
+
+def test_scenes_are_the_same_for_the_same_number() -> None:
+    assert scene_text(7) == scene_text(7) != scene_text(8)
+    texts = [scene_text(k) for k in range(300)]
+    words = ["[[body]]", "[inputs]", "signal", "dot(", "*t)", "friction", "tanh", "batch = true"]
+    words += ['"float"', '"parameters"', *(f'"{m}"' for m in random_scenes.STEPPERS)]
+    for word in words:
+        assert any(word in text for text in texts), word
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_scenes_pass(tmp_path: Path, seed: int) -> None:
+    assert_right(seed, tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> None:
+    assert_caught(seed, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3, 43))
+def test_more_random_scenes_pass(tmp_path: Path, seed: int) -> None:
+    assert_right(seed, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3, 23))
+def test_more_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> None:
+    assert_caught(seed, tmp_path)

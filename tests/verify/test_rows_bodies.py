@@ -1,0 +1,202 @@
+"""Energies of bodies once more from point masses: right for every tree, and a fault is noticed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy
+from cases import SCENES
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from test_check import StandIn
+from trees import SHAPES, trees
+
+from eomc.model import multibody as building
+from eomc.model import system
+from eomc.scene import scene
+from eomc.verify import check as checking
+from eomc.verify import rows_bodies
+from eomc.verify.rows_bodies import Bodies
+from eomc.verify.taylor import Jets
+
+NAMES = ("kinetic_energy", "potential_energy", "power")
+
+
+def compared(text: str, states: int = 4) -> dict[str, float]:
+    """How far the reference's energies are off from those of point masses."""
+    made = system.from_scene(scene.parse(text, "test.toml"))
+    assert made.scene is not None
+    module = StandIn(Jets(made))  # type: ignore[arg-type]  # which answers alike
+    check = checking.Comparison(made, module, np.random.default_rng(0), states)
+    assert check.expected
+    return {name: Bodies(check, made.scene).compare(name) for name in NAMES}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plane", [True, False])
+@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_every_tree_has_the_energies_of_its_point_masses(plane: bool, data: Any) -> None:
+    shape = data.draw(st.sampled_from([s for s in SHAPES if len(s) < 3]))
+    off = compared(data.draw(trees(shape, plane)))
+    assert max(off.values()) < rows_bodies.LIMIT, off
+
+
+KINDS = """
+eomc = 1
+name = "kinds"
+gravity = [0.3, "-g", -2]
+[coordinates]
+a = { start = 0.3 }
+b = { start = -0.4 }
+c = { start = 0.5, rate = 0.3 }
+d = { start = 0.2 }
+e = { start = -0.3 }
+f = { start = 0.7 }
+[parameters]
+m = 1.3
+g = 9.81
+[definitions]
+y = "b0_x*sin(a) + t**2/7"
+[energy]
+kinetic = "m*dot(y)**2/2"
+dissipation = "dot(y)**2/9"
+[[body]]
+name = "b0"
+joint = "KIND"
+coordinates = [COORDINATES]
+mass = "m"
+center = [0.1, 0.2, 0.3]
+inertia = [0.5, 0.6, 0.7, 0.02, -0.03, 0.04]
+rotation = [["x", 0.4], ["z", -0.9]]
+offset = [0.2, -0.1, 0.4]
+[[body]]
+name = "placed"
+mass = 0.7
+inertia = [0.1, 0.2, 0.25]
+position = ["y", "sin(c)", "t/3 + a"]
+rotation = [["y", "b/2"], ["x", "a*t"]]
+[[body]]
+name = "rest"
+mass = 1
+inertia = [1, 1, 1]
+position = ["d", "e + a", "f"]
+rotation = [["z", "c + b"]]
+[[spring]]
+bodies = ["b0", "placed"]
+points = [[0.1, 0, 0], [0, 0.5, 0.2]]
+stiffness = 20
+length = 0.4
+[[damper]]
+bodies = ["b0", "placed"]
+points = [[0.1, 0, 0], [0, 0.5, 0.2]]
+damping = 2
+"""
+
+
+def kinds(kind: str, coordinates: str) -> str:
+    quoted = ", ".join(f'"{c}"' for c in coordinates)
+    return KINDS.replace("KIND", kind).replace("COORDINATES", quoted)
+
+
+def single() -> str:
+    """One body on a spherical joint, with a spring and a damper to the world."""
+    head, rest = kinds("spherical", "abc").split("[definitions]")
+    body = rest.split("[[body]]")[1]
+    ends = rest.split("[[spring]]")[1].replace("placed", "world")
+    head = "".join(line for line in head.splitlines(True) if line[:3] not in ("d =", "e =", "f ="))
+    return f"{head}[[body]]{body}[[spring]]{ends}"
+
+
+@pytest.mark.parametrize("kind, coordinates", [("spherical", "abc"), ("free", "abcdef")])
+def test_joints_of_three_angles_and_bodies_placed_by_formulas(kind: str, coordinates: str) -> None:
+    off = compared(kinds(kind, coordinates), 3)
+    assert max(off.values()) < rows_bodies.LIMIT, off
+
+
+def wrong_rotation(axis: int, angle: Any) -> Any:
+    return building_rotation(axis, -angle if axis == 1 else angle)
+
+
+building_rotation = building.rotation_about
+
+
+def with_wrong(method: str, by: Callable[[Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
+    right = getattr(building.Builder, method)
+
+    def patch(monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(
+            building.Builder, method, lambda self, *a, **how: by(right(self, *a, **how))
+        )
+
+    return patch
+
+
+# what is wrong in bodies.py, and the energy that tells
+WRONG = {
+    "the sign of gravity": (with_wrong("_weight", lambda P: -P), "potential_energy"),
+    "a term of K": (with_wrong("_kinetic", lambda terms: terms[:-1]), "kinetic_energy"),
+    "a factor in K": (with_wrong("_kinetic", lambda K: [2 * K[0], *K[1:]]), "kinetic_energy"),
+    "the length of a spring": (with_wrong("_length", lambda x: 2 * x), "potential_energy"),
+    "the sense of a rotation": (
+        lambda monkeypatch: monkeypatch.setattr(building, "rotation_about", wrong_rotation),
+        "kinetic_energy",
+    ),
+    "products of inertia": (
+        lambda monkeypatch: monkeypatch.setattr(
+            building.Builder, "_kinetic",
+            lambda self, m, inertia, *place: RIGHT(self, m, [*inertia[:3], *(-sympy.S(x) for x in
+                                                   inertia[3:])], *place),
+        ),
+        "kinetic_energy",
+    ),
+}  # fmt: skip
+RIGHT = building.Builder._kinetic
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_fault_in_what_is_made_of_bodies_is_noticed(
+    what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    patch, name = WRONG[what]
+    patch(monkeypatch)
+    assert compared(single())[name] > 1e3 * rows_bodies.LIMIT
+
+
+def test_a_damper_left_out_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(building.Builder, "_damper", lambda *line: None)
+    assert compared(single())["power"] > 1e3 * rows_bodies.LIMIT
+
+
+def test_quaternions_are_scipys() -> None:
+    random = np.random.default_rng(3)
+    a, b, x = random.normal(size=(5, 4)), random.normal(size=(5, 4)), random.normal(size=(5, 3))
+    a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
+    one, other = (Rotation.from_quat(np.roll(q, -1, axis=1)) for q in (a, b))
+    np.testing.assert_allclose(rows_bodies.rotated(a, x), one.apply(x), atol=1e-14)
+    product = rows_bodies.multiplied(a, b)
+    np.testing.assert_allclose(rows_bodies.rotated(product, x), (one * other).apply(x), atol=1e-14)
+
+
+def test_point_masses_have_the_inertia_of_the_body() -> None:
+    made = system.from_scene(scene.read(SCENES / "tumbling_box.toml"))
+    assert made.scene is not None and made.scene.assembly is not None
+    start = checking.State(*np.array([(c.start, c.rate) for c in made.coordinates]).T)
+    line = rows_bodies.Line(made.scene, start, 0.1)
+    (body,) = [b for b in made.scene.assembly.bodies if b.joint]
+    masses, points = zip(*line.points(body), strict=True)
+    m, x = np.array(masses), np.array(points)
+    assert math.isclose(m.sum(), float(line.of(body.mass)))
+    centre = m @ x / m.sum()
+    np.testing.assert_allclose(centre, line.vector(body.center), atol=1e-12)
+    r = x - centre
+    tensor = sum(w * (y @ y * np.eye(3) - np.outer(y, y)) for w, y in zip(m, r, strict=True))
+    np.testing.assert_allclose(
+        tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
+        [float(line.of(entry)) for entry in body.inertia], atol=1e-12,
+    )  # fmt: skip
