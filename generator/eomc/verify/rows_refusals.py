@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE = range(4)
 WORDS = ("ok", "singular", "not finite", "no convergence")
 CLEAR = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
-FACTORS = (0.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
-MIXED = 24  # states with all parameters changed at random
-MOST = 240  # states that the reference is asked for; fewer where it takes long
-LARGE = 60
+FACTORS = (0.0, -3.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
+MIXED = 60  # states with all parameters changed at random
+MOST = 400  # states that the reference is asked for; fewer where it takes long
+LARGE = 240
 MARK = -7.0  # what is to be left alone
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eomc.integrators.tableaux import METHODS
+from eomc.integrators.tableaux import METHODS, Method
 from eomc.verify.oracle import Vector
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ LONG = (0.02, 0.2, 0.7)
 LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by all they may be
 ANGLES = 48  # around the circle, at which sines are looked at
 SINES = 20.0  # units; their last terms make hundreds
+SWEEPS = 60  # for the stages of implicit methods
 FEW = 6  # long steps, or steps with a row of u each
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
@@ -115,12 +116,61 @@ class Runs:
             row("angles far out", self.limit, f"units, of angles of {TURNS:.3g}", self.far)
         if self.model.nu and self.check.methods[0] == "rk4":
             row("inputs row by row", self.limit, rounding, self.inputs)
+        row("every entry written", 0, "values with entries left", self.written)
         for method in self.check.methods:
+            if method not in ("rk4", "euler", "verlet") and self.check.dtype == np.float64:
+                row(f"one step of {method}", self.limit, rounding, partial(self.step, method))
             row(f"{method} cut anywhere", 0, "runs with other bits", partial(self.cut, method))
             if self.check.dtype == np.float64 and METHODS[method].order >= EXACT:
                 row(f"{method} rounding", ROUNDED, "units of the state", partial(self.fine, method))
 
     limit = 1e3
+
+    def written(self) -> float:
+        """How many values leave entries as they were."""
+        s, n, left = self.states[-1], self.model.nq, 0
+        for name in ("D", "C", "g", "bias", "tau"):
+            out = np.full((n, n) if name in "DC" else n, np.nan, self.model.dtype)
+            place = (s.q,) if name in "Dg" else (s.q, s.qd)
+            getattr(self.check.module, name)(*place, t=s.t, params=s.params, out=out)
+            left += bool(np.any(np.isnan(out)))
+        return float(left)
+
+    def step(self, method: str) -> float:
+        """A step by the coefficients of the method, with the reference's accelerations."""
+        errors, h = [0.0], self.h
+        for e in self.check.few(4):
+            s = e.state
+            with np.errstate(all="ignore"):
+                expected = self.stages(METHODS[method], s)
+            if expected is not None and np.all(np.isfinite(expected)):
+                found = self.check.module.step(
+                    s.q, s.qd, h=h, t=s.t, u=s.u, params=s.params, method=method
+                )
+                gain = h * e.size["acceleration"]
+                size = np.abs(expected) + np.array([h * (np.abs(s.qd) + gain), gain])
+                errors.append(self.check.units(np.array(found), expected, size))
+        return float(np.max(errors))
+
+    def stages(self, m: Method, s: State) -> Vector | None:
+        """The end of the step, its stages by sweeps; None where these find none."""
+        h, b = self.h, np.array(m.b, float)
+        a = np.array([[*map(float, row), *[0.0] * (m.stages - len(row))] for row in m.a])
+        moving = np.tile(s.qd, (m.stages, 1))
+        acceleration = np.zeros_like(moving)
+        for _ in range(SWEEPS if m.implicit else m.stages):
+            at, last = s.q + h * a @ moving, acceleration
+            acceleration = np.array([
+                self.sampler.reference.acceleration(q, qd, s.t + float(c) * h, s.u, s.params)
+                for q, qd, c in zip(at, moving, m.c, strict=True)
+            ])  # fmt: skip
+            moving = s.qd + h * a @ acceleration
+            if np.all(np.abs(acceleration - last) <= 1e-15 * np.abs(acceleration)):
+                break
+        else:
+            if m.implicit:
+                return None
+        return np.array([s.q + h * b @ moving, s.qd + h * b @ acceleration])
 
     def large_step(self, s: State, part: float) -> float:
         """An h in which some coordinate moves by about this part of how far it goes."""
