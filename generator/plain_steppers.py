@@ -10,7 +10,7 @@ from math import isfinite, sqrt
 from eomc import c_function as c
 from eomc import context
 from eomc.c_function import CArgument, CFunction
-from eomc.evaluations import KINDS, source
+from eomc.evaluations import source
 from eomc.methods import literal, rounded
 from eomc.plain import Plain, handshake, indexed, of, parameters
 from eomc.plain_views import (
@@ -57,8 +57,7 @@ def files(program: Program, show: Show) -> dict[str, str]:
 def header(plain: Plain, slopes: Slopes | None, loops: Sequence[Loop]) -> Header:
     """The header's view."""
     target, s = plain.target, plain.target.system
-    found = [plain.evaluation(n).function for n in KINDS if source(target, n) is not None]
-    found.append(plain.acceleration.function)
+    found = [*plain.evaluations, plain.acceleration]
     return Header(
         title=s.title,
         stamp=tuple(context.stamp(target)),
@@ -73,7 +72,7 @@ def header(plain: Plain, slopes: Slopes | None, loops: Sequence[Loop]) -> Header
         parameters=parameters(plain),
         implicit=any(x.implicit for x in loops),
         timed=target.driven,
-        functions=tuple(found),
+        functions=tuple(x.function for x in found),
         linearization=slopes.linearization if slopes else None,
         methods=tuple(
             Declared(m.name, _titled(m), m.implicit, step(plain, m), x.run, x.batch)
@@ -95,7 +94,7 @@ def source_view(plain: Plain, slopes: str, steppers: Sequence[str]) -> Source:
         parameters=parameters(plain),
         q0=tuple(target.literal(x.start) for x in s.coordinates),
         qd0=tuple(target.literal(x.rate) for x in s.coordinates),
-        evaluations=tuple(plain.evaluation(n) for n in KINDS if source(target, n) is not None),
+        evaluations=plain.evaluations,
         acceleration=plain.acceleration,
         solved=tuple(context.solved(target)),
         slopes=slopes,
