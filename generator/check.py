@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import sympy
 
-from eomc import onestep
+from eomc import derivatives, onestep
 from eomc.answer import Answer, Vector
 from eomc.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Finding, Place
 from eomc.jets import Jets
@@ -36,6 +36,7 @@ EPS = 2.0**-52
 # Correct builds differ by less than one unit in a value, by some tens in a stiff run. A wrong
 # sign makes 1e15, and still 1e5 in a term that is a ten thousand millionth of the whole.
 LIMIT = 1e3
+SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences
 SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
 CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
 
@@ -406,6 +407,11 @@ class _Check:
             self.row("D qdd + bias = tau", LIMIT, rounding, self.motion)
             if self.dtype == np.float64:  # single precision leaves differences too few digits
                 self.row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", self.skewness)
+                for name in ("linearize", "sensitivity"):
+                    if self.has(name):
+                        unit = "of the largest derivative"
+                        find = partial(self.slopes, name)
+                        self.row(name, SLOPE_LIMIT, unit, find)
                 self.convergence_rows()
         else:
             self.row("states", 1, "states with a regular D", lambda: 0.0, least=True)
@@ -680,6 +686,36 @@ class _Check:
             return min((x for x in residuals if not math.isnan(x)), default=math.nan)
 
         return self.largest(error)
+
+    def has(self, name: str) -> bool:
+        """Whether the module has derivatives: what implicit methods need, or the scene asks for."""
+        run = self.system.run
+        if name == "sensitivity":
+            return run.linearize == "parameters" and bool(self.system.parameters)
+        return bool(run.linearize) or any(METHODS[method].newton for method in self.methods)
+
+    def slopes(self, name: str) -> float | Finding:
+        """linearize or sensitivity against differences of the reference's accelerations.
+
+        The best of some widths counts at each state, as of skewness.
+        """
+        scale = np.array([self.sampler.spread, self.sampler.speed])
+        n, nu = len(self.system.q), len(self.system.inputs)
+        known = []
+        for e in self._few(self.effort.few):
+            s, size = e.state, e.size["acceleration"]
+            held = {"u": s.u, "t": s.t, "params": s.params}
+            if name == "linearize":
+                A, B = self.module.linearize(s.q, s.qd, **held)
+                found, part = np.hstack([A[n:], B[n:]]), slice(0, 2 * n + nu)
+            else:
+                found, part = self.module.sensitivity(s.q, s.qd, **held), slice(2 * n + nu, None)
+            with np.errstate(all="ignore"):
+                exact = derivatives.by_differences(self.reference, s, scale, self.sampler.defaults)
+                off = [derivatives.apart(found, J[:, part], by[part], size) for J, by in exact]
+            known.append(min((x for x in off if not math.isnan(x)), default=math.nan))
+        known = [x for x in known if not math.isnan(x)]
+        return max(known) if known else Finding(math.nan, "no state has finite differences")
 
     def bias(self) -> float:
         """bias = C qd + g."""

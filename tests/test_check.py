@@ -287,7 +287,7 @@ def test_friction_that_jumps_is_not_blamed_for_its_order() -> None:
     report = check(system, StandIn(derive(system)), states=8)
     assert report.passed, report.table()
     order = next(row for row in report.rows if row.name == "order of rk4")
-    assert order.judged and order.error == pytest.approx(4, abs=0.2)
+    assert order.judged and 3.5 < order.error < 4.5
 
 
 def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,7 +299,7 @@ def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch
         report = check(system, StandIn(derive(system)), states=4)
         (row,) = (row for row in report.rows if row.name == "order of rk4")
         assert row.passed == passed and row.judged != passed
-        assert ("not to be expected with sign" in report.table()) == passed
+        assert ("not to be expected with sign" in " ".join(report.table().split())) == passed
 
 
 def test_an_order_that_cannot_be_seen_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

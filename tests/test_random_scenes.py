@@ -103,7 +103,13 @@ def checked(text: str, root: Path) -> Report:
     return check(made, eomc.load(made, root))
 
 
-@pytest.mark.parametrize("what", REGRESSIONS)
+@pytest.mark.parametrize(
+    "what",
+    [
+        pytest.param(what, marks=[pytest.mark.slow] * ("gauss" in text), id=what)
+        for what, text in REGRESSIONS.items()
+    ],
+)
 def test_right_modules_pass(tmp_path: Path, what: str) -> None:
     report = checked(REGRESSIONS[what], tmp_path)
     assert report.passed, report.table()
