@@ -17,10 +17,12 @@ from conftest import Modules
 from cases import scene_system
 from eomc import check as checking
 from eomc import reference as references
+from eomc import scene
 from eomc.check import Report, check
 from eomc.convergence import Convergence, Finding
 from eomc.reference import Reference, derive
 from eomc.system import System, symbol
+from eomc.system import from_scene as system_of
 
 
 class StandIn:
@@ -368,6 +370,47 @@ class Advising:
     def advice(self, q: Any, qd: Any, h: float, **how: Any) -> str | None:
         told: str | None = self.module.advice(q, qd, h * self.by, **how)
         return told
+
+
+SLOPES = """eomc = 1
+name = "slopes"
+[coordinates]
+x = { start = 0.4 }
+y = { start = 0.1, rate = 0.3 }
+[parameters]
+k = 3.0
+[inputs]
+f = { signal = "sin(x)" }
+[energy]
+kinetic = "x_dot**2/2 + (2 + sin(x))*y_dot**2/2"
+potential = "k*(x - y)**2/2"
+dissipation = "k*x_dot**2/9"
+[forces]
+y = "f*x"
+[run]
+linearize = "parameters"
+"""
+
+
+@pytest.mark.parametrize("wrong", ["", "A", "B", "sensitivity"])
+def test_derivatives_are_compared_with_differences(modules: Modules, wrong: str) -> None:
+    module = modules.of_text(SLOPES)
+
+    class Bent:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(module, name)
+
+        def linearize(self, *place: Any, **how: Any) -> Any:
+            A, B = module.linearize(*place, **how)
+            return (flipped(3, 0)(A) if wrong == "A" else A), (-B if wrong == "B" else B)
+
+        def sensitivity(self, *place: Any, **how: Any) -> Any:
+            return module.sensitivity(*place, **how) * (-1 if wrong == "sensitivity" else 1)
+
+    report = check(system_of(scene.parse(SLOPES)), Bent(), states=4)
+    row = "sensitivity" if wrong == "sensitivity" else "linearize"
+    assert failed(report) == ({row} if wrong else set()), report.table()
+    assert {"linearize", "sensitivity"} <= {row.name for row in report.rows}
 
 
 @pytest.mark.parametrize("name", ["cartpole", "mass_spring"])
