@@ -15,7 +15,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -362,6 +362,12 @@ def _units(found: Any, expected: Any, size: Any, eps: float = EPS) -> float:
         return float(np.max(np.where(off == 0, 0, off / (eps * np.asarray(size))), initial=0))
 
 
+def _largest(errors: Iterable[float | None], why: str) -> float | Finding:
+    """Of those that there are, nan before all; not judged, and why, where there is none."""
+    known = [x for x in errors if x is not None]
+    return float(np.max(known)) if known else Finding(math.nan, why)
+
+
 def _rows(run: Any, s: State) -> list[State]:
     """The states that a run from `s` went through."""
     rows = zip(run.t, run.q, run.qd, strict=True)
@@ -534,38 +540,35 @@ class _Check:
             lambda e: self.units(_ask(self.module, name, e.state), e.value[name], e.size[name])
         )
 
-    def steps(self) -> float:
+    def steps(self) -> float | Finding:
         """One step of the scene's h from a few states."""
         h = self.system.run.h
 
         def reference(**rows: Any) -> Vector:
             return np.stack(self.reference.step(h=h, **rows), axis=1)
 
-        def error(e: _Expected) -> float:
+        def error(e: _Expected) -> float | None:
             s = e.state
             with np.errstate(all="ignore"):
                 expected, size = self.sampler.reach(reference, s)
             if not np.all(np.isfinite(expected)):
-                return 0.0
+                return None
             found = self.module.step(s.q, s.qd, h=h, t=s.t, u=s.u, params=s.params)
             gain = h * e.size["acceleration"]
             return self.units(found, expected, size + np.array([h * (np.abs(s.qd) + gain), gain]))
 
-        return float(np.max([error(e) for e in self._few(self.effort.few)]))
+        return _largest(map(error, self._few(self.effort.few)), "no step from any state is finite")
 
     def step_by(self, method: str) -> float | Finding:
         """One step of a method from a few states, by its tableau on the reference's accelerations.
 
         Shorter than the scene's h where the stages of an implicit one are else not found.
         """
-        errors = [self._step_by(method, e) for e in self._few(self.effort.few)]
-        known = [x for x in errors if not math.isnan(x)]
-        if known:
-            return max(known)
-        return Finding(math.nan, "no step from any state is finite")
+        errors = (self._step_by(method, e) for e in self._few(self.effort.few))
+        return _largest(errors, "no step from any state is finite")
 
-    def _step_by(self, method: str, e: _Expected) -> float:
-        """nan where there is no such step, in the reference or in the module."""
+    def _step_by(self, method: str, e: _Expected) -> float | None:
+        """None where there is no such step, in the reference or in the module."""
         s, gain = e.state, e.size["acceleration"]
         for h in (part * self.system.run.h for part in SHORTER):
 
@@ -585,13 +588,14 @@ class _Check:
             if np.all(np.isfinite(expected)) and run.status == "ok":
                 size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain])
                 return self.units([run.q[-1], run.qd[-1]], expected, size)
-        return math.nan
+        return None
 
-    def runs(self) -> float:
+    def runs(self) -> float | Finding:
         """A short run from the start, and one from a random state with random parameters."""
-        return float(np.max([self._run(e.state) for e in self._few(2)]))
+        errors = (self._run(e.state) for e in self._few(2))
+        return _largest(errors, "a difference grows too much in one step")
 
-    def _run(self, s: State) -> float:
+    def _run(self, s: State) -> float | None:
         """As far as a difference at the start, in units of the spread, grows by GROWTH_LIMIT."""
         steps = min(self.effort.run, max(1, round(self.system.run.duration / self.system.run.h)))
         spread = np.array([self.sampler.spread, self.sampler.speed])
@@ -604,6 +608,8 @@ class _Check:
             growth = np.max(np.abs(y - x) / spread, axis=(1, 2)) / NUDGE
         growth = np.maximum.accumulate(growth)
         honest = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
+        if honest < 2:
+            return None
         t, x, growth = t[:honest], x[:honest], growth[:honest, None, None]
         run = self._simulate(s, steps=honest - 1)
         size = np.arange(1, honest + 1)[:, None, None] * (growth * spread + np.abs(x))
@@ -701,7 +707,7 @@ class _Check:
         """
         scale = np.array([self.sampler.spread, self.sampler.speed])
         n, nu = len(self.system.q), len(self.system.inputs)
-        known = []
+        known: list[float | None] = []
         for e in self._few(self.effort.few):
             s, size = e.state, e.size["acceleration"]
             held = {"u": s.u, "t": s.t, "params": s.params}
@@ -713,9 +719,8 @@ class _Check:
             with np.errstate(all="ignore"):
                 exact = derivatives.by_differences(self.reference, s, scale, self.sampler.defaults)
                 off = [derivatives.apart(found, J[:, part], by[part], size) for J, by in exact]
-            known.append(min((x for x in off if not math.isnan(x)), default=math.nan))
-        known = [x for x in known if not math.isnan(x)]
-        return max(known) if known else Finding(math.nan, "no state has finite differences")
+            known.append(min((x for x in off if x is not None), default=None))
+        return _largest(known, "no state has finite differences")
 
     def bias(self) -> float:
         """bias = C qd + g."""

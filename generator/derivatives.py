@@ -50,12 +50,15 @@ def by_differences(
         yield np.tensordot(weights, forward - back, 1).T / (width * scales), scales
 
 
-def apart(found: Vector, exact: Vector, scales: Vector, size: Vector) -> float:
+def apart(found: Vector, exact: Vector, scales: Vector, size: Vector) -> float | None:
     """The largest difference of two (nq, k), relative to the row's largest in those scales.
 
     size: (nq,), of the sums that the accelerations are; less than 1e-9 of it is no difference.
+    None where `exact` is not finite, inf where `found` alone is not.
     """
     if not np.all(np.isfinite(exact)):
-        return float("nan")
+        return None
+    if not np.all(np.isfinite(found)):
+        return np.inf
     largest = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-9 * size
     return float(np.max(np.abs(found - exact) * scales / largest[:, None], initial=0))
