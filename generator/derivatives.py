@@ -53,7 +53,7 @@ def by_differences(
 def apart(found: Vector, exact: Vector, scales: Vector, size: Vector) -> Vector:
     """The differences of two (nq, k), relative to each row's largest in those scales.
 
-    size: (nq,), of the sums that the accelerations are; of which differences lose 1e-10 to rounding.
+    size: (nq,), of the sums that the accelerations are: differences lose 1e-10 of it.
     nan where `exact` is not finite, inf where `found` alone is not.
     """
     largest = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-4 * size
