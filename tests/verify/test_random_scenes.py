@@ -86,7 +86,24 @@ potential = "-depth*exp(-x**2)"
 method = ["rk4", "gauss8", "gauss16"]
 h = 0.02
 """
+SATURATED = """eomc = 1
+name = "saturated"
+gravity = [0, 0]
+[coordinates]
+d = { start = -0.4, rate = 0.6 }
+[[body]]
+name = "sledge"
+joint = "prismatic"
+coordinates = "d"
+axis = [1, 0]
+mass = 1.84
+friction = 0.1
+[run]
+linearize = true
+method = ["rk4", "gauss4"]
+"""
 REGRESSIONS = {
+    "derivatives that are lost in a difference": SATURATED,
     "friction of a body": DRAG,
     "stiff friction and high orders": STIFF,
     "the first stepper of order 1": ORDER_1,
@@ -161,12 +178,12 @@ def test_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3, 43))
+@pytest.mark.parametrize("seed", range(21, 61))
 def test_more_random_scenes_pass(tmp_path: Path, seed: int) -> None:
     assert_right(seed, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3, 23))
+@pytest.mark.parametrize("seed", range(21, 41))
 def test_more_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> None:
     assert_caught(seed, tmp_path)

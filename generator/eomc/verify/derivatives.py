@@ -50,15 +50,16 @@ def by_differences(
         yield np.tensordot(weights, forward - back, 1).T / (width * scales), scales
 
 
-def apart(found: Vector, exact: Vector, scales: Vector, size: Vector) -> float | None:
-    """The largest difference of two (nq, k), relative to the row's largest in those scales.
+def apart(found: Vector, exact: Vector, scales: Vector, size: Vector) -> Vector:
+    """The differences of two (nq, k), relative to each row's largest in those scales.
 
-    size: (nq,), of the sums that the accelerations are; less than 1e-9 of it is no difference.
-    None where `exact` is not finite, inf where `found` alone is not.
+    size: (nq,), of the sums that the accelerations are: differences lose 1e-10 of it.
+    nan where `exact` is not finite, inf where `found` alone is not.
     """
-    if not np.all(np.isfinite(exact)):
-        return None
-    if not np.all(np.isfinite(found)):
-        return np.inf
-    largest = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-9 * size
-    return float(np.max(np.abs(found - exact) * scales / largest[:, None], initial=0))
+    largest = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-4 * size
+    with np.errstate(all="ignore"):
+        off = np.abs(found - exact) * scales / largest[:, None]
+    off = np.where(found == exact, 0, off)
+    return np.asarray(
+        np.where(np.isfinite(exact), np.where(np.isfinite(found), off, np.inf), np.nan)
+    )
