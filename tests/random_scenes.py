@@ -35,7 +35,7 @@ from eomc.emit.render import Sources
 from eomc.model import system
 from eomc.model.system import System
 from eomc.scene import scene
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import cache
 from eomc.verify.check import check
 
 ROOT = Path(__file__).parent.parent / "build" / "random"
@@ -415,14 +415,14 @@ def _built(made: System, root: Path, sources: Sources | None = None) -> ModuleTy
     if sources is None:
         return eomc.load(made, root)
     digest = hashlib.sha256(sources.files[f"{made.name}.c"].encode()).hexdigest()
-    key = compiler.key(made.digest, digest)
+    key = cache.key(made.digest, digest)
 
     def texts(extension: str) -> Sources:
         """With the extension's own name in the texts."""
         renamed = {f: text.replace("_negated", extension) for f, text in sources.files.items()}
         return replace(sources, files=renamed)
 
-    return compiler.load(compiler.build(made.name, key, texts, root))
+    return cache.load(cache.build(made.name, key, texts, root))
 
 
 def _one(task: tuple[int, bool]) -> Outcome:

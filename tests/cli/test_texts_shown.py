@@ -35,7 +35,7 @@ from payloads import (
 
 import eomc
 from eomc.base import texts
-from eomc.cli import main as cli
+from eomc.cli import terminal
 from eomc.cli.main import main
 from eomc.report import plot, report
 from eomc.scene import scene
@@ -182,18 +182,20 @@ def test_the_commands_print_no_text_raw(here: Path) -> None:
 
 
 def test_the_command_prints_through_its_border_alone() -> None:
-    source = Path(cli.__file__).read_text(encoding="utf-8")
-    assert source.count("click.echo(") == 1 and not re.search(r"^\s*print\(", source, re.M)
+    for file in Path(terminal.__file__).parent.glob("*.py"):
+        source = file.read_text(encoding="utf-8")
+        assert source.count("click.echo(") == 2 * (file.name == "terminal.py")
+        assert not re.search(r"^\s*print\(", source, re.M)
 
 
 TERMINAL = """
 import time
-from eomc.cli import main as cli
-with cli._status({given!r}, False):
+from eomc.cli import terminal
+with terminal.status_line({given!r}, False):
     time.sleep(0.2)
 times = iter(range(0, 1000, 10))
-cli.time.monotonic = lambda: next(times)
-with cli._progress({given!r}, False) as progress:
+terminal.time.monotonic = lambda: next(times)
+with terminal.progress_bar({given!r}, False) as progress:
     progress(0, 2)
     progress(1, 2)
 """

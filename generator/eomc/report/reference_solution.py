@@ -38,7 +38,7 @@ from eomc.emit.render import environment
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import cache as builds
 from eomc.verify import symbolic
 from eomc.verify.oracle import Vector
 
@@ -110,7 +110,7 @@ def of(
         raise EomcError(f"duration = {duration!r}: give a number of seconds above 0")
     start = [x for c in system.coordinates for x in (c.start, c.rate)]
     made_of = [span, rows, *start, *(p.value for p in system.parameters)]
-    wanted = compiler.key(system.digest, f"truth {made_of!r}")
+    wanted = builds.key(system.digest, f"truth {made_of!r}")
     file = Path(root) / system.name / f"truth_{span!r}_{rows}.json"
     try:
         kept = json.loads(file.read_text(encoding="utf-8"))

@@ -1,0 +1,49 @@
+"""eomc report: what every digit costs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from eomc.cli import files, options
+from eomc.cli.terminal import progress_bar, say, shown
+
+
+@click.command("report")
+@options.SCENES
+@options.BUILD
+@click.option("--digits", type=click.IntRange(1, 17), help="Answer for so many digits only.")
+@click.option("--json", "file", type=click.Path(path_type=Path), help="Write all figures to FILE.")
+@options.QUIET
+def command(
+    scenes: Sequence[Path], root: Path, digits: int | None, file: Path | None, quiet: bool
+) -> None:
+    """Measure what every digit costs: each stepper over a range of h, against 25 digits or more.
+
+    Writes a page with pictures, build/NAME/report.html.
+
+    \b
+    eomc report scenes/cartpole.toml
+    eomc report scenes/cartpole.toml --digits 8
+    """
+    from eomc.report import report as reports
+
+    measured = []
+    for scene in scenes:
+        with progress_bar(f"measuring {scene.stem}", quiet) as progress:
+            made = reports.report(scene, root, progress=progress)
+        measured.append(made.as_dict())
+        if digits is not None:
+            say(f"{made.scene}: {made.recommendation(digits)}")
+            continue
+        if not quiet:
+            say(made.table())
+        page = root / made.scene / "report.html"
+        files.write_text(page, reports.page(made))
+        if not quiet:
+            say(f"\nwrote {shown(page)}\n")
+    if file is not None:
+        files.write_text(file, json.dumps(measured, indent=1) + "\n")
