@@ -21,7 +21,7 @@ from eomc.cli.terminal import progress_bar, say, shown, status_line, warn
 
 if TYPE_CHECKING:
     from eomc.runtime.estimate import Estimate
-    from eomc.runtime.runtime import Run
+    from eomc.runtime.trajectory import Run
 
 
 @click.command("run")

@@ -153,7 +153,7 @@ def _free(folder: Path) -> None:
     if folder.is_symlink() or folder.exists():
         if not folder.is_dir():
             raise EomcError(f"{folder}: is in the way of the module: remove it, or use --build DIR")
-        if (folder / "__init__.py").exists() and not (folder / "runtime.py").exists():
+        if (folder / "__init__.py").exists() and not (folder / "slices.py").exists():
             raise EomcError(
                 f"{folder}: is a package that eomc did not build, and stays as it is: "
                 "rename the scene, or use --build DIR"
@@ -232,8 +232,8 @@ def unpickled(name: str, folder: str, alias: str, path: str, arguments: tuple[An
         if alias not in sys.modules:
             alias = load(Built(name, Path(folder), False)).__name__
     except (OSError, ValueError, KeyError, ImportError):
-        if path == "runtime.MotionError":
-            from eomc.runtime.runtime import MotionError
+        if path == "trajectory.MotionError":
+            from eomc.runtime.trajectory import MotionError
 
             return MotionError(*arguments)
         raise EomcError(
