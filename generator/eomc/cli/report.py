@@ -15,7 +15,7 @@ from eomc.cli.terminal import progress_bar, say, shown
 @click.command("report")
 @options.SCENES
 @options.BUILD
-@click.option("--digits", type=click.IntRange(1, 17), help="Answer for so many digits only.")
+@click.option("--digits", type=click.IntRange(1, 17), help="Recommend for so many digits only.")
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Write all figures to FILE.")
 @options.QUIET
 def command(
@@ -29,20 +29,21 @@ def command(
     eomc report scenes/cartpole.toml
     eomc report scenes/cartpole.toml --digits 8
     """
-    from eomc.report import report as reports
+    from eomc.report import cost_of_digits
+    from eomc.report import page as pages
 
     measured = []
     for scene in scenes:
         with progress_bar(f"measuring {scene.stem}", quiet) as progress:
-            made = reports.report(scene, root, progress=progress)
-        measured.append(made.as_dict())
+            made = cost_of_digits.measure(scene, root, progress=progress)
+        measured.append(pages.as_dict(made))
         if digits is not None:
-            say(f"{made.scene}: {made.recommendation(digits)}")
+            say(f"{made.scene}: {pages.recommendation(made, digits)}")
             continue
         if not quiet:
-            say(made.table())
+            say(pages.table(made))
         page = root / made.scene / "report.html"
-        files.write_text(page, reports.page(made))
+        files.write_text(page, pages.page(made))
         if not quiet:
             say(f"\nwrote {shown(page)}\n")
     if file is not None:
