@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,9 @@ import numpy as np
 import pytest
 import sympy
 from click.testing import CliRunner, Result
+from conftest import MODULES
 
+from eomc import pipeline
 from eomc.cli.main import main
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -53,6 +57,26 @@ def test_build_check_and_list(here: Path) -> None:
     scene = here / "cartpole.toml"
     scene.write_text(scene.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
     assert not json.loads(eomc("list", "--json").output)[0]["built"]
+
+
+LIGHT = """
+import sys
+from eomc.cli.main import main
+main(sys.argv[1:], standalone_mode=False)
+slow = {"sympy", "numpy", "pydantic", "rich", "jinja2", "cffi"}
+sys.exit(", ".join(slow & set(sys.modules)) or 0)
+"""
+
+
+def test_what_does_nothing_imports_nothing_slow(here: Path) -> None:
+    """Help, and a build that is there, in a tenth of a second."""
+    scene = str(SCENES / "cartpole.toml")
+    pipeline.build(scene, MODULES)
+    for words in (["--help"], ["build", scene, "--build", str(MODULES)]):
+        command = [sys.executable, "-c", LIGHT, *words]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
+    assert "is up to date" in done.stdout
 
 
 def test_parameters_and_start_on_the_command_line(here: Path) -> None:
