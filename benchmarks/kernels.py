@@ -37,7 +37,7 @@ from eomc.derive.tape import Stage
 from eomc.emit import c_expression
 from eomc.program import program
 from eomc.program.ir import Call, Function, Operand
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import compiler
 
 HERE = Path(__file__).resolve().parent
 BAR = 1.15

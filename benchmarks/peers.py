@@ -40,7 +40,7 @@ from work import CASES, HERE, Case, load, write
 import eomc
 from eomc.derive import lagrange
 from eomc.program import program
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import compiler
 
 CORES = os.sched_getaffinity(0)
 

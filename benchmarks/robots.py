@@ -149,7 +149,7 @@ def inside(path: Path, root: Path) -> None:
     from eomc.emit import render
     from eomc.emit.render import Sources
     from eomc.program import program
-    from eomc.toolchain import compiler as compiler
+    from eomc.toolchain import cache
 
     gc.disable()  # as eomc.read and eomc.sources do
     begun = time.perf_counter()
@@ -170,9 +170,9 @@ def inside(path: Path, root: Path) -> None:
         told["ended"] = time.perf_counter()
         return sources
 
-    made = compiler.build(system.name, compiler.key(system.digest), texts, root)
+    made = cache.build(system.name, cache.key(system.digest), texts, root)
     compiled = time.perf_counter() - float(str(told.pop("ended")))
-    manifest = json.loads((made.folder / compiler.MANIFEST).read_text(encoding="utf-8"))
+    manifest = json.loads((made.folder / cache.MANIFEST).read_text(encoding="utf-8"))
     print(
         json.dumps(
             {**told, "derive": spent, "compile": compiled, "coordinates": len(system.q),

@@ -33,7 +33,7 @@ from kernels import together as ours_batch
 from numba.np.unsafe.ndarray import to_fixed_tuple
 from physics import Matrices
 
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import compiler
 
 
 def timed(run: Run, x: Array, h: float, steps: int) -> tuple[float, Array]:

@@ -24,7 +24,7 @@ from physics import Matrices
 from runners import Array, Run, timed
 from scipy.integrate import solve_ivp
 
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import compiler
 
 Adaptive = Callable[[float], Run]
 

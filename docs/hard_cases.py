@@ -22,7 +22,7 @@ from cases import case_system, cases  # noqa: E402
 
 from eomc.base.errors import EomcError  # noqa: E402
 from eomc.integrators.tableaux import METHODS  # noqa: E402
-from eomc.report import report  # noqa: E402
+from eomc.report import cost_of_digits  # noqa: E402
 
 LONGEST = 0.5  # s of computing of one run
 LONG = 4  # times that, while fewer than six digits are found
@@ -63,7 +63,7 @@ def best(name: str) -> Best | None:
     case = cases()[name]
     system = case_system(name)
     methods = tuple(m.name for m in METHODS.values() if m.order >= LEAST_ORDER)
-    module, _ = report.variant(system, methods, ROOT / "build" / "hard_cases")
+    module, _ = cost_of_digits.variant(system, methods, ROOT / "build" / "hard_cases")
     runs = [run for method in module.methods for run in _runs(module, method, case)]
     if not runs:
         return None

@@ -33,7 +33,7 @@ from eomc.base.errors import EomcError
 from eomc.emit.render import Sources
 from eomc.model import system
 from eomc.scene import scene
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import compiler
 from eomc.verify.check import check
 
 ROOT = Path(__file__).parent.parent / "build" / "random"

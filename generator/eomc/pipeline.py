@@ -3,7 +3,7 @@
     scene.toml -> Scene -> System -> Equations -> Program -> Sources -> Module
 
 `load` goes the whole way; `sources` stops at the text. Each arrow is a function of one module:
-scene.read, system.from_scene, lagrange.derive, program.build, render.render, compile.build.
+scene.read, system.from_scene, lagrange.derive, program.build, render.render, cache.build.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from eomc.base.errors import Problem
     from eomc.emit.render import Sources
     from eomc.model.system import System
-    from eomc.toolchain.compiler import Built
+    from eomc.toolchain.cache import Built
 
 
 ScenePath = str | os.PathLike[str]
@@ -90,7 +90,7 @@ def build(
     each warning.
     Raises SceneError for a faulty scene, EomcError for what else fails.
     """
-    from eomc.toolchain import compiler as compiler
+    from eomc.toolchain import cache
 
     _refuse_other(scene, root)
     if not isinstance(scene, (str, os.PathLike)):
@@ -98,9 +98,9 @@ def build(
     else:
         made = None
         name, digest = name_and_digest(Path(scene))
-    wanted = compiler.key(digest, form)
-    if name and compiler.found(folder := compiler.place(name, Path(root), form), wanted):
-        return compiler.Built(name, folder, False)
+    wanted = cache.key(digest, form)
+    if name and cache.found(folder := cache.place(name, Path(root), form), wanted):
+        return cache.Built(name, folder, False)
     if made is None:
         assert isinstance(scene, (str, os.PathLike))
         made = read(scene)
@@ -108,7 +108,7 @@ def build(
     def texts(extension: str) -> Sources:
         return sources(made, extension, warn=warn)
 
-    return compiler.build(made.name, wanted, texts, Path(root), form)
+    return cache.build(made.name, wanted, texts, Path(root), form)
 
 
 def _refuse_other(scene: object, root: object) -> None:
@@ -134,9 +134,9 @@ def load(
     >>> cartpole = load("scenes/cartpole.toml")     # doctest: +SKIP
     >>> cartpole.simulate(duration=1.0).q[-1]       # doctest: +SKIP
     """
-    from eomc.toolchain import compiler as compiler
+    from eomc.toolchain import cache
 
-    return compiler.load(build(scene, root, form=form, warn=warn))
+    return cache.load(build(scene, root, form=form, warn=warn))
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:

@@ -25,6 +25,7 @@ SEEDS = ("0", "4242")
 
 GENERATE = """
 import eomc, json, sys
+from eomc.base import resources
 from eomc.scene import scene
 from eomc.model import system
 from pathlib import Path
@@ -35,7 +36,7 @@ for name in sys.argv[3:] + list(plain):
     text = text.replace("[run]\\n", "[run]\\n" + plain[name] + "\\n") if name in plain else text
     made = system.from_scene(scene.parse(text, f"{name}.toml"))
     files = eomc.sources(made, f"_{name}_extension").files
-    copied = ("runtime.py", "estimate.py", "package.py", "slices.py", "batch.py")
+    copied = resources.runtime(batch=True)
     wanted = (f"{name}.h", f"{name}.c") if name in plain else [n for n in files if n not in copied]
     out[name] = {n: files[n] for n in wanted}
 print(json.dumps(out))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,9 @@ import numpy as np
 import pytest
 import sympy
 from click.testing import CliRunner, Result
+from conftest import MODULES
 
+from eomc import pipeline
 from eomc.cli.main import main
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -55,11 +59,31 @@ def test_build_check_and_list(here: Path) -> None:
     assert not json.loads(eomc("list", "--json").output)[0]["built"]
 
 
+LIGHT = """
+import sys
+from eomc.cli.main import main
+main(sys.argv[1:], standalone_mode=False)
+slow = {"sympy", "numpy", "pydantic", "rich", "jinja2", "cffi"}
+sys.exit(", ".join(slow & set(sys.modules)) or 0)
+"""
+
+
+def test_what_does_nothing_imports_nothing_slow(here: Path) -> None:
+    """Help, and a build that is there, in a tenth of a second."""
+    scene = str(SCENES / "cartpole.toml")
+    pipeline.build(scene, MODULES)
+    for words in (["--help"], ["build", scene, "--build", str(MODULES)]):
+        command = [sys.executable, "-c", LIGHT, *words]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
+    assert "is up to date" in done.stdout
+
+
 def test_parameters_and_start_on_the_command_line(here: Path) -> None:
     words = ["--set", "m_c=1+2", "--start", "theta=pi/3", "--start", "x_dot=-l", "--json"]
-    told = json.loads(eomc("run", "cartpole.toml", "--duration", "0", *words).output)
-    assert told["q"] == {"x": 0.0, "theta": pytest.approx(np.pi / 3)}
-    assert told["qd"] == {"x": -2.0, "theta": 0.0}
+    summary = json.loads(eomc("run", "cartpole.toml", "--duration", "0", *words).output)
+    assert summary["q"] == {"x": 0.0, "theta": pytest.approx(np.pi / 3)}
+    assert summary["qd"] == {"x": -2.0, "theta": 0.0}
 
 
 @pytest.mark.parametrize(
@@ -157,13 +181,13 @@ def test_help_has_an_example(command: str) -> None:
     assert f"eomc {command}" in eomc(command, "--help").output
 
 
-def test_a_name_without_its_file_is_answered_by_the_file(here: Path) -> None:
+def test_a_name_without_its_file_suggests_the_file(here: Path) -> None:
     done = eomc("run", "cartpole")
     assert done.exit_code == 2
     assert "cartpole: there is no such file; did you mean 'cartpole.toml'?" in done.output
 
 
-def test_a_folder_that_is_none_is_answered_with_the_option(here: Path) -> None:
+def test_a_folder_that_is_none_suggests_the_option(here: Path) -> None:
     (here / "file").write_text("", encoding="utf-8")
     done = eomc("build", "cartpole.toml", "--build", "file")
     assert done.exit_code == 2

@@ -30,7 +30,7 @@ def eomc(*words: str) -> Result:
 
 def shell(line: str) -> subprocess.CompletedProcess[str]:
     """A line of a shell, in which `eomc` is the command."""
-    command = f'eomc() {{ "{sys.executable}" -m eomc.cli "$@"; }}; {line}'
+    command = f'eomc() {{ "{sys.executable}" -m eomc "$@"; }}; {line}'
     return subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=120)
 
 

@@ -35,9 +35,9 @@ from payloads import (
 
 import eomc
 from eomc.base import texts
-from eomc.cli import main as cli
+from eomc.cli import terminal
 from eomc.cli.main import main
-from eomc.report import plot, report
+from eomc.report import cost_of_digits, page, plot
 from eomc.scene import scene
 
 
@@ -67,13 +67,15 @@ class Tags(HTMLParser):
 
 @pytest.mark.slow
 def test_the_page_of_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "_svg", lambda draw, size: Markup("<svg></svg>"))  # no texts
-    measured = report.report(derived().system, tmp_path, longest=0.002, methods=("rk4", "dp8"))
-    plain = Tags(report.page(replace(measured, title="plain"))).seen
+    monkeypatch.setattr(page, "_svg", lambda draw, size: Markup("<svg></svg>"))  # no texts
+    measured = cost_of_digits.measure(
+        derived().system, tmp_path, longest=0.002, methods=("rk4", "dp8")
+    )
+    plain = Tags(page.page(replace(measured, title="plain"))).seen
     for name, given in PAYLOADS.items():
-        page = report.page(replace(measured, title=given))
-        assert not RAW.search(page), name
-        read = Tags(page)
+        text = page.page(replace(measured, title=given))
+        assert not RAW.search(text), name
+        read = Tags(text)
         assert read.seen == plain, name
         assert f"{texts.line(given)}: speed against error" in "".join(read.titles), name
 
@@ -153,8 +155,8 @@ def test_hostile_file_names(here: Path) -> None:
         assert made.file.isprintable() and not RAW.search(made.file)
         Path(file).write_text(filled({}).replace('"m"', '"mm"'), encoding="utf-8")
         assert "'mm' is not declared" in said("build", file, status=2)
-        told = said("build", "no " + file, status=2)
-        assert len(told.splitlines()) == 1 and "there is no such file" in told
+        output = said("build", "no " + file, status=2)
+        assert len(output.splitlines()) == 1 and "there is no such file" in output
         assert "one would replace" in said("build", file, str(here / file), status=2)
     assert len(said("list").splitlines()) == len(PAYLOADS)
     assert len(json.loads(said("list", "--json"))) == len(PAYLOADS)
@@ -182,18 +184,20 @@ def test_the_commands_print_no_text_raw(here: Path) -> None:
 
 
 def test_the_command_prints_through_its_border_alone() -> None:
-    source = Path(cli.__file__).read_text(encoding="utf-8")
-    assert source.count("click.echo(") == 1 and not re.search(r"^\s*print\(", source, re.M)
+    for file in Path(terminal.__file__).parent.glob("*.py"):
+        source = file.read_text(encoding="utf-8")
+        assert source.count("click.echo(") == 2 * (file.name == "terminal.py")
+        assert not re.search(r"^\s*print\(", source, re.M)
 
 
 TERMINAL = """
 import time
-from eomc.cli import main as cli
-with cli._status({given!r}, False):
+from eomc.cli import terminal
+with terminal.status_line({given!r}, False):
     time.sleep(0.2)
 times = iter(range(0, 1000, 10))
-cli.time.monotonic = lambda: next(times)
-with cli._progress({given!r}, False) as progress:
+terminal.time.monotonic = lambda: next(times)
+with terminal.progress_bar({given!r}, False) as progress:
     progress(0, 2)
     progress(1, 2)
 """
@@ -256,8 +260,8 @@ def test_robot_files_with_hostile_names(kind: str, here: Path) -> None:
             continue
         data = kind.format(attribute(given), attribute(given + "b"))
         Path(file).write_text(data, encoding="utf-8")
-        told = said("import", file, "--out", f"s{k}.toml")
-        assert "wrote" in told, name
+        output = said("import", file, "--out", f"s{k}.toml")
+        assert "wrote" in output, name
         read = scene.read(f"s{k}.toml")
         assert read.title.startswith(texts.line(given)), name
         wrong = data.replace('type="revolute"', 'type="none"').replace('"hinge"', '"none"')

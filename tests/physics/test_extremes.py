@@ -20,7 +20,7 @@ from cases import SCENES, scene_text
 from conftest import ROOT, Modules
 
 from eomc.model import system
-from eomc.report import reference_solution, report
+from eomc.report import cost_of_digits, reference_solution
 from eomc.scene import scene
 
 BUILDS = ROOT / "build" / "tests" / "extremes"
@@ -43,7 +43,7 @@ potential = "-m*mu/r"
 
 @cache
 def with_methods(text: str, *methods: str) -> ModuleType:
-    module, skipped = report.variant(
+    module, skipped = cost_of_digits.variant(
         system.from_scene(scene.parse(text, "extreme.toml")), methods, BUILDS
     )
     assert not skipped

@@ -21,7 +21,7 @@ import pytest
 from cases import ALIKE, case_system, cases, error_of
 from conftest import ROOT, Modules
 
-from eomc.report import report
+from eomc.report import cost_of_digits
 
 CASES = ROOT / "build" / "tests" / "cases"
 
@@ -153,7 +153,7 @@ def compiled(name: str) -> ModuleType:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EOMC_CFLAGS", "-O1")  # it is the compiling that takes the time here
         methods = dict.fromkeys(("rk4", BEST[name][0] if name in BEST else "rk4"))
-        module, skipped = report.variant(case_system(name), tuple(methods), CASES)
+        module, skipped = cost_of_digits.variant(case_system(name), tuple(methods), CASES)
     assert not skipped
     return module
 

@@ -39,7 +39,7 @@ from eomc.program.ir import (
 )
 from eomc.program.program import Program
 from eomc.scene import scene
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import cache
 
 STEPS = 40
 
@@ -261,8 +261,8 @@ def test_compile_time_grows_with_the_size_and_no_faster(tmp_path: Path) -> None:
 def module(made: Program, root: Path) -> ModuleType:
     """A program compiled under `root`."""
     name = made.system.name
-    key = compiler.key(made.system.digest, str(root))
-    return compiler.load(compiler.build(name, key, lambda extension: render(made, extension), root))
+    key = cache.key(made.system.digest, str(root))
+    return cache.load(cache.build(name, key, lambda extension: render(made, extension), root))
 
 
 @pytest.mark.slow

@@ -138,7 +138,7 @@ def test_without_matplotlib_one_sentence_says_what_to_do(tmp_path, monkeypatch):
         plot.draw(*spring(), tmp_path / "a.png")
 
 
-def test_unknown_suffixes_and_folders_are_told(tmp_path):
+def test_unknown_suffixes_and_folders_are_reported(tmp_path):
     with pytest.raises(EomcError, match=r"\.png, \.svg, \.pdf"):
         plot.draw(*spring(), tmp_path / "a.jpg")
     with pytest.raises(EomcError, match="can't be written"):

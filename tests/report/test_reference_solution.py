@@ -1,4 +1,4 @@
-"""The reference solution against answers of 30 digits, exact motions and its own promises."""
+"""The reference solution compared with results of 30 digits, exact motions and its own promises."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from eomc.emit import c_expression
 from eomc.model.system import System
 from eomc.report import reference_solution
 
-TRUTHS = ROOT / "build" / "tests" / "truths"
+REFERENCES = ROOT / "build" / "tests" / "references"
 
 
 @pytest.fixture(autouse=True)
@@ -36,8 +36,8 @@ def oscillator(duration: float = 2.0) -> System:
                        duration=duration)  # fmt: skip
 
 
-def digits_right(name: str, made: reference_solution.Truth) -> float:
-    """Digits in common with the case's answer, relative to the largest value on the way."""
+def digits_right(name: str, made: reference_solution.Reference) -> float:
+    """Digits in common with the case's result, relative to the largest value on the way."""
     case = cases()[name]
     exact = [*case["q_ref"], *case["qd_ref"]]
     found = [*made.q[-1], *made.qd[-1]]
@@ -49,7 +49,7 @@ def digits_right(name: str, made: reference_solution.Truth) -> float:
 
 
 def agrees(name: str) -> None:
-    made = reference_solution.of(case_system(name), root=TRUTHS)
+    made = reference_solution.of(case_system(name), root=REFERENCES)
     assert made.digits[-1] >= 25
     # what it promises is right, as far as the case's 30 digits tell
     assert digits_right(name, made) > min(made.digits[-1], 29) - 0.5
@@ -189,4 +189,4 @@ def test_the_scene_file_itself_will_do(tmp_path: Path) -> None:
     made = reference_solution.of(scene, duration=1.0, rows=2, root=tmp_path)
     system = replace(eomc.read(scene))
     assert made.q.shape == (3, len(system.coordinates))
-    assert (tmp_path / "mass_spring" / "truth_1.0_2.json").exists()
+    assert (tmp_path / "mass_spring" / "reference_1.0_2.json").exists()

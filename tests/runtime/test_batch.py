@@ -218,7 +218,7 @@ def test_a_batch_is_the_same_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
 
     whole = runs()
     for name in ("_FIRST", "_SECONDS"):
-        monkeypatch.setattr(sys.modules[f"{m.__name__}.batch"], name, 0.0)
+        monkeypatch.setattr(sys.modules[f"{m.__name__}.batch_work"], name, 0.0)
     for one, other in zip(whole, runs(), strict=True):
         for name in ("t", "q", "qd", "steps"):
             assert np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
@@ -255,7 +255,7 @@ def test_starts_of_any_layout_are_read_and_left_alone() -> None:
 def test_starts_that_are_not_finite_are_refused_before_any_moves(real: str, threads: int) -> None:
     """Wherever they are; nobody waits for the others' hours first."""
     m = module("cartpole", real=f'"{real}"')
-    told: list[int] = []
+    calls: list[int] = []
     for name, (row, column), number in (
         ("q0", (7, 1), np.nan), ("qd0", (19_999, 0), np.inf), ("q0", (12_000, 0), -np.inf),
         *([("qd0", (3, 1), 1e300)] if real == "float" else []),  # no float is that large
@@ -269,12 +269,12 @@ def test_starts_that_are_not_finite_are_refused_before_any_moves(real: str, thre
                     **given,
                     steps=STEPS,
                     threads=threads,
-                    progress=lambda done, _: told.append(done),
+                    progress=lambda done, _: calls.append(done),
                 )
-    assert not told
+    assert not calls
 
 
-def test_long_rows_start_where_they_were_told(tmp_path: Path) -> None:
+def test_long_rows_start_where_they_should(tmp_path: Path) -> None:
     """Nine masses in a row, on springs."""
     names = [f"x{k}" for k in range(9)]
     springs = " + ".join(f"({a} - {b})**2" for a, b in pairwise(["1", *names, "2"]))
@@ -306,7 +306,7 @@ def test_a_bad_instance_leaves_the_others_alone() -> None:
 
 
 @pytest.mark.parametrize("m_c", [-1.0, -3.0])
-def test_a_singular_instance_is_told_though_its_numbers_are_finite(m_c: float) -> None:
+def test_a_singular_instance_is_reported_though_its_numbers_are_finite(m_c: float) -> None:
     """A cart of -1 kg and a pole of 2 kg: D is indefinite, and elimination goes through.
 
     Of -3 kg: its first pivot is negative, whatever the state; the second one is positive then.
@@ -581,7 +581,7 @@ def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
     file.write_text(text.replace("[run]\n", '[run]\nreal = "float"\nbatch = true\n'))
     for name, content in fast_kit(eomc.sources(eomc.read(file))).items():
         (tmp_path / name).write_text(content, encoding="utf-8")
-    told = subprocess.run(
+    said = subprocess.run(
         ["gcc", "-std=c99", "-O3", "-mavx2", "-mfma", "-fno-math-errno", "-fno-trapping-math",
          "-fno-tree-slp-vectorize", "-fopt-info-vec-optimized", "-Wdouble-promotion",
          "-Wconversion", "-Werror", "-c", "cartpole.c"],
@@ -593,7 +593,7 @@ def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
     loops = [k for k, line in enumerate(lines[:end], 1) if k > at and "for (int i" in line]
     assert len(loops) == 10  # four of angles, four stages, the end, and who was no good
     for k in loops:
-        assert re.search(rf"cartpole\.c:{k}:\d+: optimized: loop vectorized using 32 byte", told)
+        assert re.search(rf"cartpole\.c:{k}:\d+: optimized: loop vectorized using 32 byte", said)
 
 
 def test_no_loop_over_a_tile_has_a_rest(tmp_path: Path) -> None:

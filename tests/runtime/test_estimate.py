@@ -75,10 +75,10 @@ def test_error_along_the_way_and_at_the_end(modules: Modules, every: int) -> Non
     error = run.error
     assert error.q.shape == run.q.shape and error.qd.shape == run.qd.shape
     assert error.q[0] == error.qd[0] == 0
-    truth = np.abs(run.q[:, 0] - np.cos(run.t)), np.abs(run.qd[:, 0] + np.sin(run.t))
+    exact_error = np.abs(run.q[:, 0] - np.cos(run.t)), np.abs(run.qd[:, 0] + np.sin(run.t))
     # h/4 is off by 1/256 itself, rounding by some 1e-15 times the root of the steps
-    np.testing.assert_allclose(error.q[:, 0], truth[0], rtol=0.01, atol=1e-13)
-    np.testing.assert_allclose(error.qd[:, 0], truth[1], rtol=0.01, atol=1e-13)
+    np.testing.assert_allclose(error.q[:, 0], exact_error[0], rtol=0.01, atol=1e-13)
+    np.testing.assert_allclose(error.qd[:, 0], exact_error[1], rtol=0.01, atol=1e-13)
     assert error.end == {"x": error.q[-1, 0], "x_dot": error.qd[-1, 0]}
     assert error.digits["x"] == pytest.approx(-math.log10(error.end["x"]), abs=0.01)
     assert error.order == 4 and error.observed == pytest.approx(4, abs=0.05)
@@ -87,12 +87,12 @@ def test_error_along_the_way_and_at_the_end(modules: Modules, every: int) -> Non
 
 
 def test_rounding_is_no_zero(modules: Modules) -> None:
-    """Ten digits beyond what the method leaves: what is told is rounding, neither more nor less."""
+    """Ten digits beyond what the method leaves: rounding is reported, neither more nor less."""
     run = modules("mass_spring").simulate(h=1e-4, steps=100_000, every=10_000, estimate=True)
     assert run.error.resolved and math.isnan(run.error.observed)
-    truth = np.abs(run.q[1:, 0] - np.cos(run.t[1:]))
+    exact_error = np.abs(run.q[1:, 0] - np.cos(run.t[1:]))
     assert np.all(run.error.q[1:] > 0) and np.all(run.error.q < 1e-11)
-    assert np.max(truth) < 10 * np.max(run.error.q)
+    assert np.max(exact_error) < 10 * np.max(run.error.q)
 
 
 def test_no_step_no_error(cartpole: ModuleType) -> None:
@@ -232,7 +232,7 @@ def test_a_step_beyond_the_limit_is_told_once(modules: Modules) -> None:
     assert abs(run.q[-1, 0]) > 1e3
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        module.simulate(h=0.03, steps=1000)  # told
+        module.simulate(h=0.03, steps=1000)  # reported
         module.simulate(h=0.031, steps=999)  # short
         run = module.simulate(h=0.028, steps=1000)
     assert abs(run.q[-1, 0]) < 1

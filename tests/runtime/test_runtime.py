@@ -486,17 +486,17 @@ def test_an_error_in_a_function_comes_through(driven: ModuleType) -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "words"),
+    ("result", "words"),
     [
         ([1, 2], r"^u: shape \(2,\), expected \(1,\)"),
         (math.nan, "^u: .*nan.* not finite"),
         (None, "^u: "),  # a forgotten return is no wish for the scene's signal
     ],
 )
-def test_a_functions_answer_is_looked_at(driven: ModuleType, answer: Any, words: str) -> None:
+def test_a_functions_result_is_looked_at(driven: ModuleType, result: Any, words: str) -> None:
     with warnings.catch_warnings(), pytest.raises(ValueError, match=words):
         warnings.simplefilter("ignore")
-        driven.simulate(steps=5, u=lambda t, q, qd: answer)
+        driven.simulate(steps=5, u=lambda t, q, qd: result)
 
 
 def test_energy_of_a_run_is_that_of_its_rows(everything: ModuleType) -> None:

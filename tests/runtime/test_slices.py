@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cases import SCENES
 from conftest import MODULES
-from test_module import ctrl_c_after
+from test_runtime import ctrl_c_after
 
 import eomc
 from eomc.model import system
@@ -130,7 +130,7 @@ def test_rows_in_slices_are_rows(
     whole = getattr(driven, name)(*place, t=0.2, **how)
     rows = [getattr(driven, name)(*(x[k] for x in place), t=0.2, **how) for k in range(0, 5003, 7)]
     assert np.array_equal(whole[::7], rows)
-    monkeypatch.setattr(sys.modules[f"{driven.__name__}.runtime"], "_ROWS", 100)
+    monkeypatch.setattr(sys.modules[f"{driven.__name__}.functions"], "_ROWS", 100)
     assert np.array_equal(getattr(driven, name)(*place, t=0.2, **how), whole)
 
 
@@ -139,7 +139,7 @@ def test_accelerations_in_slices_are_rows_and_name_the_bad_one(
 ) -> None:
     q, qd = np.random.default_rng(3).standard_normal((2, 5003, 2))
     whole = cartpole.acceleration(q, qd)
-    monkeypatch.setattr(sys.modules[f"{cartpole.__name__}.runtime"], "_ROWS", 100)
+    monkeypatch.setattr(sys.modules[f"{cartpole.__name__}.functions"], "_ROWS", 100)
     assert np.array_equal(cartpole.acceleration(q, qd), whole)
     qd[3777] = [0, 1.25e200]
     with pytest.raises(cartpole.MotionError, match=r"1\.25e\+200"):

@@ -10,10 +10,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_build import CHANGED, TEXT, gravity, leftovers, script
+from test_cache import CHANGED, TEXT, gravity, leftovers, script
 
 import eomc
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import cache
 
 
 @pytest.fixture(autouse=True)
@@ -136,9 +136,9 @@ def test_every_bit_of_a_build_is_looked_at(scene: Path, root: Path) -> None:
             bad = bytearray(good)
             bad[at] ^= 4
             file.write_bytes(bytes(bad))
-            assert not compiler.found(folder, _key(folder)), file
+            assert not cache.found(folder, _key(folder)), file
         file.write_bytes(good)
-    assert compiler.found(folder, _key(folder))
+    assert cache.found(folder, _key(folder))
     assert not eomc.build(scene, root).fresh
     library = next(folder.glob("_simple_pendulum_*"))
     library.write_bytes(library.read_bytes()[:-1] + b"!")

@@ -19,9 +19,13 @@ def text(kind: str, name: str) -> str:
     return (folder(kind) / name).read_text(encoding="utf-8")
 
 
-def runtime(name: str) -> str:
-    """The text of a file that is copied beside a built module."""
-    return (PACKAGE / "runtime" / name).read_text(encoding="utf-8")
+def runtime(batch: bool) -> dict[str, str]:
+    """The files of runtime/ that are copied beside a built module; batch: those for many at once.
+
+    Their text by name.
+    """
+    files = sorted((PACKAGE / "runtime").glob("[!_]*.py"))
+    return {f.name: f.read_text(encoding="utf-8") for f in files if batch or f.stem[:5] != "batch"}
 
 
 def parts() -> Iterator[tuple[str, Path]]:

@@ -91,8 +91,6 @@ def render(program: Program, extension: str) -> Sources:
     context = {**values(target), "extension": extension}
     jinja = environment()
     name = program.system.name
-    copied = ["runtime", "estimate", "package", "slices"]
-    parts = [f"{part}.py" for part in copied + (["batch"] if run.batch else [])]
 
     def text(template: str) -> str:
         return jinja.get_template(template + ".jinja").render(context)
@@ -110,7 +108,7 @@ def render(program: Program, extension: str) -> Sources:
             "main.c": text("c/main.c"),
             "selftest.c": text("c/selftest.c"),
             "__init__.py": text("python/face.py"),
-            **{part: resources.runtime(part) for part in parts},
+            **resources.runtime(run.batch),
         },
         binding=text("python/binding.c"),
         cdef=text("python/binding.cdef"),

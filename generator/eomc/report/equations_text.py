@@ -183,15 +183,15 @@ def cost(system: System) -> str:
         "",
     ]
     wide = max(map(len, made.functions))
-    told: dict[str, None] = {}
+    routes: dict[str, None] = {}
     for name, function in made.functions.items():
         others = [f"{r} {c.flops}" for r, c in function.routes if r != function.route]
         others += [f"{r} {why}" for r, why in made.passed_over.items() if name == "acceleration"]
-        beside = f"  ({function.route}; {', '.join(others)})" if others else ""
-        lines.append(f"{name:{wide}}  {function.cost.flops:5d} flops: {function.cost}{beside}")
-        told |= dict.fromkeys(r for r, _ in function.routes)
-    if len(told) > 1:
+        choice = f"  ({function.route}; {', '.join(others)})" if others else ""
+        lines.append(f"{name:{wide}}  {function.cost.flops:5d} flops: {function.cost}{choice}")
+        routes |= dict.fromkeys(r for r, _ in function.routes)
+    if len(routes) > 1:
         lines += ["", "Of each function the route of least weight is taken that loses no digits:"]
         lines.append("a division weighs as 8 additions, a sine or other call as 25.")
-        lines += [f"    {route:{max(map(len, told))}}  {_ROUTES[route]}" for route in told]
+        lines += [f"    {route:{max(map(len, routes))}}  {_ROUTES[route]}" for route in routes]
     return "\n".join(lines)

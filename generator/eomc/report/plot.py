@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
-# Okabe and Ito's colours, told apart by every kind of colour vision; yellow left out on white
+# Okabe and Ito's colours, distinct in every kind of colour vision; yellow left out on white
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK, FAINT = "#333333", "#DDDDDD"
 
@@ -324,7 +324,7 @@ class _Path:
 
 
 def _picture(system: System, t: Array, q: Array, qd: Array) -> _Plane | _Path | None:
-    """What a person expects to see of the system beside its curves."""
+    """What a person expects to see of the system next to its curves."""
     if len(t) == 0:
         return None
     if plane := _plane(system, t, q) or _polar(system, t, q):
@@ -422,11 +422,11 @@ def _polar(system: System, t: Array, q: Array) -> _Plane | None:
     potential = system.potential.xreplace(_bodies(system))
     turned = potential.subs(system.q[radius], 1)
     fall = sympy.N(turned.subs(system.q[angle], 0) - turned.subs(system.q[angle], sympy.pi))
-    hangs = bool(fall.is_negative)
+    downwards = bool(fall.is_negative)
     r, phi = (mathtext(system.coordinates[i].name).strip("$") for i in (radius, angle))
     across, along = q[:, radius] * np.sin(q[:, angle]), q[:, radius] * np.cos(q[:, angle])
-    path = np.column_stack([across, -along] if hangs else [along, across])
+    path = np.column_stack([across, -along] if downwards else [along, across])
     sine, cosine = rf"{r}\,\sin {phi}", rf"{r}\,\cos {phi}"
-    x, y = (sine, f"-{cosine}") if hangs else (cosine, sine)
+    x, y = (sine, f"-{cosine}") if downwards else (cosine, sine)
     unit = system.coordinates[radius].unit
     return _Plane(t, [("", path)], [None], (_with_unit(f"${x}$", unit), _with_unit(f"${y}$", unit)))

@@ -38,7 +38,7 @@ from eomc.emit.render import environment
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import cache as builds
 from eomc.verify import symbolic
 from eomc.verify.oracle import Vector
 
@@ -55,7 +55,7 @@ PLAIN_AGREES = 26.0  # digits of accelerations; fewer says that the equations ar
 
 
 @dataclass(frozen=True)
-class Truth:
+class Reference:
     """q, qd of shape (n, nq) at the times t (n,), as decimal texts of 37 digits.
 
     digits (n,): to how many both ways agree, relative to each coordinate's largest value so far.
@@ -84,7 +84,7 @@ class Truth:
         return np.where(size > 0, size, 1.0)
 
     def off(self, q: Vector, qd: Vector, rows: Any = slice(None)) -> Vector:
-        """x - truth of states at those rows, (n, 2 nq), right to the last bit of the difference."""
+        """States minus this at those rows, (n, 2 nq), right to the last bit of the difference."""
         high, low = self.halves
         return np.asarray((np.hstack([q, qd]) - high[rows]) - low[rows])
 
@@ -94,7 +94,7 @@ def of(
     duration: float | None = None,
     rows: int = 256,
     root: str | os.PathLike[str] = "build",
-) -> Truth:
+) -> Reference:
     """The motion from the scene's start, parameters and signals, at rows + 1 times up to duration.
 
     Parameters, start and duration are the doubles that they are, numbers in formulas exact. rows
@@ -110,31 +110,31 @@ def of(
         raise EomcError(f"duration = {duration!r}: give a number of seconds above 0")
     start = [x for c in system.coordinates for x in (c.start, c.rate)]
     made_of = [span, rows, *start, *(p.value for p in system.parameters)]
-    wanted = compiler.key(system.digest, f"truth {made_of!r}")
-    file = Path(root) / system.name / f"truth_{span!r}_{rows}.json"
+    wanted = builds.key(system.digest, f"reference {made_of!r}")
+    file = Path(root) / system.name / f"reference_{span!r}_{rows}.json"
     try:
         kept = json.loads(file.read_text(encoding="utf-8"))
         if kept["key"] == wanted:
             return _from_json(kept)
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    truth = _computed(system, span, rows)
+    made = _computed(system, span, rows)
     kept = {
-        "key": wanted, "t": truth.t.tolist(), "q": truth.q.tolist(), "qd": truth.qd.tolist(),
-        "digits": truth.digits.tolist(), "plain": truth.plain,
+        "key": wanted, "t": made.t.tolist(), "q": made.q.tolist(), "qd": made.qd.tolist(),
+        "digits": made.digits.tolist(), "plain": made.plain,
     }  # fmt: skip
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        beside = file.with_suffix(f".{os.getpid()}")
-        beside.write_text(json.dumps(kept) + "\n", encoding="utf-8")
-        os.replace(beside, file)
+        written = file.with_suffix(f".{os.getpid()}")
+        written.write_text(json.dumps(kept) + "\n", encoding="utf-8")
+        os.replace(written, file)
     except OSError as fault:
         raise FolderError(f"{file}: can't be written ({fault.strerror})") from None
-    return truth
+    return made
 
 
-def _from_json(kept: dict[str, Any]) -> Truth:
-    return Truth(
+def _from_json(kept: dict[str, Any]) -> Reference:
+    return Reference(
         t=np.array(kept["t"]),
         q=np.array(kept["q"]),
         qd=np.array(kept["qd"]),
@@ -146,13 +146,13 @@ def _from_json(kept: dict[str, Any]) -> Truth:
 # --- the program in __float128 ------------------------------------------------------------------
 
 
-def _computed(system: System, span: float, rows: int) -> Truth:
-    with tempfile.TemporaryDirectory(prefix="eomc-truth-") as folder:
+def _computed(system: System, span: float, rows: int) -> Reference:
+    with tempfile.TemporaryDirectory(prefix="eomc-reference-") as folder:
         executable = _compiled(system, Path(folder))
         one, other = (_run(executable, system, span, rows, *way) for way in WAYS)
     n = len(system.coordinates)
     digits = _agreement(one[:, : 2 * n], other[:, : 2 * n])
-    return Truth(
+    return Reference(
         t=np.asarray(np.arange(rows + 1) * (span / rows), float),
         q=one[:, :n],
         qd=one[:, n : 2 * n],
@@ -174,7 +174,7 @@ def _compiled(system: System, folder: Path) -> Path:
     for name, template in (
         (f"{system.name}.h", "c/fast/header.h"),
         (f"{system.name}.c", "c/fast/source.c"),
-        ("truth.c", "report/reference_solution.c"),
+        ("quad.c", "report/reference_solution.c"),
     ):
         text = jinja.get_template(template + ".jinja").render(given)
         (folder / name).write_text("#include <quadmath.h>\n" + text, encoding="utf-8")
@@ -185,11 +185,11 @@ def _compiled(system: System, folder: Path) -> Path:
     gcc = shutil.which("gcc")
     if gcc is None:
         raise EomcError(missing)
-    command = [gcc, "-std=gnu99", "-O1", "-w", "truth.c", "-o", "truth", "-lquadmath", "-lm"]
+    command = [gcc, "-std=gnu99", "-O1", "-w", "quad.c", "-o", "quad", "-lquadmath", "-lm"]
     made = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if made.returncode:
         raise EomcError(f"{missing}; {gcc} said:\n{made.stderr.rstrip()[:2000]}")
-    return folder / "truth"
+    return folder / "quad"
 
 
 def _run(

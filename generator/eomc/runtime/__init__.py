@@ -1,1 +1,1 @@
-"""What is copied beside a built module. Imports NumPy, and nothing of eomc."""
+"""What is copied beside a built module, batch*.py for batches only. Imports NumPy, and no eomc."""

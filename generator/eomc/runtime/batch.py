@@ -1,47 +1,26 @@
 """Many trajectories of one scene at once: what a scene with `batch = true` adds in Python.
 
-Copied beside the compiled extension like runtime.py, where the scene asks for it. Instances run
-side by side in vector registers and in threads; no result depends on either.
+Copied beside the compiled extension where the scene asks for it. Instances run in the lanes of
+vector registers and in threads; no result depends on either.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from copy import deepcopy
 from functools import cached_property
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .arguments import Array, Params, as_count, as_number, as_step_size, machine_memory, unmasked
+from .batch_work import WORTH, Work
+from .model import LARGE, RARELY, Model
 from .package import reduced
-from .runtime import (
-    _LARGE,
-    _RARELY,
-    STATUS,
-    Array,
-    Interrupted,
-    Model,
-    Params,
-    _count,
-    _memory,
-    _number,
-    _size,
-    _unmasked,
-)  # fmt: skip
-from .slices import longer
+from .trajectory import STATUS, Interrupted
 
-_GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
-_TILES = 64  # at most in a group: threads ask for the next one seldom
-_SHARES = 8  # groups of a thread, so that all end together
-_WORTH = 20_000  # steps in all from which threads pay
 _NAMES = np.array([*STATUS, "interrupted"])
-_SLOWEST = 1.5e-6  # seconds a step of an instance and coordinate: assumed until one was timed
-_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
-_FIRST = 0.02  # seconds before the first look
 
 
 class BatchRun:
@@ -75,10 +54,10 @@ class BatchRun:
     def message(self) -> str:
         """What happened, in a sentence."""
         names, counts = np.unique(self.status, return_counts=True)
-        told = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
+        found = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         done = int(self.steps.sum())
         wanted = len(self) * self._wanted
-        return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {told}"
+        return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {found}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("batch.BatchRun", *self._all())
@@ -139,13 +118,13 @@ class BatchModel(Model):
         step = self._stepper(method, "batch")
         if progress is not None and not callable(progress):
             raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
-        h, t0 = self.h if h is None else _size(h, self.dtype), _number(t0, "t0")
+        h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
-        every = min(_count(every, "every", 1), _RARELY)
+        every = min(as_count(every, "every", 1), RARELY)
         starts, table, held, count = self._instances(q0, qd0, params, u, steps)
         rows = 1 + steps // every + (steps % every > 0)
         try:
-            if count * rows * self.nq > _LARGE and self._bytes(count * rows) > _memory():
+            if count * rows * self.nq > LARGE and self._bytes(count * rows) > machine_memory():
                 raise MemoryError
             q, qd = (np.empty((count, self.nq), self.dtype) for _ in range(2))
             q_rows, qd_rows = (np.empty((count, rows, self.nq), self.dtype) for _ in range(2))
@@ -154,7 +133,7 @@ class BatchModel(Model):
                 f"{count} times {rows} rows of {2 * self.nq} numbers don't fit in memory: "
                 "keep fewer with every="
             ) from None
-        work = _Work(self, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows, starts)
+        work = Work(self, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows, starts)
         whole = work.run(threads, progress)
         if steps % every:
             q_rows[:, -1], qd_rows[:, -1] = q, qd
@@ -188,7 +167,7 @@ class BatchModel(Model):
             self._method(method)  # raises, with those there are
         if out is not None:
             into = self._pair(out, np.shape(q))
-            into[0][...], into[1][...] = _unmasked(q, "q"), _unmasked(qd, "qd")
+            into[0][...], into[1][...] = unmasked(q, "q"), unmasked(qd, "qd")
             q, qd = into
         self._movable(q, "q")
         self._movable(qd, "qd")
@@ -198,17 +177,17 @@ class BatchModel(Model):
         views = q.base is not None or qd.base is not None
         if count and (q is qd or (views and np.may_share_memory(q, qd))):
             raise ValueError("qd: lies in the memory of q, where q is to be written")
-        h, t = self.h if h is None else _size(h, self.dtype), _number(t, "t")
+        h, t = self.h if h is None else as_step_size(h, self.dtype), as_number(t, "t")
         held = None if u is None else self._input_rows(u, 1)
         table = None if params is None else self._parameter_rows(params)
         for name, given in (("params", table), ("u", held)):
             if given is not None and len(given) not in (1, count):
                 raise ValueError(f"{name}: {len(given)} instances where q has {count}")
         if threads is not None:
-            _count(threads, "threads", 1)
-        if count >= _WORTH or count * self.nq > 8 * _WORTH:
+            as_count(threads, "threads", 1)
+        if count >= WORTH or count * self.nq > 8 * WORTH:
             table, step = self._parameter_rows(params), self._stepper(method, "batch")
-            work = _Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
+            work = Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
             work.run(threads, None)
             return work.status
         # too few for threads, or for a look at Ctrl-C: straight into C
@@ -225,17 +204,17 @@ class BatchModel(Model):
 
     def _movable(self, x: Array, name: str) -> None:
         """A ValueError where C can't move these states in place."""
-        told = f"a {type(x).__name__}"
-        if isinstance(_unmasked(x, name), np.ndarray):
+        found = f"a {type(x).__name__}"
+        if isinstance(unmasked(x, name), np.ndarray):
             right, flags = x.dtype == self.dtype and x.shape[1:] == (self.nq,), x.flags
             if right and flags.carray:
                 return
             order = "" if flags.c_contiguous else ", not C-contiguous"
             order += "" if flags.aligned else ", not aligned"
             order += "" if flags.writeable else ", read-only"
-            told = f"an array of {x.dtype}, shape {x.shape}{order}"
+            found = f"an array of {x.dtype}, shape {x.shape}{order}"
         raise ValueError(
-            f"{name}: {told}; moved in place, it has to be a writeable, C-contiguous array of "
+            f"{name}: {found}; moved in place, it has to be a writeable, C-contiguous array of "
             f"{self.dtype}, shape (n, {self.nq}): make it one with numpy.require(x, "
             f"'{self.dtype}', 'CAW'), or give out=, a pair of such arrays for the result"
         )
@@ -273,7 +252,7 @@ class BatchModel(Model):
     def _rows_of(self, given: ArrayLike, name: str) -> Array:
         """(nq,) or (n, nq); an array that is that already need not be contiguous, nor finite."""
         if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == self.nq:
-            _unmasked(given, name)
+            unmasked(given, name)
             if given.dtype in (self.dtype, np.float64) and given.flags.aligned:
                 return given
         return self._array(given, name, self.nq)
@@ -322,155 +301,7 @@ class BatchModel(Model):
                 f"(batch, {steps}, {self.nu})"
             )
         at = self._pointer(array)
-        for k in range(0, array.size, _LARGE):
-            if not self._lib.all_finite(min(_LARGE, array.size - k), at + k):
+        for k in range(0, array.size, LARGE):
+            if not self._lib.all_finite(min(LARGE, array.size - k), at + k):
                 raise ValueError("u: not all numbers are finite")
         return array
-
-
-class _Work:
-    """One batch on its way: groups of instances, each taken through all its steps in pieces."""
-
-    def __init__(
-        self, model: BatchModel, step: Any, q: Array, qd: Array, h: float, t0: float,
-        steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None,
-        qd_rows: Array | None, starts: tuple[Array, Array] | None = None,
-    ) -> None:  # fmt: skip
-        self.model, self.step, self.count = model, step, len(q)
-        self.h, self.t0, self.steps, self.every = h, t0, steps, every
-        self.held, self.table = held, table
-        self.starts = starts
-        self.rows = 0 if q_rows is None else q_rows.shape[1]
-        self.done, self.status = np.zeros(self.count, "l"), np.zeros(self.count, "i")
-        address, (long, integer) = model._c[0], model._whole
-        self.ends = address(long, self.done), address(integer, self.status)
-        self.at = tuple(model._pointer(x) for x in (q, qd, q_rows, qd_rows))
-        self.failed = self.stop = False
-        self.moved = 0
-
-    def _places(self, at: int) -> tuple[Any, ...]:
-        """The addresses of an instance's q, qd and rows of both."""
-        first = self.model.nq * at
-        q, qd, q_rows, qd_rows = self.at
-        if not self.rows:
-            return q + first, qd + first, q_rows, qd_rows
-        row = first * self.rows
-        return q + first, qd + first, q_rows + row, qd_rows + row
-
-    def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
-        """All of it; False where Ctrl-C came in between."""
-        count = self.count
-        threads = None if threads is None else _count(threads, "threads", 1)
-        if count * self.steps < _WORTH:
-            threads = 1
-        elif threads is None:
-            threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-        tiles = -(-count // _GROUP)
-        size = _GROUP * max(1, min(_TILES, tiles // (_SHARES * threads) if threads > 1 else tiles))
-        groups = [(at, min(size, count - at)) for at in range(0, count, size)]
-        self._begin_all(threads if len(groups) > 1 else 1)
-        return self._all_of(groups, threads, progress)
-
-    def _all_of(
-        self,
-        groups: list[tuple[int, int]],
-        threads: int,
-        progress: Callable[[int, int], None] | None,
-    ) -> bool:
-        total = self.count * self.steps
-        if threads == 1 or len(groups) == 1:
-            try:
-                for group in groups:
-                    self._group(*group, lambda: progress and progress(self.moved, total))
-            except KeyboardInterrupt:
-                return False
-            return True
-        pool = _pool(threads)
-        waiting: set[Future[None]] = {pool.submit(self._group, *group) for group in groups}
-        try:
-            while waiting:
-                ended, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_EXCEPTION)
-                for future in ended:
-                    future.result()
-                if progress is not None:
-                    progress(self.moved, total)
-        except BaseException as fault:
-            self.stop = True
-            for future in waiting:
-                future.cancel()
-            wait(waiting)
-            if isinstance(fault, KeyboardInterrupt):
-                return False
-            raise
-        return True
-
-    def _begin_all(self, threads: int) -> None:
-        """The starts of all into what is moved, and into the first rows.
-
-        Raises ValueError where one is not finite, before any is moved.
-        """
-        if self.starts is None:
-            return
-        share = -(-self.count // threads)
-        parts = [(at, min(share, self.count - at)) for at in range(0, self.count, share)]
-        if len(parts) == 1:
-            self._begin(*parts[0])
-        else:
-            for future in [_pool(threads).submit(self._begin, *part) for part in parts]:
-                future.result()
-
-    def _begin(self, at: int, count: int) -> None:
-        assert self.starts is not None
-        q, qd, q_rows, qd_rows = self._places(at)
-        names = ("q0", q, q_rows), ("qd0", qd, qd_rows)
-        for start, (name, x, rows) in zip(self.starts, names, strict=True):
-            (far, across), wide = start.strides, start.dtype.itemsize == 8
-            first = start.__array_interface__["data"][0] + at * far
-            if not self.model._lib.batch_start(count, first, wide, far, across, x, rows, self.rows):
-                self.model._array(start, name, self.model.nq)  # raises, and says where
-
-    def _group(self, at: int, count: int, told: Callable[[], object] = lambda: None) -> None:
-        """Instances at, ..., at + count - 1 through all steps, a piece of some time at once."""
-        model = self.model
-        pointer, null = model._pointer, model._c[2]
-        end = at + count
-        q, qd, q_rows, qd_rows = self._places(at)
-        done, status = (x + at for x in self.ends)
-        each = len(self.table) > 1
-        table = pointer(self.table[at:end] if each else self.table)
-        u, u_instance, u_step = null, 0, 0
-        if self.held is not None:
-            _, many, width = self.held.shape
-            u = pointer(self.held[at:end] if len(self.held) > 1 else self.held)
-            u_instance = many * width if len(self.held) > 1 else 0
-            u_step = width if many > 1 else 0
-        first, kind = 0, (self.step, count.bit_length())
-        # the first piece is short: another batch may have been quicker
-        many = max(1, int(_FIRST / (model._paces.get(kind, _SLOWEST * model.nq) * count)))
-        while first < self.steps and not self.stop:
-            many = min(many, self.steps - first)
-            begun = perf_counter()
-            failed = self.step(
-                count, q, qd, self.t0, self.h, first, many, u + first * u_step if u_step else u,
-                u_instance, u_step, self.every, q_rows, qd_rows, self.rows, table,
-                1 if each else 0, done, status,
-            )  # fmt: skip
-            spent = perf_counter() - begun
-            self.failed |= failed
-            first += many
-            self.moved += many * count  # a figure for the bar; threads may lose one another's
-            model._paces[kind] = max(1e-10, spent / (many * count))
-            many = longer(many, spent, _SECONDS)
-            told()
-
-
-_pools: dict[int, ThreadPoolExecutor] = {}
-if hasattr(os, "register_at_fork"):  # a fork has the pools but none of their threads
-    os.register_at_fork(after_in_child=_pools.clear)
-
-
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads are kept for the next batch: starting them takes longer than a short one."""
-    if threads not in _pools:
-        _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="eomc")
-    return _pools[threads]

@@ -1,7 +1,4 @@
-"""How far a run may be trusted: its error by step doubling, and h against the stability limit.
-
-This file is copied beside each compiled extension like runtime.py.
-"""
+"""How far a run may be trusted: its error by step doubling, and h against the stability limit."""
 
 from __future__ import annotations
 
@@ -16,14 +13,15 @@ from numpy.typing import NDArray
 from .package import reduced
 
 if TYPE_CHECKING:
-    from .runtime import Model, Run
+    from .model import Model
+    from .trajectory import Run
 
 Array = NDArray[Any]
 
 _FINEST = 16  # h/16 is the shortest step taken to see a run converge
 _LONG = 2_000_000  # steps of a run beyond which no more than h/4 is taken
 _ROWS = 200  # from which on a run's own rows tell how large each coordinate becomes
-_TENTH = 0.1  # of a coordinate's scale: an answer more wrong than that is none
+_TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
 _FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
 _SMOOTH = 1e6  # growth beyond which a difference may as well have met a jump of the forces
 _WALK = 0.3  # rms of the rounding of a sum, in units of eps/2 times its size (1/sqrt(12) to 1/2)
@@ -115,14 +113,14 @@ class _Again:
 
     def __call__(self, parts: int, every: int, nudge: Array | None = None) -> Run:
         """In steps of h/parts, keeping every so many of them."""
-        told = None if self.progress is None else self._told
-        made = self.run._again(parts, every, nudge, told)
+        progress = None if self.progress is None else self._report
+        made = self.run._again(parts, every, nudge, progress)
         self.spent += parts * self.run.steps
         if made.status == "interrupted":
             raise KeyboardInterrupt
         return made
 
-    def _told(self, done: int, _: int) -> None:
+    def _report(self, done: int, _: int) -> None:
         total = 9 * self.run.steps
         if self.progress is not None:
             self.progress(min(self.spent + done, total), total)
@@ -235,7 +233,7 @@ def _size(x: Array) -> float:
 
 
 def _padded(run: Run, rows: int, every: int) -> Array:
-    """The states of a finer run beside the run's own rows: nan from where it stopped."""
+    """The states of a finer run at the run's own rows: nan from where it stopped."""
     out = np.full((rows, 2 * run._model.nq), np.nan)
     kept = rows if run.status == "ok" else min(rows, 1 + run.steps // every)
     out[:kept] = run.x[:kept]
@@ -323,14 +321,14 @@ def _modes(
     """
     n = model.nq
     try:
-        if model.has_slopes and (u is not None or not model.nu):  # signals may hang on the state
+        if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
             A = model.linearize(q, qd, u, t, params)[0].astype(float)
         else:
             A = np.block(
                 [[np.zeros((n, n)), np.eye(n)], [_slopes(model, q, qd, t, u, params, wide)]]
             )
         values = np.linalg.eigvals(A)
-    except (ArithmeticError, np.linalg.LinAlgError):  # the run itself will tell
+    except (ArithmeticError, np.linalg.LinAlgError):  # the run itself reports it
         return None
     return float(np.max(np.abs(values.imag))), float(max(0.0, np.max(-values.real)))
 

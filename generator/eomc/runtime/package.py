@@ -1,6 +1,6 @@
 """A built package as a value: it can be pickled with all it makes, and refuses assignments.
 
-Copied beside each compiled extension like runtime.py. Functions are called with parameters; a
+Functions are called with parameters; a
 parameter that is assigned to the module would change nothing there, or replace a function.
 """
 
@@ -26,7 +26,7 @@ def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
 
 
 def made(path: str, arguments: tuple[Any, ...]) -> Any:
-    """What lies at a path in this package, such as "runtime.MotionError", called."""
+    """What lies at a path in this package, such as "trajectory.MotionError", called."""
     package: Any = import_module(str(__package__))
     return functools.reduce(getattr, path.split("."), package)(*arguments)
 

@@ -1,7 +1,4 @@
-"""Long work in C is done in slices, between which Ctrl-C is answered.
-
-Copied beside each compiled extension like runtime.py.
-"""
+"""Long work in C is done in slices, between which Ctrl-C is answered."""
 
 from __future__ import annotations
 

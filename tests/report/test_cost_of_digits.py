@@ -1,4 +1,4 @@
-"""The report: what it measures against what theory says, and what the command prints and writes."""
+"""The report: what it measures compared with theory, and what the command prints and writes."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from eomc.cli.main import main
 from eomc.emit.render import Sources
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import System
-from eomc.report import report
-from eomc.report.report import Report
+from eomc.report import cost_of_digits, page
+from eomc.report.cost_of_digits import Report
 
 REPORTS = ROOT / "build" / "tests" / "reports"
 
@@ -42,7 +42,7 @@ def oscillator() -> System:
 
 @cache
 def measured() -> Report:
-    return report.report(oscillator(), REPORTS, longest=0.02, methods=("rk4", "dp8"))
+    return cost_of_digits.measure(oscillator(), REPORTS, longest=0.02, methods=("rk4", "dp8"))
 
 
 def test_errors_of_rk4_are_those_of_theory() -> None:
@@ -65,11 +65,13 @@ def test_order_stability_and_rounding() -> None:
     assert rk4.observed == pytest.approx(4, abs=0.3)
     assert dp8.observed == pytest.approx(8, abs=0.8)
     # h omega <= 2.83 and 5.96
-    assert rk4.advised == pytest.approx(METHODS["rk4"].limits[0] / 3, rel=1e-6)
-    assert dp8.advised == pytest.approx(METHODS["dp8"].limits[0] / 3, rel=1e-6)
+    assert rk4.stable_to == pytest.approx(METHODS["rk4"].limits[0] / 3, rel=1e-6)
+    assert dp8.stable_to == pytest.approx(METHODS["dp8"].limits[0] / 3, rel=1e-6)
     assert abs(measured().eigenvalue.imag) == pytest.approx(3, rel=1e-6)
     for line in (rk4, dp8):
-        assert line.advised / 8 < line.stable <= line.advised  # halved until the error is below 1
+        assert (
+            line.stable_to / 8 < line.usable_h <= line.stable_to
+        )  # halved until the error is below 1
     assert 0 < dp8.rounding < 0.1
     assert 1e-17 < min(p.along for p in dp8.points) < 1e-13
 
@@ -80,10 +82,10 @@ def test_what_is_recommended_is_the_quickest_that_is_good_enough() -> None:
         found = r.best(digits)
         assert found is not None and found.along <= 10.0**-digits
         assert not any(p.along <= 10.0**-digits and p.seconds < found.seconds for p in r.points)
-        words = r.recommendation(digits)
+        words = page.recommendation(r, digits)
         assert words.startswith(f"for {digits} digits up to t = 4 s: {found.method} with h = ")
         assert f"(4 s/{found.steps})" in words
-    assert "out of reach" in r.recommendation(17)
+    assert "out of reach" in page.recommendation(r, 17)
     best = r.best(12)
     assert best is not None and best.method == "dp8"
 
@@ -96,7 +98,7 @@ def test_a_difference_of_an_oscillator_does_not_grow() -> None:
 
 
 @pytest.mark.slow
-def test_condition_and_jumps_are_told(tmp_path: Path) -> None:
+def test_condition_and_jumps_are_reported(tmp_path: Path) -> None:
     """D = [[1, c], [c, 1]], c = 1 - 1e-9 cos x: condition (1 + c)/(1 - c) = 2e9 at x = 0."""
     x, y, v, w = sympy.symbols("x y x_dot y_dot")
     c = 1 - sympy.Rational(1, 10**9) * (1 + x**2)
@@ -104,21 +106,27 @@ def test_condition_and_jumps_are_told(tmp_path: Path) -> None:
         "nearly", {x: (0.0, 1.0), y: (0.0, 1.0)}, (v**2 + w**2) / 2 + c * v * w,
         forces={x: sympy.Abs(y) / 10**6}, duration=0.5, h=0.01,
     )  # fmt: skip
-    r = report.report(system, tmp_path, longest=0.005, methods=("rk4",))
+    r = cost_of_digits.measure(system, tmp_path, longest=0.005, methods=("rk4",))
     assert r.condition[0] == pytest.approx(2e9, rel=1e-3)
     assert r.condition[1] == 0.0
-    told = " ".join(r.remarks())
-    assert "nearly singular at t = 0 s, x = 0, y = 0: condition number 2e+09" in told
-    assert "jump or bend (abs)" in told
-    smooth = " ".join(measured().remarks())
+    said = " ".join(page.remarks(r))
+    assert "nearly singular at t = 0 s, x = 0, y = 0: condition number 2e+09" in said
+    assert "jump or bend (abs)" in said
+    smooth = " ".join(page.remarks(measured()))
     assert "D is regular" in smooth and "jump" not in smooth
 
 
-def test_advice_of_known_eigenvalues() -> None:
-    assert report.advice(np.array([100j, -100j]), (2.83, 2.79)) == pytest.approx(0.0283)
-    assert report.advice(np.array([-1000 + 0j, 1j]), (2.83, 2.79)) == pytest.approx(2.79e-3)
-    assert report.advice(np.array([5 + 0j]), (2.83, 2.79)) == math.inf  # grows by itself
-    assert report.advice(np.array([-1000 + 0j]), (math.inf, math.inf)) == math.inf
+def test_stable_steps_of_known_eigenvalues() -> None:
+    assert cost_of_digits.stable_step(np.array([100j, -100j]), (2.83, 2.79)) == pytest.approx(
+        0.0283
+    )
+    assert cost_of_digits.stable_step(np.array([-1000 + 0j, 1j]), (2.83, 2.79)) == pytest.approx(
+        2.79e-3
+    )
+    assert (
+        cost_of_digits.stable_step(np.array([5 + 0j]), (2.83, 2.79)) == math.inf
+    )  # grows by itself
+    assert cost_of_digits.stable_step(np.array([-1000 + 0j]), (math.inf, math.inf)) == math.inf
 
 
 class _Page(HTMLParser):
@@ -135,14 +143,14 @@ class _Page(HTMLParser):
 @pytest.mark.slow
 def test_the_page_is_one_file_with_its_pictures() -> None:
     pytest.importorskip("matplotlib")
-    text = report.page(measured())
-    page = _Page()
-    page.feed(text)
-    assert page.tags.count("svg") == 3 and "script" not in page.tags
-    assert all(link.startswith("#") for link in page.links)  # nothing from outside
-    for words in measured().recommendations():
+    text = page.page(measured())
+    read = _Page()
+    read.feed(text)
+    assert read.tags.count("svg") == 3 and "script" not in read.tags
+    assert all(link.startswith("#") for link in read.links)  # nothing from outside
+    for words in page.recommendations(measured()):
         assert words in text
-    assert text == report.page(measured())
+    assert text == page.page(measured())
 
 
 @pytest.mark.slow
@@ -150,23 +158,23 @@ def test_names_are_escaped_on_the_page() -> None:
     from dataclasses import replace
 
     pytest.importorskip("matplotlib")
-    text = report.page(replace(measured(), title="<script>"))
+    text = page.page(replace(measured(), title="<script>"))
     assert "<script>" not in text and "&lt;script&gt;" in text
 
 
 def test_the_figures_as_json() -> None:
-    told = json.loads(json.dumps(measured().as_dict(), allow_nan=False))
-    assert [s["method"] for s in told["steppers"]] == ["rk4", "dp8"]
-    assert told["best"]["6"]["error_along"] <= 1e-6
-    for digits, best in told["best"].items():
+    figures = json.loads(json.dumps(page.as_dict(measured()), allow_nan=False))
+    assert [s["method"] for s in figures["steppers"]] == ["rk4", "dp8"]
+    assert figures["best"]["6"]["error_along"] <= 1e-6
+    for digits, best in figures["best"].items():
         assert best is None or best["error_along"] <= 10.0 ** -int(digits)
-    assert told["truth_digits"] > 25
-    assert told["condition"]["largest"] == pytest.approx(1.0)
+    assert figures["reference_digits"] > 25
+    assert figures["condition"]["largest"] == pytest.approx(1.0)
 
 
 @pytest.mark.slow
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "METHODS", {n: METHODS[n] for n in ("rk4", "dp8")})
+    monkeypatch.setattr(cost_of_digits, "METHODS", {n: METHODS[n] for n in ("rk4", "dp8")})
     scene, file = str(SCENES / "mass_spring.toml"), tmp_path / "figures.json"
     words = ["report", scene, "--build", str(tmp_path)]
     with warnings.catch_warnings():
@@ -184,19 +192,19 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_chaos_is_told(tmp_path: Path) -> None:
+def test_chaos_is_reported(tmp_path: Path) -> None:
     """The case's own amplification at the end is 1.7e11, by a nudge of its start."""
     system = case_system("double_pendulum_chaotic")
-    r = report.report(system, tmp_path, longest=0.02, methods=("rk4", "dp8"))
+    r = cost_of_digits.measure(system, tmp_path, longest=0.02, methods=("rk4", "dp8"))
     assert r.growth.wild
     assert 1e10 < r.growth.amplification[-1] < 1e13  # another norm than the case's
     assert r.growth.horizon > 15
-    assert "no run in doubles means anything" in " ".join(r.remarks())
+    assert "no run in doubles means anything" in " ".join(page.remarks(r))
     smallest = min(p.along for p in r.points)
     assert 1e-9 < smallest < 1e-2  # 1.7e11 times rounding
 
 
-def test_a_stepper_that_a_scene_can_not_use_is_told(
+def test_a_stepper_that_a_scene_can_not_use_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def sources(system: System, *rest: object, **options: object) -> Sources:
@@ -206,7 +214,7 @@ def test_a_stepper_that_a_scene_can_not_use_is_told(
 
     plain = pipeline.sources
     monkeypatch.setattr(pipeline, "sources", sources)
-    module, skipped = report.variant(oscillator(), ("rk4", "dp8"), tmp_path)
+    module, skipped = cost_of_digits.variant(oscillator(), ("rk4", "dp8"), tmp_path)
     assert module.methods == ("dp8",) and skipped == {"rk4": "rk4 is refused here"}
     with pytest.raises(EomcError, match="no stepper can be used: rk4 is refused here"):
-        report.variant(oscillator(), ("rk4",), tmp_path)
+        cost_of_digits.variant(oscillator(), ("rk4",), tmp_path)

@@ -22,7 +22,7 @@ import eomc
 from eomc.base import resources
 from eomc.model.system import from_scene
 from eomc.scene.scene import parse
-from eomc.toolchain import compiler as compiler
+from eomc.toolchain import cache, compiler
 
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
 CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
@@ -160,7 +160,7 @@ def test_garbage_is_collected_again(scene: Path, tmp_path: Path) -> None:
         gc.enable()
 
 
-def test_what_a_build_hangs_on(
+def test_what_a_build_depends_on(
     scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Scene, flags, compiler, generator: each of them changed gives a new build."""
@@ -183,15 +183,15 @@ def test_what_a_build_hangs_on(
     for part in ("templates", "csrc"):
         shutil.copytree(resources.folder(part), tmp_path / "clone" / part)
     monkeypatch.setattr(resources, "PACKAGE", generator)
-    compiler._generator_digest.cache_clear()
+    cache._generator_digest.cache_clear()
     try:
         assert not eomc.build(scene, root).fresh  # an exact copy
         with (generator / "derive" / "tape.py").open("a") as file:
             file.write("\n")
-        compiler._generator_digest.cache_clear()
+        cache._generator_digest.cache_clear()
         assert fresh()
     finally:
-        compiler._generator_digest.cache_clear()
+        cache._generator_digest.cache_clear()
 
 
 def test_a_damaged_build_is_mended(scene: Path, root: Path) -> None:
@@ -433,7 +433,7 @@ def test_registers_are_as_wide_as_loops_have_use_for(
     """512 bits for loops over instances or stages; straight-line code is faster in 256."""
     monkeypatch.delenv("EOMC_CFLAGS", raising=False)
     made = eomc.sources(from_scene(parse(TEXT + f"{run}\n")))
-    monkeypatch.setattr(compiler, "_processor", lambda: "flags : fma avx2 avx512f")
-    assert compiler.flags(made.wide)[-1] == f"-mprefer-vector-width={width}"
-    monkeypatch.setattr(compiler, "_processor", lambda: "flags : fma avx2")
-    assert compiler.flags(made.wide) == compiler.FLAGS
+    monkeypatch.setattr(compiler, "processor", lambda: "flags : fma avx2 avx512f")
+    assert compiler.flags(wide=made.wide)[-1] == f"-mprefer-vector-width={width}"
+    monkeypatch.setattr(compiler, "processor", lambda: "flags : fma avx2")
+    assert compiler.flags(wide=made.wide) == compiler.FLAGS

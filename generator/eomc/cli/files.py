@@ -1,0 +1,36 @@
+"""Files that commands write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from eomc.base.errors import EomcError
+from eomc.cli.terminal import shown
+
+
+def scene_path(name: str) -> Path:
+    """Where a new scene goes: into scenes/ where there is one."""
+    return (Path("scenes") if Path("scenes").is_dir() else Path()) / f"{name}.toml"
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a file that must not be there yet."""
+    made = False
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            made = True
+            file.write(text)
+    except FileExistsError:
+        raise EomcError(f"{shown(path)}: is there already, and stays as it is") from None
+    except OSError as fault:
+        if made:  # and not whole
+            path.unlink(missing_ok=True)
+        raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file, over what is there."""
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as fault:
+        raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None

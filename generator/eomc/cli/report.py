@@ -1,0 +1,50 @@
+"""eomc report: what every digit costs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from eomc.cli import files, options
+from eomc.cli.terminal import progress_bar, say, shown
+
+
+@click.command("report")
+@options.SCENES
+@options.BUILD
+@click.option("--digits", type=click.IntRange(1, 17), help="Recommend for so many digits only.")
+@click.option("--json", "file", type=click.Path(path_type=Path), help="Write all figures to FILE.")
+@options.QUIET
+def command(
+    scenes: Sequence[Path], root: Path, digits: int | None, file: Path | None, quiet: bool
+) -> None:
+    """Measure what every digit costs: each stepper over a range of h, against 25 digits or more.
+
+    Writes a page with pictures, build/NAME/report.html.
+
+    \b
+    eomc report scenes/cartpole.toml
+    eomc report scenes/cartpole.toml --digits 8
+    """
+    from eomc.report import cost_of_digits
+    from eomc.report import page as pages
+
+    measured = []
+    for scene in scenes:
+        with progress_bar(f"measuring {scene.stem}", quiet) as progress:
+            made = cost_of_digits.measure(scene, root, progress=progress)
+        measured.append(pages.as_dict(made))
+        if digits is not None:
+            say(f"{made.scene}: {pages.recommendation(made, digits)}")
+            continue
+        if not quiet:
+            say(pages.table(made))
+        page = root / made.scene / "report.html"
+        files.write_text(page, pages.page(made))
+        if not quiet:
+            say(f"\nwrote {shown(page)}\n")
+    if file is not None:
+        files.write_text(file, json.dumps(measured, indent=1) + "\n")

@@ -1,0 +1,250 @@
+"""eomc run: a simulation, its end, error and speed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from eomc import pipeline
+from eomc.base import texts
+from eomc.base.errors import EomcError
+from eomc.cli import options
+from eomc.cli.pairs import pairs
+from eomc.cli.terminal import progress_bar, say, shown, status_line, warn
+
+if TYPE_CHECKING:
+    from eomc.runtime.estimate import Estimate
+    from eomc.runtime.trajectory import Run
+
+
+@click.command("run")
+@options.SCENE
+@options.BUILD
+@click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE", help="A parameter.")
+@click.option("--start", multiple=True, metavar="NAME=VALUE", help="A coordinate, or its velocity.")
+@click.option("--h", "h", type=float, help="Step size in s, instead of the scene's.")
+@click.option("--duration", type=float, help="In s, instead of the scene's.")
+@click.option("--method", help="A stepper that the scene asks for; its first where not given.")
+@click.option("--every", type=click.IntRange(1), default=1, help="Keep every so many steps.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
+)
+@click.option("--plot", type=click.Path(path_type=Path), help="Draw them: FILE.png, .svg or .pdf.")
+@options.QUIET
+@options.JSON
+def command(
+    scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str], h: float | None,
+    duration: float | None, method: str | None, every: int, out: Path | None,
+    plot: Path | None, quiet: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Simulate a scene; print the end, the error and the speed.
+
+    \b
+    eomc run scenes/cartpole.toml --plot cartpole.png
+    eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
+    """
+    _known_suffix(out, (".csv", ".npz"), "--out")
+    _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
+    with status_line(f"building {scene.stem}", quiet or as_json):
+        module = pipeline.load(scene, root, warn=warn)
+    values, q0, qd0 = _overrides(scene, module, parameters, start)
+    options: dict[str, Any] = {"h": h, "duration": duration, "params": values, "method": method}
+    try:
+        unstable = module.advice(q0, qd0, h, params=values, method=method)
+        with progress_bar("running", quiet or as_json) as progress:
+            begun = time.perf_counter()
+            done = _simulated(module, q0, qd0, every=every, progress=progress, **options)
+            seconds = time.perf_counter() - begun
+    except module.Interrupted as stop:  # what was done is kept
+        done, seconds = stop.run, time.perf_counter() - begun
+    except (ValueError, MemoryError) as fault:
+        raise EomcError(str(fault).replace("every=", "--every")) from None
+    stopped = done.status == "interrupted"
+    if done.status == "ok" and seconds < 2:
+        try:
+            with progress_bar("finding its error", quiet or as_json) as progress:
+                done.estimate(progress)
+        except module.Interrupted:  # the run itself is whole
+            stopped = True
+    if out:
+        _write(out, module, done)
+    if plot:
+        from eomc.report import plot as plots
+
+        plots.draw(pipeline.read(scene).at(values), done.t, done.q, done.qd, done.energy, plot)
+    summary = _summary(module, done, seconds, unstable, plot=plot, out=out)
+    if as_json:
+        say(json.dumps(summary, indent=1))
+    elif not quiet:
+        _print_summary(module, done, summary)
+    if done.status != "ok":
+        say(f"eomc: {done.message}", err=True)
+    if stopped or done.status != "ok":
+        sys.exit(130 if stopped else 1)
+
+
+def _known_suffix(path: Path | None, known: Sequence[str], option: str) -> None:
+    if path is not None and path.suffix not in known:
+        raise EomcError(f"{option} {shown(path)}: give a name that ends in {' or '.join(known)}")
+
+
+def _overrides(
+    scene: Path, module: Any, parameters: Sequence[str], start: Sequence[str]
+) -> tuple[dict[str, float], Any, Any]:
+    """Parameters and start from NAME=VALUE pairs; a value may be a formula such as pi/3."""
+    from eomc.scene.formulas import suggest
+
+    values: dict[str, float] = {}
+    for name, value in pairs(parameters, "--set", module.defaults):
+        if name not in module.defaults:
+            raise EomcError(f"--set: '{name}' is not a parameter{suggest(name, module.defaults)}")
+        values[name] = value
+    q0, qd0 = module.start
+    if values:  # the start may be a formula in the parameters
+        from eomc.scene import scene as scenes
+
+        q0[:], qd0[:] = scenes.read(scene, values).start()  # and may be bad for a body
+    states = {name: (q0, k) for k, name in enumerate(module.coordinates)}
+    states |= {f"{name}_dot": (qd0, k) for k, name in enumerate(module.coordinates)}
+    for name, value in pairs(start, "--start", {**module.defaults, **values}):
+        if name not in states:
+            raise EomcError(
+                f"--start: '{name}' is not a coordinate or velocity{suggest(name, states)}"
+            )
+        array, k = states[name]
+        array[k] = value
+    return values, q0, qd0
+
+
+def _simulated(module: Any, q0: Any, qd0: Any, **options: Any) -> Run:
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # reported by the caller
+        done: Run = module.simulate(q0, qd0, **options)
+        return done
+
+
+def _error(done: Run) -> dict[str, Any] | None:
+    """A run's own error for JSON, which has no inf and no nan."""
+    error = done.error
+    if error is None:
+        return None
+
+    def said(x: float) -> float | None:
+        return x if abs(x) < float("inf") else None
+
+    return {
+        "q": said(float(error.q[-1].max())),
+        "qd": said(float(error.qd[-1].max())),
+        "end": {name: said(x) for name, x in error.end.items()},
+        "digits": error.digits,
+        "order": error.order,
+        "observed_order": said(error.observed),
+        "amplification": said(error.amplification),
+        "verdict": error.verdict,
+    }
+
+
+def _summary(
+    module: Any, done: Run, seconds: float, unstable: str | None, **files: Path | None
+) -> dict[str, Any]:
+    import numpy as np
+
+    energy, jacobi = done.energy, done.jacobi
+    return {
+        "scene": module._model.name,
+        "status": done.status,
+        "message": done.message,
+        "method": done.method,
+        "h": done.h,
+        "steps": done.steps,
+        "t": float(done.t[-1]),
+        "q": dict(zip(module.coordinates, map(float, done.q[-1]), strict=True)),
+        "qd": dict(zip(module.coordinates, map(float, done.qd[-1]), strict=True)),
+        "energy": {
+            "start": float(energy[0]),
+            "end": float(energy[-1]),
+            "largest_change": float(np.max(np.abs(energy - energy[0]))),
+        },
+        "jacobi_change": None
+        if np.array_equal(energy, jacobi)
+        else float(np.max(np.abs(jacobi - jacobi[0]))),
+        "error_estimate": _error(done),
+        "beyond_stability": unstable,
+        "seconds": seconds,
+        "steps_per_second": done.steps / seconds if seconds else None,
+        "files": [str(path) for path in files.values() if path],
+    }
+
+
+def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
+    say(
+        f"{shown(module.title)}: {done.steps} steps of {summary['method']}, h = {done.h:g} s, "
+        f"to t = {done.t[-1]:g} s"
+    )
+    wide = max(map(len, module.coordinates))
+    for name, q, qd in zip(module.coordinates, done.q[-1], done.qd[-1], strict=True):
+        unit = texts.line(module.units.get(name, ""))
+        rate = f"{unit}/s" if unit else ""
+        say(f"  {name:{wide}} {q: .9g} {unit}   {name}_dot {qd: .9g} {rate}".rstrip())
+    change, jacobi = summary["energy"]["largest_change"], summary["jacobi_change"]
+    also = "" if jacobi is None else f"; Jacobi's integral by {jacobi:.2g} J"
+    end = summary["energy"]["end"]
+    say(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J{also}")
+    if summary["beyond_stability"]:
+        say(f"  {summary['beyond_stability']}")
+    if done.error is not None:
+        _print_error(module, done.error)
+    speed = summary["steps_per_second"] or 0.0
+    say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
+    for file in summary["files"]:
+        say(f"  wrote {shown(file)}")
+
+
+def _print_error(module: Any, error: Estimate) -> None:
+    import math
+
+    q, qd = float(error.q[-1].max()), float(error.qd[-1].max())
+    seen = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
+    say(
+        f"  error at the end about {q:.1g} in q, {qd:.1g} in qd "
+        f"(from the same run in shorter steps; order {error.order}, {seen})"
+    )
+    digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
+    say(
+        f"  right digits: {digits}; a difference at the start has become "
+        f"{error.amplification:.2g} times as large"
+    )
+    if not error.resolved:
+        say(f"  this motion is not resolved: {error.verdict}")
+
+
+def _write(path: Path, module: Any, done: Run) -> None:
+    """The rows as CSV (17 digits, so that they read back as they were) or as NPZ arrays."""
+    import numpy as np
+
+    names = [*module.coordinates, *(f"{c}_dot" for c in module.coordinates)]
+    try:
+        if path.suffix == ".npz":
+            np.savez(
+                path, t=done.t, q=done.q, qd=done.qd, energy=done.energy,
+                coordinates=np.array(module.coordinates),
+            )  # fmt: skip
+            return
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["t", *names, "energy"])
+            writer.writerows(
+                [repr(float(x)) for x in row]
+                for row in np.column_stack([done.t, done.q, done.qd, done.energy])
+            )
+    except OSError as fault:
+        raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None

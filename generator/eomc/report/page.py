@@ -1,0 +1,307 @@
+"""The words, the table and the page of a measurement: recommendations, remarks, pictures."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from eomc.base import texts
+from eomc.base.errors import EomcError
+from eomc.emit.render import environment
+from eomc.report.cost_of_digits import CONDITION, DIGITS, LOST, Point, Report
+
+EXPLAINED = """\
+Usable h: the largest measured with an error below 1 all along. Stable to: by the eigenvalues of
+the linearised motion; steps up to it let no difference grow, though their errors may add up to
+more than the motion. Rounding from: the h below which finer steps don't help."""
+
+
+def recommendation(report: Report, digits: float) -> str:
+    """For 6 digits up to t = 10 s: dp8 with h = 40 ms, 0.1 ms of computing."""
+    found, what = report.best(digits), f"for {digits:g} digits up to t = {report.duration:g} s"
+    if found is None:
+        p = report.finest
+        if not p.along < LOST:
+            return f"{what}: no stepper follows this motion to its end"
+        return (
+            f"{what}: out of reach here; the most is {-math.log10(p.along):.1f} digits, by "
+            f"{p.method} with h = {_time(p.h)}, {_time(p.seconds)} of computing"
+        )
+    return (
+        f"{what}: {found.method} with h = {_time(found.h)} "
+        f"({report.duration:g} s/{found.steps}), {_time(found.seconds)} of computing, "
+        f"{found.evaluations} evaluations"
+    )
+
+
+def recommendations(report: Report) -> list[str]:
+    """One for each run that is the best for some digits, and one for what is out of reach."""
+    best: dict[Point | None, str] = {}
+    for digits in DIGITS:
+        found = report.best(digits)
+        best.pop(found, None)  # the most digits that it is the best for
+        best[found] = recommendation(report, digits)
+        if found is None:
+            break
+    return list(best.values())
+
+
+def remarks(report: Report) -> list[str]:
+    """What a person should know of this scene, in sentences."""
+    g, said = report.growth, []
+    said.append(
+        f"A small difference at the start grows {g.amplification[-1]:.2g}-fold in "
+        f"{report.duration:g} s"
+        + (f", at the end by a factor e in {_time(1 / g.rate)} (chaos)." if g.wild else ".")
+    )
+    if math.isfinite(g.horizon):
+        said.append(
+            f"Beyond t = {g.horizon:.3g} s no run in doubles means anything: the rounding of "
+            "the start alone has grown to a tenth of the motion."
+        )
+    if report.digits < 25:
+        said.append(
+            f"The reference solution is known to {report.digits:.0f} digits only; smaller "
+            "errors are not distinguished."
+        )
+    condition, at, q = report.condition
+    where = ", ".join(f"{c} = {x:.4g}" for c, x in zip(report.coordinates, q, strict=True))
+    place = f"at t = {at:.4g} s, {where if len(q) <= 6 else f'{len(q)} coordinates'}"
+    if condition > CONDITION:
+        said.append(
+            f"D is nearly singular {place}: condition number {condition:.2g}, so "
+            f"{math.log10(condition):.0f} digits of the accelerations are lost there."
+        )
+    else:
+        said.append(f"D is regular: its condition number is at most {condition:.2g}, {place}.")
+    if report.corners:
+        said.append(
+            f"Forces or energies jump or bend ({report.corners}): past a jump every fixed step "
+            "is of order 1, whatever its method."
+        )
+    for name, why in report.skipped.items():
+        said.append(f"{name} is not for this scene: {why}")
+    return said
+
+
+def table(report: Report) -> str:
+    """Steppers, recommendations and remarks as text, for a terminal."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    title = f"{report.scene}: up to t = {report.duration:g} s, against {report.digits:.0f} digits"
+    table = Table(box=SIMPLE_HEAD, title=title, title_justify="left")
+    for head in ("stepper", "order", "observed", "usable h", "stable to", "smallest error",
+                 "at h", "computing", "rounding from"):  # fmt: skip
+        table.add_column(head, justify="left" if head == "stepper" else "right")
+    for row in rows(report):
+        table.add_row(*row)
+    text = io.StringIO()
+    Console(file=text, width=110).print(table)
+    lines = [line.rstrip() for line in text.getvalue().splitlines()]
+    words = [EXPLAINED, "", *recommendations(report), "", *remarks(report)]
+    return "\n".join([*lines, *words]).strip("\n")
+
+
+def rows(report: Report) -> list[tuple[str, ...]]:
+    """One for each stepper: the texts of the table."""
+    made: list[tuple[str, ...]] = []
+    for line in report.lines:
+        p = min(line.points, key=lambda p: p.along)
+        made.append(
+            (
+                line.method,
+                str(line.order),
+                _figure(line.observed, "{:.1f}"),
+                _time(line.usable_h),
+                "any" if math.isinf(line.stable_to) else _time(line.stable_to),
+                _figure(p.along, "{:.1e}"),
+                _time(p.h),
+                _time(p.seconds),
+                _time(line.rounding),
+            )
+        )
+    return made
+
+
+def as_dict(report: Report) -> dict[str, Any]:
+    """For JSON; numbers that are not finite are None."""
+
+    def number(x: float | None) -> float | None:
+        return x if x is not None and math.isfinite(x) else None
+
+    def point(p: Point) -> dict[str, Any]:
+        return {
+            "method": p.method, "h": p.h, "steps": p.steps, "status": p.status,
+            "error_q": number(p.q), "error_qd": number(p.qd), "error_end": number(p.end),
+            "error_along": number(p.along), "error_energy": number(p.energy),
+            "seconds": p.seconds, "seconds_per_second": p.seconds / report.duration,
+            "evaluations": p.evaluations,
+        }  # fmt: skip
+
+    best = {str(d): report.best(d) for d in DIGITS}
+    condition, at, q = report.condition
+    return {
+        "scene": report.scene,
+        "duration": report.duration,
+        "reference_digits": report.digits,
+        "steppers": [
+            {
+                "method": line.method, "order": line.order, "observed": number(line.observed),
+                "usable_h": number(line.usable_h), "stable_to": number(line.stable_to),
+                "rounding_h": number(line.rounding), "runs": [point(p) for p in line.points],
+            }
+            for line in report.lines
+        ],
+        "best": {d: point(p) if p else None for d, p in best.items()},
+        "recommendations": recommendations(report),
+        "remarks": remarks(report),
+        "growth": {
+            "t": report.growth.t.tolist(),
+            "amplification": [number(x) for x in report.growth.amplification.tolist()],
+            "rate": number(report.growth.rate), "chaotic": report.growth.wild,
+            "horizon": number(report.growth.horizon),
+        },
+        "fastest_eigenvalue": [report.eigenvalue.real, report.eigenvalue.imag],
+        "condition": {"largest": number(condition), "t": at, "q": q.tolist()},
+        "corners": report.corners,
+        "skipped": dict(report.skipped),
+    }  # fmt: skip
+
+
+def page(report: Report) -> str:
+    """The report as one HTML page with its pictures in it. Raises EomcError without matplotlib."""
+    shown = report.best(6) or report.finest
+    runs = [
+        (
+            p.method, _time(p.h), str(p.steps), p.status, _figure(p.q, "{:.1e}"),
+            _figure(p.qd, "{:.1e}"), _figure(p.along, "{:.1e}"), _figure(p.energy, "{:.1e}"),
+            str(p.evaluations), _time(p.seconds),
+            _time(p.seconds / report.duration),
+        )
+        for p in report.points
+    ]  # fmt: skip
+    return (
+        environment()
+        .get_template("report/report.html.jinja")
+        .render(
+            report=report,
+            title=texts.html(report.title),
+            rows=rows(report),
+            recommendations=recommendations(report),
+            remarks=remarks(report),
+            explained=EXPLAINED,
+            runs=runs,
+            work=_svg(lambda axes: _work(axes, report), (8.6, 5.0)),
+            energy=_svg(lambda axes: _energy(axes, report, shown), (8.6, 3.6)),
+            growth=_svg(lambda axes: _grown(axes, report), (8.6, 3.0)),
+            shown=_time(shown.seconds),
+            digits=f"{report.digits:.0f}",
+            duration=f"{report.duration:g}",
+        )
+    )
+
+
+def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
+    """A picture as text of SVG, the same for the same report."""
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise EomcError("the page of a report needs matplotlib: pip install matplotlib") from None
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "eomc", "font.size": 10}):
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.add_subplot()
+        axes.grid(color="#DDDDDD", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+        draw(axes)
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
+    return Markup(text.getvalue()[text.getvalue().index("<svg") :])
+
+
+def _styles(report: Report) -> dict[str, tuple[str, str]]:
+    from eomc.report.plot import COLOURS, INK
+
+    colours = (*COLOURS, INK, "#999999")
+    marks = "osD^vPX*"
+    return {
+        line.method: (colours[k % len(colours)], marks[k % len(marks)])
+        for k, line in enumerate(report.lines)
+    }
+
+
+def _work(axes: Any, report: Report) -> None:
+    """Error against time, the best stepper for each number of digits marked."""
+    styles = _styles(report)
+    for line in report.lines:
+        colour, mark = styles[line.method]
+        good = [p for p in line.points if p.along < LOST]
+        axes.loglog(
+            [p.seconds for p in good], [p.along for p in good], color=colour, marker=mark,
+            markersize=4, linewidth=1.2, label=line.method,
+        )  # fmt: skip
+    marked: dict[tuple[str, int], tuple[Point, list[int]]] = {}
+    for digits in DIGITS:
+        if found := report.best(digits):
+            marked.setdefault((found.method, found.steps), (found, []))[1].append(digits)
+    for p, reached in marked.values():
+        axes.plot(
+            p.seconds, p.along, marker="o", markersize=12, markerfacecolor="none",
+            markeredgecolor=styles[p.method][0], markeredgewidth=1.6,
+        )  # fmt: skip
+        axes.annotate(
+            f"{reached[-1]}", (p.seconds, p.along), xytext=(-9, -9), ha="right", va="center",
+            textcoords="offset points", fontweight="bold", color=styles[p.method][0],
+        )  # fmt: skip
+    axes.set_xlabel("computing time of the whole run, s")
+    axes.set_ylabel("largest relative error along the run")
+    axes.legend(frameon=False)
+
+
+def _energy(axes: Any, report: Report, shown: Point) -> None:
+    """Energy errors over time, each stepper at about the same computing time."""
+    styles = _styles(report)
+    for line in report.lines:
+        good = [p for p in line.points if p.along < LOST]
+        if not good:
+            continue
+        p = min(good, key=lambda p: abs(math.log(p.seconds / shown.seconds)))
+        t = report.t[:: max(1, (len(report.t) - 1) // p.steps)]
+        axes.semilogy(
+            t, np.maximum(p.energies, 1e-17), color=styles[line.method][0], linewidth=1.0,
+            label=f"{line.method}, h = {_time(p.h)}",
+        )  # fmt: skip
+    axes.set_xlabel("t, s")
+    axes.set_ylabel("relative energy error")
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _grown(axes: Any, report: Report) -> None:
+    """By what a difference at the start has grown."""
+    g = report.growth
+    axes.semilogy(g.t, g.amplification, color="#333333", linewidth=1.4)
+    axes.set_xlabel("t, s")
+    axes.set_ylabel("growth of a small difference")
+    if report.t[-1] > g.horizon:
+        axes.axvline(g.horizon, color="#D55E00", linewidth=1.2, linestyle="--")
+
+
+def _figure(value: float, form: str) -> str:
+    return form.format(value) if math.isfinite(value) else "-"
+
+
+def _time(seconds: float) -> str:
+    """Seconds with a unit: 2 s, 4.88 ms, 12.3 us."""
+    if not math.isfinite(seconds):
+        return "-"
+    for size, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "us")):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds * 1e9:.3g} ns"

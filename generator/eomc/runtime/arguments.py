@@ -1,0 +1,321 @@
+"""What a compiled scene is called with, checked and made what C takes.
+
+Wrong shapes, unknown names and numbers that are not finite raise ValueError with the name of the
+argument.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from numpy import empty, ndarray
+from numpy.typing import ArrayLike, NDArray
+
+from .package import Defaults, reduced
+
+Array = NDArray[Any]
+Parameters = Mapping[str, float] | Sequence[float] | Array | None
+
+_FEW = 32  # numbers that Python looks at sooner than NumPy
+
+
+class Params:
+    """A scene's parameters, by name: `p = Params(m_c=3.0); p.m_c = 4.0`. Made by the module."""
+
+    _names: tuple[str, ...] = ()
+    _defaults: tuple[float, ...] = ()
+    _dtype = "float64"
+    __slots__ = ("_array",)  # a parameter's name begins with a letter
+    _array: Array
+
+    def __init__(self, /, **values: float) -> None:
+        object.__setattr__(self, "_array", np.array(self._defaults, self._dtype))
+        for name, value in values.items():
+            self._set(name, value)
+
+    def _set(self, name: str, value: float) -> None:
+        if name not in self._names:
+            raise ValueError(not_one_of("params", name, self._names))
+        self._array[self._names.index(name)] = as_number(value, f"params: {name}")
+
+    def __getattr__(self, name: str) -> float:
+        if name not in self._names:
+            raise AttributeError(not_one_of("params", name, self._names))
+        return float(self._array[self._names.index(name)])
+
+    def __setattr__(self, name: str, value: float) -> None:
+        self._set(name, value)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # a copy too goes this way
+        return reduced("_model._made_params", dict(zip(self._names, self._values(), strict=True)))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Params):
+            return NotImplemented
+        return self._names == other._names and self._values() == other._values()
+
+    __hash__ = None  # type: ignore[assignment]  # values may be changed
+
+    def _values(self) -> list[float]:
+        values: list[float] = self._array.tolist()
+        return values
+
+    def __repr__(self) -> str:
+        inside = ", ".join(f"{n}={v:g}" for n, v in zip(self._names, self._array, strict=True))
+        return f"Params({inside})"
+
+
+class Arguments:
+    """A compiled scene: its names and numbers, and what it is called with as C takes it."""
+
+    def __init__(
+        self, extension: Any, *, name: str, title: str, dtype: str,
+        coordinates: Mapping[str, str], parameters: Mapping[str, float],
+        inputs: Mapping[str, str], units: Mapping[str, str],
+        start: tuple[Sequence[float], Sequence[float]], timed: Sequence[str], digest: str,
+    ) -> None:  # fmt: skip
+        # thirty attributes at most with those of Model: with more CPython 3.11 looks up each slowly
+        self._ffi, self._lib = extension.ffi, extension.lib
+        real = self._ffi.typeof({"float64": "double[]", "float32": "float[]"}[dtype])
+        # what any call needs: address(real, array), and the address of nothing
+        self._c = (self._ffi.from_buffer, real, self._ffi.NULL)
+        self.name, self.title, self.digest = name, title, digest
+        self.dtype = np.dtype(dtype)
+        self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
+        self.parameters = tuple(parameters)
+        self.defaults = Defaults(parameters)
+        self.units = dict(units)
+        self.nq, self.nu = len(self.coordinates), len(self.inputs)
+        self._shape = (self.nq,) if self.nq <= _FEW else None  # of a state that is soon looked at
+        self._start = (self._constant(start[0]), self._constant(start[1]))
+        self._p0 = self._constant(tuple(parameters.values()))
+        self._at = tuple(self._pointer(x) for x in (*self._start, self._p0))
+        self._timed = frozenset(timed)
+        names = {
+            "_names": self.parameters,
+            "_defaults": tuple(parameters.values()),
+            "_dtype": dtype,
+        }
+        self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
+
+    def _made_params(self, values: Mapping[str, float]) -> Any:
+        return self.Params(**values)
+
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """(q, qd) where the scene starts."""
+        q, qd = self._start
+        return q.copy(), qd.copy()
+
+    def _constant(self, values: Sequence[float]) -> Array:
+        array = np.array(values, self.dtype)
+        array.flags.writeable = False
+        return array
+
+    def _pointer(self, array: Array | None) -> Any:
+        address, real, null = self._c
+        return null if array is None else address(real, array)
+
+    def _given(self, u: Any, params: Any) -> tuple[Any, Any]:
+        """The addresses of inputs and parameters."""
+        held = self._c[2] if u is None else self._pointer(self._inputs(u))
+        return held, self._at[2] if params is None else self._pointer(self._parameters(params))
+
+    def _listed(self, x: Any) -> Any:
+        """A state (nq,) as a list, which C takes soonest; None for all that needs a closer look."""
+        if type(x) is ndarray and x.dtype is self.dtype and x.shape == self._shape:
+            numbers = x.tolist()
+            if isfinite(sum(numbers)):  # tells soonest; it may overflow all the same
+                return numbers
+        return None
+
+    def _read(self, q: Any, qd: Any) -> tuple[Any, Any, Array, Array]:
+        """What C reads a state, or many, from, and these as arrays."""
+        if (
+            type(q) is type(qd) is ndarray and q.shape == qd.shape == self._shape
+            and q.dtype is qd.dtype is self.dtype
+        ):  # fmt: skip
+            from_q, from_qd = q.tolist(), qd.tolist()
+            if isfinite(sum(from_q) + sum(from_qd)):
+                return from_q, from_qd, q, qd
+        at, moving = self._state(q, qd)
+        return self._pointer(at), self._pointer(moving), at, moving
+
+    def _numbers(self, value: ArrayLike, name: str) -> Array:
+        """A C-contiguous, aligned array of the module's numbers, of any shape."""
+        if not isinstance(value, list):
+            unmasked(value, name)
+        try:
+            array = np.asarray(value)
+            if array.dtype.kind in "cUSmM":  # text that looks like a number is none
+                raise TypeError
+            return aligned(np.ascontiguousarray(array, self.dtype))
+        except (TypeError, ValueError, OverflowError):
+            raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
+
+    def _array(self, value: ArrayLike, name: str, width: int) -> Array:
+        """Finite numbers, (width,) or (n, width)."""
+        if type(value) is ndarray and value.dtype is self.dtype and value.flags.carray:
+            array = value  # C-contiguous, aligned and, which need not be, writeable
+        else:
+            array = self._numbers(value, name)
+        if array.ndim == 1 and array.size == width <= _FEW and isfinite(sum(array.tolist())):
+            return array  # of few numbers the sum tells soonest; it may overflow all the same
+        if array.shape[-1:] != (width,) or array.ndim > 2:
+            raise ValueError(
+                f"{name}: shape {np.shape(value)}, expected ({width},) or (n, {width}): "
+                f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
+            )
+        if array.size <= _FEW and isfinite(sum(array.ravel().tolist())):
+            return array
+        if not np.isfinite(array).all():
+            if array.ndim == 1:
+                raise ValueError(f"{name}: {np.array2string(array, threshold=20)} is not finite")
+            place = np.argwhere(~np.isfinite(array))[0].tolist()
+            raise ValueError(f"{name}{place}: {array[tuple(place)]} in {self.dtype} is not finite")
+        return array
+
+    def _state(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
+        at, moving = self._array(q, "q", self.nq), self._array(qd, "qd", self.nq)
+        if at.shape != moving.shape:
+            raise ValueError(f"qd: shape {moving.shape} beside q of shape {at.shape}")
+        return at, moving
+
+    def _one(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
+        at, moving = self._state(q, qd)
+        if at.ndim != 1:
+            raise ValueError(f"q: shape {at.shape}, expected ({self.nq},)")
+        return at, moving
+
+    def _parameters(self, params: Any) -> Array:
+        if params is None:
+            return self._p0
+        if isinstance(params, self.Params):
+            values: Array = params._array
+            return values
+        if hasattr(params, "_names"):  # Params of another module
+            raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
+        if isinstance(params, Mapping):
+            given = self.Params()
+            for name, value in params.items():
+                given._set(name, value)
+            return np.asarray(given._array)
+        unmasked(params, "params")
+        try:
+            array = aligned(np.ascontiguousarray(params, self.dtype))
+        except (TypeError, ValueError, OverflowError):
+            array = empty(0, self.dtype)
+        if array.shape != self._p0.shape or not np.isfinite(array).all():
+            raise ValueError(
+                f"params: expected a dict, Params or {len(self._p0)} finite numbers in the order "
+                f"{', '.join(self.parameters)}"
+            )
+        return array
+
+    def _inputs(self, u: Any) -> Array | None:
+        if u is None:
+            return None
+        if not self.nu:
+            raise ValueError("u: this scene has no inputs")
+        array = self._array(u.reshape(1) if type(u) is ndarray and not u.ndim else u, "u", self.nu)
+        if array.ndim != 1:
+            raise ValueError(f"u: shape {array.shape}, expected ({self.nu},): one value an input")
+        return array
+
+    def _out(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
+        if out is None:
+            return empty(shape, self.dtype)
+        unmasked(out, name)
+        good = isinstance(out, np.ndarray) and out.dtype == self.dtype and out.flags.carray
+        if not good or out.shape != shape:
+            raise ValueError(
+                f"{name}: expected a writeable, aligned, C-contiguous array of {self.dtype}, "
+                f"shape {shape}"
+            )
+        array: Array = out
+        return array
+
+    def _pair(self, out: Any, shape: tuple[int, ...]) -> tuple[Array, Array]:
+        """Arrays for positions and velocities: those given, or new ones."""
+        if out is None:
+            return empty(shape, self.dtype), empty(shape, self.dtype)
+        if not isinstance(out, (tuple, list)) or len(out) != 2:
+            raise ValueError("out: expected a pair of arrays, (q, qd)")
+        return self._out(out[0], shape, "out[0]"), self._out(out[1], shape, "out[1]")
+
+
+def unmasked(value: Any, name: str) -> Any:
+    """The value; a ValueError where it is an array with masked numbers, for these have none."""
+    ma = sys.modules.get("numpy.ma")  # NumPy imports it when it is first asked for
+    if ma and isinstance(value, ma.MaskedArray) and ma.is_masked(value):
+        raise ValueError(
+            f"{name}: {ma.count_masked(value)} of {value.size} numbers are masked: "
+            "fill them in first, with .filled(...), or leave these rows out"
+        )
+    return value
+
+
+def as_number(value: Any, name: str) -> float:
+    """A finite number, or a ValueError that names the argument."""
+    if type(value) is float and isfinite(value):
+        return value
+    try:
+        number = float("x" if isinstance(value, (str, bytes)) else value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: {value!r} is not a number") from None
+    except OverflowError:  # a whole number
+        number = float("inf")
+    if not isfinite(number):
+        raise ValueError(f"{name}: {value!r} is not a finite number")
+    return number
+
+
+def as_step_size(h: Any, dtype: np.dtype[Any]) -> float:
+    """A step size in the module's numbers, or a ValueError."""
+    if type(h) is float and 1e-37 < h < 1e37:  # in single precision too
+        return h
+    size = as_number(h, "h")
+    limits = np.finfo(dtype)
+    if not limits.smallest_subnormal <= size <= limits.max:
+        why = "" if size <= 0 else f" in {dtype}"
+        raise ValueError(
+            f"h: {size:g} is not a step size{why}: give a number of seconds greater than 0"
+        )
+    return size
+
+
+def aligned(array: Array) -> Array:
+    """The array, copied where its numbers lie at addresses that C can't read them from."""
+    return array if array.flags.aligned else array.copy()
+
+
+def as_count(value: Any, name: str, least: int) -> int:
+    """A whole number, `least` or more, or a ValueError that names the argument."""
+    if type(value) is int and value >= least:
+        return value
+    number = as_number(value, name)
+    if number != int(number) or number < least:
+        raise ValueError(f"{name}: {value!r} is not a whole number, {least} or more")
+    return int(number)
+
+
+def machine_memory() -> float:
+    """The bytes of memory that the machine has; a larger array may be handed out all the same."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return float("inf")
+
+
+def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
+    """What is wrong with a name, and what there is."""
+    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}"

@@ -1,0 +1,172 @@
+"""The work of a batch: groups of instances in threads, in slices between looks at Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .arguments import Array, as_count
+from .slices import longer
+
+if TYPE_CHECKING:
+    from .batch import BatchModel
+_GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
+_TILES = 64  # at most in a group: threads ask for the next one seldom
+_SHARES = 8  # groups of a thread, so that all end together
+WORTH = 20_000  # steps in all from which threads pay
+_SLOWEST = 1.5e-6  # seconds a step of an instance and coordinate: assumed until one was timed
+_SECONDS = 0.05  # between two looks at Ctrl-C and at the progress bar
+_FIRST = 0.02  # seconds before the first look
+
+
+class Work:
+    """One batch: groups of instances, each taken through all its steps in pieces."""
+
+    def __init__(
+        self, model: BatchModel, step: Any, q: Array, qd: Array, h: float, t0: float,
+        steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None,
+        qd_rows: Array | None, starts: tuple[Array, Array] | None = None,
+    ) -> None:  # fmt: skip
+        self.model, self.step, self.count = model, step, len(q)
+        self.h, self.t0, self.steps, self.every = h, t0, steps, every
+        self.held, self.table = held, table
+        self.starts = starts
+        self.rows = 0 if q_rows is None else q_rows.shape[1]
+        self.done, self.status = np.zeros(self.count, "l"), np.zeros(self.count, "i")
+        address, (long, integer) = model._c[0], model._whole
+        self.ends = address(long, self.done), address(integer, self.status)
+        self.at = tuple(model._pointer(x) for x in (q, qd, q_rows, qd_rows))
+        self.failed = self.stop = False
+        self.moved = 0
+
+    def _places(self, at: int) -> tuple[Any, ...]:
+        """The addresses of an instance's q, qd and rows of both."""
+        first = self.model.nq * at
+        q, qd, q_rows, qd_rows = self.at
+        if not self.rows:
+            return q + first, qd + first, q_rows, qd_rows
+        row = first * self.rows
+        return q + first, qd + first, q_rows + row, qd_rows + row
+
+    def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
+        """All of it; False where Ctrl-C came in between."""
+        count = self.count
+        threads = None if threads is None else as_count(threads, "threads", 1)
+        if count * self.steps < WORTH:
+            threads = 1
+        elif threads is None:
+            threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        tiles = -(-count // _GROUP)
+        size = _GROUP * max(1, min(_TILES, tiles // (_SHARES * threads) if threads > 1 else tiles))
+        groups = [(at, min(size, count - at)) for at in range(0, count, size)]
+        self._begin_all(threads if len(groups) > 1 else 1)
+        return self._all_of(groups, threads, progress)
+
+    def _all_of(
+        self,
+        groups: list[tuple[int, int]],
+        threads: int,
+        progress: Callable[[int, int], None] | None,
+    ) -> bool:
+        total = self.count * self.steps
+        if threads == 1 or len(groups) == 1:
+            try:
+                for group in groups:
+                    self._group(*group, lambda: progress and progress(self.moved, total))
+            except KeyboardInterrupt:
+                return False
+            return True
+        pool = _pool(threads)
+        waiting: set[Future[None]] = {pool.submit(self._group, *group) for group in groups}
+        try:
+            while waiting:
+                ended, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_EXCEPTION)
+                for future in ended:
+                    future.result()
+                if progress is not None:
+                    progress(self.moved, total)
+        except BaseException as fault:
+            self.stop = True
+            for future in waiting:
+                future.cancel()
+            wait(waiting)
+            if isinstance(fault, KeyboardInterrupt):
+                return False
+            raise
+        return True
+
+    def _begin_all(self, threads: int) -> None:
+        """The starts of all into what is moved, and into the first rows.
+
+        Raises ValueError where one is not finite, before any is moved.
+        """
+        if self.starts is None:
+            return
+        share = -(-self.count // threads)
+        parts = [(at, min(share, self.count - at)) for at in range(0, self.count, share)]
+        if len(parts) == 1:
+            self._begin(*parts[0])
+        else:
+            for future in [_pool(threads).submit(self._begin, *part) for part in parts]:
+                future.result()
+
+    def _begin(self, at: int, count: int) -> None:
+        assert self.starts is not None
+        q, qd, q_rows, qd_rows = self._places(at)
+        names = ("q0", q, q_rows), ("qd0", qd, qd_rows)
+        for start, (name, x, rows) in zip(self.starts, names, strict=True):
+            (far, across), wide = start.strides, start.dtype.itemsize == 8
+            first = start.__array_interface__["data"][0] + at * far
+            if not self.model._lib.batch_start(count, first, wide, far, across, x, rows, self.rows):
+                self.model._array(start, name, self.model.nq)  # raises, and says where
+
+    def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
+        """Instances at, ..., at + count - 1 through all steps, a piece of some time at once."""
+        model = self.model
+        pointer, null = model._pointer, model._c[2]
+        end = at + count
+        q, qd, q_rows, qd_rows = self._places(at)
+        done, status = (x + at for x in self.ends)
+        each = len(self.table) > 1
+        table = pointer(self.table[at:end] if each else self.table)
+        u, u_instance, u_step = null, 0, 0
+        if self.held is not None:
+            _, many, width = self.held.shape
+            u = pointer(self.held[at:end] if len(self.held) > 1 else self.held)
+            u_instance = many * width if len(self.held) > 1 else 0
+            u_step = width if many > 1 else 0
+        first, kind = 0, (self.step, count.bit_length())
+        # the first piece is short: another batch may have been quicker
+        many = max(1, int(_FIRST / (model._paces.get(kind, _SLOWEST * model.nq) * count)))
+        while first < self.steps and not self.stop:
+            many = min(many, self.steps - first)
+            begun = perf_counter()
+            failed = self.step(
+                count, q, qd, self.t0, self.h, first, many, u + first * u_step if u_step else u,
+                u_instance, u_step, self.every, q_rows, qd_rows, self.rows, table,
+                1 if each else 0, done, status,
+            )  # fmt: skip
+            spent = perf_counter() - begun
+            self.failed |= failed
+            first += many
+            self.moved += many * count  # a figure for the bar; threads may lose one another's
+            model._paces[kind] = max(1e-10, spent / (many * count))
+            many = longer(many, spent, _SECONDS)
+            look()
+
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+if hasattr(os, "register_at_fork"):  # a fork has the pools but none of their threads
+    os.register_at_fork(after_in_child=_pools.clear)
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads are kept for the next batch: starting them takes longer than a short one."""
+    if threads not in _pools:
+        _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="eomc")
+    return _pools[threads]

@@ -1,0 +1,243 @@
+"""D, C, g, accelerations and the other functions of a state: arrays in, arrays out.
+
+Shapes: q, qd (nq,) or (n, nq); then results have a leading n as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy import empty
+from numpy.typing import ArrayLike
+
+from .arguments import Arguments, Array, Parameters, as_number, unmasked
+from .slices import slices
+from .trajectory import SAID, STATUS, MotionError, state_text
+
+_OF_POSITION = ("D", "g", "potential_energy")
+_ROWS = 20_000  # rows times coordinates squared in one call, some ms at most
+
+
+class Functions(Arguments):
+    """The functions of a state that a compiled scene has."""
+
+    def _evaluate(
+        self, name: str, shape: tuple[int, ...], q: ArrayLike, qd: ArrayLike | None, t: float,
+        u: Any, params: Any, out: Any,
+    ) -> Any:  # fmt: skip
+        address, real, null = self._c
+        at: Any
+        moving: Array | None
+        if name in _OF_POSITION:
+            at, moving, from_q, from_qd = q, None, self._listed(q), null
+            if from_q is None:
+                at = self._array(q, "q", self.nq)
+                from_q = address(real, at)
+        else:
+            from_q, from_qd, at, moving = self._read(q, qd)
+        rows = at.shape[:-1]
+        result = self._out(out, rows + shape)
+        if rows and np.ndim(t):  # a time for each row
+            unmasked(t, "t")
+            if np.shape(t) != rows:
+                raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
+            for k, now in enumerate(np.asarray(t)):
+                row_qd = None if moving is None else moving[k]
+                result[k] = self._evaluate(name, shape, at[k], row_qd, now, u, params, None)
+            return result
+        time, (inputs, p) = as_number(t, "t"), self._given(u, params)
+        function = getattr(self._lib, name, None)
+        if function is None:  # no forces, no power
+            result[...] = 0
+        elif rows and rows[0] * self.nq**2 > _ROWS:
+            to, size = address(real, result), result[:1].size
+            for k, many in slices(rows[0], _ROWS // self.nq**2 + 1):
+                here = self.nq * k
+                moving_here = from_qd + here if moving is not None else null
+                function(many, to + size * k, from_q + here, moving_here, time, inputs, p)
+        else:
+            function(
+                rows[0] if rows else 1, address(real, result), from_q, from_qd, time, inputs, p
+            )
+        return result if result.ndim else result[()]
+
+    def _by_time(
+        self, name: str, t: Array, q: Array, qd: Array
+    ) -> Iterator[tuple[int, Array, Array]]:
+        """Rows that can be evaluated in one call: all of them, unless time matters."""
+        if name not in self._timed:
+            yield 0, q, qd
+        else:
+            for k in range(len(t)):
+                yield k, q[k : k + 1], qd[k : k + 1]
+
+    def D(self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
+        """D(q): mass matrix, (nq, nq), symmetric positive definite. Others call it M."""
+        return self._evaluate("D", (self.nq, self.nq), q, None, t, None, params, out)
+
+    def C(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """C(q, qd): Coriolis matrix, (nq, nq), Christoffel form: Ddot - 2 C is skew-symmetric."""
+        return self._evaluate("C", (self.nq, self.nq), q, qd, t, None, params, out)
+
+    def g(self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
+        """g(q) = dP/dq, (nq,): generalized forces of the potential energy."""
+        return self._evaluate("g", (self.nq,), q, None, t, None, params, out)
+
+    def bias(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """C(q, qd) qd + g(q), (nq,), without forming C."""
+        return self._evaluate("bias", (self.nq,), q, qd, t, None, params, out)
+
+    def tau(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
+        params: Parameters = None, out: Any = None,
+    ) -> Any:  # fmt: skip
+        """tau = Q - dR/dqd, (nq,): of inputs, friction and other forces. u None: the signals."""
+        return self._evaluate("tau", (self.nq,), q, qd, t, u, params, out)
+
+    def kinetic_energy(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """K(q, qd), J."""
+        return self._evaluate("kinetic_energy", (), q, qd, t, None, params, out)
+
+    def potential_energy(
+        self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None
+    ) -> Any:
+        """P(q), J."""
+        return self._evaluate("potential_energy", (), q, None, t, None, params, out)
+
+    def energy(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """K + P, J."""
+        return self._evaluate("energy", (), q, qd, t, None, params, out)
+
+    def jacobi(
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        out: Any = None,
+    ) -> Any:  # fmt: skip
+        """qd.dK/dqd - K + P, J: K + P where K is quadratic in qd, else what takes its place."""
+        name = "jacobi" if hasattr(self._lib, "jacobi") else "energy"
+        return self._evaluate(name, (), q, qd, t, None, params, out)
+
+    def power(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
+        params: Parameters = None, out: Any = None,
+    ) -> Any:  # fmt: skip
+        """d(jacobi)/dt, W: by inputs, friction and driven supports. u None: the signals."""
+        return self._evaluate("power", (), q, qd, t, u, params, out)
+
+    def signal(self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None) -> Any:
+        """The scene's own inputs at a state and time, (nu,)."""
+        return self._evaluate("signal", (self.nu,), q, qd, t, None, params, None)
+
+    def acceleration(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
+        params: Parameters = None, out: Any = None,
+    ) -> Array:  # fmt: skip
+        """Qdd from D qdd + C qd + g = tau, (nq,). u None: the scene's signals.
+
+        Raises MotionError where D is singular or a result is not finite.
+        """
+        from_q, from_qd, at, moving = self._read(q, qd)
+        made = result = empty(at.shape, self.dtype)
+        if out is not None:
+            result = self._out(out, at.shape)
+        inputs, p = self._given(u, params)
+        to, time, first = self._pointer(made), as_number(t, "t"), 0
+        count = 1 if at.ndim == 1 else len(at)
+        if count * self.nq**2 <= _ROWS:
+            found = self._lib.acceleration(count, to, from_q, from_qd, time, inputs, p)
+        else:
+            for first, many in slices(count, _ROWS // self.nq**2 + 1):
+                k = self.nq * first
+                found = self._lib.acceleration(
+                    many, to + k, from_q + k, from_qd + k, time, inputs, p
+                )
+                if found & 3:
+                    break
+        if found & 3:
+            done, said = first + (found >> 2), STATUS[found & 3]
+            where = state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
+            what = SAID[said] if said == "singular" else "the acceleration is not finite there"
+            raise MotionError(f"at {where}: {what}", said)
+        if made is not result:
+            result[...] = made
+        return result
+
+    @property
+    def has_slopes(self) -> bool:
+        """Whether the module was built with the derivatives of its accelerations."""
+        return hasattr(self._lib, "linearization")
+
+    def linearize(
+        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Parameters = None
+    ) -> tuple[Array, Array]:
+        """d[q; qd]/dt = A dx + B du near a state, x = [q; qd]: A (2 nq, 2 nq), B (2 nq, nu).
+
+        Upper rows of A: [0, 1]; lower ones [dqdd/dq, dqdd/dqd], in rad or m per s^2 and per rad,
+        m or their rates; of B: 0, then dqdd/du. Exact derivatives, to rounding. u None: held at
+        the scene's signals, where these depend on the state as well.
+        Raises MotionError as `acceleration` does, ValueError where the module lacks them.
+        """
+        if not self.has_slopes:
+            raise ValueError(
+                f"linearize: {self.name} was built without it: a scene asks with [run] "
+                "linearize = true"
+            )
+        at, moving = self._one(q, qd)
+        n, m = self.nq, self.nu
+        A_q, A_qd, B_u = (empty((n, w), self.dtype) for w in (n, n, m))
+        status = self._ffi.new("int *")
+        self._lib.linearization(
+            1, self._pointer(A_q), self._pointer(A_qd), self._pointer(B_u if m else None),
+            self._pointer(at), self._pointer(moving), as_number(t, "t"),
+            *self._given(u, params), status,
+        )  # fmt: skip
+        if status[0]:
+            said = STATUS[status[0]]
+            what = SAID[said] if said == "singular" else "a derivative is not finite there"
+            raise MotionError(f"at {state_text(at, moving)}: {what}", said)
+        A, B = np.zeros((2 * n, 2 * n), self.dtype), np.zeros((2 * n, m), self.dtype)
+        A[:n, n:] = np.eye(n)
+        A[n:, :n], A[n:, n:], B[n:] = A_q, A_qd, B_u
+        return A, B
+
+    def sensitivity(
+        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Parameters = None
+    ) -> Array:
+        """dqdd/dp at a state, (nq, np), parameters in their order; exact derivatives, u held.
+
+        Raises MotionError where a derivative is not finite, ValueError where the module lacks them.
+        """
+        if not hasattr(self._lib, "sensitivity"):
+            raise ValueError(
+                f"sensitivity: {self.name} was built without it: a scene with parameters asks with "
+                '[run] linearize = "parameters"'
+            )
+        shape = (self.nq, len(self.parameters))
+        E: Array = self._evaluate("sensitivity", shape, q, qd, t, u, params, None)
+        if not np.isfinite(E).all():
+            where = state_text(np.asarray(q), np.asarray(qd))
+            raise MotionError(f"at {where}: a derivative is not finite there", "not finite")
+        return E
+
+    def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
+        """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
+        n, state = self.nq, np.asarray(unmasked(x, "x"), self.dtype)
+        if state.shape != (2 * n,):
+            raise ValueError(f"x: shape {state.shape}, expected ({2 * n},): q, then qd")
+        out = empty(2 * n, self.dtype)
+        out[:n] = state[n:]
+        out[n:] = self.acceleration(state[:n], state[n:], t, u, params)
+        return out

@@ -1,0 +1,324 @@
+"""What every compiled scene offers in Python: arrays in, arrays out, the loop in C.
+
+This file and its neighbours are copied beside each compiled extension, so that a built scene needs
+NumPy and cffi only. Angles in rad, everything in SI units.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from math import ceil, isfinite
+from time import perf_counter
+from typing import Any
+
+from numpy import empty
+from numpy.typing import ArrayLike
+
+from .arguments import Array, Parameters, as_count, as_number, as_step_size, machine_memory
+from .estimate import advice
+from .functions import Functions
+from .package import reduced
+from .slices import longer
+from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
+
+Inputs = ArrayLike | Callable[[float, Array, Array], ArrayLike] | None
+
+_MANY = 1000  # steps from which a look at the stability limit is worth its time
+LARGE = 2**24  # positions from which a look at the memory is worth its time
+_CHUNK = 16_384  # steps times coordinates before the first look, some ms
+RARELY = 2**48  # steps from row to row, more than any run makes
+_MOST = 2**60  # steps, so that C can return four times as many
+
+
+class Model(Functions):
+    """The functions of one compiled scene; the package hands them on under their own names."""
+
+    def __init__(
+        self, extension: Any, *, h: float, duration: float,
+        methods: Mapping[str, tuple[int, int, float, float]], **scene: Any,
+    ) -> None:  # fmt: skip
+        """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
+        super().__init__(extension, **scene)
+        self.h, self.duration = h, duration
+        self.methods = tuple(methods)
+        self.orders = {name: order for name, (order, *_) in methods.items()}
+        self.limits = {name: (turn, decay) for name, (_, _, turn, decay) in methods.items()}
+        self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
+        self._warned: set[Any] = set()  # methods with a step size, and u
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("_model._again", self.digest)
+
+    def _again(self, digest: str) -> Model:
+        """Itself, found by a value that was pickled; a warning where the scene was another then."""
+        if digest != self.digest:
+            warnings.warn(
+                f"{self.name}: this was pickled from another version of the scene; what is "
+                "computed from it now is of the present version",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return self
+
+    def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
+        """A method's step and loop in C, steps at once, stages; what is kept and counted."""
+        step, run = (getattr(self._lib, f"{name}_{what}") for what in ("step", "run"))
+        work = self._ffi.typeof(f"{name}_work *")
+        counted = getattr(self._lib, f"{name}_evaluations", None)
+        short = -1 if counted else min(_MANY - 1, _CHUNK // self.nq)
+        return step, run, short, stages, work, counted
+
+    def step(
+        self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
+        params: Parameters = None, method: str | None = None,
+        out: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """(q, qd) one step of size h later; u is held over the step.
+
+        u None: the scene's signals, followed through the step. Raises MotionError where the step
+        can't be made; `out` is untouched then.
+        """
+        from_q, from_qd, at, moving = self._read(q, qd)
+        if at.ndim != 1:
+            self._one(q, qd)
+        h = self.h if h is None else as_step_size(h, self.dtype)
+        inputs, p = self._given(u, params)
+        address, real, null = self._c
+        if out is None:
+            both = empty((2, self.nq), self.dtype)
+            ends, to_q, to_qd = (both[0], both[1]), address(real, both), null
+        else:
+            ends = self._pair(out, at.shape)
+            to_q, to_qd = address(real, ends[0]), address(real, ends[1])
+        step = self._loops[self._method(method)][0]
+        found = step(to_q, to_qd, from_q, from_qd, as_number(t, "t"), h, inputs, p)
+        if found:
+            said = STATUS[found]
+            raise MotionError(
+                f"no step from t = {t:.9g}, {state_text(at, moving)}: {SAID[said]}", said
+            )
+        return ends
+
+    def _method(self, method: str | None) -> str:
+        """The name of a method that the module has."""
+        if method is None:
+            return self.methods[0]
+        if method not in self.methods:
+            raise ValueError(
+                f"method: {method!r} is not in this module, which has {', '.join(self.methods)}: "
+                "a scene asks for several with a list, [run] method = [...]"
+            )
+        return method
+
+    def _stepper(self, method: str | None, what: str) -> Any:
+        """The C function of a method: its step, run or batch."""
+        return getattr(self._lib, f"{self._method(method)}_{what}")
+
+    def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
+        if steps is not None:
+            if duration is not None:
+                raise ValueError("steps: give steps or duration, not both")
+            count = as_count(steps, "steps", 0)
+            if count > _MOST:
+                raise ValueError(f"steps: {count:.3g} are more than a run can count, {_MOST:.3g}")
+            return count
+        time = self.duration if duration is None else as_number(duration, "duration")
+        if time < 0:
+            raise ValueError(f"duration: {duration} is not a time in s")
+        if time / h > _MOST:
+            raise ValueError(
+                f"duration: {time:g} s are more steps of h = {h:g} s than a run can count, "
+                f"{_MOST:.3g}: take a larger h, or a shorter duration"
+            )
+        # the first multiple of h that is not before the duration, rounding aside
+        return ceil(time / h * (1 - 1e-12))
+
+    def simulate(
+        self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
+        duration: float | None = None, steps: int | None = None, every: int = 1,
+        u: Inputs = None, params: Parameters = None, method: str | None = None, *, t0: float = 0.0,
+        out: tuple[Array, Array] | None = None,
+        progress: Callable[[int, int], None] | None = None, estimate: bool = False,
+    ) -> Run:  # fmt: skip
+        """A trajectory by fixed steps of size h, the loop in C and the GIL released.
+
+        q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration.
+        every: a row is kept of every so many steps, and the first and last state always.
+        method: one of `methods`, the first of them where None.
+        u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; or
+        a function u(t, q, qd) called before each step, which is some hundred times slower.
+        out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
+        estimate: whether to find the run's own error, `run.error`, by doing it again in shorter
+        steps, which takes some nine times as long.
+        A run that can't go on keeps what it has, warns, and says in `status` and `message` where
+        and why. Ctrl-C raises Interrupted, which holds the run so far.
+        """
+        method = self.methods[0] if method is None else self._method(method)
+        q, qd = self._start
+        from_q, from_qd, at_p = self._at
+        if q0 is not None:
+            q, from_q = self._from(q0, "q0")
+        if qd0 is not None:
+            qd, from_qd = self._from(qd0, "qd0")
+        h = self.h if h is None else as_step_size(h, self.dtype)
+        p = self._p0
+        if params is not None:
+            p = self._parameters(params).copy()
+            at_p = self._pointer(p)
+        if (
+            type(steps) is int and type(every) is int and type(t0) is float and isfinite(t0)
+            and u is None and duration is None and out is None and progress is None
+            and 0 < every <= RARELY and not estimate
+        ):  # fmt: skip
+            # few steps, nothing unusual: all else, and what fails, goes the long way
+            _, run, short, stages, _, _ = self._loops[method]
+            if 0 <= steps <= short:
+                address, real, null = self._c
+                rows = empty((2, 1 - -steps // every, self.nq), self.dtype)
+                if run(
+                    address(real, rows), null, from_q, from_qd, t0, h, steps, null, 0,
+                    every, at_p, null,
+                ) == 4 * steps:  # fmt: skip
+                    return Run(
+                        self, t0, rows, h, steps, "ok", p, every, None, method, stages * steps
+                    )
+        t0 = as_number(t0, "t0")
+        steps = self._steps(h, duration, steps)
+        every = min(as_count(every, "every", 1), RARELY)
+        if steps >= _MANY and (method, h) not in self._warned:
+            self._warned.add((method, h))
+            first = self._table(u, steps)[1]
+            if first is not None and first.ndim == 2:
+                first = first[0]
+            if words := advice(self, q, qd, h, t0, first, p, method):
+                warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=2)
+        result = self._trajectory(
+            q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress
+        )
+        if result.status != "ok":
+            if result.status == "interrupted":
+                raise Interrupted(result)
+            warnings.warn(f"{self.name}: {result.message}", RuntimeWarning, stacklevel=2)
+        if estimate:
+            result.estimate()
+        return result
+
+    def advice(
+        self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
+        u: ArrayLike | None = None, params: Parameters = None, method: str | None = None, *,
+        t0: float = 0.0,
+    ) -> str | None:  # fmt: skip
+        """Where h is beyond the stability limit of the method at a start: that, in a sentence."""
+        q, qd = self.start
+        if q0 is not None or qd0 is not None:
+            q, qd = self._state(q if q0 is None else q0, qd if qd0 is None else qd0)
+        given, method = self._parameters(params), self._method(method)
+        h = self.h if h is None else as_step_size(h, self.dtype)
+        return advice(self, q, qd, h, as_number(t0, "t0"), u, given, method)
+
+    def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
+        """A start, (nq,), and what C reads it from."""
+        if (numbers := self._listed(x0)) is not None:
+            return x0, numbers  # type: ignore[return-value]  # an array, as was seen
+        x = self._array(x0, name, self.nq)
+        if x.ndim != 1:
+            raise ValueError(f"q0, qd0: expected one state, ({self.nq},)")
+        return x, self._pointer(x)
+
+    def _trajectory(
+        self, q: Array, qd: Array, from_q: Any, from_qd: Any, h: float, steps: int, every: int,
+        u: Any, p: Array, at_p: Any, method: str, t0: float, out: tuple[Array, Array] | None,
+        progress: Callable[[int, int], None] | None,
+    ) -> Run:  # fmt: skip
+        """A run from checked arguments, whatever its status; C reads from_q, from_qd and at_p."""
+        _, run, _, stages, work_type, counted = self._loops[method]
+        nq, (address, real, null) = self.nq, self._c
+        law, held, stride = (None, None, 0) if u is None else self._table(u, steps)
+        rows = 1 - -steps // every
+        both: Any = out
+        try:
+            if out is not None:
+                both = self._pair(out, (rows, nq))
+            elif rows * nq > LARGE and self._bytes(rows) > machine_memory():
+                raise MemoryError
+            else:
+                both = empty((2, rows, nq), self.dtype)
+        except MemoryError:
+            raise MemoryError(
+                f"{rows} rows of {2 * nq} numbers don't fit in memory: keep fewer with every="
+            ) from None
+        q_rows, qd_rows = both[0], both[1]
+        to_q, to_qd = address(real, q_rows), address(real, qd_rows)
+        at_u = null if held is None else address(real, held)
+        # a step of an implicit method may solve for all its stages
+        done, chunk = 0, 1 if law else _CHUNK // (nq**3 if counted else nq) or 1
+        # what goes from one call to the next, and what is counted; a single call may do without
+        single = steps <= chunk and counted is None
+        work = null if single else self._ffi.new(work_type)
+        try:
+            while True:
+                if law and done < steps:
+                    if done:  # else the start is not among the rows yet
+                        row = -(-done // every)
+                        q, qd = q_rows[row], qd_rows[row]
+                    held = self._inputs(law(t0 + done * h, q.copy(), qd.copy()))
+                    if held is None:
+                        raise ValueError("u: the function returned None, not the inputs")
+                    at_u = address(real, held)
+                count = steps - done
+                if count > chunk:
+                    count, begun = chunk, perf_counter()
+                found = run(
+                    to_q, to_qd, from_q, from_qd, t0, h, count, at_u, stride, every, at_p, work
+                )
+                done, said = found >> 2, STATUS[found & 3]
+                if said != "ok":
+                    break
+                if progress is not None and done:
+                    progress(done, steps)
+                if done == steps:
+                    break
+                if not law:
+                    chunk = longer(count, perf_counter() - begun)
+        except KeyboardInterrupt:
+            done, said = work.done if work else done, "interrupted"
+            if not done:
+                q_rows[0], qd_rows[0] = q, qd
+        if done < steps:
+            kept = 1 - -done // every
+            both = q_rows[:kept], qd_rows[:kept]
+        evaluations = counted(work) if counted else stages * done
+        return Run(
+            self, t0, both, h, done, said, p, every, u if law else held, method,
+            evaluations,
+        )  # fmt: skip
+
+    def _bytes(self, rows: int) -> int:
+        return rows * 2 * self.nq * self.dtype.itemsize
+
+    def _table(self, u: Any, steps: int) -> tuple[Callable[..., Any] | None, Array | None, int]:
+        """(function, held values, values from one step to the next)."""
+        if u is None:
+            return None, None, 0
+        if not self.nu:
+            raise ValueError("u: this scene has no inputs")
+        if callable(u):
+            if "u" not in self._warned:
+                self._warned.add("u")
+                warnings.warn(
+                    f"{self.name}: u is a Python function, called before each step: some hundred "
+                    "times slower than a table (steps, nu) or the scene's own signal",
+                    RuntimeWarning,
+                    stacklevel=4,
+                )
+            return u, None, 0
+        array = self._numbers(u, "u")
+        if self.nu == 1 and array.ndim < 2 and array.size:
+            array = array.reshape((-1, 1) if array.size > 1 else 1)
+        array = self._array(array, "u", self.nu)
+        if array.ndim == 1:
+            return None, array, 0
+        if len(array) != steps:
+            raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a step")
+        return None, array, self.nu

@@ -1,0 +1,242 @@
+"""Runs, and how they end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .arguments import Array
+from .estimate import Estimate, estimate
+from .package import reduced
+
+if TYPE_CHECKING:
+    from .model import Model
+
+STATUS = ("ok", "singular", "not finite", "no convergence")
+SAID = {
+    "singular": "D is not positive definite there, so no acceleration exists",
+    "not finite": "the state would no longer be finite: the step may be too long, "
+    "or the motion runs into a singularity",
+    "no convergence": "the iteration for the step does not converge: take a smaller h",
+    "interrupted": "interrupted",
+}
+_LEFT_OUT = "u was a function, which a pickled run doesn't keep: simulate again"
+
+
+class MotionError(ArithmeticError):
+    """There is no acceleration or step at a state; `status` says why, as that of a run."""
+
+    def __init__(self, message: str, status: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("trajectory.MotionError", str(self), self.status)
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a simulation; `run` holds what was done until then."""
+
+    def __init__(self, run: Any) -> None:
+        super().__init__(run.message)
+        self.run = run
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("trajectory.Interrupted", self.run)
+
+
+class _Half:
+    """q or qd of a run: a half of its rows, made when it is first asked for, and kept."""
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, run: Run | None, owner: type) -> Array:
+        if run is None:
+            return self  # type: ignore[return-value]  # on the class, as for help()
+        half: Array = run._rows[self.index]
+        run.__dict__[self.name] = half
+        return half
+
+
+class Run:
+    """A trajectory: t (n,), q (n, nq), qd (n, nq), status.
+
+    status: "ok", "singular", "not finite", "no convergence" or "interrupted"; a run that is not ok
+    ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
+    when it is asked for; `steps` were done by `method`, of size h, and a row kept of `every` so
+    many. evaluations: of accelerations. error: an Estimate, where it was asked for.
+
+    Runs are equal where their scene, settings and rows are, bit by bit. A pickled run keeps all of
+    that, its parameters and its inputs, but not a u that is a function: estimate() is refused then.
+    Where it is read again, it finds the built module as it was found here.
+    """
+
+    q, qd = _Half(0), _Half(1)
+    error: Estimate | None = None
+    _energy: Array | None = None
+
+    def __init__(
+        self, model: Model, t0: float, rows: Array | tuple[Array, Array], h: float, steps: int,
+        status: str, params: Array, every: int, u: Any, method: str, evaluations: int,
+    ) -> None:  # fmt: skip
+        """rows: q and qd, in one array (2, n, nq) or two."""
+        self.t0 = t0
+        self.h = h
+        self.steps = steps
+        self.status = status
+        self.every = every
+        self.method = method
+        self.evaluations = evaluations
+        self._model = model
+        self._rows = rows
+        self._params = params
+        self._u = u
+
+    @cached_property
+    def t(self) -> Array:
+        """The times of the rows, (n,), s."""
+        return self.t0 + self.h * np.minimum(self.every * np.arange(len(self.q)), self.steps)
+
+    @property
+    def energy(self) -> Array:
+        """K + P along the run, (n,), J."""
+        if self._energy is None:
+            self._energy = self._values("energy")
+        return self._energy
+
+    @property
+    def jacobi(self) -> Array:
+        """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic."""
+        return self._values("jacobi")
+
+    def _values(self, name: str) -> Array:
+        function = getattr(self._model, name)
+        values = [
+            np.atleast_1d(function(q, qd, t=float(self.t[k]), params=self._params))
+            for k, q, qd in self._model._by_time(name, self.t, self.q, self.qd)
+        ]
+        return np.concatenate(values)
+
+    def estimate(self, progress: Callable[[int, int], None] | None = None) -> Estimate:
+        """The run's own error, by doing it again in shorter steps; kept in `error`.
+
+        Where u is a function, it is called again, as often as in the run for each finer one.
+        Raises ValueError where the run was pickled and lost that function.
+        """
+        if isinstance(self._u, str):
+            raise ValueError(f"estimate: {self._u}")
+        try:
+            self.error = estimate(self, progress)
+        except KeyboardInterrupt:
+            raise Interrupted(self) from None
+        return self.error
+
+    def _again(
+        self, parts: int, every: int, nudge: Array | None,
+        progress: Callable[[int, int], None] | None,
+    ) -> Run:  # fmt: skip
+        """The same motion in steps of h/parts, from a start moved by `nudge` (2 nq,)."""
+        model, x = self._model, self.x[0]
+        if nudge is not None:
+            x = (x + nudge).astype(model.dtype)
+        u = self._u
+        if callable(u):
+            u = held_law(u, parts)
+        elif u is not None and np.ndim(u) == 2:
+            u = np.repeat(u[: self.steps], parts, axis=0)
+        return model._trajectory(
+            x[: model.nq], x[model.nq :], model._pointer(x[: model.nq]),
+            model._pointer(x[model.nq :]), self.h / parts, self.steps * parts, every, u,
+            self._params, model._pointer(self._params), self.method, float(self.t[0]), None,
+            progress,
+        )  # fmt: skip
+
+    def _state(self) -> dict[str, Any]:
+        """All but what is made when it is asked for."""
+        made = ("t", "q", "qd")
+        return {name: value for name, value in self.__dict__.items() if name not in made}
+
+    @classmethod
+    def _of_state(cls, state: dict[str, Any]) -> Run:
+        run = cls.__new__(cls)
+        run.__dict__.update(state)
+        return run
+
+    def __copy__(self) -> Run:
+        return self._of_state(self._state())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Run:
+        return self._of_state(deepcopy(self._state(), memo))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = self._state()
+        if callable(self._u):
+            state["_u"] = _LEFT_OUT
+        return reduced("trajectory.Run._of_state", state)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Run):
+            return NotImplemented
+        alike = self._settings() == other._settings()
+        return alike and np.array_equal(self.q, other.q) and np.array_equal(self.qd, other.qd)
+
+    __hash__ = None  # type: ignore[assignment]  # rows may be changed
+
+    def _settings(self) -> tuple[Any, ...]:
+        model = self._model
+        return (
+            model.name, model.digest, self.t0, self.h, self.steps, self.status, self.every,
+            self.method, self._params.tolist(),
+        )  # fmt: skip
+
+    @property
+    def x(self) -> Array:
+        """The states [q; qd], (n, 2 nq)."""
+        return np.hstack([self.q, self.qd])
+
+    @property
+    def message(self) -> str:
+        """What happened, in a sentence."""
+        if self.status == "ok":
+            return f"{self.steps} steps of {self.h:g} s"
+        return (
+            f"stopped at t = {self.t[-1]:.9g} after {self.steps} steps of {self.h:g} s, "
+            f"{state_text(self.q[-1], self.qd[-1])}: {SAID[self.status]}"
+        )
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __repr__(self) -> str:
+        return f"<Run of {self._model.name}: {self.message}>"
+
+
+def held_law(law: Callable[..., Any], parts: int) -> Callable[..., Any]:
+    """A law u(t, q, qd) that is called before every `parts`-th step, and held between."""
+    done, u = 0, None
+
+    def held(t: float, q: Array, qd: Array) -> Any:
+        nonlocal done, u
+        if done % parts == 0:
+            u = law(t, q, qd)
+        done += 1
+        return u
+
+    return held
+
+
+def state_text(q: Array, qd: Array) -> str:
+    """A state in a message."""
+
+    def text(x: Array) -> str:
+        return np.array2string(x, precision=6, threshold=12)
+
+    return f"q = {text(q)}, qd = {text(qd)}"

@@ -1,0 +1,242 @@
+"""Built modules: found by a key, built under a lock, loaded.
+
+A module lies in `build/<name>/`. Its extension carries a digest in its name, and `__init__.py`,
+which says which extension is its own, is moved into place last: whatever interrupts a build, what
+was there before stays whole. A file lock keeps builds of one scene apart.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import importlib.util
+import json
+import os
+import shutil
+import stat
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from eomc.base import resources
+from eomc.base.errors import EomcError, FolderError
+from eomc.base.version import __version__
+from eomc.toolchain.compiler import MANY, STANDARD, compiler_for, flags, processor, standard
+
+if TYPE_CHECKING:
+    from eomc.emit.render import Sources
+
+MANIFEST = "build.json"
+_NO_LOCK = "{}: is no file, and builds of a scene lock one there: remove it"
+
+
+@dataclass(frozen=True)
+class Built:
+    """A module on disk; `fresh` where it was built just now and not found."""
+
+    name: str
+    folder: Path
+    fresh: bool
+
+
+@lru_cache(maxsize=1)
+def _generator_digest() -> str:
+    """What the generator is: its version and the text of all its parts."""
+    total = hashlib.sha256(__version__.encode())
+    for name, file in resources.parts():
+        total.update(name.encode() + file.read_bytes())
+    return total.hexdigest()
+
+
+def key(scene_digest: str, form: str = "fast") -> str:
+    """The digest of all that a build depends on: scene, generator, flags, compiler, processor."""
+    small, large = compiler_for(0), compiler_for(MANY + 1)
+    parts = (
+        scene_digest, form, _generator_digest(), small.identity, large.identity,
+        STANDARD, *flags(form), processor(), sys.version,
+        str(sysconfig.get_config_var("EXT_SUFFIX")),
+    )  # fmt: skip
+    # a variable of the environment may hold bytes that are no text
+    return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()
+
+
+def found(folder: Path, wanted: str) -> bool:
+    """Whether `folder` holds a whole build of this key, each file with its digest.
+
+    A single bit that has changed in an extension may end the process that loads it.
+    """
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        return manifest["key"] == wanted and all(
+            _digest(folder / name) == digest for name, digest in manifest["files"].items()
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+
+
+def _digest(file: Path) -> str:
+    """SHA-256; some 0.3 ms for a small scene."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def build(
+    name: str,
+    wanted: str,
+    sources: Callable[[str], Sources],
+    root: Path,
+    form: str = "fast",
+) -> Built:
+    """The module of one scene under `root`, built where it isn't there yet.
+
+    wanted: the key. sources: makes the files, given the name of the extension; called only where
+    something is to be built. form: of the C that it is compiled from.
+    Raises EomcError where the compiler fails, with its own words, or the folder can't be written.
+    """
+    folder = place(name, root, form)
+    root = folder.parent
+    if found(folder, wanted):
+        return Built(name, folder, False)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with _locked(root / f".{folder.name}.lock"):
+            if found(folder, wanted):  # by another process, meanwhile
+                return Built(name, folder, False)
+            _free(folder)
+            for left in root.glob(f".{folder.name}.build-*"):  # by a build that was killed
+                shutil.rmtree(left, ignore_errors=True)
+            with tempfile.TemporaryDirectory(dir=root, prefix=f".{folder.name}.build-") as new:
+                _build(name, wanted, sources, folder, Path(new), form)
+    except OSError as fault:
+        raise FolderError(
+            f"{fault.filename or folder}: can't be written ({fault.strerror})"
+        ) from None
+    return Built(name, folder, True)
+
+
+def place(name: str, root: Path, form: str = "fast") -> Path:
+    """The folder of a scene's module; that of the plain form, for comparison, lies inside it."""
+    return root / name if form == "fast" else root / name / ".plain"
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """A lock on a file that is made where it isn't there; nothing is written to it.
+
+    Raises EomcError where something else lies there: no link is followed, no pipe waited for.
+    """
+    try:
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        lock = os.open(path, flags, 0o666)
+    except OSError as fault:
+        if fault.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV):
+            raise
+        raise EomcError(_NO_LOCK.format(path)) from None
+    try:
+        if not stat.S_ISREG(os.fstat(lock).st_mode):
+            raise EomcError(_NO_LOCK.format(path))
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
+
+
+def _free(folder: Path) -> None:
+    """An EomcError where a folder holds a package that no build made, or is none."""
+    if folder.is_symlink() or folder.exists():
+        if not folder.is_dir():
+            raise EomcError(f"{folder}: is in the way of the module: remove it, or use --build DIR")
+        if (folder / "__init__.py").exists() and not (folder / "slices.py").exists():
+            raise EomcError(
+                f"{folder}: is a package that eomc did not build, and stays as it is: "
+                "rename the scene, or use --build DIR"
+            )
+
+
+def _build(
+    name: str,
+    wanted: str,
+    sources: Callable[[str], Sources],
+    folder: Path,
+    new: Path,
+    form: str,
+) -> None:
+    from eomc.toolchain import extension
+
+    called = f"_{name}_{wanted[:12]}"
+    made = sources(called)
+    for file, text in made.files.items():
+        (new / file).parent.mkdir(exist_ok=True)
+        # the name of a scene's file may be no text
+        (new / file).write_text(text, encoding="utf-8", errors="backslashreplace")
+    library = called + str(sysconfig.get_config_var("EXT_SUFFIX"))
+    compiler = compiler_for(made.operations)
+    extension.build(made, called, new, library, compiler, form)
+    kept = [library, *(f for f in made.files if form == "fast" or f.endswith(".py"))]
+    manifest = {
+        "key": wanted,
+        "name": name,
+        "eomc": __version__,
+        "compiler": " ".join(compiler.command),
+        "flags": " ".join((standard(form), *flags(form, made.wide))),
+        "files": {file: _digest(new / file) for file in kept},
+    }
+    (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    for file in kept:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
+    # the face last: until it is there, the old one is whole; the manifest after it
+    for file in [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST]:
+        os.replace(new / file, folder / file)
+    for path in stale:
+        path.unlink(missing_ok=True)
+
+
+def load(built: Built) -> ModuleType:
+    """Import a built module, whatever else bears its name; the same build gives the same module."""
+    manifest = json.loads((built.folder / MANIFEST).read_text(encoding="utf-8"))
+    alias = f"_eomc_{built.name}_{manifest['key'][:12]}"
+    if alias in sys.modules:
+        return sys.modules[alias]
+    spec = importlib.util.spec_from_file_location(
+        alias, built.folder / "__init__.py", submodule_search_locations=[str(built.folder)]
+    )
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[alias] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[alias]
+        raise
+    # another process can't import the alias; what is pickled here is found by its place there
+    place = (built.name, str(built.folder.resolve()), alias)
+    sys.modules[f"{alias}.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
+    return module
+
+
+def unpickled(name: str, folder: str, alias: str, path: str, arguments: tuple[Any, ...]) -> Any:
+    """A value pickled by a module that `load` had loaded; pickle calls this.
+
+    Raises EomcError where the module is no longer there; a MotionError is made all the same, since
+    pools of processes wait for ever for what can't be read.
+    """
+    try:
+        if alias not in sys.modules:
+            alias = load(Built(name, Path(folder), False)).__name__
+    except (OSError, ValueError, KeyError, ImportError):
+        if path == "trajectory.MotionError":
+            from eomc.runtime.trajectory import MotionError
+
+            return MotionError(*arguments)
+        raise EomcError(
+            f"{folder}: the module that pickled this is not there: build the scene again"
+        ) from None
+    return importlib.import_module(f"{alias}.package").made(path, arguments)

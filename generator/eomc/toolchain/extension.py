@@ -1,0 +1,109 @@
+"""Sources to a compiled extension: cffi's wrapper, two compilations, a link, a trial."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shlex
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eomc.base.errors import EomcError
+from eomc.toolchain.compiler import STANDARD, Compiler, flags, standard
+
+if TYPE_CHECKING:
+    from eomc.emit.render import Sources
+
+
+def build(
+    made: Sources, extension: str, folder: Path, library: str, compiler: Compiler, form: str
+) -> None:
+    """Compile the sources that lie in `folder` and link `library` there; it can be loaded then.
+
+    Raises EomcError where the compiler fails, with its own words.
+    """
+    import cffi
+
+    name = made.name
+    ffi = cffi.FFI()
+    ffi.cdef(made.cdef)
+    ffi.set_source(extension, made.binding, compiler_verbose=0)
+    at = "fast/" if form == "fast" else ""  # where the header lies that the binding includes
+    ffi.emit_c_code(str(folder / f"{at}binding.c"))
+    include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
+    common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
+    jobs = [
+        [*common, standard(form), *flags(form, made.wide), "-c", f"{at}{name}.c", "-o", "scene.o"],
+        # the wrapper's speed is that of the calls in it
+        [*common, STANDARD, "-O1", *include, "-c", f"{at}binding.c", "-o", "binding.o"],
+    ]
+    running = []
+    try:
+        for job in jobs:
+            running.append((job, _start(job, folder)))  # Ctrl-C may come between them
+        for job, process in running:
+            _finish(name, job, process)
+    finally:
+        for _, process in running:  # none goes on where another failed
+            process.kill()
+            process.wait()
+    link = [*compiler.command, "-shared", "scene.o", "binding.o", "-lm", "-o", library]
+    if sys.platform == "darwin":
+        link.insert(1, "-undefined")
+        link.insert(2, "dynamic_lookup")
+    _finish(name, link, _start(link, folder))
+    _try(name, extension, folder / library, compiler)
+
+
+# imports an extension from a file, with nothing of Python's own start-up but cffi's backend
+_TRIAL = """
+import sys
+sys.path.append(sys.argv[1])
+from importlib.machinery import ExtensionFileLoader, ModuleSpec
+loader = ExtensionFileLoader(sys.argv[2], sys.argv[3])
+loader.exec_module(loader.create_module(ModuleSpec(sys.argv[2], loader, origin=sys.argv[3])))
+"""
+
+
+def _try(name: str, extension: str, library: Path, compiler: Compiler) -> None:
+    """Load a new extension in a process of its own (some 10 ms), before it replaces another.
+
+    Raises EomcError where it can't be loaded, or ends that process.
+    """
+    backend = importlib.util.find_spec("_cffi_backend")
+    assert backend is not None and backend.origin is not None
+    where = os.path.dirname(backend.origin)
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", _TRIAL, where, extension, str(library.resolve())],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="backslashreplace",
+    )  # fmt: skip
+    if done.returncode:
+        lines = done.stderr.strip().splitlines()
+        said = lines[-1] if lines else f"status {done.returncode}"
+        raise EomcError(
+            f"{name}: the C compiler {shlex.join(compiler.command)} returned 0, but what it made "
+            f"can't be loaded: correct CC and EOMC_CFLAGS; the last build stays\n  {said}"
+        )
+
+
+def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
+    try:
+        return subprocess.Popen(
+            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="backslashreplace",
+        )  # fmt: skip
+    except OSError as fault:
+        raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
+
+
+def _finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) -> None:
+    words, _ = process.communicate()
+    if process.returncode:
+        raise EomcError(
+            f"{name}: the C compiler failed (status {process.returncode}):\n"
+            f"  {shlex.join(command)}\n{words.rstrip()}"
+        )
