@@ -200,7 +200,7 @@ def cold(path: Path, name: str, root: str) -> float:
 
 def row(case: Case, rounds: int) -> str:
     """The scene's line of the table."""
-    from eomc.scene import scene
+    from eomc.scene import read as scene
 
     rows, colds = [], []
     with tempfile.TemporaryDirectory() as folder:

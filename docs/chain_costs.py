@@ -20,7 +20,7 @@ import sympy
 from eomc.derive import lagrange
 from eomc.model.system import System, from_scene
 from eomc.program import program
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import symbolic
 
 

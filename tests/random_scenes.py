@@ -34,7 +34,7 @@ from eomc.base.errors import EomcError
 from eomc.emit.render import Sources
 from eomc.model import system
 from eomc.model.system import System
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.toolchain import compiler as compiler
 from eomc.verify.check import check
 

@@ -48,7 +48,7 @@ from eomc.emit.fast import context
 from eomc.model import system
 from eomc.model.system import System
 from eomc.report import equations_text
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ from conftest import ROOT, needs
 
 import eomc
 from eomc.model import system
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 # both headers in one file, and which way each goes
 PROBE = f"""

@@ -25,7 +25,7 @@ SEEDS = ("0", "4242")
 
 GENERATE = """
 import eomc, json, sys
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.model import system
 from pathlib import Path
 out = {}

@@ -27,7 +27,7 @@ from eomc.emit.render import Sources
 from eomc.model import system
 from eomc.model.system import System
 from eomc.program import outline
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify.check import check
 
 STRICT = """-std=c99 -pedantic -Wall -Wextra -Wconversion -Wdouble-promotion -Wshadow

@@ -24,7 +24,7 @@ from eomc.model.system import System, dot, symbol, t
 from eomc.program import program
 from eomc.program.ir import Call, Function, evaluate
 from eomc.program.lower import lower
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify.taylor import Jets
 
 EPS = 2.0**-52

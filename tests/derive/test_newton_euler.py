@@ -25,7 +25,7 @@ from eomc.model.system import System
 from eomc.program import program
 from eomc.program.ir import Function, evaluate
 from eomc.program.program import Program
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import check, symbolic
 from eomc.verify.oracle import Answer
 from eomc.verify.taylor import Jets

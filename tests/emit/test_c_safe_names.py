@@ -20,7 +20,7 @@ import eomc
 from eomc.base import names
 from eomc.emit import c_safe_names
 from eomc.model import system
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
 INCLUDE = f"-I{sysconfig.get_path('include')}"

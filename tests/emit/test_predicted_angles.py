@@ -19,7 +19,7 @@ from eomc.integrators.tableaux import METHODS
 from eomc.model import system
 from eomc.program import program
 from eomc.program.trig import apart
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 ODD = """
 eomc = 1

@@ -24,7 +24,7 @@ from eomc.emit.fast import two_point
 from eomc.model import system
 from eomc.program import program
 from eomc.program.ir import Assignment, Operand, Product, Sum
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import symbolic
 
 # angles alone, as sums, with a number, with a parameter and times a coordinate; a coordinate that

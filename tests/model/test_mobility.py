@@ -13,7 +13,7 @@ from eomc.base.errors import EomcError
 from eomc.cli.main import main
 from eomc.model import mobility, system
 from eomc.model.mobility import Mobility
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 
 def count(*parts: str, gravity: str = "[0, 0, -9.81]", coordinates: str = "") -> Mobility:

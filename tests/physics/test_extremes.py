@@ -21,7 +21,7 @@ from conftest import ROOT, Modules
 
 from eomc.model import system
 from eomc.report import reference_solution, report
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 BUILDS = ROOT / "build" / "tests" / "extremes"
 ORBITS = 500

@@ -38,7 +38,7 @@ from eomc.program.ir import (
     rename,
 )
 from eomc.program.program import Program
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.toolchain import compiler as compiler
 
 STEPS = 40

@@ -15,7 +15,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.robots import robot as robots
 from eomc.robots.robot import Drive, Inertia, Motion, Robot, RobotBody
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 angles = st.one_of(
     st.floats(-math.pi, math.pi),

@@ -34,7 +34,7 @@ from eomc.robots import robot as robots
 from eomc.robots import urdf
 from eomc.robots.mjcf import read
 from eomc.robots.robot import Robot
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 WANTED = "robots are compared with MuJoCo where it is there: pip install 'eomc[robots]'"
 mujoco = pytest.importorskip("mujoco", reason=WANTED)

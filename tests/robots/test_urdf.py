@@ -17,7 +17,7 @@ from eomc.model import mobility
 from eomc.robots import robot as robots
 from eomc.robots import urdf
 from eomc.robots.robot import Robot
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 INERTIAL = (
     '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/>'

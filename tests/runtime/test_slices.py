@@ -19,7 +19,7 @@ from test_module import ctrl_c_after
 
 import eomc
 from eomc.model import system
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 MANY = 10_000_000  # rows
 STIFF = 'method = "gauss8"\n'

@@ -10,7 +10,7 @@ import pytest
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model import system
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 BAD = Path(__file__).parent / "bad"
 SCENES = sorted(BAD.glob("*.toml"))

@@ -23,7 +23,7 @@ from eomc import EomcError
 from eomc.derive import lagrange
 from eomc.program import program
 from eomc.emit import render
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.model import system
 try:
     made = system.from_scene(scene.parse(sys.stdin.buffer.read(), "growth.toml"))
@@ -172,7 +172,7 @@ def test_hostile_texts_are_refused_in_words(name: str) -> None:
 
 
 def test_a_key_of_many_dots_in_a_text_is_no_key() -> None:
-    from eomc.scene import scene
+    from eomc.scene import read as scene
 
     note = "see " + "a.b.c." * 20 + "d"
     text = BASE.replace('name = "growth"', f'name = "growth"\nnote = "{note}"\ntitle = "..."')

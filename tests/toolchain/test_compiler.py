@@ -21,7 +21,7 @@ from conftest import needs
 import eomc
 from eomc.base import resources
 from eomc.model.system import from_scene
-from eomc.scene.scene import parse
+from eomc.scene.read import parse
 from eomc.toolchain import compiler as compiler
 
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ from random_scenes import outcome, scene_text
 
 import eomc
 from eomc.model import system
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify.check import Report, check
 
 # Right modules of which a row about orders, advised steps or balances once said FAILED.

@@ -219,7 +219,7 @@ def dof(scene: Path, as_json: bool) -> None:
     eomc dof scenes/arm.toml
     """
     from eomc.model import mobility
-    from eomc.scene import scene as scenes
+    from eomc.scene import read as scenes
 
     counted = mobility.count(scenes.read(scene))
     _say(json.dumps(counted.as_dict(), indent=1) if as_json else counted.table())
@@ -515,7 +515,7 @@ def _overrides(
         values[name] = value
     q0, qd0 = module.start
     if values:  # the start may be a formula in the parameters
-        from eomc.scene import scene as scenes
+        from eomc.scene import read as scenes
 
         q0[:], qd0[:] = scenes.read(scene, values).start()  # and may be bad for a body
     states = {name: (q0, k) for k, name in enumerate(module.coordinates)}
