@@ -12,7 +12,7 @@ import numpy as np
 
 from eomc.base import names
 from eomc.emit.render import Sources
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.scene import read as scene
 
 DATA = Path(__file__).parent / "data" / "cases.json"

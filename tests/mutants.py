@@ -28,7 +28,7 @@ import numpy as np
 from cases import SCENES
 from instrument import Shipped, in_a_fork
 
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
 from eomc.verify import check as checking

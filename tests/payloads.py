@@ -21,7 +21,7 @@ from conftest import needs
 
 from eomc.derive import lagrange
 from eomc.emit import render
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.program import program
 from eomc.program.program import Program

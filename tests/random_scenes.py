@@ -32,7 +32,7 @@ import eomc
 from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.emit.render import Sources
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
 from eomc.toolchain import compiler as compiler

@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT, needs
 
 import eomc
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.scene import read as scene
 
 # both headers in one file, and which way each goes

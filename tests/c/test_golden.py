@@ -26,7 +26,7 @@ SEEDS = ("0", "4242")
 GENERATE = """
 import eomc, json, sys
 from eomc.scene import read as scene
-from eomc.model import system
+from eomc.model import from_scene as system
 from pathlib import Path
 out = {}
 scenes, plain = Path(sys.argv[1]), json.loads(sys.argv[2])

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive.lagrange import derive
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System, dot, symbol, t
 from eomc.program import program
 from eomc.program.ir import Call, evaluate

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from eomc.base.errors import EomcError
 from eomc.derive import lagrange
 from eomc.derive.newton_euler import Recursion
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program import program

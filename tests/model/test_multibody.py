@@ -16,7 +16,7 @@ import trees
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
 from eomc.verify.taylor import Jets

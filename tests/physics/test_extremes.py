@@ -19,7 +19,7 @@ import pytest
 from cases import SCENES, scene_text
 from conftest import ROOT, Modules
 
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.report import reference_solution, report
 from eomc.scene import read as scene
 

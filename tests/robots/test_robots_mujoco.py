@@ -27,7 +27,7 @@ from conftest import Modules
 from numpy.typing import NDArray
 
 from eomc.derive.lagrange import derive
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.program.ir import evaluate
 from eomc.robots import robot as robots

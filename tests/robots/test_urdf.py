@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from eomc.base.errors import EomcError
 from eomc.cli.main import main
-from eomc.model import mobility
+from eomc.model import kinematics
 from eomc.robots import robot as robots
 from eomc.robots import urdf
 from eomc.robots.robot import Robot
@@ -343,7 +343,7 @@ def test_the_scene_has_the_mass_matrix_of_the_file(here: Path) -> None:
     CliRunner().invoke(main, ["import", "crane.urdf"])
     found = scene.read("crane.toml")
     assert found.assembly
-    at = mobility._Kinematics(found, found.assembly).jacobian(np.array([0.7, 0.3]), 0.0)
+    at = kinematics.Kinematics(found, found.assembly).jacobian(np.array([0.7, 0.3]), 0.0)
     assert at is not None
     axis, slide = np.array([0, 0.6, 0.8]), np.array([1, 0, 0])
     turned = np.array([[0.2, -0.01, -0.03], [-0.01, 0.1, 0.02], [-0.03, 0.02, 0.25]])

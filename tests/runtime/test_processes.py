@@ -42,7 +42,7 @@ def copied(request: pytest.FixtureRequest) -> Callable[[Any], Any]:
 def batch() -> ModuleType:
     """Many cart-poles."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
-    from eomc.model import system
+    from eomc.model import from_scene as system
     from eomc.scene import read as scene
 
     made = scene.parse(text.replace("[run]\n", "[run]\nbatch = true\n"), "many.toml")

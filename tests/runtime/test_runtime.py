@@ -143,7 +143,7 @@ def test_every_value_agrees_with_the_reference(everything: ModuleType) -> None:
 
 
 def scene_of_everything() -> System:
-    from eomc.model import system
+    from eomc.model import from_scene as system
     from eomc.scene import read as scene
 
     return system.from_scene(scene.parse(EVERYTHING, "everything.toml"))

@@ -18,7 +18,7 @@ from conftest import MODULES
 from test_module import ctrl_c_after
 
 import eomc
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.scene import read as scene
 
 MANY = 10_000_000  # rows

@@ -24,7 +24,7 @@ from eomc.derive import lagrange
 from eomc.program import program
 from eomc.emit import render
 from eomc.scene import read as scene
-from eomc.model import system
+from eomc.model import from_scene as system
 try:
     made = system.from_scene(scene.parse(sys.stdin.buffer.read(), "growth.toml"))
     if sys.argv[1] == "built":

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eomc.base.errors import EomcError
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.scene import formulas
 from eomc.scene import read as scene
 from eomc.scene.formulas import FormulaError

@@ -20,7 +20,7 @@ from conftest import needs
 
 import eomc
 from eomc.base import resources
-from eomc.model.system import from_scene
+from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain import compiler as compiler
 

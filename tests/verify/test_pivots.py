@@ -11,7 +11,7 @@ import trees
 from instrument import in_a_fork
 from mutants import Bench, Mutant, variant
 
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
 

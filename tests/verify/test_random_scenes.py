@@ -12,7 +12,7 @@ import random_scenes
 from random_scenes import outcome, scene_text
 
 import eomc
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.scene import read as scene
 from eomc.verify.check import Report, check
 
