@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import reduce
-from operator import add
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -34,8 +33,8 @@ def scaled(a: Sequence[T], factor: T) -> Vector[T]:
 
 def dot(a: Sequence[T], b: Sequence[T]) -> T:
     """a . b"""
-    terms = [_product(p, q) for p, q in zip(a, b, strict=True) if p and q]
-    return reduce(add, terms) if terms else _product(a[0], b[0])
+    terms: list[T] = [_product(p, q) for p, q in zip(a, b, strict=True) if p and q]
+    return reduce(_sum, terms) if terms else _product(a[0], b[0])
 
 
 def cross(a: Sequence[Any], b: Sequence[Any]) -> Vector[Any]:
@@ -121,9 +120,9 @@ def six(values: Any) -> Inertia[Any]:
     return xx, yy, zz, xy, xz, yz
 
 
-def _sum(p: Any, q: Any) -> Any:
-    return p + q if p and q else p or q
+def _sum(p: T, q: T) -> T:
+    return p + q if p and q else p or q  # type: ignore[operator]
 
 
-def _product(p: Any, q: Any) -> Any:
-    return q if p == 1 else p * q
+def _product(p: T, q: T) -> T:
+    return q if p == 1 else p * q  # type: ignore[operator]

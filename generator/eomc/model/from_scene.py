@@ -49,7 +49,8 @@ class _Formulas:
         self.known: dict[str, Expr] = {"t": t}
         for c in scene.coordinates:
             self.known |= {n: symbol(n) for n in (c.name, f"{c.name}_dot")}
-        self.known |= {q.name: symbol(q.name) for q in (*scene.parameters, *scene.inputs)}
+        given = [*(p.name for p in scene.parameters), *(i.name for i in scene.inputs)]
+        self.known |= {name: symbol(name) for name in given}
         self.problems: list[Problem] = []
         self.sizes: dict[str, growth.Size] = {}  # of constants and definitions
 
@@ -138,7 +139,9 @@ def from_scene(scene: Scene) -> System:
 def _at_the_start(scene: Scene) -> list[Problem]:
     """Warnings of springs and dampers that have no direction there."""
     assembly = scene.assembly
-    if not assembly or not any(line.points for line in (*assembly.springs, *assembly.dampers)):
+    if not assembly or not any(
+        [*(s.points for s in assembly.springs), *(d.points for d in assembly.dampers)]
+    ):
         return []
     from eomc.model import mobility  # and with it NumPy, which few scenes need here
 
