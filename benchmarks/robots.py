@@ -107,15 +107,15 @@ def chain(links: int) -> str:
 
 def robot(file: str, free: bool = False, locked: tuple[str, ...] = ()) -> str:
     """The scene that `eomc import` writes of a URDF of example-robot-data."""
-    from eomc.robots import robot as robots
-    from eomc.robots import urdf
+    from eomc.robots import edit, urdf
+    from eomc.robots.scene_text import scene_text
 
     try:
         found = [f for f in files("example-robot-data") or () if str(f).endswith(file)]
     except PackageNotFoundError:
         raise MissingError(f"example-robot-data is not there: {EXTRA}") from None
-    read = robots.lock(urdf.read(str(found[0].locate())), dict.fromkeys(locked, 0.0))
-    return robots.scene_text(robots.based(read, free=True) if free else read)
+    read = edit.lock(urdf.read(str(found[0].locate())), dict.fromkeys(locked, 0.0))
+    return scene_text(edit.based(read, free=True) if free else read)
 
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
@@ -200,7 +200,7 @@ def cold(path: Path, name: str, root: str) -> float:
 
 def row(case: Case, rounds: int) -> str:
     """The scene's line of the table."""
-    from eomc.scene import scene
+    from eomc.scene import read as scene
 
     rows, colds = [], []
     with tempfile.TemporaryDirectory() as folder:

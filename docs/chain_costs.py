@@ -18,9 +18,10 @@ import time
 import sympy
 
 from eomc.derive import lagrange
-from eomc.model.system import System, from_scene
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
 from eomc.program import program
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import symbolic
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from eomc.base import names
 from eomc.emit.render import Sources
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 
 DATA = Path(__file__).parent / "data" / "cases.json"
 SCENES = Path(__file__).parent.parent / "scenes"

@@ -14,8 +14,8 @@ import pytest
 from cases import SCENES
 
 import eomc
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 
 # in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

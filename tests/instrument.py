@@ -129,8 +129,8 @@ import sys, tomllib
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from eomc.verify import check
-from eomc.scene import scene
-from eomc.model import system
+from eomc.scene import read as scene
+from eomc.model import from_scene as system
 from instrument import Shipped
 made = system.from_scene(scene.parse(Path({scene!r}).read_text(), "scene.toml"))
 shipped = Shipped(made, Path({folder!r}))

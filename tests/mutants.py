@@ -28,9 +28,9 @@ import numpy as np
 from cases import SCENES
 from instrument import Shipped, in_a_fork
 
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import check as checking
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_runs import drive

@@ -21,11 +21,11 @@ from conftest import needs
 
 from eomc.derive import lagrange
 from eomc.emit import render
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.program import program
 from eomc.program.program import Program
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 CANARY = Path(__file__).parent.parent / "build" / "tests" / f"canary{os.getpid()}"
 TOUCH = f"touch {CANARY}"

@@ -31,8 +31,8 @@ from scene_author import scene_text
 import eomc
 from eomc.base.errors import EomcError
 from eomc.emit.render import Sources
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 from eomc.toolchain import compiler
 from eomc.verify.check import check
 

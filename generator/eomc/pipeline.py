@@ -46,8 +46,8 @@ def _garbage_kept() -> Iterator[None]:
 @_garbage_kept()
 def read(scene: ScenePath) -> System:
     """The checked scene as a SymPy system. Raises SceneError with every fault."""
-    from eomc.model.system import from_scene
-    from eomc.scene import scene as scenes
+    from eomc.model.from_scene import from_scene
+    from eomc.scene import read as scenes
 
     _refuse_other(scene, "")
     if not isinstance(scene, (str, os.PathLike)):

@@ -45,10 +45,10 @@ from eomc.emit import render
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
 from eomc.emit.fast import context
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.report import equations_text
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 
 @pytest.fixture(autouse=True)

@@ -16,9 +16,9 @@ from conftest import EVERYTHING, MODULES, ROOT, needs
 import eomc
 from eomc.emit import c_names
 from eomc.emit.render import Sources
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import symbolic
 
 NAMES = [

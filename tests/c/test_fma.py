@@ -10,8 +10,8 @@ import pytest
 from conftest import ROOT, needs
 
 import eomc
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 
 # both headers in one file, and which way each goes
 PROBE = f"""

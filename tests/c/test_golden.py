@@ -26,8 +26,8 @@ SEEDS = ("0", "4242")
 GENERATE = """
 import eomc, json, sys
 from eomc.base import resources
-from eomc.scene import scene
-from eomc.model import system
+from eomc.scene import read as scene
+from eomc.model import from_scene as system
 from pathlib import Path
 out = {}
 scenes, plain = Path(sys.argv[1]), json.loads(sys.argv[2])

@@ -24,10 +24,10 @@ from eomc.emit.c_expression import Block
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.plain import views
 from eomc.emit.render import Sources
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.program import outline
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify.check import check
 
 STRICT = """-std=c99 -pedantic -Wall -Wextra -Wconversion -Wdouble-promotion -Wshadow

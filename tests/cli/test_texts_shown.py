@@ -38,7 +38,7 @@ from eomc.base import texts
 from eomc.cli import terminal
 from eomc.cli.main import main
 from eomc.report import cost_of_digits, page, plot
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 
 @pytest.fixture(autouse=True)

@@ -19,12 +19,12 @@ from hypothesis import strategies as st
 
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive.lagrange import derive
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System, dot, symbol, t
 from eomc.program import program
 from eomc.program.ir import Call, evaluate
 from eomc.program.program import Program
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import check
 from eomc.verify.symbolic import Reference
 from eomc.verify.symbolic import derive as plainly

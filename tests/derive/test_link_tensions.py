@@ -19,12 +19,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from eomc.derive import lagrange, link_tensions
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System, dot, symbol, t
 from eomc.program import program
 from eomc.program.ir import Call, Function, evaluate
 from eomc.program.lower import lower
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify.taylor import Jets
 
 EPS = 2.0**-52

@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from eomc.base.errors import EomcError
 from eomc.derive import lagrange
 from eomc.derive.newton_euler import Recursion
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program import program
 from eomc.program.ir import Function, evaluate
 from eomc.program.program import Program
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import check, symbolic
 from eomc.verify.oracle import Answer
 from eomc.verify.taylor import Jets

@@ -19,8 +19,8 @@ from conftest import needs
 import eomc
 from eomc.base import names
 from eomc.emit import c_safe_names
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 
 MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
 INCLUDE = f"-I{sysconfig.get_path('include')}"

@@ -16,10 +16,10 @@ from sympy import Rational, S
 import eomc
 from eomc.derive import lagrange
 from eomc.integrators.tableaux import METHODS
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.program.trig import apart
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 ODD = """
 eomc = 1

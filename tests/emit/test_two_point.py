@@ -21,10 +21,10 @@ from eomc.derive.tape import Stage
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
 from eomc.emit.fast import two_point
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.program.ir import Assignment, Operand, Product, Sum
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import symbolic
 
 # angles alone, as sums, with a number, with a parameter and times a coordinate; a coordinate that

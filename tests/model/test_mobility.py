@@ -11,9 +11,10 @@ from click.testing import CliRunner
 
 from eomc.base.errors import EomcError
 from eomc.cli.main import main
-from eomc.model import mobility, system
+from eomc.model import from_scene as system
+from eomc.model import kinematics, mobility
 from eomc.model.mobility import Mobility
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 
 def count(*parts: str, gravity: str = "[0, 0, -9.81]", coordinates: str = "") -> Mobility:
@@ -202,7 +203,7 @@ def test_the_mass_matrix_behind_the_ranks_is_that_of_a_pendulum() -> None:
     )  # fmt: skip
     checked = scene.parse(text)
     assert checked.assembly
-    at = mobility._Kinematics(checked, checked.assembly).jacobian(np.array([0.4]), 0.0)
+    at = kinematics.Kinematics(checked, checked.assembly).jacobian(np.array([0.4]), 0.0)
     assert at is not None
     # I + m l^2 + armature; a few roundings
     assert (at.weighs.T @ at.weighs)[0, 0] == pytest.approx(0.3 + 2 * 0.25 + 0.05, rel=1e-14)
@@ -217,7 +218,7 @@ def test_the_mass_matrix_behind_the_ranks_has_the_signs_of_a_cart_pole() -> None
     )
     checked = scene.parse(text)
     assert checked.assembly
-    at = mobility._Kinematics(checked, checked.assembly).jacobian(np.array([0.2, 0.4]), 0.0)
+    at = kinematics.Kinematics(checked, checked.assembly).jacobian(np.array([0.2, 0.4]), 0.0)
     assert at is not None
     across = 2 * 0.5 * np.cos(0.4)
     right = [[5, across], [across, 2 * 0.25 + 0.1]]
@@ -294,7 +295,7 @@ offset = [1, 0]
 mass = 1
 center = [1, 0]
 """
-    monkeypatch.delattr(mobility, "_null")
+    monkeypatch.delattr(kinematics, "_null")
     found = mobility.count(scene.parse(text))
     assert (found.M, found.rank) == (1501, 1501) and not found.remarks
 
@@ -310,8 +311,8 @@ def test_elimination_does_not_judge_what_may_be_rounding() -> None:
         )  # fmt: skip
         checked = scene.parse(text)
         assert checked.assembly
-        kinematics = mobility._Kinematics(checked, checked.assembly)
-        assert kinematics.is_regular(np.array([0.4, 1.0])) is regular
+        found = kinematics.Kinematics(checked, checked.assembly)
+        assert found.is_regular(np.array([0.4, 1.0])) is regular
 
 
 @pytest.mark.parametrize(("center", "regular"), [("-0.3", False), ("0.3", True)])
@@ -325,8 +326,8 @@ def test_elimination_knows_where_a_mass_is(center: str, regular: bool) -> None:
     )  # fmt: skip
     checked = scene.parse(text)
     assert checked.assembly
-    kinematics = mobility._Kinematics(checked, checked.assembly)
-    assert kinematics.is_regular(np.array([0.4])) is regular
+    found = kinematics.Kinematics(checked, checked.assembly)
+    assert found.is_regular(np.array([0.4])) is regular
 
 
 def test_a_long_chain_has_all_its_freedoms() -> None:

@@ -16,9 +16,9 @@ import trees
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify.taylor import Jets
 
 Array = NDArray[np.float64]

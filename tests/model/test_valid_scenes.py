@@ -8,8 +8,8 @@ import pytest
 
 import eomc
 from eomc.base.errors import EomcError, SceneError
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 from eomc.verify.check import check
 
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "valid"

@@ -19,9 +19,9 @@ import pytest
 from cases import SCENES, scene_text
 from conftest import ROOT, Modules
 
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.report import cost_of_digits, reference_solution
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 BUILDS = ROOT / "build" / "tests" / "extremes"
 ORBITS = 500

@@ -22,7 +22,7 @@ import eomc
 from eomc.derive import lagrange
 from eomc.derive.tape import Stage
 from eomc.emit.render import Sources, render
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program import outline, program
@@ -38,7 +38,7 @@ from eomc.program.ir import (
     rename,
 )
 from eomc.program.program import Program
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.toolchain import cache
 
 STEPS = 40

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from eomc.base.errors import EomcError
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System, symbol
 from eomc.report import plot
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 pytest.importorskip("matplotlib")
 

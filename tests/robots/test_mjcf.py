@@ -10,7 +10,8 @@ import pytest
 
 from eomc.base.errors import EomcError, SceneError
 from eomc.robots.mjcf import read
-from eomc.robots.robot import IDENTITY, Motion, Robot
+from eomc.robots.robot import Motion, Robot
+from eomc.robots.rotations import IDENTITY
 
 CLOSE = 1e-14  # relative; the numbers below need a few operations each
 

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from eomc.base import names
 from eomc.base.errors import EomcError
-from eomc.robots import robot as robots
-from eomc.robots.robot import Drive, Inertia, Motion, Robot, RobotBody
-from eomc.scene import scene
+from eomc.robots import edit, inertias, rotations, scene_text
+from eomc.robots.inertias import Inertia
+from eomc.robots.robot import Drive, Motion, Robot, RobotBody, moved
+from eomc.scene import read as scene
 
 angles = st.one_of(
     st.floats(-math.pi, math.pi),
@@ -42,62 +43,62 @@ def turn(axis: str, by: float) -> np.ndarray:
 def test_rpy_is_the_product_of_textbook_rotations(roll: float, pitch: float, yaw: float) -> None:
     expected = turn("z", yaw) @ turn("y", pitch) @ turn("x", roll)
     # entries within 1e-12 of 0 and 1 are put there, in each factor
-    assert np.allclose(robots.from_rpy(roll, pitch, yaw), expected, atol=4e-12, rtol=0)
+    assert np.allclose(rotations.from_rpy(roll, pitch, yaw), expected, atol=4e-12, rtol=0)
 
 
 @given(angles, angles, angles)
 def test_turns_make_the_rotation_again_at_a_pitch_of_pi_half_too(
     a: float, b: float, c: float
 ) -> None:
-    rotation = robots.from_rpy(a, b, c)
-    again = robots.from_turns(robots.turns_of(rotation))
+    rotation = rotations.from_rpy(a, b, c)
+    again = rotations.from_turns(rotations.turns_of(rotation))
     # turns below 1e-10 are left out
     assert np.allclose(again, rotation, atol=3e-10, rtol=0)
 
 
 def test_few_turns_where_few_will_do() -> None:
     quarter = math.pi / 2
-    assert robots.turns_of(robots.from_rpy(quarter, 0, 0)) == (("x", quarter),)
-    assert robots.turns_of(robots.from_rpy(0, math.pi, 0)) == (("y", math.pi),)
-    assert robots.turns_of(robots.from_rpy(math.pi, 0.3, math.pi)) == (
+    assert rotations.turns_of(rotations.from_rpy(quarter, 0, 0)) == (("x", quarter),)
+    assert rotations.turns_of(rotations.from_rpy(0, math.pi, 0)) == (("y", math.pi),)
+    assert rotations.turns_of(rotations.from_rpy(math.pi, 0.3, math.pi)) == (
         ("y", pytest.approx(math.pi - 0.3)),
     )
-    assert robots.turns_of(robots.IDENTITY) == ()
+    assert rotations.turns_of(rotations.IDENTITY) == ()
 
 
 @given(angles, angles, angles)
 def test_quaternions_and_euler_angles_agree_with_turns(a: float, b: float, c: float) -> None:
     w, x = math.cos(a / 2), math.sin(a / 2)
-    assert np.allclose(robots.from_quaternion(2 * w, 2 * x, 0, 0), turn("x", a), atol=4e-12)
+    assert np.allclose(rotations.from_quaternion(2 * w, 2 * x, 0, 0), turn("x", a), atol=4e-12)
     small = turn("x", a) @ turn("y", b) @ turn("z", c)
-    assert np.allclose(robots.from_euler("xyz", (a, b, c)), small, atol=4e-12)
+    assert np.allclose(rotations.from_euler("xyz", (a, b, c)), small, atol=4e-12)
     capitals = turn("z", c) @ turn("y", b) @ turn("x", a)
-    assert np.allclose(robots.from_euler("XYZ", (a, b, c)), capitals, atol=4e-12)
+    assert np.allclose(rotations.from_euler("XYZ", (a, b, c)), capitals, atol=4e-12)
 
 
 def test_an_exact_quarter_turn_has_exact_zeros() -> None:
-    assert np.array_equal(robots.from_rpy(math.pi / 2, 0, 0), R_X)
+    assert np.array_equal(rotations.from_rpy(math.pi / 2, 0, 0), R_X)
 
 
 def test_a_turned_tensor_keeps_its_energy() -> None:
     inertia = (1.0, 2.0, 2.5, 0.1, -0.2, 0.3)
-    rotation = robots.from_rpy(0.3, -0.4, 1.1)
+    rotation = rotations.from_rpy(0.3, -0.4, 1.1)
     old = np.array([[1.0, 0.1, -0.2], [0.1, 2.0, 0.3], [-0.2, 0.3, 2.5]])
     expected = np.array(rotation) @ old @ np.array(rotation).T
-    xx, yy, zz, xy, xz, yz = robots.rotated_inertia(inertia, rotation)
+    xx, yy, zz, xy, xz, yz = inertias.rotated_inertia(inertia, rotation)
     # a few roundings
     assert np.allclose([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], expected, rtol=0, atol=1e-15)
 
 
 def test_tensors_that_no_body_has_are_told_with_one_that_would_do() -> None:
-    assert not robots.unbalanced((1.0, 1.0, 2.0, 0, 0, 0))
-    assert not robots.indefinite((0.0, 0.0, 0.0, 0, 0, 0))
-    told = robots.unbalanced((1.0, 1.0, 2.1, 0, 0, 0))
+    assert not inertias.unbalanced((1.0, 1.0, 2.0, 0, 0, 0))
+    assert not inertias.indefinite((0.0, 0.0, 0.0, 0, 0, 0))
+    told = inertias.unbalanced((1.0, 1.0, 2.1, 0, 0, 0))
     assert (
         "1, 1, 2.1 break the triangle inequality" in told
         and "[1.0333333, 1.0333333, 2.0666667, 0, 0, 0] would do" in told
     )
-    assert "-1" in robots.indefinite((1.0, 1.0, -1.0, 0, 0, 0))
+    assert "-1" in inertias.indefinite((1.0, 1.0, -1.0, 0, 0, 0))
 
 
 @pytest.mark.parametrize(
@@ -106,8 +107,8 @@ def test_tensors_that_no_body_has_are_told_with_one_that_would_do() -> None:
      (1e-8, 2e-8, 4e-8, 6e-8, 1e-8, 1e-8), (-1.0, -2.0, -0.5, 0.1, 0, 0)],
 )  # fmt: skip
 def test_the_nearest_tensor_is_a_bodys_and_none_is_nearer(inertia: Inertia) -> None:
-    near = robots.nearest(inertia)
-    assert not robots.indefinite(near) and not robots.unbalanced(near)
+    near = inertias.nearest(inertia)
+    assert not inertias.indefinite(near) and not inertias.unbalanced(near)
 
     def off(other: Inertia) -> float:
         """Of all nine entries."""
@@ -125,21 +126,21 @@ def test_the_nearest_tensor_is_a_bodys_and_none_is_nearer(inertia: Inertia) -> N
         other = tuple(part * bodys + (1 - part) * np.array(near))
         assert off(near) <= off(other) + 1e-12 * off((0, 0, 0, 0, 0, 0))
     good = (1.0, 1.1, 1.2, 0.1, 0, 0)
-    assert robots.nearest(good) == pytest.approx(good, rel=1e-14)  # eigenvalues and back
+    assert inertias.nearest(good) == pytest.approx(good, rel=1e-14)  # eigenvalues and back
 
 
 def test_tensors_that_no_body_has_are_mended_where_it_is_asked_for() -> None:
     bad = replace(arm().bodies[2], inertia=(0.1, 0.1, 0.3, 0.0, 0.0, 0.0))
     worse = replace(arm().bodies[1], inertia=(0.1, -0.1, 0.3, 0.0, 0.0, 0.0))
     bodies = tuple({"boom": bad, "column": worse}.get(b.name, b) for b in arm().bodies)
-    mended = robots.mended(replace(arm(), bodies=bodies))
-    text = robots.scene_text(mended)
+    mended = edit.mended(replace(arm(), bodies=bodies))
+    text = scene_text.scene_text(mended)
     assert "# - body column: its inertia [0.1, -0.1, 0.3, 0, 0, 0] is that of no body" in text
     assert "# - body boom: its inertia [0.1, 0.1, 0.3, 0, 0, 0] is that of no body" in text
     inertias = [b["inertia"] for b in tomllib.loads(text)["body"] if "inertia" in b]
     assert inertias[1] == pytest.approx([0.4 / 3, 0.4 / 3, 0.8 / 3])
     scene.parse(text)
-    assert robots.mended(arm()) == arm()
+    assert edit.mended(arm()) == arm()
 
 
 # --- a robot ------------------------------------------------------------------------------------
@@ -157,7 +158,7 @@ def arm() -> Robot:
             RobotBody("column", "base", "revolute", (Motion("pan", "rad", start=0.5),),
                       ((0.0, 0.0, 1.0),), (0.0, 0.0, 0.4), mass=2.0, inertia=inertia),
             RobotBody("boom", "column", "revolute", (Motion("lift", "rad", damping=0.1),),
-                      ((0.0, 1.0, 0.0),), (0.1, 0.0, 0.0), robots.from_rpy(0, 0, math.pi / 2),
+                      ((0.0, 1.0, 0.0),), (0.1, 0.0, 0.0), rotations.from_rpy(0, 0, math.pi / 2),
                       mass=1.0, center=(0.5, 0.0, 0.0), inertia=inertia),
             RobotBody("lamp", "column", mass=0.1),
             RobotBody("trolley", "boom", "prismatic", (Motion("reach", "m", note="0 to 1"),),
@@ -175,7 +176,7 @@ def place(robot: Robot, of: str, q: dict[str, float]) -> tuple[np.ndarray, np.nd
     at, turned = np.zeros(3), np.eye(3)
     while of != "world":
         body = by_name[of]
-        offset, rotation = robots.moved(body, [q[m.name] for m in body.motions])
+        offset, rotation = moved(body, [q[m.name] for m in body.motions])
         at, turned = np.array(offset) + np.array(rotation) @ at, np.array(rotation) @ turned
         of = body.parent
     return at, turned
@@ -191,24 +192,24 @@ def test_a_body_is_where_its_joints_put_it() -> None:
 @pytest.mark.parametrize("name", ["pan", "lift", "reach"])
 def test_a_locked_joint_stays_where_it_was_put(name: str) -> None:
     q = {"pan": 0.3, "lift": -0.2, "reach": 0.7}
-    locked = robots.lock(arm(), {name: q[name]})
+    locked = edit.lock(arm(), {name: q[name]})
     assert [m.name for m in locked.motions] == [n for n in q if n != name]
     for ours, theirs in zip(place(locked, "hook", q), place(arm(), "hook", q), strict=True):
         assert np.allclose(ours, theirs, atol=1e-15)
     assert name not in [drive.coordinate for drive in locked.drives]
-    assert f"joint {name} locked at {q[name]}" in robots.scene_text(locked)
+    assert f"joint {name} locked at {q[name]}" in scene_text.scene_text(locked)
 
 
 def test_what_can_not_be_locked() -> None:
     with pytest.raises(EomcError, match="did you mean 'lift'"):
-        robots.lock(arm(), {"lif": 0.0})
+        edit.lock(arm(), {"lif": 0.0})
     with pytest.raises(EomcError, match="only a joint with one coordinate"):
-        robots.lock(robots.based(arm(), free=True), {"yaw": 0.0})
+        edit.lock(edit.based(arm(), free=True), {"yaw": 0.0})
 
 
 def test_a_cut_keeps_the_root_where_it_stood_at_the_start() -> None:
     whole = arm()
-    part = robots.cut(whole, "boom")
+    part = edit.cut(whole, "boom")
     assert [b.name for b in part.bodies] == ["boom", "trolley", "hook", "tip frame"]
     assert part.bodies[0].joint == "fixed" and part.bodies[0].parent == "world"
     q = {"pan": 0.5, "lift": 0.0, "reach": 0.7}  # pan at its start
@@ -219,22 +220,24 @@ def test_a_cut_keeps_the_root_where_it_stood_at_the_start() -> None:
 
 
 def test_a_chain_keeps_what_is_fixed_to_it_but_not_what_the_tip_carries() -> None:
-    chain = robots.cut(arm(), tip="boom")
+    chain = edit.cut(arm(), tip="boom")
     assert [b.name for b in chain.bodies] == ["base", "column", "boom", "lamp"]
     assert [m.name for m in chain.motions] == ["pan", "lift"]
     with pytest.raises(EomcError, match="'lamp' is not behind 'boom'"):
-        robots.cut(arm(), "boom", "lamp")
+        edit.cut(arm(), "boom", "lamp")
     with pytest.raises(EomcError, match="did you mean 'boom'"):
-        robots.cut(arm(), "bom")
+        edit.cut(arm(), "bom")
 
 
 def test_a_base_is_freed_and_fixed_again() -> None:
-    free = robots.based(arm(), free=True)
+    free = edit.based(arm(), free=True)
     assert [m.name for m in free.motions][:6] == ["x", "y", "z", "yaw", "pitch", "roll"]
-    assert robots.based(free, free=False) == arm()
-    root = replace(arm().bodies[0], offset=(1.0, 2.0, 3.0), rotation=robots.from_rpy(0.1, 0.2, 0.3))
+    assert edit.based(free, free=False) == arm()
+    root = replace(
+        arm().bodies[0], offset=(1.0, 2.0, 3.0), rotation=rotations.from_rpy(0.1, 0.2, 0.3)
+    )
     stood = replace(arm(), bodies=(root, *arm().bodies[1:]))
-    free = robots.based(stood, free=True)
+    free = edit.based(stood, free=True)
     assert [m.start for m in free.motions[:6]] == pytest.approx([1, 2, 3, 0.3, 0.2, 0.1])
     at_start = {m.name: m.start for m in free.motions}
     hooks = place(free, "hook", at_start), place(stood, "hook", at_start)
@@ -242,19 +245,19 @@ def test_a_base_is_freed_and_fixed_again() -> None:
         assert np.allclose(ours, theirs, atol=1e-15)
     crowd = replace(arm(), bodies=(*arm().bodies, RobotBody("other")))
     with pytest.raises(EomcError, match="2 bodies stand on the world"):
-        robots.based(crowd, free=True)
+        edit.based(crowd, free=True)
 
 
 # --- the scene ------------------------------------------------------------------------------------
 
 
 def test_the_scene_says_what_differs_from_the_defaults_and_no_more() -> None:
-    tree = tomllib.loads(robots.scene_text(arm()))
+    tree = tomllib.loads(scene_text.scene_text(arm()))
     assert tree["gravity"] == [0, 0, -9.81]
     assert tree["coordinates"]["pan"] == {"unit": "rad", "start": 0.5}
     assert tree["coordinates"]["reach"] == {"unit": "m", "note": "0 to 1"}
     bodies = {body["name"]: body for body in tree["body"]}
-    assert "tip_frame" not in bodies and "tip frame" in robots.scene_text(arm())
+    assert "tip_frame" not in bodies and "tip frame" in scene_text.scene_text(arm())
     assert bodies["base"] == {"name": "base", "joint": "fixed"}
     assert bodies["column"] == {
         "name": "column", "parent": "base", "joint": "revolute", "coordinates": "pan",
@@ -269,19 +272,19 @@ def test_springs_of_joints() -> None:
     motion = Motion("pan", "rad", stiffness=3.0, rest=math.pi / 4, armature=0.02, friction=0.1)
     body = replace(arm().bodies[1], motions=(motion,))
     robot = replace(arm(), bodies=(RobotBody("base"), body), drives=())
-    tree = tomllib.loads(robots.scene_text(robot))
+    tree = tomllib.loads(scene_text.scene_text(robot))
     assert tree["spring"] == [{"coordinate": "pan", "stiffness": 3, "length": "pi/4"}]
     assert (tree["body"][1]["armature"], tree["body"][1]["friction"]) == (0.02, 0.1)
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_numbers_read_back_as_they_were(x: float) -> None:
-    assert tomllib.loads(f"x = {robots.number(x)}")["x"] == x
+    assert tomllib.loads(f"x = {scene_text.number(x)}")["x"] == x
 
 
 @given(angles)
 def test_angles_read_back_within_their_rounding(x: float) -> None:
-    text = robots.angle(x)
+    text = scene_text.angle(x)
     value = eval(text.strip('"'), {"pi": math.pi})
     assert abs(value - x) <= (1e-10 if text.startswith('"') or text == "0" else 4e-16)
 
@@ -296,7 +299,7 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
         replace(body, name="y", parent="x" * 60, motions=(Motion("y_x", "rad"),)),
     )
     drives = (Drive("a.b", "a.b"), Drive("a_b", "while"))
-    robot = robots.finished(replace(arm(), name="math", bodies=bodies, drives=drives))
+    robot = scene_text.finished(replace(arm(), name="math", bodies=bodies, drives=drives))
     coordinates = [m.name for m in robot.motions]
     taken = [*coordinates, *(f"{c}_dot" for c in coordinates), *(d.name for d in robot.drives)]
     taken += [f"{b.name}_{letter}" for b in robot.bodies for letter in "xyz"]
@@ -305,13 +308,13 @@ def test_names_become_such_as_a_scene_can_bear() -> None:
     assert names.module_fault(robot.name) is None
     assert "'a.b' in the file" in robot.motions[0].note
     assert [d.coordinate for d in robot.drives] == [coordinates[0], coordinates[2]]
-    assert robots.finished(robot) == robot
+    assert scene_text.finished(robot) == robot
 
 
 def test_texts_of_strangers_stay_texts() -> None:
     wild = 'x"""\n\x7f\x00 = [[body]] \\'
     robot = replace(arm(), title=wild, left_out=(wild,))
-    tree = tomllib.loads(robots.scene_text(robot))
+    tree = tomllib.loads(scene_text.scene_text(robot))
     assert tree["title"] == 'x"""\\n\\x7f\\x00 = [[body]] \\' and tree["name"] == "arm"
 
 
@@ -319,19 +322,21 @@ def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
     bodies = (*arm().bodies[:6], RobotBody("finger", "hook", "revolute", (Motion("f-1", "rad"),),
                                            ((1.0, 0.0, 0.0),), note="a mesh only"))  # fmt: skip
     with pytest.raises(EomcError) as fault:
-        robots.finished(replace(arm(), bodies=bodies))
+        scene_text.finished(replace(arm(), bodies=bodies))
     assert "joint f-1 moves nothing that has inertia, only finger (a mesh only)" in str(fault.value)
     assert "--lock f-1=0" in str(fault.value)
-    locked = robots.lock(replace(arm(), bodies=bodies), {"f-1": 0.0})
-    assert len(robots.finished(locked).motions) == 3
+    locked = edit.lock(replace(arm(), bodies=bodies), {"f-1": 0.0})
+    assert len(scene_text.finished(locked).motions) == 3
     with pytest.raises(EomcError, match="nothing moves"):
-        robots.finished(replace(arm(), bodies=arm().bodies[:1]))
+        scene_text.finished(replace(arm(), bodies=arm().bodies[:1]))
 
 
 def test_inertias_that_no_body_has() -> None:
     broken = replace(arm().bodies[1], inertia=(0.1, 0.1, 0.3, 0.0, 0.0, 0.0))
     robot = replace(arm(), bodies=(RobotBody("base"), broken), drives=())
-    assert any("body column: its principal moments" in w for w in robots.finished(robot).left_out)
+    assert any(
+        "body column: its principal moments" in w for w in scene_text.finished(robot).left_out
+    )
     negative = replace(broken, inertia=(0.1, 0.1, -0.1, 0.0, 0.0, 0.0))
     with pytest.raises(EomcError, match="body column: its smallest principal moment"):
-        robots.finished(replace(robot, bodies=(RobotBody("base"), negative)))
+        scene_text.finished(replace(robot, bodies=(RobotBody("base"), negative)))

@@ -27,14 +27,13 @@ from conftest import Modules
 from numpy.typing import NDArray
 
 from eomc.derive.lagrange import derive
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.program.ir import evaluate
-from eomc.robots import robot as robots
-from eomc.robots import urdf
+from eomc.robots import edit, scene_text, urdf
 from eomc.robots.mjcf import read
 from eomc.robots.robot import Robot
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 WANTED = "robots are compared with MuJoCo where it is there: pip install 'eomc[robots]'"
 mujoco = pytest.importorskip("mujoco", reason=WANTED)
@@ -112,16 +111,16 @@ class Pair:
     model: Any
 
     def text(self) -> str:
-        return robots.scene_text(self.robot)
+        return scene_text.scene_text(self.robot)
 
 
 def from_urdf(
     name: str, folder: Path, free: bool = False, locked: Mapping[str, float] | None = None
 ) -> Pair:
     file = stripped(robot_data(name), folder)
-    robot = robots.lock(urdf.read(file), locked or {})
+    robot = edit.lock(urdf.read(file), locked or {})
     if free:
-        robot = robots.based(robot, free=True)
+        robot = edit.based(robot, free=True)
     spec = mujoco.MjSpec.from_file(str(file))
     spec.compiler.fusestatic = True
     for joint, value in (locked or {}).items():

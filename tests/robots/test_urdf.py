@@ -13,11 +13,10 @@ from click.testing import CliRunner
 
 from eomc.base.errors import EomcError
 from eomc.cli.main import main
-from eomc.model import mobility
-from eomc.robots import robot as robots
-from eomc.robots import urdf
-from eomc.robots.robot import Robot
-from eomc.scene import scene
+from eomc.model import kinematics
+from eomc.robots import rotations, scene_text, urdf
+from eomc.robots.robot import Robot, moved
+from eomc.scene import read as scene
 
 INERTIAL = (
     '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/>'
@@ -78,7 +77,7 @@ def test_an_arm_is_read(read: Reader) -> None:
     base, arm, slide, tool = robot.bodies
     assert (base.joint, base.parent, tool.joint) == ("fixed", "world", "fixed")
     assert arm.joint == "revolute" and arm.axes == ((0, 0.6, 0.8),) and arm.offset == (0, 0, 0.5)
-    assert arm.rotation == robots.from_rpy(0.1, 0.2, 0.3)
+    assert arm.rotation == rotations.from_rpy(0.1, 0.2, 0.3)
     assert (arm.mass, arm.center) == (2, (0.1, 0.2, 0.3))
     # turned by a quarter about z: x' = y, y' = -x
     assert np.allclose(arm.inertia, (0.2, 0.1, 0.25, -0.01, -0.03, 0.02), rtol=0, atol=1e-16)
@@ -94,7 +93,7 @@ def test_an_arm_is_read(read: Reader) -> None:
 
 
 def test_what_is_not_modelled_is_told(read: Reader) -> None:
-    told = "\n".join(robots.finished(read(ARM)).left_out)
+    told = "\n".join(scene_text.finished(read(ARM)).left_out)
     for words in (
         "1 mesh (not opened)", "1 box", "extend mimics shoulder (times 2, plus 0.5)",
         "limits of 2 joints", "<safety_controller>", "<transmission>", "<gazebo>", "<material>",
@@ -146,17 +145,17 @@ def test_a_planar_joint_moves_across_its_axis(read: Reader, axis: str) -> None:
         at, turned, name = np.zeros(3), np.eye(3), "upper-arm"
         while name != "base":
             body = by_name[name]
-            offset, rotation = robots.moved(body, q if body.motions else ())
+            offset, rotation = moved(body, q if body.motions else ())
             at, turned = np.array(offset) + np.array(rotation) @ at, np.array(rotation) @ turned
             name = body.parent
-        joint = np.array(robots.from_rpy(0.1, 0.2, 0.3))
+        joint = np.array(rotations.from_rpy(0.1, 0.2, 0.3))
         return joint.T @ (at - [0, 0, 0.5]), joint.T @ turned
 
     at, turned = place((0, 0, 0))
     assert np.allclose(at, 0, atol=1e-15) and np.allclose(turned, np.eye(3), atol=1e-11)
     at, turned = place((0.3, -0.4, 0.7))
     assert abs(at @ normal) < 1e-11 and np.isclose(np.linalg.norm(at), 0.5, rtol=1e-11)
-    assert np.allclose(turned, robots.from_axis_angle(tuple(normal), 0.7), atol=1e-11)  # type: ignore[arg-type]
+    assert np.allclose(turned, rotations.from_axis_angle(tuple(normal), 0.7), atol=1e-11)  # type: ignore[arg-type]
 
 
 def test_a_root_called_world_is_the_world(read: Reader) -> None:
@@ -274,7 +273,7 @@ def test_a_mesh_only_is_refused_where_a_joint_needs_inertia(read: Reader) -> Non
         '<link name="slide"><visual><geometry><mesh filename="s.stl"/></geometry></visual></link>',
     )
     with pytest.raises(EomcError) as fault:
-        robots.finished(read(text))
+        scene_text.finished(read(text))
     assert "joint extend moves nothing that has mass" in str(fault.value)
     assert "slide (a mesh only, no <inertial>)" in str(fault.value)
     assert "--lock extend=0" in str(fault.value)
@@ -343,7 +342,7 @@ def test_the_scene_has_the_mass_matrix_of_the_file(here: Path) -> None:
     CliRunner().invoke(main, ["import", "crane.urdf"])
     found = scene.read("crane.toml")
     assert found.assembly
-    at = mobility._Kinematics(found, found.assembly).jacobian(np.array([0.7, 0.3]), 0.0)
+    at = kinematics.Kinematics(found, found.assembly).jacobian(np.array([0.7, 0.3]), 0.0)
     assert at is not None
     axis, slide = np.array([0, 0.6, 0.8]), np.array([1, 0, 0])
     turned = np.array([[0.2, -0.01, -0.03], [-0.01, 0.1, 0.02], [-0.03, 0.02, 0.25]])
@@ -398,8 +397,8 @@ def test_bad_options_change_nothing(here: Path, words: list[str], told: str) -> 
 
 def test_quarter_turns_are_written_as_such(read: Reader) -> None:
     text = ARM.replace('rpy="0.1 0.2 0.3"', 'rpy="1.57079632679 0 -3.14159265359"')
-    written = robots.scene_text(read(text))
+    written = scene_text.scene_text(read(text))
     assert 'rotation    = [["z", "pi"], ["x", "pi/2"]]' in written
-    rough = robots.scene_text(read(ARM.replace('rpy="0.1 0.2 0.3"', 'rpy="1.5708 0 0"')))
+    rough = scene_text.scene_text(read(ARM.replace('rpy="0.1 0.2 0.3"', 'rpy="1.5708 0 0"')))
     assert '["x", 1.5708]' in rough and "as 1.5708" in rough
     assert math.isclose(1.5708, math.pi / 2, rel_tol=1e-5)

@@ -42,8 +42,8 @@ def copied(request: pytest.FixtureRequest) -> Callable[[Any], Any]:
 def batch() -> ModuleType:
     """Many cart-poles."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
-    from eomc.model import system
-    from eomc.scene import scene
+    from eomc.model import from_scene as system
+    from eomc.scene import read as scene
 
     made = scene.parse(text.replace("[run]\n", "[run]\nbatch = true\n"), "many.toml")
     return eomc.load(system.from_scene(made), MODULES)

@@ -143,8 +143,8 @@ def test_every_value_agrees_with_the_reference(everything: ModuleType) -> None:
 
 
 def scene_of_everything() -> System:
-    from eomc.model import system
-    from eomc.scene import scene
+    from eomc.model import from_scene as system
+    from eomc.scene import read as scene
 
     return system.from_scene(scene.parse(EVERYTHING, "everything.toml"))
 

@@ -18,8 +18,8 @@ from conftest import MODULES
 from test_runtime import ctrl_c_after
 
 import eomc
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 
 MANY = 10_000_000  # rows
 STIFF = 'method = "gauss8"\n'

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 
 BAD = Path(__file__).parent / "bad"
 SCENES = sorted(BAD.glob("*.toml"))

@@ -10,7 +10,7 @@ import sympy
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from eomc.model.system import _ALGEBRA, symbol
+from eomc.model.from_scene import _ALGEBRA, symbol
 from eomc.scene.formulas import FUNCTIONS, NUMERIC, FormulaError, evaluate, parse, suggest
 
 quick = settings(max_examples=150, deadline=None, derandomize=True, database=None)

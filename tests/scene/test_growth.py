@@ -23,8 +23,8 @@ from eomc import EomcError
 from eomc.derive import lagrange
 from eomc.program import program
 from eomc.emit import render
-from eomc.scene import scene
-from eomc.model import system
+from eomc.scene import read as scene
+from eomc.model import from_scene as system
 try:
     made = system.from_scene(scene.parse(sys.stdin.buffer.read(), "growth.toml"))
     if sys.argv[1] == "built":
@@ -172,7 +172,7 @@ def test_hostile_texts_are_refused_in_words(name: str) -> None:
 
 
 def test_a_key_of_many_dots_in_a_text_is_no_key() -> None:
-    from eomc.scene import scene
+    from eomc.scene import read as scene
 
     note = "see " + "a.b.c." * 20 + "d"
     text = BASE.replace('name = "growth"', f'name = "growth"\nnote = "{note}"\ntitle = "..."')

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eomc.base.errors import EomcError
-from eomc.model import system
-from eomc.scene import formulas, scene
+from eomc.model import from_scene as system
+from eomc.scene import formulas
+from eomc.scene import read as scene
 from eomc.scene.formulas import FormulaError
 
 fuzz = settings(max_examples=150, deadline=None, derandomize=True, database=None)

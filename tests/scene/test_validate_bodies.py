@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 
 from eomc.base.errors import SceneError
-from eomc.scene import formulas, scene
+from eomc.scene import formulas
+from eomc.scene import read as scene
 from eomc.scene.assembly import Turn
 from eomc.scene.joints import JOINTS
-from eomc.scene.validate_bodies import ROUNDING
+from eomc.scene.validate_values import ROUNDING
 
 SCENES = Path(__file__).parents[2] / "scenes"
 HEAD = 'eomc = 1\nname = "made"\n'

@@ -20,8 +20,8 @@ from conftest import needs
 
 import eomc
 from eomc.base import resources
-from eomc.model.system import from_scene
-from eomc.scene.scene import parse
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
 from eomc.toolchain import cache, compiler
 
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")

@@ -11,9 +11,9 @@ import trees
 from instrument import in_a_fork
 from mutants import Bench, Mutant, variant
 
-from eomc.model import system
+from eomc.model import from_scene as system
 from eomc.model.system import System
-from eomc.scene import scene
+from eomc.scene import read as scene
 
 # a pivot, and what it is compared with: nothing, or rounding of the diagonal entry that it was
 PIVOT = re.compile(r"((?:\w+->)?[dD]_\w+|-?w\d+) <= (0|[\d.]+e-\d+\*([\w>.-]*\w))(?=[;) ?|])")

@@ -13,8 +13,8 @@ from random_scenes import outcome
 from scene_author import scene_text
 
 import eomc
-from eomc.model import system
-from eomc.scene import scene
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 from eomc.verify.check import Report, check
 
 # Right modules of which a row about orders, advised steps or balances once said FAILED.

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from test_check import StandIn
 from trees import SHAPES, trees
 
+from eomc.model import from_scene as system
 from eomc.model import multibody as building
-from eomc.model import system
-from eomc.scene import scene
+from eomc.scene import read as scene
 from eomc.verify import check as checking
 from eomc.verify import rows_bodies
 from eomc.verify.rows_bodies import Bodies

@@ -19,8 +19,9 @@ from hypothesis import strategies as st
 from sympy import atan2, cos, sin
 
 from eomc.base.errors import EomcError
-from eomc.model.system import Coordinate, Parameter, System, dot, from_scene, symbol, t
-from eomc.scene import scene
+from eomc.model.from_scene import from_scene
+from eomc.model.system import Coordinate, Parameter, System, dot, symbol, t
+from eomc.scene import read as scene
 from eomc.verify import symbolic, taylor
 from eomc.verify.symbolic import Reference, derive
 from eomc.verify.taylor import Jets

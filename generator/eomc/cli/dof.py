@@ -21,7 +21,7 @@ def command(scene: Path, as_json: bool) -> None:
     eomc dof scenes/arm.toml
     """
     from eomc.model import mobility
-    from eomc.scene import scene as scenes
+    from eomc.scene import read as scenes
 
     counted = mobility.count(scenes.read(scene))
     say(json.dumps(counted.as_dict(), indent=1) if as_json else counted.table())

@@ -46,8 +46,7 @@ def command(
     from dataclasses import replace
 
     from eomc.base import names
-    from eomc.robots import robot as robots
-    from eomc.robots import urdf, xml
+    from eomc.robots import edit, scene_text, urdf, xml
     from eomc.robots.mjcf import read
     from eomc.scene.toml_text import MAX_BYTES
 
@@ -58,21 +57,21 @@ def command(
         raise EomcError(f"--include is for MJCF files, and {shown(file)} is none")
     else:
         robot = urdf.read(file)
-    robot = robots.lock(robot, dict(pairs(locks, "--lock", {})))
-    robot = robots.cut(robot, root, tip)
+    robot = edit.lock(robot, dict(pairs(locks, "--lock", {})))
+    robot = edit.cut(robot, root, tip)
     if base:
-        robot = robots.based(robot, free=base == "free")
+        robot = edit.based(robot, free=base == "free")
     if no_drives:
         robot = replace(robot, drives=())
     if mend_inertias:
-        robot = robots.mended(robot)
+        robot = edit.mended(robot)
     if name is not None:
         if why := names.module_fault(name):
             raise EomcError(f"--name: {why}")
         robot = replace(robot, name=name)
-    robot = robots.finished(robot)
+    robot = scene_text.finished(robot)
     path = out or files.scene_path(robot.name)
-    text = robots.scene_text(robot)
+    text = scene_text.scene_text(robot)
     if len(text.encode()) > MAX_BYTES:
         raise EomcError(
             f"{shown(file)}: its scene would have {len(text.encode())} bytes, and a scene has at "

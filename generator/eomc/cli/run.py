@@ -108,7 +108,7 @@ def _overrides(
         values[name] = value
     q0, qd0 = module.start
     if values:  # the start may be a formula in the parameters
-        from eomc.scene import scene as scenes
+        from eomc.scene import read as scenes
 
         q0[:], qd0[:] = scenes.read(scene, values).start()  # and may be bad for a body
     states = {name: (q0, k) for k, name in enumerate(module.coordinates)}

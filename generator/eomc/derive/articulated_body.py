@@ -16,7 +16,7 @@ from sympy import Expr, S
 
 from eomc.derive.newton_euler import AXES, ZERO, Inertia, Recursion, Vector
 from eomc.derive.tape import Stage
-from eomc.model.multibody import Matrix
+from eomc.model.exact import Matrix
 
 Rows = list[list[Expr]]
 Pairs = tuple[tuple[Expr, Expr], ...]

@@ -22,7 +22,8 @@ import sympy
 from sympy import Expr, S
 
 from eomc.derive.tape import Tape
-from eomc.model.multibody import Link, Matrix, Tree
+from eomc.model.exact import Matrix
+from eomc.model.multibody import Link, Tree
 
 Vector = tuple[Expr, Expr, Expr]
 

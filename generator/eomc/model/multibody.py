@@ -10,24 +10,37 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import mpmath
 import sympy
-from sympy import Add, Expr, Rational, S, Symbol
+from sympy import Add, Expr, S, Symbol
 
+from eomc.base.spatial import (
+    about_axis,
+    apply,
+    moved_inertia,
+    plus,
+    product,
+    rotated_inertia,
+    scaled,
+    transposed,
+)
+from eomc.base.spatial import dot as dot_product
+from eomc.model.exact import (
+    ONE,
+    ZERO,
+    Matrix,
+    Vector,
+    aligned_with,
+    clean,
+    numeric,
+    numeric_entry,
+    unit,
+)
 from eomc.model.symbols import dot, symbol
 from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 
-Vector = tuple[Expr, Expr, Expr]
-Matrix = tuple[Vector, Vector, Vector]
 Value = Callable[[str, Formula], Expr]  # the expression of a formula that stands at a key
-
-DIGITS = 50  # of numbers that are folded
-TINY = 10**40  # what is nearer than one part in that many to a whole number is it
-
-ZERO: Vector = (S.Zero, S.Zero, S.Zero)
-ONE: Matrix = ((S.One, S.Zero, S.Zero), (S.Zero, S.One, S.Zero), (S.Zero, S.Zero, S.One))
 
 
 @dataclass(frozen=True)
@@ -169,8 +182,8 @@ class Builder:
         """The place behind one more elementary joint, which becomes a link."""
         terms = self.terms
         q, qd = symbol(coordinate), symbol(f"{coordinate}_dot")
-        k, aligned = _aligned(axis)
-        direction = tuple(S(x) for x in _unit(axis))
+        k, aligned = aligned_with(axis)
+        direction = tuple(S(x) for x in unit(axis))
         terms.links.append(
             Link(
                 name, place.link, motion == "r", k, q, qd, place.offset,
@@ -205,7 +218,7 @@ class Builder:
         else:
             about = rotated_inertia(place.rotation, [numeric_entry(x) for x in inertia])
             arm = plus(place.offset, apply(place.rotation, c))
-            about = [a + b for a, b in zip(about, point_inertia(m, arm), strict=True)]
+            about = moved_inertia([numeric_entry(x) for x in about], m, arm)
             self._add_mass(place.link, m, moment, about)
             terms.tree_kinetic += self._kinetic(mass, inertia, position, place)
         terms.tree_potential.append(self._weight(mass, position))
@@ -395,138 +408,9 @@ def _motions(body: Body) -> list[tuple[str, Sequence[float], str]]:
     return list(zip(joint.motions, joint.along(body.axes), body.coordinates, strict=True))
 
 
-# --- numbers, vectors and matrices ---------------------------------------------------------------
-
-
-def numeric_entry(e: Expr) -> Expr:
-    """Numbers as fractions of at most DIGITS digits; what is all but whole is whole."""
-    if not e.is_number:
-        return e
-    if not e.is_Rational:
-        e = Rational(str(e.evalf(DIGITS + 5)))
-    whole = (2 * e.p + e.q) // (2 * e.q)  # the nearest
-    if abs(e.p - whole * e.q) * TINY < e.q:
-        return S(whole)
-    if e.q > 10**DIGITS:
-        with mpmath.workdps(DIGITS):
-            e = Rational(mpmath.nstr(mpmath.mpf(e.p) / e.q, DIGITS))
-    return e
-
-
-def numeric(v: Vector) -> Vector:
-    """A vector with its numbers as fractions."""
-    x, y, z = map(numeric_entry, v)
-    return (x, y, z)
-
-
-def clean(matrix: Matrix) -> Matrix:
-    """A matrix with its numbers as fractions."""
-    one, two, three = map(numeric, matrix)
-    return (one, two, three)
-
-
-def plus(a: Vector, b: Vector) -> Vector:
-    """a + b"""
-    x, y, z = (p if q is S.Zero else q if p is S.Zero else p + q for p, q in zip(a, b, strict=True))
-    return (x, y, z)
-
-
-def scaled(a: Vector, factor: Expr) -> Vector:
-    """factor a"""
-    return (a[0] * factor, a[1] * factor, a[2] * factor)
-
-
-def dot_product(a: Vector, b: Vector) -> Expr:
-    """a . b"""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def apply(R: Matrix, v: Sequence[Expr]) -> Vector:
-    """R v"""
-    x, y, z = (
-        Add(*(e if r is S.One else r * e for r, e in zip(row, v, strict=True) if r is not S.Zero))
-        for row in R
-    )
-    return (x, y, z)
-
-
-def transposed(R: Matrix) -> Matrix:
-    """The transposed matrix: of a rotation, its inverse."""
-    one, two, three = zip(*R, strict=True)
-    return (one, two, three)
-
-
-def product(A: Matrix, B: Matrix) -> Matrix:
-    """A B"""
-    columns = [apply(A, column) for column in transposed(B)]
-    one, two, three = zip(*columns, strict=True)
-    return (one, two, three)
-
-
 def rotation_about(axis: int, angle: Expr) -> Matrix:
-    """The rotation about a coordinate axis: takes vectors of the turned frame to the old one."""
-    c, s = sympy.cos(angle), sympy.sin(angle)
-    a, b = ((1, 2), (2, 0), (0, 1))[axis]
-    rows = [list(row) for row in ONE]
-    rows[a][a], rows[a][b], rows[b][a], rows[b][b] = c, -s, s, c
-    one, two, three = map(tuple, rows)
-    return (one, two, three)
-
-
-def _unit(axis: Sequence[float]) -> list[Expr]:
-    """The axis as fractions, of length one in DIGITS digits."""
-    given = [Rational(str(x)) for x in axis]
-    with mpmath.workdps(DIGITS + 5):
-        long = [mpmath.mpf(x.p) / x.q for x in given]
-        size = mpmath.sqrt(sum(x * x for x in long))
-        return [numeric_entry(Rational(mpmath.nstr(x / size, DIGITS + 5))) for x in long]
-
-
-def _aligned(axis: Sequence[float]) -> tuple[int, Matrix]:
-    """(k, R) with R e_k = axis: frames are turned so that every joint has a coordinate axis."""
-    unit = _unit(axis)
-    for k, x in enumerate(unit):
-        if abs(x) == 1:
-            if x == 1:
-                return k, ONE
-            rows = [[S.Zero] * 3 for _ in range(3)]
-            for i in range(3):  # half a turn about another axis
-                rows[i][i] = S.One if i == (k + 1) % 3 else S.NegativeOne
-            one, two, three = map(tuple, rows)
-            return k, (one, two, three)
-    # Gram and Schmidt, from the coordinate axis that is farthest from it
-    far = min(range(3), key=lambda i: (abs(unit[i]), i))
-    first = [-unit[far] * x for x in unit]
-    first[far] += 1
-    size = sympy.sqrt(sum(x * x for x in first))
-    a = [numeric_entry((x / size).evalf(DIGITS + 5)) if x != 0 else S.Zero for x in first]
-    b = [
-        numeric_entry(unit[1] * a[2] - unit[2] * a[1]),
-        numeric_entry(unit[2] * a[0] - unit[0] * a[2]),
-        numeric_entry(unit[0] * a[1] - unit[1] * a[0]),
-    ]
-    return 2, transposed((tuple(a), tuple(b), tuple(unit)))
-
-
-def point_inertia(mass: Expr, at: Vector) -> list[Expr]:
-    """The inertia of a point mass: Ixx, Iyy, Izz, Ixy, Ixz, Iyz."""
-    x, y, z = at
-    return [
-        mass * (y**2 + z**2), mass * (x**2 + z**2), mass * (x**2 + y**2),
-        -mass * x * y, -mass * x * z, -mass * y * z,
-    ]  # fmt: skip
-
-
-def rotated_inertia(R: Matrix, inertia: Sequence[Expr]) -> list[Expr]:
-    """R I R^T as Ixx, Iyy, Izz, Ixy, Ixz, Iyz."""
-    if R == ONE:
-        return list(inertia)
-    xx, yy, zz, xy, xz, yz = inertia
-    I: Matrix = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))  # noqa: E741 - the field's name
-    turned = product(product(R, I), transposed(R))
-    return [
-        numeric_entry(turned[i][j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    ]
+    """The rotation about a coordinate axis: takes vectors of the rotated frame to the old one."""
+    return about_axis(axis, sympy.cos(angle), sympy.sin(angle))
 
 
 def needed(

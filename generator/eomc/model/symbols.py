@@ -1,11 +1,12 @@
-"""The symbols that a system is written in: names, the time, and rates kept as they stand."""
+"""What a system is written in: coordinates, parameters, inputs, the time, rates as they stand."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import sympy
-from sympy import Symbol
+from sympy import Expr, Symbol
 
 t = Symbol("t", real=True)
 
@@ -24,3 +25,54 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
 def symbol(name: str) -> Symbol:
     """The symbol of a name; all of a system's symbols are real."""
     return Symbol(name, real=True)
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A generalized coordinate `q` and its velocity `qd`; `start` in `unit`, `rate` in unit/s."""
+
+    name: str
+    unit: str = ""
+    start: float = 0.0
+    rate: float = 0.0
+    note: str = ""
+
+    @property
+    def q(self) -> Symbol:
+        """The coordinate's symbol."""
+        return symbol(self.name)
+
+    @property
+    def qd(self) -> Symbol:
+        """The velocity's symbol, `<name>_dot`."""
+        return symbol(f"{self.name}_dot")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that may change at run time."""
+
+    name: str
+    value: float
+    unit: str = ""
+    note: str = ""
+
+    @property
+    def symbol(self) -> Symbol:
+        """The parameter's symbol."""
+        return symbol(self.name)
+
+
+@dataclass(frozen=True)
+class Input:
+    """A quantity given from outside at every step; `signal` is its value by default."""
+
+    name: str
+    unit: str = ""
+    signal: Expr = sympy.S.Zero
+    note: str = ""
+
+    @property
+    def symbol(self) -> Symbol:
+        """The input's symbol."""
+        return symbol(self.name)

@@ -16,9 +16,20 @@ from typing import TYPE_CHECKING
 
 from eomc.base import texts
 from eomc.base.errors import EomcError, Problem, SceneError
-from eomc.robots import robot as robots
+from eomc.base.spatial import transposed
 from eomc.robots import xml
-from eomc.robots.robot import Drive, Inertia, Matrix, Motion, Robot, RobotBody, Vector
+from eomc.robots.inertias import NO_INERTIA, rotated_inertia
+from eomc.robots.robot import Drive, Motion, Robot, RobotBody, free_motions
+from eomc.robots.rotations import (
+    IDENTITY,
+    ORIGIN,
+    Matrix,
+    Vector,
+    from_axis_angle,
+    from_rpy,
+    times,
+    unit,
+)
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
 
@@ -160,7 +171,7 @@ class _Reader:
         moments = [self._number(tensor, ii, key, required=True) for ii in ("ixx", "iyy", "izz")]
         products = [self._number(tensor, ij, key) for ij in ("ixy", "ixz", "iyz")]
         a, b, c, d, e, f = (*moments, *products)
-        inertia: Inertia = robots.rotated_inertia((a, b, c, d, e, f), turn)
+        inertia = rotated_inertia((a, b, c, d, e, f), turn)
         return RobotBody(name, mass=kilograms, center=center, inertia=inertia)
 
     # --- joints
@@ -180,7 +191,7 @@ class _Reader:
         if given is not None and kind not in ("fixed", "floating"):
             axis = self._vector(given, "xyz", key, axis)
             try:
-                axis = robots.unit(axis)
+                axis = unit(axis)
             except ValueError:
                 self.say(key, 'its axis has length zero: give it a direction, <axis xyz="0 0 1"/>')
         motions = self._motions(name, kind, joint, key)
@@ -209,7 +220,7 @@ class _Reader:
 
     def _motions(self, name: str, kind: str, joint: Element, key: str) -> tuple[Motion, ...]:
         if kind == "floating":
-            return robots.free_motions(name)
+            return free_motions(name)
         if kind not in ("revolute", "continuous", "prismatic", "planar"):
             return ()
         damping = friction = 0.0
@@ -220,7 +231,7 @@ class _Reader:
             for what, value in (("damping", damping), ("friction", friction)):
                 if value < 0:
                     self.say(key, f"its {what} is negative ({value:g}): it would drive the joint")
-        unit = "m" if kind == "prismatic" else "rad"
+        of = "m" if kind == "prismatic" else "rad"
         if kind == "planar":
             slide = Motion(f"x_{name}", "m", damping=damping, friction=friction)
             return slide, replace(slide, name=f"y_{name}"), Motion(f"turn_{name}", "rad")
@@ -233,7 +244,7 @@ class _Reader:
                 start = min(max(0.0, lower), upper) if lower <= upper else 0.0
         if (mimic := joint.find("mimic")) is not None:
             note = "; ".join(filter(None, (note, f"mimics {mimic.get('joint', '?')} in the file")))
-        return (Motion(name, unit, start, note, damping, friction),)
+        return (Motion(name, of, start, note, damping, friction),)
 
     # --- the tree
 
@@ -302,11 +313,11 @@ class _Reader:
             return [held]
         turn = _to_axis(joint.axis)
         frame = f"{joint.name}_frame"
-        rotation = robots.times(joint.rotation, turn)
+        rotation = times(joint.rotation, turn)
         note = "the joint's plane is its x and y"
-        between = replace(held, name=frame, mass=0.0, inertia=robots.NO_INERTIA,
-                          center=robots.ORIGIN, rotation=rotation, note=note)  # fmt: skip
-        return [between, replace(body, parent=frame, rotation=robots.transposed(turn))]
+        between = replace(held, name=frame, mass=0.0, inertia=NO_INERTIA,
+                          center=ORIGIN, rotation=rotation, note=note)  # fmt: skip
+        return [between, replace(body, parent=frame, rotation=transposed(turn))]
 
     # --- what is not modelled
 
@@ -355,9 +366,9 @@ class _Reader:
     def _origin(self, element: Element, key: str) -> tuple[Vector, Matrix]:
         origin = element.find("origin")
         if origin is None:
-            return robots.ORIGIN, robots.IDENTITY
-        offset = self._vector(origin, "xyz", key, robots.ORIGIN)
-        return offset, robots.from_rpy(*self._vector(origin, "rpy", key, robots.ORIGIN))
+            return ORIGIN, IDENTITY
+        offset = self._vector(origin, "xyz", key, ORIGIN)
+        return offset, from_rpy(*self._vector(origin, "rpy", key, ORIGIN))
 
     def _vector(self, element: Element, attribute: str, key: str, default: Vector) -> Vector:
         written = element.get(attribute)
@@ -410,8 +421,8 @@ def _to_axis(axis: Vector) -> Matrix:
     x, y, z = axis
     across = math.hypot(x, y)
     if not across:
-        return robots.from_axis_angle((1.0, 0.0, 0.0), math.acos(z))
-    return robots.from_axis_angle((-y / across, x / across, 0.0), math.atan2(across, z))
+        return from_axis_angle((1.0, 0.0, 0.0), math.acos(z))
+    return from_axis_angle((-y / across, x / across, 0.0), math.atan2(across, z))
 
 
 def _plural(word: str, n: int) -> str:

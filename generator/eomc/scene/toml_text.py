@@ -8,6 +8,10 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from eomc.base import texts
+from eomc.base.errors import EomcError, Problem, SceneError
+from eomc.scene import messages
+
 MAX_BYTES = 1_000_000
 MOST_PARTS = 20  # of a key, a.b.c; tomllib takes memory by their square
 
@@ -42,3 +46,98 @@ def tree_and_digest(path: Path) -> tuple[dict[str, Any], str]:
     if len(data) > MAX_BYTES:
         raise ValueError("the file is too large for a scene")
     return loads(data.decode()), hashlib.sha256(data).hexdigest()
+
+
+def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
+    """A scene's text and its tree. Raises SceneError with the fault at its place."""
+    if len(data) > MAX_BYTES:
+        shown = texts.line(file)
+        raise EomcError(f"{shown}: it has more than the {MAX_BYTES} bytes a scene may have")
+    try:
+        text = data.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as fault:
+        raise SceneError([_encoding_problem(data, fault.start, file)]) from None
+    if not text.strip():
+        raise SceneError(
+            [Problem("the file is empty: 'eomc new NAME' writes a scene to start from", file=file)]
+        )
+    if line := long_key(text):
+        message = f"a key has more than {MOST_PARTS} parts: a scene's have three, a.b.c, at most"
+        source = text.split("\n")[line - 1].rstrip()
+        raise SceneError([Problem(message, "", file, line, 0, len(source), source)])
+    try:
+        tree = tomllib.loads(text)
+    except ValueError as fault:
+        raise SceneError([_toml_problem(fault, text, file)]) from None
+    except RecursionError:
+        raise SceneError([Problem("the TOML is nested too deeply", file=file)]) from None
+    if _has_huge(tree):
+        raise SceneError([_huge_problem(text, file)])
+    return text, tree
+
+
+def _encoding_problem(data: bytes, at: int, file: str) -> Problem:
+    start = data.rfind(b"\n", 0, at) + 1
+    source = data[start:].split(b"\n")[0].decode("utf-8", "replace").rstrip()
+    column = len(data[start:at].decode())
+    line = data[:start].count(b"\n") + 1
+    return Problem(
+        "the file is not UTF-8 text: save it as UTF-8", "", file, line, column, source=source
+    )
+
+
+def _has_huge(tree: dict[str, Any]) -> bool:
+    """Whether there is a whole number beyond all doubles; Python may not even print one."""
+    left: list[Any] = [tree]
+    while left:
+        value = left.pop()
+        if isinstance(value, dict):
+            left += value.values()
+        elif isinstance(value, list):
+            left += value
+        elif isinstance(value, int) and value.bit_length() > 1024:
+            return True
+    return False
+
+
+def _huge_problem(text: str, file: str) -> Problem:
+    long = re.search(r"(?i)=[^\"'\n]*?\b(0x[\da-f_]{250}|[\d_]{300}|0o[\d_]{300})", text)
+    line = text.count("\n", 0, long.start(1)) + 1 if long else 0
+    return Problem(
+        "a number has hundreds of digits, more than any double: shorten it", "", file, line
+    )
+
+
+def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
+    """tomllib's message, its place, and what is mostly meant by it."""
+    if not isinstance(fault, tomllib.TOMLDecodeError):  # an int beyond Python's 4,300 digits
+        return _huge_problem(text, file)
+    lines = text.split("\n")
+    found = re.search(r" \(at line (\d+), column (\d+)\)", str(fault))
+    line, column = (int(found[1]), int(found[2]) - 1) if found else (len(lines), -1)
+    message = re.sub(r" \(at .*\)", "", str(fault))
+    source = lines[line - 1].rstrip()
+    key = re.match(r"\s*([^=\s]+)\s*=", source)
+    width = 1
+    if re.match(r"\s*[^\s\"'=#]*[^\x00-\x7f]", source):
+        remedy = ": bare keys are ASCII, write Greek letters out (theta)"
+    elif "overwrite" in message and key:
+        remedy = f": '{key[1]}' stands here a second time, remove one of the two"
+        column, width = key.start(1), len(key[1])
+    elif "Cannot declare" in message:
+        remedy = ": a [table] stands once, put its entries together"
+        column, width = 0, len(source)
+    else:
+        told = messages.bare(source)
+        remedy = next((r for m, r in _TOML_REMEDIES.items() if m in message), "")
+        remedy = f": {told}" if told else remedy
+    return Problem(f"not TOML: {message}{remedy}", "", file, line, column, width, source)
+
+
+_TOML_REMEDIES = {
+    "Invalid value": ": formulas stand in quotes, numbers have digits on both sides of the point",
+    "Expected newline": ": one entry a line, comments begin with '#', decimals are written 9.81",
+    "Illegal character '\\n'": ": is a closing quote missing in this line?",
+    "Unescaped '\\'": ": LaTeX is not read, write names without backslash (theta)",
+    "Unclosed inline table": ": entries in { ... } are separated by commas and stand on one line",
+}

@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
-
-from mpmath import mp
 
 from eomc.base import names
 from eomc.scene import formulas
-from eomc.scene.assembly import (
-    WORLD,
-    Assembly,
-    Body,
-    Damper,
-    Spring,
-    Turn,
-    Vector,
-)
+from eomc.scene.assembly import WORLD, Assembly, Body, Vector
 from eomc.scene.formulas import Formula, nearest, suggest
 from eomc.scene.joints import JOINTS, MEANT, Z
-from eomc.scene.schema import BodyTable, DamperTable, Document, SpringTable
-from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
+from eomc.scene.schema import BodyTable, Document
+from eomc.scene.scope import Checker, Path
+from eomc.scene.validate_springs import Springs
+from eomc.scene.validate_values import ORIGIN, ZERO
 
-ROUNDING = 1e-6  # relative, of principal moments: files have them with six digits and more
-
-ZERO = formulas.parse("0")
-ORIGIN: Vector = (ZERO, ZERO, ZERO)
 FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
 
 _OF_JOINTS = (
@@ -65,18 +53,11 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
     return _Bodies(check, doc, known).assembly()
 
 
-class _Bodies:
+class _Bodies(Springs):
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
-        self.check = check
-        self.doc = doc
-        self.known = known
-        self.names: dict[str, str] = {}  # of each body, and the label of its entry
+        super().__init__(check, doc, known)
         self.moved_by: dict[str, str] = {}  # each coordinate and the body whose joint it moves
-        # entries of a vector; None where gravity doesn't tell whether the scene is plane
-        self.wide: int | None = 2
-        self.values: dict[float | str, tuple[Formula, float]] = {}  # sound formulas, by text
         self.bodies: dict[str, Body] = {}
-        self.heavy: dict[str, bool] = {}
 
     def assembly(self) -> Assembly:
         gravity = self._gravity()
@@ -146,152 +127,7 @@ class _Bodies:
                 "another name",
             )
 
-    # --- values ---------------------------------------------------------------------------------
-
-    def _value(self, path: Path, value: float | str) -> tuple[Formula, float]:
-        """A formula of parameters and its value at their defaults; 0 and nan where it is faulty."""
-        if value not in self.values:
-            rule = f"'{path[-1]}' is made of numbers, constants and parameters"
-            formula = self.check.formula(path, value, self.known, rule)
-            number = self.check.number(path, formula, self.known)
-            if formula is None or math.isnan(number):
-                return ZERO, math.nan
-            self.values[value] = formula, number
-        return self.values[value]
-
-    def _formula(self, path: Path, value: float | str) -> Formula:
-        return self._value(path, value)[0]
-
-    def _moving(self, path: Path, value: float | str) -> Formula:
-        """A formula of everything but inputs and velocities, without dot."""
-        check = self.check
-        formula = check.formula(path, value)
-        if formula is None:
-            return ZERO
-        kinds = check.kinds_of(formula.tree)
-        if INPUT in kinds:
-            check.say(
-                path,
-                f"'{path[-1]}' can't depend on inputs, whose rates nobody knows: "
-                "let them act through an actuator or [forces]",
-                check.where(formula, INPUT),
-                formula.text,
-            )
-        elif VELOCITY in kinds or any(formula.calls("dot")):
-            check.say(
-                path,
-                f"'{path[-1]}' can't depend on velocities: it is made of coordinates, "
-                "t, parameters, constants and definitions of these",
-                check.where(formula, VELOCITY),
-                formula.text,
-            )
-        check.smooth(path, formula)
-        return formula
-
-    def _vector(
-        self,
-        path: Path,
-        given: Sequence[float | str] | None,
-        formula: Callable[[Path, float | str], Formula] | None = None,
-    ) -> Vector:
-        if given is None or not self._fits(path, len(given)):
-            return ORIGIN
-        made = [(formula or self._formula)(path, entry) for entry in given]
-        x, y, z = (*made, ZERO, ZERO, ZERO)[:3]
-        return x, y, z
-
-    def _fits(self, path: Path, entries: int) -> bool:
-        if self.wide is None or entries == self.wide:
-            return self.wide is not None
-        scene = "a plane scene" if self.wide == 2 else "space"
-        words = {2: "two", 3: "three"}
-        self.check.say(
-            path,
-            f"vectors have {words[self.wide]} entries in {scene}, as gravity has, here {entries}",
-        )
-        return False
-
-    def _rotation(
-        self, path: Path, given: Any, formula: Callable[[Path, float | str], Formula]
-    ) -> tuple[Turn, ...]:
-        if given is None:
-            return ()
-        if not isinstance(given, tuple):
-            if self.wide == 3:
-                self.check.say(
-                    path, 'in space a rotation names its axis: write [["z", "pi/2"]], or more turns'
-                )
-            return (Turn("z", formula(path, given)),)
-        for axis, _ in given:
-            if axis != "z" and self.wide == 2:
-                self.check.say(path, f"a plane scene turns about z only, here about {axis}")
-                break
-        return tuple(Turn(axis, formula(path, angle)) for axis, angle in given)
-
     # --- bodies -----------------------------------------------------------------------------------
-
-    def _mass(self, path: Path, entry: BodyTable) -> tuple[Formula, Any]:
-        """Mass and inertia."""
-        mass, value = self._value((*path, "mass"), entry.mass)
-        if value < 0:
-            self.check.say(
-                (*path, "mass"), f"is {value:g} kg, and no mass is negative", text=mass.text
-            )
-        inertia, moments = self._inertia((*path, "inertia"), entry.inertia)
-        self.heavy[entry.name] = value != 0 or any(m != 0 for m in moments)
-        return mass, inertia
-
-    def _inertia(self, path: Path, given: Any) -> tuple[tuple[Formula, ...], list[float]]:
-        nothing = (ZERO,) * 6
-        if given is None or self.wide is None:
-            return nothing, [math.nan] if self.wide is None else [0.0]
-        single = not isinstance(given, tuple)
-        entries = (given,) if single else given
-        if self.wide == 2 and not single:
-            self.check.say(path, "a plane scene has one number for it, about z: write it alone")
-            return nothing, [math.nan]
-        if self.wide == 3 and (single or len(entries) not in (3, 6)):
-            here = "one number" if single else str(len(entries))
-            self.check.say(
-                path,
-                "in space it has three entries, [Ixx, Iyy, Izz], or six, "
-                f"[Ixx, Iyy, Izz, Ixy, Ixz, Iyz], here {here}",
-            )
-            return nothing, [math.nan]
-        made = [self._value(path, entry) for entry in entries]
-        found, numbers = [f for f, _ in made], [v for _, v in made]
-        if self.wide == 2:
-            if numbers[0] < 0:
-                self.check.say(
-                    path,
-                    f"is {numbers[0]:g} kg m^2, and no inertia is negative",
-                    text=found[0].text,
-                )
-            return (ZERO, ZERO, found[0], ZERO, ZERO, ZERO), numbers
-        self._moments(path, [*numbers, 0.0, 0.0, 0.0][:6])
-        return (*found, ZERO, ZERO, ZERO)[:6], numbers
-
-    def _moments(self, path: Path, inertia: Sequence[float]) -> None:
-        """What no body can have: a negative principal moment, one above the sum of the others."""
-        if not all(abs(x) < 1e150 for x in inertia):
-            return
-        xx, yy, zz, xy, xz, yz = inertia
-        tensor = mp.matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # NumPy takes 0.1 s to load
-        small, middle, large = sorted(map(float, mp.eigsy(tensor, eigvals_only=True)))
-        tiny = ROUNDING * max(abs(small), abs(large))
-        shown = f"{small:.4g}, {middle:.4g} and {large:.4g} kg m^2"
-        if small < -tiny:
-            self.check.say(
-                path,
-                f"its principal moments are {shown}, and none can be negative: "
-                "check signs and order, [Ixx, Iyy, Izz, Ixy, Ixz, Iyz]",
-            )
-        elif large > small + middle + tiny:
-            self.check.say(
-                path,
-                f"its principal moments are {shown}, and one is larger than the two others "
-                "together, which no body has: check it, about the centre of mass",
-            )
 
     def _placed(self, path: Path, entry: BodyTable) -> None:
         """A body placed by formulas."""
@@ -582,65 +418,3 @@ class _Bodies:
                 f"nothing that {' and '.join(body.coordinates)} would move has mass or inertia: "
                 f"give '{body.name}' a mass, or its joint an armature",
             )
-
-    # --- springs and dampers ----------------------------------------------------------------------
-
-    def _spring(self, path: Path, entry: SpringTable) -> Spring:
-        return Spring(
-            stiffness=self._formula((*path, "stiffness"), entry.stiffness),
-            length=self._formula((*path, "length"), entry.length),
-            **self._between(path, entry),
-        )
-
-    def _damper(self, path: Path, entry: DamperTable) -> Damper:
-        return Damper(
-            damping=self._formula((*path, "damping"), entry.damping), **self._between(path, entry)
-        )
-
-    def _between(self, path: Path, entry: SpringTable | DamperTable) -> dict[str, Any]:
-        """What a spring or damper acts on."""
-        check, what = self.check, path[0]
-        if (entry.coordinate is None) == (entry.bodies is None):
-            if not {(*path, "coordinate"), (*path, "bodies")} & check.mended:
-                check.say(
-                    path,
-                    f"a {what} acts along a 'coordinate' or between two 'bodies': give "
-                    + ("one of the two" if entry.coordinate is None else "one of the two only"),
-                )
-            return {}
-        if entry.coordinate is not None:
-            for key in ("points", "turning"):
-                if getattr(entry, key):
-                    check.say((*path, key), f"belongs to a {what} between 'bodies': remove it")
-            if entry.coordinate not in self.doc.coordinates:
-                remedy = suggest(entry.coordinate, self.doc.coordinates)
-                remedy = remedy or f": known are {', '.join([*self.doc.coordinates][:9])}"
-                check.say(
-                    (*path, "coordinate"),
-                    f"'{entry.coordinate}' is not a coordinate{remedy}",
-                    text=entry.coordinate,
-                )
-            return {"coordinate": entry.coordinate}
-        assert entry.bodies is not None
-        for name in entry.bodies:
-            if name != WORLD and name not in self.names:
-                remedy = suggest(name, [WORLD, *self.names]) or ": declare it as a [[body]]"
-                check.say((*path, "bodies"), f"there is no body '{name}'{remedy}", text=name)
-        first, second = entry.bodies
-        if first == second:
-            check.say(
-                (*path, "bodies"), f"a {what} acts between two bodies, here both are '{first}'"
-            )
-        if entry.turning:
-            if self.wide == 3:
-                check.say(
-                    (*path, "turning"),
-                    f"a {what} turns in plane scenes only: in space let it act along the "
-                    "'coordinate' of a joint",
-                )
-            if entry.points:
-                check.say((*path, "points"), f"a turning {what} has no points: remove them")
-            return {"bodies": (first, second), "turning": True}
-        points = entry.points or (None, None)
-        one, other = (self._vector((*path, "points"), point) for point in points)
-        return {"bodies": (first, second), "points": (one, other)}

@@ -15,7 +15,7 @@ from typing import Any
 
 from eomc.base.errors import Problem
 from eomc.robots import xml
-from eomc.robots.robot import Vector
+from eomc.robots.rotations import Vector
 
 SHOWN = 12  # names told in one line of what is left out
 

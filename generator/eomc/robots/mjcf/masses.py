@@ -7,26 +7,28 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from eomc.robots.mjcf import file as text
-from eomc.robots.mjcf.file import ORIENTATION, TRUTH, Attributes, Classes, Settings, Tag, Told
-from eomc.robots.robot import (
-    IDENTITY,
+from eomc.base.spatial import apply, cross, dot, plus, point_inertia, six, transposed
+from eomc.robots.inertias import (
     NO_INERTIA,
-    ORIGIN,
     Inertia,
-    Matrix,
-    RobotBody,
-    Vector,
-    added,
-    from_axis_angle,
-    from_euler,
-    from_quaternion,
     indefinite,
     principal,
     rotated_inertia,
-    times,
-    turned,
     unbalanced,
+)
+from eomc.robots.mjcf import file as text
+from eomc.robots.mjcf.file import ORIENTATION, TRUTH, Attributes, Classes, Settings, Tag, Told
+from eomc.robots.robot import RobotBody
+from eomc.robots.rotations import (
+    IDENTITY,
+    ORIGIN,
+    Matrix,
+    Vector,
+    cleaned,
+    from_axis_angle,
+    from_euler,
+    from_quaternion,
+    times,
     unit,
 )
 
@@ -41,7 +43,7 @@ class Pose(NamedTuple):
 
     def of(self, other: Pose) -> Pose:
         """The frame `other`, given in this one, where this one is given."""
-        return Pose(added(self.place, turned(self.turn, other.place)), times(self.turn, other.turn))
+        return Pose(plus(self.place, apply(self.turn, other.place)), times(self.turn, other.turn))
 
 
 STILL = Pose(ORIGIN, IDENTITY)
@@ -58,7 +60,7 @@ class Mass(NamedTuple):
         """The same in the frame in which `pose` is given."""
         return Mass(
             self.mass,
-            added(pose.place, turned(pose.turn, self.center)),
+            plus(pose.place, apply(pose.turn, self.center)),
             rotated_inertia(self.inertia, pose.turn),
         )
 
@@ -141,13 +143,12 @@ def _orientation(attributes: Attributes, tag: Tag, reader: Reader) -> Matrix:
         return _toward(first)
     if key == "axisangle":
         return from_axis_angle(first, settings.angle(v[3]))
-    along = sum(a * b for a, b in zip(v[3:], first, strict=True))
+    along = dot(v[3:], first)
     across = [a - along * b for a, b in zip(v[3:], first, strict=True)]
     second = direction(across, "the y axis of xyaxes", tag, told)
     if second is None:
         return IDENTITY
-    (a, b, c), (d, e, f) = first, second
-    return times(IDENTITY, ((a, d, b * f - c * e), (b, e, c * d - a * f), (c, f, a * e - b * d)))
+    return cleaned(transposed((first, second, cross(first, second))))
 
 
 def pose_of(attributes: Attributes, tag: Tag, reader: Reader) -> Pose:
@@ -314,26 +315,17 @@ def _sum(masses: Sequence[Mass]) -> Mass:
     x, y, z = (rounded(sum(m.mass * m.center[k] for m in masses) / total, wide) for k in range(3))
     inertia = [0.0] * 6
     for m in masses:
-        dx, dy, dz = added(m.center, (-x, -y, -z))
-        about = (
-            dy * dy + dz * dz, dx * dx + dz * dz, dx * dx + dy * dy, -dx * dy, -dx * dz, -dy * dz,
-        )  # fmt: skip
+        about = point_inertia(1.0, plus(m.center, (-x, -y, -z)))
         inertia = [
             i + own + m.mass * d for i, own, d in zip(inertia, m.inertia, about, strict=True)
         ]
     size = max(map(abs, inertia))
-    return Mass(total, (x, y, z), six([rounded(i, size) for i in inertia]))
+    return Mass(total, (x, y, z), six(rounded(i, size) for i in inertia))
 
 
 def rounded(x: float, size: float) -> float:
     """`x`, or 0 where it is what rounding left of a zero among numbers of the size `size`."""
     return x if abs(x) > ROUNDING * size else 0.0
-
-
-def six(values: Sequence[float]) -> Inertia:
-    """Six numbers as an inertia."""
-    xx, yy, zz, xy, xz, yz = values
-    return xx, yy, zz, xy, xz, yz
 
 
 def _inertial(placed: Placed, reader: Reader) -> Mass | None:
@@ -403,6 +395,6 @@ def scaled_to(bodies: Sequence[RobotBody], total: float) -> list[RobotBody]:
     now = sum(body.mass for body in bodies)
     k = total / now if now else 1.0
     return [
-        replace(body, mass=k * body.mass, inertia=six([k * v for v in body.inertia]))
+        replace(body, mass=k * body.mass, inertia=six(k * v for v in body.inertia))
         for body in bodies
     ]

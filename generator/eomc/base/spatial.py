@@ -1,0 +1,128 @@
+"""Vectors, rotations and inertias, generic in their scalars: floats or SymPy's expressions.
+
+A vector has three entries, a matrix three rows, an inertia six entries: Ixx, Iyy, Izz, Ixy, Ixz,
+Iyz, those off the diagonal being the tensor's, -sum m x y. Products with an exact zero are left
+out, which keeps expressions short and changes no number but the sign of a zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+Vector = tuple[T, T, T]
+Matrix = tuple[Vector[T], Vector[T], Vector[T]]
+Inertia = tuple[T, T, T, T, T, T]
+
+ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of a tensor, in an inertia's order
+
+
+def plus(a: Sequence[T], b: Sequence[T]) -> Vector[T]:
+    """a + b"""
+    x, y, z = (_sum(p, q) for p, q in zip(a, b, strict=True))
+    return x, y, z
+
+
+def scaled(a: Sequence[T], factor: T) -> Vector[T]:
+    """factor a"""
+    x, y, z = (_product(p, factor) for p in a)
+    return x, y, z
+
+
+def dot(a: Sequence[T], b: Sequence[T]) -> T:
+    """a . b"""
+    terms: list[T] = [_product(p, q) for p, q in zip(a, b, strict=True) if p and q]
+    return reduce(_sum, terms) if terms else _product(a[0], b[0])
+
+
+def cross(a: Sequence[Any], b: Sequence[Any]) -> Vector[Any]:
+    """a x b"""
+    (x, y, z), (u, v, w) = a, b
+    return y * w - z * v, z * u - x * w, x * v - y * u
+
+
+def apply(R: Matrix[T], v: Sequence[T]) -> Vector[T]:
+    """R v"""
+    x, y, z = (dot(row, v) for row in R)
+    return x, y, z
+
+
+def transposed(R: Matrix[T]) -> Matrix[T]:
+    """The transposed matrix: of a rotation, its inverse."""
+    one, two, three = zip(*R, strict=True)
+    return one, two, three
+
+
+def product(A: Matrix[T], B: Matrix[T]) -> Matrix[T]:
+    """A B"""
+    return transposed(matrix(apply(A, column) for column in transposed(B)))
+
+
+def matrix(rows: Any) -> Matrix[Any]:
+    """Three rows, whatever holds them, as a matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    return (a, b, c), (d, e, f), (g, h, i)
+
+
+def about_axis(k: int, cosine: Any, sine: Any) -> Matrix[Any]:
+    """The rotation about a coordinate axis: takes vectors of the rotated frame to the old one."""
+    zero = 0 * cosine
+    i, j = (k + 1) % 3, (k + 2) % 3
+    rows = [[zero] * 3 for _ in range(3)]
+    rows[k][k] = zero + 1
+    rows[i][i], rows[i][j], rows[j][i], rows[j][j] = cosine, -sine, sine, cosine
+    return matrix(rows)
+
+
+def about(axis: Sequence[Any], cosine: Any, sine: Any) -> Matrix[Any]:
+    """The rotation about an axis of length one (Rodrigues)."""
+    x, y, z = axis
+    c, s = cosine, sine
+    r = 1 - c
+    return (
+        (c + x * x * r, x * y * r - z * s, x * z * r + y * s),
+        (y * x * r + z * s, c + y * y * r, y * z * r - x * s),
+        (z * x * r - y * s, z * y * r + x * s, c + z * z * r),
+    )
+
+
+def tensor(inertia: Sequence[T]) -> Matrix[T]:
+    """The symmetric matrix of an inertia."""
+    xx, yy, zz, xy, xz, yz = inertia
+    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+
+
+def rotated_inertia(R: Matrix[T], inertia: Sequence[T]) -> Inertia[T]:
+    """R I R^T: an inertia along axes that stand in the new ones as R says, along the new ones."""
+    rotated = product(product(R, tensor(inertia)), transposed(R))
+    return six(rotated[i][j] for i, j in ENTRIES)
+
+
+def point_inertia(mass: Any, at: Sequence[Any]) -> Inertia[Any]:
+    """The inertia of a point mass about the origin."""
+    x, y, z = at
+    return (
+        mass * (y * y + z * z), mass * (x * x + z * z), mass * (x * x + y * y),
+        -mass * x * y, -mass * x * z, -mass * y * z,
+    )  # fmt: skip
+
+
+def moved_inertia(inertia: Sequence[Any], mass: Any, center: Sequence[Any]) -> Inertia[Any]:
+    """An inertia about the centre of mass, about the origin instead (Steiner's parallel axes)."""
+    return six(a + b for a, b in zip(inertia, point_inertia(mass, center), strict=True))
+
+
+def six(values: Any) -> Inertia[Any]:
+    """Six values, whatever holds them, as an inertia."""
+    xx, yy, zz, xy, xz, yz = values
+    return xx, yy, zz, xy, xz, yz
+
+
+def _sum(p: T, q: T) -> T:
+    return p + q if p and q else p or q  # type: ignore[operator]
+
+
+def _product(p: T, q: T) -> T:
+    return q if p == 1 else p * q  # type: ignore[operator]

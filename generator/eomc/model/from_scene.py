@@ -1,0 +1,148 @@
+"""A checked scene as a System: its formulas as SymPy expressions, constants folded in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy
+from sympy import Expr, Symbol
+
+from eomc.base.errors import Problem, SceneError
+from eomc.model import growth
+from eomc.model.multibody import Builder, Terms
+from eomc.model.symbols import Coordinate, Input, Parameter, dot, symbol, t
+from eomc.model.system import System
+from eomc.scene import formulas
+from eomc.scene.formulas import Formula, FormulaError
+from eomc.scene.scene import Scene
+
+
+def _number(text: str) -> Expr:
+    return (
+        sympy.Rational(text)
+        if text[:2].lower() not in ("0x", "0o", "0b")
+        else sympy.Integer(int(text, 0))
+    )
+
+
+_ALGEBRA: Mapping[str, Any] = {
+    "number": _number,
+    "pi": sympy.pi,
+    **{n: getattr(sympy, n) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")},
+    **{n: getattr(sympy, n) for n in ("sinh", "cosh", "tanh", "exp", "log", "sqrt", "sign")},
+    "abs": sympy.Abs,
+    "heaviside": lambda x: sympy.Heaviside(x),
+    "min": sympy.Min,
+    "max": sympy.Max,
+    "dot": dot,
+}
+
+_UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
+
+
+class _Formulas:
+    """A scene's formulas as expressions, over the names known so far; faults collected."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.known: dict[str, Expr] = {"t": t}
+        for c in scene.coordinates:
+            self.known |= {n: symbol(n) for n in (c.name, f"{c.name}_dot")}
+        given = [*(p.name for p in scene.parameters), *(i.name for i in scene.inputs)]
+        self.known |= {name: symbol(name) for name in given}
+        self.problems: list[Problem] = []
+        self.sizes: dict[str, growth.Size] = {}  # of constants and definitions
+
+    def value(self, key: str, formula: Formula) -> Expr:
+        """The expression of the formula at a key; zero where it is at fault."""
+        name = key.partition(".")[2] if key.startswith(("constants.", "definitions.")) else ""
+        try:
+            self.sizes[name] = growth.VARIES
+            self.sizes[name] = growth.size(formula, self.sizes)
+            found = sympy.sympify(formulas.evaluate(formula, _ALGEBRA, self.known.__getitem__))
+            if found.has(*_UNDEFINED):
+                raise FormulaError("divides by zero")
+            if found.has(sympy.I):
+                raise FormulaError("has no real value")
+        except (FormulaError, ArithmeticError, ValueError, TypeError) as fault:
+            message = f"'{formula.shown}' {fault}"
+            self.problems.append(self.scene.problem(key, message, formula))
+            return sympy.S.Zero
+        return found
+
+    def definitions(self) -> tuple[list[tuple[Symbol, Expr]], Terms]:
+        """Constants become known; then definitions in their order, and what bodies add."""
+        scene, known = self.scene, self.known
+        for constant in scene.constants:
+            known[constant.name] = self.value(f"constants.{constant.name}", constant.formula)
+        declared = [*known, *(name for name, _ in scene.definitions)]
+        builder = Builder(scene.assembly, self.value, declared) if scene.assembly else None
+        made = []
+        if builder:
+            builder.build_tree()
+            made += builder.terms.definitions
+            known |= {name.name: name for name, _ in made}
+        for name, formula in scene.definitions:
+            made.append((symbol(name), self.value(f"definitions.{name}", formula)))
+            known[name] = symbol(name)
+        if builder:
+            builder.build_rest()
+            builder.add_forces()
+            made += builder.terms.later
+        return made, builder.terms if builder else Terms()
+
+
+def from_scene(scene: Scene) -> System:
+    """The scene's formulas as SymPy expressions, constants folded in. Raises SceneError."""
+    made = _Formulas(scene)
+    value = made.value
+    definitions, more = made.definitions()
+    kinetic = value("energy.kinetic", scene.kinetic)
+    potential = value("energy.potential", scene.potential)
+    start, rate = scene.start()
+    forces = {name: value(f"forces.{name}", formula) for name, formula in scene.forces.items()}
+    zero = sympy.S.Zero
+    system = System(
+        name=scene.name,
+        coordinates=tuple(
+            Coordinate(c.name, c.unit, q, qd, c.note)
+            for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
+        ),
+        kinetic=sympy.Add(kinetic, more.kinetic, *more.tree_kinetic),
+        potential=sympy.Add(potential, more.potential, *more.tree_potential),
+        dissipation=value("energy.dissipation", scene.dissipation) + more.dissipation,
+        forces=tuple(
+            more.forces.get(c.name, zero) + forces.get(c.name, zero) for c in scene.coordinates
+        ),
+        tree=more.tree(kinetic, potential),
+        parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
+        inputs=tuple(
+            Input(i.name, i.unit, value(f"inputs.{i.name}.signal", i.signal), i.note)
+            for i in scene.inputs
+        ),
+        definitions=tuple(definitions),
+        run=scene.run,
+        title=scene.title,
+        note=scene.note,
+        file=scene.file,
+        digest=scene.digest,
+        warnings=(*scene.warnings, *_at_the_start(scene)),
+        place=scene.problem,
+        scene=scene,
+    )
+    if made.problems:
+        raise SceneError(made.problems)
+    return system
+
+
+def _at_the_start(scene: Scene) -> list[Problem]:
+    """Warnings of springs and dampers that have no direction there."""
+    assembly = scene.assembly
+    if not assembly or not any(
+        [*(s.points for s in assembly.springs), *(d.points for d in assembly.dampers)]
+    ):
+        return []
+    from eomc.model import mobility  # and with it NumPy, which few scenes need here
+
+    return mobility.meeting(scene)

@@ -1,0 +1,148 @@
+"""What System.make makes of a user's symbols and expressions, whatever their assumptions."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import sympy
+from sympy import Expr, Symbol
+from sympy.core.function import AppliedUndef
+
+from eomc.base import names
+from eomc.base.errors import EomcError
+from eomc.model import given
+from eomc.model.symbols import Coordinate, Input, Parameter, dot, symbol, t
+from eomc.scene.scene import Run
+
+_UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
+
+
+class Maker:
+    """Takes a user's symbols, of whatever assumptions and spelling, for ours."""
+
+    def __init__(self, name: str) -> None:
+        if not isinstance(name, str):
+            raise given.fault("name", f"must be text, here {name!r}")
+        if why := names.module_fault(name):
+            raise EomcError(f"System.make: name: {why}")
+        self.name = name
+        self.map: dict[Any, Expr] = {}
+        self.taken: dict[str, Any] = {}
+        self.renamed: list[tuple[str, str]] = []
+
+    def _name_of(self, one: Any, role: str) -> str:
+        if not given.is_symbol(one):
+            raise given.fault(role, f"{one!r} is not a symbol")
+        text = one.func.__name__ if isinstance(one, AppliedUndef) else str(one)
+        used = names.plain(text) if names.fault(text) else text
+        if used in self.taken:
+            raise EomcError(f"System.make: {role} '{text}': the name '{used}' is taken already")
+        if used != text:
+            self.renamed.append((text, used))
+        self.taken[used] = one
+        return used
+
+    def _expression(self, value: Any, role: str) -> Expr:
+        expr = given.expression(value, role)
+        expr = expr.replace(
+            lambda e: isinstance(e, sympy.Derivative), lambda e: self.map.get(e, e)
+        ).xreplace(self.map)
+        strange = sorted(
+            map(str, expr.atoms(AppliedUndef, sympy.Derivative) - expr.atoms(dot))
+            if expr.has(AppliedUndef, sympy.Derivative)
+            else []
+        ) + sorted(s.name for s in expr.free_symbols if s not in self.known)
+        if any(
+            isinstance(d, sympy.Derivative) and d.derivative_count > 1
+            for d in expr.atoms(sympy.Derivative)
+        ):
+            raise given.fault(role, "accelerations are what is solved for, none can be used")
+        if strange == ["t"]:
+            raise given.fault(
+                role,
+                "this t is not the time: write eomc.model.system.t, or "
+                "dynamicsymbols._t where coordinates are dynamicsymbols",
+            )
+        if strange:
+            raise EomcError(
+                f"System.make: {role}: {', '.join(strange)} not declared: "
+                "name it among coordinates, parameters, inputs or definitions"
+            )
+        if expr.has(*_UNDEFINED, sympy.I):
+            raise EomcError(f"System.make: {role}: {expr} is not a real, finite expression")
+        given.check_functions(expr, role)
+        return expr
+
+    def make(
+        self, coordinates: Any, kinetic: Any, potential: Any, parameters: Mapping[Any, float],
+        dissipation: Any, forces: Mapping[Any, Any], inputs: Any, definitions: Mapping[Any, Any],
+        units: Mapping[Any, str], title: str, run: Run,
+    ) -> dict[str, Any]:  # fmt: skip
+        """The fields of a System, by name."""
+        starts = given.symbols(coordinates, "coordinates", 0.0)
+        parameters = given.mapping(parameters, "parameters", "{m: 2.0}")
+        forces = given.mapping(forces, "forces", "{x: F}")
+        definitions = given.mapping(definitions, "definitions", "{y: l*cos(theta)}")
+        units = given.mapping(units, "units", '{m: "kg"}')
+        for text in (title, *units.values()):
+            if not isinstance(text, str):
+                raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
+        if not starts:
+            raise EomcError("System.make: give at least one coordinate")
+        made = []
+        for one, start in starts.items():
+            name = self._name_of(one, "coordinate")
+            c = Coordinate(name, units.get(one, ""), *given.start(start, f"start of {name}"))
+            self.map[one] = c.q
+            if isinstance(one, AppliedUndef):
+                time = one.args[0]
+                self.map[sympy.Derivative(one, time)] = c.qd
+                self.map[time] = t
+            else:
+                self.map[Symbol(f"{one}_dot", **one.assumptions0)] = c.qd
+            made.append(c)
+        declared = [
+            Parameter(
+                self._declare(p, "parameter"), given.number(v, f"parameter {p}"), units.get(p, "")
+            )
+            for p, v in parameters.items()
+        ]
+        pending = given.symbols(inputs, "inputs", 0)
+        given_inputs = [(i, self._declare(i, "input")) for i in pending]
+        self.known = {c.q for c in made} | {c.qd for c in made} | {t}
+        self.known |= {symbol(n) for n in self.taken}
+        ordered = []
+        for one, body in definitions.items():
+            expr = self._expression(body, f"definition {one}")
+            defined = symbol(self._declare(one, "definition"))
+            self.known.add(defined)
+            ordered.append((defined, expr))
+        unknown = [str(f) for f in forces if f not in starts]
+        if unknown:
+            raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
+        expression = self._expression
+        made_of: dict[str, Any] = {
+            "name": self.name,
+            "coordinates": tuple(made),
+            "kinetic": expression(kinetic, "kinetic"),
+            "potential": expression(potential, "potential"),
+            "dissipation": expression(dissipation, "dissipation"),
+            "forces": tuple(expression(forces.get(c, 0), f"force on {c}") for c in starts),
+            "parameters": tuple(declared),
+            "inputs": tuple(
+                Input(used, units.get(one, ""), expression(pending[one], f"signal of {one}"))
+                for one, used in given_inputs
+            ),
+            "definitions": tuple(ordered),
+            "run": run,
+            "title": title or self.name.replace("_", " ").capitalize(),
+        }
+        digest = hashlib.sha256(sympy.srepr(sorted(made_of.items())).encode()).hexdigest()
+        return made_of | {"digest": digest, "renamed": tuple(self.renamed)}
+
+    def _declare(self, one: Any, role: str) -> str:
+        used = self._name_of(one, role)
+        self.map[one] = symbol(used)
+        return used

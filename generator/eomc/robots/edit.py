@@ -1,0 +1,162 @@
+"""What a user asks for of a robot: joints locked, parts cut, another base, inertias mended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from eomc.base.errors import EomcError
+from eomc.base.spatial import apply, plus
+from eomc.robots.inertias import indefinite, nearest, principal, shown, unbalanced
+from eomc.robots.robot import Robot, RobotBody, free_motions, joined, listed, moved, without_dust
+from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_pitch_roll
+from eomc.scene.assembly import WORLD
+from eomc.scene.formulas import suggest
+
+
+def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
+    """The robot with joints frozen: coordinate -> value (rad or m).
+
+    Raises EomcError for what is not a coordinate, and for one of a joint that has several.
+    """
+    owners = {m.name: body for body in robot.bodies for m in body.motions}
+    for name in values:
+        if name not in owners:
+            raise EomcError(
+                f"--lock {name}: no joint that moves is called '{name}'"
+                + (suggest(name, owners) or f"; there are {listed(tuple(owners))}")
+            )
+        body = owners[name]
+        if len(body.motions) > 1:
+            those = ", ".join(m.name for m in body.motions)
+            raise EomcError(
+                f"--lock {name}: the {body.joint} joint of '{body.name}' moves by {those} "
+                "together: only a joint with one coordinate can be frozen"
+            )
+    bodies = []
+    for body in robot.bodies:
+        if body.motions and body.motions[0].name in values:
+            motion = body.motions[0]
+            value = values[motion.name]
+            offset, rotation = moved(body, (value,))
+            body = replace(
+                body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation,
+                note=joined(body.note, f"joint {motion.name} locked at {value!r} {motion.unit}"),
+            )  # fmt: skip
+        bodies.append(body)
+    return _without_loose_drives(replace(robot, bodies=tuple(bodies)))
+
+
+def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
+    """The bodies from `root` on, or those on the way from there to `tip`.
+
+    The root is fixed to the world where it stands while all coordinates have their start values,
+    so that gravity pulls as it did. What is fixed to a body on the way to the tip stays with it;
+    what the tip carries does not. Raises EomcError for unknown bodies and a tip not behind the
+    root.
+    """
+    by_name = {body.name: body for body in robot.bodies}
+    for option, name in (("--root", root), ("--tip", tip)):
+        if name and name not in by_name:
+            raise EomcError(
+                f"{option} {name}: no body is called '{name}'"
+                + (suggest(name, by_name) or f"; there are {listed(tuple(by_name))}")
+            )
+    kept = set(by_name)
+    if root:
+        kept = {root}
+        for body in robot.bodies:
+            if body.parent in kept:
+                kept.add(body.name)
+    if tip:
+        if tip not in kept:
+            raise EomcError(f"--tip {tip}: '{tip}' is not behind '{root}', which --root names")
+        way = [tip]
+        while (parent := by_name[way[-1]].parent) in kept:
+            way.append(parent)
+        kept = set(way)
+        for body in robot.bodies:
+            if body.joint == "fixed" and body.parent in kept and body.parent != tip:
+                kept.add(body.name)
+    bodies = []
+    for body in robot.bodies:
+        if body.name == root and body.parent != WORLD:
+            offset, rotation = _stands(by_name, body)
+            body = replace(
+                body, parent=WORLD, joint="fixed", motions=(), axes=(),
+                offset=offset, rotation=rotation,
+            )  # fmt: skip
+        if body.name in kept:
+            bodies.append(body)
+    gone = tuple(name for name in by_name if name not in kept)
+    left_out = robot.left_out
+    if gone:
+        left_out = (f"cut off: {listed(gone)}", *left_out)
+    return _without_loose_drives(replace(robot, bodies=tuple(bodies), left_out=left_out))
+
+
+def mended(robot: Robot) -> Robot:
+    """The robot with the nearest tensor in place of each that no body can have; they are told."""
+    bodies, told = [], []
+    for body in robot.bodies:
+        inertia = without_dust(body)
+        if indefinite(inertia) or unbalanced(inertia):
+            (low, _, high), new = principal(inertia)[0], nearest(inertia)
+            told.append(
+                f"body {body.name}: its inertia {shown(inertia)} is that of no body (principal "
+                f"moments {low:.4g} to {high:.4g} kg m^2): {shown(new)} is in its place"
+            )
+            body = replace(body, inertia=new)
+        bodies.append(body)
+    return replace(robot, bodies=tuple(bodies), left_out=(*robot.left_out, *told))
+
+
+def based(robot: Robot, free: bool) -> Robot:
+    """The robot with its first body free, or fixed to the world where it starts.
+
+    A free one starts where it was fixed. Raises EomcError where several bodies stand on the world.
+    """
+    roots = [body for body in robot.bodies if body.parent == WORLD]
+    if len(roots) != 1:
+        those = listed(tuple(body.name for body in roots))
+        raise EomcError(f"--base: {len(roots)} bodies stand on the world ({those}), not one")
+    root = roots[0]
+    if free and root.joint == "fixed":
+        taken = {m.name for m in robot.motions}
+        motions = free_motions()
+        if taken & {m.name for m in motions}:
+            motions = free_motions("base")
+        at = (*root.offset, *yaw_pitch_roll(root.rotation))
+        motions = tuple(replace(m, start=s) for m, s in zip(motions, at, strict=True))
+        new = replace(
+            root, joint="free", motions=motions, axes=(), offset=ORIGIN, rotation=IDENTITY
+        )  # fmt: skip
+    elif not free and root.motions:
+        offset, rotation = moved(root, [m.start for m in root.motions])
+        new = replace(
+            root, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation
+        )  # fmt: skip
+    else:
+        new = root
+    if free and new.joint != "free":
+        raise EomcError(
+            f"--base free: '{root.name}' stands on the world by a {root.joint} joint, "
+            "which the file gives it: --base free is for a root without one"
+        )
+    bodies = tuple(new if body is root else body for body in robot.bodies)
+    return _without_loose_drives(replace(robot, bodies=bodies))
+
+
+def _stands(by_name: Mapping[str, RobotBody], body: RobotBody) -> tuple[Vector, Matrix]:
+    """Where the body's frame stands in the world at the start."""
+    offset, rotation = moved(body, [m.start for m in body.motions])
+    while body.parent != WORLD:
+        body = by_name[body.parent]
+        o, r = moved(body, [m.start for m in body.motions])
+        offset, rotation = plus(o, apply(r, offset)), times(r, rotation)
+    return offset, rotation
+
+
+def _without_loose_drives(robot: Robot) -> Robot:
+    there = {m.name for m in robot.motions}
+    return replace(robot, drives=tuple(d for d in robot.drives if d.coordinate in there))

@@ -1,0 +1,295 @@
+"""A robot fit for a scene, and the scene's text: such as a person can read and edit."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from eomc.base import names
+from eomc.base.errors import EomcError
+from eomc.base.texts import line, toml
+from eomc.robots.inertias import indefinite, unbalanced
+from eomc.robots.robot import Drive, Motion, Robot, RobotBody, joined, listed, without_dust
+from eomc.robots.rotations import SNAP, Vector, turns_of
+from eomc.scene.assembly import WORLD
+from eomc.scene.joints import JOINTS
+
+_NAME = 32  # characters of a name, so that what is made of it ("_torque", "_dot") fits too
+
+
+def finished(robot: Robot) -> Robot:
+    """The robot fit for a scene: its names such as C can bear, bare frames left out and listed.
+
+    Raises EomcError where nothing moves, where a joint moves nothing that has mass, and for a
+    tensor that is not positive semi-definite. One that only breaks the triangle inequality is told.
+    """
+    bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
+    robot = _without_frames(replace(robot, bodies=bodies))
+    if not robot.motions:
+        raise EomcError(
+            f"{robot.name}: nothing moves in this robot, no joint has a coordinate; with "
+            "--base free its root does"
+        )
+    faults = [
+        f"body {b.name}: {why}, as --mend-inertias writes"
+        for b in robot.bodies
+        if (why := indefinite(b.inertia))
+    ]
+    if faults := [*faults, *_without_inertia(robot)]:
+        raise EomcError("\n".join(faults))
+    robot = _named(robot)  # after the faults, which have the names that --lock takes
+    found = tuple(
+        f"body {body.name}: {why}, as --mend-inertias writes; until then the scene is refused"
+        for body in robot.bodies
+        if (why := unbalanced(body.inertia))
+    )
+    rough = [b.name for b in robot.bodies if any(_rough(by) for _, by in turns_of(b.rotation))]
+    if rough:
+        found += (
+            "quarter turns to five digits or so, as 1.5708, which are kept as they are ("
+            f'{listed(rough, 4)}): "pi/2" in their place makes less code',
+        )
+    new = tuple(words for words in found if words not in robot.left_out)
+    return replace(robot, left_out=(*robot.left_out, *new))
+
+
+def _rough(angle: float) -> bool:
+    """Whether an angle is nearly, but not quite, a multiple of pi/2."""
+    return SNAP < abs(angle - round(angle * 2 / math.pi) * math.pi / 2) < 1e-4
+
+
+def _without_frames(robot: Robot) -> Robot:
+    """Without fixed bodies that have no mass and carry nothing: they only mark places."""
+    kept = list(robot.bodies)
+    gone: list[str] = []
+    carried: set[str] = set()
+    for body in reversed(robot.bodies):  # children come before parents
+        bare = not body.mass and not any(body.inertia)
+        if body.joint == "fixed" and bare and body.name not in carried:
+            kept.remove(body)
+            gone.append(body.name)
+        else:
+            carried.add(body.parent)
+    if not gone:
+        return robot
+    words = f"frames without mass that carry nothing: {listed(gone[::-1], 1000)}"
+    return replace(robot, bodies=tuple(kept), left_out=(*robot.left_out, words))
+
+
+def _named(robot: Robot) -> Robot:
+    """With the name of everything such as a scene can bear, and different from all others.
+
+    A coordinate takes its velocity's name too, a body those of its centre of mass.
+    """
+    taken: set[str] = set()
+
+    def fit(name: str, *ends: str) -> str:
+        plain = names.plain(name)[:_NAME].rstrip("_")
+        k = 1
+        while True:
+            new = plain if k == 1 else f"{plain}_{k}"
+            mine = {new + end for end in ends}
+            if not names.fault(new) and not mine & taken:
+                taken.update(mine)
+                return new
+            k += 1
+
+    coordinates = {m.name: fit(m.name, "", "_dot") for m in robot.motions}
+    drives = tuple(
+        replace(d, name=fit(d.name, ""), coordinate=coordinates[d.coordinate]) for d in robot.drives
+    )
+    bodies = {WORLD: WORLD}
+    out = []
+    for body in robot.bodies:
+        name = fit(body.name, "", "_x", "_y", "_z")
+        if name == WORLD:
+            name = fit("world_body", "", "_x", "_y", "_z")
+        bodies[body.name] = name
+        motions = tuple(
+            replace(m, name=new, note=_renamed(m.name, new, m.note))
+            for m in body.motions
+            if (new := coordinates[m.name])
+        )
+        note = _renamed(body.name, name, body.note)
+        out.append(replace(body, name=name, parent=bodies[body.parent], motions=motions, note=note))
+    name = names.plain(robot.name)[:_NAME].rstrip("_")
+    if names.module_fault(name):
+        name += "_robot"
+    return replace(robot, name=name, bodies=tuple(out), drives=drives)
+
+
+def _renamed(old: str, new: str, note: str) -> str:
+    return note if old == new else joined(f"'{old}' in the file", note)
+
+
+def _without_inertia(robot: Robot) -> list[str]:
+    """In words, each joint that moves nothing with mass or inertia."""
+    faults: list[str] = []
+    locks: list[str] = []
+    carries: dict[str, list[RobotBody]] = {}
+    for body in reversed(robot.bodies):  # children come before parents
+        mine = [body, *carries.get(body.name, ())]
+        carries[body.parent] = [*mine, *carries.get(body.parent, ())]
+        kinds = JOINTS[body.joint].motions
+        for kind, motion in zip(kinds, body.motions, strict=True):
+            has = any(b.mass or (kind == "r" and any(b.inertia)) for b in mine)
+            if has or motion.armature:
+                continue
+            those = listed([b.name + (f" ({b.note})" if b.note else "") for b in mine], 4)
+            lacks = "mass" if kind == "t" else "inertia"
+            faults.append(f"joint {motion.name} moves nothing that has {lacks}, only {those}")
+            if len(body.motions) == 1:
+                locks.append(f"--lock {motion.name}=0")
+    if not faults:
+        return []
+    freeze = f", or freeze what moves nothing: {' '.join(locks[::-1])}" if locks else ""
+    return [*faults[::-1], f"add mass and inertia to the file{freeze}"]
+
+
+# --- the text -------------------------------------------------------------------------------------
+
+
+def scene_text(robot: Robot) -> str:
+    """The scene of a robot as TOML, only what differs from the defaults written out.
+
+    Numbers read back as they were, save angles within 1e-10 of a multiple of pi/12, which are
+    written as such, so that their sines are exact.
+    """
+    robot = finished(robot)
+    head = [f"# {line(robot.title)}"]
+    if robot.left_out:
+        head += ["#", "# Not modelled, or to be looked at:"]
+        head += [each for words in robot.left_out for each in _bullet(words)]
+    gravity = ", ".join(map(number, robot.gravity))
+    parts = [
+        "\n".join(head),
+        "\n".join(
+            _aligned(
+                {"eomc": "1", "name": toml(robot.name), "title": toml(robot.title),
+                 "gravity": f"[{gravity}]"}
+            )
+        ),
+        "\n".join(["[coordinates]", *_aligned({m.name: _coordinate(m) for m in robot.motions})]),
+    ]  # fmt: skip
+    if robot.drives:
+        units = {m.name: m.unit for m in robot.motions}
+        parts.append(
+            "\n".join(["[inputs]", *_aligned({d.name: _input(d, units) for d in robot.drives})])
+        )
+    parts += ["\n".join(["[[body]]", *_aligned(_entry(body, robot))]) for body in robot.bodies]
+    for motion in robot.motions:
+        if motion.stiffness:
+            spring = {"coordinate": toml(motion.name), "stiffness": number(motion.stiffness)}
+            if motion.rest:
+                spring["length"] = _length(motion.rest, motion.unit)
+            parts.append("\n".join(["[[spring]]", *_aligned(spring)]))
+    return "\n\n".join(parts) + "\n"
+
+
+def number(x: float) -> str:
+    """The shortest text that reads back as x."""
+    short = repr(float(x)).removesuffix(".0")
+    return "0" if short == "-0" else short
+
+
+def angle(x: float) -> str:
+    """An angle as a scene has it: 0.3, or "pi/2" in quotes within 1e-10 of multiples of pi/12."""
+    twelfths = round(x * 12 / math.pi)
+    if abs(x - twelfths * math.pi / 12) > SNAP or abs(twelfths) > 48:
+        return _shortest(x)
+    if not twelfths:
+        return "0"
+    common = math.gcd(twelfths, 12)
+    above, below = abs(twelfths) // common, 12 // common
+    words = ("-" if twelfths < 0 else "") + (f"{above}*pi" if above > 1 else "pi")
+    return f'"{words}/{below}"' if below > 1 else f'"{words}"'
+
+
+def _shortest(x: float) -> str:
+    """An angle of a rotation, computed to about 4e-16: no more digits than that means."""
+    for digits in range(1, 17):
+        short = f"{x:.{digits}g}"
+        if abs(float(short) - x) <= 4e-16:
+            return number(float(short))
+    return number(x)
+
+
+def _length(x: float, of: str) -> str:
+    return angle(x) if of == "rad" else number(x)
+
+
+def _coordinate(m: Motion) -> str:
+    start = f", start = {_length(m.start, m.unit)}" if m.start else ""
+    note = f", note = {toml(m.note)}" if m.note else ""
+    return f"{{ unit = {toml(m.unit)}{start}{note} }}"
+
+
+def _input(drive: Drive, units: Mapping[str, str]) -> str:
+    force = "N m" if units[drive.coordinate] == "rad" else "N"
+    if drive.gear != 1:
+        force = ""  # a signal, which the gear makes a force
+    of = f"unit = {toml(force)}, " if force else ""
+    return f"{{ {of}note = {toml(drive.note or 'along ' + drive.coordinate)} }}"
+
+
+def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
+    """The keys of a [[body]] that differ from their defaults."""
+    entry = {"name": toml(body.name)}
+    if body.parent != WORLD:
+        entry["parent"] = toml(body.parent)
+    entry["joint"] = toml(body.joint)
+    if body.motions:
+        entry["coordinates"] = _each([toml(m.name) for m in body.motions])
+    if any(body.offset):
+        entry["offset"] = vector(body.offset)
+    if turns := turns_of(body.rotation):
+        shown = (f'["{axis}", {angle(by)}]' for axis, by in turns)
+        entry["rotation"] = f"[{', '.join(shown)}]"
+    if body.axes and body.axes != JOINTS[body.joint].defaults:
+        entry["axis"] = _each([vector(axis) for axis in body.axes])
+    if body.mass:
+        entry["mass"] = number(body.mass)
+    if any(body.center):
+        entry["center"] = vector(body.center)
+    if any(body.inertia):
+        kept = body.inertia if any(body.inertia[3:]) else body.inertia[:3]
+        entry["inertia"] = f"[{', '.join(map(number, kept))}]"
+    for key in ("armature", "damping", "friction"):
+        values = [number(getattr(m, key)) for m in body.motions]
+        if any(value != "0" for value in values):
+            entry[key] = values[0] if len(set(values)) == 1 else _each(values)
+    forces = [_force(m.name, robot.drives) for m in body.motions]
+    if any(force != "0" for force in forces):
+        entry["actuator"] = _each([f if f == "0" else toml(f) for f in forces])
+    if body.note:
+        entry["note"] = toml(body.note)
+    return entry
+
+
+def _force(coordinate: str, drives: Sequence[Drive]) -> str:
+    mine = [d for d in drives if d.coordinate == coordinate]
+    terms = [d.name if d.gear == 1 else f"{number(d.gear)}*{d.name}" for d in mine]
+    return " + ".join(terms).replace("+ -", "- ") or "0"
+
+
+def vector(v: Vector) -> str:
+    """A vector as TOML has it."""
+    return f"[{', '.join(map(number, v))}]"
+
+
+def _each(those: Sequence[str]) -> str:
+    return those[0] if len(those) == 1 else f"[{', '.join(those)}]"
+
+
+def _aligned(entries: Mapping[str, str]) -> list[str]:
+    wide = max(map(len, entries))
+    return [f"{key:{wide}} = {value}" for key, value in entries.items()]
+
+
+def _bullet(words: str) -> list[str]:
+    return textwrap.wrap(
+        line(words), 98, initial_indent="# - ", subsequent_indent="#   ",
+        break_on_hyphens=False,
+    )  # fmt: skip

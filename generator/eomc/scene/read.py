@@ -1,0 +1,358 @@
+"""A scene file read and checked: every fault is reported at its place. No SymPy, no C."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from functools import partial
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from typing import Any
+
+import pydantic
+
+from eomc.base import names, texts
+from eomc.base.errors import MOST, EomcError, SceneError
+from eomc.scene import formulas, messages, repeat, schema, toml_text, validate_bodies
+from eomc.scene.formulas import Formula, suggest
+from eomc.scene.scene import Coordinate, Input, Quantity, Run, Scene
+from eomc.scene.scope import DOUBT, INPUT, NOTHING, POSITION, TIME, VELOCITY, Checker
+from eomc.scene.source_map import Places
+from eomc.scene.toml_text import MAX_BYTES
+
+
+def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = None) -> Scene:
+    """Read and check a scene file, with other values in place of those of its parameters.
+
+    Raises SceneError with every fault, EomcError if unreadable.
+    """
+    path, shown = Path(file), texts.line(str(file))
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
+        meant = messages.file(path)
+        near = f"; did you mean '{texts.line(meant)}'?" if meant else suggest(path.name, others)
+        raise EomcError(f"{shown}: there is no such file{near}") from None
+    except IsADirectoryError:
+        raise EomcError(f"{shown}: is a folder: name a scene, such as scenes/NAME.toml") from None
+    except (OSError, ValueError) as fault:
+        why = getattr(fault, "strerror", None) or fault
+        raise EomcError(f"{shown}: can't be read ({why})") from None
+    return parse(data, shown, parameters)
+
+
+def parse(
+    data: bytes | str, file: str = "scene.toml", parameters: Mapping[str, float] | None = None
+) -> Scene:
+    """Check the text of a scene, as `read` does. Raises SceneError with every fault."""
+    if isinstance(data, str):
+        data = data.encode(errors="surrogatepass")
+    text, tree = toml_text.text_and_tree(data, file)
+    check = _Check(tree, Places(text, file), parameters or {})
+    return check.scene(hashlib.sha256(data).hexdigest())
+
+
+class _Check(Checker):
+    """Everything that is checked in one scene, faults collected on the way."""
+
+    def __init__(
+        self, tree: dict[str, Any], places: Places, parameters: Mapping[str, float]
+    ) -> None:
+        super().__init__(places)
+        self.values = parameters
+        messages.tables(tree, self)
+        if not repeat.expand(tree, self):
+            raise SceneError(self.problems)
+        self.bodies = bool(tree.get("body"))
+        self.doc = self._layout(tree)
+        self.tables = self._names()
+
+    def scene(self, digest: str) -> Scene:
+        """The checked scene. Raises SceneError with every fault."""
+        doc = self.doc
+        self.kinds |= {
+            **dict.fromkeys((*doc.constants, *doc.parameters), NOTHING),
+            **dict.fromkeys(doc.inputs, frozenset({INPUT})),
+            **dict.fromkeys(doc.coordinates, frozenset({POSITION})),
+            **{f"{c}_dot": frozenset({VELOCITY}) for c in doc.coordinates},
+            "t": frozenset({TIME}),
+        }
+        self.centers = validate_bodies.centers(doc)
+        self.kinds |= dict.fromkeys(self.centers - {*self.tables}, frozenset({POSITION}))
+        known: dict[str, float] = {}
+        constants = self._quantities("constants", known)
+        parameters = self._quantities("parameters", known)
+        coordinates = self._coordinates(known)
+        self._definitions()
+        inputs = self._inputs()
+        energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
+        forces = self._forces()
+        assembly = validate_bodies.assemble(self, doc, known)
+        self._unused()
+        if any(p.severity == "error" for p in self.problems):
+            raise SceneError(self.problems)
+        return Scene(
+            name=doc.name,
+            title=doc.title or doc.name.replace("_", " ").capitalize(),
+            note=doc.note,
+            file=self.places.file,
+            digest=digest,
+            coordinates=tuple(coordinates),
+            parameters=tuple(parameters),
+            constants=tuple(constants),
+            inputs=tuple(inputs),
+            definitions=tuple(self.definitions.items()),
+            **energies,
+            forces=forces,
+            run=Run(
+                doc.run.h,
+                doc.run.duration,
+                doc.run.method,
+                doc.run.real,
+                doc.run.batch,
+                doc.run.linearize,
+            ),
+            assembly=assembly,
+            places=self.places,
+            warnings=tuple(self.problems),
+        )
+
+    # layout and names
+
+    def _layout(self, tree: dict[str, Any]) -> schema.Document:
+        """The document; faulty entries are told, taken out or mended, and the rest checked on."""
+        for _ in range(100):
+            try:
+                return schema.read(tree)
+            except pydantic.ValidationError as fault:
+                errors = fault.errors()
+            # misspelt keys first: what is missing may only be misspelt
+            errors.sort(key=lambda error: error["type"] != "extra_forbidden")
+            told: set[tuple[str, ...]] = set()
+            for error in errors:
+                path = schema.place(error)
+                if path in told or (error["type"] == "missing" and schema.has(tree, path)):
+                    continue
+                told.add(path)
+                self.say(path, schema.say(error, path))
+                if error["type"] == "extra_forbidden":
+                    self._misspelt(tree, path)
+                else:
+                    self.mended.add(path)
+                    schema.mend(tree, path)
+            if ("coordinates",) in self.mended:
+                break  # everything else hangs on them
+        raise SceneError(self.problems)
+
+    def _misspelt(self, tree: dict[str, Any], path: tuple[str, ...]) -> None:
+        """Take an unknown key for the one that was meant, or out."""
+        table = schema.table_at(tree, path[:-1])
+        value = table.pop(path[-1])
+        meant = schema.meant(path)
+        if meant and meant not in table:
+            table[meant] = value
+            self.places.rename(path, (*path[:-1], meant))
+        elif isinstance(value, dict):
+            self.kinds |= dict.fromkeys(value, frozenset({DOUBT}))
+
+    def _names(self) -> dict[str, str]:
+        """Every declared name and its table."""
+        doc = self.doc
+        if why := names.module_fault(doc.name):
+            self.say(("name",), why, text=doc.name)
+        seen: dict[str, str] = {}
+        for table in ("coordinates", "parameters", "constants", "inputs", "definitions"):
+            for name in getattr(doc, table):
+                if why := names.fault(name):
+                    self.say((table, name), why)
+                elif name in seen:
+                    self.say(
+                        (table, name),
+                        f"'{name}' stands in [{seen[name]}] already: rename one of the two",
+                    )
+                seen.setdefault(name, table)
+        for name in doc.coordinates:
+            velocity = f"{name}_dot"
+            if velocity in seen:
+                self.say(
+                    (seen[velocity], velocity),
+                    f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
+                )
+        for table in ("coordinates", "parameters", "constants", "inputs"):
+            for name, entry in getattr(doc, table).items():
+                self._unit((table, name), entry.unit, getattr(entry, "start", 0))
+        return seen
+
+    def _unit(self, path: tuple[str, ...], unit: str, start: float | str = 0) -> None:
+        """Units are texts; those that show that something was meant to be converted are told."""
+        plain = unit.strip().lower()
+        if plain in ("deg", "degree", "degrees", "°", "deg/s", "°/s"):
+            number = f"{start:g}" if isinstance(start, float) and start else "30"
+            remedy = f'write {number} degrees as {messages.radians(number)}, with unit = "rad"'
+            self.say((*path, "unit"), f"angles are in radians, nothing is converted: {remedy}")
+        elif plain in (
+            "mm",
+            "cm",
+            "km",
+            "g",
+            "gram",
+            "ms",
+            "min",
+            "rpm",
+            "inch",
+            "ft",
+            "lb",
+            "lbs",
+        ):
+            message = (
+                f"'{unit}' is not an SI unit: numbers are taken as they stand, none is converted"
+            )
+            self.say((*path, "unit"), message, severity="warning")
+
+    # tables
+
+    def _quantities(self, table: str, known: dict[str, float]) -> list[Quantity]:
+        """Constants may use constants above them; parameters any constant. Adds to `known`."""
+        allowed, rule = {
+            "constants": (known, "a constant is made of numbers and of constants above it"),
+            "parameters": (
+                list(known),
+                "a parameter's value is made of numbers and constants; "
+                "what hangs on other parameters is a definition",
+            ),
+        }[table]
+        out = []
+        for name, entry in getattr(self.doc, table).items():
+            path = (table, name, "value")
+            formula = self.formula(path, entry.value, allowed, rule)
+            known[name] = self.number(path, formula, known)
+            if table == "parameters":
+                known[name] = self.values.get(name, known[name])
+            if formula:
+                out.append(Quantity(name, entry.unit, known[name], entry.note, formula))
+        return out
+
+    def _coordinates(self, known: Mapping[str, float]) -> list[Coordinate]:
+        def formula(path: tuple[str, ...], value: float | str) -> Formula | None:
+            rule = f"a {path[-1]} is made of numbers, constants and parameters"
+            found = self.formula(path, value, known, rule)
+            self.number(path, found, known)
+            return found
+
+        out = []
+        for name, entry in self.doc.coordinates.items():
+            start = formula(("coordinates", name, "start"), entry.start)
+            rate = formula(("coordinates", name, "rate"), entry.rate)
+            if start and rate:
+                out.append(Coordinate(name, entry.unit, start, rate, entry.note))
+        return out
+
+    def _definitions(self) -> None:
+        parsed = {n: self.parse(("definitions", n), v) for n, v in self.doc.definitions.items()}
+        sound = {name: formula for name, formula in parsed.items() if formula}
+        circular = self._circular(sound)
+        self.kinds |= dict.fromkeys(circular, frozenset({DOUBT}))
+        for name in parsed:
+            formula = sound.get(name)
+            path = ("definitions", name)
+            if formula is None or name in circular or path in self.mended:
+                self.kinds[name] = frozenset({DOUBT})
+            elif self.checked(path, formula):
+                self.definitions[name] = formula
+                self.kinds[name] = self.kinds_of(formula.tree)
+            else:
+                self.kinds[name] = frozenset({DOUBT})
+
+    def _circular(self, definitions: Mapping[str, Formula]) -> set[str]:
+        """The names that hang on themselves, each ring told once; beyond MOST, all."""
+        graph = {
+            name: [n.id for n in formula.names() if n.id in definitions]
+            for name, formula in definitions.items()
+        }
+        lost: set[str] = set()
+        for _ in range(MOST):
+            try:
+                TopologicalSorter(graph).prepare()
+                return lost
+            except CycleError as cycle:
+                ring = list(reversed(cycle.args[1]))
+                shown = ring if len(ring) <= 20 else [*ring[:10], "...", *ring[-9:]]
+                self.say(
+                    ("definitions", ring[0]),
+                    f"circular definition: {' -> '.join(shown)}; one of them must stand on its own",
+                    next(n for n in definitions[ring[0]].names() if n.id == ring[1]),
+                    definitions[ring[0]].text,
+                )
+                lost.update(ring)
+                graph |= {name: [] for name in ring}
+        return set(definitions)
+
+    def _inputs(self) -> list[Input]:
+        allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]
+        rule = "a signal can't hang on inputs"
+        out = []
+        for name, entry in self.doc.inputs.items():
+            signal = self.formula(("inputs", name, "signal"), entry.signal, allowed, rule)
+            if signal:
+                out.append(Input(name, entry.unit, signal, entry.note))
+        return out
+
+    def _energy(self, key: str) -> Formula:
+        path = ("energy", key)
+        formula = self.formula(path, getattr(self.doc.energy, key))
+        if formula is None:
+            return formulas.parse("0")
+        kinds = self.kinds_of(formula.tree)
+        sure = DOUBT not in kinds and not {path, ("energy",)} & self.mended
+        fault = partial(self.say, path, text=formula.text)
+        if INPUT in kinds:
+            fault(
+                "an energy can't depend on inputs: let them act through [forces]",
+                self.where(formula, INPUT),
+            )
+        if key == "potential" and VELOCITY in kinds:
+            fault(
+                "the potential energy can't depend on velocities: parts linear in them "
+                "(magnetic, gyroscopic) belong in 'kinetic' with the sign changed, "
+                "friction in 'dissipation'",
+                self.where(formula, VELOCITY),
+            )
+        if key == "kinetic" and VELOCITY not in kinds and sure and not self.bodies:
+            velocities = " or ".join(f"{c}_dot" for c in self.doc.coordinates)
+            remedy = f"use {velocities}, or dot(...) of a definition"
+            if any(f"{c}_dot" in str(self.doc.energy.potential) for c in self.doc.coordinates):
+                remedy = "are kinetic and potential swapped?"
+            fault(f"the kinetic energy has no velocities, so nothing has inertia: {remedy}")
+        if key == "dissipation" and VELOCITY not in kinds and sure and any(formula.names()):
+            fault(
+                "the dissipation has no velocities, so it gives no force -dR/dq_dot: "
+                "viscous friction is b*x_dot**2/2",
+            )
+        self.smooth(path, formula)
+        return formula
+
+    def _forces(self) -> dict[str, Formula]:
+        out = {}
+        known = list(self.doc.coordinates)
+        for name, value in self.doc.forces.items():
+            formula = self.formula(("forces", name), value)
+            if name not in known:
+                remedy = suggest(name, known) or f": a force acts along {' or '.join(known)}"
+                self.say(("forces", name), f"'{name}' is not a coordinate{remedy}")
+            elif formula:
+                out[name] = formula
+        return out
+
+    def _unused(self) -> None:
+        if any(p.severity == "error" for p in self.problems):
+            return  # a name may be unused only because its formula was refused
+        for name, table in self.tables.items():
+            if table != "coordinates" and name not in self.used:
+                self.say(
+                    (table, name),
+                    f"'{name}' is not used by any formula: remove it, or use it",
+                    severity="warning",
+                )
