@@ -15,8 +15,8 @@ import sympy
 from cases import scene_system
 from conftest import Modules
 
+from eomc.model.from_scene import from_scene as system_of
 from eomc.model.system import System, symbol
-from eomc.model.system import from_scene as system_of
 from eomc.scene import scene
 from eomc.verify import check as checking
 from eomc.verify import symbolic as references
