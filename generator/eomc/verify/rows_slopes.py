@@ -66,7 +66,7 @@ class Slopes:
             for name, matrix in found.items()
             for i in range(matrix.shape[1])
         ]
-        return max(errors) if upper else math.inf
+        return float(np.max(errors)) if upper else math.inf
 
     def sensitive(self, s: State) -> float:
         """The derivatives by each parameter beside differences."""
@@ -78,10 +78,11 @@ class Slopes:
         def moved(name: str, by: float) -> State:
             return replace(held, params={**params, name: params[name] + by})
 
-        return max(
+        errors = [
             self.column(E[:, k], float(spread["p"][k]), partial(moved, name), {"p": E}, spread)
             for k, name in enumerate(params)
-        )
+        ]
+        return float(np.max(errors))
 
     def column(
         self, found: Vector, spread: float, moved: Callable[[float], State], matrices: Any,
