@@ -14,7 +14,7 @@ export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
 demo: .venv/demo
 	@$(BIN)/eomc build $(DEMO)
 	@$(BIN)/eomc check --quiet $(DEMO)
-	@echo "checked against the pure-Python reference: 3 scenes agree"
+	@echo "compared with the pure-Python reference: 3 scenes agree"
 	@echo
 	@$(BIN)/eomc run scenes/cartpole.toml --plot build/cartpole.png --out build/cartpole.csv
 	@echo

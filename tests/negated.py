@@ -171,7 +171,7 @@ def changes(right: Any, wrong: Any, seed: int) -> bool:
         q = q0 + spread * draw.uniform(-1, 1, q0.shape)
         qd = qd0 + (spread or 0.1) * draw.uniform(-1, 1, q0.shape)
         t = float(draw.uniform(0, 1))
-        for ask in (*map(_value, FUNCTIONS), *map(_step, right.methods)):
+        for ask in (*map(_value, FUNCTIONS), _slopes, _more, *map(_step, right.methods)):
             one, other = (_try(ask, m, q, qd, t) for m in (right, wrong))
             if one is None or not np.all(np.isfinite(one)):
                 continue
@@ -188,13 +188,22 @@ Ask = Callable[[Any, Any, Any, float], Any]
 def _try(ask: Ask, module: Any, q: Any, qd: Any, t: float) -> Any:
     try:
         return np.asarray(ask(module, q, qd, t), float)
-    except ArithmeticError:
+    except (ArithmeticError, ValueError):  # no such value there, or none that was asked for
         return None
 
 
 def _value(name: str) -> Ask:
     place = 1 if name in ("D", "g", "potential_energy") else 2
     return lambda m, q, qd, t: getattr(m, name)(*(q, qd)[:place], t=t)
+
+
+def _slopes(m: Any, q: Any, qd: Any, t: float) -> Any:
+    A, B = m.linearize(q, qd, t=t)
+    return np.hstack([A, B]) if B.size else A
+
+
+def _more(m: Any, q: Any, qd: Any, t: float) -> Any:
+    return m.sensitivity(q, qd, t=t)
 
 
 def _step(method: str) -> Ask:

@@ -11,13 +11,15 @@ from eomc.base.errors import EomcError, SceneError
 from eomc.base.version import __version__
 from eomc.pipeline import build, load, read, sources
 
-__all__ = ["EomcError", "SceneError", "System", "__version__", "build", "load", "read", "sources"]
+__all__ = [
+    "EomcError", "SceneError", "System", "__version__", "build", "dot", "load", "read", "sources",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    """System, imported when it is asked for: SymPy takes half a second."""
-    if name == "System":
-        from eomc.model.system import System
+    """System and dot, imported when they are asked for: SymPy takes half a second."""
+    if name in ("System", "dot"):
+        from eomc.model import system
 
-        return System
+        return getattr(system, name)
     raise AttributeError(f"module 'eomc' has no attribute {name!r}")

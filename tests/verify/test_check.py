@@ -16,6 +16,8 @@ from cases import scene_system
 from conftest import Modules
 
 from eomc.model.system import System, symbol
+from eomc.model.system import from_scene as system_of
+from eomc.scene import scene
 from eomc.verify import check as checking
 from eomc.verify import symbolic as references
 from eomc.verify.check import Report, check
@@ -287,7 +289,7 @@ def test_friction_that_jumps_is_not_blamed_for_its_order() -> None:
     report = check(system, StandIn(derive(system)), states=8)
     assert report.passed, report.table()
     order = next(row for row in report.rows if row.name == "order of rk4")
-    assert order.judged and order.error == pytest.approx(4, abs=0.2)
+    assert order.judged and 3.5 < order.error < 4.5
 
 
 def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,7 +301,7 @@ def test_an_order_that_jumps_spoil_is_not_judged(monkeypatch: pytest.MonkeyPatch
         report = check(system, StandIn(derive(system)), states=4)
         (row,) = (row for row in report.rows if row.name == "order of rk4")
         assert row.passed == passed and row.judged != passed
-        assert ("not to be expected with sign" in report.table()) == passed
+        assert ("not to be expected with sign" in " ".join(report.table().split())) == passed
 
 
 def test_an_order_that_cannot_be_seen_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -368,6 +370,47 @@ class Advising:
     def advice(self, q: Any, qd: Any, h: float, **how: Any) -> str | None:
         told: str | None = self.module.advice(q, qd, h * self.by, **how)
         return told
+
+
+SLOPES = """eomc = 1
+name = "slopes"
+[coordinates]
+x = { start = 0.4 }
+y = { start = 0.1, rate = 0.3 }
+[parameters]
+k = 3.0
+[inputs]
+f = { signal = "sin(x)" }
+[energy]
+kinetic = "x_dot**2/2 + (2 + sin(x))*y_dot**2/2"
+potential = "k*(x - y)**2/2"
+dissipation = "k*x_dot**2/9"
+[forces]
+y = "f*x"
+[run]
+linearize = "parameters"
+"""
+
+
+@pytest.mark.parametrize("wrong", ["", "A", "B", "sensitivity"])
+def test_derivatives_are_compared_with_differences(modules: Modules, wrong: str) -> None:
+    module = modules.of_text(SLOPES)
+
+    class Bent:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(module, name)
+
+        def linearize(self, *place: Any, **how: Any) -> Any:
+            A, B = module.linearize(*place, **how)
+            return (flipped(3, 0)(A) if wrong == "A" else A), (-B if wrong == "B" else B)
+
+        def sensitivity(self, *place: Any, **how: Any) -> Any:
+            return module.sensitivity(*place, **how) * (-1 if wrong == "sensitivity" else 1)
+
+    report = check(system_of(scene.parse(SLOPES)), Bent(), states=4)
+    row = "sensitivity" if wrong == "sensitivity" else "linearize"
+    assert failed(report) == ({row} if wrong else set()), report.table()
+    assert {"linearize", "sensitivity"} <= {row.name for row in report.rows}
 
 
 @pytest.mark.parametrize("name", ["cartpole", "mass_spring"])

@@ -8,8 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import random_scenes
-from random_scenes import outcome, scene_text
+import scene_author
+from random_scenes import outcome
+from scene_author import scene_text
 
 import eomc
 from eomc.model import system
@@ -104,7 +105,13 @@ def checked(text: str, root: Path) -> Report:
     return check(made, eomc.load(made, root))
 
 
-@pytest.mark.parametrize("what", REGRESSIONS)
+@pytest.mark.parametrize(
+    "what",
+    [
+        pytest.param(what, marks=[pytest.mark.slow] * ("gauss" in text), id=what)
+        for what, text in REGRESSIONS.items()
+    ],
+)
 def test_right_modules_pass(tmp_path: Path, what: str) -> None:
     report = checked(REGRESSIONS[what], tmp_path)
     assert report.passed, report.table()
@@ -138,7 +145,7 @@ def test_scenes_are_the_same_for_the_same_number() -> None:
     assert scene_text(7) == scene_text(7) != scene_text(8)
     texts = [scene_text(k) for k in range(300)]
     words = ["[[body]]", "[inputs]", "signal", "dot(", "*t)", "friction", "tanh", "batch = true"]
-    words += ['"float"', '"parameters"', *(f'"{m}"' for m in random_scenes.STEPPERS)]
+    words += ['"float"', '"parameters"', *(f'"{m}"' for m in scene_author.STEPPERS)]
     for word in words:
         assert any(word in text for text in texts), word
 

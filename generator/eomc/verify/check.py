@@ -25,8 +25,8 @@ import sympy
 
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import System
-from eomc.verify import one_step
-from eomc.verify.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Finding, Place
+from eomc.verify import derivatives, one_step
+from eomc.verify.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Finding, Place, largest
 from eomc.verify.oracle import Answer, Vector
 from eomc.verify.rows_bodies import Bodies
 from eomc.verify.rows_compiled import compiled_rows
@@ -38,6 +38,7 @@ EPS = 2.0**-52
 # Correct builds differ by less than one unit in a value, by some tens in a stiff run. A wrong
 # sign makes 1e15, and still 1e5 in a term that is a ten thousand millionth of the whole.
 LIMIT = 1e3
+SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences
 SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
 CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
 
@@ -419,6 +420,11 @@ class Comparison:
             self.row("D qdd + bias = tau", LIMIT, rounding, self.motion)
             if self.dtype == np.float64:  # single precision leaves differences too few digits
                 self.row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", self.skewness)
+                for name in ("linearize", "sensitivity"):
+                    if self.has(name):
+                        unit = "of the largest derivative"
+                        find = partial(self.slopes, name)
+                        self.row(name, SLOPE_LIMIT, unit, find)
                 self.convergence_rows()
             if hasattr(self.module, "_model"):  # what is compiled has several ways to one answer
                 compiled_rows(self)
@@ -546,38 +552,35 @@ class Comparison:
             lambda e: self.units(ask(self.module, name, e.state), e.value[name], e.size[name])
         )
 
-    def steps(self) -> float:
+    def steps(self) -> float | Finding:
         """One step of the scene's h from a few states."""
         h = self.system.run.h
 
         def reference(**rows: Any) -> Vector:
             return np.stack(self.reference.step(h=h, **rows), axis=1)
 
-        def error(e: Expected) -> float:
+        def error(e: Expected) -> float | None:
             s = e.state
             with np.errstate(all="ignore"):
                 expected, size = self.sampler.reach(reference, s)
             if not np.all(np.isfinite(expected)):
-                return 0.0
+                return None
             found = self.module.step(s.q, s.qd, h=h, t=s.t, u=s.u, params=s.params)
             gain = h * e.size["acceleration"]
             return self.units(found, expected, size + np.array([h * (np.abs(s.qd) + gain), gain]))
 
-        return float(np.max([error(e) for e in self.few(self.effort.few)]))
+        return largest(map(error, self.few(self.effort.few)), "no step from any state is finite")
 
     def step_by(self, method: str) -> float | Finding:
         """One step of a method from a few states, by its tableau on the reference's accelerations.
 
         Shorter than the scene's h where the stages of an implicit one are else not found.
         """
-        errors = [self._step_by(method, e) for e in self.few(self.effort.few)]
-        known = [x for x in errors if not math.isnan(x)]
-        if known:
-            return max(known)
-        return Finding(math.nan, "no step from any state is finite")
+        errors = (self._step_by(method, e) for e in self.few(self.effort.few))
+        return largest(errors, "no step from any state is finite")
 
-    def _step_by(self, method: str, e: Expected) -> float:
-        """nan where there is no such step, in the reference or in the module."""
+    def _step_by(self, method: str, e: Expected) -> float | None:
+        """None where there is no such step, in the reference or in the module."""
         s, gain = e.state, e.size["acceleration"]
         for h in (part * self.system.run.h for part in SHORTER):
 
@@ -597,13 +600,14 @@ class Comparison:
             if np.all(np.isfinite(expected)) and run.status == "ok":
                 size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain])
                 return self.units([run.q[-1], run.qd[-1]], expected, size)
-        return math.nan
+        return None
 
-    def runs(self) -> float:
+    def runs(self) -> float | Finding:
         """A short run from the start, and one from a random state with random parameters."""
-        return float(np.max([self._run(e.state) for e in self.few(2)]))
+        errors = (self._run(e.state) for e in self.few(2))
+        return largest(errors, "a difference grows too much in one step")
 
-    def _run(self, s: State, h: float = 0.0, steps: int = 0) -> float:
+    def _run(self, s: State, h: float = 0.0, steps: int = 0) -> float | None:
         """As far as a difference at the start, in units of the spread, grows by GROWTH_LIMIT."""
         own = self.system.run.h
         h = h or own
@@ -623,6 +627,8 @@ class Comparison:
             growth = np.where(far < FARTHEST, growth, math.inf)
         growth = np.maximum.accumulate(growth)
         honest = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
+        if honest < 2:
+            return None
         t, x, growth = t[:honest], x[:honest], growth[:honest, None, None]
         run = self._simulate(s, h=h, steps=honest - 1)
         size = np.arange(1, honest + 1)[:, None, None] * (growth * spread + np.abs(x))
@@ -709,6 +715,35 @@ class Comparison:
             return min((x for x in residuals if not math.isnan(x)), default=math.nan)
 
         return self.largest(error)
+
+    def has(self, name: str) -> bool:
+        """Whether the module has derivatives: what implicit methods need, or the scene asks for."""
+        run = self.system.run
+        if name == "sensitivity":
+            return run.linearize == "parameters" and bool(self.system.parameters)
+        return bool(run.linearize) or any(METHODS[method].newton for method in self.methods)
+
+    def slopes(self, name: str) -> float | Finding:
+        """linearize or sensitivity against differences of the reference's accelerations.
+
+        The best of some widths counts at each state, as of skewness.
+        """
+        scale = np.array([self.sampler.spread, self.sampler.speed])
+        n, nu = len(self.system.q), len(self.system.inputs)
+        known: list[float | None] = []
+        for e in self.few(self.effort.few):
+            s, size = e.state, e.size["acceleration"]
+            held = {"u": s.u, "t": s.t, "params": s.params}
+            if name == "linearize":
+                A, B = self.module.linearize(s.q, s.qd, **held)
+                found, part = np.hstack([A[n:], B[n:]]), slice(0, 2 * n + nu)
+            else:
+                found, part = self.module.sensitivity(s.q, s.qd, **held), slice(2 * n + nu, None)
+            with np.errstate(all="ignore"):
+                exact = derivatives.by_differences(self.reference, s, scale, self.sampler.defaults)
+                off = [derivatives.apart(found, J[:, part], by[part], size) for J, by in exact]
+            known.append(min((x for x in off if x is not None), default=None))
+        return largest(known, "no state has finite differences")
 
     def bias(self) -> float:
         """bias = C qd + g."""

@@ -71,6 +71,12 @@ class Finding:
     limit: float = math.inf
 
 
+def largest(errors: Iterable[float | None], why: str) -> float | Finding:
+    """The largest of those that there are, nan before all; with none, not judged and why."""
+    known = [x for x in errors if x is not None]
+    return float(np.max(known)) if known else Finding(math.nan, why)
+
+
 @dataclass(frozen=True)
 class Place:
     """A state to run from, and the size of its energy, of which a rounding is eps."""

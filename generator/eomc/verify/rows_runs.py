@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify.convergence import Finding, largest
 from eomc.verify.oracle import Vector
 
 if TYPE_CHECKING:
@@ -143,15 +144,15 @@ class Runs:
             h = np.minimum(spread / np.abs(s.qd), np.sqrt(spread / np.abs(a)))
         return float(min(np.min(h), 100 * self.h)) or self.h
 
-    def long(self) -> float:
+    def long(self) -> float | Finding:
         """Long steps beside the reference's."""
         parts = ((), LONG) if self.check.large else (LONG, LADDER)
-        found = [
+        found = (
             self.check._run(s, h=self.large_step(s, part), steps=self.few)
             for s, some in zip(self.states, parts, strict=False)
             for part in some
-        ]
-        return float(np.max(found))
+        )
+        return largest(found, "a difference grows too much in one long step")
 
     def sines(self) -> float:
         """D, g and bias all around the circle, where sines need all of their terms."""

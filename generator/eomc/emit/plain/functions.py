@@ -200,6 +200,11 @@ class Plain:
 
     # functions
 
+    @cached_property
+    def evaluations(self) -> tuple[Computed, ...]:
+        """Those that the program has, in their order."""
+        return tuple(self.evaluation(n) for n in KINDS if source(self.target, n) is not None)
+
     def evaluation(self, name: str) -> Computed:
         """One of D, C, g, bias, tau, the energies, the signals, the sensitivity."""
         kind, target = KINDS[name], self.target

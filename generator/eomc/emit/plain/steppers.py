@@ -11,7 +11,7 @@ from eomc.base.texts import FreeText
 from eomc.emit import c_function as c
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
-from eomc.emit.evaluations import KINDS, source
+from eomc.emit.evaluations import source
 from eomc.emit.fast import context
 from eomc.emit.fast.integrators import literal, rounded
 from eomc.emit.plain.functions import Plain, handshake, indexed, of, parameters
@@ -58,8 +58,7 @@ def files(program: Program, show: Show) -> dict[str, str]:
 def header(plain: Plain, slopes: Slopes | None, loops: Sequence[Loop]) -> Header:
     """The header's view."""
     target, s = plain.target, plain.target.system
-    found = [plain.evaluation(n).function for n in KINDS if source(target, n) is not None]
-    found.append(plain.acceleration.function)
+    found = [*plain.evaluations, plain.acceleration]
     return Header(
         title=FreeText(s.title),
         stamp=tuple(context.stamp(target)),
@@ -74,7 +73,7 @@ def header(plain: Plain, slopes: Slopes | None, loops: Sequence[Loop]) -> Header
         parameters=parameters(plain),
         implicit=any(x.implicit for x in loops),
         timed=target.driven,
-        functions=tuple(found),
+        functions=tuple(x.function for x in found),
         linearization=slopes.linearization if slopes else None,
         methods=tuple(
             Declared(m.name, _titled(m), m.implicit, step(plain, m), x.run, x.batch)
@@ -96,7 +95,7 @@ def source_view(plain: Plain, slopes: str, steppers: Sequence[str]) -> Source:
         parameters=parameters(plain),
         q0=tuple(target.literal(x.start) for x in s.coordinates),
         qd0=tuple(target.literal(x.rate) for x in s.coordinates),
-        evaluations=tuple(plain.evaluation(n) for n in KINDS if source(target, n) is not None),
+        evaluations=plain.evaluations,
         acceleration=plain.acceleration,
         solved=tuple(context.solved(target)),
         slopes=slopes,

@@ -1,0 +1,64 @@
+"""The derivatives of the reference's accelerations, by differences of order 8.
+
+What a module's `linearize` and `sensitivity` are compared with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.verify.oracle import Answer, Vector
+
+if TYPE_CHECKING:
+    from eomc.verify.check import State
+
+STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of the scale of each variable
+
+
+def by_differences(
+    reference: Answer, s: State, scale: Vector, defaults: Mapping[str, float]
+) -> Iterator[tuple[Vector, Vector]]:
+    """dqdd/d[q, qd, u, p] (nq, 2 nq + nu + np) and the scales of these, for each of WIDTHS.
+
+    scale: (2, nq), of q and qd. u: held, at the signals where the state has none.
+    """
+    n, params = len(s.q), dict(s.params or defaults)
+    u = np.zeros(0)
+    if reference.system.inputs:
+        u = np.asarray(reference.evaluate("signals", s.q, s.qd, s.t, None, s.params), float)
+        u = u if s.u is None else s.u
+    x = np.concatenate([s.q, s.qd, u, list(params.values())])
+    scales = np.concatenate(
+        [scale.ravel(), np.maximum(1.0, np.abs(u)), np.abs(x[2 * n + len(u) :])]
+    )
+    scales = np.where(scales > 0, scales, 1.0)
+    for width in WIDTHS:
+        steps = np.concatenate([k * np.diag(width * scales) for m, _ in STENCIL for k in (m, -m)])
+        rows = x + steps
+        given: dict[str, Any] = {
+            "u": rows[:, 2 * n : 2 * n + len(u)] if len(u) else None,
+            "params": dict(zip(params, rows[:, 2 * n + len(u) :].T, strict=True)),
+        }
+        t = np.full(len(rows), s.t)
+        a = reference.acceleration(rows[:, :n], rows[:, n : 2 * n], t, **given)
+        forward, back = np.moveaxis(a.reshape(len(STENCIL), 2, len(x), n), 1, 0)
+        weights = np.array([w for _, w in STENCIL])
+        yield np.tensordot(weights, forward - back, 1).T / (width * scales), scales
+
+
+def apart(found: Vector, exact: Vector, scales: Vector, size: Vector) -> float | None:
+    """The largest difference of two (nq, k), relative to the row's largest in those scales.
+
+    size: (nq,), of the sums that the accelerations are; less than 1e-9 of it is no difference.
+    None where `exact` is not finite, inf where `found` alone is not.
+    """
+    if not np.all(np.isfinite(exact)):
+        return None
+    if not np.all(np.isfinite(found)):
+        return np.inf
+    largest = np.max(np.abs(exact) * scales, axis=1, initial=0) + 1e-9 * size
+    return float(np.max(np.abs(found - exact) * scales / largest[:, None], initial=0))

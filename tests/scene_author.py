@@ -1,0 +1,319 @@
+"""Random valid scenes, each the same for the same number.
+
+A scene has one to four coordinates, energies or bodies, definitions, `dot`, time, inputs with
+signals, friction, names that C and Python nearly refuse, and any of the steppers that it can use.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from eomc.base import names
+
+# single letters of C's and SymPy's, near misses of keywords, what the generated code itself says
+AWKWARD = """I E S N O Q C D J K L P R T U V beta gamma zeta Lambda lam lambda1 lambda_1 e i j k l
+m n o p q r s u v w x y z a b c d f g h If Or And Not Mod Max Min Abs Pow Add Symbol Integer pi2 oo
+zoo nan1 inf np math self out params index values y0_1 Int Double float1 double_1 int_1 for_1 in1
+None1 True1 or1 status memory steps count run step tau bias power energy theta phi psi alpha mu nu
+xi omega sigma q1 q2 qd qdd w1 w2 d_theta sin_theta cos_x theta1 x1 x_2 xdot ddot prepare defaults
+signal jacobi acceleration trouble lane method batch real result first last start sincos1 sin1 cos1
+exp1 log1 sqrt1 abs1 M_total mass_1 length stiffness l_0 Theta Phi Omega alpha_beta""".split()
+
+EXPLICIT, IMPLICIT = ("rk4", "dp8", "euler"), ("gauss4", "gauss6", "gauss8", "gauss16")
+STEPPERS = (*EXPLICIT, "verlet", *IMPLICIT)
+
+
+@dataclass
+class _Tables:
+    """A scene as it grows: the lines of each table."""
+
+    coordinates: list[str] = field(default_factory=list)
+    parameters: list[str] = field(default_factory=list)
+    constants: list[str] = field(default_factory=list)
+    inputs: list[str] = field(default_factory=list)
+    definitions: list[str] = field(default_factory=list)
+    energy: list[str] = field(default_factory=list)
+    forces: dict[str, list[str]] = field(default_factory=dict)
+    run: list[str] = field(default_factory=list)
+
+
+class _Author:
+    """Writes one scene.
+
+    static: D constant and forces of positions and time alone, so that every stepper can be used.
+    corners: whether something jumps or bends, so that implicit ones cannot.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.random = r = random.Random(f"scene {seed}")
+        self.tables = _Tables()
+        self.names = [n for n in AWKWARD if names.fault(n) is None]
+        r.shuffle(self.names)
+        self.static, self.timed = r.random() < 0.25, r.random() < 0.3
+        self.corners = False
+        self.q: list[str] = []
+        self.u: list[str] = []
+        self.points: list[str] = []
+
+    def chance(self, part: float) -> bool:
+        return self.random.random() < part
+
+    def name(self) -> str:
+        return self.names.pop()
+
+    def number(self, low: float, high: float) -> str:
+        """As people write numbers: a few digits, a fraction, an integer."""
+        x = self.random.uniform(low, high)
+        kinds = [f"{x:.3g}", f"{x:.2g}", repr(x), f"{max(1, round(3 * x))}/3"]
+        return self.random.choice(kinds) if low > 0 else f"{x:.3g}"
+
+    def value(self, low: float, high: float) -> str:
+        """A parameter, mostly; a constant or the number itself."""
+        text, kind = self.number(low, high), self.random.random()
+        if kind > 0.75:
+            return f"({text})"
+        name, quoted = self.name(), f'"{text}"' if "/" in text else text
+        if kind > 0.65:
+            self.tables.constants.append(f"{name} = {quoted}")
+        elif self.chance(0.2):
+            self.tables.parameters.append(
+                f'{name} = {{ value = {quoted}, unit = "1", note = "n" }}'
+            )
+        else:
+            self.tables.parameters.append(f"{name} = {quoted}")
+        return name
+
+    def one(self, options: Sequence[str]) -> str:
+        return self.random.choice(options)
+
+    def coordinate(self) -> str:
+        name = self.name()
+        parts = [f'unit = "{self.one(["rad", "m", "m", "1"])}"'] if self.chance(0.7) else []
+        start = self.one([self.number(-1, 1), '"pi/6"', "0", '"1/3"', "0.5"])
+        parts.append(f"start = {start}")
+        if self.chance(0.6):
+            parts.append(f"rate = {self.number(-1, 1)}")
+        self.tables.coordinates.append(f"{name} = {{ {', '.join(parts)} }}")
+        self.q.append(name)
+        return name
+
+    def inputs(self) -> None:
+        for _ in range(self.random.choice([0, 0, 1, 1, 2])):
+            name, x = self.name(), self.one(self.q)
+            signals = ["0.5*sin(2*t)", "cos(t)/2 + t/10", "0.3", "exp(-t)", f"sin({x})/4"]
+            if not self.static:
+                signals.append(f"-{x}_dot/5 - {x}/7")
+            text = self.one(signals)
+            signal = f'signal = "{text}"' if self.chance(0.8) else 'unit = "N"'
+            self.tables.inputs.append(f"{name} = {{ {signal} }}")
+            self.u.append(name)
+
+    def position(self) -> str:
+        """A definition of positions, and time perhaps."""
+        x, y = self.one(self.q), self.one(self.q)
+        a, b = self.value(0.3, 1.5), self.number(0.2, 1)
+        forms = [
+            f"{a}*sin({x})", f"{a}*cos({x}) + {y}", f"{x} - {a}*sin({y})", f"{x}*cos({y})",
+            f"{x}*sin({y})", f"{a}*{x} + {b}*{y}**2/4", f"{a}*sin({x} + {y})", f"atan({x})*{a}",
+            f"{a}*tanh({x}/2)", f"sqrt(1 + {x}**2)*{a}", f"{a}*sin({x})*cos({y})",
+            f"exp(-{x}**2)*{a}", f"{a}*log(2 + {x}**2) + {y}", f"{a}*atan2({x}, 3 + {y}**2)",
+            f"sinh({x}/5)*{a}", f"{a}*(1 + {x}**2)**0.75", f"{x}/(2 + {y}**2)*{a}",
+        ]  # fmt: skip
+        text = self.one(forms)
+        if self.points and self.chance(0.4):
+            text += f" + {self.one(self.points)}/2"
+        if self.timed and self.chance(0.6):
+            text += self.one([" + 0.1*cos(3*t)", " + t/20", " + sin(5*t)/20"])
+        name = self.name()
+        self.tables.definitions.append(f'{name} = "{text}"')
+        self.points.append(name)
+        return name
+
+    def kinetic(self) -> str:
+        masses = [self.value(0.5, 3) for _ in self.q]
+        terms = [f"{m}*{x}_dot**2/2" for m, x in zip(masses, self.q, strict=True)]
+        x, y = self.one(self.q), self.one(self.q)
+        if self.static:
+            if x != y and self.chance(0.5):
+                terms.append(f"0.2*{x}_dot*{y}_dot")
+            return " + ".join(terms)
+        for _ in range(self.random.choice([0, 1, 1, 2])):
+            terms.append(f"{self.value(0.3, 2)}*dot({self.position()})**2/2")
+        if self.chance(0.3):
+            terms.append(f"{self.value(0.2, 1)}*(2 + sin({x}))*{y}_dot**2/4")
+        if self.chance(0.15):
+            terms.append(f"{self.value(0.2, 1)}*sin({x})*{y}_dot")
+        if self.chance(0.15):
+            terms.append(f"{self.value(0.2, 1)}*cos({x})**2/3")
+        if self.timed and self.chance(0.3):
+            terms.append(f"t*{y}_dot/10")
+        return " + ".join(terms)
+
+    def potential(self) -> str:
+        terms = []
+        for x in self.q:
+            k = self.value(0.5, 20) if self.chance(0.9) else self.value(2e3, 2e4)
+            forms = [
+                f"{k}*{x}**2/2", f"{k}*(1 - cos({x}))", f"-{k}*cos({x})", f"{k}*{x}**4/4",
+                f"{k}*sqrt(1 + {x}**2)", f"{k}*log(1 + {x}**2)", f"{k}*cosh({x}/2)", f"{k}*{x}",
+                f"-{k}*exp(-{x}**2)", f"{k}*tanh({x})**2", f"{k}*({x} - 1/4)**2/2",
+                f"{k}*{x}*atan({x})", f"{k}*abs({x})**3/3", f"{k}*max(-{x}, 0)**2/2",
+            ]  # fmt: skip
+            form = self.one(forms[:12]) if self.chance(0.93) else self.one(forms[12:])
+            self.corners |= "abs" in form or "max" in form
+            terms.append(form)
+        x, y = self.one(self.q), self.one(self.q)
+        if self.chance(0.4):
+            terms.append(self.one([f"{x}*{y}/10", f"sin({x} - {y})/3", f"({x} - {y})**2/2"]))
+        if self.points and self.chance(0.6):
+            terms.append(f"{self.value(1, 10)}*{self.one(self.points)}")
+        if self.timed and self.chance(0.4):
+            terms.append(f"{x}*sin(2*t)/5")
+        return " + ".join(terms) if self.chance(0.93) else "0"
+
+    def friction(self) -> None:
+        """Along some coordinates, by dissipation or as a force; smooth or not."""
+        lost = []
+        for x in self.q:
+            if self.chance(0.5):
+                continue
+            c, v = self.value(0.05, 0.8), f"{x}_dot"
+            width = self.one(["0.01", "0.1", "0.5", self.value(0.02, 1)])
+            if self.chance(0.5):
+                lost.append(
+                    self.one(
+                        [f"{c}*{v}**2/2", f"{c}*{v}*tanh({v}/{width})", f"{c}*{v}**4/4",
+                         f"{c}*(1 + {x}**2)*{v}**2/2", f"{c}*log(cosh({v}))"]
+                    )
+                )  # fmt: skip
+                continue
+            forms = [
+                f"-{c}*{v}",
+                f"-{c}*tanh({v}/{width})",
+                f"-{c}*{v}**3",
+                f"-{c}*atan({v}/{width})",
+            ]
+            if self.chance(0.1):
+                forms = [f"-{c}*sign({v})", f"-{c}*{v}*abs({v})", f"-{c}*{v}*heaviside({x})"]
+                self.corners = True
+            self.force(x, self.one(forms))
+        if lost:
+            self.tables.energy.append(f'dissipation = "{" + ".join(lost)}"')
+
+    def force(self, x: str, text: str) -> None:
+        self.tables.forces.setdefault(x, []).append(text)
+
+    def drive(self) -> None:
+        for name in self.u:
+            x, y = self.one(self.q), self.one(self.q)
+            self.force(x, self.one([name, f"2*{name}", f"{name}*cos({y})", f"{name}/(1 + {y}**2)"]))
+        if self.timed and self.chance(0.5):
+            self.force(self.one(self.q), self.one(["sin(3*t)", "t/10", "cos(t)*exp(-t/5)"]))
+        if not self.static and self.chance(0.15):
+            x, y = self.one(self.q), self.one(self.q)
+            self.force(x, self.one([f"0.1*{y}_dot*{x}", f"sin({y}_dot)/5", f"{x}*{y}/9"]))
+
+    def settings(self) -> None:
+        r, run = self.random, self.tables.run
+        batch = self.chance(0.15)
+        can = [*EXPLICIT, *["verlet"] * self.static]
+        if not (batch or self.corners):
+            can += IMPLICIT
+        r.shuffle(can)
+        methods = can[: r.choice([1, 2, 2, 3, len(can)])]
+        if self.chance(0.6):
+            methods = ["rk4", *(m for m in methods if m != "rk4")]
+        listed = ", ".join(f'"{m}"' for m in methods)
+        if methods != ["rk4"] or self.chance(0.5):
+            run.append(f"method = [{listed}]" if len(methods) > 1 else f"method = {listed}")
+        run.append(f"h = {self.one(['0.001', '0.005', '0.01', '0.02', '0.004'])}")
+        run.append(f"duration = {self.one(['0.5', '1.0', '2.0', '5.0', '10.0'])}")
+        if batch:
+            run.append("batch = true")
+        if self.chance(0.1):
+            run.append('real = "float"')
+        if self.chance(0.25) and not self.corners:
+            run.append(
+                f"linearize = {self.one(['true', 'true', chr(34) + 'parameters' + chr(34)])}"
+            )
+
+    def energies(self) -> str:
+        for _ in range(self.random.choice([1, 1, 2, 2, 3, 4])):
+            self.coordinate()
+        self.inputs()
+        self.tables.energy.append(f'kinetic = "{self.kinetic()}"')
+        self.tables.energy.append(f'potential = "{self.potential()}"')
+        if not self.static:
+            self.friction()
+        self.drive()
+        self.settings()
+        return self.text([])
+
+    def bodies(self) -> str:
+        """A chain or tree of bodies on joints, plane or in space."""
+        plane, count, out = self.chance(0.6), self.random.choice([1, 2, 2, 3]), []
+        self.static = False
+        held: list[str] = []
+        for k in range(count):
+            x, lines = self.coordinate(), []
+            turning = self.chance(0.7)
+            lines = [f'name = "b{k}"', f'joint = "{"revolute" if turning else "prismatic"}"']
+            lines.append(f'coordinates = "{x}"')
+            if k and self.chance(0.8):
+                lines.append(f'parent = "b{self.random.randrange(k)}"')
+                lines.append(f"offset = {self.vector(plane)}")
+            if not turning or not plane:
+                axes = ["[1, 0]", "[0, 1]", "[3, 4]"] if plane else ["[1, 0, 0]", "[0, 0, 1]"]
+                axes += [] if plane else ["[0, 1, 0]", "[1, 2, 2]"]
+                lines.append(f"axis = {self.one(axes)}")
+            inertia = self.value(0.1, 0.8)
+            lines.append(f'mass = "{self.value(0.5, 3)}"')
+            lines.append(f"center = {self.vector(plane)}")
+            lines.append(
+                f'inertia = "{inertia}"' if plane else f'inertia = ["{inertia}", 0.4, 0.5]'
+            )
+            lines += self.drag(x)
+            out += ["[[body]]", *lines]
+            held.append(x)
+        for x in held:
+            if self.chance(0.4):
+                out += ["[[spring]]", f'coordinate = "{x}"', f'stiffness = "{self.value(1, 60)}"']
+        self.inputs()
+        self.drive()
+        self.settings()
+        gravity = self.one(['"-9.81"', "-9.81", "0", '"-49/5"'])
+        return self.text(out, f"gravity = [0, {gravity if plane else f'0, {gravity}'}]")
+
+    def drag(self, x: str) -> list[str]:
+        lines = []
+        if self.chance(0.3):
+            lines.append(f'damping = "{self.value(0.05, 1)}"')
+        if self.chance(0.4):
+            lines.append(f"friction = {self.one(['0.1', '0.02', '0.5'])}")
+            if self.chance(0.4):
+                lines.append(f"friction_width = {self.one(['0.05', '0.2'])}")
+        if self.chance(0.1):
+            lines.append(f'actuator = "-{x}/3"')
+        return lines
+
+    def vector(self, plane: bool) -> str:
+        entries = [self.one(["0", "0.5", '"1/3"', "-0.4", "0.3"]) for _ in range(2 if plane else 3)]
+        return f"[{', '.join(entries)}]"
+
+    def text(self, more: Sequence[str], above: str = "") -> str:
+        t, out = self.tables, ["eomc = 1", 'name = "random_scene"', *filter(None, [above])]
+        out += ["[coordinates]", *t.coordinates]
+        for heading in ("parameters", "constants", "inputs", "definitions", "energy"):
+            if lines := getattr(t, heading):
+                out += [f"[{heading}]", *lines]
+        if t.forces:
+            out += ["[forces]", *(f'{x} = "{" + ".join(e)}"' for x, e in t.forces.items())]
+        return "\n".join([*out, *more, "[run]", *t.run]) + "\n"
+
+
+def scene_text(seed: int) -> str:
+    """The scene of that number as TOML: valid, always the same."""
+    author = _Author(seed)
+    return author.bodies() if author.chance(0.25) else author.energies()

@@ -1,0 +1,52 @@
+"""What the README shows is what happens."""
+
+from __future__ import annotations
+
+import doctest
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+from cases import SCENES
+from conftest import MODULES, needs
+
+import eomc
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    """The code blocks of a language, in their order."""
+    return re.findall(rf"```{language}\n(.*?)```", README, re.S)
+
+
+def test_the_scene_is_the_one_that_is_there() -> None:
+    (shown,) = map(tomllib.loads, blocks("toml"))
+    whole = tomllib.loads((SCENES / "cartpole.toml").read_text(encoding="utf-8"))
+    for table in ("energy", "definitions", "run"):
+        assert shown[table] == whole[table]
+    assert shown["parameters"] == {name: p["value"] for name, p in whole["parameters"].items()}
+    for name, coordinate in shown["coordinates"].items():
+        assert coordinate.items() <= whole["coordinates"][name].items()
+
+
+def test_the_c_shown_is_generated_and_the_program_prints_what_is_said(tmp_path: Path) -> None:
+    files = eomc.sources(eomc.read(SCENES / "cartpole.toml")).files
+    function, program = blocks("c")
+    assert function in files["cartpole.c"]
+    for name in ("cartpole.h", "cartpole.c"):
+        (tmp_path / name).write_text(files[name], encoding="utf-8")
+    (tmp_path / "main.c").write_text(program, encoding="utf-8")
+    command, said = next(b for b in blocks("sh") if "a.out" in b).strip().split("\n")
+    command = command.removeprefix("$ ").replace("cc ", needs("cc") + " ", 1)
+    done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.strip() == said
+
+
+def test_python_answers_as_shown() -> None:
+    (session,) = (b for b in blocks("python") if ">>>" in b)
+    where = f"{str(SCENES / 'cartpole.toml')!r}, {str(MODULES)!r}"
+    session = session.replace('"scenes/cartpole.toml"', where)
+    test = doctest.DocTestParser().get_doctest(session, {}, "README.md", None, 0)
+    assert doctest.DocTestRunner().run(test).failed == 0
