@@ -15,7 +15,8 @@ from scene_author import scene_text
 import eomc
 from eomc.model import system
 from eomc.scene import scene
-from eomc.verify.check import Report, check
+from eomc.verify.check import check
+from eomc.verify.report import Report
 
 # Right modules of which a row about orders, advised steps or balances once said FAILED.
 DRAG = """eomc = 1

@@ -20,7 +20,7 @@ from eomc.verify.rows_refusals import SINGULAR
 from eomc.verify.rows_runs import EVERY, LONG, TURNS, Runs, drive
 
 if TYPE_CHECKING:
-    from eomc.verify.check import State
+    from eomc.verify.sampling import State
 
 COUNT = 150  # instances: a whole tile or two, and one that is not full
 FEW = (1, 3, 9)  # the first so many of them, alone

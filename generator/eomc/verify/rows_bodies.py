@@ -24,7 +24,8 @@ from eomc.verify.oracle import Vector
 
 if TYPE_CHECKING:
     from eomc.scene.scene import Scene
-    from eomc.verify.check import Comparison, Expected, State
+    from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import Expected, State
 
 LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
 STATES = 8  # at most

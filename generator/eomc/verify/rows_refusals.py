@@ -19,7 +19,8 @@ from eomc.verify.oracle import Vector
 from eomc.verify.rows_runs import drive, parameters
 
 if TYPE_CHECKING:
-    from eomc.verify.check import Comparison, State
+    from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import State
 
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE = range(4)
 WORDS = ("ok", "singular", "not finite", "no convergence")
@@ -169,7 +170,7 @@ class Refusals:
         step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **way)
         if not self.raises(step, status) or not np.all(np.array(out) == MARK):
             return False
-        run = self.check._simulate(s, method=method, steps=5)
+        run = self.check.simulate(s, method=method, steps=5)
         kept = np.array_equal(run.q, np.asarray([s.q], run.q.dtype))
         return bool(kept and run.status == status and run.steps == 0 and "stopped" in run.message)
 

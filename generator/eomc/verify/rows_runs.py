@@ -20,7 +20,8 @@ from eomc.verify.convergence import Finding, largest
 from eomc.verify.oracle import Vector
 
 if TYPE_CHECKING:
-    from eomc.verify.check import Comparison, Expected, State
+    from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import Expected, State
 
 STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps
 CUTS = (1, 2, 5, 38, 129, 130, 131, 177)
@@ -148,7 +149,7 @@ class Runs:
         """Long steps beside the reference's."""
         parts = ((), LONG) if self.check.large else (LONG, LADDER)
         found = (
-            self.check._run(s, h=self.large_step(s, part), steps=self.few)
+            self.check.run(s, h=self.large_step(s, part), steps=self.few)
             for s, some in zip(self.states, parts, strict=False)
             for part in some
         )
