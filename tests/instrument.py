@@ -32,8 +32,9 @@ class Shipped:
         made = eomc.sources(system, self.extension)
         folder.mkdir(parents=True, exist_ok=True)
         for file, text in made.files.items():
-            (folder / file).write_text(text, encoding="utf-8")
-        self.source = made.files[f"{self.name}.c"]
+            if file.startswith("fast/") or file.endswith(".py"):
+                (folder / file.removeprefix("fast/")).write_text(text, encoding="utf-8")
+        self.source = made.files[f"fast/{self.name}.c"]
         ffi = cffi.FFI()
         ffi.cdef(made.cdef)
         ffi.set_source(self.extension, made.binding)

@@ -32,8 +32,11 @@ from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
 from eomc.verify import check as checking
+from eomc.verify import comparison
+from eomc.verify.comparison import Comparison
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_runs import drive
+from eomc.verify.sampling import State
 
 FLAGS = ("-O1", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 SECONDS = 60.0
@@ -158,7 +161,7 @@ def outcomes(module: Any, check: Any) -> Vector:
     for n in range(RUNS):
         s = states[n % len(states)].state
         near = 1 + 0.3 * draw.standard_normal((2, len(s.q)))
-        at = checking.State(s.q * near[0], s.qd * near[1], s.t, s.u, s.params)
+        at = State(s.q * near[0], s.qd * near[1], s.t, s.u, s.params)
         for name in names:
             found.append(check.ask(name, at))
         for method in module.methods:
@@ -181,8 +184,8 @@ class Bench:
     def __init__(self, name: str, folder: Path, made: System | None = None) -> None:
         self.system = variant(name) if made is None else made
         self.shipped = Shipped(self.system, folder / name)
-        self.reference = checking.of(self.system)
-        checking.of = lambda made: self.reference
+        self.reference = comparison.of(self.system)
+        comparison.of = lambda made: self.reference
         self.mutants = mutants(self.shipped.source)
         # What the reference compiles for itself is there in all forks then. A library that was
         # loaded once is not loaded again, so that the original has a place of its own.
@@ -191,7 +194,7 @@ class Bench:
         original = own.load()
         report = checking.check(self.system, original)
         assert report.passed, report.table()
-        self.states = checking.Comparison(self.system, original, np.random.default_rng(5), None)
+        self.states = Comparison(self.system, original, np.random.default_rng(5), None)
         self._right: Vector | None = None
 
     @property

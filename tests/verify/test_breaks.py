@@ -23,7 +23,8 @@ from eomc.derive.lagrange import Equations
 from eomc.emit import c_expression
 from eomc.program import program
 from eomc.program.ir import Sum
-from eomc.verify.check import Report, check
+from eomc.verify.check import check
+from eomc.verify.report import Report
 
 Breakage = Callable[[pytest.MonkeyPatch], None]
 SCENE = "cartpole_driven"

@@ -17,11 +17,13 @@ from conftest import Modules
 
 from eomc.model.from_scene import from_scene as system_of
 from eomc.model.system import System, symbol
-from eomc.scene import scene
-from eomc.verify import check as checking
+from eomc.scene import read as scene
+from eomc.verify import sampling
 from eomc.verify import symbolic as references
-from eomc.verify.check import Report, check
+from eomc.verify.check import check
 from eomc.verify.convergence import Convergence, Finding
+from eomc.verify.report import Report
+from eomc.verify.sampling import LARGE
 from eomc.verify.symbolic import Reference, derive
 
 
@@ -244,14 +246,14 @@ def test_what_is_wrong_fails(what: str) -> None:
 def as_if_large(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference is Taylor arithmetic, and sizes come from changing all inputs at once."""
     monkeypatch.setattr(references, "WRITTEN_OUT", 0)
-    monkeypatch.setattr(checking, "MOST_NUDGES", 0)
+    monkeypatch.setattr(sampling, "MOST_NUDGES", 0)
 
 
 @pytest.mark.parametrize("name", ["cartpole_driven", "foucault_pendulum"])
 def test_what_is_right_passes_as_if_large(name: str, as_if_large: None) -> None:
     report = check(scene_system(name), StandIn(reference(name).simplified()))
     assert report.passed, report.table()
-    assert report.states == checking.LARGE.states
+    assert report.states == LARGE.states
     assert report.reference == "Taylor arithmetic"
     assert "6 random states, against Taylor arithmetic" in " ".join(report.table().split())
     values = [row for row in report.rows if row.unit == "units of rounding"]

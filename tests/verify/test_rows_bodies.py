@@ -19,9 +19,10 @@ from trees import SHAPES, trees
 from eomc.model import from_scene as system
 from eomc.model import multibody as building
 from eomc.scene import read as scene
-from eomc.verify import check as checking
 from eomc.verify import rows_bodies
+from eomc.verify.comparison import Comparison
 from eomc.verify.rows_bodies import Bodies
+from eomc.verify.sampling import State
 from eomc.verify.taylor import Jets
 
 NAMES = ("kinetic_energy", "potential_energy", "power")
@@ -32,7 +33,7 @@ def compared(text: str, states: int = 4) -> dict[str, float]:
     made = system.from_scene(scene.parse(text, "test.toml"))
     assert made.scene is not None
     module = StandIn(Jets(made))  # type: ignore[arg-type]  # which answers alike
-    check = checking.Comparison(made, module, np.random.default_rng(0), states)
+    check = Comparison(made, module, np.random.default_rng(0), states)
     assert check.expected
     return {name: Bodies(check, made.scene).compare(name) for name in NAMES}
 
@@ -186,7 +187,7 @@ def test_quaternions_are_scipys() -> None:
 def test_point_masses_have_the_inertia_of_the_body() -> None:
     made = system.from_scene(scene.read(SCENES / "tumbling_box.toml"))
     assert made.scene is not None and made.scene.assembly is not None
-    start = checking.State(*np.array([(c.start, c.rate) for c in made.coordinates]).T)
+    start = State(*np.array([(c.start, c.rate) for c in made.coordinates]).T)
     line = rows_bodies.Line(made.scene, start, 0.1)
     (body,) = [b for b in made.scene.assembly.bodies if b.joint]
     masses, points = zip(*line.points(body), strict=True)

@@ -30,7 +30,7 @@ from eomc.integrators.tableaux import METHODS
 from eomc.verify.oracle import Vector
 
 if TYPE_CHECKING:
-    from eomc.verify.check import State
+    from eomc.verify.sampling import State
 
 EPS = 2.0**-52
 SEEN = 8  # higher orders go from errors of a hundredth to rounding in two halvings of h

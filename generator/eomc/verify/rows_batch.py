@@ -16,10 +16,11 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify.oracle import Vector
+from eomc.verify.rows_refusals import SINGULAR
 from eomc.verify.rows_runs import EVERY, LONG, TURNS, Runs, drive
 
 if TYPE_CHECKING:
-    from eomc.verify.check import State
+    from eomc.verify.sampling import State
 
 COUNT = 150  # instances: a whole tile or two, and one that is not full
 FEW = (1, 3, 9)  # the first so many of them, alone
@@ -92,7 +93,7 @@ class Batches:
 
     def beside(self, method: str) -> float:
         """Each instance beside a single run of it, as far as a difference does not grow."""
-        worst, nudge = 0.0, self.check.eps ** (1 / 3)
+        errors, nudge = [], self.check.eps ** (1 / 3)
         spread = np.array([self.runs.sampler.spread, self.runs.sampler.speed])
         for u in self.tables():
             runs = self.simulate(method, self.instances, u)
@@ -108,8 +109,8 @@ class Batches:
                 wide = float(np.max(1 + np.abs(s.q) / spread[0]))  # of an angle, its last digit
                 size = STEPS * wide * (grown[:, None] + np.abs(run.rows))
                 found = np.stack([runs.q[k], runs.qd[k]])
-                worst = max(worst, self.check.units(found, run.rows, size))
-        return worst
+                errors.append(self.check.units(found, run.rows, size))
+        return float(np.max(errors, initial=0))
 
     def places(self, method: str) -> float:
         """How many batches are not to the bit what their instances are elsewhere."""
@@ -188,7 +189,16 @@ class Batches:
                 wrong += self.ends_otherwise(method, whole, k, at)
             none = self.simulate(method, [states[k] for k in bad], None if u is None else u[bad])
             wrong += not _same(none, whole, np.array(bad))
-        return float(wrong)
+        return float(wrong + self.moving(method))
+
+    def moving(self, method: str) -> int:
+        """How many instances go on that start where D is singular."""
+        starts = self.singular[:: 1 + len(self.singular) // COUNT]
+        states = [replace(self.instances[0], q=s.q, qd=s.qd, params=s.params) for s in starts]
+        if not states:
+            return 0
+        found = self.simulate(method, states, None)
+        return int(np.sum((found._codes != SINGULAR) | (found.steps != 0)))
 
     def ends_otherwise(self, method: str, whole: Any, k: int, s: State) -> bool:
         """Whether a failing instance ends otherwise than a single run does."""

@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
-from eomc.verify.check import GROWTH_LIMIT, LIMIT, NUDGE, VALUES, State, ask, nudged
+from eomc.verify.comparison import GROWTH_LIMIT
 from eomc.verify.oracle import Vector
+from eomc.verify.report import LIMIT
+from eomc.verify.sampling import NUDGE, VALUES, State, ask, nudged
 
 if TYPE_CHECKING:
-    from eomc.verify.check import Comparison, Expected
+    from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import Expected
 
 STEPS = 24  # of a run by each method
 SHORTER = 16  # by how much, where sweeps are few and fixed: what they leave is then rounding

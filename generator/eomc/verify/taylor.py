@@ -22,9 +22,8 @@ symmetric. So no full matrix of second derivatives is ever needed, nor a third d
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,30 +34,11 @@ from sympy import Expr
 from eomc.base.errors import EomcError
 from eomc.model.system import System, dot, t
 from eomc.verify.oracle import SCALARS, Answer, Values, Vector
+from eomc.verify.taylor_rules import FEEDS, FUNCTIONS, PAIRS, RULES, Fields, Jet, Op, Point, step_at
 
 BLOCK = 2**16  # entries of (nq, nq) matrices, of so many states at once: what caches hold
 
-Jet = dict[str, Any]  # value and derivatives, rows by states; what is zero is left out
-Fields = frozenset[str]
-
-_PAIRS = ("vv", "vvs", "N")  # the (nq, nq) ones
-_OF_VELOCITIES = {"v", "vs", *_PAIRS}
-
-# what of a sum's, a product's or a function's arguments, and of e, makes a derivative of dot(e)
-_FEEDS: Mapping[str, Mapping[str, str]] = {
-    "product": {
-        "value": "value",
-        "s": "value s",
-        "x": "value x",
-        "v": "value v",
-        "xs": "value s x xs",
-        "vs": "value s v vs",
-        "vv": "value v vv",
-        "vvs": "value s v vs vv vvs",
-        "N": "value x v N",
-    },
-    "dot": {"value": "s", "s": "xs", "x": "xs", "v": "x", "vs": "xs"},
-}
+_OF_VELOCITIES = {"v", "vs", *PAIRS}
 
 # what each answer takes of K, P, R, of every force Q and of every signal
 _WANTED: Mapping[str, Mapping[str, str]] = {
@@ -75,23 +55,6 @@ _WANTED: Mapping[str, Mapping[str, str]] = {
     "signals": {"u": "value"},
     "motion": {"K": "vs x vv", "P": "x", "Q": "value", "R": "v"},
 }
-
-
-@dataclass(frozen=True)
-class _Op:
-    """One operation on those before it: what it is, of which, and a number, place or function.
-
-    degree: in the velocities, inf where it is no polynomial in them; moves: 2 where it hangs on
-    q, 1 where on t alone; rate: hangs on a dot(...); given: hangs on an input.
-    """
-
-    kind: str
-    args: tuple[int, ...] = ()
-    data: Any = None
-    degree: float = 0
-    moves: int = 0
-    rate: bool = False
-    given: bool = False
 
 
 class Jets(Answer):
@@ -115,7 +78,7 @@ class Jets(Answer):
                 "the kinetic energy is not quadratic in the velocities, or can't be seen to be: "
                 "write it as a sum of products. Friction belongs in 'dissipation' or [forces]"
             )
-        self._plans: dict[str, tuple[tuple[int, _Op, Fields], ...]] = {}
+        self._plans: dict[str, tuple[tuple[int, Op, Fields], ...]] = {}
 
     def _value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
@@ -146,7 +109,7 @@ class Jets(Answer):
             qd = np.zeros_like(qd)
         inputs, parameters = ([_column(z) for z in zs] for zs in (u.T, values))
         with np.errstate(all="ignore"):
-            found = self._outputs(name, _State(q, qd, _column(t), inputs, parameters))
+            found = self._outputs(name, Point(q, qd, _column(t), inputs, parameters))
         found[~np.isfinite(found.reshape(len(found), -1)).all(axis=1)] = math.nan
         return found
 
@@ -156,7 +119,7 @@ class Jets(Answer):
         both = self._value("motion", q, qd, t, u, values)  # D and tau - bias beside it
         return np.asarray(np.linalg.solve(both[..., :-1], both[..., -1:])[..., 0])
 
-    def _outputs(self, name: str, state: _State) -> Vector:
+    def _outputs(self, name: str, state: Point) -> Vector:
         """The values of `name`, a row a state."""
         jets = self._run(name, state)
         roots, (b, nq) = self._list.roots, state.q.shape
@@ -206,12 +169,12 @@ class Jets(Answer):
                 found = each("u")
         return np.array(found[:, 0] if name in SCALARS else found)
 
-    def _run(self, name: str, state: _State) -> dict[int, Jet]:
+    def _run(self, name: str, state: Point) -> dict[int, Jet]:
         if name not in self._plans:
             self._plans[name] = tuple(self._list.plan(_WANTED[name]))
         jets: dict[int, Jet] = {}
         for index, op, want in self._plans[name]:
-            jets[index] = _RULES[op.kind](op, [jets.get(arg, {}) for arg in op.args], want, state)
+            jets[index] = RULES[op.kind](op, [jets.get(arg, {}) for arg in op.args], want, state)
         return jets
 
 
@@ -225,28 +188,6 @@ def _column(z: Any) -> Any:
     return np.asarray(z, float)[:, None] if np.ndim(z) else np.float64(z)
 
 
-@dataclass(frozen=True)
-class _State:
-    """Where the operations are carried out: q, qd (b, nq); t, u, values: numbers or columns."""
-
-    q: Vector
-    qd: Vector
-    t: Any
-    u: Any
-    values: Any
-
-    @cached_property
-    def d(self) -> Vector:
-        """The direction (qd, 1) of x = (q, t)."""
-        return np.concatenate([self.qd, np.ones((len(self.qd), 1))], axis=1)
-
-    def unit(self, i: int, more: int) -> Vector:
-        """The unit row i of nq + more entries."""
-        row = np.zeros((1, self.q.shape[1] + more))
-        row[0, i] = 1
-        return row
-
-
 # --- from expressions to a flat list of operations ------------------------------------------------
 
 
@@ -255,20 +196,20 @@ class _List:
     """The operations of all of a system's expressions, each written once, in order."""
 
     system: System
-    ops: list[_Op] = field(default_factory=list)
+    ops: list[Op] = field(default_factory=list)
     known: dict[Expr, int] = field(default_factory=dict)
     roots: dict[str, list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         s = self.system
         for i, (q, qd) in enumerate(zip(s.q, s.qd, strict=True)):
-            self.known[q] = self.add(_Op("q", data=i, moves=2))
-            self.known[qd] = self.add(_Op("qd", data=i, degree=1))
-        self.known[t] = self.add(_Op("t", moves=1))
+            self.known[q] = self.add(Op("q", data=i, moves=2))
+            self.known[qd] = self.add(Op("qd", data=i, degree=1))
+        self.known[t] = self.add(Op("t", moves=1))
         for i, u in enumerate(s.u):
-            self.known[u] = self.add(_Op("u", data=i, given=True))
+            self.known[u] = self.add(Op("u", data=i, given=True))
         for i, p in enumerate(s.parameters):
-            self.known[p.symbol] = self.add(_Op("parameter", data=i))
+            self.known[p.symbol] = self.add(Op("parameter", data=i))
         for name, body in s.definitions:
             self.known[name] = self.node(body)
         forces = s.forces or (sympy.S.Zero,) * len(s.q)
@@ -276,7 +217,7 @@ class _List:
         roots["u"] = [i.signal for i in s.inputs]
         self.roots = {name: [self.node(e) for e in exprs] for name, exprs in roots.items()}
 
-    def add(self, op: _Op) -> int:
+    def add(self, op: Op) -> int:
         self.ops.append(op)
         return len(self.ops) - 1
 
@@ -285,7 +226,7 @@ class _List:
         args = tuple(args)
         of = [self.ops[i] for i in args]
         moves, rate, given = (max(getattr(a, n) for a in of) for n in ("moves", "rate", "given"))
-        return self.add(_Op(kind, args, data, degree, moves, rate or kind == "dot", given))
+        return self.add(Op(kind, args, data, degree, moves, rate or kind == "dot", given))
 
     def node(self, e: Any) -> int:
         """The operation that gives `e`."""
@@ -296,7 +237,7 @@ class _List:
 
     def made(self, e: Expr) -> int:
         if e.is_number:
-            return self.add(_Op("number", data=np.float64(e)))
+            return self.add(Op("number", data=np.float64(e)))
         if isinstance(e, dot):
             return self.rate(e)
         if e.is_Add:
@@ -318,9 +259,9 @@ class _List:
                 found = self.make("extreme", (found, other), e.func is sympy.Max, degree)
             return found
         if isinstance(e, sympy.Heaviside):
-            return self.make("function", args[:1], _step_at(float(e.args[1])), degree)
-        if e.func in _FUNCTIONS and len(args) == 1:
-            return self.make("function", args, _FUNCTIONS[e.func], degree)
+            return self.make("function", args[:1], step_at(float(e.args[1])), degree)
+        if e.func in FUNCTIONS and len(args) == 1:
+            return self.make("function", args, FUNCTIONS[e.func], degree)
         raise EomcError(f"{self.system.name}: the derivatives of {e} are not known")
 
     def product(self, e: Expr) -> int:
@@ -344,7 +285,7 @@ class _List:
             raise EomcError(f"{e} hangs on {what}, whose rates are not known")
         return self.make("dot", (inside,), degree=1 if op.moves == 2 else 0)
 
-    def plan(self, wanted: Mapping[str, str]) -> Iterator[tuple[int, _Op, Fields]]:
+    def plan(self, wanted: Mapping[str, str]) -> Iterator[tuple[int, Op, Fields]]:
         """The operations that the wanted derivatives need, in order, and what of each."""
         need: dict[int, set[str]] = {}
         for root, fields in wanted.items():
@@ -356,7 +297,7 @@ class _List:
                 if op.kind == "sum":
                     feeds = [field_]
                 else:
-                    feeds = _FEEDS["dot" if op.kind == "dot" else "product"].get(field_, "").split()
+                    feeds = FEEDS["dot" if op.kind == "dot" else "product"].get(field_, "").split()
                 for arg in op.args:
                     self._demand(need, arg, feeds)
         return ((i, op, frozenset(need[i])) for i, op in enumerate(self.ops) if need.get(i))
@@ -370,292 +311,3 @@ class _List:
                     here.add(name)
             elif name == "value" or op.moves or op.degree:
                 here.add(name)
-
-
-# --- rules ----------------------------------------------------------------------------------------
-
-
-def _weighted(*terms: tuple[Any, Any]) -> Any:
-    """sum w z over pairs; what is None is zero."""
-    total = None
-    for w, z in terms:
-        if w is None or z is None:
-            continue
-        part = (w[..., None] if z.ndim == 3 and isinstance(w, np.ndarray) else w) * z
-        total = part if total is None else total + part
-    return total
-
-
-def _plus(total: Any, part: Any) -> Any:
-    return part if total is None else total if part is None else total + part
-
-
-def _outer(a: Any, b: Any) -> Any:
-    return None if a is None or b is None else a[:, :, None] * b[:, None, :]
-
-
-def _with_transpose(a: Any, sign: int = 1) -> Any:
-    return None if a is None else a + a.swapaxes(1, 2) if sign > 0 else a - a.swapaxes(1, 2)
-
-
-def _kept(jet: Jet) -> Jet:
-    return {name: part for name, part in jet.items() if part is not None}
-
-
-def _leaf(op: _Op, args: list[Jet], want: Fields, at: _State) -> Jet:
-    match op.kind:
-        case "number":
-            return {"value": op.data}
-        case "parameter":
-            return {"value": at.values[op.data]}
-        case "u":
-            return {"value": at.u[op.data]}
-        case "t":
-            return {"value": at.t, "s": np.ones((1, 1)), "x": at.unit(-1, 1)}
-        case "q":
-            i = op.data
-            return {"value": at.q[:, i, None], "s": at.qd[:, i, None], "x": at.unit(i, 1)}
-    return {"value": at.qd[:, op.data, None], "v": at.unit(op.data, 0)}
-
-
-def _sum(op: _Op, args: list[Jet], want: Fields, at: _State) -> Jet:
-    out: Jet = {}
-    for name in want:
-        total, mine = None, False
-        for weight, a in zip(op.data, args, strict=True):
-            if name in a:
-                part = a[name] if weight == 1 else weight * a[name]
-                if total is None:
-                    total = part
-                elif name in _PAIRS and mine and total.shape == part.shape:
-                    total += part
-                else:
-                    total, mine = total + part, True
-        if total is not None:
-            out[name] = total
-    return out
-
-
-def _product(op: _Op, args: list[Jet], want: Fields, at: _State) -> Jet:
-    return _times(args[0], args[1], want)
-
-
-def _times(a: Jet, b: Jet, want: Fields) -> Jet:
-    """Leibniz's rule."""
-    x, y, g, h = a["value"], b["value"], a.get, b.get
-    if len(a) == 1:  # a number, or what hangs on parameters alone
-        large = x[..., None] if isinstance(x, np.ndarray) else x
-        return {n: (large if n in _PAIRS else x) * z for n, z in b.items() if n in want}
-    out: Jet = {}
-    for name in want:
-        if name == "value":
-            out[name] = x * y
-            continue
-        terms = [(x, h(name)), (y, g(name))]
-        if name in ("xs", "vs"):
-            terms += [(g("s"), h(name[0])), (h("s"), g(name[0]))]
-        elif name == "vvs":
-            terms += [(g("s"), h("vv")), (h("s"), g("vv"))]
-        found = _weighted(*terms)
-        if name == "vv":
-            found = _plus(found, _with_transpose(_outer(g("v"), h("v"))))
-        elif name == "vvs":
-            mixed = _plus(_outer(g("v"), h("vs")), _outer(g("vs"), h("v")))
-            found = _plus(found, _with_transpose(mixed))
-        elif name == "N":
-            mixed = _plus(_outer(g("v"), _of_q(h("x"))), _outer(h("v"), _of_q(g("x"))))
-            found = _plus(found, _with_transpose(mixed, -1))
-        out[name] = found
-    return _kept(out)
-
-
-def _of_q(x: Any) -> Any:
-    """dt left out."""
-    return None if x is None else x[:, :-1]
-
-
-def _chain(f: tuple[Any, Any, Any], a: Jet, want: Fields) -> Jet:
-    """A function's value and two derivatives, f, f' and f'', at a."""
-    value, slope, bend = f
-    g = a.get
-    out: Jet = {}
-    for name in want:
-        if name == "value":
-            out[name] = value
-        elif name in ("s", "x", "v"):
-            out[name] = _weighted((slope, g(name)))
-        elif name in ("xs", "vs"):
-            turn = None if g("s") is None else bend * g("s")
-            out[name] = _weighted((slope, g(name)), (turn, g(name[0])))
-        else:  # of K alone, which is a polynomial in the velocities
-            raise AssertionError(name)
-    return _kept(out)
-
-
-def _function(op: _Op, args: list[Jet], want: Fields, at: _State) -> Jet:
-    return _chain(op.data(args[0]["value"]), args[0], want)
-
-
-def _power(op: _Op, args: list[Jet], want: Fields, at: _State) -> Jet:
-    """a^b; where b changes, exp(b log a)."""
-    a, b = args
-    x, y = np.asarray(a["value"]), b["value"]
-    value = x**y
-    if len(b) == 1:
-        slope = _falling(y, x, y - 1)
-        return _chain((value, slope, _falling(y * (y - 1), x, y - 2)), a, want)
-    inside = frozenset(f for name in want for f in _FEEDS["product"][name].split())
-    exponent = _times(b, _chain(_log(x), a, inside), inside)
-    return _chain((value, value, value), exponent, want)
-
-
-def _falling(factor: Any, x: Any, y: Any) -> Any:
-    """factor x^y, 0 where the factor is."""
-    return np.where(np.asarray(factor) == 0, 0.0, factor * x**y)
-
-
-def _atan2(op: _Op, args: list[Jet], want: Fields, at: _State) -> Jet:
-    """The angle of (x, y), as atan in a frame turned so that y is 0 there."""
-    inside = frozenset(f for name in want for f in _FEEDS["product"][name].split())
-    y, x = args
-    r = np.hypot(x["value"], y["value"])
-    c, s = x["value"] / r, y["value"] / r
-    across, along = (
-        _kept({n: _weighted((i, y.get(n)), (j, x.get(n))) for n in inside - {"value"}})
-        for i, j in ((c, -s), (s, c))
-    )
-    slope = _chain((1 / r, -1 / r**2, 2 / r**3), along | {"value": r}, inside)
-    angle = _times(across | {"value": 0 * r}, slope, inside)  # atan' = 1 and atan'' = 0 at 0
-    return {n: z for n, z in angle.items() if n in want} | {
-        "value": np.arctan2(y["value"], x["value"])
-    }
-
-
-def _extreme(op: _Op, args: list[Jet], want: Fields, at: _State) -> Jet:
-    """The larger of two, or the smaller; half of each where they are equal."""
-    a, b = args
-    larger, x, y = op.data, np.asarray(a["value"]), b["value"]
-    first = np.heaviside(x - y if larger else y - x, 0.5)
-    corner = _corner(x - y)
-    out: Jet = {"value": np.maximum(x, y) if larger else np.minimum(x, y)}
-    for name in want - {"value"}:
-        out[name] = _weighted((first, a.get(name)), (1 - first, b.get(name)))
-        if name in ("xs", "vs") and out[name] is not None:
-            out[name] = out[name] + corner
-    return _kept(out)
-
-
-def _rate(op: _Op, args: list[Jet], want: Fields, at: _State) -> Jet:
-    """d/dt, from the derivatives along d = (qd, 1)."""
-    (e,) = args
-    xs = e.get("xs")
-    out: Jet = {"value": e.get("s", 0.0), "x": xs, "v": _of_q(e.get("x")), "vs": _of_q(xs)}
-    if "s" in want and xs is not None:
-        out["s"] = np.sum(xs * at.d, axis=1, keepdims=True)
-    return {name: part for name, part in out.items() if name in want and part is not None}
-
-
-_RULES: Mapping[str, Callable[[_Op, list[Jet], Fields, _State], Jet]] = {
-    **dict.fromkeys(("number", "parameter", "u", "t", "q", "qd"), _leaf),
-    "sum": _sum,
-    "product": _product,
-    "function": _function,
-    "power": _power,
-    "atan2": _atan2,
-    "extreme": _extreme,
-    "dot": _rate,
-}
-
-
-# --- functions: value, first and second derivative ------------------------------------------------
-
-Three = tuple[Any, Any, Any]
-
-
-def _corner(x: Any) -> Any:
-    """nan where a derivative doesn't exist, at 0."""
-    return np.where(np.asarray(x) == 0, math.nan, 0.0)
-
-
-def _sin(x: Any) -> Three:
-    s = np.sin(x)
-    return s, np.cos(x), -s
-
-
-def _cos(x: Any) -> Three:
-    c = np.cos(x)
-    return c, -np.sin(x), -c
-
-
-def _tan(x: Any) -> Three:
-    f = np.tan(x)
-    slope = 1 + f**2
-    return f, slope, 2 * f * slope
-
-
-def _asin(x: Any) -> Three:
-    slope = 1 / np.sqrt((1 - x) * (1 + x))
-    return np.arcsin(x), slope, x * slope**3
-
-
-def _acos(x: Any) -> Three:
-    _, slope, bend = _asin(x)
-    return np.arccos(x), -slope, -bend
-
-
-def _atan(x: Any) -> Three:
-    slope = 1 / (1 + x**2)
-    return np.arctan(x), slope, -2 * x * slope**2
-
-
-def _sinh(x: Any) -> Three:
-    s = np.sinh(x)
-    return s, np.cosh(x), s
-
-
-def _cosh(x: Any) -> Three:
-    c = np.cosh(x)
-    return c, np.sinh(x), c
-
-
-def _tanh(x: Any) -> Three:
-    f, slope = np.tanh(x), 1 / np.cosh(x) ** 2
-    return f, slope, -2 * f * slope
-
-
-def _exp(x: Any) -> Three:
-    e = np.exp(x)
-    return e, e, e
-
-
-def _log(x: Any) -> Three:
-    return np.log(x), 1 / x, -1 / x**2
-
-
-def _abs(x: Any) -> Three:
-    return np.abs(x), np.sign(x), _corner(x)
-
-
-def _sign(x: Any) -> Three:
-    return np.sign(x), _corner(x), _corner(x)
-
-
-def _step_at(at_zero: float) -> Callable[[Any], Three]:
-    return lambda x: (np.heaviside(x, at_zero), _corner(x), _corner(x))
-
-
-_FUNCTIONS: Mapping[Any, Callable[[Any], Three]] = {
-    sympy.sin: _sin,
-    sympy.cos: _cos,
-    sympy.tan: _tan,
-    sympy.asin: _asin,
-    sympy.acos: _acos,
-    sympy.atan: _atan,
-    sympy.sinh: _sinh,
-    sympy.cosh: _cosh,
-    sympy.tanh: _tanh,
-    sympy.exp: _exp,
-    sympy.log: _log,
-    sympy.Abs: _abs,
-    sympy.sign: _sign,
-}

@@ -1,0 +1,383 @@
+"""A compiled module compared with the reference, and with what mechanics says of any scene."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+import sympy
+
+from eomc.integrators.tableaux import METHODS
+from eomc.model.system import System
+from eomc.verify import derivatives, one_step
+from eomc.verify.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Finding, Place, largest
+from eomc.verify.oracle import Vector
+from eomc.verify.report import Row
+from eomc.verify.sampling import LARGE, NUDGE, SMALL, Expected, Sampler, State, ask, units
+from eomc.verify.symbolic import of
+from eomc.verify.taylor import Jets
+
+FARTHEST = 100.0  # of the spread: how far long steps may lead
+GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
+# parts of the scene's h, until stages are found by sweeps
+SHORTER = tuple(4.0**-k for k in range(7))
+
+
+def _rows(run: Any, s: State) -> list[State]:
+    """The states that a run from `s` went through."""
+    rows = zip(run.t, run.q, run.qd, strict=True)
+    return [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
+
+
+class Comparison:
+    """All rows of one report."""
+
+    def __init__(
+        self, system: System, module: Any, random: np.random.Generator, states: int | None
+    ) -> None:
+        self.system, self.module = system, module
+        self.dtype = np.dtype(getattr(module, "dtype", "float64"))
+        self.eps = float(np.finfo(self.dtype).eps)
+        self.methods: tuple[str, ...] = getattr(module, "methods", ("rk4",))
+        self.reference = of(system)
+        self.large = isinstance(self.reference, Jets)
+        self.effort = LARGE if self.large else SMALL
+        self.sampler = Sampler(self.reference, random, self.effort)
+        self.expected = self.sampler.states(self.effort.states if states is None else states)
+        self.rows: list[Row] = []
+
+    def convergence_rows(self) -> None:
+        """Orders, advised steps, the balance of power: see `convergence`."""
+        runs, methods = self.convergence, self.methods
+        for method in methods:
+            least = min(METHODS[method].order, SEEN) - ORDER_MARGIN
+            find = partial(runs.order, method)
+            self.smooth_row(f"order of {method}", least, "order observed", find)
+        for method in methods[1:]:
+            unit = "of the two methods' own errors"
+            self.row(f"{method} beside {methods[0]}", 2, unit, partial(runs.beside, method))
+        unit = "order at which it closes"
+        self.smooth_row("power balance", runs.closing_limit, unit, runs.closing)
+        for method in methods:
+            if math.isfinite(min(METHODS[method].limits)):
+                self.advice_row(method)
+
+    def row(
+        self, name: str, limit: float, unit: str, measure: Callable[[], float | Finding],
+        least: bool = False,
+    ) -> None:  # fmt: skip
+        """Add what `measure` finds: at most the limit, or more than it where it is the least."""
+        try:
+            found = measure()
+        except Exception as fault:  # whatever the module raises is an outcome of the check
+            self.rows.append(Row(name, math.nan, limit, False, f"{type(fault).__name__}: {fault}"))
+            return
+        error, why = (found.value, found.why) if isinstance(found, Finding) else (found, "")
+        if isinstance(found, Finding) and found.unit:
+            passed = error <= found.limit
+            self.rows.append(Row(name, error, found.limit, passed, found.unit))
+            return
+        if why:
+            idle = math.isinf(error)
+            unit = ("no limit to test: " if idle else "not judged: ") + why
+            self.rows.append(Row(name, error, limit, True, unit, judged=idle))
+            return
+        self.rows.append(Row(name, error, limit, error > limit if least else error <= limit, unit))
+
+    def smooth_row(
+        self, name: str, limit: float, unit: str, measure: Callable[[], Finding]
+    ) -> None:
+        """A row about orders, which is not judged where the scene's functions have corners."""
+        self.row(name, limit, unit, measure, least=True)
+        row = self.rows[-1]
+        if math.isinf(row.error):
+            self.rows[-1] = replace(row, unit=unit + ": exact, no error to measure")
+        elif not row.passed and self.corners and not math.isnan(row.error):
+            note = f"not judged: {unit} not to be expected with {self.corners}"
+            self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
+
+    def advice_row(self, method: str) -> None:
+        """At which part of the advised h a run is lost: not at an eighth of it, but at twice it."""
+        unit = "of the advised h, where runs are lost"
+        find = partial(self.convergence.advised, method)
+        self.row(f"h of {method}", PARTS[0], unit, find, least=True)
+        row = self.rows[-1]
+        if not row.passed and self.corners:
+            note = f"not judged: no matter with {self.corners}"
+            self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
+
+    @cached_property
+    def convergence(self) -> Convergence:
+        """The rows that come from runs of several step sizes."""
+        own = [e for e in self.expected if e.state.params is None]
+        usual = own[1:4] or self.expected[:3]  # the scene's own parameters, away from its start
+        return Convergence(
+            self.module,
+            self.methods,
+            [Place(e.state, float(e.size["jacobi"])) for e in usual],
+            self.expected[0].state,
+            np.array([self.sampler.spread, self.sampler.speed]),
+            self.system.run.h,
+            self.system.run.duration,
+        )
+
+    @cached_property
+    def corners(self) -> str:
+        """The functions in the scene that jump or bend."""
+        s = self.system
+        exprs = (
+            *(s.kinetic, s.potential, s.dissipation, *s.forces),
+            *(e for _, e in s.definitions),
+            *(i.signal for i in s.inputs),
+        )
+        kinds = (sympy.sign, sympy.Heaviside, sympy.Abs, sympy.Min, sympy.Max)
+        found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
+        return ", ".join(sorted(found))
+
+    def largest(self, of: Callable[[Expected], float]) -> float:
+        """The largest error over all states; nan wins."""
+        return float(np.max([of(e) for e in self.expected]))
+
+    # against the reference
+
+    def faces(self) -> float:
+        """How many of the module's names, defaults and start values are not the system's."""
+        s, m, start = self.system, self.module, self.sampler.start
+        pairs = [
+            (tuple(m.coordinates), tuple(c.name for c in s.coordinates)),
+            (tuple(m.parameters), tuple(p.name for p in s.parameters)),
+            (tuple(m.inputs), tuple(i.name for i in s.inputs)),
+            (dict(m.defaults), self.sampler.defaults),
+            *(
+                (np.asarray(a).tolist(), b.astype(self.dtype).tolist())
+                for a, b in zip(m.start, (start.q, start.qd), strict=True)
+            ),
+        ]
+        return float(sum(theirs != ours for theirs, ours in pairs))
+
+    def value(self, name: str) -> float:
+        """One of VALUES or the acceleration."""
+        return self.largest(
+            lambda e: self.units(ask(self.module, name, e.state), e.value[name], e.size[name])
+        )
+
+    def steps(self) -> float | Finding:
+        """One step of the scene's h from a few states."""
+        h = self.system.run.h
+
+        def reference(**rows: Any) -> Vector:
+            return np.stack(self.reference.step(h=h, **rows), axis=1)
+
+        def error(e: Expected) -> float | None:
+            s = e.state
+            with np.errstate(all="ignore"):
+                expected, size = self.sampler.reach(reference, s)
+            if not np.all(np.isfinite(expected)):
+                return None
+            found = self.module.step(s.q, s.qd, h=h, t=s.t, u=s.u, params=s.params)
+            gain = h * e.size["acceleration"]
+            return self.units(found, expected, size + np.array([h * (np.abs(s.qd) + gain), gain]))
+
+        return largest(map(error, self.few(self.effort.few)), "no step from any state is finite")
+
+    def step_by(self, method: str) -> float | Finding:
+        """One step of a method from a few states, by its tableau on the reference's accelerations.
+
+        Shorter than the scene's h where the stages of an implicit one are else not found.
+        """
+        errors = (self._step_by(method, e) for e in self.few(self.effort.few))
+        return largest(errors, "no step from any state is finite")
+
+    def _step_by(self, method: str, e: Expected) -> float | None:
+        """None where there is no such step, in the reference or in the module."""
+        s, gain = e.state, e.size["acceleration"]
+        for h in (part * self.system.run.h for part in SHORTER):
+
+            def reference(q: Vector, qd: Vector, t: Vector, h: float = h, **given: Any) -> Vector:
+                def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
+                    return self.reference.acceleration(q, qd, t, **given)
+
+                ends = one_step.step(METHODS[method], acceleration, q, qd, t, h)
+                return np.moveaxis(ends, 0, 1)
+
+            with np.errstate(all="ignore"):
+                try:
+                    expected, size = self.sampler.reach(reference, s)
+                except np.linalg.LinAlgError:
+                    continue
+            run = self.simulate(s, method=method, h=h, steps=1, t0=s.t)
+            if np.all(np.isfinite(expected)) and run.status == "ok":
+                size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain])
+                return self.units([run.q[-1], run.qd[-1]], expected, size)
+        return None
+
+    def runs(self) -> float | Finding:
+        """A short run from the start, and one from a random state with random parameters."""
+        errors = (self.run(e.state) for e in self.few(2))
+        return largest(errors, "a difference grows too much in one step")
+
+    def run(self, s: State, h: float = 0.0, steps: int = 0) -> float | None:
+        """As far as a difference at the start, in units of the spread, grows by GROWTH_LIMIT."""
+        own = self.system.run.h
+        h = h or own
+        steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
+        spread = np.array([self.sampler.spread, self.sampler.speed])
+
+        # of alternating signs, as what is rounded excites the fastest modes too
+        by = NUDGE * spread * (np.where(np.arange(len(s.q)) % 2, -1, 1) if h > own else 1)
+        q, qd = (np.array([x, x + d]) for x, d in zip((s.q, s.qd), by, strict=True))
+        u = None if s.u is None else np.array([s.u, s.u])
+        with np.errstate(all="ignore"):
+            t, *found = self.reference.simulate(q, qd, h=h, steps=steps, u=u, params=s.params)
+            x, y = np.moveaxis(np.stack(found, axis=1), 2, 0)
+            growth = np.max(np.abs(y - x) / spread, axis=(1, 2)) / NUDGE
+        if h > own:  # long steps may blow up, and say nothing then
+            far = np.max(np.abs(x - x[:1]) / spread, axis=(1, 2))
+            growth = np.where(far < FARTHEST, growth, math.inf)
+        growth = np.maximum.accumulate(growth)
+        honest = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
+        if honest < 2:
+            return None
+        t, x, growth = t[:honest], x[:honest], growth[:honest, None, None]
+        run = self.simulate(s, h=h, steps=honest - 1)
+        size = np.arange(1, honest + 1)[:, None, None] * (growth * spread + np.abs(x))
+        if str(getattr(run.status, "value", run.status)) != "ok":
+            raise RuntimeError(f"the run ended with status {run.status}")
+        off_time = self.units(run.t, t, np.abs(t) + h)
+        return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
+
+    def simulate(self, s: State, **how: Any) -> Any:
+        """The module's run from a state."""
+        with warnings.catch_warnings():  # a run that stops early is looked at here
+            warnings.simplefilter("ignore", RuntimeWarning)
+            return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
+
+    def run_energy(self) -> float:
+        """The energy that a run reports, at the states that it reports."""
+        s = self.few(2)[-1].state
+        run = self.simulate(s, steps=2)
+        errors = []
+        for row, found in zip(_rows(run, s), run.energy, strict=True):
+            energy, size = self.sampler.energy(row)
+            if np.isfinite(energy):
+                errors.append(self.units(found, energy, size))
+        return float(np.max(errors, initial=0))
+
+    def ask(self, name: str, s: State) -> Vector:
+        """The module's value of that name."""
+        return ask(self.module, name, s)
+
+    def few(self, count: int) -> list[Expected]:
+        """Some of the states: the first ones and the last ones."""
+        half = count // 2
+        return self.expected[:half] + self.expected[half:][-half:]
+
+    def units(self, found: Any, expected: Any, size: Any) -> float:
+        """The largest difference in units of the module's rounding."""
+        return units(found, expected, size, self.eps)
+
+    # properties of the module alone
+
+    def symmetry(self) -> float:
+        """D = D^T."""
+
+        def error(e: Expected) -> float:
+            D = ask(self.module, "D", e.state)
+            return self.units(D, D.T, e.size["D"])
+
+        return self.largest(error)
+
+    def definiteness(self) -> float:
+        """The least eigenvalue of D_ij / sqrt(D_ii D_jj) over all states."""
+
+        def least(e: Expected) -> float:
+            D = ask(self.module, "D", e.state)
+            diagonal = np.diag(D)
+            if np.any(diagonal <= 0):
+                return float(np.min(diagonal))
+            return float(np.linalg.eigvalsh(D / np.sqrt(np.outer(diagonal, diagonal)))[0])
+
+        return -self.largest(lambda e: -least(e))
+
+    def skewness(self) -> float:
+        """(Ddot - 2C + dD/dt) + its transpose, Ddot and dD/dt by differences of order 8.
+
+        The best of some widths counts: too wide is inexact, too narrow rounds, but no width
+        makes a wrong C right.
+        """
+        stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+
+        def error(e: Expected) -> float:
+            s = e.state
+            rate = np.max(np.abs(s.qd) / self.sampler.spread) or 1.0
+            C = ask(self.module, "C", s)
+
+            def along(qd: Vector, width: float) -> Vector:
+                at = (ask(self.module, "D", replace(s, q=s.q + k * width * qd, t=s.t + k * width))
+                      for n, _ in stencil for k in (n, -n))  # fmt: skip
+                return sum((w * (next(at) - next(at)) for _, w in stencil), 0 * C) / width
+
+            def residual(width: float) -> float:
+                A = along(s.qd, width) + along(0 * s.qd, width) - 2 * C
+                return float(np.max(np.abs(A + A.T) / (rate * e.size["D"] + np.abs(C))))
+
+            residuals = (residual(part / rate) for part in (0.03, 0.003, 3e-4, 3e-5))
+            return min((x for x in residuals if not math.isnan(x)), default=math.nan)
+
+        return self.largest(error)
+
+    def has(self, name: str) -> bool:
+        """Whether the module has derivatives: what implicit methods need, or the scene asks for."""
+        run = self.system.run
+        if name == "sensitivity":
+            return run.linearize == "parameters" and bool(self.system.parameters)
+        return bool(run.linearize) or any(METHODS[method].newton for method in self.methods)
+
+    def slopes(self, name: str) -> float | Finding:
+        """linearize or sensitivity against differences of the reference's accelerations.
+
+        The best of some widths counts for each entry, as of skewness.
+        """
+        scale = np.array([self.sampler.spread, self.sampler.speed])
+        n, nu = len(self.system.q), len(self.system.inputs)
+        known: list[float | None] = []
+        for e in self.few(self.effort.few):
+            s, size = e.state, e.size["acceleration"]
+            held = {"u": s.u, "t": s.t, "params": s.params}
+            if name == "linearize":
+                A, B = self.module.linearize(s.q, s.qd, **held)
+                if not np.array_equal(A[:n], np.eye(n, 2 * n, n)) or np.any(B[:n]):
+                    return math.inf  # dq/dt = qd
+                found, part = np.hstack([A[n:], B[n:]]), slice(0, 2 * n + nu)
+            else:
+                found, part = self.module.sensitivity(s.q, s.qd, **held), slice(2 * n + nu, None)
+            with np.errstate(all="ignore"):
+                exact = derivatives.by_differences(self.reference, s, scale, self.sampler.defaults)
+                off = [derivatives.apart(found, J[:, part], by[part], size) for J, by in exact]
+            least = np.fmin.reduce(off)  # each entry's: what is wrong is so at every width
+            known.append(float(np.max(least, initial=0)) if np.all(least >= 0) else None)
+        return largest(known, "no state has finite differences")
+
+    def bias(self) -> float:
+        """bias = C qd + g."""
+
+        def error(e: Expected) -> float:
+            bias, C, g = (ask(self.module, name, e.state) for name in ("bias", "C", "g"))
+            return self.units(C @ e.state.qd + g, bias, e.size["bias"])
+
+        return self.largest(error)
+
+    def motion(self) -> float:
+        """D qdd + bias = tau."""
+
+        def error(e: Expected) -> float:
+            names = ("D", "acceleration", "bias", "tau")
+            D, qdd, bias, tau = (ask(self.module, name, e.state) for name in names)
+            return self.units(D @ qdd + bias, tau, e.size["motion"])
+
+        return self.largest(error)

@@ -1,0 +1,82 @@
+"""What `check` has found: rows, and their report."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+# Correct builds differ by less than one unit in a value, by some tens in a stiff run. A wrong
+# sign makes 1e15, and still 1e5 in a term that is a ten thousand millionth of the whole.
+LIMIT = 1e3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One thing that was tested: how far it was off, in what unit, and how far it may be.
+
+    Where nothing could be judged, `judged` is false and `unit` says why; such a row counts as
+    passed.
+    """
+
+    name: str
+    error: float
+    limit: float
+    passed: bool
+    unit: str
+    judged: bool = True
+
+
+@dataclass(frozen=True)
+class Report:
+    """The outcome of `check`. `states` were used, `rejected` ones had no regular D.
+
+    reference: what they were compared with: "equations written out" or "Taylor arithmetic".
+    """
+
+    scene: str
+    rows: tuple[Row, ...]
+    states: int
+    rejected: int
+    reference: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether every row has passed."""
+        return all(row.passed for row in self.rows)
+
+    def table(self) -> str:
+        """The rows as text, for a terminal."""
+        from rich.box import SIMPLE_HEAD
+        from rich.console import Console
+        from rich.table import Table
+
+        used = f"{self.states} random states" + f", {self.rejected} rejected" * bool(self.rejected)
+        title = f"{self.scene}: {used}, against {self.reference}"
+        table = Table(box=SIMPLE_HEAD, title=title, title_justify="left")
+        table.add_column()
+        table.add_column()
+        table.add_column("found", justify="right")
+        table.add_column("limit", justify="right")
+        table.add_column("in")
+        for row in self.rows:
+            mark = ("ok" if row.judged else "?") if row.passed else "FAILED"
+            table.add_row(mark, row.name, f"{row.error:.3g}", f"{row.limit:g}", row.unit)
+        text = io.StringIO()
+        Console(file=text, width=100).print(table)
+        return "\n".join(line.rstrip() for line in text.getvalue().splitlines()).strip("\n")
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON; numbers that are not finite are None."""
+        rows = [asdict(row) for row in self.rows]
+        for row in rows:
+            row["error"] = row["error"] if math.isfinite(row["error"]) else None
+        return {
+            "scene": self.scene,
+            "passed": self.passed,
+            "states": self.states,
+            "rejected": self.rejected,
+            "reference": self.reference,
+            "rows": rows,
+        }

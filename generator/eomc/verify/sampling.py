@@ -1,0 +1,254 @@
+"""States at which a module is compared with the reference, and the sizes of what is rounded there.
+
+A unit of rounding is eps times the size of what was added up on the way. That size is not
+the result, which may cancel to nothing: it is |f| + sum_i |x_i df/dx_i|, what one rounding of
+each of the inputs x does to f, and in addition the size that the laws of motion give to the sums
+that f is made of: sqrt(D_ii D_jj) for D_ij, D qd times a rate for forces, K and P for energies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from eomc.verify.oracle import Answer, Vector
+
+EPS = 2.0**-52
+CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
+NUDGE = 1e-6  # relative change of an input from which its influence is estimated
+MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
+NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
+DRAWS = 8  # how often: the influence is known to a quarter of itself
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is compared with the reference, as far as an answer of it costs time.
+
+    states: at how many; ahead: steps taken to see how far things go, each `stride` times the
+    scene's h; few: how many states for one step; run: steps of a run.
+    """
+
+    states: int
+    ahead: int
+    stride: int
+    few: int
+    run: int
+
+
+SMALL = Effort(states=16, ahead=50, stride=1, few=4, run=100)
+LARGE = Effort(states=6, ahead=5, stride=10, few=4, run=4)  # a tenth of a second an answer
+
+# the module's name for a value, and the reference's
+VALUES = {
+    "D": "D",
+    "C": "C",
+    "g": "g",
+    "bias": "bias",
+    "tau": "tau",
+    "kinetic_energy": "kinetic",
+    "potential_energy": "potential",
+    "energy": "energy",
+    "jacobi": "jacobi",
+    "power": "power",
+}
+
+
+@dataclass(frozen=True)
+class State:
+    """Where to evaluate: q, qd (nq,), t in s, u (nu,) or None for the signals, params or None."""
+
+    q: Vector
+    qd: Vector
+    t: float = 0.0
+    u: Vector | None = None
+    params: Mapping[str, float] | None = None
+
+
+def ask(module: Any, name: str, s: State) -> Vector:
+    """The module's value of that name."""
+    place = (s.q,) if name in ("D", "g", "potential_energy") else (s.q, s.qd)
+    inputs = {"u": s.u} if name in ("tau", "power", "acceleration") else {}
+    return np.asarray(getattr(module, name)(*place, t=s.t, params=s.params, **inputs), float)
+
+
+def nudged(s: State, defaults: Mapping[str, float]) -> list[State]:
+    """The state with one input after the other changed by a small part of itself."""
+    found = []
+    for field in ("q", "qd", "u"):
+        values = getattr(s, field)
+        for i in np.flatnonzero(values) if values is not None else ():
+            changed = values.copy()
+            changed[i] *= 1 + NUDGE
+            found.append(replace(s, **{field: changed}))
+    if s.t:
+        found.append(replace(s, t=s.t * (1 + NUDGE)))
+    params = s.params or defaults
+    for name, value in params.items():
+        found.append(replace(s, params={**params, name: value * (1 + NUDGE)}))
+    return found
+
+
+def _shaken(s: State, defaults: Mapping[str, float], random: np.random.Generator) -> State:
+    """The state with all inputs changed at random by small parts of themselves."""
+
+    def shake(x: Any) -> Any:
+        return x * (1 + NUDGE * random.standard_normal(np.shape(x)))
+
+    params = {name: float(shake(value)) for name, value in (s.params or defaults).items()}
+    u = None if s.u is None else shake(s.u)
+    return State(shake(s.q), shake(s.qd), float(shake(s.t)), u, params)
+
+
+def _stacked(states: Sequence[State], defaults: Mapping[str, float]) -> dict[str, Any]:
+    """States, all with inputs from outside or none, as arguments with a row each."""
+    params = [s.params or defaults for s in states]
+    return {
+        "q": np.array([s.q for s in states]),
+        "qd": np.array([s.qd for s in states]),
+        "t": np.array([s.t for s in states]),
+        "u": None if states[0].u is None else np.array([s.u for s in states]),
+        "params": {name: np.array([p[name] for p in params]) for name in defaults},
+    }
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The reference's values at a state, and the sizes that errors are measured against."""
+
+    state: State
+    value: Mapping[str, Vector]
+    size: Mapping[str, Vector]
+
+
+class Sampler:
+    """Draws states around the start that are finite and have a regular D."""
+
+    def __init__(self, reference: Answer, random: np.random.Generator, effort: Effort) -> None:
+        self.reference, self.random = reference, random
+        self.system = system = reference.system
+        self.defaults = {p.name: p.value for p in system.parameters}
+        self.rejected = 0
+        start = self.start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
+        # how far things go: from the start, from what happens next, else 1 of the unit
+        with np.errstate(all="ignore"):
+            try:
+                h = effort.stride * system.run.h
+                _, q, qd = reference.simulate(h=h, steps=effort.ahead)
+            except np.linalg.LinAlgError:
+                q, qd = start.q[None], start.qd[None]
+        far, fast = (np.nan_to_num(np.max(np.abs(x), axis=0), posinf=0) for x in (q, qd))
+        self.angles = np.array([c.unit == "rad" for c in system.coordinates])
+        self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
+        self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
+
+    def states(self, count: int) -> list[Expected]:
+        """The start, some states with the parameters' defaults, then all at random."""
+        found: list[Expected] = []
+        nearness = 1.0  # every rejection moves the next draw closer to the start
+        for attempt in range(20 * count):
+            if len(found) == count:
+                break
+            usual = len(found) < count // 4
+            state = self.start if attempt == 0 else self.draw(nearness, usual, len(found) % 2 == 1)
+            with np.errstate(all="ignore"):
+                expected = self.expected(state) if self.regular(state) else None
+            if expected is None:
+                self.rejected += 1
+                nearness *= 0.7
+            else:
+                found.append(expected)
+                nearness = 1.0
+        return found
+
+    def draw(self, nearness: float, usual: bool, given: bool) -> State:
+        """A random state; `usual`: default parameters; `given`: inputs from outside."""
+        random, n, start = self.random, len(self.start.q), self.start
+        centre = np.where(self.angles, nearness < 1, 1) * start.q
+        q = centre + nearness * self.spread * random.uniform(-1, 1, n)
+        qd = start.qd + nearness * self.speed * random.uniform(-1, 1, n)
+        t = random.uniform(0, self.system.run.duration)
+        u = None
+        if given and self.system.inputs:
+            signals = np.abs(self.reference.evaluate("signals", q, qd, t))
+            u = random.normal(size=len(signals)) * np.where(signals > 0, signals, 1)
+        # a parameter that is 0 by default, such as a friction, is tried too
+        factors = np.exp(random.uniform(-0.5, 0.5, len(self.defaults)))
+        params = {
+            name: value * factor if value else factor - 0.5
+            for (name, value), factor in zip(self.defaults.items(), factors.tolist(), strict=True)
+        }
+        return State(q, qd, t, u, None if usual else params)
+
+    def regular(self, s: State) -> bool:
+        """D finite and far from singular, and positive definite where we chose the parameters."""
+        D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
+        diagonal = np.abs(np.diag(D))
+        if not (np.all(np.isfinite(D)) and np.all(diagonal > 0)):
+            return False
+        eigenvalues = np.linalg.eigvalsh(D / np.sqrt(np.outer(diagonal, diagonal)))
+        least, most = np.min(np.abs(eigenvalues)), np.max(np.abs(eigenvalues))
+        return bool(least * CONDITION_LIMIT > most and (s.params is None or eigenvalues[0] > 0))
+
+    def expected(self, s: State) -> Expected | None:
+        """The reference's values and their sizes; None where something is not finite."""
+        value: dict[str, Vector] = {}
+        reach: dict[str, Vector] = {}
+        for name, field in VALUES.items():
+            value[name], reach[name] = self.reach(partial(self.reference.evaluate, field), s)
+        D, qd = value["D"], np.abs(s.qd)
+        qdd = np.asarray(np.linalg.solve(D, value["tau"] - value["bias"]), float)
+        value["acceleration"] = qdd
+        if not all(np.all(np.isfinite(x)) for x in value.values()):
+            return None
+        diagonal = np.sqrt(np.diag(reach["D"]))
+        inertia = np.outer(diagonal, diagonal) + reach["D"]
+        rate = np.max(qd / self.spread)  # of change of D, in 1/s
+        force = reach["bias"] + reach["g"] + reach["tau"] + rate * inertia @ qd
+        # a force that is zero along one coordinate may be the sum of what others have whole
+        force = np.maximum(force, diagonal * np.max(force / diagonal))
+        energy = reach["kinetic_energy"] + reach["potential_energy"]
+        size = {
+            "D": inertia,
+            "C": reach["C"] + rate * inertia,
+            **dict.fromkeys(("g", "bias", "tau"), force),
+            **dict.fromkeys(("kinetic_energy", "potential_energy", "energy", "jacobi"), energy),
+            "power": reach["power"] + force @ qd,
+            "motion": inertia @ np.abs(qdd) + force,
+        }
+        size["acceleration"] = np.abs(np.linalg.inv(D)) @ size["motion"]
+        return Expected(s, value, size)
+
+    def energy(self, s: State) -> tuple[Vector, Vector]:
+        """K + P and its size."""
+        names = ("kinetic", "potential")
+        K, P = (self.reach(partial(self.reference.evaluate, name), s)[1] for name in names)
+        return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), K + P
+
+    def reach(self, of: Callable[..., Any], s: State) -> tuple[Vector, Vector]:
+        """f and |f| + sum_i |x_i df/dx_i|; of: f of states as rows.
+
+        Where there are many inputs the sum is the root of that of the squares, from DRAWS changes
+        of all at once: no larger, and smaller by the root of their number at most.
+        """
+        near = nudged(s, self.defaults)
+        many = len(near) > MOST_NUDGES
+        if many:
+            near = [_shaken(s, self.defaults, self.random) for _ in range(DRAWS)]
+        found = np.asarray(of(**_stacked([s, *near], self.defaults)))
+        value, off = found[0], np.nan_to_num(np.abs(found[1:] - found[0]) / NUDGE)
+        spread = np.sqrt(np.mean(off**2, axis=0)) if many else np.sum(off, axis=0)
+        return value, np.abs(value) + spread
+
+
+def units(found: Any, expected: Any, size: Any, eps: float = EPS) -> float:
+    """The largest difference in units of rounding, nan where something is not a number."""
+    off = np.abs(np.asarray(found, float) - expected)
+    if off.shape != np.shape(expected):
+        raise ValueError(f"shape {np.shape(found)} where {np.shape(expected)} is meant")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.max(np.where(off == 0, 0, off / (eps * np.asarray(size))), initial=0))
