@@ -135,7 +135,7 @@ def test_what_it_can_not_do_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         patch.setattr(reference_solution, "SECONDS", 0.05)
         reference_solution.of(oscillator(1e6), root=tmp_path)
     monkeypatch.setattr(shutil, "which", lambda name: None if name == "gcc" else f"/bin/{name}")
-    monkeypatch.setattr(reference_solution.compiler, "key", lambda *a: "another")
+    monkeypatch.setattr(reference_solution.builds, "key", lambda *a: "another")
     with pytest.raises(EomcError, match="libquadmath"):
         reference_solution.of(oscillator(), rows=4, root=tmp_path)
 
