@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
 from fractions import Fraction
-from math import comb, inf
+from math import comb, inf, lcm
 
 Row = tuple[Fraction, ...]
 
@@ -48,7 +48,7 @@ class Method:
 
     @property
     def implicit(self) -> bool:
-        """Whether the stages hang on one another."""
+        """Whether the stages depend on one another."""
         return any(any(row[i:]) for i, row in enumerate(self.a))
 
     @property
@@ -190,11 +190,13 @@ _DIGITS = 45  # that the nodes are computed to, of which the last few may be off
 
 
 def _value(polynomial: Row, x: Fraction) -> Fraction:
-    """A polynomial, lowest power first."""
-    value = Fraction(0)
-    for coefficient in reversed(polynomial):
-        value = value * x + coefficient
-    return value
+    """A polynomial, lowest power first; one fraction is cancelled in the end, not one a step."""
+    whole = lcm(*(c.denominator for c in polynomial))
+    value, power = 0, 1  # over whole and powers of x's denominator
+    for c in reversed(polynomial):
+        value = value * x.numerator + c.numerator * (whole // c.denominator) * power
+        power *= x.denominator
+    return Fraction(value * x.denominator, whole * power)
 
 
 def _integral(polynomial: Row) -> Row:
@@ -204,13 +206,14 @@ def _integral(polynomial: Row) -> Row:
 
 def _lagrange(nodes: Row) -> tuple[Row, ...]:
     """The polynomials that are 1 at one of the nodes and 0 at the others."""
-    out = []
-    for i, at in enumerate(nodes):
-        basis = [Fraction(1)]
-        for other in (x for k, x in enumerate(nodes) if k != i):
-            shifted, kept = [Fraction(0), *basis], [*(-other * c for c in basis), Fraction(0)]
-            basis = [(a + b) / (at - other) for a, b in zip(shifted, kept, strict=True)]
-        out.append(tuple(basis))
+    whole, out = lcm(*(x.denominator for x in nodes)), []
+    places = [x.numerator * (whole // x.denominator) for x in nodes]
+    for i, at in enumerate(places):
+        basis, size = [1], 1  # in whole x
+        for other in (x for k, x in enumerate(places) if k != i):
+            basis = [a - other * b for a, b in zip([0, *basis], [*basis, 0], strict=True)]
+            size *= at - other
+        out.append(tuple(Fraction(c * whole**k, size) for k, c in enumerate(basis)))
     return tuple(out)
 
 
