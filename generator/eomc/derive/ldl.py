@@ -33,6 +33,10 @@ class Solution:
     matrix: str = "D"
 
 
+# qdd by one way of solving; or why that was not tried; or None where there is nothing to try
+Way = Solution | str | None
+
+
 def solve(
     tape: Tape,
     D: Rows,
@@ -40,7 +44,7 @@ def solve(
     short: Callable[[Expr], Expr] = lambda atom: atom,
     kept: Callable[[Expr], Expr] = lambda atom: atom,
     prompt: bool = False,
-) -> tuple[tuple[int, ...], Vector, Pairs]:
+) -> Solution:
     """x with D x = b by L diag(d) L^T x = b, unrolled; zeros are neither stored nor computed.
 
     Source: Golub & Van Loan, *Matrix Computations*, 4th ed., alg. 4.1.2. The next pivot is the
@@ -99,7 +103,7 @@ def solve(
     for k, inverse, factors in reversed(steps):
         rest = [-factor * x[i] for i, factor in factors.items()]
         x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *map(tape.define, rest)))
-    return tuple(order), tuple(x[i] for i in range(n)), tuple(pivots)
+    return Solution(tape, tuple(x[i] for i in range(n)), tuple(order), tuple(pivots))
 
 
 def work(D: Rows) -> int:

@@ -14,6 +14,7 @@ from eomc.scene import messages
 from eomc.scene.formulas import nearest
 
 REALS = ("double", "float")
+_NAMES = tuple(METHODS)
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
 _Value = _Number | pydantic.StrictStr
@@ -62,7 +63,7 @@ def _listed(value: object) -> object:
 
 
 _Methods = Annotated[
-    tuple[Literal[tuple(METHODS)], ...],  # type: ignore[valid-type]
+    tuple[Literal[_NAMES], ...],  # type: ignore[valid-type]
     pydantic.BeforeValidator(_listed),
 ]
 

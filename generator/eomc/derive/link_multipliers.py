@@ -346,14 +346,12 @@ class _Links:
             tape.total([self._dot(x, groups[g].beta), *map(self._less, given(g, x))])
             for g, x in rows
         ]
-        order, tensions, pivots = solve(
-            tape, matrix, right, kept=tape.whole, prompt=is_prompt(self.system)
-        )
+        solved = solve(tape, matrix, right, kept=tape.whole, prompt=is_prompt(self.system))
         turning = []
         for g, (u, square) in enumerate(zip(slopes, squares, strict=True)):
             drawn = [
                 tape.times(self._through(g, u, h, y), tension)
-                for (h, y), tension in zip(rows, tensions, strict=True)
+                for (h, y), tension in zip(rows, solved.acceleration, strict=True)
                 if (g, h) in near
             ]
             whole = [*drawn, *given(g, u), self._less(self._dot(u, groups[g].beta))]
@@ -363,8 +361,8 @@ class _Links:
             for row in back
         )
         names = [max(k for k, c in enumerate(groups[g].direction) if c != 0) for g, _ in rows]
-        by_row = tuple(names[k] for k in order)
-        return Solution(tape, acceleration, by_row, (*pivots, *self._nonzero()), "S")
+        by_row = tuple(names[k] for k in solved.order)
+        return Solution(tape, acceleration, by_row, (*solved.pivots, *self._nonzero()), "S")
 
     def _through_rows(self, back: Sequence[Vector], loads: Sequence[Expr]) -> list[Expr]:
         """Forces on the angles from those on the coordinates."""
