@@ -1,4 +1,4 @@
-"""Accelerations by tensions: the same as by D, at the promised cost, refused where they must be.
+"""Accelerations by link multipliers: the same as by D, at the promised cost, refused elsewhere.
 
 In 40 digits the route must be Lagrange's to the last bit of a double; in doubles it is held
 against jets.py, which shares nothing with it. Nothing is compiled but in the last tests.
@@ -253,7 +253,7 @@ def test_other_systems_of_the_kind(kind: str) -> None:
 
 
 def test_bodies_that_are_points_in_relative_angles() -> None:
-    """Their world coordinates hang on sums of angles."""
+    """Their world coordinates depend on sums of angles."""
     made = made_of(trees.chain(4, points=True))
     assert made.tree is not None
     assert_right(made)
@@ -295,7 +295,7 @@ def test_the_order_names_the_last_coordinate_of_each_angle(relative: bool) -> No
 
 
 def test_every_other_link_goes_first_where_one_trajectory_is_all() -> None:
-    """Their pivots hang on parameters alone; the others then from both ends."""
+    """Their pivots depend on parameters alone; the others then from both ends."""
     order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]))).order
     assert set(order[:5]) == {0, 2, 4, 6, 8}
     assert set(order[5:7]) == {1, 7}
@@ -320,7 +320,7 @@ def test_divisions_do_not_wait_for_one_another() -> None:
 
 @pytest.mark.parametrize("size", [1e-34, 1e34])
 def test_masses_of_any_size(size: float) -> None:
-    """Products of pivots stay in the range of a double; accelerations hang on ratios of masses."""
+    """Products of pivots stay in the range of a double; only ratios of masses count."""
     n = 40
     made = made_of(links([k - 1 for k in range(n)], equal=False))
     ours, state = by_multipliers(made), states(made)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
@@ -365,7 +365,7 @@ UNSUITED = {
     "otherwise than on a sum": moving([(x * sin(a), -x * cos(a))], [x, a]),
     "irrational": moving([(*FIRST, L * sin(a + sympy.sqrt(2) * b))], [a, b], m * B_DOT**2),
     "velocities in K, more than": scene_system("chain"),
-    "hang on coordinates": moving([FIRST], [a, b], (2 + cos(a)) * B_DOT**2),
+    "depend on coordinates": moving([FIRST], [a, b], (2 + cos(a)) * B_DOT**2),
     "no sum of masses": moving([FIRST], [a, b], m * (B_DOT - A_DOT / 3) ** 2),
     "one direction": moving([FIRST[:1], (L * sin(a) + R * sin(b), L * cos(b))], [a, b]),
     "no links": moving([(x,), (y,)], [x, y]),
@@ -385,7 +385,7 @@ def test_what_is_of_another_kind_is_passed_over_with_the_reason(why: str) -> Non
     assert why in built.passed_over["multipliers"]
 
 
-def test_a_negative_mass_is_told() -> None:
+def test_a_negative_mass_is_reported() -> None:
     """Where it is a number nothing is left of it to look at in a tape; D is indefinite."""
     made = System.make(
         "negative",

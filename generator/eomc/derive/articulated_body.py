@@ -31,7 +31,7 @@ class MasslessError(Exception):
 
 
 def accelerations(recursion: Recursion, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
-    """qdd by link, and each pivot beside a value of its size without cancellation.
+    """qdd by link, and each pivot paired with a value of its size without cancellation.
 
     drive: the generalized forces by link, less what is not the tree's. Raises MasslessError where
     a joint moves nothing.

@@ -52,12 +52,12 @@ def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Func
 def _roundings(made: Mapping[str, Function], system: System) -> dict[str, float]:
     """The largest relative error of each, in doubles, over some states around the start.
 
-    Infinite where one fails and another does not: a massless link has no tension, but may have D.
+    Infinite where one fails and another does not: without mass no multiplier, but perhaps D.
     """
     states = range(5 if all(len(f.body) < 500 for f in made.values()) else 2)
     errors = {route: _errors(f, system, states) for route, f in made.items()}
-    told = [k for k in states if any(math.isfinite(found[k]) for found in errors.values())]
-    return {route: max((found[k] for k in told), default=0.0) for route, found in errors.items()}
+    some = [k for k in states if any(math.isfinite(found[k]) for found in errors.values())]
+    return {route: max((found[k] for k in some), default=0.0) for route, found in errors.items()}
 
 
 def _errors(function: Function, system: System, states: Iterable[int]) -> list[float]:

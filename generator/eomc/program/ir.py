@@ -98,8 +98,8 @@ class Cost:
             (self.sincos, "sincos"),
             (self.calls, "other call"),
         ]
-        told = [f"{n} {what}{'s' if n > 1 and what != 'sincos' else ''}" for n, what in parts if n]
-        return ", ".join(told) or "no arithmetic"
+        found = [f"{n} {what}{'s' if n > 1 and what != 'sincos' else ''}" for n, what in parts if n]
+        return ", ".join(found) or "no arithmetic"
 
 
 @dataclass(frozen=True)

@@ -188,11 +188,11 @@ def _renamed(function: Function, hints: Mapping[str, str]) -> Function:
             plain.add(wish)
         give(a.name, wish)
 
-    told = {name for name, used in assigned.items() if used.rstrip("_") not in plain}
+    telling = {name for name, used in assigned.items() if used.rstrip("_") not in plain}
     marked = replace(
         function,
-        early=tuple(replace(a, named=a.name in told) for a in function.early),
-        body=tuple(replace(a, named=a.name in told) for a in function.body),
+        early=tuple(replace(a, named=a.name in telling) for a in function.early),
+        body=tuple(replace(a, named=a.name in telling) for a in function.body),
     )
     return rename(marked, assigned)
 

@@ -23,8 +23,8 @@ TIME = t.name
 _READERS = {
     "signal": "and a signal reads",
     "tau": "and forces or the dissipation read",
-    "bias": "and inertial forces here hang on",
-    "acceleration": "and here they hang on",
+    "bias": "and inertial forces here depend on",
+    "acceleration": "and here they depend on",
 }
 MOST_IMPLICIT = 360  # accelerations of all stages: their matrix, on the stack, is a megabyte
 
@@ -140,7 +140,7 @@ def _unsuited(program: Program) -> list[Problem]:
         name = next(name for name, names in read.items() if names)
         found = ", ".join(read[name])
         message = (
-            f"'verlet' needs accelerations that hang on positions and time alone, "
+            f"'verlet' needs accelerations that depend on positions and time alone, "
             f"{_READERS[name]} {found}. "
             "Take 'rk4', 'dp8' or 'gauss4'"
         )
