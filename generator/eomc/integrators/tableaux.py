@@ -251,7 +251,7 @@ def _gauss(s: int, name: str) -> Method:
         b=tuple(_value(area, Fraction(1)) for area in areas),
         notes=(
             "A-stable: no step is too long for a motion that decays. Symmetric, and symplectic in",
-            "(q, p) where D is constant; where D hangs on q, in (q, qd) nearly so.",
+            "(q, p) where D is constant; where D depends on q, in (q, qd) nearly so.",
         ),
     )
 
@@ -277,7 +277,7 @@ def _swept(s: int, sweeps: int, name: str, limits: tuple[float, float]) -> Metho
             "The accelerations at the stages begin as the polynomial through those of the step",
             f"before, and {sweeps} sweeps put those found there in their place, all stages side by",
             "side (van der Houwen & Sommeijer, J. Comput. Appl. Math. 29 (1990), 111-127, iterate",
-            f"so). Of order {2 * s}, and {order} where accelerations hang on velocities. No",
+            f"so). Of order {2 * s}, and {order} where they depend on velocities. No",
             "derivatives: h must be small against the fastest motion, also where that died out.",
         ),
         sweeps=sweeps,
@@ -300,7 +300,7 @@ EULER = Method(
     a=((_ZERO,),),
     b=(_ONE,),
     notes=(
-        "v = qd + h a(q, qd), r = q + h v. Symplectic where D is constant and the forces hang on",
+        "v = qd + h a(q, qd), r = q + h v. Symplectic where D is constant and forces depend on",
         "positions alone; of order 1 everywhere.",
     ),
     end=(_ONE,),
@@ -314,8 +314,8 @@ VERLET = Method(
     a=((_ZERO,),),
     b=(_ONE,),
     notes=(
-        "v = qd + h a(q + h/2 qd), r = q + h/2 (qd + v). For accelerations that hang on positions",
-        "and time alone; symmetric, and symplectic where the forces have a potential.",
+        "v = qd + h a(q + h/2 qd), r = q + h/2 (qd + v). For accelerations that depend on",
+        "positions and time alone; symmetric, and symplectic where the forces have a potential.",
     ),
     nodes=(_HALF,),
     end=(_HALF,),

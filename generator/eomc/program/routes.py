@@ -132,7 +132,7 @@ def _by_articulated_bodies(_: System, order: str) -> str:
 def _by_multipliers(system: System, order: str) -> str:
     fractions = "Along a chain s = N/M: s_k is N there, and S_k is M times the entry it was. "
     return (
-        "a = qdd by the tensions of the links, S = N T N^T = L diag(s) L^T, eliminated in the "
+        "a = qdd by link multipliers (tensions), S = N T N^T = L diag(s) L^T, eliminated in the "
         f"order of the links of {order}. {fractions if is_prompt(system) else ''}"
         "Every mass must be positive."
     )
