@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,3 +55,19 @@ def test_a_comment_says_how_d_is_solved(name: str) -> None:
     route = ROUTES[name]
     assert route.sentence
     assert "x, theta" in route.solved(scene_system("cartpole"), "x, theta")
+
+
+def test_no_other_file_compares_their_names() -> None:
+    package = Path(__file__).parents[2] / "generator" / "eomc"
+    files = [f for f in package.rglob("*.py") if f.name != "routes.py"]
+    trees = {f: ast.parse(f.read_text(encoding="utf-8")) for f in files}
+    compared = [
+        (f.name, node.lineno)
+        for f, tree in trees.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Compare)
+        for part in ast.walk(node)
+        if isinstance(part, ast.Constant) and part.value in ROUTES
+    ]
+    assert files
+    assert not compared
