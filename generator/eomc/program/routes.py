@@ -30,8 +30,8 @@ class Material:
         self.expander = Expander(derived.lagrange.tape) if derived.lagrange else None
 
     @cached_property
-    def expanded(self) -> tuple[Rows, Sequence[Expr]] | None:
-        """D and b of D qdd = b, multiplied out; None where they grow too large."""
+    def expanded(self) -> tuple[Tape, Rows, Sequence[Expr]] | None:
+        """D and b of D qdd = b, multiplied out on a tape; None where they grow too large."""
         if self.lagrange is None or self.expander is None:
             return None
         D, n = self.lagrange.D, len(self.lagrange.bias)
@@ -41,7 +41,7 @@ class Material:
             return None
         entries = dict(zip(lower, both, strict=False))
         rows = tuple(tuple(entries[max(i, j), min(i, j)] for j in range(n)) for i in range(n))
-        return rows, both[len(lower) :]
+        return self.lagrange.tape, rows, both[len(lower) :]
 
 
 @dataclass(frozen=True)
@@ -111,15 +111,13 @@ def _expanded_functions(material: Material) -> Functions | None:
 
 
 def _expanded(material: Material) -> Way:
-    if material.lagrange is None or material.expanded is None:
-        return None
-    return solve(material.lagrange.tape, *material.expanded)
+    return solve(*material.expanded) if material.expanded else None
 
 
 def _cancelled(material: Material) -> Way:
-    if material.lagrange is None or material.expander is None or material.expanded is None:
+    if material.expander is None or material.expanded is None:
         return None
-    return solve(material.lagrange.tape, *material.expanded, material.expander.short)
+    return solve(*material.expanded, material.expander.short)
 
 
 def _by_articulated_bodies(_: System, order: str) -> str:
