@@ -23,7 +23,8 @@ from eomc.model import from_scene as system
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program import program
-from eomc.program.ir import Function, evaluate
+from eomc.program.interpret import evaluate
+from eomc.program.ir import Function
 from eomc.program.program import Program
 from eomc.scene import read as scene
 from eomc.verify import check, symbolic
@@ -57,7 +58,7 @@ def built_from(text: str) -> Program:
 def every_route(made: System) -> dict[tuple[str, str], Function]:
     """Each function by each of its routes, by (name, route)."""
     found: dict[tuple[str, str], Function] = {}
-    right = program._cheapest
+    right = program.cheapest
 
     def all_of_them(name: str, of: System, routes: Mapping[str, Any]) -> Function:
         for route, way in routes.items():
@@ -65,7 +66,7 @@ def every_route(made: System) -> dict[tuple[str, str], Function]:
         return found[name, next(iter(routes))]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(program, "_cheapest", all_of_them)
+        patch.setattr(program, "cheapest", all_of_them)
         built(made)
     return found
 
@@ -211,7 +212,7 @@ def test_lagrange_over_world_coordinates_says_the_same(monkeypatch: pytest.Monke
     monkeypatch.setattr(lagrange, "LAGRANGE_DEFINITIONS", 1000)
     for joint in ("cylindrical", "universal"):
         made = made_of(held(joint, 2, axis=AXES[joint], damping="c"))
-        assert "program" in lagrange.derive(made)
+        assert lagrange.derive(made).lagrange
         assert_every_route_agrees(made, Jets(made))
 
 

@@ -26,6 +26,7 @@ from eomc.model import from_scene as system
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program import outline, program
+from eomc.program.interpret import evaluate, nearby
 from eomc.program.ir import (
     Assignment,
     Call,
@@ -34,7 +35,6 @@ from eomc.program.ir import (
     Operand,
     Product,
     Sum,
-    evaluate,
     rename,
 )
 from eomc.program.program import Program
@@ -85,7 +85,7 @@ def test_pieces_compute_what_the_whole_computes(
 ) -> None:
     """To the last bit, each from nothing but what it says that it reads."""
     whole = chain_program[name]
-    state = program.nearby(chain_program.system, 1)
+    state = nearby(chain_program.system, 1)
     parts = outline.split(whole, size)
     assert (len(parts) == 1) == (size == 10**6)
     crossing: dict[str, float] = {}
@@ -378,7 +378,7 @@ def test_matrices_by_columns_are_the_matrices(
         (columns.C(*states), whole.C(*states)),
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
-    values = program.nearby(plain.system, 2)
+    values = nearby(plain.system, 2)
     exact = program.matrix(by_columns(plain), "C", values)
     expected, _ = evaluate(plain["C"], values)
     np.testing.assert_allclose(np.ravel(exact), expected, rtol=1e-13, atol=1e-13)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from eomc.derive.lagrange import derive
 from eomc.model import from_scene as system
 from eomc.program import program
-from eomc.program.ir import evaluate
+from eomc.program.interpret import evaluate
 from eomc.robots import edit, scene_text, urdf
 from eomc.robots.mjcf import read
 from eomc.robots.robot import Robot

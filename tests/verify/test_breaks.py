@@ -19,9 +19,10 @@ from conftest import ROOT
 import eomc
 from eomc.base import resources
 from eomc.derive import lagrange
-from eomc.derive.lagrange import Equations
+from eomc.derive.equations import Equations
 from eomc.emit import c_expression
-from eomc.program import program
+from eomc.model.system import System
+from eomc.program import admissible, program
 from eomc.program.ir import Sum
 from eomc.verify.check import check
 from eomc.verify.report import Report
@@ -51,11 +52,13 @@ def derived(change: Callable[[Equations], Equations]) -> Breakage:
 
     def breakage(patch: pytest.MonkeyPatch) -> None:
         right = lagrange.derive
-        patch.setattr(
-            lagrange,
-            "derive",
-            lambda system: {route: change(e) for route, e in right(system).items()},
-        )
+
+        def wrong(system: System) -> lagrange.Derivation:
+            made = right(system)
+            ways = {"lagrange": made.lagrange, "newton_euler": made.newton_euler}
+            return replace(made, **{way: change(e) for way, e in ways.items() if e})
+
+        patch.setattr(lagrange, "derive", wrong)
 
     return breakage
 
@@ -85,7 +88,7 @@ def text(right: str, wrong: str) -> Breakage:
 
 def lowered(patch: pytest.MonkeyPatch) -> None:
     """On its way to assignments the last sum of the acceleration loses a sign."""
-    right = program.lower
+    right = admissible.lower
 
     def wrong(name: str, *how: Any) -> Any:
         made = right(name, *how)
@@ -97,7 +100,7 @@ def lowered(patch: pytest.MonkeyPatch) -> None:
         body[k] = replace(body[k], value=Sum(((-weight, first), *rest), body[k].value.constant))
         return replace(made, body=tuple(body))
 
-    patch.setattr(program, "lower", wrong)
+    patch.setattr(admissible, "lower", wrong)
 
 
 def printed(patch: pytest.MonkeyPatch) -> None:
@@ -108,7 +111,7 @@ def printed(patch: pytest.MonkeyPatch) -> None:
 
 def eliminated(patch: pytest.MonkeyPatch) -> None:
     """The solver's last pivot is taken with the wrong sign, after D itself was right."""
-    right = program._cheapest
+    right = program.cheapest
 
     def wrong(name: str, *how: Any) -> Any:
         made = right(name, *how)
@@ -117,7 +120,7 @@ def eliminated(patch: pytest.MonkeyPatch) -> None:
         outputs = tuple(replace(o, coefficient=-o.coefficient) for o in made.outputs[:1])
         return replace(made, outputs=(*outputs, *made.outputs[1:]))
 
-    patch.setattr(program, "_cheapest", wrong)
+    patch.setattr(program, "cheapest", wrong)
 
 
 MOTION = "D qdd + bias = tau"

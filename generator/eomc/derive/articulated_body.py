@@ -2,8 +2,8 @@
 
 Each joint is eliminated on the way inwards: what is beyond it resists the parent with its
 inertia less what the joint gives way. Source: Featherstone, *Rigid Body Dynamics Algorithms*,
-ch. 7. Here the forces at qdd = 0 (trees.py) hold all that velocities and gravity do, so no term
-of theirs is left: each link's wrench is that force plus its inertia times what qdd adds.
+ch. 7. Here the forces at qdd = 0 (newton_euler.py) hold all that velocities and gravity do, so no
+term of theirs is left: each link's wrench is that force plus its inertia times what qdd adds.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from itertools import combinations_with_replacement
 
 from sympy import Expr, S
 
-from eomc.derive.newton_euler import AXES, ZERO, Inertia, Recursion, Vector
+from eomc.derive.newton_euler import Inertia, Recursion
 from eomc.derive.tape import Stage
+from eomc.derive.vectors import AXES, ZERO, Vector
 from eomc.model.exact import Matrix
 
 Rows = list[list[Expr]]
@@ -30,7 +31,7 @@ class MasslessError(Exception):
 
 
 def accelerations(recursion: Recursion, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
-    """qdd by link, and each pivot beside a value of its size without cancellation.
+    """qdd by link, and each pivot paired with a value of its size without cancellation.
 
     drive: the generalized forces by link, less what is not the tree's. Raises MasslessError where
     a joint moves nothing.

@@ -22,7 +22,7 @@ class Solution:
     """qdd by one way of solving D qdd = tau - bias, on the tape where it stands.
 
     order: the order in which coordinates are eliminated; pivots: those of L diag(pivots) L^T, all
-    positive where D is positive definite, each beside a value of the size of what it came from.
+    positive where D is positive definite, each paired with a value of the size of its origin.
     matrix: what is eliminated, D or, for the forces that hold links together, S.
     """
 
@@ -33,6 +33,10 @@ class Solution:
     matrix: str = "D"
 
 
+# qdd by one way of solving; or why that was not tried; or None where there is nothing to try
+Way = Solution | str | None
+
+
 def solve(
     tape: Tape,
     D: Rows,
@@ -40,24 +44,24 @@ def solve(
     short: Callable[[Expr], Expr] = lambda atom: atom,
     kept: Callable[[Expr], Expr] = lambda atom: atom,
     prompt: bool = False,
-) -> tuple[tuple[int, ...], Vector, Pairs]:
+) -> Solution:
     """x with D x = b by L diag(d) L^T x = b, unrolled; zeros are neither stored nor computed.
 
     Source: Golub & Van Loan, *Matrix Computations*, 4th ed., alg. 4.1.2. The next pivot is the
-    one with the fewest entries left beside it (minimum degree), among equals the earliest known,
+    one with the fewest entries left in its row (minimum degree), among equals the earliest known,
     and then the one with the fewest divisions in a row behind it: a chain is eliminated from both
     its ends, each at the other's side in a processor.
     short: rewrites what elimination makes, so that terms which cancel are gone. kept: what is done
     with the entries of L; where they are kept whole, each x waits for one operation on the one
     before, not for two.
     prompt: so that x waits for less, at the price of more operations. A pivot that parameters
-    decide is taken as if it had an entry less beside it, so every other of a chain goes first.
+    decide is taken as if it had an entry less in its row, so every other of a chain goes first.
     Along what is left a pivot is p = N/M, N and M made of those before without a division,
 
         p_i - a^2/p_k = (N_i N_k - a^2 M_i M_k)/(M_i N_k),
 
     and all divisions M/N are done side by side. It rounds as the other form does. Of such a pivot
-    N is given, beside M times the entry that it came from.
+    N is given, paired with M times the entry that it came from.
     """
     n = len(b)
     A = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
@@ -68,8 +72,8 @@ def solve(
     while left:
 
         def rank(i: int) -> tuple[int, int, int, int]:
-            stage, beside = tape.stage_of(A[i, i]), sum((i, j) in A for j in left)
-            return beside - (prompt and stage <= Stage.PARAMETER), stage, behind[i], i
+            stage, entries = tape.stage_of(A[i, i]), sum((i, j) in A for j in left)
+            return entries - (prompt and stage <= Stage.PARAMETER), stage, behind[i], i
 
         k = min(left, key=rank)
         left.remove(k)
@@ -77,17 +81,17 @@ def solve(
         pivot = A[k, k]
         pivots.append((pivot, tape.define(over[k] * D[k][k])))
         inverse = tape.define(over[k] / pivot)
-        beside = {i: A[i, k] for i in left if (i, k) in A}
-        for i in beside:
+        row = {i: A[i, k] for i in left if (i, k) in A}
+        for i in row:
             behind[i] = max(behind[i], behind[k] + 1)
-        factors = {i: kept(tape.define(a * inverse)) for i, a in beside.items()}
-        chained = prompt and len(beside) == 1 and tape.stage_of(pivot) > Stage.PARAMETER
+        factors = {i: kept(tape.define(a * inverse)) for i, a in row.items()}
+        chained = prompt and len(row) == 1 and tape.stage_of(pivot) > Stage.PARAMETER
         for i, factor in factors.items():
             y[i] = short(tape.define(y[i] - factor * y[k]))
-            for j, a in beside.items():
+            for j, a in row.items():
                 if j < i:
                     A[i, j] = A[j, i] = short(tape.define(A.get((i, j), S.Zero) - factor * a))
-            a = beside[i]
+            a = row[i]
             if chained and length[i] + length[k] <= LONGEST:
                 N = A[i, i] * pivot - kept(tape.define(a * a)) * over[i] * over[k]
                 A[i, i], over[i] = kept(tape.define(N)), kept(tape.define(over[i] * pivot))
@@ -99,7 +103,7 @@ def solve(
     for k, inverse, factors in reversed(steps):
         rest = [-factor * x[i] for i, factor in factors.items()]
         x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *map(tape.define, rest)))
-    return tuple(order), tuple(x[i] for i in range(n)), tuple(pivots)
+    return Solution(tape, tuple(x[i] for i in range(n)), tuple(order), tuple(pivots))
 
 
 def work(D: Rows) -> int:
@@ -108,8 +112,8 @@ def work(D: Rows) -> int:
     total = 0
     while left:
         k = min(left, key=lambda i: (len(left[i]), i))
-        beside = left.pop(k)
-        total += len(beside) * (len(beside) + 6) + 2
-        for i in beside:
-            left[i] = (left[i] | beside) - {i, k}
+        row = left.pop(k)
+        total += len(row) * (len(row) + 6) + 2
+        for i in row:
+            left[i] = (left[i] | row) - {i, k}
     return total

@@ -7,9 +7,9 @@ velocities, the accelerations and the forces that each link needs (Newton and Eu
 - bias: those forces, summed inwards and projected on the joints;
 - composite bodies: D from the inertia of everything beyond a joint.
 
-articulated.py solves for the accelerations without D. Sources: Featherstone, *Rigid Body Dynamics
-Algorithms*, ch. 5 and 6; Khalil & Dombre, *Modeling, Identification and Control of Robots*, ch. 9
-(the matrix U, the grouping of inertial parameters).
+articulated_body.py solves for the accelerations without D. Sources: Featherstone, *Rigid Body
+Dynamics Algorithms*, ch. 5 and 6; Khalil & Dombre, *Modeling, Identification and Control of
+Robots*, ch. 9 (the matrix U, the grouping of inertial parameters).
 """
 
 from __future__ import annotations
@@ -22,13 +22,9 @@ import sympy
 from sympy import Expr, S
 
 from eomc.derive.tape import Tape
+from eomc.derive.vectors import AXES, ZERO, Vector, Vectors
 from eomc.model.exact import Matrix
 from eomc.model.multibody import Link, Tree
-
-Vector = tuple[Expr, Expr, Expr]
-
-ZERO: Vector = (S.Zero, S.Zero, S.Zero)
-AXES = ((1, 2), (2, 0), (0, 1))  # the other two of each axis, in their turning order
 
 
 @dataclass(frozen=True)
@@ -59,72 +55,26 @@ class _Forces:
     moment: list[Vector]
 
 
-class Recursion:
+class Recursion(Vectors):
     """A tree on a tape: sines, grouped inertias and the sweeps."""
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
-        self.tape = tape
+        super().__init__(tape)
         self.links = tree.links
         self.n = len(tree.links)
-        self.gravity = self._vector(tree.gravity)
-        self.still = self._vector(tree.still)
+        self.gravity = self.vector(tree.gravity)
+        self.still = self.vector(tree.still)
         self.cosine = [self.define(sympy.cos(x.q)) if x.turns else S.One for x in self.links]
         self.sine = [self.define(sympy.sin(x.q)) if x.turns else S.Zero for x in self.links]
         self.rotation: list[Matrix] = [
-            tuple(self._vector(row) for row in x.rotation)  # type: ignore[misc]
+            tuple(self.vector(row) for row in x.rotation)  # type: ignore[misc]
             for x in self.links
         ]
         self.arm = [self._arm(k) for k in range(self.n)]
         self.armature = [self.define(x.armature) for x in self.links]
         self.inertia = self._grouped()
 
-    # --- arithmetic on atoms of the tape ----------------------------------------------------------
-
-    def define(self, e: Expr) -> Expr:
-        """The atom of an expression."""
-        return self.tape.define(e)
-
-    def add(self, *terms: Expr) -> Expr:
-        """Their sum."""
-        return self.tape.total([x for x in terms if x is not S.Zero])
-
-    def times(self, a: Expr, b: Expr) -> Expr:
-        """a b"""
-        return S.Zero if a is S.Zero or b is S.Zero else self.tape.times(a, b)
-
-    def minus(self, a: Expr) -> Expr:
-        """-a"""
-        return self.tape.scaled(S.NegativeOne, a)
-
-    def _vector(self, v: Sequence[Expr]) -> Vector:
-        x, y, z = map(self.define, v)
-        return (x, y, z)
-
-    def plus(self, *vectors: Vector) -> Vector:
-        """Their sum."""
-        x, y, z = (self.add(*parts) for parts in zip(*vectors, strict=True))
-        return (x, y, z)
-
-    def dot(self, a: Vector, b: Vector) -> Expr:
-        """a . b"""
-        return self.add(*(self.times(x, y) for x, y in zip(a, b, strict=True)))
-
-    def cross(self, a: Vector, b: Vector) -> Vector:
-        """a x b"""
-        x, y, z = (
-            self.add(self.times(a[i], b[j]), self.minus(self.times(a[j], b[i]))) for i, j in AXES
-        )
-        return (x, y, z)
-
-    def apply(self, R: Sequence[Vector], v: Vector) -> Vector:
-        """R v"""
-        x, y, z = (self.dot(row, v) for row in R)
-        return (x, y, z)
-
-    def applied_transposed(self, R: Sequence[Vector], v: Vector) -> Vector:
-        """R^T v"""
-        x, y, z = (self.dot(column, v) for column in zip(*R, strict=True))
-        return (x, y, z)
+    # --- frames ----------------------------------------------------------------------------------
 
     def turn(self, k: int, v: Vector, back: bool = False) -> Vector:
         """A vector of link k's frame in the joint's frame; `back`: the other way."""
@@ -149,7 +99,7 @@ class Recursion:
     def _arm(self, k: int) -> Vector:
         """From the parent's origin to link k's, in the parent's frame."""
         link = self.links[k]
-        offset = self._vector(link.offset)
+        offset = self.vector(link.offset)
         if link.turns:
             return offset
         slide = tuple(self.times(row[link.axis], link.q) for row in self.rotation[k])
@@ -166,7 +116,7 @@ class Recursion:
     def _own(self, link: Link) -> Inertia:
         names = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
         inertia = dict(zip(names, map(self.define, link.inertia), strict=True))
-        return Inertia(self.define(link.mass), self._vector(link.moment), inertia)
+        return Inertia(self.define(link.mass), self.vector(link.moment), inertia)
 
     def _sum(self, one: Inertia, other: Inertia) -> Inertia:
         if one.is_zero() or other.is_zero():
@@ -239,11 +189,6 @@ class Recursion:
             more = self.minus(self.add(self.times(g[i], r[j]), self.times(r[i], g[j])))
             inertia[i, j] = self.add(x.entry(i, j), more, twice if i == j else S.Zero)
         return Inertia(x.mass, self.plus(x.moment, shift), inertia)
-
-    def scaled(self, v: Vector, x: Expr) -> Vector:
-        """x v"""
-        a, b, c = (self.times(e, x) for e in v)
-        return (a, b, c)
 
     def _turned(self, k: int, x: Inertia) -> Inertia:
         """By the joint's angle."""

@@ -70,7 +70,7 @@ class Tape:
         if expr.is_Symbol or expr.is_number:
             return expr
         if expr.is_Add:
-            return self._sum(self.define(term) for term in expr.args)
+            return self.total(self.define(term) for term in expr.args)
         if expr.is_Mul or expr.is_Pow:
             return self._product(Mul.make_args(expr))
         made = expr.func(*(self.define(arg) for arg in expr.args))
@@ -230,9 +230,6 @@ class Tape:
 
     def total(self, atoms: Iterable[Expr]) -> Expr:
         """The sum of atoms."""
-        return self._sum(atoms)
-
-    def _sum(self, atoms: Iterable[Expr]) -> Expr:
         weights: dict[Symbol, Expr] = {}
         constant: Expr = S.Zero
         for atom in atoms:
@@ -348,7 +345,7 @@ class Tape:
     # --- derivatives -----------------------------------------------------------------------------
 
     def live(self, atoms: Iterable[Expr], stop: Set[Symbol] = frozenset()) -> list[Symbol]:
-        """The names that `atoms` hang on, in order; what stands behind `stop` is left out."""
+        """The names that `atoms` depend on, in order; what stands behind `stop` is left out."""
         found: set[Symbol] = set()
         queue = [s for atom in atoms for s in atom.free_symbols]
         while queue:
@@ -360,12 +357,10 @@ class Tape:
         return sorted(found, key=self._number.__getitem__)
 
     def leaves_of(self, atoms: Iterable[Expr]) -> set[Symbol]:
-        """The leaves that `atoms` hang on."""
+        """The leaves that `atoms` depend on."""
         atoms = list(atoms)
-        names = self.live(atoms)
-        seen = {s for atom in atoms for s in atom.free_symbols}.union(
-            *(self.parts[n] for n in names)
-        )
+        parts = (self.parts[n] for n in self.live(atoms))
+        seen = {s for atom in atoms for s in atom.free_symbols}.union(*parts)
         return seen & self.leaves.keys()
 
     def partial(self, symbol: Symbol, part: Symbol) -> Expr:
@@ -397,7 +392,7 @@ class Tape:
                 for part in self.parts[symbol]
                 if part in tangent
             ]
-            if terms and (sum_ := self._sum(terms)) != 0:
+            if terms and (sum_ := self.total(terms)) != 0:
                 tangent[symbol] = sum_
         return [
             self.scaled(factor, tangent[symbol]) if symbol in tangent else S.Zero
@@ -422,11 +417,11 @@ class Tape:
         for symbol in reversed(self.live([o for o, _ in outputs], stop)):
             if symbol in stop or symbol not in terms:
                 continue
-            adjoint = self._sum(terms[symbol])
+            adjoint = self.total(terms[symbol])
             for part in self.parts[symbol]:
                 slope = self.partial(symbol, part)
                 terms.setdefault(part, []).append(self.times(slope, adjoint))
-        return [self._sum(terms.get(symbol, ())) for symbol in wrt]
+        return [self.total(terms.get(symbol, ())) for symbol in wrt]
 
     def substitute(self, outputs: Sequence[Expr], values: Mapping[Symbol, Expr]) -> list[Expr]:
         """The outputs with `values` in place of leaves."""

@@ -12,8 +12,8 @@ from typing import Any
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target, arguments
 from eomc.emit.evaluations import KINDS, takes_t
-from eomc.program.ir import evaluate
-from eomc.program.program import matrix, nearby
+from eomc.program.interpret import evaluate, nearby
+from eomc.program.program import matrix
 from eomc.program.trig import apart
 
 # by whether numbers are doubles: the limit of |x| in sincos.h, sincosf.h

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
 from fractions import Fraction
-from math import comb, inf
+from math import comb, inf, lcm
 
 Row = tuple[Fraction, ...]
 
@@ -48,7 +48,7 @@ class Method:
 
     @property
     def implicit(self) -> bool:
-        """Whether the stages hang on one another."""
+        """Whether the stages depend on one another."""
         return any(any(row[i:]) for i, row in enumerate(self.a))
 
     @property
@@ -190,11 +190,13 @@ _DIGITS = 45  # that the nodes are computed to, of which the last few may be off
 
 
 def _value(polynomial: Row, x: Fraction) -> Fraction:
-    """A polynomial, lowest power first."""
-    value = Fraction(0)
-    for coefficient in reversed(polynomial):
-        value = value * x + coefficient
-    return value
+    """A polynomial, lowest power first; one fraction is cancelled in the end, not one a step."""
+    whole = lcm(*(c.denominator for c in polynomial))
+    value, power = 0, 1  # over whole and powers of x's denominator
+    for c in reversed(polynomial):
+        value = value * x.numerator + c.numerator * (whole // c.denominator) * power
+        power *= x.denominator
+    return Fraction(value * x.denominator, whole * power)
 
 
 def _integral(polynomial: Row) -> Row:
@@ -204,13 +206,14 @@ def _integral(polynomial: Row) -> Row:
 
 def _lagrange(nodes: Row) -> tuple[Row, ...]:
     """The polynomials that are 1 at one of the nodes and 0 at the others."""
-    out = []
-    for i, at in enumerate(nodes):
-        basis = [Fraction(1)]
-        for other in (x for k, x in enumerate(nodes) if k != i):
-            shifted, kept = [Fraction(0), *basis], [*(-other * c for c in basis), Fraction(0)]
-            basis = [(a + b) / (at - other) for a, b in zip(shifted, kept, strict=True)]
-        out.append(tuple(basis))
+    whole, out = lcm(*(x.denominator for x in nodes)), []
+    places = [x.numerator * (whole // x.denominator) for x in nodes]
+    for i, at in enumerate(places):
+        basis, size = [1], 1  # in whole x
+        for other in (x for k, x in enumerate(places) if k != i):
+            basis = [a - other * b for a, b in zip([0, *basis], [*basis, 0], strict=True)]
+            size *= at - other
+        out.append(tuple(Fraction(c * whole**k, size) for k, c in enumerate(basis)))
     return tuple(out)
 
 
@@ -248,7 +251,7 @@ def _gauss(s: int, name: str) -> Method:
         b=tuple(_value(area, Fraction(1)) for area in areas),
         notes=(
             "A-stable: no step is too long for a motion that decays. Symmetric, and symplectic in",
-            "(q, p) where D is constant; where D hangs on q, in (q, qd) nearly so.",
+            "(q, p) where D is constant; where D depends on q, in (q, qd) nearly so.",
         ),
     )
 
@@ -274,7 +277,7 @@ def _swept(s: int, sweeps: int, name: str, limits: tuple[float, float]) -> Metho
             "The accelerations at the stages begin as the polynomial through those of the step",
             f"before, and {sweeps} sweeps put those found there in their place, all stages side by",
             "side (van der Houwen & Sommeijer, J. Comput. Appl. Math. 29 (1990), 111-127, iterate",
-            f"so). Of order {2 * s}, and {order} where accelerations hang on velocities. No",
+            f"so). Of order {2 * s}, and {order} where they depend on velocities. No",
             "derivatives: h must be small against the fastest motion, also where that died out.",
         ),
         sweeps=sweeps,
@@ -297,7 +300,7 @@ EULER = Method(
     a=((_ZERO,),),
     b=(_ONE,),
     notes=(
-        "v = qd + h a(q, qd), r = q + h v. Symplectic where D is constant and the forces hang on",
+        "v = qd + h a(q, qd), r = q + h v. Symplectic where D is constant and forces depend on",
         "positions alone; of order 1 everywhere.",
     ),
     end=(_ONE,),
@@ -311,8 +314,8 @@ VERLET = Method(
     a=((_ZERO,),),
     b=(_ONE,),
     notes=(
-        "v = qd + h a(q + h/2 qd), r = q + h/2 (qd + v). For accelerations that hang on positions",
-        "and time alone; symmetric, and symplectic where the forces have a potential.",
+        "v = qd + h a(q + h/2 qd), r = q + h/2 (qd + v). For accelerations that depend on",
+        "positions and time alone; symmetric, and symplectic where the forces have a potential.",
     ),
     nodes=(_HALF,),
     end=(_HALF,),

@@ -11,9 +11,10 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from eomc.base.errors import EomcError
+from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import dot
 from eomc.scene.scene import Run
-from eomc.scene.schema import METHODS, REALS
+from eomc.scene.schema import REALS
 
 _FUNCTIONS = (
     *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),

@@ -1,19 +1,16 @@
-"""Assignments: the small language that programs are written in, and its evaluation in Python.
+"""The small language that programs are written in.
 
-A function is a list of sums, products and calls over names; what hangs on parameters alone comes
+A function is a list of sums, products and calls over names; what depends on parameters alone comes
 first. Knows nothing of mechanics or C.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import Any
+from functools import cached_property
 
-import mpmath
-from sympy import Expr, Rational, S
+from sympy import Expr, S
 
 from eomc.derive.tape import Stage
 
@@ -101,15 +98,15 @@ class Cost:
             (self.sincos, "sincos"),
             (self.calls, "other call"),
         ]
-        told = [f"{n} {what}{'s' if n > 1 and what != 'sincos' else ''}" for n, what in parts if n]
-        return ", ".join(told) or "no arithmetic"
+        found = [f"{n} {what}{'s' if n > 1 and what != 'sincos' else ''}" for n, what in parts if n]
+        return ", ".join(found) or "no arithmetic"
 
 
 @dataclass(frozen=True)
 class Function:
     """One function of the generated code.
 
-    `early` hangs on parameters alone, `body` on the rest; `outputs` are the results, row-major
+    `early` depends on parameters alone, `body` on the rest; `outputs` are the results, row-major
     where they are a matrix. `checks` are (pivot, diagonal) pairs that must be positive.
     """
 
@@ -163,98 +160,3 @@ def renamed_value(value: Value, real: Callable[[str], str]) -> Value:
     return Call(
         value.function, tuple(replace(a, name=real(a.name)) if a.name else a for a in value.args)
     )
-
-
-# --- evaluation in Python -----------------------------------------------------------------------
-
-_NAMES = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt".split()
-
-_DOUBLES: Mapping[str, Callable[..., Any]] = {
-    **{name: getattr(math, name) for name in _NAMES},
-    "number": float,
-    "pow": math.pow,
-    "abs": abs,
-    "sign": lambda x: (x > 0) - (x < 0),
-    "heaviside": lambda x: 0.5 + 0.5 * ((x > 0) - (x < 0)),
-    "min": min,
-    "max": max,
-    "reciprocal": lambda x: 1 / x,
-}
-
-
-def _many_digits() -> Mapping[str, Callable[..., Any]]:
-    """The same in 40 digits."""
-    mp = mpmath.mp.clone()
-    mp.dps = 40
-    return {
-        **_DOUBLES,
-        **{name: getattr(mp, name) for name in _NAMES},
-        "number": lambda x: mp.mpf(x.p) / x.q if isinstance(x, Rational) else mp.mpf(x.evalf(40)),
-        "pow": mp.power,
-    }
-
-
-def evaluate(
-    function: Function, values: Mapping[str, float], exact: bool = False, unit: float = 2.0**-52
-) -> tuple[list[float], bool]:
-    """The results of a function, and whether every pivot is positive, beyond rounding by `unit`.
-
-    values: coordinates, velocities, parameters, inputs and t by name. In Python floats, or in 40
-    digits and then rounded where `exact`. Raises ArithmeticError or ValueError where a result is
-    not a finite, real number.
-    """
-    return evaluator(function, exact, unit)(values)
-
-
-def evaluator(
-    function: Function, exact: bool = False, unit: float = 2.0**-52
-) -> Callable[[Mapping[str, float]], tuple[list[float], bool]]:
-    """`evaluate` of one function for many states: its numbers are converted once."""
-    of = _many_digits() if exact else _DOUBLES
-    number = lru_cache(maxsize=None)(of["number"])  # most are 1 and -1
-
-    def atom(o: Operand) -> tuple[Any, str]:
-        return number(o.coefficient), o.name
-
-    steps: list[tuple[str, Callable[..., Any], Any, Sequence[Any]]] = []
-    for a in (*function.early, *function.body):
-        v = a.value
-        if isinstance(v, Sum):
-            terms = [(number(w), n) for w, n in v.terms]
-            steps.append((a.name, _added, number(v.constant), terms))
-        elif isinstance(v, Product):
-            steps.append((a.name, _multiplied, number(v.coefficient), v.factors))
-        else:
-            steps.append((a.name, _called, of[v.function], [atom(o) for o in v.args]))
-    outputs = [atom(o) for o in function.outputs]
-    checks = [(atom(pivot), atom(diagonal)) for pivot, diagonal in function.checks]
-    tolerance = 8 * unit * max(1, len(checks))
-
-    def evaluated(values: Mapping[str, float]) -> tuple[list[float], bool]:
-        known: dict[str, Any] = {"": 1, **values}  # a number alone has no name
-        for name, do, first, rest in steps:
-            known[name] = do(known, first, rest)
-        try:
-            results = [float(c * known[n]) for c, n in outputs]
-        except TypeError:  # a complex number
-            raise ValueError(f"{function.name} is not real") from None
-        if not all(map(math.isfinite, results)):
-            raise ValueError(f"{function.name} is not finite")
-        return results, all(
-            c * known[n] > (0 if (c, n) == (e, m) else tolerance * (e * known[m]))
-            for (c, n), (e, m) in checks
-        )
-
-    return evaluated
-
-
-def _added(known: Mapping[str, Any], constant: Any, terms: Sequence[tuple[Any, str]]) -> Any:
-    return sum([w * known[n] for w, n in terms], constant)
-
-
-def _multiplied(known: Mapping[str, Any], coefficient: Any, factors: Sequence[str]) -> Any:
-    return math.prod([known[n] for n in factors], start=coefficient)
-
-
-def _called(known: Mapping[str, Any], do: Callable[..., Any], args: Sequence[Any]) -> Any:
-    return do(*[c * known[n] for c, n in args])

@@ -1,4 +1,4 @@
-"""Long functions in pieces: straight-line code cut where few values cross.
+"""Long functions outlined: straight-line code cut where few values cross.
 
 Compilers take time that grows with the square of a function's length and more, so what is long is
 emitted as several functions that hand values on. Knows nothing of C.
@@ -18,16 +18,16 @@ from eomc.derive.tape import Stage
 from eomc.program.ir import Assignment, Call, Function, Operand
 
 LARGE = 1000  # weight from which a function is cut
-PIECE = 500  # weight of a piece, up to a third more or less
+PIECE = 500  # weight of an outlined function, up to a third more or less
 LANE_PIECE = 180  # the same in loops over a tile: the processor is to see a few instances at once
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A run of a function's assignments.
+    """An outlined function: a run of another's assignments.
 
     function: the run, with the results and checks that are ready behind it; outputs: the places of
-    these results in the whole. reads: values made by earlier pieces; keeps: values that later ones
+    these results in the whole. reads: values made by earlier ones; keeps: values that later ones
     read.
     """
 
@@ -43,7 +43,7 @@ def weight(function: Function) -> int:
 
 
 def is_large(function: Function) -> bool:
-    """Whether a function is too long for one piece."""
+    """Whether a function is long enough to be outlined."""
     return weight(function) > LARGE
 
 
@@ -54,7 +54,7 @@ def _weight(a: Assignment) -> int:
 
 
 def split(function: Function, piece: int) -> tuple[Piece, ...]:
-    """The function in pieces of about `piece` operations.
+    """The function as outlined functions of about `piece` operations.
 
     The assignments stay what they are, and each still stands behind those that it reads: the values
     are the same to the last bit. Values that cross count as named.
@@ -110,7 +110,7 @@ def _paired(run: tuple[Assignment, ...]) -> list[Assignment]:
 
 
 def _cuts(run: list[Assignment], piece: int) -> list[int]:
-    """Where pieces end: within a third of their size, there where the fewest values cross."""
+    """Where to cut: within a third of the size, where the fewest values cross."""
     last: dict[str, int] = {}
     for k, a in enumerate(run):
         last |= dict.fromkeys(a.value.names, k)

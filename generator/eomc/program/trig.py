@@ -25,7 +25,7 @@ class Angle:
 
 
 def apart(function: Function, coordinates: Collection[str]) -> tuple[tuple[Angle, ...], Function]:
-    """The angles that hang on coordinates alone, and the function that reads their sines."""
+    """The angles that depend on coordinates alone, and the function that reads their sines."""
     values = {a.name: a.value for a in function.body}
     found: dict[tuple[Operand, ...], dict[str, str]] = {}
     for a in function.body:

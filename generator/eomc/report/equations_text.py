@@ -13,6 +13,7 @@ from eomc.emit import c_expression
 from eomc.model.symbols import ALONG
 from eomc.model.system import System, t
 from eomc.program import program
+from eomc.program.routes import ROUTES
 from eomc.verify import symbolic
 
 WRITTEN_OUT = 400  # operations of D, C and bias up to which a person may want them written out
@@ -164,17 +165,6 @@ def _assignments(made: program.Program) -> str:
     return "\n\n".join(parts)
 
 
-_ROUTES = {
-    "program": "Lagrange over the program of K and P",
-    "expanded": "the same, multiplied out",
-    "cancelled": "multiplied out again during elimination",
-    "tree": "Newton and Euler along the tree",
-    "composite": "Newton and Euler, D of composite bodies, L D L^T",
-    "articulated": "Newton and Euler, articulated bodies",
-    "tensions": "the tensions of links between point masses",
-}
-
-
 def cost(system: System) -> str:
     """The operations of each generated function, by each route, and why one was taken."""
     made = program.build(lagrange.derive(system))
@@ -193,5 +183,5 @@ def cost(system: System) -> str:
     if len(routes) > 1:
         lines += ["", "Of each function the route of least weight is taken that loses no digits:"]
         lines.append("a division weighs as 8 additions, a sine or other call as 25.")
-        lines += [f"    {route:{max(map(len, routes))}}  {_ROUTES[route]}" for route in routes]
+        lines += [f"    {r:{max(map(len, routes))}}  {ROUTES[r].sentence}" for r in routes]
     return "\n".join(lines)

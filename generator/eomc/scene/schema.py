@@ -9,11 +9,12 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from eomc.base import texts
+from eomc.integrators.tableaux import METHODS
 from eomc.scene import messages
 from eomc.scene.formulas import nearest
 
-METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "gauss16", "euler", "verlet")
 REALS = ("double", "float")
+_NAMES = tuple(METHODS)
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
 _Value = _Number | pydantic.StrictStr
@@ -62,7 +63,7 @@ def _listed(value: object) -> object:
 
 
 _Methods = Annotated[
-    tuple[Literal[METHODS], ...],  # type: ignore[valid-type]
+    tuple[Literal[_NAMES], ...],  # type: ignore[valid-type]
     pydantic.BeforeValidator(_listed),
 ]
 

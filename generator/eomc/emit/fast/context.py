@@ -14,7 +14,6 @@ from typing import Any
 from eomc.base import resources
 from eomc.base.texts import FreeText, command, flat, line
 from eomc.base.version import __version__
-from eomc.derive.link_tensions import is_prompt
 from eomc.emit import c_expression, selftest
 from eomc.emit.c_expression import indent
 from eomc.emit.c_names import Target, after, arguments
@@ -140,19 +139,7 @@ def _example(target: Target) -> dict[str, Any]:
 
 def solved(target: Target) -> list[str]:
     """How D qdd = tau - bias is solved, as lines of a comment."""
-    program = target.program
-    way = "D = L diag(d) L^T"
-    if program["acceleration"].route == "articulated":
-        way = "articulated bodies (Featherstone), the pivots d being those of D = L diag(d) L^T"
-    order = ", ".join(program.system.coordinates[k].name for k in program.order)
-    if program["acceleration"].route == "tensions":
-        fractions = "Along a chain s = N/M: s_k is N there, and S_k is M times the entry it was. "
-        return textwrap.wrap(
-            "a = qdd by the tensions of the links, S = N T N^T = L diag(s) L^T, eliminated in the "
-            f"order of the links of {order}. {fractions if is_prompt(program.system) else ''}"
-            "Every mass must be positive.", 92,
-        )  # fmt: skip
-    return textwrap.wrap(f"a = qdd by {way}, eliminated in the order {order}.", 92)
+    return textwrap.wrap(target.program.solved, 92)
 
 
 def _face(target: Target) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Accelerations by tensions: the same as by D, at the promised cost, refused where they must be.
+"""Accelerations by link multipliers: the same as by D, at the promised cost, refused elsewhere.
 
 In 40 digits the route must be Lagrange's to the last bit of a double; in doubles it is held
 against jets.py, which shares nothing with it. Nothing is compiled but in the last tests.
@@ -18,11 +18,13 @@ from conftest import Modules
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from eomc.derive import lagrange, link_tensions
+from eomc.derive import lagrange, link_multipliers
+from eomc.derive.ldl import Solution
 from eomc.model import from_scene as system
 from eomc.model.system import System, dot, symbol, t
 from eomc.program import program
-from eomc.program.ir import Call, Function, evaluate
+from eomc.program.interpret import evaluate
+from eomc.program.ir import Call, Function
 from eomc.program.lower import lower
 from eomc.scene import read as scene
 from eomc.verify.taylor import Jets
@@ -40,14 +42,15 @@ def made_of(text: str) -> System:
     return system.from_scene(scene.parse(text, "links.toml"))
 
 
-def by_tensions(made: System) -> Function:
+def by_multipliers(made: System) -> Function:
     """The acceleration by this route, whichever is the cheapest."""
-    found = link_tensions.solution(made)
+    found = link_multipliers.solution(made)
     return lower("acceleration", found.tape, found.acceleration, found.pivots, ())
 
 
 def by_lagrange(made: System) -> Function:
-    found = lagrange._by_lagrange(made).solutions["program"]
+    _, found, _ = lagrange._by_lagrange(made)
+    assert isinstance(found, Solution)
     return lower("acceleration", found.tape, found.acceleration, found.pivots, ())
 
 
@@ -75,7 +78,7 @@ def independent(made: System, state: Mapping[str, float]) -> tuple[np.ndarray, f
 
 def assert_right(made: System) -> Function:
     """In 40 digits the route is Lagrange's, in doubles as near to jets as D's condition lets be."""
-    ours, theirs = by_tensions(made), by_lagrange(made)
+    ours, theirs = by_multipliers(made), by_lagrange(made)
     for state in states(made):
         exact, regular = evaluate(ours, state, exact=True)
         other, _ = evaluate(theirs, state, exact=True)
@@ -162,7 +165,7 @@ def test_springs_dampers_forces_inputs_and_a_driven_pivot(relative: bool, equal:
 @pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
 def test_positions_may_be_written_out(relative: bool) -> None:
     costs = {
-        by_tensions(made_of(links(CHAIN, relative=relative, written=written))).cost
+        by_multipliers(made_of(links(CHAIN, relative=relative, written=written))).cost
         for written in (False, True)
     }
     assert len(costs) == 1
@@ -250,13 +253,13 @@ def test_other_systems_of_the_kind(kind: str) -> None:
 
 
 def test_bodies_that_are_points_in_relative_angles() -> None:
-    """Their world coordinates hang on sums of angles."""
+    """Their world coordinates depend on sums of angles."""
     made = made_of(trees.chain(4, points=True))
     assert made.tree is not None
     assert_right(made)
     built = program.build(lagrange.derive(made_of(trees.chain(10, points=True))))
-    assert built["acceleration"].route == "tensions"
-    assert {"articulated", "tensions"} <= dict(built["acceleration"].routes).keys()
+    assert built["acceleration"].route == "multipliers"
+    assert {"articulated", "multipliers"} <= dict(built["acceleration"].routes).keys()
 
 
 # --- what it costs -------------------------------------------------------------------------------
@@ -269,16 +272,16 @@ BATCH = "\n[run]\nbatch = true\n"
 def test_flops_of_a_chain(n: int, equal: int, unequal: int) -> None:
     """19 a link, and five more where masses and lengths differ; up to 24 where none is to wait."""
     chain = [k - 1 for k in range(n)]
-    assert by_tensions(made_of(links(chain) + BATCH)).cost.flops <= equal
-    assert by_tensions(made_of(links(chain, equal=False) + BATCH)).cost.flops <= unequal
-    prompt = by_tensions(made_of(links(chain))).cost
+    assert by_multipliers(made_of(links(chain) + BATCH)).cost.flops <= equal
+    assert by_multipliers(made_of(links(chain, equal=False) + BATCH)).cost.flops <= unequal
+    prompt = by_multipliers(made_of(links(chain))).cost
     assert prompt.flops <= 24 * n
     assert prompt.divisions <= n // 2
 
 
 def test_a_chain_is_eliminated_from_both_ends() -> None:
     """So that only half of its divisions wait for one another."""
-    order = link_tensions.solution(made_of(links([k - 1 for k in range(9)]) + BATCH)).order
+    order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]) + BATCH)).order
     assert [order.index(k) for k in range(4)] == sorted(order.index(k) for k in range(4))
     assert [order.index(k) for k in (8, 7, 6, 5)] == sorted(order.index(k) for k in (5, 6, 7, 8))
     assert order[-1] == 4
@@ -287,20 +290,20 @@ def test_a_chain_is_eliminated_from_both_ends() -> None:
 @pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
 def test_the_order_names_the_last_coordinate_of_each_angle(relative: bool) -> None:
     """That of the link itself, whatever it is measured from."""
-    order = link_tensions.solution(made_of(links(CHAIN, relative=relative))).order
+    order = link_multipliers.solution(made_of(links(CHAIN, relative=relative))).order
     assert sorted(order) == [0, 1, 2, 3, 4]
 
 
 def test_every_other_link_goes_first_where_one_trajectory_is_all() -> None:
-    """Their pivots hang on parameters alone; the others then from both ends."""
-    order = link_tensions.solution(made_of(links([k - 1 for k in range(9)]))).order
+    """Their pivots depend on parameters alone; the others then from both ends."""
+    order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]))).order
     assert set(order[:5]) == {0, 2, 4, 6, 8}
     assert set(order[5:7]) == {1, 7}
 
 
 def test_divisions_do_not_wait_for_one_another() -> None:
     """No reciprocal of what a place decides is made of another."""
-    function = by_tensions(made_of(links([k - 1 for k in range(12)])))
+    function = by_multipliers(made_of(links([k - 1 for k in range(12)])))
     values = {a.name: a.value for a in function.body}
 
     def divisions_in_a_row(name: str) -> int:
@@ -317,10 +320,10 @@ def test_divisions_do_not_wait_for_one_another() -> None:
 
 @pytest.mark.parametrize("size", [1e-34, 1e34])
 def test_masses_of_any_size(size: float) -> None:
-    """Products of pivots stay in the range of a double; accelerations hang on ratios of masses."""
+    """Products of pivots stay in the range of a double; only ratios of masses count."""
     n = 40
     made = made_of(links([k - 1 for k in range(n)], equal=False))
-    ours, state = by_tensions(made), states(made)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
+    ours, state = by_multipliers(made), states(made)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
     scaled = {**state, **{f"m{k}": size * state[f"m{k}"] for k in range(n)}}
     (expected, _), (found, regular) = evaluate(ours, state), evaluate(ours, scaled)
     assert regular
@@ -333,7 +336,7 @@ def test_products_of_pivots_lose_nothing(n: int) -> None:
     more than there may be in one."""
     chain = links([k - 1 for k in range(n)], equal=False)
     made = made_of(chain)
-    prompt, plain = by_tensions(made), by_tensions(made_of(chain + BATCH))
+    prompt, plain = by_multipliers(made), by_multipliers(made_of(chain + BATCH))
     assert prompt != plain
     for state in states(made, 2):
         (found, _), (expected, _) = (evaluate(f, state, exact=True) for f in (prompt, plain))
@@ -343,7 +346,7 @@ def test_products_of_pivots_lose_nothing(n: int) -> None:
 
 def test_a_float_has_no_room_for_products_of_pivots() -> None:
     chain = links([k - 1 for k in range(9)])
-    plain, many = (by_tensions(made_of(f"{chain}\n[run]\n{run}\n")) for run in (
+    plain, many = (by_multipliers(made_of(f"{chain}\n[run]\n{run}\n")) for run in (
         'real = "float"', "batch = true",
     ))  # fmt: skip
     assert plain == many
@@ -352,7 +355,7 @@ def test_a_float_has_no_room_for_products_of_pivots() -> None:
 def test_it_is_taken_where_it_is_the_cheapest() -> None:
     for n in (3, 5, 10):
         made = made_of(links([k - 1 for k in range(n)]))
-        assert program.build(lagrange.derive(made))["acceleration"].route == "tensions"
+        assert program.build(lagrange.derive(made))["acceleration"].route == "multipliers"
 
 
 # --- where it is not ------------------------------------------------------------------------------
@@ -362,7 +365,7 @@ UNSUITED = {
     "otherwise than on a sum": moving([(x * sin(a), -x * cos(a))], [x, a]),
     "irrational": moving([(*FIRST, L * sin(a + sympy.sqrt(2) * b))], [a, b], m * B_DOT**2),
     "velocities in K, more than": scene_system("chain"),
-    "hang on coordinates": moving([FIRST], [a, b], (2 + cos(a)) * B_DOT**2),
+    "depend on coordinates": moving([FIRST], [a, b], (2 + cos(a)) * B_DOT**2),
     "no sum of masses": moving([FIRST], [a, b], m * (B_DOT - A_DOT / 3) ** 2),
     "one direction": moving([FIRST[:1], (L * sin(a) + R * sin(b), L * cos(b))], [a, b]),
     "no links": moving([(x,), (y,)], [x, y]),
@@ -375,14 +378,14 @@ UNSUITED = {
 
 @pytest.mark.parametrize("why", UNSUITED)
 def test_what_is_of_another_kind_is_passed_over_with_the_reason(why: str) -> None:
-    with pytest.raises(link_tensions.UnsuitedError, match=why):
-        link_tensions.solution(UNSUITED[why])
+    with pytest.raises(link_multipliers.UnsuitedError, match=why):
+        link_multipliers.solution(UNSUITED[why])
     built = program.build(lagrange.derive(UNSUITED[why]))
-    assert "tensions" not in dict(built["acceleration"].routes)
-    assert why in built.passed_over["tensions"]
+    assert "multipliers" not in dict(built["acceleration"].routes)
+    assert why in built.passed_over["multipliers"]
 
 
-def test_a_negative_mass_is_told() -> None:
+def test_a_negative_mass_is_reported() -> None:
     """Where it is a number nothing is left of it to look at in a tape; D is indefinite."""
     made = System.make(
         "negative",
@@ -391,8 +394,8 @@ def test_a_negative_mass_is_told() -> None:
         0,
         parameters=PARAMETERS,
     )
-    with pytest.raises(link_tensions.UnsuitedError, match="no sum of masses"):
-        link_tensions.solution(made)
+    with pytest.raises(link_multipliers.UnsuitedError, match="no sum of masses"):
+        link_multipliers.solution(made)
     acceleration = program.build(lagrange.derive(made))["acceleration"]
     for state in states(made):
         assert not evaluate(acceleration, state)[1]
@@ -400,14 +403,14 @@ def test_a_negative_mass_is_told() -> None:
 
 def test_angles_that_do_not_determine_the_coordinates() -> None:
     points = [(L * sin(e), L * cos(e)) for e in (a, b, a - b)]
-    with pytest.raises(link_tensions.UnsuitedError, match="do not determine"):
-        link_tensions.solution(moving(points, [a, b, c]))
+    with pytest.raises(link_multipliers.UnsuitedError, match="do not determine"):
+        link_multipliers.solution(moving(points, [a, b, c]))
 
 
 @pytest.mark.parametrize("gone", ["m", "l", "m1", "l1", "m0", "l0"])
 def test_a_mass_or_link_of_nothing_is_singular(gone: str) -> None:
     """Even where all that is left of it cancels."""
-    ours = by_tensions(made_of(links([-1, 0, 1], equal=len(gone) == 1)))
+    ours = by_multipliers(made_of(links([-1, 0, 1], equal=len(gone) == 1)))
     state = states(made_of(links([-1, 0, 1], equal=len(gone) == 1)))[0]
     assert evaluate(ours, state)[1]
     try:
@@ -434,11 +437,11 @@ def test_singular_and_regular_in_c(modules: Modules) -> None:
 def test_a_scene_with_a_massless_link_keeps_the_way_by_d() -> None:
     """D is regular with m0 = 0 where the links are not in line; 1/m0 is nothing to go by."""
     text = links([-1, 0, 1, 2], equal=False)
-    assert program.build(lagrange.derive(made_of(text)))["acceleration"].route == "tensions"
+    assert program.build(lagrange.derive(made_of(text)))["acceleration"].route == "multipliers"
     made = made_of(text.replace("m0 = 1.0", "m0 = 0.0"))
     built = program.build(lagrange.derive(made))
-    assert "tensions" in dict(built["acceleration"].routes)
-    assert built["acceleration"].route != "tensions"
+    assert "multipliers" in dict(built["acceleration"].routes)
+    assert built["acceleration"].route != "multipliers"
     values = {**states(made)[0], "m0": 0.0}
     right, _ = independent(made, values)
     np.testing.assert_allclose(evaluate(built["acceleration"], values)[0], right, rtol=1e-12)

@@ -1,8 +1,8 @@
-"""Accelerations of point masses on links by the tensions of the links, without D.
+"""Accelerations of point masses on links by link multipliers (tensions), without D.
 
 Where K = sum m ydot^2/2, positions are sums y = A e + d(t) of increments, and each increment is a
 function of one angle: x2 = l1 sin a1 + l2 sin a2 has sin a1 and sin a2. So e = B (y - d) with B
-sparse, and edd = u phidd + beta for a group of increments that hang on one angle phi = sum c_i q_i.
+sparse, and edd = u phidd + beta for a group of increments of one angle phi = sum c_i q_i.
 What holds a group together is a force along n, perpendicular to its u:
 
     M ydd = F + B^T (N^T lambda + U f),    N edd = N beta,    edd = B (ydd - ddd)
@@ -49,7 +49,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Group:
-    """Increments that hang on one angle, sum direction_i q_i: their slopes along it and beta.
+    """Increments of one angle, sum direction_i q_i: their slopes along it and beta.
 
     across: the rows n with n . slopes = 0.
     """
@@ -62,7 +62,7 @@ class Group:
 
 
 def is_prompt(system: System) -> bool:
-    """Whether tensions are eliminated so that little is waited for, see elimination.solve.
+    """Whether multipliers are eliminated so that little is waited for, see ldl.solve.
 
     Many computed at once don't wait, and products of pivots would leave the range of a float.
     """
@@ -70,8 +70,8 @@ def is_prompt(system: System) -> bool:
 
 
 def solution(system: System) -> Solution:
-    """qdd by the tensions. Raises UnsuitedError where the system is not of this kind."""
-    most = 2 * len(system.q)  # velocities; with more there are more tensions than coordinates
+    """qdd by the multipliers. Raises UnsuitedError where the system is not of this kind."""
+    most = 2 * len(system.q)  # velocities; with more there are more multipliers than coordinates
     speeds = system.kinetic.atoms(dot) | (system.kinetic.free_symbols & {*system.qd})
     if len(speeds) > most:
         raise UnsuitedError(f"{len(speeds)} velocities in K, more than {most}")
@@ -79,7 +79,7 @@ def solution(system: System) -> Solution:
 
 
 class _Links:
-    """The points, increments and groups of a system, and the equations of its tensions."""
+    """The points, increments and groups of a system, and the equations of its multipliers."""
 
     def __init__(self, system: System, e: Energies) -> None:
         self.system = system
@@ -107,7 +107,7 @@ class _Links:
         self.near = {(self.group_of[a], self.group_of[b]) for a, b in self.T}
 
     def _moves(self, symbol: Symbol) -> bool:
-        """Whether it hangs on coordinates, not on time alone."""
+        """Whether it depends on coordinates, not on time alone."""
         return self.tape.stage[symbol] > Stage.TIME
 
     def _dot(self, a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
@@ -124,7 +124,7 @@ class _Links:
         speeds, places = [*e.points, *self.system.qd], [*e.points.values(), *q]
         stop, kinetic = frozenset(e.points), [(e.kinetic, S.One)]
         if any(x != 0 for x in self.tape.gradient(kinetic, q, stop)):
-            raise UnsuitedError("masses that hang on coordinates")
+            raise UnsuitedError("masses that depend on coordinates")
         momenta = self.tape.gradient(kinetic, speeds, stop)
         return [
             Point(place, speed, self._mass(momentum, speed))
@@ -148,7 +148,7 @@ class _Links:
     def _sum_of(self, atom: Expr) -> dict[Symbol, Expr]:
         """The atom as a sum of names known after the parameters, each times what these decide.
 
-        What hangs on parameters alone does not move, and is left out.
+        What depends on parameters alone does not move, and is left out.
         """
         for symbol in self.tape.live([atom]):  # in order, so that nothing recurses
             if symbol not in self.sums:
@@ -179,7 +179,7 @@ class _Links:
         return {symbol: S.One}
 
     def _groups(self) -> list[Group]:
-        """The increments by the angle that they hang on; as many angles as coordinates."""
+        """The increments by the angle that they depend on; as many angles as coordinates."""
         members: dict[tuple[Expr, ...], dict[int, Expr]] = {}
         for a, increment in enumerate(self.increments):
             slopes = [split(x) for x in self.tape.gradient([(increment, S.One)], self.system.q)]
@@ -187,17 +187,19 @@ class _Links:
             last, name = slopes[on[-1]]
             if any(slopes[k][1] != name for k in on):
                 found = ", ".join(self.system.q[k].name for k in on)
-                raise UnsuitedError(f"a position hangs on {found} otherwise than on a sum of them")
+                raise UnsuitedError(
+                    f"a position depends on {found} otherwise than on a sum of them"
+                )
             direction = tuple(factor / last for factor, _ in slopes)
             if not all(c.is_Rational for c in direction):
-                raise UnsuitedError("a position hangs on a sum with irrational weights")
+                raise UnsuitedError("a position depends on a sum with irrational weights")
             slope = last if name is None else self.tape.scaled(last, name)
             members.setdefault(direction, {})[a] = slope
         n = len(self.system.q)
         if len(self.increments) == len(members):
             raise UnsuitedError("no links")
         if len(members) != n:
-            raise UnsuitedError(f"positions hang on {len(members)} angles, of {n} coordinates")
+            raise UnsuitedError(f"positions depend on {len(members)} angles, of {n} coordinates")
         return [self._group(direction, found) for direction, found in members.items()]
 
     def _group(self, direction: tuple[Expr, ...], found: Mapping[int, Expr]) -> Group:
@@ -214,7 +216,7 @@ class _Links:
         constant = [k for k, x in enumerate(slopes) if self.tape.stage_of(x) <= Stage.PARAMETER]
         if not constant:
             if len(slopes) == 1:
-                raise UnsuitedError("a position that hangs on an angle along one direction only")
+                raise UnsuitedError("a position that depends on an angle along one direction only")
             raise UnsuitedError(f"{len(slopes)} increments on one angle, none of them steady")
         one = constant[0]
         self.divisors.append(slopes[one])
@@ -273,7 +275,7 @@ class _Links:
         return at, on
 
     def _free(self, forces: Sequence[Expr]) -> list[Expr]:
-        """B (M^-1 F - ddd): edd without tensions and forces on angles."""
+        """B (M^-1 F - ddd): edd without multipliers and forces on angles."""
         tape, free = self.tape, []
         for point, force, terms in zip(self.points, forces, self.driven, strict=True):
             rates = tape.forward(tape.forward(list(terms), {t: S.One}), {t: S.One})
@@ -313,10 +315,10 @@ class _Links:
                 return self.tape.times(first, self._dot(x, y))
         return self._dot(x, [self._dot(row, y) for row in T])
 
-    # --- the tensions ----------------------------------------------------------------------------
+    # --- the multipliers -------------------------------------------------------------------------
 
     def solution(self) -> Solution:
-        """qdd; each of its pivots belongs to a tension, or is what something was divided by."""
+        """qdd; each of its pivots belongs to a multiplier, or is what something was divided by."""
         tape, groups, near = self.tape, self.groups, self.near
         forces, loads = self._forces()
         free = self._free(forces)
@@ -330,7 +332,7 @@ class _Links:
         rows = [(g, n) for g, group in enumerate(groups) for n in group.across]
 
         def given(g: int, x: Vector) -> list[Expr]:
-            """x . edd for a row x on group g, as far as it does not hang on tensions."""
+            """x . edd for a row x on group g, without the multipliers' part."""
             pushed = [
                 tape.times(self._through(g, x, h, slopes[h]), push)
                 for h, push in enumerate(pushes)
@@ -346,14 +348,12 @@ class _Links:
             tape.total([self._dot(x, groups[g].beta), *map(self._less, given(g, x))])
             for g, x in rows
         ]
-        order, tensions, pivots = solve(
-            tape, matrix, right, kept=tape.whole, prompt=is_prompt(self.system)
-        )
+        solved = solve(tape, matrix, right, kept=tape.whole, prompt=is_prompt(self.system))
         turning = []
         for g, (u, square) in enumerate(zip(slopes, squares, strict=True)):
             drawn = [
-                tape.times(self._through(g, u, h, y), tension)
-                for (h, y), tension in zip(rows, tensions, strict=True)
+                tape.times(self._through(g, u, h, y), multiplier)
+                for (h, y), multiplier in zip(rows, solved.acceleration, strict=True)
                 if (g, h) in near
             ]
             whole = [*drawn, *given(g, u), self._less(self._dot(u, groups[g].beta))]
@@ -363,8 +363,8 @@ class _Links:
             for row in back
         )
         names = [max(k for k, c in enumerate(groups[g].direction) if c != 0) for g, _ in rows]
-        by_row = tuple(names[k] for k in order)
-        return Solution(tape, acceleration, by_row, (*pivots, *self._nonzero()), "S")
+        by_row = tuple(names[k] for k in solved.order)
+        return Solution(tape, acceleration, by_row, (*solved.pivots, *self._nonzero()), "S")
 
     def _through_rows(self, back: Sequence[Vector], loads: Sequence[Expr]) -> list[Expr]:
         """Forces on the angles from those on the coordinates."""

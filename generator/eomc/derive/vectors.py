@@ -1,0 +1,73 @@
+"""Vectors of space whose entries are atoms of a tape."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sympy import Expr, S
+
+from eomc.derive.tape import Tape
+
+Vector = tuple[Expr, Expr, Expr]
+
+ZERO: Vector = (S.Zero, S.Zero, S.Zero)
+AXES = ((1, 2), (2, 0), (0, 1))  # the other two of each axis, in their turning order
+
+
+class Vectors:
+    """Sums and products that leave out what is zero."""
+
+    def __init__(self, tape: Tape) -> None:
+        self.tape = tape
+
+    def define(self, e: Expr) -> Expr:
+        """The atom of an expression."""
+        return self.tape.define(e)
+
+    def add(self, *terms: Expr) -> Expr:
+        """Their sum."""
+        return self.tape.total([x for x in terms if x is not S.Zero])
+
+    def times(self, a: Expr, b: Expr) -> Expr:
+        """a b"""
+        return S.Zero if a is S.Zero or b is S.Zero else self.tape.times(a, b)
+
+    def minus(self, a: Expr) -> Expr:
+        """-a"""
+        return self.tape.scaled(S.NegativeOne, a)
+
+    def vector(self, v: Sequence[Expr]) -> Vector:
+        """The atoms of a vector."""
+        x, y, z = map(self.define, v)
+        return (x, y, z)
+
+    def plus(self, *vectors: Vector) -> Vector:
+        """Their sum."""
+        x, y, z = (self.add(*parts) for parts in zip(*vectors, strict=True))
+        return (x, y, z)
+
+    def dot(self, a: Vector, b: Vector) -> Expr:
+        """a . b"""
+        return self.add(*(self.times(x, y) for x, y in zip(a, b, strict=True)))
+
+    def cross(self, a: Vector, b: Vector) -> Vector:
+        """a x b"""
+        x, y, z = (
+            self.add(self.times(a[i], b[j]), self.minus(self.times(a[j], b[i]))) for i, j in AXES
+        )
+        return (x, y, z)
+
+    def apply(self, R: Sequence[Vector], v: Vector) -> Vector:
+        """R v"""
+        x, y, z = (self.dot(row, v) for row in R)
+        return (x, y, z)
+
+    def applied_transposed(self, R: Sequence[Vector], v: Vector) -> Vector:
+        """R^T v"""
+        x, y, z = (self.dot(column, v) for column in zip(*R, strict=True))
+        return (x, y, z)
+
+    def scaled(self, v: Vector, x: Expr) -> Vector:
+        """x v"""
+        a, b, c = (self.times(e, x) for e in v)
+        return (a, b, c)

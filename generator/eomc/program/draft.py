@@ -1,0 +1,110 @@
+"""Right-hand sides of one function, while they are being put in order."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+
+from eomc.derive.tape import Stage
+from eomc.program.ir import Assignment, Operand, Product, Sum, Value, renamed_value
+
+
+class Draft:
+    """Values by name, with the stage and the wished-for name of each."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, Value] = {}
+        self.stages: dict[str, Stage] = {}
+        self.hints: dict[str, str] = {}
+        self.known: dict[Value, str] = {}
+        self.made = 0
+
+    def new(self, value: Value) -> str:
+        """The name of a value, made up where it has none."""
+        if value not in self.known:
+            self.made += 1
+            self.put(f"_n{self.made:06d}", value)
+        return self.known[value]
+
+    def put(self, name: str, value: Value) -> None:
+        """Set what a name stands for."""
+        old = self.values.get(name)
+        if old is not None:
+            if old == value:
+                return
+            if self.known.get(old) == name:
+                del self.known[old]
+        self.values[name] = value
+        self.known.setdefault(value, name)
+        self.stages[name] = self.stage(value)
+
+    def stage(self, value: Value) -> Stage:
+        """When a value becomes known."""
+        return max((self.stages[n] for n in value.names), default=Stage.NUMBER)
+
+    def uses(self, ends: Iterable[Operand]) -> Counter[str]:
+        """How often each name is read."""
+        uses: Counter[str] = Counter(o.name for o in ends if o.name)
+        for value in self.values.values():
+            uses.update(value.names)
+        return uses
+
+    def drop(self, ends: Iterable[Operand]) -> None:
+        """Remove what no end needs; replace plain aliases by what they stand for."""
+        needed: set[str] = set()
+        queue = [o.name for o in ends if o.name]
+        while queue:
+            name = queue.pop()
+            if name in self.values and name not in needed:
+                needed.add(name)
+                queue.extend(self.values[name].names)
+        self.values = {n: v for n, v in self.values.items() if n in needed}
+        self.known = {v: n for n, v in reversed(self.values.items())}
+
+    def sort(self) -> None:
+        """Definitions before their uses, stages anew."""
+        self.values = {name: self.values[name] for name in _in_order(self.values)}
+        for name, value in self.values.items():
+            self.stages[name] = self.stage(value)
+
+    def assignments(self, ends: list[Operand]) -> list[Assignment]:
+        """The values by stage and then in order; aliases are gone."""
+        aliases: dict[str, Operand] = {}
+        for name, value in self.values.items():
+            single: Operand | None = None
+            if isinstance(value, Product) and len(value.factors) == 1:
+                single = Operand(value.coefficient, value.factors[0])
+            elif isinstance(value, Sum) and len(value.terms) == 1 and value.constant == 0:
+                single = Operand(*value.terms[0])
+            if single is not None and single.coefficient == 1:
+                aliases[name] = aliases.get(single.name, single)
+
+        def real(name: str) -> str:
+            return aliases[name].name if name in aliases else name
+
+        for name, value in list(self.values.items()):
+            self.values[name] = renamed_value(value, real)
+        ends[:] = [Operand(o.coefficient, real(o.name)) for o in ends]
+        self.hints = {real(n): h for n, h in self.hints.items()}
+        for alias in aliases:
+            del self.values[alias]
+        self.drop(ends)
+        self.sort()
+        ordered = [Assignment(n, v, self.stages[n]) for n, v in self.values.items()]
+        return sorted(ordered, key=lambda a: a.stage)
+
+
+def _in_order(values: Mapping[str, Value]) -> list[str]:
+    """Names so that each stands after those it is made of, otherwise as they came."""
+    done: dict[str, None] = {}
+    for start in values:
+        stack = [start]
+        while stack:
+            name = stack[-1]
+            missing = [n for n in values[name].names if n in values and n not in done]
+            if missing:
+                stack.extend(reversed(missing))
+            else:
+                done.setdefault(name)
+                stack.pop()
+    return list(done)

@@ -1,0 +1,119 @@
+"""Functions evaluated in Python, in doubles or in forty digits, and states to evaluate them at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import mpmath
+from sympy import Rational
+
+from eomc.model.system import System, t
+from eomc.program.ir import Function, Operand, Product, Sum
+
+_NAMES = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt".split()
+
+_DOUBLES: Mapping[str, Callable[..., Any]] = {
+    **{name: getattr(math, name) for name in _NAMES},
+    "number": float,
+    "pow": math.pow,
+    "abs": abs,
+    "sign": lambda x: (x > 0) - (x < 0),
+    "heaviside": lambda x: 0.5 + 0.5 * ((x > 0) - (x < 0)),
+    "min": min,
+    "max": max,
+    "reciprocal": lambda x: 1 / x,
+}
+
+
+def _many_digits() -> Mapping[str, Callable[..., Any]]:
+    """The same in 40 digits."""
+    mp = mpmath.mp.clone()
+    mp.dps = 40
+    return {
+        **_DOUBLES,
+        **{name: getattr(mp, name) for name in _NAMES},
+        "number": lambda x: mp.mpf(x.p) / x.q if isinstance(x, Rational) else mp.mpf(x.evalf(40)),
+        "pow": mp.power,
+    }
+
+
+def evaluate(
+    function: Function, values: Mapping[str, float], exact: bool = False, unit: float = 2.0**-52
+) -> tuple[list[float], bool]:
+    """The results of a function, and whether every pivot is positive, beyond rounding by `unit`.
+
+    values: coordinates, velocities, parameters, inputs and t by name. In Python floats, or in 40
+    digits and then rounded where `exact`. Raises ArithmeticError or ValueError where a result is
+    not a finite, real number.
+    """
+    return evaluator(function, exact, unit)(values)
+
+
+def evaluator(
+    function: Function, exact: bool = False, unit: float = 2.0**-52
+) -> Callable[[Mapping[str, float]], tuple[list[float], bool]]:
+    """`evaluate` of one function for many states: its numbers are converted once."""
+    of = _many_digits() if exact else _DOUBLES
+    number = lru_cache(maxsize=None)(of["number"])  # most are 1 and -1
+
+    def atom(o: Operand) -> tuple[Any, str]:
+        return number(o.coefficient), o.name
+
+    steps: list[tuple[str, Callable[..., Any], Any, Sequence[Any]]] = []
+    for a in (*function.early, *function.body):
+        v = a.value
+        if isinstance(v, Sum):
+            terms = [(number(w), n) for w, n in v.terms]
+            steps.append((a.name, _added, number(v.constant), terms))
+        elif isinstance(v, Product):
+            steps.append((a.name, _multiplied, number(v.coefficient), v.factors))
+        else:
+            steps.append((a.name, _called, of[v.function], [atom(o) for o in v.args]))
+    outputs = [atom(o) for o in function.outputs]
+    checks = [(atom(pivot), atom(diagonal)) for pivot, diagonal in function.checks]
+    tolerance = 8 * unit * max(1, len(checks))
+
+    def evaluated(values: Mapping[str, float]) -> tuple[list[float], bool]:
+        known: dict[str, Any] = {"": 1, **values}  # a number alone has no name
+        for name, do, first, rest in steps:
+            known[name] = do(known, first, rest)
+        try:
+            results = [float(c * known[n]) for c, n in outputs]
+        except TypeError:  # a complex number
+            raise ValueError(f"{function.name} is not real") from None
+        if not all(map(math.isfinite, results)):
+            raise ValueError(f"{function.name} is not finite")
+        return results, all(
+            c * known[n] > (0 if (c, n) == (e, m) else tolerance * (e * known[m]))
+            for (c, n), (e, m) in checks
+        )
+
+    return evaluated
+
+
+def _added(known: Mapping[str, Any], constant: Any, terms: Sequence[tuple[Any, str]]) -> Any:
+    return sum([w * known[n] for w, n in terms], constant)
+
+
+def _multiplied(known: Mapping[str, Any], coefficient: Any, factors: Sequence[str]) -> Any:
+    return math.prod([known[n] for n in factors], start=coefficient)
+
+
+def _called(known: Mapping[str, Any], do: Callable[..., Any], args: Sequence[Any]) -> Any:
+    return do(*[c * known[n] for c, n in args])
+
+
+def nearby(system: System, k: int) -> dict[str, float]:
+    """Values by name of the k-th of some states around the start (0: the start itself)."""
+    out = {p.name: p.value for p in system.parameters} | {t.name: 0.0}
+    for i, c in enumerate(system.coordinates):
+        # steps in directions that have nothing to do with one another, short as they are printed
+        out[c.name] = (
+            float(f"{c.start + 0.37 * k * math.sin(1.0 + i + 2.3 * k):.6g}") if k else c.start
+        )
+        rate = c.rate + 0.53 * k * math.cos(0.7 + i + 1.9 * k)
+        out[f"{c.name}_dot"] = float(f"{rate:.6g}") if k else c.rate
+    return out

@@ -1,0 +1,174 @@
+"""The registry of routes: every way to compute what the equations of motion say.
+
+A new route is a function of the `Material`, here or in derive/, and its entry in `ROUTES`; which
+route a function takes is decided by admissible.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from sympy import Expr
+
+from eomc.derive.equations import Equations
+from eomc.derive.lagrange import Derivation
+from eomc.derive.ldl import Rows, Way, solve
+from eomc.derive.link_multipliers import is_prompt
+from eomc.derive.tape import Tape
+from eomc.model.system import System
+from eomc.program.polynomial import Expander
+
+
+class Material:
+    """What routes are made of: a derivation, and Lagrange's equations multiplied out."""
+
+    def __init__(self, derived: Derivation) -> None:
+        self.derived = derived
+        self.lagrange = derived.lagrange
+        self.expander = Expander(derived.lagrange.tape) if derived.lagrange else None
+
+    @cached_property
+    def expanded(self) -> tuple[Tape, Rows, Sequence[Expr]] | None:
+        """D and b of D qdd = b, multiplied out on a tape; None where they grow too large."""
+        if self.lagrange is None or self.expander is None:
+            return None
+        D, n = self.lagrange.D, len(self.lagrange.bias)
+        lower = [(i, j) for i in range(n) for j in range(i + 1)]
+        both = self.expander.expand([*(D[i][j] for i, j in lower), *self.lagrange.balance])
+        if both is None:
+            return None
+        entries = dict(zip(lower, both, strict=False))
+        rows = tuple(tuple(entries[max(i, j), min(i, j)] for j in range(n)) for i in range(n))
+        return self.lagrange.tape, rows, both[len(lower) :]
+
+
+@dataclass(frozen=True)
+class Functions:
+    """Results of functions by name, on a tape; notes: where unusual terms of K went."""
+
+    tape: Tape
+    outputs: Mapping[str, Sequence[Expr]]
+    notes: tuple[str, ...]
+
+
+def _by_ldl(_: System, order: str) -> str:
+    return f"a = qdd by D = L diag(d) L^T, eliminated in the order {order}."
+
+
+@dataclass(frozen=True)
+class Route:
+    """One way to the accelerations, to the other functions, or to both.
+
+    sentence: what it is, for people. accelerations: qdd, or why it is passed over, or None where
+    there is nothing to try; functions: None likewise. solved: how D qdd = tau - bias is solved,
+    for a comment, with the order in which coordinates are eliminated. penalty: a factor on its
+    weight, for what operations do not count.
+    """
+
+    name: str
+    sentence: str
+    accelerations: Callable[[Material], Way] = lambda _: None
+    functions: Callable[[Material], Functions | None] = lambda _: None
+    solved: Callable[[System, str], str] = _by_ldl
+    penalty: float = 1.0
+
+
+def _functions(e: Equations | None) -> Functions | None:
+    if e is None:
+        return None
+    by_rows = {"D": e.D, "C": e.C}
+    wanted: dict[str, list[Expr]] = {
+        **{
+            name if len(rows) == len(e.g) else f"{name}_column": [x for row in rows for x in row]
+            for name, rows in by_rows.items()
+        },
+        "g": list(e.g),
+        "bias": list(e.bias),
+        "tau": list(e.tau),
+        "kinetic_energy": [e.kinetic],
+        "potential_energy": [e.potential],
+        "energy": [e.tape.define(e.kinetic + e.potential)],
+    }
+    if e.jacobi is not None:
+        wanted["jacobi"] = [e.jacobi]
+    if e.power != 0:
+        wanted["power"] = [e.power]
+    if e.signals:
+        wanted["signal"] = list(e.signals)
+    return Functions(e.tape, wanted, e.notes)
+
+
+def _expanded_functions(material: Material) -> Functions | None:
+    plain = _functions(material.lagrange)
+    if plain is None or material.expander is None:
+        return None
+    expand = material.expander.expand
+    found = {name: expand(outputs) for name, outputs in plain.outputs.items()}
+    outputs = {name: short for name, short in found.items() if short is not None}
+    return replace(plain, outputs=outputs)
+
+
+def _expanded(material: Material) -> Way:
+    return solve(*material.expanded) if material.expanded else None
+
+
+def _cancelled(material: Material) -> Way:
+    if material.expander is None or material.expanded is None:
+        return None
+    return solve(*material.expanded, material.expander.short)
+
+
+def _by_articulated_bodies(_: System, order: str) -> str:
+    return (
+        "a = qdd by articulated bodies (Featherstone), the pivots d being those of "
+        f"D = L diag(d) L^T, eliminated in the order {order}."
+    )
+
+
+def _by_multipliers(system: System, order: str) -> str:
+    fractions = "Along a chain s = N/M: s_k is N there, and S_k is M times the entry it was. "
+    return (
+        "a = qdd by link multipliers (tensions), S = N T N^T = L diag(s) L^T, eliminated in the "
+        f"order of the links of {order}. {fractions if is_prompt(system) else ''}"
+        "Every mass must be positive."
+    )
+
+
+ROUTES: Mapping[str, Route] = {
+    r.name: r
+    for r in (
+        Route(
+            "lagrange",
+            "Lagrange over the program of K and P",
+            lambda m: m.derived.ldl,
+            lambda m: _functions(m.lagrange),
+        ),
+        Route("expanded", "the same, multiplied out", _expanded, _expanded_functions),
+        Route("cancelled", "multiplied out again during elimination", _cancelled),
+        Route(
+            "articulated",
+            "Newton and Euler, articulated bodies",
+            lambda m: m.derived.articulated,
+            solved=_by_articulated_bodies,
+        ),
+        Route(
+            "composite",
+            "Newton and Euler, D of composite bodies, L D L^T",
+            lambda m: m.derived.composite,
+        ),
+        Route(
+            "newton-euler",
+            "Newton and Euler along the tree",
+            functions=lambda m: _functions(m.derived.newton_euler),
+        ),
+        Route(
+            "multipliers",
+            "link multipliers: the tensions of links between point masses",
+            lambda m: m.derived.multipliers,
+            solved=_by_multipliers,
+            penalty=1.25,  # D bears massless links: that is worth a fifth
+        ),
+    )
+}

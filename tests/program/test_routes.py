@@ -1,0 +1,73 @@
+"""Every route of the registry computes the same motion; a new one is tested by its entry."""
+
+from __future__ import annotations
+
+import ast
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cases import scene_system
+
+from eomc.derive.lagrange import derive
+from eomc.derive.ldl import Solution
+from eomc.program.interpret import evaluate, nearby
+from eomc.program.lower import lower
+from eomc.program.routes import ROUTES, Material
+
+SCENES = ("simple_pendulum", "cartpole", "cartpole_bodies", "suspension")
+
+
+@cache
+def solutions(scene: str) -> dict[str, Solution]:
+    material = Material(derive(scene_system(scene)))
+    ways = {route.name: route.accelerations(material) for route in ROUTES.values()}
+    return {name: way for name, way in ways.items() if isinstance(way, Solution)}
+
+
+def test_each_is_good_for_something() -> None:
+    used = {name for scene in SCENES for name in solutions(scene)}
+    material = Material(derive(scene_system("cartpole_bodies")))
+    used |= {r.name for r in ROUTES.values() if r.functions(material)}
+    assert used == ROUTES.keys()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_all_agree_in_forty_digits(scene: str) -> None:
+    system = scene_system(scene)
+    found = {
+        name: lower("acceleration", way.tape, way.acceleration, way.pivots, ())
+        for name, way in solutions(scene).items()
+    }
+    assert len(found) > 1
+    for k in range(3):
+        state = nearby(system, k) | {i.name: 0.7 for i in system.inputs}
+        right, _ = evaluate(found["lagrange"], state, exact=True)
+        for name, function in found.items():
+            ours, regular = evaluate(function, state, exact=True)
+            assert regular, name
+            np.testing.assert_allclose(ours, right, rtol=1e-15, atol=1e-25, err_msg=name)
+
+
+@pytest.mark.parametrize("name", ROUTES)
+def test_a_comment_says_how_d_is_solved(name: str) -> None:
+    route = ROUTES[name]
+    assert route.sentence
+    assert "x, theta" in route.solved(scene_system("cartpole"), "x, theta")
+
+
+def test_no_other_file_compares_their_names() -> None:
+    package = Path(__file__).parents[2] / "generator" / "eomc"
+    files = [f for f in package.rglob("*.py") if f.name != "routes.py"]
+    trees = {f: ast.parse(f.read_text(encoding="utf-8")) for f in files}
+    compared = [
+        (f.name, node.lineno)
+        for f, tree in trees.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Compare)
+        for part in ast.walk(node)
+        if isinstance(part, ast.Constant) and part.value in ROUTES
+    ]
+    assert files
+    assert not compared
