@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from sympy.physics.mechanics import dynamicsymbols
 
 import eomc
 from eomc.base.errors import EomcError
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System, dot
+from eomc.scene.read import parse
 
 SCENES = Path(__file__).parents[2] / "scenes"
 MODULES = Path("build/tests/modules")
@@ -136,10 +139,57 @@ def test_rates_that_nobody_knows_are_refused(inside: sympy.Expr) -> None:
         eomc.sources(system)
 
 
-def test_jumps_in_energies_are_refused() -> None:
-    system = System.make("a", [x], x_dot**2 / 2, x * sympy.sign(x))
-    with pytest.raises(EomcError, match="jumps"):
-        eomc.sources(system)
+@pytest.mark.parametrize("jump", [sympy.sign(x), sympy.Heaviside(x)])
+def test_jumps_in_energies_are_refused_and_the_energy_is_named(jump: sympy.Expr) -> None:
+    with pytest.raises(EomcError, match=r"potential: (sign|Heaviside)\(...\) jumps"):
+        System.make("a", [x], x_dot**2 / 2, x * jump)
+    y = sympy.Symbol("y")
+    with pytest.raises(EomcError, match=r"kinetic: .* jumps"):
+        System.make("a", [x], x_dot**2 * (2 + y), definitions={y: jump})
+    assert System.make("a", [x], x_dot**2 / 2, forces={x: jump}).forces[0] != 0
+
+
+def test_jumps_of_parameters_are_numbers() -> None:
+    a = sympy.Symbol("a")
+    made = System.make("s", [x], x_dot**2 / 2, sympy.sign(a) * x**2, parameters={a: 1})
+    assert made.potential.has(sympy.sign)
+
+
+def test_steps_and_matrices_are_refused() -> None:
+    with pytest.raises(EomcError, match="h: must be greater than zero, here -1"):
+        System.make("a", [x], x_dot**2 / 2, h=-1)
+    with pytest.raises(EomcError, match="kinetic: give one expression, not a matrix of 1 by 1"):
+        System.make("a", [x], sympy.Matrix([x_dot**2 / 2]))
+
+
+@pytest.mark.parametrize(
+    ("key", "more"),
+    [
+        ("run.h", {"h": 1e-60}),
+        ("energy.potential", {"potential": sympy.Float("1e300") * x**2}),
+        ("parameters.m", {"parameters": {sympy.Symbol("m"): 1e39}}),
+    ],
+)
+def test_numbers_that_no_float_can_be(key: str, more: dict[str, Any]) -> None:
+    assert System.make("a", [x], x_dot**2 / 2, **more)
+    with pytest.raises(EomcError, match=f"{key}: .* a float can be"):
+        System.make("a", [x], x_dot**2 / 2, real="float", **more)
+
+
+def test_a_scene_of_floats_says_where_a_number_is_too_large() -> None:
+    text = """eomc = 1
+name = "a"
+[coordinates]
+x = {}
+[energy]
+kinetic = "x_dot**2/2"
+potential = "1e250*x**2"
+[run]
+real = "float"
+h = 1e-60
+"""
+    with pytest.raises(EomcError, match=r"(?s)scene.toml:7.*1e\+250 is more.*:10.*is 1e-60, less"):
+        from_scene(parse(text))
 
 
 @pytest.mark.parametrize("more", [sympy.Abs(x_dot) ** 3, sympy.sqrt(x_dot**2)])

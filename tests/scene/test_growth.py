@@ -129,10 +129,10 @@ HOSTILE: dict[str, tuple[str, str]] = {
         BASE.replace("1.25", "{ value = 1, " + ", ".join(f"d{k} = 1" for k in range(20_000)) + "}"),
         "unknown key",
     ),
-    "dots": (BASE.replace("m = 1.25", "a" + ".a" * 100_000 + " = 1"), "more than 20 parts"),
-    "dots in a header": (BASE + "[a" + ".a" * 100_000 + "]", "more than 20 parts"),
-    "dots in braces": (BASE.replace("1.25", "{a" + ".a" * 100_000 + " = 1}"), "than 20 parts"),
-    "quoted dots": (BASE.replace("m = 1.25", "m" + ".'a'" * 100_000 + " = 1"), "than 20 parts"),
+    "dots": (BASE.replace("m = 1.25", "a" + ".a" * 100_000 + " = 1"), "more than 8 parts"),
+    "dots in a header": (BASE + "[a" + ".a" * 100_000 + "]", "more than 8 parts"),
+    "dots in braces": (BASE.replace("1.25", "{a" + ".a" * 100_000 + " = 1}"), "than 8 parts"),
+    "quoted dots": (BASE.replace("m = 1.25", "m" + ".'a'" * 100_000 + " = 1"), "than 8 parts"),
     "rings": (
         BASE.replace("[energy]", many(lambda k: f'd{k} = "d{k ^ 1}"', 20_000) + "\n[energy]"),
         "circular definition: d0 -> d1 -> d0",
@@ -146,7 +146,7 @@ HOSTILE: dict[str, tuple[str, str]] = {
         BASE.replace("1.25", "[\n" + ("1," * 900 + "\n") * 480 + "]"), "must be a number",
     ),
     "a long key": (BASE.replace("m = ", "m" * 900_000 + " = "), "characters: 40 are the most"),
-    "a digit a million times": (BASE.replace("1.25", "1" * 900_000), "thousands of digits"),
+    "a digit a million times": (BASE.replace("1.25", "1" * 900_000), "hundreds of digits"),
     "digits in a formula": (BASE.replace('"x"', f'"x*{"1" * 9000}"'), "more than 1,000 digits"),
     "digits after a point": (BASE.replace('"x"', f'"x*0.{"1" * 9000}"'), "more than 1,000 digits"),
     "10**10**10": (BASE.replace('"x"', '"10**10**10"'), "an exponent lies between -64 and 64"),
@@ -158,6 +158,18 @@ HOSTILE: dict[str, tuple[str, str]] = {
         BASE.replace("x = {", '"y[i]" = { repeat = "i = 1..1000000000" }\nx = {'),
         "1000000000 is too large for an index",
     ),
+    "bodies": (BASE + "[[body]]\n" * 100_000, "growth.toml:10008:1: error: this is table 10,001"),
+    "headers": (
+        BASE + many(lambda k: f"[h{k}]", 70_000), "a scene has 10,000 at most: write alike ones",
+    ),
+    "keys of 16 parts": (
+        BASE.replace("m = 1.25", many(lambda k: f"k{k}{'.a' * 15} = 1", 22_000)),
+        "growth.toml:6:1: error: a key has more than 8 parts",
+    ),
+    "keys of 8 parts": (
+        BASE.replace("m = 1.25", many(lambda k: f"k{k}{'.a' * 7} = 1", 22_000)), "unknown table",
+    ),
+    "9,000 bodies": (BASE + "[[body]]\n" * 9_000, "body.1.name: missing"),
     "100 megabytes": (BASE + "#" * 100_000_000, "more than the 1000000 bytes"),
 }  # fmt: skip
 

@@ -437,3 +437,14 @@ def test_registers_are_as_wide_as_loops_have_use_for(
     assert compiler.flags(wide=made.wide)[-1] == f"-mprefer-vector-width={width}"
     monkeypatch.setattr(compiler, "processor", lambda: "flags : fma avx2")
     assert compiler.flags(wide=made.wide) == compiler.FLAGS
+
+
+def test_a_relative_root_survives_another_current_folder(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python caches a finder for each path; that of a relative one looked in the old folder."""
+    for place in ("one", "other"):
+        (tmp_path / place).mkdir()
+        monkeypatch.chdir(tmp_path / place)
+        assert eomc.load(scene, "build").g([1.0]).size == 1
+        scene.write_text(CHANGED, encoding="utf-8")

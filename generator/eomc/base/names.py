@@ -77,6 +77,9 @@ def plain(name: str) -> str:
 
 def fault(name: str) -> str | None:
     """Why `name` can't be used in a scene, with a remedy; None where it can."""
+    if len(name) > 10 * MAX_LENGTH:
+        shown = f"{name[:MAX_LENGTH]}..."
+        return f"'{shown}' has {len(name)} characters: {MAX_LENGTH} are the most, for readable C"
     if name in _WHY:
         better = _BETTER.get(name, f"{name}_1")
         return f"'{name}' is {_WHY[name]}: choose another name, such as {better}"

@@ -131,8 +131,8 @@ def from_scene(scene: Scene) -> System:
         place=scene.problem,
         scene=scene,
     )
-    if made.problems:
-        raise SceneError(made.problems)
+    if faults := made.problems or system.beyond_float():
+        raise SceneError(faults)
     return system
 
 

@@ -123,12 +123,18 @@ class Maker:
         if unknown:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
         expression = self._expression
-        made_of: dict[str, Any] = {
-            "name": self.name,
-            "coordinates": tuple(made),
+        energies = {
             "kinetic": expression(kinetic, "kinetic"),
             "potential": expression(potential, "potential"),
             "dissipation": expression(dissipation, "dissipation"),
+        }
+        fixed = {p.symbol for p in declared}
+        for role, energy in energies.items():
+            given.check_smooth(energy, role, dict(ordered), fixed)
+        made_of: dict[str, Any] = {
+            "name": self.name,
+            "coordinates": tuple(made),
+            **energies,
             "forces": tuple(expression(forces.get(c, 0), f"force on {c}") for c in starts),
             "parameters": tuple(declared),
             "inputs": tuple(

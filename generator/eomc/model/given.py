@@ -46,6 +46,9 @@ def expression(given: Any, role: str) -> Expr:
         expr = sympy.sympify(given)
     except (sympy.SympifyError, TypeError, AttributeError):
         expr = None
+    if isinstance(expr, (sympy.MatrixBase, sympy.MatrixExpr)):
+        rows, columns = expr.shape
+        raise fault(role, f"give one expression, not a matrix of {rows} by {columns}: its entry")
     if not isinstance(expr, Expr):
         raise fault(role, f"{given!r} is not an expression")
     return expr
@@ -64,6 +67,28 @@ def check_functions(expr: Expr, role: str) -> None:
         more = [arg for arg in part.args if arg not in seen]
         seen.update(more)
         queue += more
+
+
+def check_smooth(expr: Expr, role: str, definitions: Mapping[Symbol, Expr], fixed: Any) -> None:
+    """Raise EomcError where `expr`, which is differentiated, has a function that jumps.
+
+    fixed: symbols that do not vary, in which such functions do not jump.
+    """
+    queue, seen = [expr], {expr}
+    while queue:
+        part = queue.pop()
+        for jump in part.atoms(sympy.sign, sympy.Heaviside):
+            if jump.free_symbols - fixed:
+                name = type(jump).__name__
+                raise fault(
+                    role,
+                    f"{name}(...) jumps, and the {role} energy is differentiated: use Abs, Min or "
+                    "Max (Max(x, 0)**2 for a stop), a smooth tanh(x/width), or give the force "
+                    "itself in forces",
+                )
+        more = [definitions[s] for s in part.free_symbols if s in definitions]
+        queue += [e for e in more if e not in seen]
+        seen.update(more)
 
 
 def number(given: Any, role: str) -> float:

@@ -13,11 +13,13 @@ from typing import Any
 import sympy
 from sympy import Expr, Symbol
 
-from eomc.base.errors import Problem
+from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
 from eomc.model.multibody import Tree
 from eomc.model.symbols import Coordinate, Input, Parameter, dot, symbol, t
 from eomc.scene.scene import Run, Scene
+
+LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision, in C
 
 __all__ = ["Coordinate", "Input", "Parameter", "System", "dot", "symbol", "t"]
 
@@ -120,4 +122,31 @@ class System:
             coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
             inputs, definitions or {}, units or {}, title, run,
         )  # fmt: skip
-        return cls(**parts)
+        system = cls(**parts)
+        if faults := system.beyond_float():
+            raise SceneError(faults)
+        return system
+
+    def beyond_float(self) -> list[Problem]:
+        """Faults of numbers that a system in single precision can't have."""
+        if self.run.real != "float":
+            return []
+        faults = []
+        if self.run.h < LEAST_FLOAT:
+            why = f"is {self.run.h:g}, less than a float can be: take a larger step, or real double"
+            faults.append(self.problem("run.h", why))
+        numbers = [(f"parameters.{p.name}", sympy.Float(p.value)) for p in self.parameters]
+        expressions: list[tuple[str, Expr]] = [
+            *((f"definitions.{s}", e) for s, e in self.definitions),
+            ("energy.kinetic", self.kinetic),
+            ("energy.potential", self.potential),
+            ("energy.dissipation", self.dissipation),
+            *((f"forces.{c.name}", e) for c, e in zip(self.coordinates, self.forces, strict=True)),
+            *((f"inputs.{i.name}.signal", i.signal) for i in self.inputs),
+        ]
+        numbers += [(key, n) for key, e in expressions for n in e.atoms(sympy.Number)]
+        for key, n in numbers:
+            if abs(n) > LARGEST_FLOAT:
+                why = f"{float(n):g} is more than a float can be: use other units, or real double"
+                faults.append(self.problem(key, why))
+        return faults

@@ -13,7 +13,10 @@ from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.scene import messages
 
 MAX_BYTES = 1_000_000
-MOST_PARTS = 20  # of a key, a.b.c; tomllib takes memory by their square
+MOST_PARTS = 8  # of a key, a.b.c; tomllib takes memory by their square
+MOST_TABLES = 10_000  # headers, [table] or [[body]]: more take seconds to check
+
+_HEADER = re.compile(r"^[ \t]*\[[^\],\n]*\]\]?[ \t]*(?:#.*)?$", re.MULTILINE)
 
 _TEXTS = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'')
 _PARTS = re.compile(rf"\s*[\w-]+(?:\s*\.\s*[\w-]+){{{MOST_PARTS},}}\s*", re.ASCII)
@@ -64,6 +67,15 @@ def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
     if line := long_key(text):
         message = f"a key has more than {MOST_PARTS} parts: a scene's have three, a.b.c, at most"
         source = text.split("\n")[line - 1].rstrip()
+        raise SceneError([Problem(message, "", file, line, 0, len(source), source)])
+    headers = [found.start() for found in _HEADER.finditer(text)]
+    if len(headers) > MOST_TABLES:
+        line = text.count("\n", 0, headers[MOST_TABLES]) + 1
+        source = text.split("\n")[line - 1].rstrip()
+        message = (
+            f"this is table {MOST_TABLES + 1:,} of {len(headers):,}, and a scene has "
+            f'{MOST_TABLES:,} at most: write alike ones once, with repeat = "i = 1..n"'
+        )
         raise SceneError([Problem(message, "", file, line, 0, len(source), source)])
     try:
         tree = tomllib.loads(text)

@@ -201,12 +201,13 @@ def _build(
 
 def load(built: Built) -> ModuleType:
     """Import a built module, whatever else bears its name; the same build gives the same module."""
-    manifest = json.loads((built.folder / MANIFEST).read_text(encoding="utf-8"))
+    folder = built.folder.resolve()  # Python caches finders by path, whatever the current folder
+    manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     alias = f"_eomc_{built.name}_{manifest['key'][:12]}"
     if alias in sys.modules:
         return sys.modules[alias]
     spec = importlib.util.spec_from_file_location(
-        alias, built.folder / "__init__.py", submodule_search_locations=[str(built.folder)]
+        alias, folder / "__init__.py", submodule_search_locations=[str(folder)]
     )
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
