@@ -1,4 +1,4 @@
-"""csrc/quadrants.h, turn.h: sines for loops are those of sincos.h, and turning adds a rounding."""
+"""csrc/sincos/: quadrants.h has the bits of sincos.h, incremental.h adds one rounding."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-CSRC = Path(__file__).resolve().parents[2] / "csrc"
+CSRC = Path(__file__).resolve().parents[2] / "csrc" / "sincos"
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 
 LOOPS = """
 #include "sincos$.h"
 #include "quadrants$.h"
-#include "turn$.h"
+#include "incremental$.h"
 
 void plain(long n, const real *x, real *s, real *c)
 {

@@ -21,6 +21,8 @@ from eomc.program import program
 from eomc.program.trig import apart
 from eomc.scene import scene
 
+CSRC = ROOT / "csrc" / "sincos"
+
 ODD = """
 eomc = 1
 name = "odd"
@@ -143,7 +145,7 @@ def test_a_wide_angle_goes_to_libm(tmp_path: Path) -> None:
 def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
     """near.h in units of rounding of 1, from exact sines, up to its bound and beyond."""
     compiler = needs("gcc")
-    headers = [(ROOT / "csrc" / f).read_text(encoding="utf-8") for f in ("sincos.h", "near.h")]
+    headers = [(CSRC / f).read_text(encoding="utf-8") for f in ("sincos.h", "with_fallback.h")]
     main = r"""
     #include <stdio.h>
     int main(void)
@@ -192,8 +194,8 @@ def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
 def test_sines_near_what_was_foretold_are_sines(vectors: bool, tmp_path: Path) -> None:
     """foretold.h in units of rounding of 1, in vector registers and without, up to its bounds."""
     compiler = needs("gcc")
-    names = "sincos.h", "foretold.h", "foretold_both.h"
-    text = "\n".join((ROOT / "csrc" / f).read_text(encoding="utf-8") for f in names)
+    names = "sincos.h", "predicted.h", "predicted_both.h"
+    text = "\n".join((CSRC / f).read_text(encoding="utf-8") for f in names)
     if not vectors:
         text = text.replace("#ifdef __GNUC__", "#if 0")
     main = r"""

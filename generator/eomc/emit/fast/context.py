@@ -197,12 +197,12 @@ def _csrc(target: Target, turned: int, lanes: bool, pairs: bool) -> list[str]:
     """The hand-written C that this scene needs, under its own prefix."""
     suffix = target.real.function_suffix
     files = [
-        *([f"sincos{suffix}.h"] if target.sincos else []),
-        *(["near.h", "foretold.h"] if turned else []),
-        *(["foretold_both.h"] if turned > 1 else []),
-        *([f"quadrants{suffix}.h"] if target.sincos and target.system.run.batch else []),
-        *([f"turn{suffix}.h"] if lanes or pairs else []),
-        *(["around.h", "beside.h"] if pairs else []),
+        *([f"sincos/sincos{suffix}.h"] if target.sincos else []),
+        *(["sincos/with_fallback.h", "sincos/predicted.h"] if turned else []),
+        *(["sincos/predicted_both.h"] if turned > 1 else []),
+        *([f"sincos/quadrants{suffix}.h"] if target.sincos and target.system.run.batch else []),
+        *([f"sincos/incremental{suffix}.h"] if lanes or pairs else []),
+        *(["sincos/triple.h", "vector/interleave.h"] if pairs else []),
     ]
     texts = [resources.text("csrc", file).replace("#include <math.h>\n", "") for file in files]
     if pairs and target.sincos:  # loops have sines of their own, and compilers a third less to do

@@ -53,7 +53,7 @@ def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any
     if not turned:
         return None
     P, f = target.prefix, target.real.function_suffix
-    # what turn_both and turn of csrc/turn.h, turnf.h are good for
+    # what turn_both and turn of csrc/sincos/incremental.h, incrementalf.h are good for
     both_by, by = (0.125, 0.015625) if target.real is DOUBLE else (0.25, 0.0625)
     vector = f"{P}_vector"
 
