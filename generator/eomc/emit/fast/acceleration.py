@@ -90,7 +90,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
         "newton": any(METHODS[name].newton for name in s.run.methods),
         "angles": rotations.scalar(target, turned),
-        "foretold": predicted_angles.steps(target, turned, rest.uses, scalar, c, p),
+        "predicted": predicted_angles.steps(target, turned, rest.uses, scalar, c, p),
         "turned": len(turned),
         "pairs": scalar["pairs"],
         "fabs": "fabs" + target.real.function_suffix,

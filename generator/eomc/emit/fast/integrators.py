@@ -171,8 +171,8 @@ def _implicit(
         "c": [literal(x, real) for x in m.c],
         "A": matrix(m.a),
         "AA": matrix(m.a_squared),
-        "ahead": matrix(m.ahead),
-        "guess": " + ".join(f"ahead[i][{j}]*m->a[{j}][k]" for j in range(s)),
+        "extrapolation": matrix(m.ahead),
+        "guess": " + ".join(f"extrapolation[i][{j}]*m->a[{j}][k]" for j in range(s)),
         "gathered": _start(target, arrays),
         "stage": [
             f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*({total('AA[i]')}));",
@@ -226,8 +226,8 @@ def _side_by_side(
         "c": [literal(x, real) for x in m.c],
         "A": by_stage(m.a),
         "AA": by_stage(m.a_squared),
-        "A_ahead": by_stage(m.a_ahead),
-        "AA_ahead": by_stage(m.a_squared_ahead),
+        "A_extrapolated": by_stage(m.a_ahead),
+        "AA_extrapolated": by_stage(m.a_squared_ahead),
         "sweep_arguments": arguments(
             f"{stages} *{alone} b", f"const {stages} *{alone} a",
             f"const {P}_{m.name}_sums *w", rest,

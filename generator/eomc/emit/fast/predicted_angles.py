@@ -1,7 +1,7 @@
-"""Steps of RK4 whose angles are foretold, as their template wants them.
+"""Steps of RK4 with predicted angles, for their template.
 
-Sines and cosines at two angles near which a step will come are computed in the step before, while
-a processor waits for its accelerations, and turned by the little that is missing.
+The sines and cosines at two predicted angles are computed one step before, while the processor
+waits for accelerations, and rotated by the small difference.
 """
 
 from __future__ import annotations
@@ -50,11 +50,14 @@ def steps(
         given = arguments(u, time if target.signal_t else "", target.p_call)
         return f"{P}_signal({given});"
 
-    def turn(known: str, distance: str, s: str) -> list[str]:
-        return [
-            f"{P}_turn_on({distance.format(k=k, a1=of('a1', a), a2=of('a2', a), sum=of('sum', a))}"
-            f", &{known}_known[{k}], &{s}.{a.sine}, &{s}.{a.cosine}, &far);"
+    def turn(time: str, distance: str, s: str) -> list[str]:
+        by = [
+            distance.format(k=k, a1=of("a1", a), a2=of("a2", a), sum=of("sum", a))
             for k, a in enumerate(turned)
+        ]
+        return [
+            f"{P}_predicted_rotate({d}, &{time}_terms[{k}], &{s}.{a.sine}, &{s}.{a.cosine}, &far);"
+            for k, (a, d) in enumerate(zip(turned, by, strict=True))
         ]
 
     def at(*lines: str) -> list[str]:
@@ -78,12 +81,15 @@ def steps(
             "&x", "t0, first" if driven else "", "h", "n", "steps", "u_stride" if inputs else "",
             "every", c, p,
         ),
-        "foretell": [
-            f"{P}_foretell(&ahead[{k}], {along(target, a, 'q->', a.offset)}, "
+        "predict": [
+            f"{P}_predict(&predicted[{k}], {along(target, a, 'q->', a.offset)}, "
             f"{along(target, a, 'qd->', S.Zero)}, {along(target, a, 'a->', S.Zero)}, mid, end);"
             for k, a in enumerate(turned)
-        ] + [f"{P}_foretold_both(&ahead[{k}], &ahead[{k + 1}]);" for k in range(0, n - 1, 2)]
-        + [f"{P}_foretold_at(&ahead[{n - 1}]);"] * (n % 2),
+        ] + [
+            f"{P}_predicted_both(&predicted[{k}], &predicted[{k + 1}]);"
+            for k in range(0, n - 1, 2)
+        ]
+        + [f"{P}_predicted_sincos(&predicted[{n - 1}]);"] * (n % 2),
         "timed": driven and (not once or TIME in uses or target.signal_t),
         "once": once,
         "signals_before": [
@@ -97,10 +103,10 @@ def steps(
             line
             for k, a in enumerate(turned)
             for line in (
-                f"{P}_know(&mid_known[{k}], &end_known[{k}], &x.ahead[{k}], &far);",
-                f"to_mid[{k}] = ({of('x.q', a, a.offset)} - x.ahead[{k}].x[0])"
+                f"{P}_predicted_unpack(&mid_terms[{k}], &end_terms[{k}], &x.predicted[{k}], &far);",
+                f"to_mid[{k}] = ({of('x.q', a, a.offset)} - x.predicted[{k}].x[0])"
                 f" + (h_2*{of('x.qd', a)} + {of('x.q_rest', a)});",
-                f"to_end[{k}] = ({of('x.q', a, a.offset)} - x.ahead[{k}].x[1])"
+                f"to_end[{k}] = ({of('x.q', a, a.offset)} - x.predicted[{k}].x[1])"
                 f" + (h*{of('x.qd', a)} + {of('x.q_rest', a)});",
             )
         ],
