@@ -32,26 +32,26 @@ void side_by_side(long n, const real *x, real *s, real *c)
         eomc_sincos$_side_by_side(x[i], &s[i], &c[i]);
 }
 
-void turn(long n, const real *d, real *s, real *c)
+void rotate(long n, const real *d, real *s, real *c)
 {
     for (long i = 0; i < n; i++)
-        eomc_turn$(d[i], s[i], c[i], &s[i], &c[i]);
+        eomc_sincos$_rotate(d[i], s[i], c[i], &s[i], &c[i]);
 }
 
-void turn_on(long n, const real *d, real *s, real *c)
+void rotate_on(long n, const real *d, real *s, real *c)
 {
     real back, back_too;
 
     for (long i = 0; i < n; i++)
-        eomc_turn_both$(d[i], s[i], c[i], &back, &back_too, &s[i], &c[i]);
+        eomc_sincos$_rotate_both(d[i], s[i], c[i], &back, &back_too, &s[i], &c[i]);
 }
 
-void turn_back(long n, const real *d, real *s, real *c)
+void rotate_back(long n, const real *d, real *s, real *c)
 {
     real on, on_too;
 
     for (long i = 0; i < n; i++)
-        eomc_turn_both$(-d[i], s[i], c[i], &s[i], &c[i], &on, &on_too);
+        eomc_sincos$_rotate_both(-d[i], s[i], c[i], &s[i], &c[i], &on, &on_too);
 }
 """
 FLAGS = {"vector": ["-O3", "-march=native"], "scalar": ["-O1", "-fno-tree-vectorize"]}
@@ -100,15 +100,15 @@ def test_sines_for_loops_are_those_of_one_bit_for_bit(library: ctypes.CDLL, real
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize(("way", "widest"), [("turn", 6), ("turn_on", 3), ("turn_back", 3)])
-def test_turning_costs_one_unit_of_rounding(
+@pytest.mark.parametrize(("way", "widest"), [("rotate", 6), ("rotate_on", 3), ("rotate_back", 3)])
+def test_rotating_costs_one_unit_of_rounding(
     library: ctypes.CDLL, real: Any, way: str, widest: int
 ) -> None:
     """Against sums of angles in long double; for float, against double."""
     exact = np.longdouble if real is np.float64 else np.float64
     random = np.random.default_rng(6)
     if real is np.float32:
-        widest -= 2 if way == "turn" else 1
+        widest -= 2 if way == "rotate" else 1
     x = random.uniform(-4, 4, 50_000).astype(exact)
     d = (random.choice([-1, 1], len(x)) * 2.0 ** -random.uniform(widest, 40, len(x))).astype(real)
     d[:3] = 2.0**-widest, -(2.0**-widest), 0.0

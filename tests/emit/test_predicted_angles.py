@@ -1,4 +1,4 @@
-"""Sines that are turned from stage to stage, sums that are compensated, runs that are cut."""
+"""Sines that are rotated from stage to stage, sums that are compensated, runs that are cut."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_angles_that_are_linear_in_coordinates_are_found() -> None:
 
 @pytest.mark.parametrize("h", [0.001, 0.02, 0.3])
 def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path) -> None:
-    """Turns of some 1e-6, 1e-4 and, beyond what is turned, 1e-1."""
+    """Turns of some 1e-6, 1e-4 and, beyond what is rotated, 1e-1."""
     (tmp_path / "odd.toml").write_text(ODD, encoding="utf-8")
     links = range(1, 7)
     coordinates = "".join(f"a{k} = {{ start = {0.3 * k} }}\n" for k in links)
@@ -90,7 +90,7 @@ def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path
 
 
 def test_steps_leave_their_predictions_and_come_back(tmp_path: Path) -> None:
-    """A pole that falls: it turns by h^2 a/8 from the angles predicted, up to 2^-12.5 is near."""
+    """A pole that falls: it turns by h^2 a/8 from the predicted angles, up to 2^-12.5 is close."""
     h, steps = 0.016, 800
     module = eomc.load(SCENES / "cartpole.toml", tmp_path)
     run = module.simulate(h=h, steps=steps)
@@ -141,7 +141,7 @@ def test_a_wide_angle_goes_to_libm(tmp_path: Path) -> None:
 
 
 def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
-    """near.h in units of rounding of 1, from exact sines, up to its bound and beyond."""
+    """with_fallback.h in units of rounding of 1, from exact sines, up to its bound and beyond."""
     compiler = needs("gcc")
     headers = [(CSRC / f).read_text(encoding="utf-8") for f in ("sincos.h", "with_fallback.h")]
     main = r"""
@@ -151,7 +151,7 @@ def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
         double x, d, s0, c0, s, c;
 
         while (scanf("%lf %lf %lf %lf", &x, &d, &s0, &c0) == 4) {
-            eomc_sincos_near(x, d, s0, c0, &s, &c);
+            eomc_sincos_with_fallback(x, d, s0, c0, &s, &c);
             printf("%.17g %.17g\n", s, c);
         }
         return 0;

@@ -238,7 +238,7 @@ def test_steps_at_an_angle_too_wide_to_move(at: int, modules: Modules) -> None:
     _, q, _ = trusted.simulate(start, rates, h=0.01, steps=20)
     run = module.simulate(start, rates, h=0.01, steps=20)
     assert (run.q[:, at] == 7e22).all()
-    # whether it has turned by h^2 a inside a step its numbers do not tell; a wrong sine makes 0.1
+    # whether it has rotated by h^2 a inside a step its numbers do not tell; a wrong sine makes 0.1
     np.testing.assert_allclose(run.q, q, rtol=0, atol=1e-4)
 
 

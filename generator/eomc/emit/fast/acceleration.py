@@ -47,28 +47,28 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
     parts = two_point.apart(target, function)
     large, arrays = is_large(function), is_large(function) or parts is not None
     extent = str(two_point.width(target, parts)) if parts else NQ
-    turned, rest = ((), function) if parts else rotations.turned_apart(target, function)
-    prepare = _prepare_apart(target, function) if arrays else _prepare(target, rest, turned)
+    rotated, rest = ((), function) if parts else rotations.rotated_apart(target, function)
+    prepare = _prepare_apart(target, function) if arrays else _prepare(target, rest, rotated)
     kept = prepare["prepared_members"]
     if parts:  # in loops over many it is printed anew
         function = with_names(function, frozenset(kept))
     takes_c, takes_p = bool(kept), target.needs_p and "signal" in target.program
     t, u = "t" if target.driven else "", "u" if s.inputs else ""
     c, p = "c" if takes_c else "", "p" if takes_p else ""
-    scalar = _mode(target, rest, prepare, takes_c, takes_p, turned, parts)
-    faster = "pairs" if parts else "angles" if turned else ""
+    scalar = _mode(target, rest, prepare, takes_c, takes_p, rotated, parts)
+    faster = "pairs" if parts else "angles" if rotated else ""
 
     t_arg, u_arg = f"{real} t" if t else "", f"const {real} *u" if u else ""
     outer = arguments(u_arg, target.p_arg)
     x = f"{real} q[{NQ}], {real} qd[{NQ}]"
     rows = f"long every, {real} *q_rows, {real} *qd_rows"
     t0_arg = f"{real} t0" if t else ""
-    lane = batch.lane(target, function, prepare, scalar) if s.run.batch else None
-    side_by_side = (
-        stage_parallel.lane(target, function, kept, arrays) if _swept(s) and not large else None
+    tile = batch.mode(target, function, prepare, scalar) if s.run.batch else None
+    stages = (
+        stage_parallel.mode(target, function, kept, arrays) if _swept(s) and not large else None
     )
     chosen = [
-        integrators.method(target, METHODS[name], slopes, scalar, side_by_side, faster, lane)
+        integrators.method(target, METHODS[name], slopes, scalar, stages, faster, tile)
         for name in s.run.methods
     ]
     return prepare | {
@@ -80,18 +80,18 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "takes_c": takes_c,
         "cost": sentence(function),
         "scalar": scalar,
-        "lane": lane,
-        "side_by_side": side_by_side,
-        "lanes_turn": bool(lane and lane["angles"]),
+        "tile": tile,
+        "stage_parallel": stages,
+        "batch_rotates": bool(tile and tile["angles"]),
         "rates_now": f"{P}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
         "stepper_call": after(t, "h", u, c, p),
         "methods": chosen,
         "tile_rates": any(m.get("by_rates") for m in chosen),
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
         "newton": any(METHODS[name].newton for name in s.run.methods),
-        "angles": rotations.scalar(target, turned),
-        "predicted": predicted_angles.steps(target, turned, rest.uses, scalar, c, p),
-        "turned": len(turned),
+        "angles": rotations.scalar(target, rotated),
+        "predicted": predicted_angles.steps(target, rotated, rest.uses, scalar, c, p),
+        "rotated": len(rotated),
         "pairs": scalar["pairs"],
         "fabs": "fabs" + target.real.function_suffix,
         "fmax": "fmax" + target.real.function_suffix,
@@ -117,11 +117,11 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
             f"{rows}, long row_count", target.p_arg and f"{target.p_arg}, long p_instance",
             "long *done", "int *status",
         ) + ")",
-        **(batch.tile(target, len(kept), lane) if lane else {}),
+        **(batch.sizes(target, len(kept), tile) if tile else {}),
         "input_names": target.input_names,
         "sincos": f"{P}_sincos{target.real.function_suffix}" if target.sincos else "",
         "reach": target.literal(target.real.reach),
-        "prepare_lane": arguments(
+        "prepare_tile": arguments(
             "&prepared" if takes_c else "", "p + k*p_instance" if target.needs_p else ""
         ),
         "retry_call": after(
@@ -143,13 +143,13 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
 
 
 def _swept(system: System) -> bool:
-    """Whether some method has its stages side by side."""
+    """Whether some method has its stages in parallel."""
     return any(METHODS[name].sweeps for name in system.run.methods)
 
 
-def _prepare(target: Target, function: Function, turned: Sequence[Angle]) -> dict[str, Any]:
+def _prepare(target: Target, function: Function, rotated: Sequence[Angle]) -> dict[str, Any]:
     own = [p.name for p in target.system.parameters]
-    where = {name: f"s->{name}" for name in rotations.sines(turned)}
+    where = {name: f"s->{name}" for name in rotations.sines(rotated)}
     body = target.body(function, where, keep=_in_prepared, parameters=own)
     kept = _with_signal(target, list(body.kept))
     return {
@@ -197,9 +197,9 @@ def _reads_p(prepare: Mapping[str, Any]) -> bool:
 
 
 def _with_signal(target: Target, kept: list[str]) -> list[str]:
-    """With the parameters that the signals read, since lanes have no others."""
-    by_lanes = target.system.run.batch or _swept(target.system)
-    if not (by_lanes and "signal" in target.program):
+    """With the parameters that the signals read, since tiles have no others."""
+    in_loops = target.system.run.batch or _swept(target.system)
+    if not (in_loops and "signal" in target.program):
         return kept
     own = [p.name for p in target.system.parameters]
     uses = target.program["signal"].uses
@@ -216,13 +216,12 @@ def _mode(
     prepare: Mapping[str, Any],
     takes_c: bool,
     takes_p: bool,
-    turned: Sequence[Angle],
+    rotated: Sequence[Angle],
     parts: Parts | None,
 ) -> dict[str, Any]:
     """solve, rates and steppers for one trajectory: they return whether D was regular.
 
-    turned: the angles whose sines and cosines are not computed in `function`. parts: its two parts,
-    where places are taken in pairs.
+    rotated: the angles whose sines and cosines come from outside. parts: of the two-point form.
     """
     s, real, P = target.system, target.real.name, target.prefix
     timed, u, arrays = TIME in function.uses, bool(s.inputs), "body" not in prepare
@@ -232,7 +231,7 @@ def _mode(
     p_arg = target.p_arg if takes_p else ""
     c, p = "c" if takes_c else "", "p" if takes_p else ""
     state = f"const {P}_vector *q, const {P}_vector *qd"
-    s_arg, s_call = (f"const {P}_angles *s", "s") if turned else ("", "")
+    s_arg, s_call = (f"const {P}_angles *s", "s") if rotated else ("", "")
     rates_rest = (t_arg, u_arg, c_arg, p_arg)
     alone = f"{target.PREFIX}_ALONE " if parts else ""
 
@@ -248,12 +247,12 @@ def _mode(
         "head": "static int"
         if arrays
         else f"{target.PREFIX}_INLINE int"
-        if turned
+        if rotated
         else "static inline int",
         "vector": f"{P}_vector",
-        "solve": "solve_at" if turned and not u else "solve",
+        "solve": "solve_at" if rotated and not u else "solve",
         "rates": "rates" if u else "solve",
-        "rates_at": ("rates" if u else "solve") + ("_at" if turned else ""),
+        "rates_at": ("rates" if u else "solve") + ("_at" if rotated else ""),
         "suffix": "",
         "solve_arguments": arguments(
             f"{P}_vector *a", state, s_arg, f"{real} t" if timed else "", u_arg, c_arg

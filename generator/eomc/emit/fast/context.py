@@ -71,7 +71,7 @@ def values(target: Target) -> dict[str, Any]:
         "has_u": bool(s.inputs),
         "has_p": target.needs_p,
         "batch": s.run.batch,
-        "csrc": _csrc(target, moved["turned"], moved["lanes_turn"], bool(moved["pairs"])),
+        "csrc": _csrc(target, moved["rotated"], moved["batch_rotates"], bool(moved["pairs"])),
         "slopes": slopes,
         "in_pieces": moved["large"]
         or bool(moved["pairs"] or moved["angles"])
@@ -193,15 +193,15 @@ def _face(target: Target) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _csrc(target: Target, turned: int, lanes: bool, pairs: bool) -> list[str]:
+def _csrc(target: Target, rotated: int, tiles: bool, pairs: bool) -> list[str]:
     """The hand-written C that this scene needs, under its own prefix."""
     suffix = target.real.function_suffix
     files = [
         *([f"sincos/sincos{suffix}.h"] if target.sincos else []),
-        *(["sincos/with_fallback.h", "sincos/predicted.h"] if turned else []),
-        *(["sincos/predicted_both.h"] if turned > 1 else []),
+        *(["sincos/with_fallback.h", "sincos/predicted.h"] if rotated else []),
+        *(["sincos/predicted_both.h"] if rotated > 1 else []),
         *([f"sincos/quadrants{suffix}.h"] if target.sincos and target.system.run.batch else []),
-        *([f"sincos/incremental{suffix}.h"] if lanes or pairs else []),
+        *([f"sincos/incremental{suffix}.h"] if tiles or pairs else []),
         *(["sincos/triple.h", "vector/interleave.h"] if pairs else []),
     ]
     texts = [resources.text("csrc", file).replace("#include <math.h>\n", "") for file in files]

@@ -20,7 +20,7 @@ from sympy import Expr, S
 from eomc.derive.tape import Stage, is_negative
 from eomc.emit import c_expression, vectors
 from eomc.emit.c_expression import DOUBLE
-from eomc.emit.c_names import TROUBLE, Argument, Target, arguments
+from eomc.emit.c_names import FAILED, Argument, Target, arguments
 from eomc.program import outline, trig
 from eomc.program.ir import Assignment, Function, Operand, Product, Sum, rename
 from eomc.program.trig import Angle
@@ -46,10 +46,10 @@ def apart(target: Target, function: Function) -> Parts | None:
     """The two parts of an acceleration; None where they bring nothing."""
     if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
         return None
-    turned, rest = trig.apart(function, target.names)
-    if not turned or not (len(turned) >= FEWEST or outline.is_large(function)):
+    rotated, rest = trig.apart(function, target.names)
+    if not rotated or not (len(rotated) >= FEWEST or outline.is_large(function)):
         return None
-    sines = {name for a in turned for name in (a.sine, a.cosine)}
+    sines = {name for a in rotated for name in (a.sine, a.cosine)}
     own = [p.name for p in target.system.parameters]
     fixed = {*own, *(a.name for a in function.early)}
     _, rest = outline.staged(rest, own)
@@ -84,7 +84,7 @@ def apart(target: Target, function: Function) -> Parts | None:
     kept = tuple(new.get(name, name) for name in kept)
     named = frozenset(kept)
     configuration = outline.with_names(configuration, named)
-    return Parts(tuple(turned), _last_come_last(configuration), _last_come_last(motion), kept)
+    return Parts(tuple(rotated), _last_come_last(configuration), _last_come_last(motion), kept)
 
 
 def _without_factors(
@@ -167,13 +167,13 @@ def context(
     def sines(index: str) -> dict[str, str]:
         found = {}
         for k, a in enumerate(parts.angles):
-            found[a.sine] = f"at->sine[{_beside(k)} + {index}]"
-            found[a.cosine] = f"at->cosine[{_beside(k)} + {index}]"
+            found[a.sine] = f"at->sine[{_interleaved(k)} + {index}]"
+            found[a.cosine] = f"at->cosine[{_interleaved(k)} + {index}]"
         return found
 
     def state(index: str) -> Callable[[str, str], str]:
         return lambda array, name: (
-            f"at->q[{_beside(target.names.index(name))} + {index}]"
+            f"at->q[{_interleaved(target.names.index(name))} + {index}]"
             if array == "q"
             else f"qd->x[{target.enum[name]}]"
         )
@@ -185,7 +185,7 @@ def context(
         [
             Argument(f"const {P}_pair *{target.PREFIX}_ALONE at", "at", place),
             Argument(f"const {P}_prepared *c", "c", frozenset(kept)),
-            Argument(f"{real} *{target.PREFIX}_ALONE troubles", "troubles", frozenset({TROUBLE})),
+            Argument(f"{real} *{target.PREFIX}_ALONE failures", "failures", frozenset({FAILED})),
         ],
         [f"k->{name}[i]" for name in parts.kept],
         Argument(f"{P}_kept *{target.PREFIX}_ALONE k", "k", frozenset()),
@@ -200,7 +200,7 @@ def context(
         parts.motion,
         "motion",
         [
-            Argument("int lane", "lane", place | set(parts.kept)),
+            Argument("int point", "point", place | set(parts.kept)),
             Argument(f"const {P}_kept *k", "k", frozenset(parts.kept)),
             Argument(f"const {P}_pair *at", "at", place),
             Argument(f"const {P}_vector *qd", "qd", groups["qd"]),
@@ -210,8 +210,8 @@ def context(
         ],
         [f"a->x[{target.enum[name]}]" for name in target.names],
         Argument(f"{P}_vector *{target.PREFIX}_ALONE a", "a", frozenset()),
-        lambda f: target.loads(f, state("lane"), target.element),
-        where | sines("lane") | {name: f"k->{name}[lane]" for name in parts.kept},
+        lambda f: target.loads(f, state("point"), target.element),
+        where | sines("point") | {name: f"k->{name}[point]" for name in parts.kept},
         inline=inline,
         in_order=True,
     )
@@ -219,21 +219,21 @@ def context(
     t, driven = "t" if timed else "", "t" if target.driven else ""
     u, c, p = "u" if groups["u"] else "", "c" if kept else "", "p" if takes_p else ""
     t_arg, c_arg = f"{real} t", f"const {P}_prepared *c" if c else ""
-    whole = f"{P}_vector *a, int lane, const {P}_kept *k, const {P}_pair *at, const {P}_vector *qd"
+    whole = f"{P}_vector *a, int point, const {P}_kept *k, const {P}_pair *at, const {P}_vector *qd"
     configuration_lines = [
-        *([f"{real} troubles[2] = {{ 0, 0 }};"] if configuration["troubled"] else []),
+        *([f"{real} failures[2] = {{ 0, 0 }};"] if configuration["fails"] else []),
         *configuration["locals"],
         "",
         *configuration["calls"],
-        "return !(troubles[0] + troubles[1] > 0);" if configuration["troubled"] else "return 1;",
+        "return !(failures[0] + failures[1] > 0);" if configuration["fails"] else "return 1;",
     ]
     motion_lines = [*motion["locals"], *motion["calls"], f"return {motion['outcome']};"]
-    place_now = ", ".join(state("lane")("q", name) for name in target.names)
+    place_now = ", ".join(state("point")("q", name) for name in target.names)
     places = bool(groups["q"] & (parts.configuration.uses | parts.motion.uses))
     places = places or (bool(groups["u"]) and target.signal_state)
 
     def motion_call(given: str, time: str) -> str:
-        return f"{P}_motion({arguments('a, lane, k, at, qd', time, given, c)})"
+        return f"{P}_motion({arguments('a, point, k, at, qd', time, given, c)})"
 
     def stage(to: str, velocity: str, time: str) -> str:
         shared = f"{to}, &k, &now, {velocity}"
@@ -261,7 +261,7 @@ def context(
                 "d": ("x", "d->x", False),
                 "e": ("y", "e->x", False),
                 "mid": ("x", "mid->x", True),
-                "turn": ("turn", "d->x", False),
+                "rotation": ("rotation", "d->x", False),
             }.items()
         },
         "configuration_arguments": arguments(f"{P}_kept *k, const {P}_pair *at", c_arg),
@@ -271,7 +271,7 @@ def context(
         "motion_arguments": arguments(whole, t and t_arg, u and u_arg, c_arg),
         "motion_lines": motion_lines,
         "motion_unused": _unread(
-            [x for x in ("lane", "k", "at", "qd", t, u, c) if x], motion_lines
+            [x for x in ("point", "k", "at", "qd", t, u, c) if x], motion_lines
         ),
         "moving_arguments": arguments(
             whole, driven and t_arg, u_arg, c_arg, target.p_arg if p else ""
@@ -313,8 +313,8 @@ def width(target: Target, parts: Parts) -> int:
     return max(_whole(len(target.names)), _whole(first + _whole(len(parts.angles))))
 
 
-def _beside(k: int) -> int:
-    """Where number k of two places stands in an array of both, as beside.h has it."""
+def _interleaved(k: int) -> int:
+    """Where number k of two places stands in an array of both, as interleave.h has it."""
     return 2 * (k - k % FOUR) + (0, 4, 2, 6)[k % FOUR]
 
 
@@ -323,41 +323,41 @@ def _step_weight(parts: Parts) -> int:
     return 2 * outline.weight(parts.configuration) + 4 * outline.weight(parts.motion)
 
 
-def _put_together(target: Target, cut: Sequence[dict[str, Any]], wide: int) -> None:
+def _put_together(target: Target, cut: Sequence[dict[str, Any]], width: int) -> None:
     """The accelerations that a piece makes, stored four at a time where all four are there."""
     for piece in cut:
         ready = dict(piece["results"])
         if piece is cut[-1]:
-            ready |= dict.fromkeys(range(len(target.names), wide), target.zero)
+            ready |= dict.fromkeys(range(len(target.names), width), target.zero)
         lines = []
-        for begin in range(0, wide, FOUR):
+        for begin in range(0, width, FOUR):
             block = [k for k in range(begin, begin + FOUR) if k in ready]
             if len(block) == FOUR:
                 four = ", ".join(ready[k] for k in block)
-                lines.append(f"{target.prefix}_put(a->x + {begin}, {four});")
+                lines.append(f"{target.prefix}_store(a->x + {begin}, {four});")
             else:
                 lines += [f"a->x[{k}] = {ready[k]};" for k in block]
         piece["stores"] = lines
 
 
 def _angles(target: Target, parts: Parts, to: str, vector: str, offset: bool) -> dict[str, Any]:
-    """Where the angles of one place are found, or without offset what they are turned by."""
-    turned, real = parts.angles, target.real.name
-    first = target.names.index(turned[0].terms[0][1])
-    names = target.names[first : first + len(turned)]
-    plain = len(names) == len(turned) and all(
+    """Where the angles of one place are found, or without offset what they are rotated by."""
+    rotated, real = parts.angles, target.real.name
+    first = target.names.index(rotated[0].terms[0][1])
+    names = target.names[first : first + len(rotated)]
+    plain = len(names) == len(rotated) and all(
         a.terms == ((S.One, name),) and (a.offset == 0 or not offset)
-        for a, name in zip(turned, names, strict=True)
+        for a, name in zip(rotated, names, strict=True)
     )
     if plain:
         at = f"{vector} + {first}" if first else vector
         return {"declared": f"const {real} *const {to} = {at};", "lines": []}
-    texts = [_along(target, a, vector, a.offset if offset else S.Zero) for a in turned]
+    texts = [_along(target, a, vector, a.offset if offset else S.Zero) for a in rotated]
     texts += [target.zero] * (_whole(len(texts)) - len(texts))
     return {
         "declared": f"{real} {to}[{len(texts)}];",
         "lines": [
-            f"{target.prefix}_put({to} + {k}, {', '.join(texts[k : k + FOUR])});"
+            f"{target.prefix}_store({to} + {k}, {', '.join(texts[k : k + FOUR])});"
             for k in range(0, len(texts), FOUR)
         ],
     }
