@@ -56,7 +56,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
     t, u = "t" if target.driven else "", "u" if s.inputs else ""
     c, p = "c" if takes_c else "", "p" if takes_p else ""
     scalar = _mode(target, rest, prepare, takes_c, takes_p, rotated, parts)
-    faster = "pairs" if parts else "angles" if rotated else ""
+    faster = "two_point" if parts else "angles" if rotated else ""
 
     t_arg, u_arg = f"{real} t" if t else "", f"const {real} *u" if u else ""
     outer = arguments(u_arg, target.p_arg)
@@ -92,7 +92,7 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "angles": rotations.scalar(target, rotated),
         "predicted": predicted_angles.steps(target, rotated, rest.uses, scalar, c, p),
         "rotated": len(rotated),
-        "pairs": scalar["pairs"],
+        "two_point": scalar["two_point"],
         "fabs": "fabs" + target.real.function_suffix,
         "fmax": "fmax" + target.real.function_suffix,
         "method_names": repr(s.run.methods),
@@ -306,7 +306,7 @@ def _mode(
         "rows": indent(vectors.rows(target, arrays), 12),
         "arrays": arrays,
         "flag": "int" if real == "float" else "long long",  # as wide as a real
-        "pairs": None,
+        "two_point": None,
         "own_signal": None,
     }
     if not arrays:
@@ -321,7 +321,7 @@ def _mode(
         }
     kept = prepare["prepared_members"]
     if parts:
-        made["pairs"] = two = two_point.context(target, parts, kept, timed, takes_p)
+        made["two_point"] = two = two_point.context(target, parts, kept, timed, takes_p)
         return made | {
             "unused": [],
             "loads": two["solve_locals"],

@@ -71,10 +71,10 @@ def values(target: Target) -> dict[str, Any]:
         "has_u": bool(s.inputs),
         "has_p": target.needs_p,
         "batch": s.run.batch,
-        "csrc": _csrc(target, moved["rotated"], moved["batch_rotates"], bool(moved["pairs"])),
+        "csrc": _csrc(target, moved["rotated"], moved["batch_rotates"], bool(moved["two_point"])),
         "slopes": slopes,
         "in_pieces": moved["large"]
-        or bool(moved["pairs"] or moved["angles"])
+        or bool(moved["two_point"] or moved["angles"])
         or s.run.batch
         or any(f["in_pieces"] for f in evaluations)
         or bool(slopes and slopes["inner"]["pieces"]),
@@ -193,7 +193,7 @@ def _face(target: Target) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _csrc(target: Target, rotated: int, tiles: bool, pairs: bool) -> list[str]:
+def _csrc(target: Target, rotated: int, tiles: bool, two_point: bool) -> list[str]:
     """The hand-written C that this scene needs, under its own prefix."""
     suffix = target.real.function_suffix
     files = [
@@ -201,11 +201,13 @@ def _csrc(target: Target, rotated: int, tiles: bool, pairs: bool) -> list[str]:
         *(["sincos/with_fallback.h", "sincos/predicted.h"] if rotated else []),
         *(["sincos/predicted_both.h"] if rotated > 1 else []),
         *([f"sincos/quadrants{suffix}.h"] if target.sincos and target.system.run.batch else []),
-        *([f"sincos/incremental{suffix}.h"] if tiles or pairs else []),
-        *(["sincos/triple.h", "vector/interleave.h"] if pairs else []),
+        *([f"sincos/incremental{suffix}.h"] if tiles or two_point else []),
+        *(["sincos/triple.h", "vector/interleave.h"] if two_point else []),
     ]
     texts = [resources.text("csrc", file).replace("#include <math.h>\n", "") for file in files]
-    if pairs and target.sincos:  # loops have sines of their own, and compilers a third less to do
+    if (
+        two_point and target.sincos
+    ):  # loops have sines of their own, and compilers a third less to do
         inlined = f"static inline void eomc_sincos{suffix}("
         assert inlined in texts[0]
         texts[0] = texts[0].replace(inlined, f"EOMC_PIECE void eomc_sincos{suffix}(")

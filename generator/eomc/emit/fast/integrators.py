@@ -18,7 +18,7 @@ from eomc.program.program import TIME
 
 RK4_BY = {
     "angles": "c/fast/rk4_angles.c.jinja",
-    "pairs": "c/fast/rk4_pairs.c.jinja",
+    "two_point": "c/fast/rk4_two_point.c.jinja",
 }  # what makes it faster
 
 
@@ -60,7 +60,7 @@ def _about(m: Method) -> dict[str, Any]:
         "order": m.order,
         "source": m.source,
         "stages": m.stages,
-        "pairs": False,
+        "two_point": False,
         "limits": m.limits,
         "notes": m.notes,
         "implicit": m.implicit,
@@ -112,7 +112,7 @@ def _explicit(m: Method, real: Real, faster: str, tile: Mapping[str, Any] | None
         "by_stages": by_stages,
         "by_rates": not by_stages or bool(tile and tile["angles"]),
         "angles": faster == "angles",
-        "pairs": faster == "pairs",
+        "two_point": faster == "two_point",
         "template": RK4_BY.get(faster, tile_template),
         "tile_template": tile_template,
         "begin": [f"r->$ = q->$ + {half}*h*qd->$;"] if first else [],
