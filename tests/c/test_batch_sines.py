@@ -26,10 +26,10 @@ void plain(long n, const real *x, real *s, real *c)
         eomc_sincos$_small(x[i], &s[i], &c[i]);
 }
 
-void side_by_side(long n, const real *x, real *s, real *c)
+void by_bits(long n, const real *x, real *s, real *c)
 {
     for (long i = 0; i < n; i++)
-        eomc_sincos$_side_by_side(x[i], &s[i], &c[i]);
+        eomc_sincos$_by_bits(x[i], &s[i], &c[i]);
 }
 
 void rotate(long n, const real *d, real *s, real *c)
@@ -93,7 +93,7 @@ def test_sines_for_loops_are_those_of_one_bit_for_bit(library: ctypes.CDLL, real
     x = np.concatenate([x, np.nextafter(x, real(9)), np.nextafter(x, real(-9))])
     x = x[np.abs(x) <= limit]
     found = []
-    for function in (library.plain, library.side_by_side):
+    for function in (library.plain, library.by_bits):
         s, c = np.empty_like(x), np.empty_like(x)
         call(function, x, s, c)
         found.append(s.tobytes() + c.tobytes())

@@ -232,7 +232,7 @@ def body(
     where: how each name from outside is written (`m_c` -> `p->m_c`).
     keep: how the rest reads what parameters decide, where that lives in a struct; `parameters`
     are kept there too where the rest reads them. branchless: for a loop over many.
-    stored: where values go that are no locals. pivots: how many the whole has, if this is a piece.
+    stored: where values go that are no locals. pivots: how many the whole has, if this is a part.
     in_order: terms of sums stay in their order.
     """
     stored = stored or {}

@@ -21,14 +21,14 @@ from eomc.program.program import TIME, Program
 _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
-    "moving prepared along column slopes count failures point E".split()
+    "moving constants along column slopes count failures point E".split()
 )
 
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
 # that is called so has another name in C
 OWN = frozenset(
-    "ALIGNED ALONE BLOCK FAST_FMA FAST_FMAF FORCE_INLINE H INLINE NOT_FINITE NO_CONVERGENCE NQ NU "
-    "OK PIECE ROLLED SINGULAR STAMP TILE".split()
+    "ALIGNED ALONE BLOCK FAST_FMA FAST_FMAF FORCE_INLINE H INLINE NOINLINE NOT_FINITE "
+    "NO_CONVERGENCE NQ NU OK ROLLED SINGULAR STAMP TILE".split()
 )
 
 FAILED = "*failed"  # where an instance notes its failure, as a name that an argument brings
@@ -39,7 +39,7 @@ Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -
 
 @dataclass(frozen=True)
 class Argument:
-    """One that a piece may need: its declaration, what is passed, the names that it brings."""
+    """One of an outlined function: its declaration, what is passed, the names that it brings."""
 
     declared: str
     passed: str
@@ -208,9 +208,9 @@ class Target:
             "along": frozenset(x.name + ALONG for x in (*s.q, *s.qd, *s.u)),
         }
 
-    # functions in pieces
+    # outlined functions
 
-    def in_pieces(
+    def outlined(
         self,
         function: Function,
         what: str,
@@ -224,11 +224,11 @@ class Target:
         inline: bool = False,
         in_order: bool = False,
     ) -> dict[str, Any]:
-        """A long function as several static ones, for pieces.c.jinja.
+        """A long function outlined to several static ones, for outlined.c.jinja.
 
-        what: its name in C, behind the prefix. given: the arguments; a piece has those that it
+        what: its name in C, behind the prefix. given: the arguments; each has those that it
         reads, and `out` where results are ready, which go to the places `results`. tile, pair: each
-        piece is a loop over a tile, or over two. inline: no function of its own in the end.
+        of them is a loop over a tile, or over two. inline: no function of its own in the end.
         in_order: terms of sums stay in their order.
         """
         function = unclashed(function)
@@ -244,7 +244,7 @@ class Target:
             f"{values} *{self.PREFIX + '_ALONE ' if end else ''}s", "&s", frozenset(crossing)
         )
         handed = {name: f"s->{name}{at}" for name in crossing}
-        kind = "INLINE" if inline else "PIECE"
+        kind = "INLINE" if inline else "NOINLINE"
         made, calls = [], []
         pivots = len(function.checks)
         for k, part in enumerate(parts, 1):
@@ -294,7 +294,7 @@ class Target:
             "members": [name + (f"[{size}]" if end else "") for name in crossing],
             "loop": end,
             "width": 8 if end else 4,
-            "pieces": made,
+            "functions": made,
             "calls": calls,
             "fails": any(m["failed"] for m in made),
             "locals": [
@@ -306,14 +306,14 @@ class Target:
 
 
 def _about(k: int, part: outline.Piece, count: int, what: str) -> str:
-    """What a piece computes from what, in a sentence, as lines of a comment."""
+    """What an outlined function computes from what, in a sentence, as lines of a comment."""
     named = [n for n in part.keeps if not (n[0] == "w" and n[1:].isdigit())]
     made = ", ".join(named[:8]) + (", ..." if len(part.keeps) > 8 else "")
     told = [f"{what}, {k} of {count}: {outline.weight(part.function)} operations"]
     if part.reads:
-        told.append(f"from {len(part.reads)} values of the pieces before")
+        told.append(f"from {len(part.reads)} values of those before")
     if part.keeps:
-        told.append(f"{len(part.keeps)} for those behind" + (f" ({made})" if named else ""))
+        told.append(f"{len(part.keeps)} for those after" + (f" ({made})" if named else ""))
     if part.outputs:
         told.append(f"{len(part.outputs)} results")
     return textwrap.fill(", ".join(told) + ".", 94, subsequent_indent=" * ")

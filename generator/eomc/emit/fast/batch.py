@@ -1,7 +1,7 @@
 """Accelerations and steps of many instances at once, for the templates.
 
-Large: each piece is a loop over a tile. Small: what one instance needs is inlined into such loops,
-one for every stage of a step.
+Large: each outlined function is a loop over a tile. Small: what one instance needs is inlined into
+such loops, one for every stage of a step.
 """
 
 from __future__ import annotations
@@ -25,21 +25,20 @@ CACHE = 32_768  # bytes that a tile may have: a first-level cache
 
 
 def mode(
-    target: Target, function: Function, prepare: Mapping[str, Any], mode: Mapping[str, Any]
+    target: Target, function: Function, constants: Mapping[str, Any], mode: Mapping[str, Any]
 ) -> dict[str, Any]:
     """The same for a batch: no branches; failures are noted in `failed`.
 
-    Accelerations and steppers of a whole tile. Large: each piece is a loop over it. Small: what one
-    instance needs is inlined into such loops, one for every stage of a step.
+    Accelerations and steppers of a whole tile.
     """
     s, real, P = target.system, target.real.name, target.prefix
     large, held = is_large(function), bool(s.inputs)
     timed = TIME in function.uses
-    kept = prepare["prepared_members"]
+    kept = constants["constants_members"]
     alone = f"{target.PREFIX}_ALONE "
     rest = f"int count, {real} *{alone}failures"  # how many to take, and which failed
     u_arg = f"const {P}_inputs_tile *u" if held else ""
-    c_arg = f"const {P}_prepared_tile *c" if kept else ""
+    c_arg = f"const {P}_constants_tile *c" if kept else ""
     t_arg = f"{real} t" if target.driven else ""
     state = f"const {P}_vector_tile *q, const {P}_vector_tile *qd"
     c = "c" if kept else ""
@@ -51,7 +50,7 @@ def mode(
         return after(time if timed else "", c, "count, failures")
 
     made = dict(mode) | {
-        "head": "static void" if large else f"{target.PREFIX}_PIECE void",
+        "head": "static void" if large else f"{target.PREFIX}_NOINLINE void",
         "inline": f"{target.PREFIX}_{'INLINE' if large else 'FORCE_INLINE'}",
         "vector": f"{P}_vector_tile",
         "solve": "solve_tile",
@@ -90,7 +89,7 @@ def mode(
         "each": lambda lines, width=4: indent(_each_of_tile(target, lines), width),
         "angles": None,
         "one": None,
-        "pieces": None,
+        "outlined": None,
         "own_signal": _signal_of_tile(target, kept, c_arg, rest) if large else None,
     }  # fmt: skip
     if not large:
@@ -142,14 +141,14 @@ def _small(target: Target, function: Function, kept: Sequence[str], arrays: bool
 
 
 def _given(target: Target, kept: Sequence[str], u: str, c: str, k: str = "i") -> list[str]:
-    """The inputs and the prepared values of one instance."""
+    """The inputs and the constants values of one instance."""
     lines = []
     if target.system.inputs:
         inside = ", ".join(f"{u}x[{target.enum[n]}][i]" for n in target.input_names)
         lines.append(f"const {target.prefix}_inputs given = {{ {inside} }};")
     if kept:
         inside = ", ".join(f"{c}{n}[{k}]" for n in kept)
-        lines.append(f"const {target.prefix}_prepared here = {{ {inside} }};")
+        lines.append(f"const {target.prefix}_constants here = {{ {inside} }};")
     return lines
 
 
@@ -255,7 +254,7 @@ def _large(
 ) -> dict[str, Any]:
     s, P = target.system, target.prefix
     _, rest = staged(function, [p.name for p in s.parameters])
-    cut = target.in_pieces(
+    cut = target.outlined(
         rest,
         "solve_tile",
         _tile_arguments(target, kept),
@@ -266,7 +265,7 @@ def _large(
         tile=True,
     )
     return {
-        "pieces": cut,
+        "outlined": cut,
         "unused": [*made["unused"], *(["failures"] if not cut["fails"] else [])],
         "loads": cut["locals"],
         "blocks": [],
@@ -280,14 +279,14 @@ def _in_tile(target: Target) -> Access:
 
 
 def _tile_arguments(target: Target, kept: Sequence[str]) -> list[Argument]:
-    """What a piece over a tile may read."""
+    """What an outlined function over a tile may read."""
     P, groups, real = target.prefix, target.groups(), target.real.name
     return [
         Argument(f"const {P}_vector_tile *q", "q", groups["q"]),
         Argument(f"const {P}_vector_tile *qd", "qd", groups["qd"]),
         Argument(f"{real} t", "t", groups["t"]),
         Argument(f"const {P}_inputs_tile *u", "u", groups["u"]),
-        Argument(f"const {P}_prepared_tile *c", "c", frozenset(kept)),
+        Argument(f"const {P}_constants_tile *c", "c", frozenset(kept)),
         Argument("int count", "count", frozenset({COUNT})),
         Argument(f"{real} *{target.PREFIX}_ALONE failures", "failures", frozenset({FAILED})),
     ]
@@ -301,7 +300,7 @@ def _signal_of_tile(
         return None
     P, given = target.prefix, target.program["signal"]
     own = {p.name for p in target.system.parameters}
-    cut = target.in_pieces(
+    cut = target.outlined(
         given,
         "signal_tile",
         _tile_arguments(target, [n for n in kept if n in own]),
@@ -313,7 +312,7 @@ def _signal_of_tile(
     )
     state = f"const {P}_vector_tile *q, const {P}_vector_tile *qd"
     return {
-        "pieces": cut,
+        "outlined": cut,
         "arguments": arguments(
             f"{P}_inputs_tile *u", f"{target.real.name} t" if target.signal_t else "",
             state if target.signal_state else "", c_arg, failed,
@@ -348,8 +347,8 @@ def sizes(target: Target, kept: int, tile: Mapping[str, Any]) -> dict[str, int]:
     numbers above 512 bytes. A tile that is not full is taken by blocks: rows of 64 bytes."""
     s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
     numbers = 4 * n + len(s.u) + kept + 1  # two states, and whether it failed
-    if tile["pieces"]:
-        numbers += len(tile["pieces"]["members"]) // 2 + 4 * n  # of those, not all live at once
+    if tile["outlined"]:
+        numbers += len(tile["outlined"]["members"]) // 2 + 4 * n  # of those, not all live at once
     else:
         numbers += max(METHODS[name].stages for name in s.run.methods) * n
         numbers += 3 * len(tile["angles"]["members"]) if tile["angles"] else 0

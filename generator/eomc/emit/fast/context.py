@@ -73,11 +73,11 @@ def values(target: Target) -> dict[str, Any]:
         "batch": s.run.batch,
         "csrc": _csrc(target, moved["rotated"], moved["batch_rotates"], bool(moved["two_point"])),
         "slopes": slopes,
-        "in_pieces": moved["large"]
+        "noinline": moved["large"]
         or bool(moved["two_point"] or moved["angles"])
         or s.run.batch
-        or any(f["in_pieces"] for f in evaluations)
-        or bool(slopes and slopes["inner"]["pieces"]),
+        or any(f["is_large"] for f in evaluations)
+        or bool(slopes and slopes["inner"]["outlined"]),
         **moved,
         **_example(target),
         **selftest.values(target),
@@ -210,7 +210,7 @@ def _csrc(target: Target, rotated: int, tiles: bool, two_point: bool) -> list[st
     ):  # loops have sines of their own, and compilers a third less to do
         inlined = f"static inline void eomc_sincos{suffix}("
         assert inlined in texts[0]
-        texts[0] = texts[0].replace(inlined, f"EOMC_PIECE void eomc_sincos{suffix}(")
+        texts[0] = texts[0].replace(inlined, f"EOMC_NOINLINE void eomc_sincos{suffix}(")
     return [
         text.replace("eomc_", f"{target.prefix}_").replace("EOMC_", f"{target.PREFIX}_").strip()
         for text in texts

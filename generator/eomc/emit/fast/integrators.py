@@ -193,7 +193,7 @@ def _stage_parallel(
     timed = TIME in target.program["acceleration"].uses
     t, u = ("t" if target.driven else ""), ("u" if target.system.inputs else "")
     rest = scalar["stepper_arguments"].split(", ", 2)[2]
-    c, p = ("c" if "_prepared *c" in rest else ""), ("p" if "_params *p" in rest else "")
+    c, p = ("c" if "_constants *c" in rest else ""), ("p" if "_params *p" in rest else "")
     values, memory = f"{P}_{m.name}_stages", f"{P}_{m.name}_memory *m"
     arrays, alone = scalar["arrays"], f"{target.PREFIX}_ALONE"
 

@@ -24,7 +24,7 @@ def steps(
     """What is done for each angle and coordinate, stage by stage; None where no angle is rotated.
 
     uses: what the accelerations read besides sines and cosines. scalar: how they are called, with c
-    and p, which stand for what is prepared and for the parameters where they are read.
+    and p, which stand for what is constants and for the parameters where they are read.
     """
     if not rotated:
         return None
@@ -75,7 +75,7 @@ def steps(
         "arguments": arguments(
             f"{P}_rk4_state *state", f"{real} t0, long first" if driven else "", f"{real} h",
             "long n", "long steps", "long u_stride" if inputs else "", "long every",
-            f"const {P}_prepared *prepared" if c else "", target.p_arg if p else "",
+            f"const {P}_constants *constants" if c else "", target.p_arg if p else "",
         ),
         "call": arguments(
             "&x", "t0, first" if driven else "", "h", "n", "steps", "u_stride" if inputs else "",

@@ -28,7 +28,7 @@ def mode(
     s, real, P = target.system, target.real.name, target.prefix
     timed, given = TIME in function.uses, bool(s.inputs)
     t_arg = f"{real} t" if target.driven else ""
-    c_arg, c = (f"const {P}_prepared *c", "c") if kept else ("", "")
+    c_arg, c = (f"const {P}_constants *c", "c") if kept else ("", "")
     u_arg = f"const {P}_inputs *u" if given else ""
     state, failed = f"const {P}_vector *q, const {P}_vector *qd", f"{real} *failed"
     s_arg, s_call = (f"const {P}_angles *s", "s") if sines else ("", "")
@@ -74,7 +74,7 @@ def signal(
     made = target.body(given, where=where, branchless=True)
     t, at = target.signal_t, target.signal_state
     return {
-        "pieces": None,
+        "outlined": None,
         "arguments": arguments(
             f"{target.prefix}_inputs *u", f"{target.real.name} t" if t else "",
             state if at else "", c_arg, failed,

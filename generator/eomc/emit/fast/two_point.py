@@ -179,12 +179,12 @@ def context(
         )
 
     place = frozenset({*groups["q"], *sines("i")})
-    configuration = target.in_pieces(
+    configuration = target.outlined(
         parts.configuration,
         "configuration",
         [
             Argument(f"const {P}_two_points *{target.PREFIX}_ALONE at", "at", place),
-            Argument(f"const {P}_prepared *c", "c", frozenset(kept)),
+            Argument(f"const {P}_constants *c", "c", frozenset(kept)),
             Argument(f"{real} *{target.PREFIX}_ALONE failures", "failures", frozenset({FAILED})),
         ],
         [f"k->{name}[i]" for name in parts.handed],
@@ -196,7 +196,7 @@ def context(
         in_order=True,
     )
     u_arg = f"const {real} *u"
-    velocity = target.in_pieces(
+    velocity = target.outlined(
         parts.velocity,
         "velocity",
         [
@@ -206,7 +206,7 @@ def context(
             Argument(f"const {P}_vector *qd", "qd", groups["qd"]),
             Argument(f"{real} t", "t", groups["t"]),
             Argument(u_arg, "u", groups["u"]),
-            Argument(f"const {P}_prepared *c", "c", frozenset(kept)),
+            Argument(f"const {P}_constants *c", "c", frozenset(kept)),
         ],
         [f"a->x[{target.enum[name]}]" for name in target.names],
         Argument(f"{P}_vector *{target.PREFIX}_ALONE a", "a", frozenset()),
@@ -215,10 +215,10 @@ def context(
         inline=inline,
         in_order=True,
     )
-    _put_together(target, velocity["pieces"], width(target, parts))
+    _put_together(target, velocity["functions"], width(target, parts))
     t, driven = "t" if timed else "", "t" if target.driven else ""
     u, c, p = "u" if groups["u"] else "", "c" if kept else "", "p" if takes_p else ""
-    t_arg, c_arg = f"{real} t", f"const {P}_prepared *c" if c else ""
+    t_arg, c_arg = f"{real} t", f"const {P}_constants *c" if c else ""
     whole = f"{P}_vector *a, int point, const {P}_configuration_values *k, "
     whole += f"const {P}_two_points *at, const {P}_vector *qd"
     configuration_lines = [
@@ -329,10 +329,10 @@ def _step_weight(parts: Parts) -> int:
 
 
 def _put_together(target: Target, cut: Sequence[dict[str, Any]], width: int) -> None:
-    """The accelerations that a piece makes, stored four at a time where all four are there."""
-    for piece in cut:
-        ready = dict(piece["results"])
-        if piece is cut[-1]:
+    """The accelerations that a function makes, stored four at a time where all four are there."""
+    for f in cut:
+        ready = dict(f["results"])
+        if f is cut[-1]:
             ready |= dict.fromkeys(range(len(target.names), width), target.zero)
         lines = []
         for begin in range(0, width, FOUR):
@@ -342,7 +342,7 @@ def _put_together(target: Target, cut: Sequence[dict[str, Any]], width: int) -> 
                 lines.append(f"{target.prefix}_store(a->x + {begin}, {four});")
             else:
                 lines += [f"a->x[{k}] = {ready[k]};" for k in block]
-        piece["stores"] = lines
+        f["stores"] = lines
 
 
 def _angles(target: Target, parts: Parts, to: str, vector: str, offset: bool) -> dict[str, Any]:
