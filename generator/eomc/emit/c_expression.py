@@ -298,7 +298,7 @@ def body(
 def _failures(
     printer: Printer, pairs: Iterable[tuple[Operand, Operand]], tolerance: float
 ) -> tuple[str, ...]:
-    """Conditions under which a pivot is no good, each once; a positive number always is."""
+    """Conditions under which a pivot fails, each once; a positive number always is."""
     asked = [(p, d) for p, d in pairs if p.name or not (p == d and p.coefficient > 0)]
     return tuple(dict.fromkeys(_fails(printer, pair, tolerance) for pair in asked))
 
@@ -355,7 +355,7 @@ def _inlined(function: Function, kept: frozenset[str]) -> frozenset[str]:
         uses[o.name] += 1
         stage_of_reader.setdefault(o.name, last)
     for pair in function.checks:
-        uses.update(2 * [o.name for o in pair])  # read beside the statements
+        uses.update(2 * [o.name for o in pair])  # read outside the statements
     inline: set[str] = set()
     weight: dict[str, int] = {}
     for a in everything:

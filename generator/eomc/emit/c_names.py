@@ -101,19 +101,19 @@ class Target:
 
     @cached_property
     def signal_state(self) -> bool:
-        """Whether the scene's signals hang on the state."""
+        """Whether the scene's signals depend on the state."""
         signal = self.program.functions.get("signal")
         state = {x.name for x in (*self.system.q, *self.system.qd)}
         return signal is not None and bool(signal.uses & state)
 
     @cached_property
     def signal_t(self) -> bool:
-        """Whether the scene's signals hang on the time."""
+        """Whether the scene's signals depend on the time."""
         return "signal" in self.program and TIME in self.program["signal"].uses
 
     @cached_property
     def driven(self) -> bool:
-        """Whether motion hangs on the time, by itself or by the signals."""
+        """Whether motion depends on the time, by itself or by the signals."""
         return TIME in self.program["acceleration"].uses or self.signal_t
 
     @cached_property

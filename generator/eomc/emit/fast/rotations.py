@@ -44,7 +44,7 @@ def scalar(target: Target, rotated: Sequence[Angle]) -> dict[str, Any] | None:
 
 
 def of_tile(target: Target, rotated: Sequence[Angle], arrays: bool) -> dict[str, Any] | None:
-    """The sines and cosines of an instance: at a place; in loops over a tile, rotated from others.
+    """The sines and cosines of an instance, computed or, in loops over a tile, rotated from others.
 
     triple: statements for three loops of every angle: reduced at q + h/2 qd, their sine and cosine,
     and rotated to q and q + h qd. further: rotated from the middle by h^2/4 a1 and from the end by

@@ -1,9 +1,9 @@
 """The two-point form of an acceleration: a configuration part for two points, a velocity part.
 
 What a configuration q alone decides, D and its factors above all, RK4 needs at q and q + h/2 qd
-when a step begins, and at its other two places as soon as two accelerations are there. So that part
-is written once, as loops over two configurations in vector registers; what is left, the velocity's
-part, follows stage by stage.
+when a step begins, and at its other two configurations as soon as two accelerations are there. So
+that part is written once, as loops over two configurations in vector registers; the rest, the
+velocity part, follows stage by stage.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def apart(target: Target, function: Function) -> Parts | None:
 def _without_factors(
     late: Sequence[Assignment], place: Set[str], fixed: Set[str]
 ) -> tuple[list[Assignment], list[Assignment]]:
-    """Products with one factor of all that the place decides in them; and these factors."""
+    """Products with one factor of all that the configuration decides in them; and these factors."""
     made: dict[Product, str] = {}
     out = []
     for a in late:
@@ -319,12 +319,12 @@ def width(target: Target, parts: Parts) -> int:
 
 
 def _interleaved(k: int) -> int:
-    """Where number k of two places stands in an array of both, as interleave.h has it."""
+    """Where number k of two points stands in an array of both, as interleave.h has it."""
     return 2 * (k - k % FOUR) + (0, 4, 2, 6)[k % FOUR]
 
 
 def _step_weight(parts: Parts) -> int:
-    """The operations of the parts in a step, those for both places counted once."""
+    """The operations of the parts in a step, those for both points counted once."""
     return 2 * outline.weight(parts.configuration) + 4 * outline.weight(parts.velocity)
 
 
@@ -346,7 +346,7 @@ def _put_together(target: Target, cut: Sequence[dict[str, Any]], width: int) -> 
 
 
 def _angles(target: Target, parts: Parts, to: str, vector: str, offset: bool) -> dict[str, Any]:
-    """Where the angles of one place are found, or without offset what they are rotated by."""
+    """Where the angles of one point are found, or without offset what they are rotated by."""
     rotated, real = parts.angles, target.real.name
     first = target.names.index(rotated[0].terms[0][1])
     names = target.names[first : first + len(rotated)]
