@@ -123,7 +123,6 @@ def _function(target: Target, name: str) -> dict[str, Any]:
         "size": size,
         "unused": unused,
         "signal_call": target.signal_call("now", "q", "qd"),
-        "binding_call": _binding_call(target, name, size, takes_q, timed, takes_u),
         "column": None,
         "outlined": None,
         "is_large": is_large(function),
@@ -228,24 +227,6 @@ def _by_columns(target: Target, name: str, function: Function) -> dict[str, Any]
     }
 
 
-def _binding_call(
-    target: Target, name: str, size: str, takes_q: bool, timed: bool, takes_u: bool
-) -> str:
-    """The call for row k of many."""
-    NQ, signal = f"{target.PREFIX}_NQ", name == "signal"
-    at = f"q + {NQ}*k" if takes_q else ""
-    given = arguments(
-        f"out + {size}*k" if size else "",
-        "t" if timed and signal else "",
-        at,
-        at.replace("q", "qd", 1) if KINDS[name].qd else "",
-        "t" if timed and not signal else "",
-        "u" if takes_u else "",
-        target.p_cast,
-    )
-    return f"{'' if size else 'out[k] = '}{target.prefix}_{name}({given});"
-
-
 # --- the derivatives of the accelerations ---------------------------------------------------------
 
 
@@ -302,11 +283,6 @@ def linearization(target: Target) -> dict[str, Any] | None:
         "signal_near": target.signal_call("near_u", "near_q", "near_qd")
         if target.signal_state
         else "",
-        "binding": f"{P}_linearization("
-        + arguments(
-            *(f"{n} + {NQ}*{w}*k" for n, w, _ in parts), f"q + {NQ}*k", f"qd + {NQ}*k",
-            "t" if target.driven else "", "u" if s.inputs else "", target.p_cast,
-        ) + ")",
     }  # fmt: skip
 
 

@@ -95,7 +95,6 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
         "two_point": scalar["two_point"],
         "fabs": "fabs" + target.real.function_suffix,
         "fmax": "fmax" + target.real.function_suffix,
-        "method_names": repr(s.run.methods),
         "t_call": after(t),
         "p_call": after(target.p_call),
         "acceleration_prototype": f"{P}_status {P}_acceleration("
@@ -128,12 +127,6 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
             t, "h", u and "u ? u + (base + i)*u_instance + n*u_step : 0",
             "&c" if takes_c else "", "p + (base + i)*p_instance" if takes_p else "",
         ),
-        "batch_binding": lambda name: f"{P}_{name}_batch("
-        + arguments(
-            "count", "q", "qd", t and "t0", "h", "first", "steps",
-            u and "u, u_instance, u_step", "every", "q_rows", "qd_rows", "row_count",
-            f"{target.p_cast}, p_instance" if target.needs_p else "", "done", "status",
-        ) + ")",
         "vector_members": [f"{real} x[{extent}];"] if arrays
         else [f"{real} {', '.join(target.names)};"],
         "vector_of": lambda name, element: vectors.vector_of(target, arrays, name, element),
