@@ -97,8 +97,8 @@ EOMC_INLINE void eomc_predicted_unpack(eomc_predicted_terms *mid,
 }
 
 /* s, c at the distance d from a predicted angle. */
-EOMC_INLINE void eomc_predicted_rotate(double d, const eomc_predicted_terms *k,
-    double *s, double *c, double *far)
+EOMC_INLINE void eomc_predicted_rotate(
+    double d, const eomc_predicted_terms *k, double *s, double *c, double *far)
 {
     const double z = 0.4999999979425627 * d * d;
 

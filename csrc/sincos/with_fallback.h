@@ -11,8 +11,8 @@
  * (a0 + a1 d^2) the next term of Taylor's series, d^7/5040, is shared out by Chebyshev's rule; that
  * is off by 2^-57.3 at most, cos d - 1 by d^8/40320 < 2^-63.
  */
-EOMC_INLINE void eomc_sincos_with_fallback(double x, double d, double s0, double c0,
-    double *s, double *c)
+EOMC_INLINE void eomc_sincos_with_fallback(
+    double x, double d, double s0, double c0, double *s, double *c)
 {
     if (fabs(d) <= 0.015625) {
         const double z = d * d;
