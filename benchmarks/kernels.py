@@ -70,7 +70,7 @@ def libraries(source: str, folder: Path) -> list[ctypes.CDLL]:
         if shutil.which(name) is None:
             continue
         library = folder / f"{source}-{name}.so"
-        includes = [f"-I{HERE.parent / 'csrc'}", f"-I{folder}"]
+        includes = [f"-I{HERE.parent / 'csrc' / 'sincos'}", f"-I{folder}"]
         flags = [
             compiler.STANDARD,
             *compiler.flags(source == "cartpole"),

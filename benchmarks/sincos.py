@@ -1,4 +1,4 @@
-"""Derive the constants of csrc/sincos.h and sincosf.h; measure error and speed beside libm's.
+"""Derive constants of csrc/sincos/sincos.h and sincosf.h; measure error and speed against libm.
 
 python benchmarks/sincos.py            error in ulp and time per call, two tables
 python benchmarks/sincos.py --float    the same of sincosf.h, the error over every float
@@ -24,7 +24,7 @@ import mpmath
 import numpy as np
 from numpy.typing import NDArray
 
-CSRC = Path(__file__).resolve().parent.parent / "csrc"
+CSRC = Path(__file__).resolve().parent.parent / "csrc" / "sincos"
 
 Array = NDArray[Any]  # of either precision
 

@@ -1,7 +1,7 @@
 /*
  * What the kernels beside this file share: four doubles side by side, and their sine and cosine.
  *
- * Needs AVX2 and FMA. csrc/sincos.h is on the include path: eomc_sincos, for arguments that
+ * Needs AVX2 and FMA. csrc/sincos/sincos.h is on the include path: eomc_sincos, for arguments that
  * sincos4 can't take, and the derivation of the coefficients.
  */
 #ifndef LANES_H

@@ -8,7 +8,7 @@
  * - stages 1 and 2 have their configurations from the start, q and q + h/2 qd; those of 3 and 4 are
  *   both known once a2 is. So configurations are worked out two at a time, in a vector's lanes.
  * - sines and cosines of both in vectors of four; those of stages 3 and 4 turned from stage 2's by
- *   h^2/4 a1 and h/2 qd + h^2/2 a2, as csrc/turn.h does.
+ *   h^2/4 a1 and h/2 qd + h^2/2 a2, as csrc/sincos/incremental.h does.
  *
  * That brought 1,016 to 712 ns a step with nothing else running, turning 2 % more. No gain:
  * statements reordered by list scheduling (more spills), gcc's scheduling before register

@@ -1,4 +1,4 @@
-"""csrc/quadrants.h, turn.h: sines for loops are those of sincos.h, and turning adds a rounding."""
+"""csrc/sincos/: quadrants.h has the bits of sincos.h, incremental.h adds one rounding."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-CSRC = Path(__file__).resolve().parents[2] / "csrc"
+CSRC = Path(__file__).resolve().parents[2] / "csrc" / "sincos"
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 
 LOOPS = """
 #include "sincos$.h"
 #include "quadrants$.h"
-#include "turn$.h"
+#include "incremental$.h"
 
 void plain(long n, const real *x, real *s, real *c)
 {
@@ -26,32 +26,32 @@ void plain(long n, const real *x, real *s, real *c)
         eomc_sincos$_small(x[i], &s[i], &c[i]);
 }
 
-void side_by_side(long n, const real *x, real *s, real *c)
+void by_bits(long n, const real *x, real *s, real *c)
 {
     for (long i = 0; i < n; i++)
-        eomc_sincos$_side_by_side(x[i], &s[i], &c[i]);
+        eomc_sincos$_by_bits(x[i], &s[i], &c[i]);
 }
 
-void turn(long n, const real *d, real *s, real *c)
+void rotate(long n, const real *d, real *s, real *c)
 {
     for (long i = 0; i < n; i++)
-        eomc_turn$(d[i], s[i], c[i], &s[i], &c[i]);
+        eomc_sincos$_rotate(d[i], s[i], c[i], &s[i], &c[i]);
 }
 
-void turn_on(long n, const real *d, real *s, real *c)
+void rotate_on(long n, const real *d, real *s, real *c)
 {
     real back, back_too;
 
     for (long i = 0; i < n; i++)
-        eomc_turn_both$(d[i], s[i], c[i], &back, &back_too, &s[i], &c[i]);
+        eomc_sincos$_rotate_both(d[i], s[i], c[i], &back, &back_too, &s[i], &c[i]);
 }
 
-void turn_back(long n, const real *d, real *s, real *c)
+void rotate_back(long n, const real *d, real *s, real *c)
 {
     real on, on_too;
 
     for (long i = 0; i < n; i++)
-        eomc_turn_both$(-d[i], s[i], c[i], &s[i], &c[i], &on, &on_too);
+        eomc_sincos$_rotate_both(-d[i], s[i], c[i], &s[i], &c[i], &on, &on_too);
 }
 """
 FLAGS = {"vector": ["-O3", "-march=native"], "scalar": ["-O1", "-fno-tree-vectorize"]}
@@ -93,22 +93,22 @@ def test_sines_for_loops_are_those_of_one_bit_for_bit(library: ctypes.CDLL, real
     x = np.concatenate([x, np.nextafter(x, real(9)), np.nextafter(x, real(-9))])
     x = x[np.abs(x) <= limit]
     found = []
-    for function in (library.plain, library.side_by_side):
+    for function in (library.plain, library.by_bits):
         s, c = np.empty_like(x), np.empty_like(x)
         call(function, x, s, c)
         found.append(s.tobytes() + c.tobytes())
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize(("way", "widest"), [("turn", 6), ("turn_on", 3), ("turn_back", 3)])
-def test_turning_costs_one_unit_of_rounding(
+@pytest.mark.parametrize(("way", "widest"), [("rotate", 6), ("rotate_on", 3), ("rotate_back", 3)])
+def test_rotating_costs_one_unit_of_rounding(
     library: ctypes.CDLL, real: Any, way: str, widest: int
 ) -> None:
     """Against sums of angles in long double; for float, against double."""
     exact = np.longdouble if real is np.float64 else np.float64
     random = np.random.default_rng(6)
     if real is np.float32:
-        widest -= 2 if way == "turn" else 1
+        widest -= 2 if way == "rotate" else 1
     x = random.uniform(-4, 4, 50_000).astype(exact)
     d = (random.choice([-1, 1], len(x)) * 2.0 ** -random.uniform(widest, 40, len(x))).astype(real)
     d[:3] = 2.0**-widest, -(2.0**-widest), 0.0

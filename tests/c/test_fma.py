@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from cases import fast_kit
 from conftest import ROOT, needs
 
 import eomc
@@ -15,9 +16,9 @@ from eomc.scene import read as scene
 
 # both headers in one file, and which way each goes
 PROBE = f"""
-#include "{ROOT / "csrc" / "sincos.h"}"
+#include "{ROOT / "csrc" / "sincos" / "sincos.h"}"
 #undef EOMC_INLINE
-#include "{ROOT / "csrc" / "sincosf.h"}"
+#include "{ROOT / "csrc" / "sincos" / "sincosf.h"}"
 int in_double = EOMC_FAST_FMA, in_float = EOMC_FAST_FMAF;
 """
 # what a compiler defines for a processor, and where there is a multiply-add: in double, in float
@@ -139,7 +140,7 @@ def test_sines_on_cortex_m(board: str, tmp_path: Path) -> None:
     (tmp_path / "errors.c").write_text(ERRORS)
     command = [
         *(needs("arm-none-eabi-gcc"), *BOARDS[board][0].split(), "-mthumb", "-O2"),
-        *("--specs=nosys.specs", "-nostartfiles", f"-I{ROOT / 'csrc'}"),
+        *("--specs=nosys.specs", "-nostartfiles", f"-I{ROOT / 'csrc' / 'sincos'}"),
         *("errors.c", "process.c", "-lm", "-o", "errors"),
     ]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
@@ -151,10 +152,10 @@ def test_sines_on_cortex_m(board: str, tmp_path: Path) -> None:
 def outcome(text: str, folder: Path, *flags: str) -> tuple[int, str]:
     """Status and words of the self-test of a scene."""
     s = system.from_scene(scene.parse(text))
-    for file, content in eomc.sources(s).files.items():
+    for file, content in fast_kit(eomc.sources(s)).items():
         (folder / file).write_text(content, encoding="utf-8")
     (folder / "fma.c").write_text(TWO_ROUNDINGS)
-    command = ["cc", "-std=c99", "-O2", *flags, "selftest.c", f"{s.name}.c", "-lm"]
+    command = ["cc", "-std=c99", "-O2", "-I.", *flags, "selftest.c", f"{s.name}.c", "-lm"]
     subprocess.run(command, cwd=folder, check=True)
     done = subprocess.run(["./a.out"], cwd=folder, capture_output=True, text=True)
     return done.returncode, done.stdout

@@ -1,4 +1,4 @@
-"""csrc/sincos.h, sincosf.h: error, special values, the same bits from scalar and vector code."""
+"""csrc/sincos/sincos.h, sincosf.h: error, special values, same bits from scalar and vector code."""
 
 from __future__ import annotations
 

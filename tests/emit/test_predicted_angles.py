@@ -1,4 +1,4 @@
-"""Sines that are turned from stage to stage, sums that are compensated, runs that are cut."""
+"""Sines that are rotated from stage to stage, sums that are compensated, runs that are cut."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.program.trig import apart
 from eomc.scene import read as scene
+
+CSRC = ROOT / "csrc" / "sincos"
 
 ODD = """
 eomc = 1
@@ -70,7 +72,7 @@ def test_angles_that_are_linear_in_coordinates_are_found() -> None:
 
 @pytest.mark.parametrize("h", [0.001, 0.02, 0.3])
 def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path) -> None:
-    """Turns of some 1e-6, 1e-4 and, beyond what is turned, 1e-1."""
+    """Turns of some 1e-6, 1e-4 and, beyond what is rotated, 1e-1."""
     (tmp_path / "odd.toml").write_text(ODD, encoding="utf-8")
     links = range(1, 7)
     coordinates = "".join(f"a{k} = {{ start = {0.3 * k} }}\n" for k in links)
@@ -87,8 +89,8 @@ def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_steps_leave_what_was_foretold_and_come_back(tmp_path: Path) -> None:
-    """A pole that falls: it turns by h^2 a/8 from the angles foretold, up to 2^-12.5 is near."""
+def test_steps_leave_their_predictions_and_come_back(tmp_path: Path) -> None:
+    """A pole that falls: it turns by h^2 a/8 from the predicted angles, up to 2^-12.5 is close."""
     h, steps = 0.016, 800
     module = eomc.load(SCENES / "cartpole.toml", tmp_path)
     run = module.simulate(h=h, steps=steps)
@@ -99,9 +101,7 @@ def test_steps_leave_what_was_foretold_and_come_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("signal", ["2*sin(3*t)", "2*cos(t)*a - a_dot", "0.7"])
-def test_signals_and_held_inputs_reach_steps_near_what_was_foretold(
-    signal: str, tmp_path: Path
-) -> None:
+def test_signals_and_held_inputs_reach_steps_near_predictions(signal: str, tmp_path: Path) -> None:
     """Signals of time, of the state and constant ones; and inputs held over a step each."""
     scene = ODD.replace("[energy]", f'[inputs]\nu = {{ signal = "{signal}" }}\n[energy]')
     text = scene.replace('name = "odd"', 'name = "pushed"') + '[forces]\nb = "u"\n'
@@ -141,9 +141,9 @@ def test_a_wide_angle_goes_to_libm(tmp_path: Path) -> None:
 
 
 def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
-    """near.h in units of rounding of 1, from exact sines, up to its bound and beyond."""
+    """with_fallback.h in units of rounding of 1, from exact sines, up to its bound and beyond."""
     compiler = needs("gcc")
-    headers = [(ROOT / "csrc" / f).read_text(encoding="utf-8") for f in ("sincos.h", "near.h")]
+    headers = [(CSRC / f).read_text(encoding="utf-8") for f in ("sincos.h", "with_fallback.h")]
     main = r"""
     #include <stdio.h>
     int main(void)
@@ -151,7 +151,7 @@ def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
         double x, d, s0, c0, s, c;
 
         while (scanf("%lf %lf %lf %lf", &x, &d, &s0, &c0) == 4) {
-            eomc_sincos_near(x, d, s0, c0, &s, &c);
+            eomc_sincos_with_fallback(x, d, s0, c0, &s, &c);
             printf("%.17g %.17g\n", s, c);
         }
         return 0;
@@ -189,11 +189,11 @@ def test_a_turned_sine_is_a_sine(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("vectors", [True, False])
-def test_sines_near_what_was_foretold_are_sines(vectors: bool, tmp_path: Path) -> None:
-    """foretold.h in units of rounding of 1, in vector registers and without, up to its bounds."""
+def test_sines_near_predictions_are_sines(vectors: bool, tmp_path: Path) -> None:
+    """predicted.h in units of rounding of 1, in vector registers and without, up to its bounds."""
     compiler = needs("gcc")
-    names = "sincos.h", "foretold.h", "foretold_both.h"
-    text = "\n".join((ROOT / "csrc" / f).read_text(encoding="utf-8") for f in names)
+    names = "sincos.h", "predicted.h", "predicted_both.h"
+    text = "\n".join((CSRC / f).read_text(encoding="utf-8") for f in names)
     if not vectors:
         text = text.replace("#ifdef __GNUC__", "#if 0")
     main = r"""
@@ -204,30 +204,30 @@ def test_sines_near_what_was_foretold_are_sines(vectors: bool, tmp_path: Path) -
         int wrong = 0;
 
         while (scanf("%lf %lf %lf", &x[0], &x[1], &d) == 3) {
-            eomc_foretold f, g;
-            eomc_known k[2];
+            eomc_predicted f, g;
+            eomc_predicted_terms k[2];
 
             far = 0;
-            eomc_foretell(&f, x[0], 1.0, 0.0, 0.0, x[1] - x[0]);
+            eomc_predict(&f, x[0], 1.0, 0.0, 0.0, x[1] - x[0]);
             g.x[0] = f.x[1], g.x[1] = f.x[0];
-            eomc_foretold_both(&f, &g);
-            for (int k = 0; k < 2; k++, eomc_foretold_at(&g))
+            eomc_predicted_both(&f, &g);
+            for (int k = 0; k < 2; k++, eomc_predicted_sincos(&g))
                 for (int i = 0; i < 2; i++)
                     wrong |= f.x[i] - f.x[i] == 0
                         && (f.s[i] != g.s[1 - i] || f.c[i] != g.c[1 - i]);
-            eomc_know(&k[0], &k[1], &f, &far);
+            eomc_predicted_unpack(&k[0], &k[1], &f, &far);
             for (int i = 0; i < 2; i++) {
-                eomc_turn_on(d, &k[i], &s, &c, &far);
+                eomc_predicted_rotate(d, &k[i], &s, &c, &far);
                 printf("%.17g %.17g %.17g ", f.x[i], s, c);
             }
-            printf("%d\n", eomc_are_near(far));
+            printf("%d\n", eomc_predicted_close(far));
         }
         return wrong;
     }
     """
-    (tmp_path / "foretold.c").write_text(text + main, encoding="utf-8")
+    (tmp_path / "predicted.c").write_text(text + main, encoding="utf-8")
     subprocess.run(
-        [compiler, "-std=c99", "-O2", "foretold.c", "-o", "foretold", "-lm"],
+        [compiler, "-std=c99", "-O2", "predicted.c", "-o", "predicted", "-lm"],
         cwd=tmp_path, check=True,
     )  # fmt: skip
     random = np.random.default_rng(9)
@@ -239,7 +239,7 @@ def test_sines_near_what_was_foretold_are_sines(vectors: bool, tmp_path: Path) -
     rows = [*zip(*x.T, d, strict=True), *beyond]
     lines = "\n".join(" ".join(repr(float(value)) for value in row) for row in rows)
     done = subprocess.run(
-        ["./foretold"], cwd=tmp_path, input=lines, capture_output=True, text=True, check=True
+        ["./predicted"], cwd=tmp_path, input=lines, capture_output=True, text=True, check=True
     )
     found = [[float(value) for value in line.split()] for line in done.stdout.splitlines()]
     assert [row[-1] for row in found] == [1] * 4000 + [0] * len(beyond)
@@ -295,7 +295,7 @@ def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
     ("name", "h"), [("cartpole", 0.005), ("cartpole", 0.016), ("double_pendulum", 0.004)]
 )
 def test_a_run_cut_in_c_is_the_same_to_the_last_bit(name: str, h: float, tmp_path: Path) -> None:
-    """With the memory handed on; without it, sums begin anew. Near what was foretold, and not."""
+    """With the memory handed on; without it, sums begin anew. Near what was predicted, and not."""
     for file, text in fast_kit(eomc.sources(eomc.read(SCENES / f"{name}.toml"))).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     main = r"""

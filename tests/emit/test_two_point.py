@@ -1,4 +1,4 @@
-"""RK4 with its places in pairs: an acceleration in two parts, one of them for two at once."""
+"""Two-point RK4: an acceleration in two parts, one of them for two configurations at once."""
 
 from __future__ import annotations
 
@@ -123,15 +123,15 @@ def test_parts_are_the_whole() -> None:
     early = {"phase", "m", *(a.name for a in function.early)}
     assert parts.configuration.uses <= {"x", "a", "b", "c", "d", "e"} | sines | early
     place = {"x", "a", "b", "c", "d", "e"} | sines | {a.name for a in parts.configuration.body}
-    for a in parts.motion.body:
+    for a in parts.velocity.body:
         assert not place.issuperset(set(a.value.names) - early)
         if isinstance(a.value, Product):  # one factor of all that the place decides
             known = [name for name in a.value.factors if name in place | early]
             assert len(known) <= 1 or place.isdisjoint(known)
             assert abs(a.value.coefficient) == 1 or place.isdisjoint(known)
-    assert {o.name for o in parts.configuration.outputs} == set(parts.kept)
-    assert set(parts.kept) <= parts.motion.uses
-    assert len(parts.configuration.checks) + len(parts.motion.checks) <= len(function.checks)
+    assert {o.name for o in parts.configuration.outputs} == set(parts.handed)
+    assert set(parts.handed) <= parts.velocity.uses
+    assert len(parts.configuration.checks) + len(parts.velocity.checks) <= len(function.checks)
 
 
 def test_what_is_known_last_comes_last() -> None:
@@ -188,11 +188,11 @@ def test_few_angles_and_light_configurations_stay_whole(modules: Modules) -> Non
         source = (Path(modules(name).__file__).parent / "fast" / f"{name}.c").read_text(
             encoding="utf-8"
         )
-        assert "_pair;" not in source
+        assert "_two_points;" not in source
     source = (Path(modules("chain").__file__).parent / "fast" / "chain.c").read_text(
         encoding="utf-8"
     )
-    assert "} chain_pair;" in source
+    assert "} chain_two_points;" in source
 
 
 @pytest.mark.parametrize("h", [0.001, 0.02, 0.2, 0.45])
@@ -238,7 +238,7 @@ def test_steps_at_an_angle_too_wide_to_move(at: int, modules: Modules) -> None:
     _, q, _ = trusted.simulate(start, rates, h=0.01, steps=20)
     run = module.simulate(start, rates, h=0.01, steps=20)
     assert (run.q[:, at] == 7e22).all()
-    # whether it has turned by h^2 a inside a step its numbers do not tell; a wrong sine makes 0.1
+    # whether it has rotated by h^2 a inside a step its numbers do not tell; a wrong sine makes 0.1
     np.testing.assert_allclose(run.q, q, rtol=0, atol=1e-4)
 
 
@@ -284,11 +284,11 @@ def test_it_is_faster_where_it_is_taken(tmp_path: Path) -> None:
     """The file says so in its head, and keeps no sines from step to step."""
     (tmp_path / "links.toml").write_text(chain(10), encoding="utf-8")
     files = fast_kit(eomc.sources(eomc.read(tmp_path / "links.toml")))
-    assert "Places are taken in pairs" in files["links10.c"]
+    assert "Two configurations at a time" in files["links10.c"]
     assert "angles s;" not in files["links10.h"]
 
 
-def test_sums_are_compensated_where_places_are_in_pairs(modules: Modules) -> None:
+def test_sums_are_compensated_in_the_two_point_form(modules: Modules) -> None:
     """130,000 steps, so short that rounding is all of their error, beside 256 of order 8.
 
     Both are then off by some units of rounding, 2^-53 of numbers near 1, that the motion makes five
@@ -300,7 +300,7 @@ def test_sums_are_compensated_where_places_are_in_pairs(modules: Modules) -> Non
     assert np.abs(short.x[-1] - few.x[-1]).max() < 60 * 2.0**-53
 
 
-def test_weights_add_up_to_one_where_places_are_in_pairs(modules: Modules) -> None:
+def test_weights_add_up_to_one_in_the_two_point_form(modules: Modules) -> None:
     """An oscillator beside five angles: a step of it is a linear map, its power the answer.
 
     In 326 turns a relative error of h/6, 2^-54, makes 1e-13.

@@ -605,9 +605,9 @@ def test_no_loop_over_a_tile_has_a_rest(tmp_path: Path) -> None:
     for file, content in fast_kit(sources).items():
         (tmp_path / file).write_text(content, encoding="utf-8")
     text = fast_kit(sources)[f"{sources.name}.c"]
-    rounded = "wide = (int)(m + CARTPOLE_BLOCK - 1) & -CARTPOLE_BLOCK"
+    rounded = "used = (int)(m + CARTPOLE_BLOCK - 1) & -CARTPOLE_BLOCK"
     assert rounded in text
-    (tmp_path / "blind.c").write_text(text.replace(rounded, "wide = (int)m"), encoding="utf-8")
+    (tmp_path / "blind.c").write_text(text.replace(rounded, "used = (int)m"), encoding="utf-8")
     sizes = []
     for file in (f"{sources.name}.c", "blind.c"):
         subprocess.run(

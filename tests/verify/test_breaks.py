@@ -163,7 +163,7 @@ BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
     ),
     "the sine": (text("*s = ", "*s = -"), {"acceleration", "g"}),
     "what Python asks for": (
-        text("{{ f.binding_call }}", "{ {{ f.binding_call }} out[0] = -out[0]; }"),
+        text("{{ f.call }};", "{ {{ f.call }}; out[0] = -out[0]; }"),
         {"D", "D > 0"},
     ),
 }

@@ -26,7 +26,7 @@ VARIANTS = {
 UNREACHABLE = {
     "chain": (
         r"return CHAIN_SINGULAR;|\*status = CHAIN_SINGULAR;",
-        "its pivots are positive multiples of what chain_prepare has looked at: equal uniform rods",
+        "its pivots are positive multiples of what chain_compute_constants checks: equal rods",
     ),
 }
 

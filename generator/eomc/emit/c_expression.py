@@ -222,7 +222,7 @@ def body(
     real: Real = DOUBLE,
     keep: Callable[[str], str] | None = None,
     parameters: Sequence[str] = (),
-    lane: bool = False,
+    branchless: bool = False,
     stored: Mapping[str, str] | None = None,
     pivots: int = 0,
     in_order: bool = False,
@@ -231,8 +231,8 @@ def body(
 
     where: how each name from outside is written (`m_c` -> `p->m_c`).
     keep: how the rest reads what parameters decide, where that lives in a struct; `parameters`
-    are kept there too where the rest reads them. lane: without branches, for a loop over many.
-    stored: where values go that are no locals. pivots: how many the whole has, if this is a piece.
+    are kept there too where the rest reads them. branchless: for a loop over many.
+    stored: where values go that are no locals. pivots: how many the whole has, if this is a part.
     in_order: terms of sums stay in their order.
     """
     stored = stored or {}
@@ -277,7 +277,7 @@ def body(
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             if names := angles.pop(a.value.args, None):
-                lines[a.stage] += _sincos(printer, a.value.args[0], names, lane, stored)
+                lines[a.stage] += _sincos(printer, a.value.args[0], names, branchless, stored)
             continue
         text, strength = printer.value(a.value)
         if a.name in inline:
@@ -298,7 +298,7 @@ def body(
 def _failures(
     printer: Printer, pairs: Iterable[tuple[Operand, Operand]], tolerance: float
 ) -> tuple[str, ...]:
-    """Conditions under which a pivot is no good, each once; a positive number always is."""
+    """Conditions under which a pivot fails, each once; a positive number always is."""
     asked = [(p, d) for p, d in pairs if p.name or not (p == d and p.coefficient > 0)]
     return tuple(dict.fromkeys(_fails(printer, pair, tolerance) for pair in asked))
 
@@ -320,7 +320,7 @@ def _sincos(
     printer: Printer,
     angle: Operand,
     names: Mapping[str, str],
-    lane: bool,
+    branchless: bool,
     stored: Mapping[str, str],
 ) -> list[str]:
     real = printer.real
@@ -334,8 +334,8 @@ def _sincos(
     both = ", ".join(f"&{stored.get(n, n)}" for n in (one, other))
     return [
         *([f"{real.name} {', '.join(local)};"] if local else []),
-        f"{printer.prefix}_sincos{suffix}_lane({argument}, {both}, trouble);"
-        if lane
+        f"{printer.prefix}_sincos{suffix}_branchless({argument}, {both}, failed);"
+        if branchless
         else f"{printer.prefix}_sincos{suffix}({argument}, {both});",
     ]
 
@@ -355,7 +355,7 @@ def _inlined(function: Function, kept: frozenset[str]) -> frozenset[str]:
         uses[o.name] += 1
         stage_of_reader.setdefault(o.name, last)
     for pair in function.checks:
-        uses.update(2 * [o.name for o in pair])  # read beside the statements
+        uses.update(2 * [o.name for o in pair])  # read outside the statements
     inline: set[str] = set()
     weight: dict[str, int] = {}
     for a in everything:

@@ -20,26 +20,26 @@ from eomc.program.program import TIME, Program
 # names that the templates use inside functions; a user's name that is one of them gets a "_"
 _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
-    "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 trouble held at "
-    "moving prepared along column slopes wide troubles E".split()
+    "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
+    "moving constants along column slopes count failures point E".split()
 )
 
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
 # that is called so has another name in C
 OWN = frozenset(
-    "ALIGNED ALONE BLOCK FAST_FMA FAST_FMAF H INLINE LANE NOT_FINITE NO_CONVERGENCE NQ NU OK PIECE "
-    "ROLLED SINGULAR STAMP TILE".split()
+    "ALIGNED ALONE BLOCK FAST_FMA FAST_FMAF FORCE_INLINE H INLINE NOINLINE NOT_FINITE "
+    "NO_CONVERGENCE NQ NU OK ROLLED SINGULAR STAMP TILE".split()
 )
 
-TROUBLE = "*trouble"  # what a lane notes its failure in, as a name that an argument brings
-WIDE = "*wide"  # how many instances of a tile are to be taken, likewise
+FAILED = "*failed"  # where an instance notes its failure, as a name that an argument brings
+COUNT = "*count"  # how many instances of a tile are to be taken, likewise
 
 Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C
 
 
 @dataclass(frozen=True)
 class Argument:
-    """One that a piece may need: its declaration, what is passed, the names that it brings."""
+    """One of an outlined function: its declaration, what is passed, the names that it brings."""
 
     declared: str
     passed: str
@@ -101,19 +101,19 @@ class Target:
 
     @cached_property
     def signal_state(self) -> bool:
-        """Whether the scene's signals hang on the state."""
+        """Whether the scene's signals depend on the state."""
         signal = self.program.functions.get("signal")
         state = {x.name for x in (*self.system.q, *self.system.qd)}
         return signal is not None and bool(signal.uses & state)
 
     @cached_property
     def signal_t(self) -> bool:
-        """Whether the scene's signals hang on the time."""
+        """Whether the scene's signals depend on the time."""
         return "signal" in self.program and TIME in self.program["signal"].uses
 
     @cached_property
     def driven(self) -> bool:
-        """Whether motion hangs on the time, by itself or by the signals."""
+        """Whether motion depends on the time, by itself or by the signals."""
         return TIME in self.program["acceleration"].uses or self.signal_t
 
     @cached_property
@@ -208,9 +208,9 @@ class Target:
             "along": frozenset(x.name + ALONG for x in (*s.q, *s.qd, *s.u)),
         }
 
-    # functions in pieces
+    # outlined functions
 
-    def in_pieces(
+    def outlined(
         self,
         function: Function,
         what: str,
@@ -219,24 +219,24 @@ class Target:
         out: Argument,
         loads: Callable[[Function], list[str]],
         where: Mapping[str, str] | None = None,
-        lane: bool = False,
+        tile: bool = False,
         pair: bool = False,
         inline: bool = False,
         in_order: bool = False,
     ) -> dict[str, Any]:
-        """A long function as several static ones, for pieces.c.jinja.
+        """A long function outlined to several static ones, for outlined.c.jinja.
 
-        what: its name in C, behind the prefix. given: the arguments; a piece has those that it
-        reads, and `out` where results are ready, which go to the places `results`. lane, pair: each
-        piece is a loop over a tile, or over two. inline: no function of its own in the end.
+        what: its name in C, behind the prefix. given: the arguments; each has those that it
+        reads, and `out` where results are ready, which go to the places `results`. tile, pair: each
+        of them is a loop over a tile, or over two. inline: no function of its own in the end.
         in_order: terms of sums stay in their order.
         """
         function = unclashed(function)
-        small = outline.LANE_PIECE if lane else outline.PIECE
+        small = outline.LANE_PIECE if tile else outline.PIECE
         piece = small if outline.is_large(function) else outline.LARGE
         parts = outline.split(function, piece)
-        end = "wide" if lane else "2" if pair else ""
-        size = f"{self.PREFIX}_TILE" if lane else end
+        end = "count" if tile else "2" if pair else ""
+        size = f"{self.PREFIX}_TILE" if tile else end
         at = "[i]" if end else ""
         values = f"{self.prefix}_{what}_values"
         crossing = [name for part in parts for name in part.keeps]
@@ -244,7 +244,7 @@ class Target:
             f"{values} *{self.PREFIX + '_ALONE ' if end else ''}s", "&s", frozenset(crossing)
         )
         handed = {name: f"s->{name}{at}" for name in crossing}
-        kind = "INLINE" if inline else "PIECE"
+        kind = "INLINE" if inline else "NOINLINE"
         made, calls = [], []
         pivots = len(function.checks)
         for k, part in enumerate(parts, 1):
@@ -254,13 +254,13 @@ class Target:
                 dict(where or {}) | {name: handed[name] for name in part.reads},
                 stored={name: handed[name] for name in part.keeps},
                 pivots=pivots,
-                lane=lane,
+                branchless=tile,
                 in_order=in_order,
             )
             failures = [*body.early_failures, *body.failures]
             checks = bool(failures)
-            troubled = bool(end) and (checks or (lane and body.sincos))
-            read = f.uses | {WIDE, *([TROUBLE] if troubled else [])}
+            fails = bool(end) and (checks or (tile and body.sincos))
+            read = f.uses | {COUNT, *([FAILED] if fails else [])}
             needed = [a for a in given if a.names & read]
             if crossing and (part.reads or part.keeps):
                 needed.insert(0, struct)
@@ -272,14 +272,14 @@ class Target:
             one = f"1.0{self.real.suffix}"
             ends = [f"return {none_of(failures)};"] if checks else []
             if end:
-                ends = [f"*trouble = {x} ? {one} : *trouble;" for x in failures]
+                ends = [f"*failed = {x} ? {one} : *failed;" for x in failures]
             found = dict(zip(part.outputs, body.results, strict=True))
             made.append(
                 {
                     "comment": _about(k, part, len(parts), what),
                     "prototype": f"{self.PREFIX}_{kind} {'int' if checks and not end else 'void'} "
                     f"{name}({arguments(*(a.declared for a in needed)) or 'void'})",
-                    "trouble": troubled,
+                    "failed": fails,
                     "loads": loads(f),
                     "blocks": [*body.early, *body.blocks],
                     "results": found,
@@ -294,9 +294,9 @@ class Target:
             "members": [name + (f"[{size}]" if end else "") for name in crossing],
             "loop": end,
             "width": 8 if end else 4,
-            "pieces": made,
+            "functions": made,
             "calls": calls,
-            "troubled": any(m["trouble"] for m in made),
+            "fails": any(m["failed"] for m in made),
             "locals": [
                 *([f"{values} s;"] if crossing else []),
                 *(["int good = 1;"] if checked else []),
@@ -306,14 +306,14 @@ class Target:
 
 
 def _about(k: int, part: outline.Piece, count: int, what: str) -> str:
-    """What a piece computes from what, in a sentence, as lines of a comment."""
+    """What an outlined function computes from what, in a sentence, as lines of a comment."""
     named = [n for n in part.keeps if not (n[0] == "w" and n[1:].isdigit())]
     made = ", ".join(named[:8]) + (", ..." if len(part.keeps) > 8 else "")
     told = [f"{what}, {k} of {count}: {outline.weight(part.function)} operations"]
     if part.reads:
-        told.append(f"from {len(part.reads)} values of the pieces before")
+        told.append(f"from {len(part.reads)} values of those before")
     if part.keeps:
-        told.append(f"{len(part.keeps)} for those behind" + (f" ({made})" if named else ""))
+        told.append(f"{len(part.keeps)} for those after" + (f" ({made})" if named else ""))
     if part.outputs:
         told.append(f"{len(part.outputs)} results")
     return textwrap.fill(", ".join(told) + ".", 94, subsequent_indent=" * ")

@@ -123,15 +123,14 @@ def _function(target: Target, name: str) -> dict[str, Any]:
         "size": size,
         "unused": unused,
         "signal_call": target.signal_call("now", "q", "qd"),
-        "binding_call": _binding_call(target, name, size, takes_q, timed, takes_u),
         "column": None,
-        "pieces": None,
-        "in_pieces": is_large(function),
+        "outlined": None,
+        "is_large": is_large(function),
     }
     if by_columns:
         return made | _by_columns(target, name, function)
     if is_large(function):
-        return made | _in_pieces(target, name, function)
+        return made | _outlined(target, name, function)
     return made | _straight(target, kind.out if size else "", function)
 
 
@@ -147,7 +146,7 @@ def _straight(target: Target, out: str, function: Function) -> dict[str, Any]:
     }
 
 
-def _in_pieces(target: Target, name: str, function: Function) -> dict[str, Any]:
+def _outlined(target: Target, name: str, function: Function) -> dict[str, Any]:
     """Its statements in functions of their own, called one after the other."""
     kind, real, uses = KINDS.get(name), target.real.name, function.uses
     array = kind.out if kind is not None else "column"
@@ -164,7 +163,7 @@ def _in_pieces(target: Target, name: str, function: Function) -> dict[str, Any]:
         )
         if uses & target.groups()[key]
     ]
-    made = target.in_pieces(
+    made = target.outlined(
         function,
         name,
         given,
@@ -173,7 +172,7 @@ def _in_pieces(target: Target, name: str, function: Function) -> dict[str, Any]:
         lambda f: target.loads(f, target.element, target.element),
     )
     return {
-        "pieces": made,
+        "outlined": made,
         "loads": [*([f"{real} result;"] if scalar else []), *made["locals"]],
         "blocks": [],
         "results": [*made["calls"], *(["return result;"] if scalar else [])],
@@ -192,9 +191,9 @@ def _by_columns(target: Target, name: str, function: Function) -> dict[str, Any]
         f"{real} column[{NQ}]", f"const {real} along[{NQ}]", *(declared[key] for key in read)
     )
     if is_large(function):
-        column = _in_pieces(target, f"{name}_column", function)
+        column = _outlined(target, f"{name}_column", function)
     else:
-        column = {"pieces": None} | _straight(target, "column", function)
+        column = {"outlined": None} | _straight(target, "column", function)
     one, zero = f"1.0{target.real.suffix}", target.zero
     cell = f"{kind.out}[{NQ}*i + j]"
     rows = (
@@ -226,24 +225,6 @@ def _by_columns(target: Target, name: str, function: Function) -> dict[str, Any]
             "}",
         ],
     }
-
-
-def _binding_call(
-    target: Target, name: str, size: str, takes_q: bool, timed: bool, takes_u: bool
-) -> str:
-    """The call for row k of many."""
-    NQ, signal = f"{target.PREFIX}_NQ", name == "signal"
-    at = f"q + {NQ}*k" if takes_q else ""
-    given = arguments(
-        f"out + {size}*k" if size else "",
-        "t" if timed and signal else "",
-        at,
-        at.replace("q", "qd", 1) if KINDS[name].qd else "",
-        "t" if timed and not signal else "",
-        "u" if takes_u else "",
-        target.p_cast,
-    )
-    return f"{'' if size else 'out[k] = '}{target.prefix}_{name}({given});"
 
 
 # --- the derivatives of the accelerations ---------------------------------------------------------
@@ -302,11 +283,6 @@ def linearization(target: Target) -> dict[str, Any] | None:
         "signal_near": target.signal_call("near_u", "near_q", "near_qd")
         if target.signal_state
         else "",
-        "binding": f"{P}_linearization("
-        + arguments(
-            *(f"{n} + {NQ}*{w}*k" for n, w, _ in parts), f"q + {NQ}*k", f"qd + {NQ}*k",
-            "t" if target.driven else "", "u" if s.inputs else "", target.p_cast,
-        ) + ")",
     }  # fmt: skip
 
 
@@ -315,17 +291,17 @@ def _slopes(target: Target, function: Function, out: str, given: list[Argument])
     results = [f"{out}[{k}]" for k in range(len(function.outputs))]
     if is_large(function):
         filled = Argument(f"{target.real.name} *{out}", out, frozenset())
-        cut = target.in_pieces(
+        cut = target.outlined(
             function, "slopes", given, results, filled,
             lambda f: target.loads(f, target.element, target.element),
         )  # fmt: skip
         return {
-            "pieces": cut, "loads": cut["locals"], "blocks": [], "results": cut["calls"],
+            "outlined": cut, "loads": cut["locals"], "blocks": [], "results": cut["calls"],
             "end": cut["outcome"],
         }  # fmt: skip
     body = target.body(function)
     return {
-        "pieces": None,
+        "outlined": None,
         "loads": target.loads(function, target.element, target.element),
         "blocks": [*body.early, *body.blocks],
         "results": [f"{to} = {x};" for to, x in zip(results, body.results, strict=True)],

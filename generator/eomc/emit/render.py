@@ -17,12 +17,13 @@ import jinja2
 from eomc.base import resources
 from eomc.base.texts import docstring
 from eomc.base.texts import name as plain
-from eomc.emit.c_expression import REALS
+from eomc.emit import package, selftest, views
+from eomc.emit.c_expression import REALS, indent
 from eomc.emit.c_names import Target
 from eomc.emit.c_safe_names import borne
 from eomc.emit.fast.context import values
 from eomc.emit.plain import steppers
-from eomc.emit.plain.views import View
+from eomc.emit.plain import views as plain_views
 from eomc.integrators.tableaux import METHODS
 from eomc.program.outline import weight
 from eomc.program.program import Program
@@ -63,6 +64,7 @@ def environment() -> jinja2.Environment:
         autoescape=lambda name: (name or "").endswith(".html.jinja"),
     )
     made.filters["docstring"] = docstring
+    made.filters["block"] = indent
     return made
 
 
@@ -88,14 +90,15 @@ def render(program: Program, extension: str) -> Sources:
     program, written = borne(program)
     run = s.run
     target = Target(program, REALS[run.real], written)
-    context = {**values(target), "extension": extension}
+    context = values(target)
+    binding = package.binding(target)
     jinja = environment()
     name = program.system.name
 
     def text(template: str) -> str:
         return jinja.get_template(template + ".jinja").render(context)
 
-    def show(view: View) -> str:
+    def show(view: views.View | plain_views.View) -> str:
         given = {field.name: getattr(view, field.name) for field in fields(view)}
         return jinja.get_template(view.TEMPLATE + ".jinja").render(given)
 
@@ -105,13 +108,13 @@ def render(program: Program, extension: str) -> Sources:
             **steppers.files(program, show),
             f"{FAST}/{name}.h": text("c/fast/header.h"),
             f"{FAST}/{name}.c": text("c/fast/source.c"),
-            "main.c": text("c/main.c"),
-            "selftest.c": text("c/selftest.c"),
-            "__init__.py": text("python/face.py"),
+            "main.c": show(package.main(target)),
+            "selftest.c": show(selftest.view(target)),
+            "__init__.py": show(package.face(target, extension)),
             **resources.runtime(run.batch),
         },
-        binding=text("python/binding.c"),
-        cdef=text("python/binding.cdef"),
+        binding=show(binding),
+        cdef=show(package.declarations(binding)),
         operations=sum(map(weight, program.functions.values())),
         wide=run.batch or any(METHODS[method].sweeps for method in run.methods),
     )

@@ -7,11 +7,13 @@ import struct
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from itertools import chain, islice
-from typing import Any
 
+from eomc.base.texts import FreeText
 from eomc.emit.c_expression import DOUBLE
-from eomc.emit.c_names import Target, arguments
-from eomc.emit.evaluations import KINDS, takes_t
+from eomc.emit.c_names import Target
+from eomc.emit.fast.context import stamp
+from eomc.emit.public import Public
+from eomc.emit.views import SelfTest, State
 from eomc.program.interpret import evaluate, nearby
 from eomc.program.program import matrix
 from eomc.program.trig import apart
@@ -25,23 +27,32 @@ STATES = 3  # near the start, and as many with large angles
 GRID = 16  # large angles are multiples of 1/GRID: so are their sums and multiples, exactly
 
 
-def values(target: Target) -> dict[str, Any]:
-    """The variables of selftest.c's template."""
-    double = target.real is DOUBLE
+def view(target: Target) -> SelfTest:
+    """The view of selftest.c."""
+    double, public = target.real is DOUBLE, Public(target)
     near = (_state(target, nearby(target.system, k), 0.0) for k in range(6))
     states = list(islice(filter(None, near), STATES))
     far = (_state(target, x, LARGE[double]) for x in _large(target))
     large = list(islice(filter(None, far), STATES))
-    return {
-        "states": [*states, *large],
-        "tolerance": USUAL[double],
-        "large_tolerance": LARGE[double] if large else 0,
-        "large_limit": "2^20" if double else "2^13",
-        "calls": _calls(target),
-    }
+    now = {"t": target.zero, "u": "NULL", "p": f"&{target.prefix}_defaults"}
+    return SelfTest(
+        title=FreeText(target.system.title),
+        stamp=tuple(stamp(target)),
+        prefix=target.prefix,
+        PREFIX=target.PREFIX,
+        real=target.real.name,
+        states=(*states, *large),
+        tolerance=USUAL[double],
+        large_tolerance=LARGE[double] if large else 0,
+        large_limit="2^20" if double else "2^13",
+        D=public.evaluation("D").call(**now),
+        bias=public.evaluation("bias").call(**now),
+        tau=public.evaluation("tau").call(**now) if "tau" in target.program else "",
+        acceleration=public.acceleration.call(**now),
+    )
 
 
-def _state(target: Target, x: Mapping[str, float], close: float) -> dict[str, Any] | None:
+def _state(target: Target, x: Mapping[str, float], close: float) -> State | None:
     """One state as literals; None where it has no accelerations, or where angles are large
     (`close` > 0) and numbers are too short to judge D and bias as closely as that.
     """
@@ -68,11 +79,11 @@ def _state(target: Target, x: Mapping[str, float], close: float) -> dict[str, An
         D = [x for row in matrix(program, "D", known) for x in row]
     except (ArithmeticError, ValueError):
         return None
-    return {
-        "x": [target.literal(known[name.name]) for name in (*s.q, *s.qd)],
-        "expected": [target.literal(value) for value in (*D, *bias, *qdd)],
-        "tolerance": close or USUAL[target.real is DOUBLE],
-    }
+    return State(
+        x=tuple(target.literal(known[name.name]) for name in (*s.q, *s.qd)),
+        expected=tuple(target.literal(value) for value in (*D, *bias, *qdd)),
+        tolerance=close or USUAL[target.real is DOUBLE],
+    )
 
 
 def _single(x: float) -> float:
@@ -113,28 +124,3 @@ def _lost(angle: float, double: bool) -> float:
     n, rounded = round(angle / (math.pi / 2)), (lambda x: x) if double else _single
     half_pi = rounded(math.pi / 2)
     return float(abs(Fraction(rounded(n * half_pi)) - n * Fraction(half_pi)))
-
-
-def _calls(target: Target) -> dict[str, str]:
-    s = target.system
-    state = arguments("q", "qd")
-
-    def call(name: str) -> str:
-        kind = KINDS[name]
-        given = arguments(
-            name, "q", "qd" if kind.qd else "", target.zero if takes_t(target, name) else "",
-            "NULL" if kind.u and s.inputs else "", "&" + target.prefix + "_defaults"
-            if target.needs_p else "",
-        )  # fmt: skip
-        return f"{target.prefix}_{name}({given});"
-
-    return {
-        "D": call("D"),
-        "bias": call("bias"),
-        "tau": call("tau") if "tau" in target.program else "",
-        "acceleration": f"{target.prefix}_acceleration("
-        + arguments(
-            "qdd", state, target.zero if target.driven else "",
-            "NULL" if s.inputs else "", f"&{target.prefix}_defaults" if target.needs_p else "",
-        ) + ")",
-    }  # fmt: skip

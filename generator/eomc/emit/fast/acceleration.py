@@ -1,7 +1,7 @@
 """Accelerations of one trajectory for the templates, and what surrounds them.
 
-A small acceleration is inlined into the steppers, its state in named scalars. A large one comes in
-pieces that are called, its state in arrays, and in a batch each piece is a loop over a tile.
+A small acceleration is inlined into the steppers, its state in named scalars. A large one calls
+outlined functions, its state in arrays, and in a batch each of them is a loop over a tile.
 """
 
 from __future__ import annotations
@@ -47,55 +47,54 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
     parts = two_point.apart(target, function)
     large, arrays = is_large(function), is_large(function) or parts is not None
     extent = str(two_point.width(target, parts)) if parts else NQ
-    turned, rest = ((), function) if parts else rotations.turned_apart(target, function)
-    prepare = _prepare_apart(target, function) if arrays else _prepare(target, rest, turned)
-    kept = prepare["prepared_members"]
+    rotated, rest = ((), function) if parts else rotations.rotated_apart(target, function)
+    constants = _constants_apart(target, function) if arrays else _constants(target, rest, rotated)
+    kept = constants["constants_members"]
     if parts:  # in loops over many it is printed anew
         function = with_names(function, frozenset(kept))
     takes_c, takes_p = bool(kept), target.needs_p and "signal" in target.program
     t, u = "t" if target.driven else "", "u" if s.inputs else ""
     c, p = "c" if takes_c else "", "p" if takes_p else ""
-    scalar = _mode(target, rest, prepare, takes_c, takes_p, turned, parts)
-    faster = "pairs" if parts else "angles" if turned else ""
+    scalar = _mode(target, rest, constants, takes_c, takes_p, rotated, parts)
+    faster = "two_point" if parts else "angles" if rotated else ""
 
     t_arg, u_arg = f"{real} t" if t else "", f"const {real} *u" if u else ""
     outer = arguments(u_arg, target.p_arg)
     x = f"{real} q[{NQ}], {real} qd[{NQ}]"
     rows = f"long every, {real} *q_rows, {real} *qd_rows"
     t0_arg = f"{real} t0" if t else ""
-    lane = batch.lane(target, function, prepare, scalar) if s.run.batch else None
-    side_by_side = (
-        stage_parallel.lane(target, function, kept, arrays) if _swept(s) and not large else None
+    tile = batch.mode(target, function, constants, scalar) if s.run.batch else None
+    stages = (
+        stage_parallel.mode(target, function, kept, arrays) if _swept(s) and not large else None
     )
     chosen = [
-        integrators.method(target, METHODS[name], slopes, scalar, side_by_side, faster, lane)
+        integrators.method(target, METHODS[name], slopes, scalar, stages, faster, tile)
         for name in s.run.methods
     ]
-    return prepare | {
+    return constants | {
         "large": large,
-        "prepare_arguments": arguments(f"{P}_prepared *c" if takes_c else "", target.p_arg),
-        "prepare_call": arguments("&prepared" if takes_c else "", target.p_call),
-        "prepare_unread": target.needs_p and not _reads_p(prepare),
-        "p_unused": target.needs_p and not prepare["has_prepare"] and not takes_p,
+        "constants_arguments": arguments(f"{P}_constants *c" if takes_c else "", target.p_arg),
+        "constants_call": arguments("&constants" if takes_c else "", target.p_call),
+        "constants_unread": target.needs_p and not _reads_p(constants),
+        "p_unused": target.needs_p and not constants["has_constants"] and not takes_p,
         "takes_c": takes_c,
         "cost": sentence(function),
         "scalar": scalar,
-        "lane": lane,
-        "side_by_side": side_by_side,
-        "lanes_turn": bool(lane and lane["angles"]),
+        "tile": tile,
+        "stage_parallel": stages,
+        "batch_rotates": bool(tile and tile["angles"]),
         "rates_now": f"{P}_{scalar['rates']}(&a, &at, &moving{scalar['call']('t')})",
         "stepper_call": after(t, "h", u, c, p),
         "methods": chosen,
         "tile_rates": any(m.get("by_rates") for m in chosen),
         "implicit": any(METHODS[name].implicit for name in s.run.methods),
         "newton": any(METHODS[name].newton for name in s.run.methods),
-        "angles": rotations.scalar(target, turned),
-        "foretold": predicted_angles.steps(target, turned, rest.uses, scalar, c, p),
-        "turned": len(turned),
-        "pairs": scalar["pairs"],
+        "angles": rotations.scalar(target, rotated),
+        "predicted": predicted_angles.steps(target, rotated, rest.uses, scalar, c, p),
+        "rotated": len(rotated),
+        "two_point": scalar["two_point"],
         "fabs": "fabs" + target.real.function_suffix,
         "fmax": "fmax" + target.real.function_suffix,
-        "method_names": repr(s.run.methods),
         "t_call": after(t),
         "p_call": after(target.p_call),
         "acceleration_prototype": f"{P}_status {P}_acceleration("
@@ -117,122 +116,119 @@ def dynamics(target: Target, slopes: Mapping[str, Any] | None) -> dict[str, Any]
             f"{rows}, long row_count", target.p_arg and f"{target.p_arg}, long p_instance",
             "long *done", "int *status",
         ) + ")",
-        **(batch.tile(target, len(kept), lane) if lane else {}),
+        **(batch.sizes(target, len(kept), tile) if tile else {}),
         "input_names": target.input_names,
         "sincos": f"{P}_sincos{target.real.function_suffix}" if target.sincos else "",
         "reach": target.literal(target.real.reach),
-        "prepare_lane": arguments(
-            "&prepared" if takes_c else "", "p + k*p_instance" if target.needs_p else ""
+        "constants_tile": arguments(
+            "&constants" if takes_c else "", "p + k*p_instance" if target.needs_p else ""
         ),
         "retry_call": after(
             t, "h", u and "u ? u + (base + i)*u_instance + n*u_step : 0",
             "&c" if takes_c else "", "p + (base + i)*p_instance" if takes_p else "",
         ),
-        "batch_binding": lambda name: f"{P}_{name}_batch("
-        + arguments(
-            "count", "q", "qd", t and "t0", "h", "first", "steps",
-            u and "u, u_instance, u_step", "every", "q_rows", "qd_rows", "row_count",
-            f"{target.p_cast}, p_instance" if target.needs_p else "", "done", "status",
-        ) + ")",
         "vector_members": [f"{real} x[{extent}];"] if arrays
         else [f"{real} {', '.join(target.names)};"],
         "vector_of": lambda name, element: vectors.vector_of(target, arrays, name, element),
-        "prepared_here": f"const {P}_prepared c = "
+        "constants_here": f"const {P}_constants c = "
         + "{ " + ", ".join(f"s.c.{n}[i]" for n in kept) + " };",
     }  # fmt: skip
 
 
 def _swept(system: System) -> bool:
-    """Whether some method has its stages side by side."""
+    """Whether some method has its stages in parallel."""
     return any(METHODS[name].sweeps for name in system.run.methods)
 
 
-def _prepare(target: Target, function: Function, turned: Sequence[Angle]) -> dict[str, Any]:
+def _constants(target: Target, function: Function, rotated: Sequence[Angle]) -> dict[str, Any]:
     own = [p.name for p in target.system.parameters]
-    where = {name: f"s->{name}" for name in rotations.sines(turned)}
-    body = target.body(function, where, keep=_in_prepared, parameters=own)
+    where = {name: f"s->{name}" for name in rotations.sines(rotated)}
+    body = target.body(function, where, keep=_in_constants, parameters=own)
     kept = _with_signal(target, list(body.kept))
     return {
-        "prepared_members": kept,
-        "prepare_pieces": None,
-        "prepare_early": [line for block in body.early for line in block.lines],
-        "prepare_sets": [f"c->{n} = {'p->' if n in own else ''}{n};" for n in kept],
-        "prepare_result": none_of(body.early_failures),
-        "has_prepare": bool(kept or body.early_failures),
+        "constants_members": kept,
+        "constants_outlined": None,
+        "constants_early": [line for block in body.early for line in block.lines],
+        "constants_sets": [f"c->{n} = {'p->' if n in own else ''}{n};" for n in kept],
+        "constants_result": none_of(body.early_failures),
+        "has_constants": bool(kept or body.early_failures),
         "body": body,
     }
 
 
-def _prepare_apart(target: Target, function: Function) -> dict[str, Any]:
-    """The same as a function of its own, itself in pieces where it is long."""
+def _constants_apart(target: Target, function: Function) -> dict[str, Any]:
+    """The same as a function of its own, itself outlined where it is long."""
     own = [p.name for p in target.system.parameters]
     first, _ = staged(function, own)
     kept = _with_signal(target, [o.name for o in first.outputs])
     first = replace(first, outputs=tuple(Operand(S.One, n) for n in kept))
     places = [f"c->{n}" for n in kept]
-    made = {"prepared_members": kept, "has_prepare": bool(kept or first.checks)}
+    made = {"constants_members": kept, "has_constants": bool(kept or first.checks)}
     if not is_large(first):
         body = target.body(first, parameters=own)
         sets = [f"{to} = {text};" for to, text in zip(places, body.results, strict=True)]
         return made | {
-            "prepare_pieces": None,
-            "prepare_early": [line for block in body.early for line in block.lines],
-            "prepare_sets": sets,
-            "prepare_result": none_of(body.early_failures),
+            "constants_outlined": None,
+            "constants_early": [line for block in body.early for line in block.lines],
+            "constants_sets": sets,
+            "constants_result": none_of(body.early_failures),
         }
     given = [Argument(target.p_arg, "p", frozenset(own))]
-    out = Argument(f"{target.prefix}_prepared *c", "c", frozenset())
-    cut = target.in_pieces(first, "prepare", given, places, out, lambda f: [])
+    out = Argument(f"{target.prefix}_constants *c", "c", frozenset())
+    cut = target.outlined(first, "compute_constants", given, places, out, lambda f: [])
     return made | {
-        "prepare_pieces": cut,
-        "prepare_early": cut["locals"],
-        "prepare_sets": cut["calls"],
-        "prepare_result": cut["outcome"],
+        "constants_outlined": cut,
+        "constants_early": cut["locals"],
+        "constants_sets": cut["calls"],
+        "constants_result": cut["outcome"],
     }
 
 
-def _reads_p(prepare: Mapping[str, Any]) -> bool:
-    lines = [*prepare["prepare_early"], *prepare["prepare_sets"], prepare["prepare_result"]]
+def _reads_p(constants: Mapping[str, Any]) -> bool:
+    lines = [
+        *constants["constants_early"],
+        *constants["constants_sets"],
+        constants["constants_result"],
+    ]
     return any(re.search(r"\bp\b", line) for line in lines)
 
 
 def _with_signal(target: Target, kept: list[str]) -> list[str]:
-    """With the parameters that the signals read, since lanes have no others."""
-    by_lanes = target.system.run.batch or _swept(target.system)
-    if not (by_lanes and "signal" in target.program):
+    """With the parameters that the signals read, since tiles have no others."""
+    in_loops = target.system.run.batch or _swept(target.system)
+    if not (in_loops and "signal" in target.program):
         return kept
     own = [p.name for p in target.system.parameters]
     uses = target.program["signal"].uses
     return [n for n in own if n in kept or n in uses] + [n for n in kept if n not in own]
 
 
-def _in_prepared(name: str) -> str:
+def _in_constants(name: str) -> str:
     return f"c->{name}"
 
 
 def _mode(
     target: Target,
     function: Function,
-    prepare: Mapping[str, Any],
+    constants: Mapping[str, Any],
     takes_c: bool,
     takes_p: bool,
-    turned: Sequence[Angle],
+    rotated: Sequence[Angle],
     parts: Parts | None,
 ) -> dict[str, Any]:
     """solve, rates and steppers for one trajectory: they return whether D was regular.
 
-    turned: the angles whose sines and cosines are not computed in `function`. parts: its two parts,
-    where places are taken in pairs.
+    rotated: the angles whose sines and cosines come from outside. parts: of the two-point form.
     """
     s, real, P = target.system, target.real.name, target.prefix
-    timed, u, arrays = TIME in function.uses, bool(s.inputs), "body" not in prepare
+    timed, u, arrays = TIME in function.uses, bool(s.inputs), "body" not in constants
     t_arg = f"{real} t" if target.driven else ""
     u_arg = f"const {real} *u" if u else ""
-    c_arg = f"const {P}_prepared *c" if takes_c else ""
+    c_arg = f"const {P}_constants *c" if takes_c else ""
     p_arg = target.p_arg if takes_p else ""
     c, p = "c" if takes_c else "", "p" if takes_p else ""
     state = f"const {P}_vector *q, const {P}_vector *qd"
-    s_arg, s_call = (f"const {P}_angles *s", "s") if turned else ("", "")
+    s_arg, s_call = (f"const {P}_angles *s", "s") if rotated else ("", "")
     rates_rest = (t_arg, u_arg, c_arg, p_arg)
     alone = f"{target.PREFIX}_ALONE " if parts else ""
 
@@ -248,12 +244,12 @@ def _mode(
         "head": "static int"
         if arrays
         else f"{target.PREFIX}_INLINE int"
-        if turned
+        if rotated
         else "static inline int",
         "vector": f"{P}_vector",
-        "solve": "solve_at" if turned and not u else "solve",
+        "solve": "solve_at" if rotated and not u else "solve",
         "rates": "rates" if u else "solve",
-        "rates_at": ("rates" if u else "solve") + ("_at" if turned else ""),
+        "rates_at": ("rates" if u else "solve") + ("_at" if rotated else ""),
         "suffix": "",
         "solve_arguments": arguments(
             f"{P}_vector *a", state, s_arg, f"{real} t" if timed else "", u_arg, c_arg
@@ -281,7 +277,7 @@ def _mode(
             p_arg,
         ),
         "unused": _unread(target, function),
-        "pieces": None,
+        "outlined": None,
         "signal_at": [
             vectors.gathered(target, arrays, "q", "at"),
             vectors.gathered(target, arrays, "qd", "moving"),
@@ -307,11 +303,11 @@ def _mode(
         "rows": indent(vectors.rows(target, arrays), 12),
         "arrays": arrays,
         "flag": "int" if real == "float" else "long long",  # as wide as a real
-        "pairs": None,
+        "two_point": None,
         "own_signal": None,
     }
     if not arrays:
-        body: Body = prepare["body"]
+        body: Body = constants["body"]
         return made | {
             "loads": target.loads(function, in_vector, target.element),
             "blocks": body.blocks,
@@ -320,9 +316,9 @@ def _mode(
             ],
             "end": [f"return {none_of(body.failures)};"],
         }
-    kept = prepare["prepared_members"]
+    kept = constants["constants_members"]
     if parts:
-        made["pairs"] = two = two_point.context(target, parts, kept, timed, takes_p)
+        made["two_point"] = two = two_point.context(target, parts, kept, timed, takes_p)
         return made | {
             "unused": [],
             "loads": two["solve_locals"],
@@ -337,19 +333,19 @@ def _mode(
         Argument(f"const {P}_vector *qd", "qd", groups["qd"]),
         Argument(f"{real} t", "t", groups["t"]),
         Argument(u_arg, "u", groups["u"]),
-        Argument(f"const {P}_prepared *c", "c", frozenset(kept)),
+        Argument(f"const {P}_constants *c", "c", frozenset(kept)),
     ]
-    cut = target.in_pieces(
+    cut = target.outlined(
         rest,
         "solve",
         given,
         [in_vector("a", name) for name in target.names],
         Argument(f"{P}_vector *a", "a", frozenset()),
         lambda f: target.loads(f, in_vector, target.element),
-        {n: _in_prepared(n) for n in kept},
+        {n: _in_constants(n) for n in kept},
     )
     return made | {
-        "pieces": cut,
+        "outlined": cut,
         "unused": [*made["unused"], *(["c"] if takes_c and not rest.uses & set(kept) else [])],
         "loads": cut["locals"],
         "blocks": [],

@@ -1,7 +1,7 @@
 """Accelerations and steps of many instances at once, for the templates.
 
-Large: each piece is a loop over a tile. Small: what one instance needs is inlined into such loops,
-one for every stage of a step.
+Large: each outlined function is a loop over a tile. Small: what one instance needs is inlined into
+such loops, one for every stage of a step.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 from eomc.emit import vectors
 from eomc.emit.c_expression import DOUBLE, indent
-from eomc.emit.c_names import TROUBLE, WIDE, Access, Argument, Target, after, arguments
+from eomc.emit.c_names import COUNT, FAILED, Access, Argument, Target, after, arguments
 from eomc.emit.fast import rotations, stage_parallel
 from eomc.integrators.tableaux import METHODS
 from eomc.program.ir import Function
@@ -21,65 +21,65 @@ from eomc.program.program import TIME
 from eomc.program.trig import Angle, apart
 
 KEPT = {"a1": "first", "a2": "second", "a3": "third", "a4": "fourth"}  # by the stages of RK4
-NEAR = 32_768  # bytes that a tile may have: a first-level cache
+CACHE = 32_768  # bytes that a tile may have: a first-level cache
 
 
-def lane(
-    target: Target, function: Function, prepare: Mapping[str, Any], mode: Mapping[str, Any]
+def mode(
+    target: Target, function: Function, constants: Mapping[str, Any], mode: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The same for a batch: no branches; what goes wrong is noted in trouble.
+    """The same for a batch: no branches; failures are noted in `failed`.
 
-    Accelerations and steppers of a whole tile. Large: each piece is a loop over it. Small: what one
-    instance needs is inlined into such loops, one for every stage of a step.
+    Accelerations and steppers of a whole tile.
     """
     s, real, P = target.system, target.real.name, target.prefix
     large, held = is_large(function), bool(s.inputs)
     timed = TIME in function.uses
-    kept = prepare["prepared_members"]
+    kept = constants["constants_members"]
     alone = f"{target.PREFIX}_ALONE "
-    rest = f"int wide, {real} *{alone}troubles"  # how many to take, and what went wrong
-    u_arg = f"const {P}_inputs_lanes *u" if held else ""
-    c_arg = f"const {P}_prepared_lanes *c" if kept else ""
+    rest = f"int count, {real} *{alone}failures"  # how many to take, and which failed
+    u_arg = f"const {P}_inputs_tile *u" if held else ""
+    c_arg = f"const {P}_constants_tile *c" if kept else ""
     t_arg = f"{real} t" if target.driven else ""
-    state = f"const {P}_lanes *q, const {P}_lanes *qd"
+    state = f"const {P}_vector_tile *q, const {P}_vector_tile *qd"
     c = "c" if kept else ""
     own = bool(kept) and target.needs_p and not large
 
     def rates(time: str) -> str:
         if held:
-            return after(time if target.driven else "", "u", "held", c, "wide, troubles")
-        return after(time if timed else "", c, "wide, troubles")
+            return after(time if target.driven else "", "u", "held", c, "count, failures")
+        return after(time if timed else "", c, "count, failures")
 
     made = dict(mode) | {
-        "head": "static void" if large else f"{target.PREFIX}_PIECE void",
-        "inline": f"{target.PREFIX}_{'INLINE' if large else 'LANE'}",
-        "vector": f"{P}_lanes",
-        "solve": "solve_lane",
-        "rates": ("rates_lane" if held else "solve_lane") if large else "rates_tile",
-        "suffix": "_lane",
+        "head": "static void" if large else f"{target.PREFIX}_NOINLINE void",
+        "inline": f"{target.PREFIX}_{'INLINE' if large else 'FORCE_INLINE'}",
+        "vector": f"{P}_vector_tile",
+        "solve": "solve_tile",
+        "signal": "signal_tile",
+        "rates": "rates_tile" if held or not large else "solve_tile",
+        "suffix": "_tile",
         "solve_arguments": arguments(
-            f"{P}_lanes *a", state, f"{real} t" if timed else "", u_arg, c_arg, rest
+            f"{P}_vector_tile *a", state, f"{real} t" if timed else "", u_arg, c_arg, rest
         ),
-        "solve_u": after("t" if timed else "", "held ? u : &now", c, "wide, troubles"),
+        "solve_u": after("t" if timed else "", "held ? u : &now", c, "count, failures"),
         "rates_arguments": arguments(
-            f"{P}_lanes *{'' if large else alone}a", state, t_arg, u_arg,
+            f"{P}_vector_tile *{'' if large else alone}a", state, t_arg, u_arg,
             "int held" if held else "", c_arg, rest,
         ),
-        "inputs": f"{P}_inputs_lanes",
+        "inputs": f"{P}_inputs_tile",
         "stepper_arguments": arguments(
-            f"{P}_lanes *r, {P}_lanes *v" if large else f"{P}_lanes *{alone}r, {P}_lanes *{alone}v",
+            *(f"{P}_vector_tile *{'' if large else alone}{name}" for name in "rv"),
             state, t_arg, f"{real} h", u_arg and f"{u_arg}, int held", c_arg, rest,
         ),
         "tile_prototype": lambda name: f"int {P}_{name}_tile_step("
         + arguments(
             f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
             t_arg, f"{real} h", "int held" if held else "", "int own" if own else "",
-            "int wide",
+            "int count",
         ) + ")",
         "own": own,
-        "stepper_call": lambda troubles: after(
+        "stepper_call": lambda failures: after(
             "t" if target.driven else "", "h", "&s->u, held" if held else "",
-            "&s->c" if kept else "", "wide", troubles,
+            "&s->c" if kept else "", "count", failures,
         ),
         "call": rates,
         "compensated": False,
@@ -89,38 +89,36 @@ def lane(
         "each": lambda lines, width=4: indent(_each_of_tile(target, lines), width),
         "angles": None,
         "one": None,
-        "pieces": None,
-        "own_signal": _signal_lanes(target, kept, c_arg, rest) if large else None,
+        "outlined": None,
+        "own_signal": _signal_of_tile(target, kept, c_arg, rest) if large else None,
     }  # fmt: skip
     if not large:
-        return made | _lane_small(target, function, kept, mode["arrays"])
-    return made | _lane_large(target, function, kept, made)
+        return made | _small(target, function, kept, mode["arrays"])
+    return made | _large(target, function, kept, made)
 
 
 def _each_of_tile(target: Target, lines: Sequence[str]) -> list[str]:
     """Statements for every coordinate of every instance."""
     inside = [line.replace("$", "x[j][i]") for line in lines]
-    return vectors.loop("j", f"{target.PREFIX}_NQ", vectors.loop("i", "wide", inside))
+    return vectors.loop("j", f"{target.PREFIX}_NQ", vectors.loop("i", "count", inside))
 
 
-def _lane_small(
-    target: Target, function: Function, kept: Sequence[str], arrays: bool
-) -> dict[str, Any]:
+def _small(target: Target, function: Function, kept: Sequence[str], arrays: bool) -> dict[str, Any]:
     """Accelerations of one instance, and how loops over a tile call them."""
     s, real = target.system, target.real
     held, timed = bool(s.inputs), TIME in function.uses
     reach = real.reach and "rk4" in s.run.methods
-    turned, rest = apart(function, target.names) if reach else ((), function)
+    rotated, rest = apart(function, target.names) if reach else ((), function)
 
-    def call(angles: str, time: str, hold: str, trouble: str = "&trouble") -> str:
+    def call(angles: str, time: str, hold: str, failed: str = "&failed") -> str:
         now = time if (target.driven if held else timed) else ""
         return after(
-            angles if turned else "", now, f"&given, {hold}" if held else "",
-            "&here" if kept else "", trouble,
+            angles if rotated else "", now, f"&given, {hold}" if held else "",
+            "&here" if kept else "", failed,
         )  # fmt: skip
 
-    one = stage_parallel.lane(target, rest, kept, arrays, rotations.sines(turned))
-    angles = rotations.lane(target, turned, arrays)
+    one = stage_parallel.mode(target, rest, kept, arrays, rotations.sines(rotated))
+    angles = rotations.of_tile(target, rotated, arrays)
     own = bool(kept) and target.needs_p
     k = "own ? i : 0" if own else "0"
     return {
@@ -131,26 +129,26 @@ def _lane_small(
             "const " + vectors.vector_of(target, arrays, "moving", "qd->x[#][i]"),
             *_given(target, kept, "u->", "c->"),
         ],
-        "rates_call": call("&s", "t", "held", "&troubles[i]"),
+        "rates_call": call("&s", "t", "held", "&failures[i]"),
         "rates_held": lambda hold: arguments(
             "a, q, qd", "t" if target.driven else "", "u", hold, "c" if kept else "",
-            "wide, troubles",
+            "count, failures",
         ),
         "stages": _stages(
-            target, arrays, turned, angles, own, _given(target, kept, "s->u.", "s->c.", k), call
+            target, arrays, rotated, angles, own, _given(target, kept, "s->u.", "s->c.", k), call
         ),
     }  # fmt: skip
 
 
 def _given(target: Target, kept: Sequence[str], u: str, c: str, k: str = "i") -> list[str]:
-    """The inputs and the prepared values of one instance."""
+    """The inputs and the constants values of one instance."""
     lines = []
     if target.system.inputs:
         inside = ", ".join(f"{u}x[{target.enum[n]}][i]" for n in target.input_names)
         lines.append(f"const {target.prefix}_inputs given = {{ {inside} }};")
     if kept:
         inside = ", ".join(f"{c}{n}[{k}]" for n in kept)
-        lines.append(f"const {target.prefix}_prepared here = {{ {inside} }};")
+        lines.append(f"const {target.prefix}_constants here = {{ {inside} }};")
     return lines
 
 
@@ -169,14 +167,14 @@ def _each_known(names: Sequence[str], call: Callable[[list[str]], str]) -> list[
 def _stages(
     target: Target,
     arrays: bool,
-    turned: Sequence[Angle],
+    rotated: Sequence[Angle],
     angles: Mapping[str, Any] | None,
     own: bool,
     given: Sequence[str],
     call: Callable[[str, str, str], str],
 ) -> dict[str, Any]:
     """The stages of RK4 as loops over a tile: what each reads, and what it leaves."""
-    P, real, members = target.prefix, target.real.name, rotations.sines(turned)
+    P, real, members = target.prefix, target.real.name, rotations.sines(rotated)
     alone = f"{target.PREFIX}_ALONE "
     t_arg, t = (f"{real} t", "t") if target.driven else ("", "")
     plans = [
@@ -205,13 +203,13 @@ def _stages(
                 "given": [
                     *earlier(read[k - 1]),
                     *given,
-                    *([f"const {P}_angles s_at = {{ {sines} }};"] if turned else []),
+                    *([f"const {P}_angles s_at = {{ {sines} }};"] if rotated else []),
                 ],
                 "vectors": ["at", "moving", f"a{k}"] if lines else ["a1"],
                 "lines": lines,
                 "call": f"(&a{k}, {'&at, &moving' if lines else '&q, &qd'}"
                 + call("&s_at", time, "held") + ");",
-                "spoilt": f"a{k}.{first} += trouble < 1 ? 0 : ({real})NAN;",
+                "spoilt": f"a{k}.{first} += failed < 1 ? 0 : ({real})NAN;",
                 "kept": [f"{KEPT[f'a{k}']}.x[#][i] = a{k}.$;"],
             }
         )  # fmt: skip
@@ -220,16 +218,16 @@ def _stages(
         for name, of in (("at", "q"), ("moving", "qd"))
     ]
     return {
-        "prototype": f"{target.PREFIX}_LANE int {P}_rk4_stages("
+        "prototype": f"{target.PREFIX}_FORCE_INLINE int {P}_rk4_stages("
         + arguments(
             f"{P}_states *{alone}to", f"const {P}_states *{alone}from", f"{P}_tile *{alone}s",
             t_arg, f"{real} h", "int held" if target.system.inputs else "",
-            "int own" if own else "", "int wide",
+            "int own" if own else "", "int count",
         ) + ")",
         "calls": _each_known(
             ["held"] * bool(target.system.inputs) + ["own"] * own,
             lambda known: (
-                f"odd = {P}_rk4_stages({arguments('to, from, s', t, 'h', *known, 'wide')});"
+                f"odd = {P}_rk4_stages({arguments('to, from, s', t, 'h', *known, 'count')});"
             ),
         ),
         "before": loops[:2],
@@ -251,24 +249,24 @@ def _stages(
     }  # fmt: skip
 
 
-def _lane_large(
+def _large(
     target: Target, function: Function, kept: Sequence[str], made: Mapping[str, Any]
 ) -> dict[str, Any]:
     s, P = target.system, target.prefix
     _, rest = staged(function, [p.name for p in s.parameters])
-    cut = target.in_pieces(
+    cut = target.outlined(
         rest,
-        "solve_lane",
-        _lane_arguments(target, kept),
-        [_in_lanes(target)("a", name) for name in target.names],
-        Argument(f"{P}_lanes *{target.PREFIX}_ALONE a", "a", frozenset()),
-        lambda f: target.loads(f, _in_lanes(target), _in_lanes(target)),
+        "solve_tile",
+        _tile_arguments(target, kept),
+        [_in_tile(target)("a", name) for name in target.names],
+        Argument(f"{P}_vector_tile *{target.PREFIX}_ALONE a", "a", frozenset()),
+        lambda f: target.loads(f, _in_tile(target), _in_tile(target)),
         {n: f"c->{n}[i]" for n in kept},
-        lane=True,
+        tile=True,
     )
     return {
-        "pieces": cut,
-        "unused": [*made["unused"], *(["troubles"] if not cut["troubled"] else [])],
+        "outlined": cut,
+        "unused": [*made["unused"], *(["failures"] if not cut["fails"] else [])],
         "loads": cut["locals"],
         "blocks": [],
         "results": cut["calls"],
@@ -276,58 +274,58 @@ def _lane_large(
     }
 
 
-def _in_lanes(target: Target) -> Access:
+def _in_tile(target: Target) -> Access:
     return lambda array, name: f"{array}->x[{target.enum[name]}][i]"
 
 
-def _lane_arguments(target: Target, kept: Sequence[str]) -> list[Argument]:
-    """What a piece over a tile may read."""
+def _tile_arguments(target: Target, kept: Sequence[str]) -> list[Argument]:
+    """What an outlined function over a tile may read."""
     P, groups, real = target.prefix, target.groups(), target.real.name
     return [
-        Argument(f"const {P}_lanes *q", "q", groups["q"]),
-        Argument(f"const {P}_lanes *qd", "qd", groups["qd"]),
+        Argument(f"const {P}_vector_tile *q", "q", groups["q"]),
+        Argument(f"const {P}_vector_tile *qd", "qd", groups["qd"]),
         Argument(f"{real} t", "t", groups["t"]),
-        Argument(f"const {P}_inputs_lanes *u", "u", groups["u"]),
-        Argument(f"const {P}_prepared_lanes *c", "c", frozenset(kept)),
-        Argument("int wide", "wide", frozenset({WIDE})),
-        Argument(f"{real} *{target.PREFIX}_ALONE troubles", "troubles", frozenset({TROUBLE})),
+        Argument(f"const {P}_inputs_tile *u", "u", groups["u"]),
+        Argument(f"const {P}_constants_tile *c", "c", frozenset(kept)),
+        Argument("int count", "count", frozenset({COUNT})),
+        Argument(f"{real} *{target.PREFIX}_ALONE failures", "failures", frozenset({FAILED})),
     ]
 
 
-def _signal_lanes(
-    target: Target, kept: Sequence[str], c_arg: str, trouble: str
+def _signal_of_tile(
+    target: Target, kept: Sequence[str], c_arg: str, failed: str
 ) -> dict[str, Any] | None:
     """The scene's signals for a whole tile."""
     if "signal" not in target.program:
         return None
     P, given = target.prefix, target.program["signal"]
     own = {p.name for p in target.system.parameters}
-    cut = target.in_pieces(
+    cut = target.outlined(
         given,
-        "signal_lane",
-        _lane_arguments(target, [n for n in kept if n in own]),
+        "signal_tile",
+        _tile_arguments(target, [n for n in kept if n in own]),
         [f"u->x[{target.enum[name]}][i]" for name in target.input_names],
-        Argument(f"{P}_inputs_lanes *{target.PREFIX}_ALONE u", "u", frozenset()),
-        lambda f: target.loads(f, _in_lanes(target), _in_lanes(target)),
+        Argument(f"{P}_inputs_tile *{target.PREFIX}_ALONE u", "u", frozenset()),
+        lambda f: target.loads(f, _in_tile(target), _in_tile(target)),
         {n: f"c->{n}[i]" for n in own},
-        lane=True,
+        tile=True,
     )
-    state = f"const {P}_lanes *q, const {P}_lanes *qd"
+    state = f"const {P}_vector_tile *q, const {P}_vector_tile *qd"
     return {
-        "pieces": cut,
+        "outlined": cut,
         "arguments": arguments(
-            f"{P}_inputs_lanes *u", f"{target.real.name} t" if target.signal_t else "",
-            state if target.signal_state else "", c_arg, trouble,
+            f"{P}_inputs_tile *u", f"{target.real.name} t" if target.signal_t else "",
+            state if target.signal_state else "", c_arg, failed,
         ),
         "unused": [
             *([] if not c_arg or given.uses & own else ["c"]),
-            *([] if cut["troubled"] else ["troubles"]),
+            *([] if cut["fails"] else ["failures"]),
             *_unread_state(target, given),
         ],
         "loads": cut["locals"],
         "blocks": [],
         "results": cut["calls"],
-        "call": _signal_lane_call(target, c_arg, "troubles"),
+        "call": _signal_call(target, c_arg, "failures"),
     }  # fmt: skip
 
 
@@ -337,22 +335,22 @@ def _unread_state(target: Target, given: Function) -> list[str]:
     return [name for name in ("q", "qd") if not given.uses & target.groups()[name]]
 
 
-def _signal_lane_call(target: Target, c_arg: str, trouble: str) -> str:
+def _signal_call(target: Target, c_arg: str, failed: str) -> str:
     return arguments(
         "&now", "t" if target.signal_t else "", "q, qd" if target.signal_state else "",
-        "c" if c_arg else "", "wide", trouble,
+        "c" if c_arg else "", "count", failed,
     )  # fmt: skip
 
 
-def tile(target: Target, kept: int, lane: Mapping[str, Any]) -> dict[str, int]:
-    """Instances side by side: as many as stay near with what belongs to them, and no row of their
+def sizes(target: Target, kept: int, tile: Mapping[str, Any]) -> dict[str, int]:
+    """Instances of a tile: as many as fit a first-level cache with their data, and no row of their
     numbers above 512 bytes. A tile that is not full is taken by blocks: rows of 64 bytes."""
     s, n, size = target.system, len(target.system.q), 8 if target.real is DOUBLE else 4
-    numbers = 4 * n + len(s.u) + kept + 1  # two states, and whether there was trouble
-    if lane["pieces"]:
-        numbers += len(lane["pieces"]["members"]) // 2 + 4 * n  # of those, not all live at once
+    numbers = 4 * n + len(s.u) + kept + 1  # two states, and whether it failed
+    if tile["outlined"]:
+        numbers += len(tile["outlined"]["members"]) // 2 + 4 * n  # of those, not all live at once
     else:
         numbers += max(METHODS[name].stages for name in s.run.methods) * n
-        numbers += 3 * len(lane["angles"]["members"]) if lane["angles"] else 0
-    block, near = 64 // size, NEAR // (size * numbers)
-    return {"tile": max(block, min(512 // size, near // block * block)), "block": block}
+        numbers += 3 * len(tile["angles"]["members"]) if tile["angles"] else 0
+    block, fitting = 64 // size, CACHE // (size * numbers)
+    return {"tile_size": max(block, min(512 // size, fitting // block * block)), "block": block}

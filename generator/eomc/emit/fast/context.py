@@ -7,17 +7,16 @@ template.
 
 from __future__ import annotations
 
-import math
 import textwrap
 from typing import Any
 
 from eomc.base import resources
 from eomc.base.texts import FreeText, command, flat, line
 from eomc.base.version import __version__
-from eomc.emit import c_expression, selftest
+from eomc.emit import c_expression
 from eomc.emit.c_expression import indent
-from eomc.emit.c_names import Target, after, arguments
-from eomc.emit.evaluations import functions, linearization, takes_t
+from eomc.emit.c_names import Target
+from eomc.emit.evaluations import functions, linearization
 from eomc.emit.fast.acceleration import dynamics
 
 
@@ -31,56 +30,44 @@ def values(target: Target) -> dict[str, Any]:
         "prefix": target.prefix,
         "PREFIX": target.PREFIX,
         "real": real.name,
-        "dtype": real.dtype,
         "lit": lambda text: text + real.suffix,
         "stamp": stamp(target),
         "handshake": f"0x{s.digest[:8]}u",
-        "digest": s.digest,
         "notes": notes(target),
         "description": description(target),
         "coordinates": [
-            {"written": target.as_written(c.name), "enum": enum[c.name],
+            {"enum": enum[c.name],
              "words": words(c.unit, c.note)}
             for c in s.coordinates
         ],
         "inputs": [
-            {"written": target.as_written(i.name), "enum": enum[i.name],
+            {"enum": enum[i.name],
              "words": words(i.unit, i.note)}
             for i in s.inputs
         ],
         "parameters": [
-            {"name": p.name, "written": target.as_written(p.name),
-             "words": words(p.unit, p.note), "value": target.literal(p.value),
-             "number": repr(p.value), "named": f"/* {p.name} */"}
+            {"name": p.name, "words": words(p.unit, p.note), "value": target.literal(p.value),
+             "named": f"/* {p.name} */"}
             for p in s.parameters
         ],
         "q0": [target.literal(c.start) for c in s.coordinates],
         "qd0": [target.literal(c.rate) for c in s.coordinates],
-        "start": [c.start for c in s.coordinates],
-        "rates_at_start": [c.rate for c in s.coordinates],
-        "n": len(s.coordinates),
-        "m": len(s.inputs),
         "functions": evaluations,
-        "names": target.names,
         "solved": solved(target),
-        "run": s.run,
         "indent": indent,
         "broken": lambda text: "\n".join(c_expression.broken(text)),
         "has_t": target.driven,
         "has_u": bool(s.inputs),
         "has_p": target.needs_p,
         "batch": s.run.batch,
-        "csrc": _csrc(target, moved["turned"], moved["lanes_turn"], bool(moved["pairs"])),
+        "csrc": _csrc(target, moved["rotated"], moved["batch_rotates"], bool(moved["two_point"])),
         "slopes": slopes,
-        "in_pieces": moved["large"]
-        or bool(moved["pairs"] or moved["angles"])
+        "noinline": moved["large"]
+        or bool(moved["two_point"] or moved["angles"])
         or s.run.batch
-        or any(f["in_pieces"] for f in evaluations)
-        or bool(slopes and slopes["inner"]["pieces"]),
+        or any(f["is_large"] for f in evaluations)
+        or bool(slopes and slopes["inner"]["outlined"]),
         **moved,
-        **_example(target),
-        **selftest.values(target),
-        **_face(target),
     }  # fmt: skip
 
 
@@ -120,82 +107,29 @@ def words(unit: str, note: str) -> FreeText:
     return FreeText(", ".join(t for t in (line(unit), flat(note)) if t))
 
 
-def _example(target: Target) -> dict[str, Any]:
-    """What main.c needs: the scene's own run, some two hundred rows of it."""
-    run, s = target.system.run, target.system
-    steps = max(1, math.ceil(run.duration / run.h * (1 - 1e-12)))
-    timed = takes_t(target, "energy")
-    call = f"{target.prefix}_energy(" + "{}" + after(target.p_call) + ")"
-    names = [target.as_written(c.name) for c in s.coordinates]
-    return {
-        "h": target.literal(run.h),
-        "steps": steps,
-        "main_every": max(1, steps // 200),
-        "columns": ["t", *names, *(f"{n}_dot" for n in names), "energy"],
-        "energy_call": call.format("q, qd, t" if timed else "q, qd"),
-        "energy_call_end": call.format(f"q, qd, ({target.real.name})steps*h" if timed else "q, qd"),
-    }
-
-
 def solved(target: Target) -> list[str]:
     """How D qdd = tau - bias is solved, as lines of a comment."""
     return textwrap.wrap(target.program.solved, 92)
 
 
-def _face(target: Target) -> dict[str, Any]:
-    """What the Python package needs."""
-    s = target.system
-    NQ = f"{target.PREFIX}_NQ"
-    t, u = "t" if target.driven else "", "u" if s.inputs else ""
-    given = target.as_written
-    units = {given(c.name): c.unit for c in s.coordinates}
-    units |= {given(p.name): p.unit for p in s.parameters}
-    units |= {given(i.name): i.unit for i in s.inputs}
-    return {
-        "coordinate_units": FreeText({given(c.name): c.unit for c in s.coordinates}),
-        "parameter_values": repr({given(p.name): p.value for p in s.parameters}),
-        "input_units": FreeText({given(i.name): i.unit for i in s.inputs}),
-        "units": FreeText({name: unit for name, unit in units.items() if unit}),
-        "timed": repr(
-            tuple(n for n in ("energy", "jacobi") if n in target.program and takes_t(target, n))
-        ),
-        "face_functions": [
-            "C", "D", "acceleration", "advice", "bias", "energy", "g", "jacobi", "kinetic_energy",
-            "linearize", "potential_energy", "power", "rhs", "sensitivity", "signal", "simulate",
-            *(["simulate_batch"] if s.run.batch else []), "step",
-            *(["step_batch"] if s.run.batch else []), "tau",
-        ],
-        "acceleration_binding": f"{target.prefix}_acceleration("
-        + arguments(f"out + {NQ}*k", f"q + {NQ}*k", f"qd + {NQ}*k", t, u, target.p_cast)
-        + ")",
-        "run_binding": lambda name: f"{target.prefix}_{name}_run("
-        + arguments(
-            "q", "qd", "t0" if t else "", "h", "first", "steps",
-            u and "u ? u + first*u_stride : u, u_stride", "every",
-            f"q_rows + {NQ}*(row + 1)", f"qd_rows + {NQ}*(row + 1)", target.p_cast,
-            "work ? &work->memory : NULL", "&found",
-        ) + ")",
-        "step_binding": lambda name: f"{target.prefix}_{name}_step("
-        + arguments("at", "moving", t, "h", u, target.p_cast) + ")",
-    }  # fmt: skip
-
-
-def _csrc(target: Target, turned: int, lanes: bool, pairs: bool) -> list[str]:
+def _csrc(target: Target, rotated: int, tiles: bool, two_point: bool) -> list[str]:
     """The hand-written C that this scene needs, under its own prefix."""
     suffix = target.real.function_suffix
     files = [
-        *([f"sincos{suffix}.h"] if target.sincos else []),
-        *(["near.h", "foretold.h"] if turned else []),
-        *(["foretold_both.h"] if turned > 1 else []),
-        *([f"quadrants{suffix}.h"] if target.sincos and target.system.run.batch else []),
-        *([f"turn{suffix}.h"] if lanes or pairs else []),
-        *(["around.h", "beside.h"] if pairs else []),
+        *([f"sincos/sincos{suffix}.h"] if target.sincos else []),
+        *(["sincos/with_fallback.h", "sincos/predicted.h"] if rotated else []),
+        *(["sincos/predicted_both.h"] if rotated > 1 else []),
+        *([f"sincos/quadrants{suffix}.h"] if target.sincos and target.system.run.batch else []),
+        *([f"sincos/incremental{suffix}.h"] if tiles or two_point else []),
+        *(["sincos/triple.h", "vector/interleave.h"] if two_point else []),
     ]
     texts = [resources.text("csrc", file).replace("#include <math.h>\n", "") for file in files]
-    if pairs and target.sincos:  # loops have sines of their own, and compilers a third less to do
+    if (
+        two_point and target.sincos
+    ):  # loops have sines of their own, and compilers a third less to do
         inlined = f"static inline void eomc_sincos{suffix}("
         assert inlined in texts[0]
-        texts[0] = texts[0].replace(inlined, f"EOMC_PIECE void eomc_sincos{suffix}(")
+        texts[0] = texts[0].replace(inlined, f"EOMC_NOINLINE void eomc_sincos{suffix}(")
     return [
         text.replace("eomc_", f"{target.prefix}_").replace("EOMC_", f"{target.PREFIX}_").strip()
         for text in texts

@@ -18,7 +18,7 @@ from eomc.program.program import TIME
 
 RK4_BY = {
     "angles": "c/fast/rk4_angles.c.jinja",
-    "pairs": "c/fast/rk4_pairs.c.jinja",
+    "two_point": "c/fast/rk4_two_point.c.jinja",
 }  # what makes it faster
 
 
@@ -60,7 +60,7 @@ def _about(m: Method) -> dict[str, Any]:
         "order": m.order,
         "source": m.source,
         "stages": m.stages,
-        "pairs": False,
+        "two_point": False,
         "limits": m.limits,
         "notes": m.notes,
         "implicit": m.implicit,
@@ -73,19 +73,19 @@ def _about(m: Method) -> dict[str, Any]:
 
 def method(
     target: Target, m: Method, slopes: Mapping[str, Any] | None, scalar: Mapping[str, Any],
-    side_by_side: Mapping[str, Any] | None, faster: str,
-    lane: Mapping[str, Any] | None,
+    stage_parallel: Mapping[str, Any] | None, faster: str,
+    tile: Mapping[str, Any] | None,
 ) -> dict[str, Any]:  # fmt: skip
     """A method as its template wants it. faster: what RK4 makes use of, if anything."""
     arrays = scalar["arrays"]
     if m.sweeps:
-        return _side_by_side(target, m, scalar, side_by_side)
+        return _stage_parallel(target, m, scalar, stage_parallel)
     if slopes is not None and m.newton:
         return _implicit(target, m, slopes, scalar, arrays)
-    return _explicit(m, target.real, faster, lane)
+    return _explicit(m, target.real, faster, tile)
 
 
-def _explicit(m: Method, real: Real, faster: str, lane: Mapping[str, Any] | None) -> dict[str, Any]:
+def _explicit(m: Method, real: Real, faster: str, tile: Mapping[str, Any] | None) -> dict[str, Any]:
     """An explicit method as its template wants it; RK4 has one of its own, written out by hand."""
 
     def total(row: Row) -> str:
@@ -106,15 +106,15 @@ def _explicit(m: Method, real: Real, faster: str, lane: Mapping[str, Any] | None
     stages = [] if m is RK4 else list(zip(m.c, m.a_squared, m.a, strict=True))[1:]
     first, half = m.c[0], literal(m.c[0], real)
     faster = faster if m is RK4 else ""
-    lane_template = "c/fast/rk4.c.jinja" if m is RK4 else "c/fast/explicit.c.jinja"
-    by_stages = m is RK4 and bool(lane and lane["one"])
+    tile_template = "c/fast/rk4.c.jinja" if m is RK4 else "c/fast/explicit.c.jinja"
+    by_stages = m is RK4 and bool(tile and tile["one"])
     return _about(m) | {
         "by_stages": by_stages,
-        "by_rates": not by_stages or bool(lane and lane["angles"]),
+        "by_rates": not by_stages or bool(tile and tile["angles"]),
         "angles": faster == "angles",
-        "pairs": faster == "pairs",
-        "template": RK4_BY.get(faster, lane_template),
-        "lane_template": lane_template,
+        "two_point": faster == "two_point",
+        "template": RK4_BY.get(faster, tile_template),
+        "tile_template": tile_template,
         "begin": [f"r->$ = q->$ + {half}*h*qd->$;"] if first else [],
         "begin_at": "r, qd" if first else "q, qd",
         "begin_time": time(first) if first else "t",
@@ -171,8 +171,8 @@ def _implicit(
         "c": [literal(x, real) for x in m.c],
         "A": matrix(m.a),
         "AA": matrix(m.a_squared),
-        "ahead": matrix(m.ahead),
-        "guess": " + ".join(f"ahead[i][{j}]*m->a[{j}][k]" for j in range(s)),
+        "extrapolation": matrix(m.ahead),
+        "guess": " + ".join(f"extrapolation[i][{j}]*m->a[{j}][k]" for j in range(s)),
         "gathered": _start(target, arrays),
         "stage": [
             f"at.$ = q->$ + (c_[i]*h*qd->$ + hh*({total('AA[i]')}));",
@@ -182,20 +182,19 @@ def _implicit(
     }  # fmt: skip
 
 
-def _side_by_side(
-    target: Target, m: Method, scalar: Mapping[str, Any], lane: Mapping[str, Any] | None
+def _stage_parallel(
+    target: Target, m: Method, scalar: Mapping[str, Any], stages: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     """A method of few sweeps as its template wants it, for one trajectory.
 
-    lane: what a loop over the stages calls; None where accelerations are long, and stages take
-    turns.
+    stages: what a loop over them calls; None where accelerations are long, and stages take turns.
     """
     real, P, s = target.real, target.prefix, m.stages
     timed = TIME in target.program["acceleration"].uses
     t, u = ("t" if target.driven else ""), ("u" if target.system.inputs else "")
     rest = scalar["stepper_arguments"].split(", ", 2)[2]
-    c, p = ("c" if "_prepared *c" in rest else ""), ("p" if "_params *p" in rest else "")
-    stages, memory = f"{P}_{m.name}_stages", f"{P}_{m.name}_memory *m"
+    c, p = ("c" if "_constants *c" in rest else ""), ("p" if "_params *p" in rest else "")
+    values, memory = f"{P}_{m.name}_stages", f"{P}_{m.name}_memory *m"
     arrays, alone = scalar["arrays"], f"{target.PREFIX}_ALONE"
 
     def by_stage(rows: Sequence[Row]) -> list[str]:
@@ -220,24 +219,24 @@ def _side_by_side(
         "angles": False,
         "arguments": arguments(scalar["stepper_arguments"], memory),
         "call_more": after("m"),
-        "inline": f"{target.PREFIX}_LANE" if lane else "static inline",
-        "side_by_side": lane is not None,
+        "inline": f"{target.PREFIX}_FORCE_INLINE" if stages else "static inline",
+        "stage_parallel": stages is not None,
         "sum": total([f"w[{k}][i]*a[{k}]" for k in range(s)]),
         "c": [literal(x, real) for x in m.c],
         "A": by_stage(m.a),
         "AA": by_stage(m.a_squared),
-        "A_ahead": by_stage(m.a_ahead),
-        "AA_ahead": by_stage(m.a_squared_ahead),
+        "A_extrapolated": by_stage(m.a_ahead),
+        "AA_extrapolated": by_stage(m.a_squared_ahead),
         "sweep_arguments": arguments(
-            f"{stages} *{alone} b", f"const {stages} *{alone} a",
+            f"{values} *{alone} b", f"const {values} *{alone} a",
             f"const {P}_{m.name}_sums *w", rest,
         ),
         "sweep": lambda of, sums: f"{P}_{m.name}_sweep("
         + arguments(of, f"&{P}_{m.name}_{sums}", "q", "qd", t, "h", u, c, p) + ");",
-        "settle_arguments": arguments(f"{stages} *a", "int fresh", rest, memory),
+        "settle_arguments": arguments(f"{values} *a", "int fresh", rest, memory),
         "settle_call": arguments("&a", "!smooth", "q", "qd", t, "h", u, c, p, "m"),
         "given": f"const {P}_inputs given = {{ {inputs} }};",
-        "lanes": [
+        "loops": [
             {"only": "if (u)", "call": held("1")}, {"only": "else", "call": held("0")},
         ] if u else [{"only": "", "call": after("t + c_[i]*h" if timed else "", c, "&bad")}],
         "eps": repr(real.epsilon) + real.suffix,

@@ -1,7 +1,7 @@
-"""Steps of RK4 whose angles are foretold, as their template wants them.
+"""Steps of RK4 with predicted angles, for their template.
 
-Sines and cosines at two angles near which a step will come are computed in the step before, while
-a processor waits for its accelerations, and turned by the little that is missing.
+The sines and cosines at two predicted angles are computed one step before, while the processor
+waits for accelerations, and rotated by the small difference.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from eomc.program.trig import Angle
 
 
 def steps(
-    target: Target, turned: Sequence[Angle], uses: Collection[str], scalar: Mapping[str, Any],
+    target: Target, rotated: Sequence[Angle], uses: Collection[str], scalar: Mapping[str, Any],
     c: str, p: str,
 ) -> dict[str, Any] | None:  # fmt: skip
-    """What is done for each angle and coordinate, stage by stage; None where no angle is turned.
+    """What is done for each angle and coordinate, stage by stage; None where no angle is rotated.
 
     uses: what the accelerations read besides sines and cosines. scalar: how they are called, with c
-    and p, which stand for what is prepared and for the parameters where they are read.
+    and p, which stand for what is constants and for the parameters where they are read.
     """
-    if not turned:
+    if not rotated:
         return None
-    P, real, names, n = target.prefix, target.real.name, target.names, len(turned)
+    P, real, names, n = target.prefix, target.real.name, target.names, len(rotated)
     driven, inputs = target.driven, bool(target.system.inputs)
     # signals of time alone serve all stages of a time, and the end of a step the next one's start
     once = inputs and not target.signal_state
@@ -50,11 +50,14 @@ def steps(
         given = arguments(u, time if target.signal_t else "", target.p_call)
         return f"{P}_signal({given});"
 
-    def turn(known: str, distance: str, s: str) -> list[str]:
+    def rotate(time: str, distance: str, s: str) -> list[str]:
+        by = [
+            distance.format(k=k, a1=of("a1", a), a2=of("a2", a), sum=of("sum", a))
+            for k, a in enumerate(rotated)
+        ]
         return [
-            f"{P}_turn_on({distance.format(k=k, a1=of('a1', a), a2=of('a2', a), sum=of('sum', a))}"
-            f", &{known}_known[{k}], &{s}.{a.sine}, &{s}.{a.cosine}, &far);"
-            for k, a in enumerate(turned)
+            f"{P}_predicted_rotate({d}, &{time}_terms[{k}], &{s}.{a.sine}, &{s}.{a.cosine}, &far);"
+            for k, (a, d) in enumerate(zip(rotated, by, strict=True))
         ]
 
     def at(*lines: str) -> list[str]:
@@ -72,18 +75,21 @@ def steps(
         "arguments": arguments(
             f"{P}_rk4_state *state", f"{real} t0, long first" if driven else "", f"{real} h",
             "long n", "long steps", "long u_stride" if inputs else "", "long every",
-            f"const {P}_prepared *prepared" if c else "", target.p_arg if p else "",
+            f"const {P}_constants *constants" if c else "", target.p_arg if p else "",
         ),
         "call": arguments(
             "&x", "t0, first" if driven else "", "h", "n", "steps", "u_stride" if inputs else "",
             "every", c, p,
         ),
-        "foretell": [
-            f"{P}_foretell(&ahead[{k}], {along(target, a, 'q->', a.offset)}, "
+        "predict": [
+            f"{P}_predict(&predicted[{k}], {along(target, a, 'q->', a.offset)}, "
             f"{along(target, a, 'qd->', S.Zero)}, {along(target, a, 'a->', S.Zero)}, mid, end);"
-            for k, a in enumerate(turned)
-        ] + [f"{P}_foretold_both(&ahead[{k}], &ahead[{k + 1}]);" for k in range(0, n - 1, 2)]
-        + [f"{P}_foretold_at(&ahead[{n - 1}]);"] * (n % 2),
+            for k, a in enumerate(rotated)
+        ] + [
+            f"{P}_predicted_both(&predicted[{k}], &predicted[{k + 1}]);"
+            for k in range(0, n - 1, 2)
+        ]
+        + [f"{P}_predicted_sincos(&predicted[{n - 1}]);"] * (n % 2),
         "timed": driven and (not once or TIME in uses or target.signal_t),
         "once": once,
         "signals_before": [
@@ -95,12 +101,12 @@ def steps(
         ] if once and target.signal_t else [],
         "begin": [
             line
-            for k, a in enumerate(turned)
+            for k, a in enumerate(rotated)
             for line in (
-                f"{P}_know(&mid_known[{k}], &end_known[{k}], &x.ahead[{k}], &far);",
-                f"to_mid[{k}] = ({of('x.q', a, a.offset)} - x.ahead[{k}].x[0])"
+                f"{P}_predicted_unpack(&mid_terms[{k}], &end_terms[{k}], &x.predicted[{k}], &far);",
+                f"to_mid[{k}] = ({of('x.q', a, a.offset)} - x.predicted[{k}].x[0])"
                 f" + (h_2*{of('x.qd', a)} + {of('x.q_rest', a)});",
-                f"to_end[{k}] = ({of('x.q', a, a.offset)} - x.ahead[{k}].x[1])"
+                f"to_end[{k}] = ({of('x.q', a, a.offset)} - x.predicted[{k}].x[1])"
                 f" + (h*{of('x.qd', a)} + {of('x.q_rest', a)});",
             )
         ],
@@ -108,22 +114,22 @@ def steps(
         "stage_2": [
             *at("mid.$ = x.q.$ + h_2*x.qd.$;", "end.$ = x.q.$ + h*x.qd.$;"),
             *moving("v.$ = x.qd.$ + h_2*a1.$;"),
-            *turn("mid", "to_mid[{k}]", "now"),
+            *rotate("mid", "to_mid[{k}]", "now"),
         ],
         "rates_2": rates(2, "mid", "v", "now", middle, "u_mid"),
         "stage_3": [
             *at("place.$ = mid.$ + hh_4*a1.$;"),
             *moving("v.$ = x.qd.$ + h_2*a2.$;"),
-            *turn("mid", "to_mid[{k}] + hh_4*{a1}", "now"),
+            *rotate("mid", "to_mid[{k}] + hh_4*{a1}", "now"),
         ],
         "rates_3": rates(3, "place", "v", "now", middle, "u_mid"),
         "stage_4": [
             *at("place.$ = end.$ + hh_2*a2.$;"),
             *moving("v.$ = x.qd.$ + h*a3.$;"),
-            *turn("end", "to_end[{k}] + hh_2*{a2}", "now"),
+            *rotate("end", "to_end[{k}] + hh_2*{a2}", "now"),
         ],
         "rates_4": rates(4, "place", "v", "now", end, "u_end"),
-        "end": turn("end", "to_end[{k}] + hh_6*{sum}", "x.s"),
+        "end": rotate("end", "to_end[{k}] + hh_6*{sum}", "x.s"),
         "all": " + ".join(f"(to.{name} + going.{name})" for name in names),
         "rows": [
             line

@@ -1,4 +1,4 @@
-"""Sines and cosines of a step that are turned from others, as the templates want them."""
+"""Incremental sines and cosines: those of a stage rotated from others, for the templates."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from eomc.program.outline import is_large
 from eomc.program.trig import Angle, apart
 
 
-def turned_apart(target: Target, function: Function) -> tuple[tuple[Angle, ...], Function]:
-    """The angles that RK4 turns, and the acceleration that reads their sines and cosines."""
+def rotated_apart(target: Target, function: Function) -> tuple[tuple[Angle, ...], Function]:
+    """The angles that RK4 rotates, and the acceleration that reads their sines and cosines."""
     if target.real is not DOUBLE or "rk4" not in target.system.run.methods or is_large(function):
         return (), function
     return apart(function, target.names)
 
 
-def scalar(target: Target, turned: Sequence[Angle]) -> dict[str, Any] | None:
-    """The struct of sines and cosines, and how they are had at a place, and near one."""
-    if not turned:
+def scalar(target: Target, rotated: Sequence[Angle]) -> dict[str, Any] | None:
+    """The struct of sines and cosines, how they are computed, and how they are rotated."""
+    if not rotated:
         return None
     P = target.prefix
     return {
-        "members": sines(turned),
-        "count": len(turned),
+        "members": sines(rotated),
+        "count": len(rotated),
         "at": [
             f"{P}_sincos({along(target, a, 'q->', a.offset)}, &s->{a.sine}, &s->{a.cosine});"
-            for a in turned
+            for a in rotated
         ],
-        "near": [
-            f"{P}_sincos_near({along(target, a, 'q->', a.offset)}, "
+        "rotated": [
+            f"{P}_sincos_with_fallback({along(target, a, 'q->', a.offset)}, "
             f"{along(target, a, 'd->', S.Zero)}, from->{a.sine}, "
             f"from->{a.cosine}, &s->{a.sine}, &s->{a.cosine});"
-            for a in turned
+            for a in rotated
         ],
     }
 
 
-def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any] | None:
-    """The sines and cosines of an instance: at a place; in loops over a tile, turned from others.
+def of_tile(target: Target, rotated: Sequence[Angle], arrays: bool) -> dict[str, Any] | None:
+    """The sines and cosines of an instance, computed or, in loops over a tile, rotated from others.
 
-    around: statements for three loops of every angle: reduced at q + h/2 qd, their sine and cosine,
-    and turned to q and q + h qd. further: turned from the middle by h^2/4 a1 and from the end by
-    h^2/2 a2, in place. within: that all angles are within what turns are good for.
+    triple: statements for three loops of every angle: reduced at q + h/2 qd, their sine and cosine,
+    and rotated to q and q + h qd. further: rotated from the middle by h^2/4 a1 and from the end by
+    h^2/2 a2, in place. within: that all angles are within what rotations are good for.
     """
-    if not turned:
+    if not rotated:
         return None
     P, f = target.prefix, target.real.function_suffix
-    # what turn_both and turn of csrc/turn.h, turnf.h are good for
+    # the bounds of sincos_rotate_both and sincos_rotate in csrc/sincos/incremental.h
     both_by, by = (0.125, 0.015625) if target.real is DOUBLE else (0.25, 0.0625)
     vector = f"{P}_vector"
 
@@ -69,10 +69,10 @@ def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any
     def sum_of(angle: Angle, vector: str, offset: Expr = S.Zero) -> str:
         return along(target, angle, vector, offset, arrays)
 
-    def turn(angle: Angle, of: str) -> str:
+    def rotate(angle: Angle, of: str) -> str:
         d = sum_of(angle, "d.")
         place = f"{of}.{angle.sine}[i], {of}.{angle.cosine}[i], {both(of + '.', angle, '[i]')}"
-        return f"{P}_turn{f}({d}, {place});"
+        return f"{P}_sincos{f}_rotate({d}, {place});"
 
     def within(angle: Angle, v: str, most: str) -> str:
         return f"fabs{f}({sum_of(angle, v)}) <= {most}"
@@ -100,7 +100,7 @@ def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any
         r = f"mid.{angle.sine}[i], mid.{angle.cosine}[i]"
         return [f"{P}_sincos{f}_of_reduced({r}, {both('mid.', angle, '[i]')});"]
 
-    def around(angle: Angle) -> list[str]:
+    def triple(angle: Angle) -> list[str]:
         d = sum_of(angle, "d.")
         middle = f"mid.{angle.sine}[i], mid.{angle.cosine}[i]"
         sides = f"{both('back.', angle, '[i]')}, {both('on.', angle, '[i]')}"
@@ -108,7 +108,7 @@ def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any
             f"{vector} d;",
             "",
             *coordinates(angle, "d.$ = h_2*from->qd.x[#][i];"),
-            f"{P}_turn_both{f}({d}, {middle}, {sides});",
+            f"{P}_sincos{f}_rotate_both({d}, {middle}, {sides});",
         ]
 
     def further(angle: Angle) -> list[str]:
@@ -119,31 +119,31 @@ def lane(target: Target, turned: Sequence[Angle], arrays: bool) -> dict[str, Any
             *coordinates(angle, "a2.$ = second.x[#][i];"),
             odd([within(angle, v, "small") for v in ("a1.", "a2.")]),
             *coordinates(angle, "d.$ = hh_4*a1.$;"),
-            turn(angle, "mid"),
+            rotate(angle, "mid"),
             *coordinates(angle, "d.$ = hh_2*a2.$;"),
-            turn(angle, "on"),
+            rotate(angle, "on"),
         ]
 
     return {
-        "members": sines(turned),
+        "members": sines(rotated),
         "at": [
-            f"{P}_sincos{f}_lane({sum_of(a, 'q->', a.offset)}, {both('s->', a)}, trouble);"
-            for a in turned
+            f"{P}_sincos{f}_branchless({sum_of(a, 'q->', a.offset)}, {both('s->', a)}, failed);"
+            for a in rotated
         ],
-        "around": [x for a in turned for x in (reduced(a), computed(a), around(a))],
-        "further": [further(a) for a in turned],
+        "triple": [x for a in rotated for x in (reduced(a), computed(a), triple(a))],
+        "further": [further(a) for a in rotated],
         "slow": f"{target.literal(both_by)}/fabs{f}(h_2)",
         "small": f"{target.literal(by)}/hh_2",
-        "slowly": [x for a in turned for x in slowly(a, "q.", "qd.")],
-        "narrow": [within(a, v, "small") for v in ("a1.", "a2.") for a in turned],
-        "within": " && ".join(within(a, "d.", "most") for a in turned),
+        "slowly": [x for a in rotated for x in slowly(a, "q.", "qd.")],
+        "narrow": [within(a, v, "small") for v in ("a1.", "a2.") for a in rotated],
+        "within": " && ".join(within(a, "d.", "most") for a in rotated),
         "changes": "const " + vectors.vector_of(target, arrays, "d", "v->x[#][i]"),
     }
 
 
-def sines(turned: Sequence[Angle]) -> list[str]:
-    """The names of all that is turned."""
-    return [name for a in turned for name in (a.sine, a.cosine)]
+def sines(rotated: Sequence[Angle]) -> list[str]:
+    """The names of all that is rotated."""
+    return [name for a in rotated for name in (a.sine, a.cosine)]
 
 
 def along(target: Target, angle: Angle, vector: str, offset: Expr, arrays: bool = False) -> str:

@@ -1,9 +1,9 @@
-"""An acceleration in two parts, of which the first is computed for two places side by side.
+"""The two-point form of an acceleration: a configuration part for two points, a velocity part.
 
 What a configuration q alone decides, D and its factors above all, RK4 needs at q and q + h/2 qd
-when a step begins, and at its other two places as soon as two accelerations are there. So that part
-is written once, as loops over two configurations in vector registers; what is left, the motion's
-part, follows stage by stage.
+when a step begins, and at its other two configurations as soon as two accelerations are there. So
+that part is written once, as loops over two configurations in vector registers; the rest, the
+velocity part, follows stage by stage.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from sympy import Expr, S
 from eomc.derive.tape import Stage, is_negative
 from eomc.emit import c_expression, vectors
 from eomc.emit.c_expression import DOUBLE
-from eomc.emit.c_names import TROUBLE, Argument, Target, arguments
+from eomc.emit.c_names import FAILED, Argument, Target, arguments
 from eomc.program import outline, trig
 from eomc.program.ir import Assignment, Function, Operand, Product, Sum, rename
 from eomc.program.trig import Angle
 
-FEWEST = 5  # angles from which on it pays to have them side by side
+FEWEST = 5  # angles from which on it pays to interleave them
 FOUR = 4  # numbers that are loaded and stored at once
 SUM, PRODUCT, QUOTIENT = 4, 3, 13  # cycles until their results are there, about
 SHORT = 400  # operations of a step up to which its parts are inlined
@@ -34,22 +34,22 @@ SHORT = 400  # operations of a step up to which its parts are inlined
 @dataclass(frozen=True)
 class Parts:
     """angles: those whose sines and cosines come from outside. configuration: gives the values that
-    `motion` reads of it, by their names `kept`. What parameters alone decide is in neither."""
+    `velocity` reads of it, by their names `handed`. What parameters alone decide is in neither."""
 
     angles: tuple[Angle, ...]
     configuration: Function
-    motion: Function
-    kept: tuple[str, ...]
+    velocity: Function
+    handed: tuple[str, ...]
 
 
 def apart(target: Target, function: Function) -> Parts | None:
     """The two parts of an acceleration; None where they bring nothing."""
     if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
         return None
-    turned, rest = trig.apart(function, target.names)
-    if not turned or not (len(turned) >= FEWEST or outline.is_large(function)):
+    rotated, rest = trig.apart(function, target.names)
+    if not rotated or not (len(rotated) >= FEWEST or outline.is_large(function)):
         return None
-    sines = {name for a in turned for name in (a.sine, a.cosine)}
+    sines = {name for a in rotated for name in (a.sine, a.cosine)}
     own = [p.name for p in target.system.parameters]
     fixed = {*own, *(a.name for a in function.early)}
     _, rest = outline.staged(rest, own)
@@ -65,32 +65,32 @@ def apart(target: Target, function: Function) -> Parts | None:
     checks = [
         (made.issuperset({o.name for o in pair if o.name} - fixed), pair) for pair in rest.checks
     ]
-    motion = replace(
+    velocity = replace(
         rest, body=tuple(late), checks=tuple(pair for early, pair in checks if not early)
     )
-    read = motion.uses
-    kept = tuple(a.name for a in first if a.name in read)
+    read = velocity.uses
+    handed = tuple(a.name for a in first if a.name in read)
     configuration = replace(
         rest,
         name="configuration",
         body=tuple(first),
-        outputs=tuple(Operand(S.One, name) for name in kept),
+        outputs=tuple(Operand(S.One, name) for name in handed),
         checks=tuple(pair for early, pair in checks if early),
     )
-    if 4 * outline.weight(configuration) < outline.weight(motion):
+    if 4 * outline.weight(configuration) < outline.weight(velocity):
         return None
-    new = _numbered(configuration, kept)
-    configuration, motion = rename(configuration, new), rename(motion, new)
-    kept = tuple(new.get(name, name) for name in kept)
-    named = frozenset(kept)
+    new = _numbered(configuration, handed)
+    configuration, velocity = rename(configuration, new), rename(velocity, new)
+    handed = tuple(new.get(name, name) for name in handed)
+    named = frozenset(handed)
     configuration = outline.with_names(configuration, named)
-    return Parts(tuple(turned), _last_come_last(configuration), _last_come_last(motion), kept)
+    return Parts(tuple(rotated), _last_come_last(configuration), _last_come_last(velocity), handed)
 
 
 def _without_factors(
     late: Sequence[Assignment], place: Set[str], fixed: Set[str]
 ) -> tuple[list[Assignment], list[Assignment]]:
-    """Products with one factor of all that the place decides in them; and these factors."""
+    """Products with one factor of all that the configuration decides in them; and these factors."""
     made: dict[Product, str] = {}
     out = []
     for a in late:
@@ -143,20 +143,20 @@ def _last_come_last(function: Function) -> Function:
     return replace(function, body=tuple(body))
 
 
-def _numbered(function: Function, kept: Sequence[str]) -> dict[str, str]:
+def _numbered(function: Function, handed: Sequence[str]) -> dict[str, str]:
     """k1, k2, ... for values that have no name of their own and are handed on."""
     own = {a.name for a in function.body if a.named}
     taken = {*function.uses, *(a.name for a in function.body)}
     fresh = (name for n in count(1) if (name := f"k{n}") not in taken)
-    return dict(zip((name for name in kept if name not in own), fresh, strict=False))
+    return dict(zip((name for name in handed if name not in own), fresh, strict=False))
 
 
 def context(
     target: Target, parts: Parts, kept: Sequence[str], timed: bool, takes_p: bool
 ) -> dict[str, Any]:
-    """What pairs.c.jinja and rk4_pairs.c.jinja print.
+    """What two_point.c.jinja and rk4_two_point.c.jinja print.
 
-    kept: what parameters alone decide; timed: whether accelerations hang on t by themselves;
+    kept: what parameters alone decide; timed: whether accelerations depend on t by themselves;
     takes_p: whether the scene's signals need the parameters.
     """
     P, real = target.prefix, target.real.name
@@ -167,28 +167,28 @@ def context(
     def sines(index: str) -> dict[str, str]:
         found = {}
         for k, a in enumerate(parts.angles):
-            found[a.sine] = f"at->sine[{_beside(k)} + {index}]"
-            found[a.cosine] = f"at->cosine[{_beside(k)} + {index}]"
+            found[a.sine] = f"at->sine[{_interleaved(k)} + {index}]"
+            found[a.cosine] = f"at->cosine[{_interleaved(k)} + {index}]"
         return found
 
     def state(index: str) -> Callable[[str, str], str]:
         return lambda array, name: (
-            f"at->q[{_beside(target.names.index(name))} + {index}]"
+            f"at->q[{_interleaved(target.names.index(name))} + {index}]"
             if array == "q"
             else f"qd->x[{target.enum[name]}]"
         )
 
     place = frozenset({*groups["q"], *sines("i")})
-    configuration = target.in_pieces(
+    configuration = target.outlined(
         parts.configuration,
         "configuration",
         [
-            Argument(f"const {P}_pair *{target.PREFIX}_ALONE at", "at", place),
-            Argument(f"const {P}_prepared *c", "c", frozenset(kept)),
-            Argument(f"{real} *{target.PREFIX}_ALONE troubles", "troubles", frozenset({TROUBLE})),
+            Argument(f"const {P}_two_points *{target.PREFIX}_ALONE at", "at", place),
+            Argument(f"const {P}_constants *c", "c", frozenset(kept)),
+            Argument(f"{real} *{target.PREFIX}_ALONE failures", "failures", frozenset({FAILED})),
         ],
-        [f"k->{name}[i]" for name in parts.kept],
-        Argument(f"{P}_kept *{target.PREFIX}_ALONE k", "k", frozenset()),
+        [f"k->{name}[i]" for name in parts.handed],
+        Argument(f"{P}_configuration_values *{target.PREFIX}_ALONE k", "k", frozenset()),
         lambda f: target.loads(f, state("i"), target.element),
         where | sines("i"),
         pair=True,
@@ -196,63 +196,64 @@ def context(
         in_order=True,
     )
     u_arg = f"const {real} *u"
-    motion = target.in_pieces(
-        parts.motion,
-        "motion",
+    velocity = target.outlined(
+        parts.velocity,
+        "velocity",
         [
-            Argument("int lane", "lane", place | set(parts.kept)),
-            Argument(f"const {P}_kept *k", "k", frozenset(parts.kept)),
-            Argument(f"const {P}_pair *at", "at", place),
+            Argument("int point", "point", place | set(parts.handed)),
+            Argument(f"const {P}_configuration_values *k", "k", frozenset(parts.handed)),
+            Argument(f"const {P}_two_points *at", "at", place),
             Argument(f"const {P}_vector *qd", "qd", groups["qd"]),
             Argument(f"{real} t", "t", groups["t"]),
             Argument(u_arg, "u", groups["u"]),
-            Argument(f"const {P}_prepared *c", "c", frozenset(kept)),
+            Argument(f"const {P}_constants *c", "c", frozenset(kept)),
         ],
         [f"a->x[{target.enum[name]}]" for name in target.names],
         Argument(f"{P}_vector *{target.PREFIX}_ALONE a", "a", frozenset()),
-        lambda f: target.loads(f, state("lane"), target.element),
-        where | sines("lane") | {name: f"k->{name}[lane]" for name in parts.kept},
+        lambda f: target.loads(f, state("point"), target.element),
+        where | sines("point") | {name: f"k->{name}[point]" for name in parts.handed},
         inline=inline,
         in_order=True,
     )
-    _put_together(target, motion["pieces"], width(target, parts))
+    _put_together(target, velocity["functions"], width(target, parts))
     t, driven = "t" if timed else "", "t" if target.driven else ""
     u, c, p = "u" if groups["u"] else "", "c" if kept else "", "p" if takes_p else ""
-    t_arg, c_arg = f"{real} t", f"const {P}_prepared *c" if c else ""
-    whole = f"{P}_vector *a, int lane, const {P}_kept *k, const {P}_pair *at, const {P}_vector *qd"
+    t_arg, c_arg = f"{real} t", f"const {P}_constants *c" if c else ""
+    whole = f"{P}_vector *a, int point, const {P}_configuration_values *k, "
+    whole += f"const {P}_two_points *at, const {P}_vector *qd"
     configuration_lines = [
-        *([f"{real} troubles[2] = {{ 0, 0 }};"] if configuration["troubled"] else []),
+        *([f"{real} failures[2] = {{ 0, 0 }};"] if configuration["fails"] else []),
         *configuration["locals"],
         "",
         *configuration["calls"],
-        "return !(troubles[0] + troubles[1] > 0);" if configuration["troubled"] else "return 1;",
+        "return !(failures[0] + failures[1] > 0);" if configuration["fails"] else "return 1;",
     ]
-    motion_lines = [*motion["locals"], *motion["calls"], f"return {motion['outcome']};"]
-    place_now = ", ".join(state("lane")("q", name) for name in target.names)
-    places = bool(groups["q"] & (parts.configuration.uses | parts.motion.uses))
+    velocity_lines = [*velocity["locals"], *velocity["calls"], f"return {velocity['outcome']};"]
+    place_now = ", ".join(state("point")("q", name) for name in target.names)
+    places = bool(groups["q"] & (parts.configuration.uses | parts.velocity.uses))
     places = places or (bool(groups["u"]) and target.signal_state)
 
-    def motion_call(given: str, time: str) -> str:
-        return f"{P}_motion({arguments('a, lane, k, at, qd', time, given, c)})"
+    def call_with(given: str, time: str) -> str:
+        return f"{P}_velocity_part({arguments('a, point, k, at, qd', time, given, c)})"
 
-    def stage(to: str, velocity: str, time: str) -> str:
-        shared = f"{to}, &k, &now, {velocity}"
+    def stage(to: str, qd: str, time: str) -> str:
+        shared = f"{to}, &k, &now, {qd}"
         if u:
-            return f"{P}_moving({arguments(shared, time if driven else '', u, c, p)})"
-        return f"{P}_motion({arguments(shared, time if timed else '', c)})"
+            return f"{P}_driven_velocity_part({arguments(shared, time if driven else '', u, c, p)})"
+        return f"{P}_velocity_part({arguments(shared, time if timed else '', c)})"
 
     return {
-        "members": [f"{name}[2]" for name in parts.kept],
+        "members": [f"{name}[2]" for name in parts.handed],
         "width": width(target, parts),
         "count": len(parts.angles),
         "whole": _whole(len(parts.angles)),
         "inline": f"{target.PREFIX}_INLINE" if inline else "static",
-        "places": places,
+        "coordinates": places,
         "each": lambda lines: c_expression.indent(
             vectors.each(target, True, lines, width=width(target, parts))
         ),
         "configuration": configuration,
-        "motion": motion,
+        "velocity": velocity,
         "angles": {
             name: _angles(target, parts, *given)
             for name, given in {
@@ -261,19 +262,21 @@ def context(
                 "d": ("x", "d->x", False),
                 "e": ("y", "e->x", False),
                 "mid": ("x", "mid->x", True),
-                "turn": ("turn", "d->x", False),
+                "rotation": ("rotation", "d->x", False),
             }.items()
         },
-        "configuration_arguments": arguments(f"{P}_kept *k, const {P}_pair *at", c_arg),
+        "configuration_arguments": arguments(
+            f"{P}_configuration_values *k, const {P}_two_points *at", c_arg
+        ),
         "configuration_call": arguments("&k, &now", c),
         "configuration_lines": configuration_lines,
         "configuration_unused": _unread([c] if c else [], configuration_lines),
-        "motion_arguments": arguments(whole, t and t_arg, u and u_arg, c_arg),
-        "motion_lines": motion_lines,
-        "motion_unused": _unread(
-            [x for x in ("lane", "k", "at", "qd", t, u, c) if x], motion_lines
+        "velocity_arguments": arguments(whole, t and t_arg, u and u_arg, c_arg),
+        "velocity_lines": velocity_lines,
+        "velocity_unused": _unread(
+            [x for x in ("point", "k", "at", "qd", t, u, c) if x], velocity_lines
         ),
-        "moving_arguments": arguments(
+        "driven_arguments": arguments(
             whole, driven and t_arg, u_arg, c_arg, target.p_arg if p else ""
         ),
         "signal_at": [
@@ -283,16 +286,18 @@ def context(
         if target.signal_state
         else [],
         "signal_call": target.signal_call("now", "place", "moving"),
-        "moved_now": motion_call("now", t),
-        "moved_given": motion_call("u", t),
+        "moved_now": call_with("now", t),
+        "moved_given": call_with("u", t),
         "stage": stage,
-        "solve_locals": [f"{P}_pair at;", f"{P}_kept k;", "int good;"],
+        "solve_locals": [f"{P}_two_points at;", f"{P}_configuration_values k;", "int good;"],
         "solve_lines": [
-            f"{P}_pair_angles(&at, q, q);",
-            *([f"{P}_pair_places(&at, q, q);"] if places else []),
-            f"good = {P}_configuration({arguments('&k, &at', c)});",
+            f"{P}_two_point_angles(&at, q, q);",
+            *([f"{P}_two_point_coordinates(&at, q, q);"] if places else []),
+            f"good = {P}_configuration_part({arguments('&k, &at', c)});",
         ],
-        "solve_end": [f"return {P}_motion({arguments('a, 0, &k, &at, qd', t, u, c)}) && good;"],
+        "solve_end": [
+            f"return {P}_velocity_part({arguments('a, 0, &k, &at, qd', t, u, c)}) && good;"
+        ],
     }
 
 
@@ -313,51 +318,51 @@ def width(target: Target, parts: Parts) -> int:
     return max(_whole(len(target.names)), _whole(first + _whole(len(parts.angles))))
 
 
-def _beside(k: int) -> int:
-    """Where number k of two places stands in an array of both, as beside.h has it."""
+def _interleaved(k: int) -> int:
+    """Where number k of two points stands in an array of both, as interleave.h has it."""
     return 2 * (k - k % FOUR) + (0, 4, 2, 6)[k % FOUR]
 
 
 def _step_weight(parts: Parts) -> int:
-    """The operations of the parts in a step, those for both places counted once."""
-    return 2 * outline.weight(parts.configuration) + 4 * outline.weight(parts.motion)
+    """The operations of the parts in a step, those for both points counted once."""
+    return 2 * outline.weight(parts.configuration) + 4 * outline.weight(parts.velocity)
 
 
-def _put_together(target: Target, cut: Sequence[dict[str, Any]], wide: int) -> None:
-    """The accelerations that a piece makes, stored four at a time where all four are there."""
-    for piece in cut:
-        ready = dict(piece["results"])
-        if piece is cut[-1]:
-            ready |= dict.fromkeys(range(len(target.names), wide), target.zero)
+def _put_together(target: Target, cut: Sequence[dict[str, Any]], width: int) -> None:
+    """The accelerations that a function makes, stored four at a time where all four are there."""
+    for f in cut:
+        ready = dict(f["results"])
+        if f is cut[-1]:
+            ready |= dict.fromkeys(range(len(target.names), width), target.zero)
         lines = []
-        for begin in range(0, wide, FOUR):
+        for begin in range(0, width, FOUR):
             block = [k for k in range(begin, begin + FOUR) if k in ready]
             if len(block) == FOUR:
                 four = ", ".join(ready[k] for k in block)
-                lines.append(f"{target.prefix}_put(a->x + {begin}, {four});")
+                lines.append(f"{target.prefix}_store(a->x + {begin}, {four});")
             else:
                 lines += [f"a->x[{k}] = {ready[k]};" for k in block]
-        piece["stores"] = lines
+        f["stores"] = lines
 
 
 def _angles(target: Target, parts: Parts, to: str, vector: str, offset: bool) -> dict[str, Any]:
-    """Where the angles of one place are found, or without offset what they are turned by."""
-    turned, real = parts.angles, target.real.name
-    first = target.names.index(turned[0].terms[0][1])
-    names = target.names[first : first + len(turned)]
-    plain = len(names) == len(turned) and all(
+    """Where the angles of one point are found, or without offset what they are rotated by."""
+    rotated, real = parts.angles, target.real.name
+    first = target.names.index(rotated[0].terms[0][1])
+    names = target.names[first : first + len(rotated)]
+    plain = len(names) == len(rotated) and all(
         a.terms == ((S.One, name),) and (a.offset == 0 or not offset)
-        for a, name in zip(turned, names, strict=True)
+        for a, name in zip(rotated, names, strict=True)
     )
     if plain:
         at = f"{vector} + {first}" if first else vector
         return {"declared": f"const {real} *const {to} = {at};", "lines": []}
-    texts = [_along(target, a, vector, a.offset if offset else S.Zero) for a in turned]
+    texts = [_along(target, a, vector, a.offset if offset else S.Zero) for a in rotated]
     texts += [target.zero] * (_whole(len(texts)) - len(texts))
     return {
         "declared": f"{real} {to}[{len(texts)}];",
         "lines": [
-            f"{target.prefix}_put({to} + {k}, {', '.join(texts[k : k + FOUR])});"
+            f"{target.prefix}_store({to} + {k}, {', '.join(texts[k : k + FOUR])});"
             for k in range(0, len(texts), FOUR)
         ],
     }

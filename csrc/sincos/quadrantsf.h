@@ -28,7 +28,7 @@ EOMC_INLINE void eomc_sincosf_of_reduced(float r, float shift, float *s,
 }
 
 /* The same of any angle that eomc_sincosf_small can take. */
-EOMC_INLINE void eomc_sincosf_side_by_side(float x, float *s, float *c)
+EOMC_INLINE void eomc_sincosf_by_bits(float x, float *s, float *c)
 {
     float shifted;
     const float r = eomc_sincosf_reduce(x, &shifted);

@@ -1,6 +1,6 @@
-/* eomc_foretold_at for two, to the same bits, in registers twice as wide if there are any. */
-EOMC_INLINE void eomc_foretold_both(
-    eomc_foretold *f, eomc_foretold *g)
+/* eomc_predicted_sincos for two, to the same bits, in registers twice as wide if there are any. */
+EOMC_INLINE void eomc_predicted_both(
+    eomc_predicted *f, eomc_predicted *g)
 {
 #ifdef __GNUC__
     typedef double eomc_four __attribute__((vector_size(32)));
@@ -29,7 +29,7 @@ EOMC_INLINE void eomc_foretold_both(
     f->s = s_f, f->c = c_f;
     g->s = s_g, g->c = c_g;
 #else
-    eomc_foretold_at(f);
-    eomc_foretold_at(g);
+    eomc_predicted_sincos(f);
+    eomc_predicted_sincos(g);
 #endif
 }

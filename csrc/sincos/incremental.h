@@ -1,5 +1,5 @@
 /*
- * Sines and cosines turned by a small angle d, without a branch, for loops over many:
+ * Sines and cosines rotated by a small angle d, without a branch, for loops over many:
  *
  *     sin(x + d) = s0 + (c0 sin d + s0 (cos d - 1))
  *     cos(x + d) = c0 - (s0 sin d - c0 (cos d - 1))
@@ -10,7 +10,7 @@
  */
 
 /* By d, |d| <= 2^-6. */
-EOMC_INLINE void eomc_turn(double d, double s0, double c0,
+EOMC_INLINE void eomc_sincos_rotate(double d, double s0, double c0,
     double *s, double *c)
 {
     const double z = d * d;
@@ -24,7 +24,7 @@ EOMC_INLINE void eomc_turn(double d, double s0, double c0,
 }
 
 /* By -d and by d, |d| <= 2^-3. */
-EOMC_INLINE void eomc_turn_both(double d, double s0, double c0,
+EOMC_INLINE void eomc_sincos_rotate_both(double d, double s0, double c0,
     double *s_back, double *c_back, double *s_on, double *c_on)
 {
     const double z = d * d;

@@ -28,7 +28,7 @@ EOMC_INLINE void eomc_sincos_of_reduced(double r, double shift, double *s,
 }
 
 /* The same of any angle that eomc_sincos_small can take. */
-EOMC_INLINE void eomc_sincos_side_by_side(double x, double *s, double *c)
+EOMC_INLINE void eomc_sincos_by_bits(double x, double *s, double *c)
 {
     double shifted;
     const double r = eomc_sincos_reduce(x, &shifted);

@@ -1,13 +1,13 @@
 /*
- * Numbers that scalar code has made, for loops in vector registers: four are stored at once.
- * Stored one by one they could not be loaded together until all of them have left for the cache.
+ * Numbers from scalar code for loops in vector registers, stored four at a time: a vector load waits
+ * until numbers that were stored one by one have reached the cache.
  */
 #ifdef __GNUC__
 typedef double eomc_four __attribute__((vector_size(32), aligned(8)));
 #endif
 
 /* to = a, b, c, d. */
-EOMC_INLINE void eomc_put(double *to, double a, double b, double c, double d)
+EOMC_INLINE void eomc_store(double *to, double a, double b, double c, double d)
 {
 #ifdef __GNUC__
     const eomc_four all = { a, b, c, d };
@@ -18,9 +18,9 @@ EOMC_INLINE void eomc_put(double *to, double a, double b, double c, double d)
 #endif
 }
 
-/* to = x and y side by side, four of either, in the order that registers take to:
+/* to = x and y interleaved, four of each, in the order that takes one shuffle of either half:
  * x0 y0, x2 y2, x1 y1, x3 y3. */
-EOMC_INLINE void eomc_beside(double *to, const double *x, const double *y)
+EOMC_INLINE void eomc_interleave(double *to, const double *x, const double *y)
 {
 #ifdef __GNUC__
     const eomc_four a = *(const eomc_four *)x, b = *(const eomc_four *)y;

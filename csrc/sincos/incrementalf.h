@@ -1,12 +1,12 @@
 /*
- * Sines and cosines turned by a small angle d, in single precision: turn.h for float.
+ * Sines and cosines rotated by a small angle d, in single precision: incremental.h for float.
  *
  * Error: what s0 and c0 bring, and one unit of rounding of 1 at most besides; the polynomials are
  * off by 2^-27 of 1 at most.
  */
 
 /* By d, |d| <= 2^-4. */
-EOMC_INLINE void eomc_turnf(float d, float s0, float c0, float *s, float *c)
+EOMC_INLINE void eomc_sincosf_rotate(float d, float s0, float c0, float *s, float *c)
 {
     const float z = d * d;
     const float sin_d = eomc_mul_addf(d * z, -0.16665038f, d);
@@ -17,7 +17,7 @@ EOMC_INLINE void eomc_turnf(float d, float s0, float c0, float *s, float *c)
 }
 
 /* By -d and by d, |d| <= 1/4. */
-EOMC_INLINE void eomc_turn_bothf(float d, float s0, float c0,
+EOMC_INLINE void eomc_sincosf_rotate_both(float d, float s0, float c0,
     float *s_back, float *c_back, float *s_on, float *c_on)
 {
     const float z = d * d;

@@ -4,15 +4,15 @@
  *     sin x = s0 + (c0 sin d + s0 (cos d - 1))
  *     cos x = c0 - (s0 sin d - c0 (cos d - 1))
  *
- * |d| <= 2^-6: by short polynomials, in half the time of sincos.  The branch is as good as free,
- * since it nearly always goes the same way.  Anything else, a NaN too, goes to sincos.
+ * |d| <= 2^-6: by short polynomials, in half the time of sincos.  The branch is nearly always
+ * predicted.  Anything else, a NaN too, goes to sincos.
  *
  * Error: what s0 and c0 bring, and one unit of rounding of 1 at most besides.  In sin d = d + d^3
  * (a0 + a1 d^2) the next term of Taylor's series, d^7/5040, is shared out by Chebyshev's rule; that
  * is off by 2^-57.3 at most, cos d - 1 by d^8/40320 < 2^-63.
  */
-EOMC_INLINE void eomc_sincos_near(double x, double d, double s0, double c0,
-    double *s, double *c)
+EOMC_INLINE void eomc_sincos_with_fallback(
+    double x, double d, double s0, double c0, double *s, double *c)
 {
     if (fabs(d) <= 0.015625) {
         const double z = d * d;

@@ -1,22 +1,22 @@
 /*
- * Sines and cosines near two angles that are foretold: of the middle and of the end of a step.
+ * Sines and cosines near two predicted angles: of the middle and of the end of a step.
  *
- * What a step needs lies by some h^2 a away from
+ * The angles of a step lie within some h^2 a of
  *
  *     x + t x' + t^2/2 x'',   t = 3/2 h and 2 h,   x, x' and x'' one step before
  * (of the first step t = h/2 and h, from its start),
  *
- * so their sines and cosines are computed while nobody waits for them, side by side, and those of
- * the stages are turned from there by the distance d:
+ * so the sines and cosines of these two are computed early, in one vector register, and those of
+ * the stages are rotated from there by the distance d:
  *
  *     sin(x + d) = s + d c - d^2/2 (s + d c/3)
  *     cos(x + d) = c - d s - d^2/2 (c - d s/3)
  *
- * Error: at the angles foretold, |x| <= 2^20, at most 2^-53, and 1.7 2^-53 in all where
+ * Error: at the predicted angles, |x| <= 2^20, at most 2^-53, and 1.7 2^-53 in all where
  * d <= 2^-12: the term left out, d^4/24, is mostly made good by a half that is a little less.
  *
- * far: halves of the squares of d are added to it, and as much as 2^-25 for |x| = 2^20; up to
- * that in all they are near. A NaN stays in it.
+ * far: halves of the squares of d are added to it, and as much as 2^-25 for |x| = 2^20; a sum of at
+ * most that is close enough. A NaN stays in it.
  */
 #ifdef __GNUC__
 typedef double eomc_two __attribute__((vector_size(16)));
@@ -27,15 +27,15 @@ typedef double eomc_two[2];
 
 typedef struct {
     eomc_two x, s, c;
-} eomc_foretold;
+} eomc_predicted;
 
-/* s, c and their thirds, which turning takes. */
+/* s, c and their thirds: what a rotation takes. */
 typedef struct {
     double s, c, s_3, c_3;
-} eomc_known;
+} eomc_predicted_terms;
 
 /* f->x: of an angle x with the derivatives v and a, at the times mid and end from now. */
-EOMC_INLINE void eomc_foretell(eomc_foretold *f,
+EOMC_INLINE void eomc_predict(eomc_predicted *f,
     double x, double v, double a, double mid, double end)
 {
     const eomc_two on = { mid, end }, bent = { 0.5 * mid * mid, 0.5 * end * end };
@@ -49,7 +49,7 @@ EOMC_INLINE void eomc_foretell(eomc_foretold *f,
 }
 
 /* At f->x, as eomc_sincos_small, but for the last digits of the smallest sines. */
-EOMC_INLINE void eomc_foretold_at(eomc_foretold *f)
+EOMC_INLINE void eomc_predicted_sincos(eomc_predicted *f)
 {
 #ifdef __GNUC__
     const double magic = 6755399441055744.0;
@@ -81,8 +81,8 @@ EOMC_INLINE void eomc_foretold_at(eomc_foretold *f)
 #endif
 }
 
-EOMC_INLINE void eomc_know(eomc_known *mid,
-    eomc_known *end, const eomc_foretold *f, double *far)
+EOMC_INLINE void eomc_predicted_unpack(eomc_predicted_terms *mid,
+    eomc_predicted_terms *end, const eomc_predicted *f, double *far)
 {
 #ifdef __GNUC__
     const eomc_two s_3 = f->s * (1.0 / 3.0), c_3 = f->c * (1.0 / 3.0);
@@ -96,9 +96,9 @@ EOMC_INLINE void eomc_know(eomc_known *mid,
     *far += f->x[1] * 2.710505431213761e-20 * f->x[1];
 }
 
-/* s, c at the distance d from what is known. */
-EOMC_INLINE void eomc_turn_on(double d, const eomc_known *k,
-    double *s, double *c, double *far)
+/* s, c at the distance d from a predicted angle. */
+EOMC_INLINE void eomc_predicted_rotate(
+    double d, const eomc_predicted_terms *k, double *s, double *c, double *far)
 {
     const double z = 0.4999999979425627 * d * d;
 
@@ -107,7 +107,7 @@ EOMC_INLINE void eomc_turn_on(double d, const eomc_known *k,
     *far += z;
 }
 
-EOMC_INLINE int eomc_are_near(double far)
+EOMC_INLINE int eomc_predicted_close(double far)
 {
     return far <= 2.98023223876953125e-08;
 }

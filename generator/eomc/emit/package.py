@@ -1,0 +1,142 @@
+"""The views of what stands beside both forms of C: example, binding, Python package."""
+
+from __future__ import annotations
+
+import math
+
+from eomc.base.texts import FreeText
+from eomc.emit.c_names import Target
+from eomc.emit.evaluations import KINDS, takes_t
+from eomc.emit.fast.context import stamp, words
+from eomc.emit.public import Public
+from eomc.emit.views import Binding, Bound, BoundMethod, Declarations, Face, Main, Named
+from eomc.integrators.tableaux import METHODS
+
+ROWS = 200  # of main.c, about
+FUNCTIONS = (
+    "C D acceleration advice bias energy g jacobi kinetic_energy linearize potential_energy power "
+    "rhs sensitivity signal simulate simulate_batch step step_batch tau"
+).split()
+
+
+def main(target: Target) -> Main:
+    """The scene's own run, some two hundred rows of it."""
+    s, public = target.system, Public(target)
+    steps = max(1, math.ceil(s.run.duration / s.run.h * (1 - 1e-12)))
+    names = [target.as_written(c.name) for c in s.coordinates]
+    method, energy = s.run.methods[0], public.evaluation("energy")
+    return Main(
+        title=FreeText(s.title),
+        stamp=tuple(stamp(target)),
+        prefix=target.prefix,
+        PREFIX=target.PREFIX,
+        real=target.real.name,
+        has_p=target.needs_p,
+        method=method,
+        h=target.literal(s.run.h),
+        steps=steps,
+        every=max(1, steps // ROWS),
+        columns=("t", *names, *(f"{n}_dot" for n in names), "energy"),
+        run=public.run(method).call(
+            t0="0", first="n", steps="next", u="NULL", u_stride="0", every="0", q_rows="NULL",
+            qd_rows="NULL", memory="&memory", status="&status",
+        ),
+        energy=energy.call(),
+        energy_at_end=energy.call(t=f"({target.real.name})steps*h"),
+    )  # fmt: skip
+
+
+def _bound(target: Target) -> tuple[Bound, ...]:
+    """The evaluation functions."""
+    at, found = _rows(target), []
+    for function in Public(target).evaluations():
+        name = function.name.removeprefix(f"{target.prefix}_")
+        kind, out = KINDS[name], function.arguments[0].extent
+        call = function.call(**at | ({kind.out: f"out + {out}*k"} if kind.out else {}))
+        found.append(Bound(name, call if kind.out else f"out[k] = {call}"))
+    return tuple(found)
+
+
+def _rows(target: Target) -> dict[str, str]:
+    """q and qd of row k, and the parameters, which come as plain numbers."""
+    NQ = f"{target.PREFIX}_NQ"
+    return {"q": f"q + {NQ}*k", "qd": f"qd + {NQ}*k", "p": target.p_cast}
+
+
+def _methods(target: Target) -> tuple[BoundMethod, ...]:
+    """The calls of step, run and batch."""
+    public, p, NQ = Public(target), target.p_cast, f"{target.PREFIX}_NQ"
+    return tuple(
+        BoundMethod(
+            name,
+            METHODS[name].implicit,
+            public.step(name).call(q="at", qd="moving", p=p),
+            public.run(name).call(
+                u="u ? u + first*u_stride : u", q_rows=f"q_rows + {NQ}*(row + 1)",
+                qd_rows=f"qd_rows + {NQ}*(row + 1)", p=p, memory="work ? &work->memory : NULL",
+                status="&found",
+            ),
+            public.batch(name).call(p=p),
+        )
+        for name in target.system.run.methods
+    )  # fmt: skip
+
+
+def binding(target: Target) -> Binding:
+    """One signature for every function, rows of states at a time."""
+    public, at, NQ = Public(target), _rows(target), f"{target.PREFIX}_NQ"
+    linear = public.linearization
+    matrices = {a.name: f"{a.name} + {a.extent}*k" for a in linear.arguments if a.name[0] in "AB"}
+    return Binding(
+        prefix=target.prefix,
+        PREFIX=target.PREFIX,
+        real=target.real.name,
+        evaluations=_bound(target),
+        acceleration=public.acceleration.call(qdd=f"out + {NQ}*k", **at),
+        linearization=linear.call(**at, **matrices) if _linearized(target) else "",
+        batch=target.system.run.batch,
+        methods=_methods(target),
+        parameter_count=len(target.system.parameters),
+    )
+
+
+def _linearized(target: Target) -> bool:
+    return bool({"linearization", "linearization_column"} & set(target.program.functions))
+
+
+def declarations(bound: Binding) -> Declarations:
+    """What cffi is told."""
+    return Declarations(
+        bound.real, bound.evaluations, bound.linearization, bound.batch, bound.methods
+    )
+
+
+def face(target: Target, extension: str) -> Face:
+    """The Python package's __init__."""
+    s, written = target.system, target.as_written
+    units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
+    units |= {i.name: i.unit for i in s.inputs}
+    return Face(
+        title=FreeText(s.title),
+        stamp=tuple(stamp(target)),
+        prefix=target.prefix,
+        extension=extension,
+        digest=s.digest,
+        dtype=target.real.dtype,
+        coordinates=tuple(Named(written(c.name), words(c.unit, c.note)) for c in s.coordinates),
+        parameters=tuple(
+            Named(written(p.name), words(p.unit, p.note), repr(p.value)) for p in s.parameters
+        ),
+        inputs=tuple(Named(written(i.name), words(i.unit, i.note)) for i in s.inputs),
+        coordinate_units=FreeText({written(c.name): c.unit for c in s.coordinates}),
+        parameter_values={written(p.name): p.value for p in s.parameters},
+        input_units=FreeText({written(i.name): i.unit for i in s.inputs}),
+        units=FreeText({written(name): unit for name, unit in units.items() if unit}),
+        start=([c.start for c in s.coordinates], [c.rate for c in s.coordinates]),
+        h=s.run.h,
+        duration=s.run.duration,
+        timed=tuple(n for n in ("energy", "jacobi") if n in target.program and takes_t(target, n)),
+        batch=s.run.batch,
+        methods=tuple(METHODS[name] for name in s.run.methods),
+        functions=tuple(n for n in FUNCTIONS if s.run.batch or not n.endswith("_batch")),
+    )

@@ -1,0 +1,125 @@
+"""The public C functions of a scene as values: their prototypes, which both forms of C have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from eomc.emit.c_function import CArgument, CFunction, filled, given
+from eomc.emit.c_names import Target
+from eomc.emit.evaluations import KINDS, source, takes_t
+
+STATE = ("q", "qd")
+
+
+@dataclass(frozen=True)
+class Public:
+    """What a header declares for a scene."""
+
+    target: Target
+
+    def usual(self, *names: str) -> tuple[CArgument, ...]:
+        """Those of q, qd, t, h, u, p that this scene has."""
+        target, real = self.target, self.target.real.name
+        there = {
+            "q": given(real, "q", f"{target.PREFIX}_NQ"),
+            "qd": given(real, "qd", f"{target.PREFIX}_NQ"),
+            "t": CArgument(real, "t") if target.driven else None,
+            "h": CArgument(real, "h"),
+            "u": given(real, "u") if target.system.inputs else None,
+            "p": given(f"{target.prefix}_params", "p") if target.needs_p else None,
+        }
+        return tuple(a for name in names if (a := there[name]))
+
+    def evaluations(self) -> tuple[CFunction, ...]:
+        """D, C, g, bias, tau, the energies, the sensitivity, the signals: those that there are."""
+        return tuple(map(self.evaluation, (n for n in KINDS if source(self.target, n) is not None)))
+
+    def evaluation(self, name: str) -> CFunction:
+        """One of them."""
+        kind, target, real = KINDS[name], self.target, self.target.real.name
+        NQ, signal = f"{target.PREFIX}_NQ", name == "signal"
+        extents = {"n*n": f"{NQ}*{NQ}", "n*p": f"{NQ}*{len(target.system.parameters)}", "n": NQ}
+        extent = (extents | {"m": f"{target.PREFIX}_NU"}).get(kind.shape, "")
+        t = (CArgument(real, "t"),) if takes_t(target, name) else ()
+        state = STATE if kind.qd else STATE[:1]
+        return CFunction(
+            f"{target.prefix}_{name}",
+            "void" if kind.out else real,
+            (
+                *([filled(real, kind.out, extent)] if kind.out else []),
+                *(t if signal else ()),
+                *(self.usual(*state) if not signal or target.signal_state else ()),
+                *(() if signal else t),
+                *self.usual(*(["u"] if kind.u else []), "p"),
+            ),
+        )
+
+    @property
+    def acceleration(self) -> CFunction:
+        """qdd, with a status."""
+        target = self.target
+        qdd = filled(target.real.name, "qdd", f"{target.PREFIX}_NQ")
+        return self._status("acceleration", qdd, *self.usual(*STATE, "t", "u", "p"))
+
+    @property
+    def linearization(self) -> CFunction:
+        """A_q, A_qd and B, with a status."""
+        target, NQ = self.target, f"{self.target.PREFIX}_NQ"
+        widths = {"A_q": NQ, "A_qd": NQ}
+        if target.system.inputs:
+            widths["B"] = f"{target.PREFIX}_NU"
+        out = (filled(target.real.name, name, f"{NQ}*{w}") for name, w in widths.items())
+        return self._status("linearization", *out, *self.usual(*STATE, "t", "u", "p"))
+
+    def step(self, method: str) -> CFunction:
+        """One step in place."""
+        return self._status(f"{method}_step", *self._moved, *self.usual("t", "h", "u", "p"))
+
+    def run(self, method: str) -> CFunction:
+        """Many steps in place."""
+        P = self.target.prefix
+        strides = [CArgument("long", "u_stride")] if self.target.system.inputs else []
+        return CFunction(
+            f"{P}_{method}_run",
+            "long",
+            (
+                *self._moved, *self._steps, *self.usual("u"), *strides, *self._rows,
+                *self.usual("p"), CArgument(f"{P}_{method}_memory *", "memory"),
+                CArgument(f"{P}_status *", "status"),
+            ),
+        )  # fmt: skip
+
+    def batch(self, method: str) -> CFunction:
+        """The same of many instances."""
+        target, real = self.target, self.target.real.name
+        strides = [CArgument("long", name) for name in ("u_instance", "u_step", "p_instance")]
+        return CFunction(
+            f"{target.prefix}_{method}_batch",
+            "void",
+            (
+                CArgument("long", "count"), filled(real, "q"), filled(real, "qd"), *self._steps,
+                *self.usual("u"), *(strides[:2] if target.system.inputs else []), *self._rows,
+                CArgument("long", "row_count"), *self.usual("p"),
+                *(strides[2:] if target.needs_p else []),
+                CArgument("long *", "done"), CArgument("int *", "status"),
+            ),
+        )  # fmt: skip
+
+    def _status(self, name: str, *arguments: CArgument) -> CFunction:
+        return CFunction(f"{self.target.prefix}_{name}", f"{self.target.prefix}_status", arguments)
+
+    @property
+    def _moved(self) -> tuple[CArgument, ...]:
+        real, NQ = self.target.real.name, f"{self.target.PREFIX}_NQ"
+        return tuple(filled(real, name, NQ) for name in STATE)
+
+    @property
+    def _steps(self) -> tuple[CArgument, ...]:
+        real = self.target.real.name
+        t0 = [CArgument(real, "t0")] if self.target.driven else []
+        return (*t0, CArgument(real, "h"), CArgument("long", "first"), CArgument("long", "steps"))
+
+    @property
+    def _rows(self) -> tuple[CArgument, ...]:
+        rows = (filled(self.target.real.name, f"{name}_rows") for name in STATE)
+        return (CArgument("long", "every"), *rows)

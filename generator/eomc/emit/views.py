@@ -1,0 +1,146 @@
+"""What the templates beside both forms of C ask for: one frozen view each, values only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from eomc.base.texts import FreeText
+from eomc.integrators.tableaux import Method
+
+
+@dataclass(frozen=True)
+class Main:
+    """c/main.c.jinja: the scene's own run. run, energy, energy_at_end: calls."""
+
+    TEMPLATE: ClassVar[str] = "c/main.c"
+    title: FreeText
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    PREFIX: str
+    real: str
+    has_p: bool
+    method: str
+    h: str
+    steps: int
+    every: int
+    columns: tuple[str, ...]
+    run: str
+    energy: str
+    energy_at_end: str
+
+
+@dataclass(frozen=True)
+class State:
+    """A state of selftest.c and what is expected there: literals; the limit for D and bias."""
+
+    x: tuple[str, ...]
+    expected: tuple[str, ...]
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class SelfTest:
+    """c/selftest.c.jinja. large_tolerance: 0 without large angles. The last four: calls."""
+
+    TEMPLATE: ClassVar[str] = "c/selftest.c"
+    title: FreeText
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    PREFIX: str
+    real: str
+    states: tuple[State, ...]
+    tolerance: float
+    large_tolerance: float
+    large_limit: str
+    D: str
+    bias: str
+    tau: str
+    acceleration: str
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A function of the scene in the binding: its name, and its call for row k of many."""
+
+    name: str
+    call: str
+
+
+@dataclass(frozen=True)
+class BoundMethod:
+    """A method in the binding, and the calls of its three functions."""
+
+    name: str
+    implicit: bool
+    step: str
+    run: str
+    batch: str
+
+
+@dataclass(frozen=True)
+class Binding:
+    """python/binding.c.jinja. linearization: its call, if there is one."""
+
+    TEMPLATE: ClassVar[str] = "python/binding.c"
+    prefix: str
+    PREFIX: str
+    real: str
+    evaluations: tuple[Bound, ...]
+    acceleration: str
+    linearization: str
+    batch: bool
+    methods: tuple[BoundMethod, ...]
+    parameter_count: int
+
+
+@dataclass(frozen=True)
+class Declarations:
+    """python/binding.cdef.jinja: what cffi is told of the binding."""
+
+    TEMPLATE: ClassVar[str] = "python/binding.cdef"
+    real: str
+    evaluations: tuple[Bound, ...]
+    linearization: str
+    batch: bool
+    methods: tuple[BoundMethod, ...]
+
+
+@dataclass(frozen=True)
+class Named:
+    """A coordinate, parameter or input by its author's name; of a parameter with its value."""
+
+    written: str
+    words: FreeText
+    number: str = ""
+
+
+@dataclass(frozen=True)
+class Face:
+    """python/face.py.jinja. start: coordinates and velocities; functions: public, of the model."""
+
+    TEMPLATE: ClassVar[str] = "python/face.py"
+    title: FreeText
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    extension: str
+    digest: str
+    dtype: str
+    coordinates: tuple[Named, ...]
+    parameters: tuple[Named, ...]
+    inputs: tuple[Named, ...]
+    coordinate_units: FreeText
+    parameter_values: Mapping[str, float]
+    input_units: FreeText
+    units: FreeText
+    start: tuple[list[float], list[float]]
+    h: float
+    duration: float
+    timed: tuple[str, ...]
+    batch: bool
+    methods: tuple[Method, ...]
+    functions: tuple[str, ...]
+
+
+View = Main | SelfTest | Binding | Declarations | Face
