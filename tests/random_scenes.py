@@ -106,7 +106,8 @@ def _built(sources: Sources, folder: Path) -> ModuleType:
     """
     folder.mkdir(parents=True)
     for file, text in sources.files.items():
-        (folder / file).write_text(text, encoding="utf-8")
+        if file.startswith("fast/") or file.endswith(".py"):
+            (folder / file.removeprefix("fast/")).write_text(text, encoding="utf-8")
     binding = re.sub(r"^static (?=(int|long|void) )", "", sources.binding, flags=re.M)
     (folder / "binding.c").write_text(
         "#include <stddef.h>\n#include <stdint.h>\n" + binding, encoding="utf-8"

@@ -24,7 +24,8 @@ from eomc.verify.taylor import Jets
 
 FARTHEST = 100.0  # of the spread: how far long steps may lead
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
-# parts of the scene's h, until stages are found by sweeps
+LONGER = 16.0  # times the scene's h: a long step
+# parts of it, until stages are found by sweeps
 SHORTER = tuple(4.0**-k for k in range(7))
 
 
@@ -188,15 +189,21 @@ class Comparison:
     def step_by(self, method: str) -> float | Finding:
         """One step of a method from a few states, by its tableau on the reference's accelerations.
 
-        Shorter than the scene's h where the stages of an implicit one are else not found.
+        Of the scene's h, and of LONGER, where what is of high order in h is more than rounding.
+        Shorter where the stages of an implicit one are else not found.
         """
-        errors = (self._step_by(method, e) for e in self.few(self.effort.few))
+        errors = (
+            self._step_by(method, e, h)
+            for e in self.few(self.effort.few)
+            for h in (self.system.run.h, LONGER * self.system.run.h)
+        )
         return largest(errors, "no step from any state is finite")
 
-    def _step_by(self, method: str, e: Expected) -> float | None:
+    def _step_by(self, method: str, e: Expected, longest: float) -> float | None:
         """None where there is no such step, in the reference or in the module."""
         s, gain = e.state, e.size["acceleration"]
-        for h in (part * self.system.run.h for part in SHORTER):
+        spread = np.array([self.sampler.spread, self.sampler.speed])
+        for h in (part * longest for part in SHORTER):
 
             def reference(q: Vector, qd: Vector, t: Vector, h: float = h, **given: Any) -> Vector:
                 def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
@@ -210,6 +217,8 @@ class Comparison:
                     expected, size = self.sampler.reach(reference, s)
                 except np.linalg.LinAlgError:
                     continue
+            if h > self.system.run.h and not np.all(np.abs(expected - [s.q, s.qd]) < spread):
+                continue
             run = self.simulate(s, method=method, h=h, steps=1, t0=s.t)
             if np.all(np.isfinite(expected)) and run.status == "ok":
                 size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain])

@@ -7,6 +7,7 @@ memory. All ways give the same motion, most of them the same bits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,6 +30,7 @@ EVERY = 3  # no divisor of STEPS
 # The largest move of a step that is long, in parts of how far things go (half a turn): too far for
 # an angle to be predicted, and then too far for its sine to be rotated.
 LONG = (0.02, 0.2, 0.7)
+TURNED = 0.3  # radians: where a polynomial for rotations by 2^-6 is off by millions of roundings
 LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by all they may be
 ANGLES = 48  # around the circle, at which sines are looked at
 SINES = 20.0  # units; their last terms make hundreds
@@ -145,13 +147,19 @@ class Runs:
             h = np.minimum(spread / np.abs(s.qd), np.sqrt(spread / np.abs(a)))
         return float(min(np.min(h), 100 * self.h)) or self.h
 
+    def turning_step(self, s: State) -> float:
+        """An h in which accelerations alone turn some angle by TURNED at half of it."""
+        a = np.asarray(self.check.module.acceleration(s.q, s.qd, s.t, s.u, s.params), float)
+        fastest = float(np.max(np.abs(a[self.sampler.angles]), initial=0))
+        return min(math.sqrt(4 * TURNED / fastest), 100 * self.h) if fastest > 0 else self.h
+
     def long(self) -> float | Finding:
         """Long steps beside the reference's."""
         parts = ((), LONG) if self.check.large else (LONG, LADDER)
         found = (
-            self.check.run(s, h=self.large_step(s, part), steps=self.few)
+            self.check.run(s, h=h, steps=self.few)
             for s, some in zip(self.states, parts, strict=False)
-            for part in some
+            for h in (self.turning_step(s), *(self.large_step(s, part) for part in some))
         )
         return largest(found, "a difference grows too much in one long step")
 
