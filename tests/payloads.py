@@ -197,9 +197,10 @@ def tokens(files: dict[str, str], folder: Path) -> str:
     """What a C compiler sees of the C files."""
     names = [name for name in files if name.endswith((".c", ".h"))]
     for name in names:
+        (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(files[name], encoding="utf-8")
     command = [needs("gcc"), "-E", "-P", "-Wcomment", "-Wtrigraphs", "-Werror"]
-    command += ["-std=c99", "-x", "c"]
+    command += ["-std=c99", "-I.", "-x", "c"]
     done = subprocess.run([*command, *names], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0 and not done.stderr, done.stderr
     return done.stdout

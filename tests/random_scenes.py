@@ -414,7 +414,7 @@ def _built(made: System, root: Path, sources: Sources | None = None) -> ModuleTy
     """The module of a system, or of sources that are not what the system would give."""
     if sources is None:
         return eomc.load(made, root)
-    digest = hashlib.sha256(sources.files[f"{made.name}.c"].encode()).hexdigest()
+    digest = hashlib.sha256(sources.files[f"fast/{made.name}.c"].encode()).hexdigest()
     key = compiler.key(made.digest, digest)
 
     def texts(extension: str) -> Sources:

@@ -217,8 +217,9 @@ def runs(made: System, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[An
     )
     assert done.returncode == 0, done.stderr
     for file in ("main.c", "selftest.c"):
-        command = [needs("gcc"), "-std=c99", "-Wall", "-Wextra", "-Werror", "-o", file[:-2]]
-        subprocess.run([*command, file, "fields.c", "-lm"], cwd=built.folder, check=True)
+        command = [needs("gcc"), "-std=c99", "-Wall", "-Wextra", "-Werror", "-I."]
+        parts = ("-o", file[:-2], file, "fields.c", "-lm")
+        subprocess.run([*command, *parts], cwd=built.folder, check=True)
         printed = subprocess.run([f"./{file[:-2]}"], cwd=built.folder, capture_output=True)
         assert printed.returncode == 0 and not RAW.search(printed.stdout.decode())
     told: list[Any] = json.loads(done.stdout)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sysconfig
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
@@ -132,7 +133,16 @@ def test_no_function_or_macro_of_a_scene_is_one_of_the_library() -> None:
                 assert names.module_fault(macro[: -len(end)]), macro
 
 
-def compiled(folder: Path, name: str, *flags: str) -> None:
+def compiled(files: Mapping[str, str], folder: Path, name: str, *flags: str) -> None:
+    """Both forms of C, each as what Python includes too."""
+    for form, kit in (("plain", files), ("fast", {f[5:]: files[f] for f in files if "/" in f})):
+        (folder / form).mkdir(exist_ok=True)
+        for file in (f"{name}.h", f"{name}.c"):
+            (folder / form / file).write_text(kit[file], encoding="utf-8")
+        compiles(folder / form, name, *flags)
+
+
+def compiles(folder: Path, name: str, *flags: str) -> None:
     binding = f'#include <Python.h>\n#include "{name}.h"\n'
     (folder / "binding_.c").write_text(binding, encoding="utf-8")
     for mode, file in (("-std=gnu99", f"{name}.c"), ("-std=gnu99", "binding_.c"),
@@ -190,9 +200,8 @@ def test_names_of_our_own_do_not_collide(role: str, run: str, tmp_path: Path) ->
     assert len(every) > 100
     step = 6 if role in ("coordinates", "inputs") else 30
     for first in range(0, len(every), step):
-        for file, content in made(of_names(role, every[first : first + step], RUNS[run])).items():
-            (tmp_path / file).write_text(content, encoding="utf-8")
-        compiled(tmp_path, "scene", "-Werror=shadow")
+        files = made(of_names(role, every[first : first + step], RUNS[run]))
+        compiled(files, tmp_path, "scene", "-Werror=shadow")
 
 
 SOME = "NAN INFINITY HUGE_VAL EOF errno NULL M_PI FP_NAN CHAR_BIT LONG_MAX EIO stdin linux".split()
@@ -202,10 +211,8 @@ SOME = "NAN INFINITY HUGE_VAL EOF errno NULL M_PI FP_NAN CHAR_BIT LONG_MAX EIO s
 def test_macros_as_names_compile(role: str, tmp_path: Path) -> None:
     given = [n for n in SOME if not names.fault(n)]
     assert len(given) >= 11
-    for file, content in made(of_names(role, given[:4], RUNS["batch"])).items():
-        (tmp_path / file).write_text(content, encoding="utf-8")
-    for file, content in made(of_names(role, given[4:8], RUNS["implicit"])).items():
-        (tmp_path / file).write_text(content, encoding="utf-8")
-        if file == "scene.h" and role != "definitions":
-            assert f"{given[4]} is {given[4]}_" in content
-    compiled(tmp_path, "scene")
+    compiled(made(of_names(role, given[:4], RUNS["batch"])), tmp_path, "scene")
+    files = made(of_names(role, given[4:8], RUNS["implicit"]))
+    if role != "definitions":
+        assert f"{given[4]} is {given[4]}_" in files["scene.h"]
+    compiled(files, tmp_path, "scene")
