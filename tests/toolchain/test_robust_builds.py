@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_build import CHANGED, TEXT, gravity, leftovers, script
+from test_compiler import CHANGED, TEXT, gravity, leftovers, script
 
 import eomc
 from eomc.toolchain import compiler as compiler
