@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cases import cases, scene_text, variant
-from conftest import MODULES
+from conftest import MODULES, tiers
 
 import eomc
 from eomc.integrators import tableaux
@@ -127,7 +127,9 @@ REACHED = {
 }
 
 
-@pytest.mark.parametrize(("name", "h"), REACHED.items())
+@pytest.mark.parametrize(
+    ("name", "h"), tiers(REACHED.items(), "cartpole_torque_physicalP", "lagrange_top_nutation")
+)
 def test_it_reaches_what_doubles_allow(name: str, h: float) -> None:
     case = cases()[name]
     text = scene_text(name).replace("[run]", '[run]\nmethod = ["gauss16"]')

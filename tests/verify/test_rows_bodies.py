@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import sympy
 from cases import SCENES
+from conftest import tiers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -113,7 +114,9 @@ def single() -> str:
     return f"{head}[[body]]{body}[[spring]]{ends}"
 
 
-@pytest.mark.parametrize("kind, coordinates", [("spherical", "abc"), ("free", "abcdef")])
+@pytest.mark.parametrize(
+    "kind, coordinates", tiers((("spherical", "abc"), ("free", "abcdef")), "spherical")
+)
 def test_joints_of_three_angles_and_bodies_placed_by_formulas(kind: str, coordinates: str) -> None:
     off = compared(kinds(kind, coordinates), 3)
     assert max(off.values()) < rows_bodies.LIMIT, off
