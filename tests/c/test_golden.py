@@ -1,7 +1,7 @@
 """The files of three scenes and the plain C of two more, word for word, under two hash seeds.
 
-After a change that is meant: `python tests/test_golden.py --accept` writes tests/golden/ anew.
-Read the difference (`git diff tests/golden`) as a reviewer of C would before keeping it.
+After a change that is meant: `python tests/c/test_golden.py --accept` writes tests/c/golden/ anew.
+Read the difference (`git diff tests/c/golden`) as a reviewer of C would before keeping it.
 """
 
 from __future__ import annotations

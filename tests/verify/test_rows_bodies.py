@@ -140,7 +140,7 @@ def with_wrong(method: str, by: Callable[[Any], Any]) -> Callable[[pytest.Monkey
     return patch
 
 
-# what is wrong in bodies.py, and the energy that tells
+# what is wrong in multibody.py, and the energy that tells
 WRONG = {
     "the sign of gravity": (with_wrong("_weight", lambda P: -P), "potential_energy"),
     "a term of K": (with_wrong("_kinetic", lambda terms: terms[:-1]), "kinetic_energy"),
