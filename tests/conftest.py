@@ -5,10 +5,11 @@ from __future__ import annotations
 import shutil
 import signal
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from cases import SCENES
@@ -124,6 +125,12 @@ def no_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
+
+
+def tiers(values: Iterable[Any], *quick: Any) -> list[Any]:
+    """Parameters: those whose first value is one of `quick`, and the others for the slow tier."""
+    rows = [value if isinstance(value, tuple) else (value,) for value in values]
+    return [pytest.param(*row, marks=() if row[0] in quick else pytest.mark.slow) for row in rows]
 
 
 def needs(compiler: str) -> str:

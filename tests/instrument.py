@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 import cffi
+from cases import fast_kit
 
 import eomc
 from eomc.model.system import System
@@ -31,10 +32,10 @@ class Shipped:
         self.compiler = compiling.find_compiler().command
         made = eomc.sources(system, self.extension)
         folder.mkdir(parents=True, exist_ok=True)
-        for file, text in made.files.items():
-            if file.startswith("fast/") or file.endswith(".py"):
-                (folder / file.removeprefix("fast/")).write_text(text, encoding="utf-8")
-        self.source = made.files[f"fast/{self.name}.c"]
+        files = fast_kit(made)
+        for file, text in files.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        self.source = files[f"{self.name}.c"]
         ffi = cffi.FFI()
         ffi.cdef(made.cdef)
         ffi.set_source(self.extension, made.binding)

@@ -140,7 +140,7 @@ _SIGN = re.compile(r"(?<=[\w)]) ([+-]) (?=[\w(])")
 
 def _text(made: Sources, choice: random.Random) -> tuple[Sources, str]:
     """One `+` or `-` in the lines of rk4's step that add up states and accelerations."""
-    name = f"{made.name}.c"
+    name = f"fast/{made.name}.c"
     text = made.files[name]
     begin = re.search(rf"^[^\n;]*{made.name}_rk4\([^;]*?\)\n\{{", text, re.M)
     assert begin is not None

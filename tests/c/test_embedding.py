@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from cases import fast_kit, scene_system
 from compilers import STRICT, compiled, run
-from conftest import EVERYTHING, MODULES, ROOT, needs
+from conftest import EVERYTHING, MODULES, ROOT, needs, tiers
 
 import eomc
 from eomc.emit import c_names
@@ -51,7 +51,9 @@ def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path
 
 
-kits = pytest.mark.parametrize(("kit", "name"), [(n, n) for n in NAMES], indirect=["kit"])
+kits = pytest.mark.parametrize(
+    ("kit", "name"), tiers([(n, n) for n in NAMES], "cartpole", "everything"), indirect=["kit"]
+)
 driven = pytest.mark.parametrize("kit", ["cartpole_driven"], indirect=True)
 
 

@@ -1,7 +1,7 @@
 """Accelerations by link multipliers: the same as by D, at the promised cost, refused elsewhere.
 
 In 40 digits the route must be Lagrange's to the last bit of a double; in doubles it is held
-against jets.py, which shares nothing with it. Nothing is compiled but in the last tests.
+against verify/taylor.py, which shares nothing with it. Nothing is compiled but in the last tests.
 """
 
 from __future__ import annotations

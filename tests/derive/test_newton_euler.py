@@ -1,7 +1,7 @@
 """Trees of bodies by the recursive routes, against the energies differentiated as Taylor series.
 
-jets.py starts from the energies over world coordinates and shares nothing else with trees.py and
-articulated.py. Programs are evaluated in Python: nothing is compiled here.
+verify/taylor.py starts from the energies over world coordinates and shares nothing else with
+newton_euler.py and articulated_body.py. Programs are evaluated in Python: nothing is compiled here.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import mpmath
 import numpy as np
 import pytest
 from cases import fast_kit
-from conftest import Modules, needs
+from conftest import Modules, needs, tiers
 from sympy import S
 
 import eomc
@@ -195,7 +195,7 @@ def test_few_angles_and_light_configurations_stay_whole(modules: Modules) -> Non
     assert "} chain_two_points;" in source
 
 
-@pytest.mark.parametrize("h", [0.001, 0.02, 0.2, 0.45])
+@pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.2, 0.45), 0.02, 0.45))
 def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modules) -> None:
     """Turned by little, by nearly what is allowed, by more: then sines are computed anew."""
     module, trusted = modules.of_text(ODD), symbolic.derive(odd())
@@ -207,7 +207,7 @@ def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modu
         np.testing.assert_allclose(run.qd, qd, rtol=1e-11, atol=1e-12 * scale)
 
 
-@pytest.mark.parametrize("links", [5, 8])
+@pytest.mark.parametrize("links", tiers((5, 8), 5))
 def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
     module = modules.of_text(chain(links))
     made = system.from_scene(scene.parse(chain(links), "links.toml"))
@@ -259,7 +259,7 @@ def test_faults_are_told(modules: Modules) -> None:
         assert np.isfinite(run.q).all()
 
 
-@pytest.mark.parametrize("text", [ODD, chain(6)])
+@pytest.mark.parametrize("text", tiers((ODD, chain(6)), chain(6)), ids=["odd", "chain"])
 def test_all_that_shares_it_agrees(text: str, modules: Modules) -> None:
     """Batches and other steppers, over the same two parts."""
     module = modules.of_text(many(text))

@@ -1,7 +1,7 @@
 """Bodies, springs and forces of scenes against mechanics written out anew.
 
-test_trees.py holds the routes against the energies that bodies.py writes. Here these, and the
-forces, are held against what shares nothing with the generator: a body is a handful of point
+test_newton_euler.py compares the routes with the energies that multibody.py writes. Here these, and
+the forces, are compared with what shares nothing with the generator: a body is a handful of point
 masses, its place a product of SciPy's rotations, its velocity a difference in time.
 """
 

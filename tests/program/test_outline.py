@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cases import SCENES, fast_kit, scene_system
 from compilers import STRICT, compiled
-from conftest import EVERYTHING, needs
+from conftest import EVERYTHING, needs, tiers
 from sympy import S
 
 import eomc
@@ -356,7 +356,9 @@ def by_columns(made: Program) -> Program:
     return replace(made, functions=functions)
 
 
-@pytest.mark.parametrize("name", ["cartpole", "furuta_pendulum", "kapitza_pendulum"])
+@pytest.mark.parametrize(
+    "name", tiers(("cartpole", "furuta_pendulum", "kapitza_pendulum"), "furuta_pendulum")
+)
 @pytest.mark.parametrize("small", [False, True])
 def test_matrices_by_columns_are_the_matrices(
     name: str, small: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cases import fast_kit
-from conftest import needs
+from conftest import needs, tiers
 
 import eomc
 
@@ -48,7 +48,7 @@ def starts(m: ModuleType, count: int) -> tuple[Any, Any]:
 NAMES = ["cartpole", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum"]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", tiers(NAMES, "cartpole_driven", "kapitza_pendulum"))
 def test_each_instance_moves_as_it_would_alone(name: str) -> None:
     m = module(name)
     q0, qd0 = starts(m, 130)
@@ -76,7 +76,7 @@ def test_place_and_threads_change_no_bit() -> None:
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-@pytest.mark.parametrize("name", ["cartpole", "cartpole_driven", "tumbling_box"])
+@pytest.mark.parametrize("name", tiers(("cartpole", "cartpole_driven", "tumbling_box"), "cartpole"))
 def test_how_many_there_are_changes_no_bit(name: str, real: str) -> None:
     """Tiles that are not full are taken by blocks: any number of instances, each as among many."""
     m = module(name, real=f'"{real}"')
@@ -91,7 +91,9 @@ def test_how_many_there_are_changes_no_bit(name: str, real: str) -> None:
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-@pytest.mark.parametrize("name", ["cartpole", "cartpole_driven", "double_pendulum"])
+@pytest.mark.parametrize(
+    "name", tiers(("cartpole", "cartpole_driven", "double_pendulum"), "cartpole")
+)
 def test_a_fast_neighbour_changes_no_bit(name: str, real: str) -> None:
     """Sines are turned in slow instances and computed in fast ones, whatever is beside them."""
     m = module(name, real=f'"{real}"')
@@ -619,7 +621,7 @@ def test_no_loop_over_a_tile_has_a_rest(tmp_path: Path) -> None:
     assert sizes[0] < 0.9 * sizes[1]
 
 
-@pytest.mark.parametrize("name", ["cartpole", "kepler_orbit", "furuta_pendulum"])
+@pytest.mark.parametrize("name", tiers(("cartpole", "kepler_orbit", "furuta_pendulum"), "cartpole"))
 @pytest.mark.parametrize("real", ["double", "float"])
 def test_strict_compilers_have_no_complaint(name: str, real: str, tmp_path: Path) -> None:
     """With angles that are turned and without, steppers by stages and by rates."""

@@ -1,6 +1,6 @@
-"""Every mistake in tests/bad/*.toml gets the message beside it, word for word.
+"""Every mistake in tests/scene/bad/*.toml gets the message beside it, word for word.
 
-After a change that is meant: `python tests/test_bad_scenes.py` writes the messages anew. Read
+After a change that is meant: `python tests/scene/test_bad_scenes.py` writes the messages anew. Read
 each one as its user would before keeping it.
 """
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from cases import SCENES
-from conftest import needs
+from conftest import needs, tiers
 from instrument import missed
 
 QUICK = ("cartpole", "cartpole_driven")
@@ -65,7 +65,7 @@ def after_solve(name: str, source: str) -> set[int]:
     return found
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", tiers(QUICK, "cartpole_driven"))
 def test_every_line_is_executed(name: str, tmp_path: Path) -> None:
     assert unexplained(name, text_of(name), tmp_path) == []
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import scene_author
+from conftest import tiers
 from random_scenes import outcome
 from scene_author import scene_text
 
@@ -106,13 +107,7 @@ def checked(text: str, root: Path) -> Report:
     return check(made, eomc.load(made, root))
 
 
-@pytest.mark.parametrize(
-    "what",
-    [
-        pytest.param(what, marks=[pytest.mark.slow] * ("gauss" in text), id=what)
-        for what, text in REGRESSIONS.items()
-    ],
-)
+@pytest.mark.parametrize("what", tiers(REGRESSIONS, "friction of a body", "friction alone"))
 def test_right_modules_pass(tmp_path: Path, what: str) -> None:
     report = checked(REGRESSIONS[what], tmp_path)
     assert report.passed, report.table()
@@ -151,12 +146,12 @@ def test_scenes_are_the_same_for_the_same_number() -> None:
         assert any(word in text for text in texts), word
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", tiers(range(3), 1))
 def test_random_scenes_pass(tmp_path: Path, seed: int) -> None:
     assert_right(seed, tmp_path)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", tiers(range(2), 0))
 def test_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> None:
     assert_caught(seed, tmp_path)
 

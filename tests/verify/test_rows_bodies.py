@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import sympy
 from cases import SCENES
+from conftest import tiers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -114,7 +115,9 @@ def single() -> str:
     return f"{head}[[body]]{body}[[spring]]{ends}"
 
 
-@pytest.mark.parametrize("kind, coordinates", [("spherical", "abc"), ("free", "abcdef")])
+@pytest.mark.parametrize(
+    "kind, coordinates", tiers((("spherical", "abc"), ("free", "abcdef")), "spherical")
+)
 def test_joints_of_three_angles_and_bodies_placed_by_formulas(kind: str, coordinates: str) -> None:
     off = compared(kinds(kind, coordinates), 3)
     assert max(off.values()) < rows_bodies.LIMIT, off
@@ -138,7 +141,7 @@ def with_wrong(method: str, by: Callable[[Any], Any]) -> Callable[[pytest.Monkey
     return patch
 
 
-# what is wrong in bodies.py, and the energy that tells
+# what is wrong in multibody.py, and the energy that tells
 WRONG = {
     "the sign of gravity": (with_wrong("_weight", lambda P: -P), "potential_energy"),
     "a term of K": (with_wrong("_kinetic", lambda terms: terms[:-1]), "kinetic_energy"),

@@ -215,7 +215,7 @@ class Refusals:
                     at = replace(s, **{field: x})
                     found, clean = self.accelerate(at)
                     wrong += not clean
-                    wrong += not found and self.matters(s, field, i)
+                    wrong += not found and self.matters(s, field, i) and not self.bounded(at)
                     for method in self.check.methods:
                         run = drive(self.model, method, at, self.check.system.run.h, 3)
                         wrong += run.done != 0 or run.status not in (SINGULAR, NOT_FINITE,
@@ -229,6 +229,15 @@ class Refusals:
         x[i] += 0.1 * (1 + abs(x[i]))
         one, other = (self.check.ask("acceleration", at) for at in (s, replace(s, **{field: x})))
         return not np.array_equal(one, other)
+
+    def bounded(self, s: State) -> bool:
+        """Whether the reference is finite there, as tanh and atan are at infinity."""
+        with np.errstate(all="ignore"):
+            values = [
+                self.check.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
+                for name in ("D", "bias", "tau")
+            ]
+        return all(bool(np.all(np.isfinite(value))) for value in values)
 
     def linearized(self, s: State) -> bool:
         """Whether the derivatives are finite, or were not written."""
