@@ -226,6 +226,7 @@ def body(
     stored: Mapping[str, str] | None = None,
     pivots: int = 0,
     in_order: bool = False,
+    reserved: frozenset[str] = frozenset(),
 ) -> Body:
     """The statements of a function.
 
@@ -233,7 +234,7 @@ def body(
     keep: how the rest reads what parameters decide, where that lives in a struct; `parameters`
     are kept there too where the rest reads them. branchless: for a loop over many.
     stored: where values go that are no locals. pivots: how many the whole has, if this is a part.
-    in_order: terms of sums stay in their order.
+    in_order: terms of sums stay in their order. reserved: names that no value gets.
     """
     stored = stored or {}
     stages = {a.name: a.stage for a in (*function.early, *function.body)}
@@ -243,7 +244,7 @@ def body(
     early_names = [*parameters, *(a.name for a in function.early)]
     kept = [n for n in early_names if n in late_reads] if keep else []
     inline = _inlined(function, frozenset(kept))
-    new = _numbered(function, inline)
+    new = _numbered(function, inline, reserved)
     function, kept = rename(function, new), [new.get(n, n) for n in kept]
     inline = frozenset(new[n] for n in inline)
     # a value may bear the name of something outside that is not read here
@@ -369,11 +370,13 @@ def _inlined(function: Function, kept: frozenset[str]) -> frozenset[str]:
     return frozenset(inline)
 
 
-def _numbered(function: Function, inline: frozenset[str]) -> dict[str, str]:
+def _numbered(
+    function: Function, inline: frozenset[str], reserved: frozenset[str]
+) -> dict[str, str]:
     """w1, w2, ... counted anew over the values that keep a name."""
     everything = (*function.early, *function.body)
     plain = [a.name for a in everything if not a.named and a.name not in inline]
-    taken = function.uses | {a.name for a in everything if a.named}
+    taken = function.uses | reserved | {a.name for a in everything if a.named}
     fresh = (w for k in count(1) if (w := f"w{k}") not in taken)
     return dict(zip(plain, fresh, strict=False)) | {name: f"_{name}" for name in inline}
 

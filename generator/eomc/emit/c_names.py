@@ -174,8 +174,10 @@ class Target:
         self, function: Function, where: Mapping[str, str] | None = None, **options: Any
     ) -> Body:
         """The statements of a function; see c_expression.body for the options."""
+        known = self.where() | dict(where or {})
+        reserved = self.system.names
         return c_expression.body(
-            unclashed(function), self.prefix, self.where() | dict(where or {}), self.real, **options
+            unclashed(function), self.prefix, known, self.real, reserved=reserved, **options
         )
 
     def loads(self, function: Function, state: Access, inputs: Access) -> list[str]:

@@ -77,6 +77,12 @@ class System:
         return replace(self, parameters=changed)
 
     @property
+    def names(self) -> frozenset[str]:
+        """Those of coordinates, velocities, inputs and parameters, which no value may take."""
+        given = (*self.q, *self.qd, *self.u)
+        return frozenset([*(x.name for x in given), *(p.name for p in self.parameters)])
+
+    @property
     def u(self) -> tuple[Symbol, ...]:
         """The inputs' symbols, in scene order."""
         return tuple(i.symbol for i in self.inputs)

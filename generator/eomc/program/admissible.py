@@ -32,7 +32,10 @@ class Candidate:
 
 def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Function:
     """By the route with the fewest operations among those that lose no digits against another."""
-    made = {way: lower(name, r.tape, r.outputs, r.checks, r.labels) for way, r in routes.items()}
+    made = {
+        way: lower(name, r.tape, r.outputs, r.checks, r.labels, system.names)
+        for way, r in routes.items()
+    }
 
     def rank(route: str) -> tuple[float, int]:
         return _weight(made[route].cost) * ROUTES[route].penalty, len(made[route].early)

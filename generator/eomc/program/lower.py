@@ -20,10 +20,13 @@ def lower(
     outputs: Sequence[Expr],
     checks: Sequence[tuple[Expr, Expr]],
     labels: Sequence[str],
+    reserved: frozenset[str] = frozenset(),
 ) -> Function:
     """The function that computes `outputs`, and whose `checks` must be positive.
 
     labels: names for outputs, then for pivots and diagonal entries, where they have none.
+    reserved: names that no value gets, whether the function reads them or not: values of several
+    functions may lie in one struct with parameters.
     """
     ends = [*outputs, *(atom for pair in checks for atom in pair)]
     work = _Reader(tape)
@@ -48,7 +51,7 @@ def lower(
         "",
         (),
     )
-    return _renamed(function, work.hints)
+    return _renamed(function, work.hints, reserved)
 
 
 class _Reader(Draft):
@@ -151,10 +154,10 @@ def _cost(body: Sequence[Assignment], outputs: Sequence[Operand]) -> Cost:
 # --- names ----------------------------------------------------------------------------------------
 
 
-def _renamed(function: Function, hints: Mapping[str, str]) -> Function:
+def _renamed(function: Function, hints: Mapping[str, str], reserved: frozenset[str]) -> Function:
     """Names for people: those of the scene, sin_theta and the like, w1, w2, ... for the rest."""
     assigned: dict[str, str] = {}
-    taken = set(function.uses)
+    taken = {*function.uses, *reserved}
 
     def give(name: str, wish: str) -> None:
         used = wish

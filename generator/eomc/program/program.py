@@ -97,15 +97,15 @@ def _solving(solution: Solution, system: System) -> Candidate:
 
 def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
     """The derivatives of the accelerations that [run] or a method needs, by the route taken."""
-    run = system.run
+    run, names = system.run, system.names
     if run.linearize or any(METHODS[name].newton for name in run.methods):
         rows = linearization(system, taken.tape, taken.outputs)
         by_rows = len(rows) == len(system.q) and len(rows[0]) > len(rows)
         name = "linearization" if by_rows else "linearization_column"
-        yield lower(name, taken.tape, [x for row in rows for x in row], taken.checks, ())
+        yield lower(name, taken.tape, [x for row in rows for x in row], taken.checks, (), names)
     if run.linearize == "parameters" and system.parameters:
         rows = sensitivity(system, taken.tape, taken.outputs)
-        yield lower("sensitivity", taken.tape, [x for row in rows for x in row], (), ())
+        yield lower("sensitivity", taken.tape, [x for row in rows for x in row], (), (), names)
 
 
 def _unsuited(program: Program) -> list[Problem]:

@@ -79,7 +79,7 @@ def apart(target: Target, function: Function) -> Parts | None:
     )
     if 4 * outline.weight(configuration) < outline.weight(velocity):
         return None
-    new = _numbered(configuration, handed)
+    new = _numbered(configuration, handed, target.system.names)
     configuration, velocity = rename(configuration, new), rename(velocity, new)
     handed = tuple(new.get(name, name) for name in handed)
     named = frozenset(handed)
@@ -143,10 +143,12 @@ def _last_come_last(function: Function) -> Function:
     return replace(function, body=tuple(body))
 
 
-def _numbered(function: Function, handed: Sequence[str]) -> dict[str, str]:
+def _numbered(
+    function: Function, handed: Sequence[str], reserved: frozenset[str]
+) -> dict[str, str]:
     """k1, k2, ... for values that have no name of their own and are handed on."""
     own = {a.name for a in function.body if a.named}
-    taken = {*function.uses, *(a.name for a in function.body)}
+    taken = {*function.uses, *reserved, *(a.name for a in function.body)}
     fresh = (name for n in count(1) if (name := f"k{n}") not in taken)
     return dict(zip((name for name in handed if name not in own), fresh, strict=False))
 
