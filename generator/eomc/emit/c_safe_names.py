@@ -46,8 +46,8 @@ def may_be_macro(name: str) -> bool:
 
 
 def may_be_enumerator_of_others(name: str) -> bool:
-    """The same of a name with the scene's in front, in capitals."""
-    return bool(_FAMILY.fullmatch(name))
+    """The same of a name with the scene's in front, in capitals; no macro ends in a "_"."""
+    return not name.endswith("_") and bool(_FAMILY.fullmatch(name))
 
 
 def in_c(name: str, prefix: str) -> str:
