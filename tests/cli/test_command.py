@@ -162,6 +162,7 @@ inertia = [0.1, 0.2, 0.3]
 """
 
 
+@pytest.mark.slow  # SymPy simplifies for most of a minute
 def test_fractions_of_slanted_axes_are_shown_as_decimals(here: Path) -> None:
     """D = n.J n + m |n x c|^2 with n = (1, 2, 3)/sqrt(14), which has no short fraction."""
     (here / "slanted.toml").write_text(SLANTED, encoding="utf-8")

@@ -189,7 +189,7 @@ def test_pieces_are_clean_for_strict_compilers(
     paired = "float" not in run and run != 'method = "dp8"'
     parts = ("_configuration_2(", "_motion_2(") if paired else ("_solve_4(",)
     assert all(part in fast_kit(made)[source] for part in (*parts, "_C_4("))
-    assert ("_solve_lane_4(" in fast_kit(made)[source]) == ("batch" in run)
+    assert ("_solve_tile_4(" in fast_kit(made)[source]) == ("batch" in run)
     for command in ("gcc", "clang"):
         compiled(
             needs(command),
@@ -320,7 +320,7 @@ def test_signals_and_held_inputs_reach_a_batch_in_pieces(
     made = scene_system("cartpole_driven")
     m = module(derived(replace(made, run=replace(made.run, batch=True))), tmp_path)
     source = tmp_path / made.name / "fast" / f"{made.name}.c"
-    assert "_solve_lane_2(" in source.read_text(encoding="utf-8")
+    assert "_solve_tile_2(" in source.read_text(encoding="utf-8")
     q0, qd0 = (np.tile(x, (9, 1)) for x in m.start)
     q0[:, 1] += np.linspace(-1, 1, 9)
     for u in (None, [0.5]):

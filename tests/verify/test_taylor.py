@@ -253,10 +253,9 @@ def test_first_and_second_derivatives(name: str) -> None:
     """K = ydot^2/2 and P = y of y(x): D = y'^2, g = y', bias = y' y'' v^2 + y', C = y' y'' v."""
     formula, exact = FORMULAS[name]
     y, p = symbol("y"), symbol("p")
-    made = System.make(
-        "free", [x], dot(y) ** 2 / 2, y, definitions={y: formula}, parameters={p: 1.7}
-    )
-    found = Jets(made)
+    made = System.make("free", [x], dot(y) ** 2 / 2, y, definitions={y: x}, parameters={p: 1.7})
+    # as it stands: what jumps is refused in an energy, and its rules serve in forces
+    found = Jets(replace(made, definitions=tuple((name, formula) for name, _ in made.definitions)))
     for at in (0.3, 0.9):
         with mpmath.workdps(40):
             value, slope, bend = (float(mpmath.diff(exact, mpmath.mpf(at), n)) for n in range(3))
