@@ -187,7 +187,7 @@ def test_pieces_are_clean_for_strict_compilers(
     made = render(derived(everything(run)), "_everything")
     source = written(made, tmp_path)
     paired = "float" not in run and run != 'method = "dp8"'
-    parts = ("_configuration_2(", "_motion_2(") if paired else ("_solve_4(",)
+    parts = ("_configuration_2(", "_velocity_2(") if paired else ("_solve_4(",)
     assert all(part in fast_kit(made)[source] for part in (*parts, "_C_4("))
     assert ("_solve_tile_4(" in fast_kit(made)[source]) == ("batch" in run)
     for command in ("gcc", "clang"):
@@ -232,7 +232,7 @@ for name in sys.argv[1:]:
         ).stdout
         for s in ("0", seed)
     ]  # fmt: skip
-    assert "_motion_1(" in outcomes[0] and "_C_2(" in outcomes[0]
+    assert "_velocity_1(" in outcomes[0] and "_C_2(" in outcomes[0]
     assert outcomes[0] == outcomes[1]
 
 
