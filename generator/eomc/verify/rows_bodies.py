@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
 STATES = 8  # at most
+OWN = 10  # times the difference between lines: rounding of a derivative
 NODES = 16  # of the interpolating polynomials
 WIDTHS = (0.1, 0.01, 1e-3)  # of the line, in parts of the time in which things go far
 
@@ -66,8 +68,12 @@ class Bodies:
         return float(np.max([self.off(name, e) for e in self.check.few(STATES)]))
 
     def off(self, name: str, e: Expected) -> float:
-        """The difference at one state, in parts of its size; nan where nothing can be compared."""
-        s, found = e.state, []
+        """The difference at one state, in parts of its size; nan where nothing can be compared.
+
+        Beyond what the lines of different widths differ by themselves: far out, where positions
+        are large against what they change by, a derivative of them has fewer digits.
+        """
+        s, found, lines = e.state, [], []
         rate = float(np.max(np.abs(s.qd) / self.check.sampler.spread)) or 1.0
         if name == "power":  # that of forces alone
             value = float(self.check.ask("tau", s) @ s.qd)
@@ -80,10 +86,14 @@ class Bodies:
                 line = self.lines.get(key) or Line(self.scene, s, width / rate)
                 ours = self.lines.setdefault(key, line).value(name)
             if not math.isnan(ours):
+                lines.append(ours)
                 found.append(abs(value - ours) / (size or 1.0))
             if found and found[-1] < LIMIT / 10:
                 break
-        return min(found, default=math.nan)
+        if len(lines) < 2:
+            return min(found, default=math.nan)
+        own = min(abs(a - b) for a, b in pairwise(lines)) / (size or 1.0)
+        return max(0.0, min(found) - OWN * float(own))
 
 
 @dataclass(frozen=True)

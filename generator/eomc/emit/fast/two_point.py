@@ -190,7 +190,7 @@ def context(
             Argument(f"{real} *{target.PREFIX}_ALONE failures", "failures", frozenset({FAILED})),
         ],
         [f"k->{name}[i]" for name in parts.handed],
-        Argument(f"{P}_configuration_values *{target.PREFIX}_ALONE k", "k", frozenset()),
+        Argument(f"{P}_configuration_results *{target.PREFIX}_ALONE k", "k", frozenset()),
         lambda f: target.loads(f, state("i"), target.element),
         where | sines("i"),
         pair=True,
@@ -203,7 +203,7 @@ def context(
         "velocity",
         [
             Argument("int point", "point", place | set(parts.handed)),
-            Argument(f"const {P}_configuration_values *k", "k", frozenset(parts.handed)),
+            Argument(f"const {P}_configuration_results *k", "k", frozenset(parts.handed)),
             Argument(f"const {P}_two_points *at", "at", place),
             Argument(f"const {P}_vector *qd", "qd", groups["qd"]),
             Argument(f"{real} t", "t", groups["t"]),
@@ -221,7 +221,7 @@ def context(
     t, driven = "t" if timed else "", "t" if target.driven else ""
     u, c, p = "u" if groups["u"] else "", "c" if kept else "", "p" if takes_p else ""
     t_arg, c_arg = f"{real} t", f"const {P}_constants *c" if c else ""
-    whole = f"{P}_vector *a, int point, const {P}_configuration_values *k, "
+    whole = f"{P}_vector *a, int point, const {P}_configuration_results *k, "
     whole += f"const {P}_two_points *at, const {P}_vector *qd"
     configuration_lines = [
         *([f"{real} failures[2] = {{ 0, 0 }};"] if configuration["fails"] else []),
@@ -268,7 +268,7 @@ def context(
             }.items()
         },
         "configuration_arguments": arguments(
-            f"{P}_configuration_values *k, const {P}_two_points *at", c_arg
+            f"{P}_configuration_results *k, const {P}_two_points *at", c_arg
         ),
         "configuration_call": arguments("&k, &now", c),
         "configuration_lines": configuration_lines,
@@ -291,7 +291,7 @@ def context(
         "moved_now": call_with("now", t),
         "moved_given": call_with("u", t),
         "stage": stage,
-        "solve_locals": [f"{P}_two_points at;", f"{P}_configuration_values k;", "int good;"],
+        "solve_locals": [f"{P}_two_points at;", f"{P}_configuration_results k;", "int good;"],
         "solve_lines": [
             f"{P}_two_point_angles(&at, q, q);",
             *([f"{P}_two_point_coordinates(&at, q, q);"] if places else []),
