@@ -113,7 +113,7 @@ def test_ctrl_c_in_an_implicit_method_and_in_its_estimate() -> None:
     )  # fmt: skip
     assert stop.run.steps > 0
     run = m.simulate(h=0.005, steps=800, params={"b": 5.0})
-    soon(lambda: run.estimate())
+    soon(lambda: run.estimate(), before=0.05)
 
 
 # --- slices change nothing ------------------------------------------------------------------------

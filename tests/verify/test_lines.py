@@ -78,8 +78,15 @@ def test_every_line_of_every_scene_is_executed(name: str, tmp_path: Path) -> Non
     assert unexplained(name, text_of(name), tmp_path) == []
 
 
+UNSEEN = pytest.mark.xfail(
+    strict=True, reason="no row of check leads a run of gauss16 gently into a singular D"
+)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("what", VARIANTS)
+@pytest.mark.parametrize(
+    "what", [pytest.param(what, marks=[UNSEEN] * (what == "gauss16")) for what in VARIANTS]
+)
 def test_every_line_of_other_steppers_is_executed(what: str, tmp_path: Path) -> None:
     name, more = VARIANTS[what]
     assert unexplained(name, text_of(name, more), tmp_path) == []

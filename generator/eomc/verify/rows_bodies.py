@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,8 +28,8 @@ if TYPE_CHECKING:
     from eomc.verify.sampling import Expected, State
 
 LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
+UNITS = 1e3  # of rounding, which are more in single precision
 STATES = 8  # at most
-OWN = 10  # times the difference between lines: rounding of a derivative
 NODES = 16  # of the interpolating polynomials
 WIDTHS = (0.1, 0.01, 1e-3)  # of the line, in parts of the time in which things go far
 
@@ -58,9 +57,10 @@ class Bodies:
 
     def report(self) -> None:
         """Add them."""
+        limit = max(LIMIT, UNITS * self.check.eps)
         for name in ("kinetic_energy", "potential_energy", "power"):
             label = "power of forces" if name == "power" else name
-            self.check.row(f"{label} of bodies", LIMIT, "of its size, from point masses",
+            self.check.row(f"{label} of bodies", limit, "of its size, from point masses",
                            partial(self.compare, name))  # fmt: skip
 
     def compare(self, name: str) -> float:
@@ -68,12 +68,8 @@ class Bodies:
         return float(np.max([self.off(name, e) for e in self.check.few(STATES)]))
 
     def off(self, name: str, e: Expected) -> float:
-        """The difference at one state, in parts of its size; nan where nothing can be compared.
-
-        Beyond what the lines of different widths differ by themselves: far out, where positions
-        are large against what they change by, a derivative of them has fewer digits.
-        """
-        s, found, lines = e.state, [], []
+        """The difference at one state, in parts of its size; nan where nothing can be compared."""
+        s, found = e.state, []
         rate = float(np.max(np.abs(s.qd) / self.check.sampler.spread)) or 1.0
         if name == "power":  # that of forces alone
             value = float(self.check.ask("tau", s) @ s.qd)
@@ -86,14 +82,10 @@ class Bodies:
                 line = self.lines.get(key) or Line(self.scene, s, width / rate)
                 ours = self.lines.setdefault(key, line).value(name)
             if not math.isnan(ours):
-                lines.append(ours)
                 found.append(abs(value - ours) / (size or 1.0))
             if found and found[-1] < LIMIT / 10:
                 break
-        if len(lines) < 2:
-            return min(found, default=math.nan)
-        own = min(abs(a - b) for a, b in pairwise(lines)) / (size or 1.0)
-        return max(0.0, min(found) - OWN * float(own))
+        return min(found, default=math.nan)
 
 
 @dataclass(frozen=True)
