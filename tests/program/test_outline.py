@@ -425,3 +425,12 @@ def test_parameters_may_be_called_like_values(tmp_path: Path) -> None:
     state = ([0.1, 0.4], [0.2, -0.3])
     assert np.array_equal(found.acceleration(*state), plain.acceleration(*state))
     assert np.array_equal(found.C(*state), plain.C(*state))
+
+
+@pytest.mark.parametrize("name", ["chain", "cartpole_driven"])
+def test_no_type_is_defined_twice(in_small_pieces: None, name: str) -> None:
+    """What the configuration hands on, and what its outlined functions do, are two structs."""
+    made = scene_system(name)
+    files = fast_kit(render(derived(made), "_twice"))
+    types = re.findall(r"^\} (\w+);", files[f"{name}.h"] + files[f"{name}.c"], re.M)
+    assert len(types) == len(set(types)) > 3
