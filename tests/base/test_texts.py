@@ -14,7 +14,7 @@ import sys
 import tomllib
 import unicodedata
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -41,10 +41,11 @@ from payloads import (
 import eomc
 from eomc.base import texts
 from eomc.base.errors import EomcError, SceneError
-from eomc.emit import render
+from eomc.emit import package, render, selftest
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
 from eomc.emit.fast import context
+from eomc.emit.plain import steppers
 from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.report import equations_text
@@ -178,13 +179,26 @@ def strings(value: Any) -> Iterator[str]:
     elif isinstance(value, (list, tuple, set)):
         for each in value:
             yield from strings(each)
+    elif is_dataclass(value) and not isinstance(value, texts.FreeText):
+        for each in vars(value).values():
+            yield from strings(each)
 
 
 def test_templates_are_given_free_text_only_as_free_text() -> None:
     whole = derived()
     marked = replace(whole, system=with_texts(whole.system, "MARKED"))
-    given = context.values(Target(marked, DOUBLE))
-    assert not [s for s in strings(given) if "MARKED" in s]
+    target = Target(marked, DOUBLE)
+    given = [context.values(target), package.main(target), package.face(target, "_x")]
+    given += [package.binding(target), selftest.view(target)]
+
+    def show(view: Any) -> str:
+        given.append(view)
+        return ""
+
+    steppers.files(marked, show)
+    assert len(given) > 7
+    for view in given:
+        assert not [s for s in strings(view) if "MARKED" in s], type(view)
 
 
 def test_free_text_is_not_printed_by_mistake() -> None:
