@@ -1,7 +1,7 @@
 """C functions as values, and the few kinds of statement that a program becomes.
 
 A function prints its prototype, its definition and a call; which of its arguments it does not read
-it knows by itself. With ccode.py the only Python that holds C syntax.
+it knows by itself. With c_expression.py the only Python that holds C syntax.
 """
 
 from __future__ import annotations

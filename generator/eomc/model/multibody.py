@@ -2,7 +2,7 @@
 
 Energies are written as a textbook does, over the world coordinates of centres of mass and the
 entries of rotation matrices: that is what the reference and the Lagrangian route start from. The
-tree says the same body by body, for the recursive routes (trees.py).
+tree says the same body by body, for the recursive routes (derive/newton_euler.py).
 """
 
 from __future__ import annotations

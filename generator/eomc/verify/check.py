@@ -34,7 +34,7 @@ def check(
     plain: the same compiled from plain C, which is compared with the reference and with `module`.
     states: how many, by default as many as take seconds. Always the same states for the same
     seed. A module that raises fails the row, which shows its words. Raises EomcError where
-    `reference.of` does.
+    `symbolic.of` does.
     """
     made = Comparison(system, module, np.random.default_rng(seed), states)
     made.row("names, defaults, start", 0, "that differ", made.faces)
