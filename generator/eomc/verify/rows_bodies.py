@@ -1,9 +1,10 @@
 """Rows of `check` about bodies: their energies and forces once more, from the scene's own tables.
 
-The reference starts from K and P, which multibody.py makes of a scene. Here every body becomes point
-masses that have its mass, its centre and its inertia, frames are composed joint by joint with
+The reference starts from K and P, which multibody.py makes of a scene. Here every body becomes
+point masses that have its mass, its centre and its inertia, frames are composed joint by joint with
 quaternions, and numbers are taken along a straight line through the state, q + s qd at the time
-t + s, so that rates are derivatives of interpolating polynomials. No SymPy, nothing of multibody.py.
+t + s, so that rates are derivatives of interpolating polynomials. No SymPy, nothing of
+multibody.py.
 """
 
 from __future__ import annotations
