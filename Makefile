@@ -8,6 +8,8 @@ BIN := .venv/bin
 DEMO := scenes/cartpole.toml scenes/cartpole_driven.toml scenes/cartpole_tutorial.toml
 # what a test run writes, it writes under build/
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
+# some shells forbid bytecode: every command then takes four seconds to start, instead of 0.7
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-all test-slow lint golden bench clean
 
