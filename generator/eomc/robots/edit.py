@@ -38,11 +38,8 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
         if body.motions and body.motions[0].name in values:
             motion = body.motions[0]
             value = values[motion.name]
-            offset, rotation = moved(body, (value,))
-            body = replace(
-                body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation,
-                note=joined(body.note, f"joint {motion.name} locked at {value!r} {motion.unit}"),
-            )  # fmt: skip
+            note = joined(body.note, f"joint {motion.name} locked at {value!r} {motion.unit}")
+            body = replace(_fixed(body, *moved(body, (value,))), note=note)
         bodies.append(body)
     return _without_loose_drives(replace(robot, bodies=tuple(bodies)))
 
@@ -78,37 +75,29 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
         for body in robot.bodies:
             if body.joint == "fixed" and body.parent in kept and body.parent != tip:
                 kept.add(body.name)
-    bodies = []
-    for body in robot.bodies:
+    bodies = [body for body in robot.bodies if body.name in kept]
+    for k, body in enumerate(bodies):
         if body.name == root and body.parent != WORLD:
-            offset, rotation = _stands(by_name, body)
-            body = replace(
-                body, parent=WORLD, joint="fixed", motions=(), axes=(),
-                offset=offset, rotation=rotation,
-            )  # fmt: skip
-        if body.name in kept:
-            bodies.append(body)
+            bodies[k] = replace(_fixed(body, *_stands(by_name, body)), parent=WORLD)
     gone = tuple(name for name in by_name if name not in kept)
-    left_out = robot.left_out
-    if gone:
-        left_out = (f"cut off: {listed(gone)}", *left_out)
+    left_out = ((f"cut off: {listed(gone)}",) if gone else ()) + robot.left_out
     return _without_loose_drives(replace(robot, bodies=tuple(bodies), left_out=left_out))
 
 
 def mended(robot: Robot) -> Robot:
-    """The robot with the nearest tensor in place of each that no body can have; they are told."""
-    bodies, told = [], []
+    """The robot with the nearest tensor in place of each that no body can have, noted."""
+    bodies, words = [], []
     for body in robot.bodies:
         inertia = without_dust(body)
         if indefinite(inertia) or unbalanced(inertia):
             (low, _, high), new = principal(inertia)[0], nearest(inertia)
-            told.append(
+            words.append(
                 f"body {body.name}: its inertia {shown(inertia)} is that of no body (principal "
                 f"moments {low:.4g} to {high:.4g} kg m^2): {shown(new)} is in its place"
             )
             body = replace(body, inertia=new)
         bodies.append(body)
-    return replace(robot, bodies=tuple(bodies), left_out=(*robot.left_out, *told))
+    return replace(robot, bodies=tuple(bodies), left_out=(*robot.left_out, *words))
 
 
 def based(robot: Robot, free: bool) -> Robot:
@@ -121,6 +110,7 @@ def based(robot: Robot, free: bool) -> Robot:
         those = listed(tuple(body.name for body in roots))
         raise EomcError(f"--base: {len(roots)} bodies stand on the world ({those}), not one")
     root = roots[0]
+    new = root
     if free and root.joint == "fixed":
         taken = {m.name for m in robot.motions}
         motions = free_motions()
@@ -128,16 +118,9 @@ def based(robot: Robot, free: bool) -> Robot:
             motions = free_motions("base")
         at = (*root.offset, *yaw_pitch_roll(root.rotation))
         motions = tuple(replace(m, start=s) for m, s in zip(motions, at, strict=True))
-        new = replace(
-            root, joint="free", motions=motions, axes=(), offset=ORIGIN, rotation=IDENTITY
-        )  # fmt: skip
+        new = replace(_fixed(root, ORIGIN, IDENTITY), joint="free", motions=motions)
     elif not free and root.motions:
-        offset, rotation = moved(root, [m.start for m in root.motions])
-        new = replace(
-            root, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation
-        )  # fmt: skip
-    else:
-        new = root
+        new = _fixed(root, *_at_start(root))
     if free and new.joint != "free":
         raise EomcError(
             f"--base free: '{root.name}' stands on the world by a {root.joint} joint, "
@@ -147,12 +130,20 @@ def based(robot: Robot, free: bool) -> Robot:
     return _without_loose_drives(replace(robot, bodies=bodies))
 
 
+def _fixed(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
+    return replace(body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation)
+
+
+def _at_start(body: RobotBody) -> tuple[Vector, Matrix]:
+    return moved(body, [m.start for m in body.motions])
+
+
 def _stands(by_name: Mapping[str, RobotBody], body: RobotBody) -> tuple[Vector, Matrix]:
     """Where the body's frame stands in the world at the start."""
-    offset, rotation = moved(body, [m.start for m in body.motions])
+    offset, rotation = _at_start(body)
     while body.parent != WORLD:
         body = by_name[body.parent]
-        o, r = moved(body, [m.start for m in body.motions])
+        o, r = _at_start(body)
         offset, rotation = plus(o, apply(r, offset)), times(r, rotation)
     return offset, rotation
 

@@ -48,17 +48,9 @@ def from_axis_angle(axis: Vector, angle: float) -> Matrix:
     return cleaned(about(unit(axis), math.cos(angle), math.sin(angle)))
 
 
-def from_turns(turns: Sequence[tuple[str, float]]) -> Matrix:
-    """The rotation of turns (axis, rad), one after the other about the axes turned so far."""
-    out = IDENTITY
-    for axis, angle in turns:
-        out = times(out, from_axis_angle(IDENTITY["xyz".index(axis)], angle))
-    return out
-
-
 def from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
     """Rz(yaw) Ry(pitch) Rx(roll), as URDF writes it."""
-    return from_turns((("z", yaw), ("y", pitch), ("x", roll)))
+    return from_euler("zyx", (yaw, pitch, roll))
 
 
 def from_quaternion(w: float, x: float, y: float, z: float) -> Matrix:
@@ -83,6 +75,13 @@ def from_euler(sequence: str, angles: Sequence[float]) -> Matrix:
         turn = from_axis_angle(IDENTITY["xyz".index(axis.lower())], angle)
         out = times(out, turn) if axis.islower() else times(turn, out)
     return out
+
+
+def toward(z: Vector) -> Matrix:
+    """The smallest rotation that takes the z axis to the unit vector `z`; half a turn about x."""
+    sine = math.hypot(z[0], z[1])
+    axis = (-z[1], z[0], 0.0) if sine > 1e-10 else (1.0, 0.0, 0.0)
+    return from_axis_angle(axis, math.atan2(sine, z[2]))
 
 
 def turns_of(a: Matrix) -> tuple[tuple[str, float], ...]:

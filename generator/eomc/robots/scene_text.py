@@ -23,7 +23,7 @@ def finished(robot: Robot) -> Robot:
     """The robot fit for a scene: its names such as C can bear, bare frames left out and listed.
 
     Raises EomcError where nothing moves, where a joint moves nothing that has mass, and for a
-    tensor that is not positive semi-definite. One that only breaks the triangle inequality is told.
+    tensor that is not positive semi-definite; one that breaks the triangle inequality is noted.
     """
     bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
     robot = _without_frames(replace(robot, bodies=bodies))
@@ -162,29 +162,23 @@ def scene_text(robot: Robot) -> str:
     if robot.left_out:
         head += ["#", "# Not modelled, or to be looked at:"]
         head += [each for words in robot.left_out for each in _bullet(words)]
-    gravity = ", ".join(map(number, robot.gravity))
+    about = {"eomc": "1", "name": toml(robot.name), "title": toml(robot.title),
+             "gravity": vector(robot.gravity)}  # fmt: skip
+    units = {m.name: m.unit for m in robot.motions}
     parts = [
         "\n".join(head),
-        "\n".join(
-            _aligned(
-                {"eomc": "1", "name": toml(robot.name), "title": toml(robot.title),
-                 "gravity": f"[{gravity}]"}
-            )
-        ),
-        "\n".join(["[coordinates]", *_aligned({m.name: _coordinate(m) for m in robot.motions})]),
-    ]  # fmt: skip
+        _table("", about),
+        _table("[coordinates]", {m.name: _coordinate(m) for m in robot.motions}),
+    ]
     if robot.drives:
-        units = {m.name: m.unit for m in robot.motions}
-        parts.append(
-            "\n".join(["[inputs]", *_aligned({d.name: _input(d, units) for d in robot.drives})])
-        )
-    parts += ["\n".join(["[[body]]", *_aligned(_entry(body, robot))]) for body in robot.bodies]
+        parts.append(_table("[inputs]", {d.name: _input(d, units) for d in robot.drives}))
+    parts += [_table("[[body]]", _entry(body, robot)) for body in robot.bodies]
     for motion in robot.motions:
         if motion.stiffness:
             spring = {"coordinate": toml(motion.name), "stiffness": number(motion.stiffness)}
             if motion.rest:
                 spring["length"] = _length(motion.rest, motion.unit)
-            parts.append("\n".join(["[[spring]]", *_aligned(spring)]))
+            parts.append(_table("[[spring]]", spring))
     return "\n\n".join(parts) + "\n"
 
 
@@ -283,9 +277,9 @@ def _each(those: Sequence[str]) -> str:
     return those[0] if len(those) == 1 else f"[{', '.join(those)}]"
 
 
-def _aligned(entries: Mapping[str, str]) -> list[str]:
+def _table(head: str, entries: Mapping[str, str]) -> str:
     wide = max(map(len, entries))
-    return [f"{key:{wide}} = {value}" for key, value in entries.items()]
+    return "\n".join([head] * bool(head) + [f"{k:{wide}} = {v}" for k, v in entries.items()])
 
 
 def _bullet(words: str) -> list[str]:

@@ -6,7 +6,6 @@ frame; axes stand in it; ixy and its like are entries of the tensor.
 
 from __future__ import annotations
 
-import math
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -20,16 +19,7 @@ from eomc.base.spatial import transposed
 from eomc.robots import xml
 from eomc.robots.inertias import NO_INERTIA, rotated_inertia
 from eomc.robots.robot import Drive, Motion, Robot, RobotBody, free_motions
-from eomc.robots.rotations import (
-    IDENTITY,
-    ORIGIN,
-    Matrix,
-    Vector,
-    from_axis_angle,
-    from_rpy,
-    times,
-    unit,
-)
+from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, times, toward, unit
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
 
@@ -125,7 +115,7 @@ class _Reader:
         self.faults.append(Problem(message, key, self.shown))
 
     def _parts(self, element: Element, tags: Sequence[str], key: str) -> None:
-        """Tell parts that are there twice; attributes that they should not have are for later."""
+        """Report parts that are there twice; attributes that do not belong there are for later."""
         for tag in tags:
             parts = element.findall(tag)
             if len(parts) > 1:
@@ -311,7 +301,7 @@ class _Reader:
         )
         if joint.kind != "planar" or joint.axis == (0.0, 0.0, 1.0):
             return [held]
-        turn = _to_axis(joint.axis)
+        turn = toward(joint.axis)
         frame = f"{joint.name}_frame"
         rotation = times(joint.rotation, turn)
         note = "the joint's plane is its x and y"
@@ -393,18 +383,10 @@ class _Reader:
     def _value(self, word: str, what: str, key: str) -> float:
         """The number; 0 where it is none, so that the rest is read too."""
         try:
-            value = xml.number(word)
-        except ValueError:
-            self.say(key, f"{what}: '{word}' is not a number{_macro(word)}")
+            return xml.number(word)
+        except ValueError as why:
+            self.say(key, f"{what}: {why}{_macro(word)}")
             return 0.0
-        if not math.isfinite(value):
-            self.say(key, f"{what}: '{word}' is not a finite number")
-            return 0.0
-        large = xml.LARGE
-        if abs(value) > large:
-            self.say(key, f"{what}: '{word}' is more than {large:g}, which can't be meant")
-            return 0.0
-        return value if abs(value) > 1 / large else 0.0
 
 
 def _macro(written: str) -> str:
@@ -414,15 +396,6 @@ def _macro(written: str) -> str:
 
 def _shapes(link: Element) -> list[str]:
     return [str(shape.tag) for shape in link.iter() if shape.tag in _SHAPES]
-
-
-def _to_axis(axis: Vector) -> Matrix:
-    """The smallest rotation that takes z to `axis`."""
-    x, y, z = axis
-    across = math.hypot(x, y)
-    if not across:
-        return from_axis_angle((1.0, 0.0, 0.0), math.acos(z))
-    return from_axis_angle((-y / across, x / across, 0.0), math.atan2(across, z))
 
 
 def _plural(word: str, n: int) -> str:

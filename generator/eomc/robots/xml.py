@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import stat
@@ -48,10 +49,16 @@ def root(file: str | os.PathLike[str]) -> Element:
 
 
 def number(word: str) -> float:
-    """The number that a word is; ValueError for what only Python takes for one, as 1_0."""
-    if "_" in word or not word.isascii():
-        raise ValueError(word)
-    return float(word)
+    """The number that a word is; ValueError, in words, for what only Python takes for one: 1_0."""
+    try:
+        value = float("x" if "_" in word or not word.isascii() else word)
+    except ValueError:
+        raise ValueError(f"'{word}' is not a number") from None
+    if not math.isfinite(value):
+        raise ValueError(f"'{word}' is not a finite number")
+    if abs(value) > LARGE:
+        raise ValueError(f"'{word}' is more than {LARGE:g}, which can't be meant")
+    return value if abs(value) > 1 / LARGE else 0.0
 
 
 RUN_XACRO = "it holds xacro macros: run xacro first (xacro robot.urdf.xacro > robot.urdf)"

@@ -6,9 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from eomc.robots.mjcf import file as text
-from eomc.robots.mjcf import masses
-from eomc.robots.mjcf.file import ACTUATORS, Attributes, Tag, Told
+from eomc.robots.mjcf.file import ACTUATORS, Given, Report, Tag
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
 from eomc.robots.robot import Drive, joined
@@ -21,78 +19,78 @@ def actuated(
     """The joints with their actuators' armature and damping, and the drives of hinges and slides.
 
     Of an actuator whose force is gain times its control the input is the control; of any other
-    (servos, muscles, ...) it is the force, before the gear, which is told.
+    (servos, muscles, ...) it is the force, before the gear, which is reported.
     """
-    told = reader.told
+    report = reader.report
     found = {joint.name: joint for joint in joints}
     drives: list[Drive] = []
     tags = [tag for section in root.each("actuator") for tag in section.children]
     named = {tag.attributes["name"] for tag in tags if "name" in tag.attributes}
     for tag in tags:
         if tag.kind not in ACTUATORS:
-            told.leave("elements that MJCF does not have", f"{tag.kind} in actuator")
+            report.leave("elements that MJCF does not have", f"{tag.kind} in actuator")
             continue
-        a = masses.attributes_of(Placed(tag, "", STILL, ""), "actuator", reader)
+        a = reader.given(Placed(tag, "", STILL, ""), "actuator")
         on = a.get("joint", a.get("jointinparent", ""))
         name = a.get("name") or fresh(f"{on or 'no'}_{tag.kind}", named)
         named.add(name)
         if not on:
-            told.leave("actuators on tendons, sites, bodies and slider-cranks", name)
+            report.leave("actuators on tendons, sites, bodies and slider-cranks", name)
             continue
         if on not in found:
-            told.fault(tag, f'there is no joint "{on}"')
+            a.fault(f'there is no joint "{on}"')
             continue
         joint = found[on]
         if joint.type in {"free", "ball"}:
-            told.leave("actuators on free and ball joints", name)
+            report.leave("actuators on free and ball joints", name)
             continue
-        gear = (text.numbers(a, "gear", tag, told, 6, 1) or (1.0,))[0]
-        damping = text.numbers(a, "damping", tag, told, 3, 1) or (0.0,)
+        gear = (a.numbers("gear", 6, 1) or (1.0,))[0]
+        damping = a.numbers("damping", 3, 1) or (0.0,)
         if any(damping[1:]):
-            told.leave("damping in the square and cube of actuators", name)
+            report.leave("damping in the square and cube of actuators", name)
         (motion,) = joint.motions
         motion = replace(
             motion,
-            armature=motion.armature + gear**2 * text.number(a, "armature", tag, told),
+            armature=motion.armature + gear**2 * a.number("armature"),
             damping=motion.damping + gear**2 * damping[0],
         )
         found[on] = joint._replace(motions=(motion,))
         law = a.get(" law", "general")
         laws = [a.get(key, "none") for key in ("dyntype", "biastype")]
         if law in {"motor", "general"} and {*laws, a.get("gaintype", "fixed")} == {"none", "fixed"}:
-            gear *= (text.numbers(a, "gainprm", tag, told, 100, 1) or (1.0,))[0]
+            gear *= (a.numbers("gainprm", 100, 1) or (1.0,))[0]
         else:
-            told.leave("laws of actuators, whose input here is their force", f"{name} ({law})")
-        if text.number(a, "delay", tag, told):
-            told.leave("delays of actuators", name)
-        note = joined(*(_within(a, key, name, tag, reader) for key in ("ctrl", "force")))
+            report.leave("laws of actuators, whose input here is their force", f"{name} ({law})")
+        if a.number("delay"):
+            report.leave("delays of actuators", name)
+        note = joined(*(_within(a, key, name, reader) for key in ("ctrl", "force")))
         drives.append(Drive(name, on, gear, note))
     return list(found.values()), tuple(drives)
 
 
-def _within(a: Attributes, key: str, name: str, tag: Tag, reader: Reader) -> str:
-    """A range of an actuator in words, for its note; told as left out."""
-    values = text.numbers(a, f"{key}range", tag, reader.told, 2)
+def _within(a: Given, key: str, name: str, reader: Reader) -> str:
+    """A range of an actuator in words, for its note; reported as left out."""
+    values = a.numbers(f"{key}range", 2)
     if not values or not limited(a, f"{key}limited", reader.settings):
         return ""
-    reader.told.leave("limits of actuators, kept as notes", name)
+    a.report.leave("limits of actuators, kept as notes", name)
     what = {"ctrl": "input", "force": "force"}[key]
     return f"{what} from {values[0]:.6g} to {values[1]:.6g}"
 
 
-def started(root: Tag, joints: Sequence[Found], told: Told) -> list[Found]:
-    """The joints with the start of the key frame "home", where there is one; singular ones told."""
+def started(root: Tag, joints: Sequence[Found], report: Report) -> list[Found]:
+    """The joints with the start of the key frame "home"; singular starts are reported."""
     sizes = {"hinge": 1, "slide": 1, "ball": 4, "free": 7}
     size = sum(sizes[joint.type] for joint in joints)
     out = list(joints)
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):
-        name = tag.attributes.get("name", "")
-        if name != "home" or "qpos" not in tag.attributes:
-            told.leave("key frames", name)
+        a = Given(tag.attributes, tag, report)
+        if a.get("name") != "home" or "qpos" not in a:
+            report.leave("key frames", a.get("name"))
             continue
-        values = text.numbers(tag.attributes, "qpos", tag, told, 1_000_000, 0) or ()
+        values = a.numbers("qpos", 1_000_000, 0) or ()
         if len(values) != size:
-            told.leave(f"the start of the key frame home: it has not the {size} numbers of qpos")
+            report.leave(f"the start of the key frame home: it has not the {size} numbers of qpos")
             continue
         out, at = [], 0
         for joint in joints:
@@ -100,7 +98,7 @@ def started(root: Tag, joints: Sequence[Found], told: Told) -> list[Found]:
             at += len(mine)
             if joint.type in {"ball", "free"}:
                 if not any(mine[-4:]):
-                    told.fault(tag, f"the quaternion of joint {joint.name} has the length zero")
+                    a.fault(f"the quaternion of joint {joint.name} has the length zero")
                     continue
                 w, x, y, z = mine[-4:]
                 mine = (*mine[:-4], *yaw_pitch_roll(from_quaternion(w, x, y, z)))
@@ -108,7 +106,7 @@ def started(root: Tag, joints: Sequence[Found], told: Told) -> list[Found]:
             out.append(joint._replace(motions=tuple(motions)))
     for joint in out:
         if joint.type in {"ball", "free"} and abs(math.cos(joint.motions[-2].start)) < 1e-6:
-            told.leave(
+            report.leave(
                 "to be looked at: yaw, pitch and roll are singular at the start, "
                 "with a pitch of a quarter turn",
                 joint.name,

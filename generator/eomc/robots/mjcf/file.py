@@ -17,13 +17,13 @@ from eomc.base.errors import Problem
 from eomc.robots import xml
 from eomc.robots.rotations import Vector
 
-SHOWN = 12  # names told in one line of what is left out
+SHOWN = 12  # names in one line of what is left out
 
 ORIENTATION = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 PLACE = {"name", "class", "pos", "user", "group", *ORIENTATION}
 CONTACT = set("solreflimit solimplimit solreffriction solimpfriction margin".split())
 
-# what a tag may have; an attribute not in here is told
+# what a tag may have; an attribute not in here is reported
 KNOWN = {
     "body": PLACE | {"childclass", "mocap", "gravcomp", "sleep", "simple", "fuse"},
     "frame": PLACE | {"childclass"},
@@ -51,6 +51,8 @@ ACTUATORS = set(
 PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
 LAW = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}  # an actuator's force
 
+TRUTH = ("false", "true")
+
 Attributes = dict[str, str]
 Classes = dict[str, dict[str, Attributes]]
 
@@ -71,15 +73,11 @@ class Tag:
 
 
 @dataclass
-class Told:
+class Report:
     """What reading has found: faults, and what is left out, by kind, in the order found."""
 
     faults: list[Problem] = field(default_factory=list)
     left: dict[str, list[str]] = field(default_factory=dict)
-
-    def fault(self, tag: Tag, message: str) -> None:
-        """Keep a fault, with the line it stands in; reading goes on to find the others."""
-        self.faults.append(Problem(message, key=called(tag), file=str(tag.file), line=tag.line))
 
     def leave(self, kind: str, name: str = "") -> None:
         """Keep that the thing `name`, of a kind, is left out."""
@@ -89,13 +87,76 @@ class Told:
         """What is left out, one line a kind."""
         lines = []
         for kind, those in self.left.items():
-            named = list(dict.fromkeys(name for name in those if name))[:SHOWN]
             line = f"{kind} ({len(those)})" if len(those) > 1 else kind
-            if named:
+            if named := [*dict.fromkeys(name for name in those if name)][:SHOWN]:
                 more = len(those) - len(named)
                 line += f": {', '.join(named)}" + (f" and {more} more" if more else "")
             lines.append(line)
         return tuple(lines)
+
+
+@dataclass(frozen=True)
+class Given:
+    """The attributes that a tag has, by itself or from its class; faults in them are reported."""
+
+    attributes: Attributes
+    tag: Tag
+    report: Report
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.attributes
+
+    def get(self, key: str, default: str = "") -> str:
+        """An attribute as it is written."""
+        return self.attributes.get(key, default)
+
+    def fault(self, message: str) -> None:
+        """Report a fault, with the line it stands in; reading goes on to find the others."""
+        tag = self.tag
+        self.report.faults.append(Problem(message, called(tag), str(tag.file), tag.line))
+
+    def numbers(self, key: str, most: int, least: int | None = None) -> tuple[float, ...] | None:
+        """The numbers of an attribute, `least` (by default `most`) to `most` of them.
+
+        None where there is no such attribute, or a fault.
+        """
+        text = self.attributes.get(key)
+        if text is None:
+            return None
+        least = most if least is None else least
+        try:
+            values = tuple(map(xml.number, text.split()))
+        except ValueError as why:
+            self.fault(f'{key}="{text}": {why}')
+            return None
+        if not least <= len(values) <= most:
+            wanted = str(most) if least == most else f"{least} to {most}"
+            self.fault(f'{key}="{text}" has {len(values)} numbers; it takes {wanted}')
+            return None
+        return values
+
+    def vector(self, key: str) -> Vector | None:
+        """Three numbers; None as for numbers."""
+        values = self.numbers(key, 3)
+        return (values[0], values[1], values[2]) if values else None
+
+    def number(self, key: str, default: float = 0.0) -> float:
+        """One number."""
+        values = self.numbers(key, 1)
+        return values[0] if values else default
+
+    def choice(self, key: str, choices: Sequence[str], default: str = "") -> str:
+        """A word out of `choices`, of which the first is the default if no other is given."""
+        default = default or choices[0]
+        word = self.get(key, default)
+        if word in choices:
+            return word
+        self.fault(f'{key}="{word}" is not one of {", ".join(choices)}')
+        return default
+
+    def truth(self, key: str, default: bool = False) -> bool:
+        """Whether it is "true"."""
+        return self.choice(key, TRUTH, TRUTH[default]) == "true"
 
 
 @dataclass(frozen=True)
@@ -122,7 +183,7 @@ class Settings:
 # ---- the file
 
 
-def load(path: Path, include: bool, told: Told) -> Tag:
+def load(path: Path, include: bool, report: Report) -> Tag:
     """The file as tags, with what it includes in the place of <include>."""
     root = _parse(path)
     folder = path.resolve().parent
@@ -135,7 +196,7 @@ def load(path: Path, include: bool, told: Told) -> Tag:
         while queue:
             child = queue.pop()
             if child.kind == "include":
-                queue += _included(child, folder, include, opened, told)[::-1]
+                queue += _included(child, folder, include, opened, report)[::-1]
             else:
                 children.append(child)
         tag.children[:] = children
@@ -143,23 +204,25 @@ def load(path: Path, include: bool, told: Told) -> Tag:
     return root
 
 
-def _included(tag: Tag, folder: Path, include: bool, opened: set[Path], told: Told) -> list[Tag]:
+def _included(
+    tag: Tag, folder: Path, include: bool, opened: set[Path], report: Report
+) -> list[Tag]:
     """What stands in the file that <include> names; it must lie in `folder`."""
-    name = tag.attributes.get("file", "")
+    a = Given(tag.attributes, tag, report)
+    name = a.get("file")
     if not include:
-        told.fault(
-            tag,
+        a.fault(
             f'the file "{name}" is not opened: allow it with --include, '
-            "or put what it holds in the place of <include>",
+            "or put what it holds in the place of <include>"
         )
         return []
     target = (folder / name).resolve()
     if not target.is_relative_to(folder):
-        told.fault(tag, f'"{name}" lies outside the folder of the model; move it into the folder')
+        a.fault(f'"{name}" lies outside the folder of the model; move it into the folder')
     elif target in opened:
-        told.fault(tag, f'"{name}" is included a second time; MJCF allows it once')
+        a.fault(f'"{name}" is included a second time; MJCF allows it once')
     elif not target.is_file():
-        told.fault(tag, f'there is no file "{name}" in the folder of the model')
+        a.fault(f'there is no file "{name}" in the folder of the model')
     else:
         opened.add(target)
         return _parse(target).children
@@ -170,7 +233,7 @@ def _parse(path: Path) -> Tag:
     """The elements of one file, with their lines. Raises EomcError for what is not XML."""
     from defusedxml.ElementTree import DefusedXMLParser
 
-    xml.root(path)  # tells whatever is wrong with the file; what follows adds the lines
+    xml.root(path)  # raises whatever is wrong with the file; what follows adds the lines
     roots: list[Tag] = []
     stack: list[Tag] = []
 
@@ -201,123 +264,67 @@ def called(tag: Tag) -> str:
     return f'{tag.kind} "{name}"' if name else tag.kind
 
 
-def numbers(
-    attributes: Attributes, key: str, tag: Tag, told: Told, most: int, least: int | None = None
-) -> tuple[float, ...] | None:
-    """The numbers of an attribute, `least` (by default `most`) to `most` of them.
-
-    None where there is no such attribute, or a fault, which is told.
-    """
-    text = attributes.get(key)
-    if text is None:
-        return None
-    least = most if least is None else least
-    try:
-        values = tuple(xml.number(word) for word in text.split())
-    except ValueError:
-        told.fault(tag, f'{key}="{text}" holds something that is not a number')
-        return None
-    if not all(math.isfinite(value) for value in values):
-        told.fault(tag, f'{key}="{text}" must be finite')
-        return None
-    if any(abs(value) > xml.LARGE for value in values):
-        told.fault(tag, f'{key}="{text}" is more than {xml.LARGE:g}, which can\'t be meant')
-        return None
-    if not least <= len(values) <= most:
-        wanted = str(most) if least == most else f"{least} to {most}"
-        told.fault(tag, f'{key}="{text}" has {len(values)} numbers; it takes {wanted}')
-        return None
-    return values
-
-
-def vector(attributes: Attributes, key: str, tag: Tag, told: Told) -> Vector | None:
-    """Three numbers; None as for _numbers."""
-    values = numbers(attributes, key, tag, told, 3)
-    return (values[0], values[1], values[2]) if values else None
-
-
-def number(attributes: Attributes, key: str, tag: Tag, told: Told, default: float = 0.0) -> float:
-    """One number."""
-    values = numbers(attributes, key, tag, told, 1)
-    return values[0] if values else default
-
-
-def choice(attributes: Attributes, key: str, tag: Tag, told: Told, choices: Sequence[str]) -> str:
-    """A word out of `choices`, of which the first is the default."""
-    word = attributes.get(key, choices[0])
-    if word in choices:
-        return word
-    told.fault(tag, f'{key}="{word}" is not one of {", ".join(choices)}')
-    return choices[0]
-
-
-def unknown(tag: Tag, told: Told) -> None:
-    """Tell the attributes of a tag that MJCF doesn't have."""
+def unknown(tag: Tag, report: Report) -> None:
+    """Report the attributes of a tag that MJCF doesn't have."""
     for key in tag.attributes:
         if key not in KNOWN[tag.kind]:
-            told.leave("attributes that MJCF does not have", f"{key} of {called(tag)}")
+            report.leave("attributes that MJCF does not have", f"{key} of {called(tag)}")
 
 
 # ---- settings and defaults
 
-TRUTH = ("false", "true")
 
-
-def settings_of(root: Tag, told: Told) -> Settings:
+def settings_of(root: Tag, report: Report) -> Settings:
     """<compiler> and <option>; of what is said twice, the last holds."""
     s = Settings()
     for tag in root.each("compiler"):
-        a = tag.attributes
-
-        def truth(key: str, now: bool, a: Attributes = a, tag: Tag = tag) -> bool:
-            return choice(a, key, tag, told, TRUTH) == "true" if key in a else now
-
-        if a.get("coordinate", "local") != "local":
-            told.fault(
-                tag,
-                'coordinate="global" is not read, nor by MuJoCo since 2.3.4; '
-                "let an older MuJoCo save the model in local coordinates",
-            )
-        seq = a.get("eulerseq", s.eulerseq)
-        if len(seq) != 3 or set(seq.lower()) - set("xyz"):
-            told.fault(tag, f'eulerseq="{seq}" must be three of x, y, z, X, Y, Z')
-            seq = s.eulerseq
-        groups = numbers(a, "inertiagrouprange", tag, told, 2)
-        angle = choice(a, "angle", tag, told, ("degree", "radian"))
-        inertia = choice(a, "inertiafromgeom", tag, told, ("auto", *TRUTH))
-        s = replace(
-            s,
-            degrees=angle == "degree" if "angle" in a else s.degrees,
-            eulerseq=seq,
-            autolimits=truth("autolimits", s.autolimits),
-            inertia=inertia if "inertiafromgeom" in a else s.inertia,
-            groups=(groups[0], groups[1]) if groups else s.groups,
-            boundmass=number(a, "boundmass", tag, told, s.boundmass),
-            boundinertia=number(a, "boundinertia", tag, told, s.boundinertia),
-            totalmass=number(a, "settotalmass", tag, told, s.totalmass),
-            balance=truth("balanceinertia", s.balance),
-            alignfree=truth("alignfree", s.alignfree),
-        )
+        s = _compiler(s, Given(tag.attributes, tag, report))
     for tag in root.each("option"):
-        a = tag.attributes
-        s = replace(s, gravity=vector(a, "gravity", tag, told) or s.gravity)
-        for key in ("density", "viscosity", "wind"):
-            values = numbers(a, key, tag, told, 3, 1)
-            if values and any(values):
-                told.leave("forces of the surrounding fluid", key)
-        for key in a:
-            if key not in {"gravity", "density", "viscosity", "wind"}:
-                told.leave("options of MuJoCo's simulation", key)
+        a = Given(tag.attributes, tag, report)
+        s = replace(s, gravity=a.vector("gravity") or s.gravity)
+        for key in a.attributes:
+            if key in {"density", "viscosity", "wind"}:
+                if any(a.numbers(key, 3, 1) or ()):
+                    report.leave("forces of the surrounding fluid", key)
+            elif key != "gravity":
+                report.leave("options of MuJoCo's simulation", key)
         for flag in tag.each("flag"):
             for key, value in flag.attributes.items():
                 if key == "gravity" and value == "disable":
                     s = replace(s, gravity=(0.0, 0.0, 0.0))
                 else:
-                    told.leave("flags of MuJoCo's simulation", f"{key}={value}")
+                    report.leave("flags of MuJoCo's simulation", f"{key}={value}")
     return s
 
 
-def classes_of(root: Tag, told: Told) -> Classes:
+def _compiler(s: Settings, a: Given) -> Settings:
+    if a.get("coordinate", "local") != "local":
+        a.fault(
+            'coordinate="global" is not read, nor by MuJoCo since 2.3.4; '
+            "let an older MuJoCo save the model in local coordinates"
+        )
+    seq = a.get("eulerseq", s.eulerseq)
+    if len(seq) != 3 or set(seq.lower()) - set("xyz"):
+        a.fault(f'eulerseq="{seq}" must be three of x, y, z, X, Y, Z')
+        seq = s.eulerseq
+    groups = a.numbers("inertiagrouprange", 2)
+    angle = a.choice("angle", ("degree", "radian"), "degree" if s.degrees else "radian")
+    return replace(
+        s,
+        degrees=angle == "degree",
+        eulerseq=seq,
+        autolimits=a.truth("autolimits", s.autolimits),
+        inertia=a.choice("inertiafromgeom", ("auto", *TRUTH), s.inertia),
+        groups=(groups[0], groups[1]) if groups else s.groups,
+        boundmass=a.number("boundmass", s.boundmass),
+        boundinertia=a.number("boundinertia", s.boundinertia),
+        totalmass=a.number("settotalmass", s.totalmass),
+        balance=a.truth("balanceinertia", s.balance),
+        alignfree=a.truth("alignfree", s.alignfree),
+    )
+
+
+def classes_of(root: Tag, report: Report) -> Classes:
     """The default classes, each with the attributes of its kinds of elements, inherited too.
 
     All actuators of a class share one entry, "actuator". Elements of a class hold for the classes
@@ -337,11 +344,12 @@ def classes_of(root: Tag, told: Told) -> Classes:
                 if kind != "default":
                     own[kind] = merged(own.get(kind, {}), child)
             for child in tag.each("default"):
-                inner = child.attributes.get("class", "")
+                a = Given(child.attributes, child, report)
+                inner = a.get("class")
                 if not inner:
-                    told.fault(child, 'a <default> inside another needs a name: class="..."')
+                    a.fault('a <default> inside another needs a name: class="..."')
                 elif inner in classes:
-                    told.fault(child, f'there are two default classes "{inner}"; rename one')
+                    a.fault(f'there are two default classes "{inner}"; rename one')
                 else:
                     classes[inner] = dict(own)
                     waiting.append((child, inner))
@@ -352,7 +360,7 @@ def merged(base: Attributes, tag: Tag) -> Attributes:
     """The attributes of a tag over those of its class.
 
     An orientation replaces an inherited one of whatever kind, and fromto a whole inherited pose.
-    A shortcut of <general> starts from its own law of force, told under the key " law".
+    A shortcut of <general> starts from its own law of force, kept under the key " law".
     """
     own = {k: v for k, v in tag.attributes.items() if k not in {"class", "childclass"}}
     over = dict(base)

@@ -7,19 +7,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from eomc.base.spatial import apply, plus, scaled
-from eomc.robots.mjcf import file as text
-from eomc.robots.mjcf import masses
-from eomc.robots.mjcf.file import Attributes, Settings, Tag, Told
-from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader
+from eomc.robots.mjcf.file import Given, Report, Settings, unknown
+from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader, direction, rounded
 from eomc.robots.robot import Motion, free_motions, joined
-from eomc.robots.rotations import (
-    IDENTITY,
-    ORIGIN,
-    Vector,
-    from_axis_angle,
-    unit,
-    yaw_pitch_roll,
-)
+from eomc.robots.rotations import IDENTITY, ORIGIN, Vector, from_axis_angle, unit, yaw_pitch_roll
 
 
 class Found(NamedTuple):
@@ -47,60 +38,58 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
 
     The motions of free and ball joints get their names in _named.
     """
-    told, settings, tag = reader.told, reader.settings, placed.tag
-    text.unknown(tag, told)
+    report, settings, tag = reader.report, reader.settings, placed.tag
+    unknown(tag, report)
     free = tag.kind == "freejoint"
-    a = tag.attributes if free else masses.attributes_of(placed, "joint", reader)
-    kind = "free" if free else text.choice(a, "type", tag, told, TYPES)
+    a = reader.own(tag) if free else reader.given(placed, "joint")
+    kind = "free" if free else a.choice("type", TYPES)
     turns = kind != "slide"
 
     def value(key: str) -> float:
-        number = text.number(a, key, tag, told)
+        number = a.number(key)
         return settings.angle(number) if kind == "hinge" else number
 
     def first(key: str) -> float:
-        """The linear coefficient; those of the square and the cube are told."""
-        numbers = text.numbers(a, key, tag, told, 3, 1) or (0.0,)
+        """The linear coefficient; those of the square and the cube are reported."""
+        numbers = a.numbers(key, 3, 1) or (0.0,)
         if any(numbers[1:]):
-            told.leave(f"{key} in the square and cube of joints", name)
+            report.leave(f"{key} in the square and cube of joints", name)
         return numbers[0]
 
     own = {
         "damping": first("damping"),
-        "friction": text.number(a, "frictionloss", tag, told),
-        "armature": text.number(a, "armature", tag, told),
+        "friction": a.number("frictionloss"),
+        "armature": a.number("armature"),
         "stiffness": first("stiffness"),
     }
     for key, number in own.items():
         if number < 0:
-            told.fault(tag, f"{key} must not be negative")
-    spring = text.numbers(a, "springdamper", tag, told, 2)
+            a.fault(f"{key} must not be negative")
+    spring = a.numbers("springdamper", 2)
     if spring and min(spring) > 0:
-        told.leave("stiffness and damping given by springdamper", name)
+        report.leave("stiffness and damping given by springdamper", name)
         own |= {"stiffness": 0.0, "damping": 0.0}
-    if text.number(a, "springyield", tag, told):
-        told.leave("yield of the springs of joints", name)
-    note = _limits(a, kind, tag, reader, name)
-    at = text.vector(a, "pos", tag, told) or ORIGIN
-    anchor = plus(placed.pose.place, apply(placed.pose.turn, at))
+    if a.number("springyield"):
+        report.leave("yield of the springs of joints", name)
+    note = _limits(a, kind, settings, name)
+    anchor = plus(placed.pose.place, apply(placed.pose.turn, a.vector("pos") or ORIGIN))
     if kind == "free":
         align = a.get("align", "auto")
         if align == "true" or (align == "auto" and settings.alignfree):
-            told.leave("alignment of free joints with the principal axes (alignfree)", name)
+            report.leave("alignment of free joints with the principal axes (alignfree)", name)
         start = (*pose.place, *yaw_pitch_roll(pose.turn))
         motions = tuple(
             replace(m, start=s, rest=s) for m, s in zip(free_motions(), start, strict=True)
         )
-        return _balled(Found(name, kind, kind, motions, (), ORIGIN, STILL, 0.0), own, told)
+        return _balled(Found(name, kind, kind, motions, (), ORIGIN, STILL, 0.0), own, report)
     if kind == "ball":
         motions = tuple(replace(m, note=joined(m.note, note)) for m in free_motions()[3:])
-        return _balled(Found(name, kind, "spherical", motions, (), anchor, STILL, 0.0), own, told)
-    axis = masses.direction(
-        text.numbers(a, "axis", tag, told, 3) or (0.0, 0.0, 1.0), "axis", tag, told
-    )
+        return _balled(Found(name, kind, "spherical", motions, (), anchor, STILL, 0.0), own, report)
+    axis = direction(a.numbers("axis", 3) or (0.0, 0.0, 1.0), "axis", a)
     if axis is None:
         return None
-    axis = unit(_cleaned(apply(placed.pose.turn, axis)))
+    x, y, z = (rounded(c, 1.0) for c in apply(placed.pose.turn, axis))
+    axis = unit((x, y, z))
     ref = value("ref")
     motion = Motion(
         name,
@@ -118,21 +107,15 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
     return Found(name, kind, "prismatic", (motion,), (axis,), ORIGIN, zero, 0.0)
 
 
-def _cleaned(v: Vector) -> Vector:
-    """A unit vector without what rounding left of zeros."""
-    x, y, z = (masses.rounded(c, 1.0) for c in v)
-    return x, y, z
-
-
-def _balled(joint: Found, own: dict[str, float], told: Told) -> Found:
+def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
     """A free or ball joint with what acts along its coordinates.
 
     MuJoCo lets damping, friction and springs of turns act on the angular velocity and on the
-    angle of the whole turn; per angle they are the same only near zero angles, which is told.
+    angle of the whole turn; per angle they are the same only near zero angles, which is reported.
     """
     given = [key for key in ("damping", "friction", "stiffness") if own[key]]
     if given:
-        told.leave(
+        report.leave(
             f"{' and '.join(given)} of whole turns: here they act on each of the three angles, "
             "which is the same near zero angles only",
             joint.name,
@@ -151,29 +134,27 @@ def _balled(joint: Found, own: dict[str, float], told: Told) -> Found:
     return joint._replace(motions=motions, armature=own["armature"])
 
 
-def _limits(a: Attributes, kind: str, tag: Tag, reader: Reader, name: str) -> str:
-    """The limits of a joint in words, for its note; told as left out."""
-    told, settings = reader.told, reader.settings
+def _limits(a: Given, kind: str, settings: Settings, name: str) -> str:
+    """The limits of a joint in words, for its note; reported as left out."""
     notes = []
-    limits = text.numbers(a, "range", tag, told, 2)
+    limits = a.numbers("range", 2)
     if limits and kind != "free" and limited(a, "limited", settings):
-        told.leave("limits of joints, kept as notes", name)
+        a.report.leave("limits of joints, kept as notes", name)
         low, high = (settings.angle(v) if kind != "slide" else v for v in limits)
         of = "rad" if kind != "slide" else "m"
         if kind == "ball":
             notes.append(f"turns by {high:.6g} rad at most")
         else:
             notes.append(f"from {low:.6g} to {high:.6g} {of}")
-    force = text.numbers(a, "actuatorfrcrange", tag, told, 2)
+    force = a.numbers("actuatorfrcrange", 2)
     if force and kind in {"hinge", "slide"} and limited(a, "actuatorfrclimited", settings):
-        told.leave("limits of the actuators' force on joints, kept as notes", name)
-        notes.append(
-            f"driven with {force[0]:.6g} to {force[1]:.6g} {'N m' if kind == 'hinge' else 'N'}"
-        )
+        a.report.leave("limits of the actuators' force on joints, kept as notes", name)
+        newton = "N m" if kind == "hinge" else "N"
+        notes.append(f"driven with {force[0]:.6g} to {force[1]:.6g} {newton}")
     return joined(*notes)
 
 
-def limited(a: Attributes, key: str, settings: Settings) -> bool:
+def limited(a: Given, key: str, settings: Settings) -> bool:
     """Whether a range that is given holds."""
     word = a.get(key, "auto")
     return word == "true" or (word == "auto" and settings.autolimits)

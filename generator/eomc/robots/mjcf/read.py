@@ -8,10 +8,9 @@ from pathlib import Path
 
 from eomc.base.errors import SceneError
 from eomc.base.spatial import plus, scaled, six
-from eomc.robots.mjcf import file as text
 from eomc.robots.mjcf import masses
 from eomc.robots.mjcf.actuators import actuated, started
-from eomc.robots.mjcf.file import TRUTH, Tag, Told
+from eomc.robots.mjcf.file import Given, Report, Tag, classes_of, load, settings_of, unknown
 from eomc.robots.mjcf.joints import Found, fresh, joint_of, named
 from eomc.robots.mjcf.masses import STILL, Mass, Placed, Pose, Reader
 from eomc.robots.robot import Robot, RobotBody, joined
@@ -49,22 +48,24 @@ def read(path: str | Path, include: bool = False) -> Robot:
     Raises SceneError with every fault found; EomcError where the file can't be read.
     """
     path = Path(path)
-    told = Told()
-    root = text.load(path, include, told)
+    report = Report()
+    root = load(path, include, report)
     if root.kind != "mujoco":
         what = "URDF" if root.kind == "robot" else "not MJCF"
-        told.fault(root, f"the file's element is <{root.kind}>, which is {what}; MJCF has <mujoco>")
-        raise SceneError(told.faults)
-    settings = text.settings_of(root, told)
-    reader = Reader(settings, text.classes_of(root, told), told)
+        Given({}, root, report).fault(
+            f"the file's element is <{root.kind}>, which is {what}; MJCF has <mujoco>"
+        )
+        raise SceneError(report.faults)
+    settings = settings_of(root, report)
+    reader = Reader(settings, classes_of(root, report), report)
     bodies, joints = _bodies(root, reader)
     joints, drives = actuated(root, joints, reader)
-    joints = started(root, joints, told)
+    joints = started(root, joints, report)
     if settings.totalmass > 0:
         bodies = masses.scaled_to(bodies, settings.totalmass)
-    _sections(root, told)
-    if told.faults:
-        raise SceneError(told.faults)
+    _sections(root, report)
+    if report.faults:
+        raise SceneError(report.faults)
     name = root.attributes.get("model", "") or path.stem
     return Robot(
         name=name,
@@ -72,19 +73,17 @@ def read(path: str | Path, include: bool = False) -> Robot:
         gravity=settings.gravity,
         bodies=_moving(bodies, joints),
         drives=drives,
-        left_out=told.lines(),
+        left_out=report.lines(),
     )
 
 
-def _geom_told(placed: Placed, reader: Reader) -> None:
-    """Tell that a geom's shape and contacts are left out."""
-    text.unknown(placed.tag, reader.told)
-    a = masses.attributes_of(placed, "geom", reader)
-    name = a.get("name", "")
-    if a.get("contype", "1") != "0" or a.get("conaffinity", "1") != "0":
-        reader.told.leave("contacts of geoms", name)
-    else:
-        reader.told.leave("shapes of geoms without contact", name)
+def _geom_left_out(placed: Placed, reader: Reader) -> None:
+    """Report that a geom's shape and contacts are left out."""
+    unknown(placed.tag, reader.report)
+    a = reader.given(placed, "geom")
+    touches = a.get("contype", "1") != "0" or a.get("conaffinity", "1") != "0"
+    what = "contacts of geoms" if touches else "shapes of geoms without contact"
+    reader.report.leave(what, a.get("name"))
 
 
 # ---- the tree
@@ -95,7 +94,7 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
 
     Each joint is that of one body, in the order of the bodies that move.
     """
-    told = reader.told
+    report, settings = reader.report, reader.settings
     worlds = list(root.each("worldbody"))
     below = [tag for world in worlds for tag in _below(world)]
     names = {
@@ -105,13 +104,13 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
     inner = [placed for world in worlds for placed in _contents(world, WORLD, "", reader)]
     for placed in inner:
         if placed.tag.kind == "geom":
-            _geom_told(placed, reader)
+            _geom_left_out(placed, reader)
         elif placed.tag.kind != "body":
-            told.fault(placed.tag, "the world can't have this; put it into a <body>")
+            reader.own(placed.tag).fault("the world can't have this; put it into a <body>")
     # a body, and whether its parent stands still
     waiting = [(placed, True) for placed in reversed(inner) if placed.tag.kind == "body"]
     if not waiting:
-        told.fault(worlds[0] if worlds else root, "there is no <body> in <worldbody>")
+        reader.own([*worlds, root][0]).fault("there is no <body> in <worldbody>")
     bodies: list[RobotBody] = []
     joints: list[Found] = []
     seen: dict[str, set[str]] = {"body": {WORLD}, "joint": set()}
@@ -119,7 +118,7 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
     def called(tag: Tag, kind: str, otherwise: str) -> str:
         name = tag.attributes.get("name", "")
         if name and name in seen[kind]:
-            told.fault(tag, f'there are two called "{name}"; rename one')
+            reader.own(tag).fault(f'there are two called "{name}"; rename one')
         name = name or fresh(otherwise, names[kind] | seen[kind])
         seen[kind].add(name)
         return name
@@ -127,12 +126,11 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
     count = 0
     while waiting:
         placed, still = waiting.pop()
-        tag, parent = placed.tag, placed.body
+        tag, parent, a = placed.tag, placed.body, reader.own(placed.tag)
         count += 1
         name = called(tag, "body", f"body{count}")
-        pose = placed.pose.of(masses.pose_of(tag.attributes, tag, reader))
-        childclass = tag.attributes.get("childclass", placed.childclass)
-        inner = _contents(tag, name, childclass, reader)
+        pose = placed.pose.of(masses.pose_of(a, settings))
+        inner = _contents(tag, name, a.get("childclass", placed.childclass), reader)
         found = [
             joint_of(p, called(p.tag, "joint", f"{name}_joint"), pose, reader)
             for p in inner
@@ -141,18 +139,18 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
         own = [joint for joint in found if joint is not None]
         if any(joint.type == "free" for joint in own):
             if parent != WORLD:
-                told.fault(tag, "only a body in <worldbody> can have a free joint")
+                a.fault("only a body in <worldbody> can have a free joint")
             if len(own) > 1:
-                told.fault(tag, "a body with a free joint has no other joints; leave one")
-        if text.choice(tag.attributes, "mocap", tag, told, TRUTH) == "true":
-            told.leave("motions of mocap bodies, which stand still here", name)
-        if text.number(tag.attributes, "gravcomp", tag, told):
-            told.leave("compensation of gravity (gravcomp) of bodies", name)
+                a.fault("a body with a free joint has no other joints; leave one")
+        if a.truth("mocap"):
+            report.leave("motions of mocap bodies, which stand still here", name)
+        if a.number("gravcomp"):
+            report.leave("compensation of gravity (gravcomp) of bodies", name)
         for p in inner:
             if p.tag.kind == "geom":
-                _geom_told(p, reader)
+                _geom_left_out(p, reader)
         mass = masses.body_mass(tag, inner, reader)
-        chain, own, anchor = _chain(name, parent, still, pose, own, mass, names["body"], told)
+        chain, own, anchor = _chain(name, parent, still, pose, own, mass, names["body"], report)
         seen["body"].update(body.name for body in chain)
         bodies += chain
         joints += own
@@ -175,30 +173,30 @@ def _below(tag: Tag) -> Iterator[Tag]:
 
 
 def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Placed]:
-    """What a body holds, frames resolved, in the file's order; what is not read is told."""
-    told = reader.told
+    """What a body holds, frames resolved, in the file's order; what is not read is reported."""
+    report = reader.report
     if tag.kind == "body":
-        text.unknown(tag, told)
+        unknown(tag, report)
     found: list[Placed] = []
-    masses.class_of(childclass, tag, reader)
+    reader.class_of(childclass, tag)
     waiting = [Placed(child, body, STILL, childclass) for child in reversed(tag.children)]
     while waiting:
         placed = waiting.pop()
         inner = placed.tag
         name = inner.attributes.get("name", inner.attributes.get("prefix", ""))
         if inner.kind == "frame":
-            text.unknown(inner, told)
-            around = placed.pose.of(masses.pose_of(inner.attributes, inner, reader))
+            unknown(inner, report)
+            around = placed.pose.of(masses.pose_of(reader.own(inner), reader.settings))
             default = inner.attributes.get("childclass", placed.childclass)
             waiting += [Placed(child, body, around, default) for child in reversed(inner.children)]
         elif inner.kind in {"body", "joint", "freejoint", "geom", "inertial"}:
             found.append(placed)
         elif inner.kind in ORNAMENTS:
-            told.leave(f"{inner.kind}s", name)
+            report.leave(f"{inner.kind}s", name)
         elif inner.kind in GENERATORS:
-            told.leave(f"<{inner.kind}> and all that it adds, masses too", name or f"in {body}")
+            report.leave(f"<{inner.kind}> and all that it adds, masses too", name or f"in {body}")
         else:
-            told.leave("elements that MJCF does not have", f"{inner.kind} in {body}")
+            report.leave("elements that MJCF does not have", f"{inner.kind} in {body}")
     return found
 
 
@@ -210,7 +208,7 @@ def _chain(
     joints: Sequence[Found],
     mass: Mass,
     taken: Collection[str],
-    told: Told,
+    report: Report,
 ) -> tuple[list[RobotBody], list[Found], Vector]:
     """The bodies for one <body>: one a joint, in their order, the mass in the last.
 
@@ -244,7 +242,7 @@ def _chain(
         anchor = joint.anchor
         # as an inertia of the body it is exact where what carries the joint does not turn
         if joint.armature and not (still and all(j.type == "slide" for j in joints[:i])):
-            told.leave(
+            report.leave(
                 "exact armature of ball joints: here it acts on each of the three angles, "
                 "which is the same near zero angles only",
                 joint.name,
@@ -286,19 +284,19 @@ def _moving(bodies: Sequence[RobotBody], joints: Sequence[Found]) -> tuple[Robot
     return tuple(out)
 
 
-# ---- what is beside the tree
+# ---- sections besides the tree
 
 
-def _sections(root: Tag, told: Told) -> None:
-    """Tell the sections of the file that are not read."""
+def _sections(root: Tag, report: Report) -> None:
+    """Report the sections of the file that are not read."""
     for section in root.children:
         if section.kind in SECTIONS:
             for tag in section.children:
-                told.leave(SECTIONS[section.kind], _label(tag))
+                report.leave(SECTIONS[section.kind], _label(tag))
         elif section.kind in SETTINGS:
-            told.leave("settings of MuJoCo's viewer and memory", section.kind)
+            report.leave("settings of MuJoCo's viewer and memory", section.kind)
         elif section.kind not in READ:
-            told.leave("elements that MJCF does not have", section.kind)
+            report.leave("elements that MJCF does not have", section.kind)
 
 
 def _label(tag: Tag) -> str:
