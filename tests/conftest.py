@@ -22,6 +22,8 @@ from eomc.scene import read as scene
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+pytest_plugins = ["builds"]  # fixtures of tests/toolchain
+
 ROOT = Path(__file__).parent.parent
 MODULES = ROOT / "build" / "tests" / "modules"  # kept from one run of the tests to the next
 

@@ -1,7 +1,7 @@
 """The fast derivation, by sweeps and routes, is Euler and Lagrange: against the plain reference.
 
 Random small systems with everything that a kinetic energy may contain. The program is evaluated
-in Python, so nothing is compiled here; test_runtime.py and `eomc check` hold the C against it.
+in Python, so nothing is compiled here; tests/runtime and `eomc check` hold the C against it.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cases import SCENES
 from conftest import MODULES
-from test_runtime import ctrl_c_after
+from test_interrupts import ctrl_c_after
 
 import eomc
 from eomc.model import from_scene as system

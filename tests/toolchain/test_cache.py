@@ -7,7 +7,6 @@ import gc
 import os
 import shutil
 import signal
-import stat
 import subprocess
 import sys
 import time
@@ -15,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from cases import SCENES
+from builds import CHANGED, TEXT, gravity, leftovers, script
 from conftest import needs
 
 import eomc
@@ -24,53 +23,7 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain import cache, compiler
 
-TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
-CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
-
-
-@pytest.fixture(autouse=True)
-def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
-    monkeypatch.delenv("CC", raising=False)
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    """A scene file that a test may change."""
-    file = tmp_path / "simple_pendulum.toml"
-    file.write_text(TEXT, encoding="utf-8")
-    return file
-
-
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    return tmp_path / "build"
-
-
-def script(file: Path, text: str) -> str:
-    """An executable shell script; its path."""
-    file.write_text("#!/bin/sh\n" + text, encoding="utf-8")
-    file.chmod(file.stat().st_mode | stat.S_IXUSR)
-    return str(file)
-
-
-def marks(folder: Path) -> dict[str, tuple[int, int, int]]:
-    """What tells whether a file was touched, by name."""
-    return {
-        f.name: (f.stat().st_ino, f.stat().st_mtime_ns, f.stat().st_size)
-        for f in folder.iterdir()
-        if f.name != "__pycache__"
-    }
-
-
-def gravity(root: Path) -> float:
-    """g(1 rad) of the module that lies there, as a new process imports it."""
-    done = subprocess.run(
-        [sys.executable, "-c", "import simple_pendulum as m; print(m.g([1.0])[0])"],
-        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return float(done.stdout)
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 def started(scene: Path, root: Path, **environment: str) -> subprocess.Popen[str]:
@@ -83,10 +36,13 @@ def started(scene: Path, root: Path, **environment: str) -> subprocess.Popen[str
     )  # fmt: skip
 
 
-def leftovers(root: Path) -> list[str]:
-    """Whatever stands beside the module and its lock."""
-    expected = {"simple_pendulum", ".simple_pendulum.lock"}
-    return sorted(f.name for f in root.iterdir() if f.name not in expected)
+def marks(folder: Path) -> dict[str, tuple[int, int, int]]:
+    """What tells whether a file was touched, by name."""
+    return {
+        f.name: (f.stat().st_ino, f.stat().st_mtime_ns, f.stat().st_size)
+        for f in folder.iterdir()
+        if f.name != "__pycache__"
+    }
 
 
 # --- when ----------------------------------------------------------------------------------------
@@ -206,15 +162,6 @@ def test_a_damaged_build_is_mended(scene: Path, root: Path) -> None:
 
 
 # --- what goes wrong -----------------------------------------------------------------------------
-
-
-@pytest.fixture
-def built(scene: Path, root: Path) -> float:
-    """A good build; its gravity. The scene is then changed, so that another build is due."""
-    eomc.build(scene, root)
-    before = gravity(root)
-    scene.write_text(CHANGED, encoding="utf-8")
-    return before
 
 
 def test_a_failing_compiler_is_heard(

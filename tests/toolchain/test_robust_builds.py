@@ -10,39 +10,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_cache import CHANGED, TEXT, gravity, leftovers, script
+from builds import gravity, leftovers, script
 
 import eomc
 from eomc.toolchain import cache
 
-
-@pytest.fixture(autouse=True)
-def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
-    monkeypatch.delenv("CC", raising=False)
-
-
-@pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    """A scene file that a test may change."""
-    file = tmp_path / "simple_pendulum.toml"
-    file.write_text(TEXT, encoding="utf-8")
-    return file
-
-
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    return tmp_path / "build"
-
-
-@pytest.fixture
-def built(scene: Path, root: Path) -> float:
-    """A good build; its gravity. The scene is then changed, so that another build is due."""
-    eomc.build(scene, root)
-    before = gravity(root)
-    scene.write_text(CHANGED, encoding="utf-8")
-    return before
-
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 # --- the lock -------------------------------------------------------------------------------------
 

@@ -1,0 +1,34 @@
+"""Scenes with batch = true, and many states of them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from cases import SCENES
+
+import eomc
+
+STEPS = 60
+
+
+def module(name: str, **run: str) -> ModuleType:
+    """A scene with batch = true, built under build/ and kept there from test to test."""
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    options = "".join(f"{k} = {v}\n" for k, v in {"batch": "true", **run}.items())
+    many = "_".join(["many", name, *(value.strip('"') for value in run.values())])
+    text = re.sub(r"^name\s*=.*", f'name = "{many}"', text, flags=re.M)
+    text = text.replace("[run]\n", "[run]\n" + options)
+    path = Path("build/tests") / f"{many}.toml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return eomc.load(path, path.parent / "modules")
+
+
+def starts(m: ModuleType, count: int) -> tuple[Any, Any]:
+    """`count` states around the scene's start."""
+    random = np.random.default_rng(1)
+    return tuple(x + 0.2 * random.standard_normal((count, len(x))) for x in m.start)  # type: ignore[return-value]

@@ -1,0 +1,37 @@
+"""MJCF models from text."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from eomc.base.errors import SceneError
+from eomc.robots.mjcf import read
+from eomc.robots.robot import Robot
+
+PI = math.pi
+CLOSE = 1e-14  # relative; the numbers below need a few operations each
+
+
+def model(tmp_path: Path, inside: str, before: str = "", after: str = "") -> Robot:
+    """The robot of a text: `inside` <worldbody>, `before` and `after` it."""
+    file = tmp_path / "model.xml"
+    file.write_text(f"<mujoco>{before}\n<worldbody>{inside}</worldbody>\n{after}</mujoco>")
+    return read.read(file)
+
+
+def refused(tmp_path: Path, inside: str, before: str = "", after: str = "") -> str:
+    with pytest.raises(SceneError) as fault:
+        model(tmp_path, inside, before, after)
+    return str(fault.value)
+
+
+BALL = '<geom size="0.1"/>'
+BODY = f'<body name="a"><joint name="j"/>{BALL}</body>'
+
+
+def told(robot: Robot, *words: str) -> bool:
+    """Whether one line of what is left out holds all the words."""
+    return any(all(word in line for word in words) for line in robot.left_out)

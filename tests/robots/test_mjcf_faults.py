@@ -1,0 +1,150 @@
+"""MJCF that is refused, and included files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mjcf_text import refused
+
+from eomc.base.errors import EomcError, SceneError
+from eomc.robots.mjcf import read
+from eomc.robots.robot import Motion
+
+
+@pytest.mark.parametrize(
+    ("inside", "before", "words"),
+    [
+        (
+            '<body name="a"><joint/><geom name="g" type="mesh" mesh="m"/></body>',
+            "",
+            ['geom "g"', "a follows from a mesh", "<inertial>"],
+        ),
+        (
+            '<body name="a"><joint/><inertial pos="0 0 0" mass="1"/><geom type="mesh"/></body>',
+            '<compiler inertiafromgeom="true"/>',
+            ['inertiafromgeom="auto"'],
+        ),
+        ('<body><joint name="j" axis="0 0 0"/></body>', "", ['joint "j"', "length zero"]),
+        ('<body quat="0 0 0 0"/>', "", ["quat has the length zero", "1 0 0 0"]),
+        ('<body pos="1 2"/>', "", ['pos="1 2" has 2 numbers; it takes 3']),
+        ('<body pos="1 2 z"/>', "", ["not a number"]),
+        ('<body pos="1 2 nan"/>', "", ["finite"]),
+        ('<body pos="1 2 1e200"/>', "", ["more than 1e+100, which can't be meant"]),
+        ('<body pos="1 2 1_0"/>', "", ["not a number"]),
+        ('<body><geom size="1e90" density="1e90"/></body>', "", ["inertia overflows"]),
+        ('<body quat="1 0 0 0" euler="1 2 3"/>', "", ["given twice, by quat and euler"]),
+        (
+            '<body name="a"><inertial pos="0 0 0" mass="1" diaginertia="1 1 3"/></body>',
+            "",
+            ["triangle", "balanceinertia"],
+        ),
+        (
+            '<body><inertial pos="0 0 0" mass="1" fullinertia="1 1 1 2 0 0"/></body>',
+            "",
+            ["principal moment", "boundinertia"],
+        ),
+        ('<body name="a"><inertial pos="0 0 0" mass="-1"/></body>', "", ["mass of a", "negative"]),
+        ('<body name="a"><inertial mass="1"/></body>', "", ["needs pos and mass"]),
+        ('<body><geom size="0 1"/></body>', "", ["size of a sphere is 1 positive"]),
+        ('<body><geom type="box" size="1 1"/></body>', "", ["size of a box is 3 positive"]),
+        ('<body><geom type="capsule" fromto="0 0 0 0 0 1"/></body>', "", ["needs a size"]),
+        ('<body><geom type="cone" size="1"/></body>', "", ['type="cone" is not one of sphere']),
+        ('<body><geom size="1" density="-1"/></body>', "", ["not be negative"]),
+        ('<body><joint damping="-1"/></body>', "", ["damping must not be negative"]),
+        (
+            '<body><geom type="ellipsoid" size="1 2 3" shellinertia="true"/></body>',
+            "",
+            ["shell of an ellipsoid"],
+        ),
+        ('<body name="a"/><body name="a"/>', "", ["body", 'two called "a"', "rename"]),
+        ("<body><body><freejoint/></body></body>", "", ["only a body in <worldbody>"]),
+        ("<body><freejoint/><joint/></body>", "", ["no other joints"]),
+        ("<joint/>", "", ["the world can't have this"]),
+        ("", "", ["no <body>"]),
+        ('<body childclass="no"/>', "", ['no default class "no"']),
+        ("<body/>", '<compiler coordinate="global"/>', ["global", "older MuJoCo"]),
+        ("<body/>", '<compiler eulerseq="xyw"/>', ["three of x, y, z"]),
+        ("<body/>", "<default><default/></default>", ["needs a name"]),
+        ("<body/>", '<include file="part.xml"/>', ['"part.xml" is not opened', "--include"]),
+    ],
+)
+def test_faults_say_where_what_and_what_to_do(
+    tmp_path: Path, inside: str, before: str, words: list[str]
+) -> None:
+    text = refused(tmp_path, inside, before)
+    for word in [*words, "model.xml:"]:
+        assert word in text
+
+
+def test_faults_are_told_all_at_once_with_their_lines(tmp_path: Path) -> None:
+    text = refused(
+        tmp_path,
+        '\n<body name="a"><joint axis="0 0 0"/>\n<geom size="-1"/>\n</body>',
+        after='<actuator>\n<motor joint="nowhere"/></actuator>',
+    )
+    lines = [line.split("model.xml:")[1].split(":")[0] for line in text.splitlines()]
+    assert lines == ["3", "4", "7"]
+    assert 'no joint "nowhere"' in text
+
+
+def test_what_is_not_mjcf_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "model.xml"
+    for text, words in (
+        ('<robot name="r"/>', "URDF"),
+        ("<html/>", "not MJCF"),
+        ("<mujoco>", "not XML"),
+        ("", "empty"),
+        ('<!DOCTYPE m [<!ENTITY a "b">]><mujoco model="&a;"/>', "entities"),
+        ('<!DOCTYPE m SYSTEM "/etc/passwd"><mujoco/>', "document type"),
+    ):
+        file.write_text(text)
+        with pytest.raises(EomcError, match=words):
+            read.read(file)
+    with pytest.raises(EomcError, match="no such file"):
+        read.read(tmp_path / "none.xml")
+
+
+def write(folder: Path, **files: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (folder / f"{name}.xml").write_text(text)
+    return folder / "main.xml"
+
+
+def test_included_files_stand_in_the_place_of_include(tmp_path: Path) -> None:
+    main = write(
+        tmp_path,
+        main="""<mujoco><include file="set.xml"/>
+            <worldbody><include file="arm.xml"/></worldbody></mujoco>""",
+        set="""<x><compiler angle="radian"/>
+            <default><joint damping="2"/></default></x>""",
+        arm='<x><body name="a"><include file="joint.xml"/><geom size="0.1"/></body></x>',
+        joint='<x><joint ref="0.5"/></x>',
+    )
+    (motion,) = read.read(main, include=True).motions
+    assert motion == Motion("a_joint", "rad", start=0.5, damping=2)
+    with pytest.raises(SceneError, match="is not opened"):
+        read.read(main)
+
+
+def test_no_file_outside_the_models_folder_is_opened(tmp_path: Path) -> None:
+    secret = tmp_path / "secret.xml"
+    secret.write_text('<mujoco><worldbody><body name="x"/></worldbody></mujoco>')
+    folder = tmp_path / "model"
+    body = "<worldbody><body/></worldbody>"
+    for name in ("../secret.xml", str(secret), "link.xml"):
+        main = write(folder, main=f'<mujoco><include file="{name}"/>{body}</mujoco>')
+        if name == "link.xml":
+            (folder / name).symlink_to(secret)
+        with pytest.raises(SceneError, match="outside the folder"):
+            read.read(main, include=True)
+
+
+def test_a_file_that_is_missing_or_included_twice_is_told(tmp_path: Path) -> None:
+    main = write(tmp_path, main='<mujoco><include file="none.xml"/></mujoco>')
+    with pytest.raises(SceneError, match=r'no file "none.xml"'):
+        read.read(main, include=True)
+    main = write(tmp_path, main='<mujoco><include file="main.xml"/></mujoco>')
+    with pytest.raises(SceneError, match="a second time"):
+        read.read(main, include=True)

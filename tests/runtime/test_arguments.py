@@ -1,0 +1,177 @@
+"""Arguments that a compiled module refuses, by name."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from cases import SCENES
+from conftest import MODULES, Modules
+from states import QD, Q
+
+NAN = math.nan
+MASKED = np.ma.array([0.3, 1.1], mask=[0, 1])
+BAD_VALUES = [
+    ("D", ([1],), {}, r"q: shape \(1,\), expected \(2,\) or \(n, 2\): x, theta"),
+    ("D", ([[[1, 2]]],), {}, r"q: shape \(1, 1, 2\)"),
+    ("D", (5,), {}, r"q: shape \(\)"),
+    ("D", (None,), {}, r"q: "),
+    ("D", (["a", "b"],), {}, r"q: .*not an array of numbers"),
+    ("D", ([1 + 2j, 0],), {}, r"q: "),
+    ("D", (np.array([1 + 2j, 0]),), {}, r"q: .*not an array of numbers"),
+    ("D", ([[1, 2], [3]],), {}, r"q: "),
+    ("D", ([1, NAN],), {}, r"q: .*nan.* is not finite"),
+    ("D", ([1, math.inf],), {}, r"q: .*inf.* is not finite"),
+    ("C", (Q, [1, 2, 3]), {}, r"qd: shape \(3,\)"),
+    ("C", ([Q, Q], QD), {}, r"qd: shape \(2,\) beside q of shape \(2, 2\)"),
+    ("bias", (Q, [NAN, 0]), {}, r"qd: .*nan.* is not finite"),
+    ("acceleration", (Q, None), {}, r"qd: "),
+    ("step", (Q, None), {}, r"qd: "),
+    ("step", ([Q, Q], [QD, QD]), {}, r"q: shape \(2, 2\), expected \(2,\)"),
+    ("acceleration", (Q, QD), {"t": NAN}, r"t: nan is not a finite number"),
+    ("acceleration", (Q, QD), {"t": "now"}, r"t: "),
+    ("tau", (Q, QD), {"t": None}, r"t: "),
+    ("acceleration", (Q, QD), {"u": [1, 2]}, r"u: shape \(2,\), expected \(1,\)"),
+    ("acceleration", (Q, QD), {"u": [[1.0]]}, r"u: shape \(1, 1\), expected \(1,\)"),
+    ("tau", (Q, QD), {"u": NAN}, r"u: .*nan.* is not finite"),
+    ("D", (Q,), {"params": {"mc": 1}}, r"params: 'mc' is not one of m_c, m_p, l, g"),
+    ("D", (Q,), {"params": {"m_c": NAN}}, r"params: m_c: nan is not a finite number"),
+    ("D", (Q,), {"params": {"m_c": "two"}}, r"params: m_c"),
+    ("D", (Q,), {"params": {"m_c": None}}, r"params: m_c"),
+    ("D", (Q,), {"params": {"self": 1.0}}, r"params: 'self' is not one of"),
+    ("D", (Q,), {"params": {1: 1.0}}, r"params: "),
+    ("D", (Q,), {"params": [1, 2]}, r"params: expected .*4 finite numbers.*m_c, m_p, l, g"),
+    ("D", (Q,), {"params": [1, 2, 3, NAN]}, r"params: expected .*finite"),
+    ("D", (Q,), {"params": "heavy"}, r"params: "),
+    ("D", (Q,), {"out": np.zeros(4)}, r"out: .*shape \(2, 2\)"),
+    ("D", (Q,), {"out": np.zeros((2, 2), np.float32)}, r"out: .*float64"),
+    ("D", (Q,), {"out": [[0, 0], [0, 0]]}, r"out: "),
+    ("step", (Q, QD), {"out": 3}, r"out"),
+    ("step", (Q, QD), {"out": (np.zeros(2),)}, r"out"),
+    ("step", (Q, QD), {"out": (np.zeros(2), np.zeros(3))}, r"out.*shape \(2,\)"),
+    ("step", (Q, QD), {"h": 0}, r"h: 0 is not a step size"),
+    ("step", (Q, QD), {"h": -0.01}, r"h: -0.01 is not a step size: .*greater than 0"),
+    ("step", (Q, QD), {"h": -1}, r"h: -1 is not a step size"),
+    ("advice", (Q, QD), {"h": -0.01}, r"h: -0.01 is not a step size"),
+    ("step", (Q, QD), {"h": NAN}, r"h: nan"),
+    ("step", (Q, QD), {"h": "small"}, r"h: "),
+    ("D", (MASKED,), {}, r"q: 1 of 2 numbers are masked: fill them in first, with .filled"),
+    ("acceleration", ([MASKED.data] * 2, np.ma.array([QD] * 2, mask=True)), {}, r"qd: 4 of 4 num"),
+    ("step", (Q, QD), {"u": np.ma.array([1.0], mask=True)}, r"u: 1 of 1 numbers are masked"),
+    ("D", ([Q, Q],), {"t": MASKED}, r"t: 1 of 2 numbers are masked"),
+    ("D", ([Q, Q],), {"t": [0.0]}, r"t: shape \(1,\), expected one number or \(2,\)"),
+    (
+        "D",
+        (Q,),
+        {"params": np.ma.array([2.0, 2, 2, 9.8], mask=[0, 0, 1, 0])},
+        r"params: 1 of 4 num",
+    ),
+    ("acceleration", (Q, QD), {"out": MASKED.copy()}, r"out: 1 of 2 numbers are masked"),
+    ("rhs", (0, np.ma.array([*Q, *QD], mask=[0, 0, 0, 1])), {}, r"x: 1 of 4 numbers are masked"),
+    ("rhs", (0, [1, 2]), {}, r"x: shape \(2,\), expected \(4,\): q, then qd"),
+    ("rhs", (0, None), {}, r"x: "),
+]
+
+
+def identify(value: Any) -> str | None:
+    return value if isinstance(value, str) and value.isidentifier() else None
+
+
+@pytest.mark.parametrize(("name", "place", "how", "words"), BAD_VALUES, ids=identify)
+def test_a_wrong_argument_is_named(
+    driven: ModuleType, name: str, place: Any, how: Any, words: str
+) -> None:
+    with pytest.raises(ValueError, match="(?s)^" + words):
+        getattr(driven, name)(*place, **how)
+
+
+BAD_RUNS = [
+    ({"q0": [1]}, r"q0: shape \(1,\), expected \(2,\)"),
+    ({"q0": [[1, 2]]}, r"q0.*: expected one state, \(2,\)"),
+    ({"qd0": [NAN, 0]}, r"qd0: .*nan.* is not finite"),
+    ({"q0": MASKED, "steps": 1}, r"q0: 1 of 2 numbers are masked: fill them in"),
+    ({"u": np.ma.masked_less([0.0, 1.0], 0.5), "steps": 2}, r"u: 1 of 2 numbers are masked"),
+    ({"u": lambda t, q, qd: MASKED[1:], "steps": 2}, r"u: 1 of 1 numbers are masked"),
+    ({"h": 0}, r"h: 0 is not a step size: give a number of seconds greater than 0"),
+    ({"h": -0.1}, r"h: -0.1 is not a step size: give a number of seconds greater than 0"),
+    ({"h": math.inf}, r"h: inf"),
+    ({"h": 10**400}, r"h: 1000.* is not a finite number"),
+    ({"h": 1e-300, "duration": 1e300}, r"duration: 1e\+300 s are more steps .*take a larger h"),
+    ({"h": 1e-300, "duration": 1}, r"duration: 1 s are more steps"),
+    ({"steps": 10**30}, r"steps: 1e\+30 are more than a run can count"),
+    ({"q0": [0.0, 10**400]}, r"q0: .*is not an array of numbers"),
+    ({"params": [10**400, 1, 1, 1]}, r"params: expected"),
+    ({"h": "a"}, r"h: "),
+    ({"h": "0.1"}, r"h: '0.1' is not a number"),
+    ({"duration": -1}, r"duration: -1 is not a time"),
+    ({"duration": NAN}, r"duration: nan"),
+    ({"duration": "long"}, r"duration: "),
+    ({"steps": 1, "duration": 1}, r"steps: give steps or duration, not both"),
+    ({"steps": -1}, r"steps: -1 is not a whole number, "),
+    ({"steps": 1.5}, r"steps: 1.5 is not a whole number, "),
+    ({"steps": NAN}, r"steps: nan"),
+    ({"steps": "a"}, r"steps: "),
+    ({"every": 0}, r"every: 0 is not a whole number, "),
+    ({"every": -3}, r"every: -3"),
+    ({"every": 2.5}, r"every: 2.5"),
+    ({"every": NAN}, r"every: nan"),
+    ({"every": None}, r"every: None"),
+    ({"t0": NAN}, r"t0: nan is not a finite number"),
+    ({"t0": "a"}, r"t0: "),
+    ({"method": "euler"}, r"method: 'euler' is not in this module"),
+    ({"params": {"x": 1}}, r"params: 'x' is not one of"),
+    ({"u": [1, 2, 3], "steps": 2}, r"u: 3 rows for 2 steps: give one row a step"),
+    ({"u": np.ones((3, 2)), "steps": 3}, r"u: shape \(3, 2\), expected \(1,\) or \(n, 1\)"),
+    ({"u": [1, NAN], "steps": 2}, r"u\[1, 0\]: nan in float64 is not finite"),
+    ({"u": []}, r"u: "),
+    ({"u": "push"}, r"u: .* not an array of numbers"),
+    ({"out": 3}, r"out"),
+    ({"out": (np.zeros((3, 2)),)}, r"out"),
+    ({"out": (np.zeros((3, 2)), np.zeros((3, 2)))}, r"out\[0\]: .*shape \(2001, 2\)"),
+]
+
+
+# the words as names: a function's own differ from process to process
+@pytest.mark.parametrize(("how", "words"), BAD_RUNS, ids=[words for _, words in BAD_RUNS])
+def test_a_wrong_argument_of_a_run_is_named(driven: ModuleType, how: Any, words: str) -> None:
+    with pytest.raises(ValueError, match="(?s)^" + words):
+        driven.simulate(**how)
+
+
+@pytest.mark.parametrize("u", [1.0, [], lambda t, q, qd: 0.0])
+def test_a_scene_without_inputs_takes_none(cartpole: ModuleType, u: Any) -> None:
+    for call in (cartpole.tau, cartpole.acceleration, cartpole.step):
+        with pytest.raises(ValueError, match=r"^u: this scene has no inputs"):
+            call(Q, QD, u=u)
+    with pytest.raises(ValueError, match=r"^u: this scene has no inputs"):
+        cartpole.simulate(u=u)
+
+
+def test_another_scenes_params_are_refused(cartpole: ModuleType, modules: Modules) -> None:
+    with pytest.raises(ValueError, match=r"^params: these are another scene's: m, l, g"):
+        cartpole.D(Q, params=modules("simple_pendulum").Params())
+
+
+def test_velocities_left_out_are_refused_not_read_from_nowhere() -> None:
+    """In a process of its own: a null pointer would end this one."""
+    tries = "\n".join(
+        f"try: m.{name}([0.0, 1.0], None)\n"
+        "except ValueError as e: assert str(e).startswith('qd:')\n"
+        f"else: raise SystemExit('{name} took None')"
+        for name in ("C", "bias", "tau", "kinetic_energy", "energy", "jacobi", "power", "signal")
+    )
+    code = f"import eomc\nm = eomc.load({str(SCENES / 'cartpole_driven.toml')!r}, {str(MODULES)!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{tries}"], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr or f"ended by signal {-done.returncode}"
+
+
+def test_too_many_rows_are_told_before_the_run(cartpole: ModuleType) -> None:
+    with pytest.raises(MemoryError, match=r"rows of 4 numbers don't fit in memory.*every="):
+        cartpole.simulate(steps=10**15)

@@ -1,0 +1,134 @@
+"""Instances of a batch that end early, and Ctrl-C."""
+
+from __future__ import annotations
+
+import _thread
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from batches import STEPS, module, starts
+
+import eomc
+
+
+def test_a_bad_instance_leaves_the_others_alone() -> None:
+    m = module("kepler_orbit")
+    q0, qd0 = np.tile(m.start[0], (100, 1)), np.tile(m.start[1], (100, 1))
+    good = m.simulate_batch(q0, qd0, steps=STEPS, every=7)
+    q0[41] = 0.0  # at the centre, where the force is infinite
+    runs = m.simulate_batch(q0, qd0, steps=STEPS, every=7)
+    assert runs.status[41] == "not finite" and runs.steps[41] == 0
+    assert np.array_equal(runs.q[41, 0], q0[41]) and np.isnan(runs.q[41, 1:]).all()
+    others = np.arange(100) != 41
+    assert set(runs.status[others]) == {"ok"}
+    assert np.array_equal(runs.q[others], good.q[others])
+
+
+@pytest.mark.parametrize("m_c", [-1.0, -3.0])
+def test_a_singular_instance_is_reported_though_its_numbers_are_finite(m_c: float) -> None:
+    """A cart of -1 kg and a pole of 2 kg: D is indefinite, and elimination goes through.
+
+    Of -3 kg: its first pivot is negative, whatever the state; the second one is positive then.
+    """
+    m = module("cartpole")
+    q0, qd0 = starts(m, 70)
+    masses = np.full(70, m.defaults["m_c"])
+    q0[41, 1], masses[41] = 0.3, m_c
+    with pytest.warns(RuntimeWarning, match="D is not positive definite"):
+        alone = m.simulate(q0[41], qd0[41], steps=STEPS, params={"m_c": masses[41]})
+    runs = m.simulate_batch(q0, qd0, steps=STEPS, params={"m_c": masses})
+    assert (runs.status[41], runs.steps[41]) == (alone.status, alone.steps) == ("singular", 0)
+    assert np.array_equal(runs.q[41, 0], q0[41]) and np.isnan(runs.q[41, 1:]).all()
+    others = np.arange(70) != 41
+    apart = m.simulate_batch(q0[others], qd0[others], steps=STEPS, params={"m_c": masses[others]})
+    assert set(runs.status[others]) == {"ok"}
+    assert np.array_equal(runs.q[others], apart.q) and np.array_equal(runs.qd[others], apart.qd)
+    shared = m.simulate_batch(q0[41], qd0[40:43], steps=STEPS, params={"m_c": m_c})
+    assert shared.status[1] == "singular" and not shared.steps[1]
+    assert m_c > -2 or (set(shared.status), shared.steps.any()) == ({"singular"}, False)
+
+
+@pytest.mark.parametrize("method", ["rk4", "dp8"])
+def test_positions_and_velocities_overflow_each_alone(method: str, tmp_path: Path) -> None:
+    """Under a force, near the largest double; what the other makes of it is finite."""
+    (tmp_path / "push.toml").write_text(
+        "eomc = 1\nname = 'push'\n[coordinates]\nx = {}\n[parameters]\nf = 1e299\n[energy]\n"
+        "kinetic = 'x_dot**2/2'\npotential = '-f*x'\n"
+        f"[run]\nh = 0.01\nbatch = true\nmethod = '{method}'\n",
+        encoding="utf-8",
+    )
+    m = eomc.load(tmp_path / "push.toml", tmp_path)
+    largest = np.finfo(float).max
+    q0, qd0 = np.zeros((9, 1)), np.zeros((9, 1))
+    qd0[2] = largest
+    q0[5], qd0[5] = largest, 1e300
+    runs = m.simulate_batch(q0, qd0, steps=3)
+    assert runs.steps.tolist() == [3, 3, 0, 3, 3, 0, 3, 3, 3]
+    for k in (2, 5):
+        with pytest.warns(RuntimeWarning, match="no longer be finite"):
+            alone = m.simulate(q0[k], qd0[k], steps=3)
+        assert runs.status[k] == alone.status == "not finite"
+        assert runs.q[k, 0] == q0[k] and runs.qd[k, 0] == qd0[k] and np.isnan(runs.q[k, 1:]).all()
+
+
+def test_an_instance_that_fails_on_the_way_keeps_its_last_state() -> None:
+    m = module("mass_spring")
+    k = np.full(9, m.defaults["k"])
+    k[4] *= 1e6  # far beyond the stability limit: it grows until it overflows
+    with pytest.warns(RuntimeWarning, match="not finite|no longer be finite"):
+        alone = m.simulate(steps=400, every=5, params={"k": k[4]})
+    runs = m.simulate_batch(steps=400, every=5, params={"k": k})
+    assert 5 < alone.steps < 400 and runs.status[4] == alone.status == "not finite"
+    assert runs.steps[4] == alone.steps
+    rows = len(alone.t)
+    assert np.allclose(runs.q[4, :rows], alone.q, rtol=1e-9)
+    assert np.isnan(runs.q[4, rows:]).all() and np.isfinite(runs.q[5]).all()
+
+
+def test_ctrl_c_stops_within_a_second_and_keeps_what_was_done() -> None:
+    m = module("kepler_orbit")
+    q0, qd0 = np.tile(m.start[0], (300, 1)), np.tile(m.start[1], (300, 1))
+    threading.Timer(0.3, _thread.interrupt_main).start()
+    begun = time.perf_counter()
+    with pytest.raises(m.Interrupted) as stop:
+        m.simulate_batch(q0, qd0, steps=10**9, every=10**8)
+    assert time.perf_counter() - begun < 1.3
+    assert stop.value.run.steps.sum() > 0 and "interrupted" in stop.value.run.message
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_instances_that_ctrl_c_came_before_are_at_their_start(threads: int) -> None:
+    m = module("kepler_orbit")
+    count = 30_000  # more than a thread takes at once
+    q0 = np.tile(m.start[0], (count, 1)) * np.linspace(0.9, 1.1, count)[:, None]
+    qd0 = np.tile(m.start[1], (count, 1))
+    threading.Timer(0.3, _thread.interrupt_main).start()
+    with pytest.raises(m.Interrupted) as stop:
+        m.simulate_batch(q0, qd0, steps=10**6, every=10**6, threads=threads)
+    run = stop.value.run
+    assert run.steps[0] > 0 and run.steps[-1] == 0
+    assert np.array_equal(run.q[-1, 0], q0[-1]) and np.isnan(run.q[-1, 1]).all()
+    assert np.array_equal(run.qd[:, 0], qd0)
+
+
+def test_instances_that_end_one_after_another_leave_the_last_alone() -> None:
+    """Copies take the places of those that ended, and may have to be replaced themselves."""
+    m = module("mass_spring")
+    k = np.full(70, m.defaults["k"])
+    k[:63] *= np.geomspace(
+        1e6, 1e9, 63
+    )  # the stiffer, the sooner it overflows; one of a tile stays
+    k[66] *= 1e8
+    runs = m.simulate_batch(steps=400, every=5, params={"k": k})
+    stays = np.setdiff1d(np.arange(63, 70), [66])
+    assert set(runs.status[stays]) == {"ok"} and len(set(runs.steps[:63])) > 10
+    for at in (0, 31, 62, 66):
+        with pytest.warns(RuntimeWarning):
+            alone = m.simulate(steps=400, every=5, params={"k": k[at]})
+        assert (runs.status[at], runs.steps[at]) == (alone.status, alone.steps)
+        assert np.allclose(runs.q[at, : len(alone.t)], alone.q, rtol=1e-9)
+    undisturbed = m.simulate_batch(steps=400, every=5, params={"k": k[stays]})
+    assert np.array_equal(runs.q[stays], undisturbed.q)

@@ -1,0 +1,132 @@
+"""The compiled module as a package: what it says of itself, and beside other modules."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from cases import SCENES
+from conftest import MODULES, Modules
+
+import eomc
+from eomc.model.system import System, symbol, t
+
+PENDULUM = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
+
+
+def test_says_what_it_is(cartpole: ModuleType, driven: ModuleType) -> None:
+    assert cartpole.coordinates == ("x", "theta")
+    assert cartpole.parameters == ("m_c", "m_p", "l", "g")
+    assert cartpole.inputs == ()
+    assert driven.inputs == ("force",)
+    assert cartpole.defaults == {"m_c": 2.0, "m_p": 2.0, "l": 2.0, "g": 9.8}
+    assert cartpole.units["theta"] == "rad"
+    assert driven.units["force"] == "N"
+    assert cartpole.title == "Cart-pole"
+    assert "m_c = 2.0: kg, mass of the cart" in cartpole.__doc__
+    assert set(cartpole.__all__) >= {"D", "C", "g", "bias", "acceleration", "step", "simulate"}
+
+
+def test_start_is_the_scenes_whatever_is_done_to_it(cartpole: ModuleType) -> None:
+    q, qd = cartpole.start
+    assert q.tolist() == [0, math.pi / 2]
+    assert qd.tolist() == [0, 0]
+    with contextlib.suppress(ValueError):  # it may be read-only
+        q[0] = 7
+    try:
+        assert cartpole.start[0].tolist() == [0, math.pi / 2]
+        assert cartpole.simulate(steps=0).q.tolist() == [[0, math.pi / 2]]
+    finally:
+        if q.flags.writeable:
+            q[0] = 0
+
+
+def test_params_know_their_names(cartpole: ModuleType) -> None:
+    p = cartpole.Params(m_c=3.0)
+    assert p.m_c == 3.0
+    assert p.m_p == 2.0
+    p.m_p = 5
+    assert repr(p) == "Params(m_c=3, m_p=5, l=2, g=9.8)"
+    assert list(p) == list(cartpole.parameters)
+    with pytest.raises(ValueError, match=r"params: 'mass' is not one of m_c, m_p, l, g"):
+        p.mass = 1.0
+    with pytest.raises(ValueError, match=r"params: m_c: nan is not a finite number"):
+        p.m_c = math.nan
+
+
+def test_a_parameter_may_have_any_name_that_a_scene_may_use(everything: ModuleType) -> None:
+    """`values`, `h`, `I`: what they mean is what the scene says, in Params too."""
+    p = everything.Params()
+    assert {n: getattr(p, n) for n in everything.parameters} == everything.defaults
+    for name in everything.parameters:
+        given = everything.Params(**{name: 2.5})
+        assert getattr(given, name) == 2.5, name
+
+
+def test_modules_side_by_side(cartpole: ModuleType, driven: ModuleType, modules: Modules) -> None:
+    """Each keeps its own names, sizes and numbers, and loading again gives the same one."""
+    spring = modules("mass_spring")
+    assert [m.D(np.zeros(len(m.coordinates))).shape for m in (cartpole, spring)] == [(2, 2), (1, 1)]
+    assert spring.simulate(h=0.01, duration=1).q[-1] == pytest.approx(math.cos(1), abs=1e-9)
+    assert eomc.load(SCENES / "cartpole.toml", MODULES) is cartpole
+    assert driven.Params is not cartpole.Params
+
+
+def test_a_changed_scene_is_a_new_module_in_the_same_process(tmp_path: Path) -> None:
+    """And the old one, still held, still works."""
+    file = tmp_path / "simple_pendulum.toml"
+    file.write_text(PENDULUM, encoding="utf-8")
+    old = eomc.load(file, tmp_path / "build")
+    file.write_text(PENDULUM.replace('"m*g*y"', '"2*m*g*y"'), encoding="utf-8")
+    new = eomc.load(file, tmp_path / "build")
+    assert new.g([1.0]) == 2 * old.g([1.0])
+    assert new.simulate(steps=10).q[-1] != old.simulate(steps=10).q[-1]
+    file.write_text(PENDULUM, encoding="utf-8")
+    assert eomc.load(file, tmp_path / "build").g([1.0]) == old.g([1.0])
+
+
+def test_the_folder_is_a_package_that_needs_numpy_and_cffi_alone(tmp_path: Path) -> None:
+    """PYTHONPATH=build, `import cartpole`; neither the generator nor SymPy is there."""
+    folder = eomc.build(SCENES / "cartpole.toml", MODULES).folder
+    code = """
+import importlib.abc, sys
+class Refuse(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("eomc", "sympy", "jinja2", "pydantic", "click", "rich"):
+            raise ImportError(f"{name} is not for a compiled scene")
+sys.meta_path.insert(0, Refuse())
+import cartpole
+assert cartpole.simulate().status == "ok"
+assert cartpole.__name__ == "cartpole"
+strange = {m.split(".")[0] for m in sys.modules} & {"eomc", "sympy", "scipy"}
+assert not strange, strange
+print(cartpole.__file__)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True, text=True, cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(folder.parent)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()).parent == folder
+
+
+def test_a_module_from_sympy_expressions() -> None:
+    """The same compiled face; time in K and an input beside it."""
+    x, v, m, u = symbol("x"), symbol("x_dot"), symbol("m"), symbol("u")
+    system = System.make(
+        "rocket", {x: (0.0, 1.0)}, m * (2 - t) * v**2 / 2, parameters={m: 3}, inputs={u: t},
+        forces={x: u}, h=0.1, duration=1,
+    )  # fmt: skip
+    rocket = eomc.load(system, MODULES)
+    assert rocket.D([0.0], t=0.5) == pytest.approx(4.5)
+    # d/dt (m (2 - t) v) = t: m (2 - t) v = 6 + t^2/2
+    run = rocket.simulate(h=0.001, duration=1)
+    assert run.qd[-1, 0] == pytest.approx(6.5 / 3, abs=1e-12)
