@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -80,6 +80,17 @@ def _escaped(found: re.Match[str]) -> str:
 def flat(text: str) -> str:
     """A note of several lines as one, blanks and line breaks together one blank."""
     return line(" ".join(re.split(r"[ \t\r\n]+", text.strip(" \t\r\n"))))
+
+
+def listed(names: Collection[str], most: int = 12) -> str:
+    """Names in a line, the first of many."""
+    shown = ", ".join([*names][:most]) or "none"
+    return shown + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def plural(word: str, n: int) -> str:
+    """The word for n things."""
+    return word if n == 1 else word + ("es" if word.endswith(("x", "sh")) else "s")
 
 
 def comment(text: str) -> str:

@@ -20,6 +20,7 @@ from eomc.derive.vectors import AXES, ZERO, Vector
 from eomc.model.exact import Matrix
 
 Rows = list[list[Expr]]
+Column = tuple[Sequence[Expr], Sequence[Expr]]  # of an inertia along a joint: moment, force
 Pairs = tuple[tuple[Expr, Expr], ...]
 
 
@@ -63,18 +64,15 @@ class _Articulated:
         size: list[Expr] = [S.Zero] * n
         pivots: list[tuple[Expr, Expr]] = []
         inverse: list[Expr] = [S.Zero] * n
-        columns: list[tuple[Vector, Vector]] = [(ZERO, ZERO)] * n
+        columns: list[Column] = [(ZERO, ZERO)] * n
         left: list[Expr] = [S.Zero] * n
         for k in reversed(range(n)):
             link, body, a = self.links[k], bodies[k], self.links[k].axis
             if link.turns:
-                u_m = (body.J[0][a], body.J[1][a], body.J[2][a])
-                u_f = (body.H[a][0], body.H[a][1], body.H[a][2])
-                own = u_m[a]
+                u_m, u_f = body.J[a], body.H[a]
             else:
-                u_m = (body.H[0][a], body.H[1][a], body.H[2][a])
-                u_f = (body.M[0][a], body.M[1][a], body.M[2][a])
-                own = u_f[a]
+                u_m, u_f = [row[a] for row in body.H], body.M[a]
+            own = (u_m if link.turns else u_f)[a]
             d = r.add(own, r.armature[k])
             if d == 0:
                 raise MasslessError(k)
@@ -99,7 +97,7 @@ class _Articulated:
 
     def _outwards(
         self,
-        columns: Sequence[tuple[Vector, Vector]],
+        columns: Sequence[Column],
         inverse: Sequence[Expr],
         left: Sequence[Expr],
     ) -> list[Expr]:
@@ -146,14 +144,11 @@ class _Articulated:
         M = [[x.mass if i == j else S.Zero for j in range(3)] for i in range(3)]
         return _Inertia(J, H, M)
 
-    def _reduced(
-        self, k: int, body: _Inertia, column: tuple[Vector, Vector], inverse: Expr
-    ) -> _Inertia:
+    def _reduced(self, k: int, body: _Inertia, column: Column, inverse: Expr) -> _Inertia:
         """I - U U^T / d; without armature exactly zero along the joint."""
         r, link = self.r, self.links[k]
         u_m, u_f = column
         w_m, w_f = r.scaled(u_m, inverse), r.scaled(u_f, inverse)
-        gone = r.armature[k] == 0
 
         def less(old: Expr, a: Expr, b: Expr) -> Expr:
             return r.add(old, r.minus(r.times(a, b)))
@@ -161,7 +156,7 @@ class _Articulated:
         J = self._symmetric(lambda i, j: less(body.J[i][j], w_m[i], u_m[j]))
         M = self._symmetric(lambda i, j: less(body.M[i][j], w_f[i], u_f[j]))
         H = [[less(body.H[i][j], w_m[i], u_f[j]) for j in range(3)] for i in range(3)]
-        if gone:
+        if r.armature[k] == 0:
             a = link.axis
             for i in range(3):
                 if link.turns:
@@ -180,9 +175,7 @@ class _Articulated:
         add = self.r.add
 
         def both(a: Rows, b: Rows) -> Rows:
-            return [
-                [add(x, y) for x, y in zip(p, q, strict=True)] for p, q in zip(a, b, strict=True)
-            ]
+            return [list(map(add, p, q)) for p, q in zip(a, b, strict=True)]
 
         return _Inertia(both(one.J, other.J), both(one.H, other.H), both(one.M, other.M))
 
@@ -199,10 +192,10 @@ class _Articulated:
         arm = r.arm[k]
         if arm == ZERO:
             return x
-        columns = [r.cross(arm, (x.M[0][j], x.M[1][j], x.M[2][j])) for j in range(3)]
+        columns = [r.cross(arm, column) for column in x.M]
         H = [[r.add(x.H[i][j], columns[j][i]) for j in range(3)] for i in range(3)]
-        from_right = [r.cross((row[0], row[1], row[2]), arm) for row in H]
-        from_left = [r.cross(arm, (row[0], row[1], row[2])) for row in x.H]
+        from_right = [r.cross(row, arm) for row in H]
+        from_left = [r.cross(arm, row) for row in x.H]
         J = self._symmetric(
             lambda i, j: r.add(x.J[i][j], r.minus(from_right[i][j]), from_left[j][i])
         )
@@ -232,9 +225,7 @@ class _Articulated:
 
     def _rotated(self, R: Matrix, m: Rows, symmetric: bool) -> Rows:
         r = self.r
-        half = [r.apply(R, (row[0], row[1], row[2])) for row in m]  # m R^T by rows
+        columns = list(zip(*(r.apply(R, row) for row in m), strict=True))  # of m R^T
         if symmetric:
-            return self._symmetric(lambda i, j: r.dot(R[i], (half[0][j], half[1][j], half[2][j])))
-        return [
-            [r.dot(R[i], (half[0][j], half[1][j], half[2][j])) for j in range(3)] for i in range(3)
-        ]
+            return self._symmetric(lambda i, j: r.dot(R[i], columns[j]))
+        return [[r.dot(row, column) for column in columns] for row in R]

@@ -21,7 +21,12 @@ WRITTEN_OUT = 2500  # names on the tape, about, from which C is computed column 
 
 @dataclass(frozen=True)
 class Motion:
-    """What Lagrange's equations give: D, bias, its part g at rest, tau and D qdd = balance."""
+    """What Lagrange's equations give, as atoms of a tape; shapes as in the field: D, C (nq, nq).
+
+    D: by rows, or where that would be long a single column, D e, for a direction e whose entries
+    are `along`. g: the part of bias at rest. balance: b in D qdd = b. notes: where unusual terms of
+    K went.
+    """
 
     D: Rows
     bias: Vector
@@ -33,30 +38,20 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Equations:
-    """The equations of motion as atoms of a tape; shapes as in the field: D, C (nq, nq).
+class Equations(Motion):
+    """The equations of motion. C: as D; kinetic, potential: K and P.
 
-    D, C: by rows, or where that would be long a single column, D e and C e, for a direction e
-    whose entries are the leaves `along` (then `is_column`). kinetic, potential: K and P.
     jacobi: p.qd - K + P, what is conserved without forces and explicit time; None where it is
-    K + P. power: d(jacobi)/dt; 0 for a conservative system. balance: b in D qdd = b.
-    notes: where unusual terms of K went.
+    K + P. power: d(jacobi)/dt; 0 for a conservative system.
     """
 
-    system: System
     tape: Tape
-    D: Rows
     C: Rows
-    g: Vector
-    bias: Vector
-    tau: Vector
     signals: Vector
     kinetic: Expr
     potential: Expr
     jacobi: Expr | None
     power: Expr
-    balance: Vector
-    notes: tuple[str, ...]
 
 
 def along(system: System) -> list[Symbol]:
@@ -81,20 +76,14 @@ def equations(system: System, e: Energies, motion: Motion) -> Equations:
     works = [tape.define(force * v) for force, v in zip(e.forces, qd, strict=True)]
     power = add(*works, -lost, explicit[1], -explicit[0])
     return Equations(
-        system=system,
+        **vars(motion),
         tape=tape,
-        D=motion.D,
         C=_coriolis(system, tape, motion.bias, motion.quadratic),
-        g=motion.g,
-        bias=motion.bias,
-        tau=motion.tau,
         signals=tuple(e.signals),
         kinetic=e.kinetic,
         potential=e.potential,
         jacobi=jacobi,
         power=power,
-        balance=motion.balance,
-        notes=motion.notes,
     )
 
 

@@ -167,7 +167,7 @@ class Recursion(Vectors):
         if all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
             return x
         full = [[x.entry(i, j) for j in range(3)] for i in range(3)]
-        half = [self.apply(R, (row[0], row[1], row[2])) for row in full]  # (R I)^T, I symmetric
+        half = [self.apply(R, row) for row in full]  # (R I)^T, I symmetric
         columns = list(zip(*half, strict=True))
         pairs = combinations_with_replacement(range(3), 2)
         inertia = {(i, j): self.dot(R[j], columns[i]) for i, j in pairs}
@@ -251,7 +251,7 @@ class Recursion(Vectors):
             p, r = link.parent, self.arm[k]
             alpha, at = (alphas[p], origins[p]) if p >= 0 else (ZERO, fall)
             if p >= 0 and r != ZERO:
-                at = self.plus(at, self._applied(matrices[p], r))
+                at = self.plus(at, self.apply(matrices[p], r))
             alpha, at = self.outwards(k, alpha), self.outwards(k, at)
             turning = self.outwards(k, spin[p]) if p >= 0 else ZERO
             own = self.on_axis(k, rates[k])
@@ -266,13 +266,9 @@ class Recursion(Vectors):
             U = self._acceleration_matrix(alpha, squares)
             matrices.append(U)
             x = self.inertia[k]
-            out.force.append(self.plus(self.scaled(at, x.mass), self._applied(U, x.moment)))
+            out.force.append(self.plus(self.scaled(at, x.mass), self.apply(U, x.moment)))
             out.moment.append(self._moment(x, spin[k], alpha, at, U))
         return out
-
-    def _applied(self, U: list[list[Expr]], v: Vector) -> Vector:
-        x, y, z = (self.dot((row[0], row[1], row[2]), v) for row in U)
-        return (x, y, z)
 
     def _squares(self, w: Vector) -> dict[tuple[int, int], Expr]:
         pairs = combinations_with_replacement(range(3), 2)
@@ -395,7 +391,7 @@ class Recursion(Vectors):
             velocities.append(v)
             x, w = self.inertia[k], spin[k]
             whole = [[x.entry(i, j) for j in range(3)] for i in range(3)]
-            momentum = self._applied(whole, w)
+            momentum = self.apply(whole, w)
             terms += [
                 self.times(self.define(x.mass / 2), self.dot(v, v)),
                 self.dot(v, self.cross(w, x.moment)),

@@ -41,33 +41,33 @@ class Vectors:
         x, y, z = map(self.define, v)
         return (x, y, z)
 
-    def plus(self, *vectors: Vector) -> Vector:
+    def plus(self, *vectors: Sequence[Expr]) -> Vector:
         """Their sum."""
         x, y, z = (self.add(*parts) for parts in zip(*vectors, strict=True))
         return (x, y, z)
 
-    def dot(self, a: Vector, b: Vector) -> Expr:
+    def dot(self, a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
         """a . b"""
         return self.add(*(self.times(x, y) for x, y in zip(a, b, strict=True)))
 
-    def cross(self, a: Vector, b: Vector) -> Vector:
+    def cross(self, a: Sequence[Expr], b: Sequence[Expr]) -> Vector:
         """a x b"""
         x, y, z = (
             self.add(self.times(a[i], b[j]), self.minus(self.times(a[j], b[i]))) for i, j in AXES
         )
         return (x, y, z)
 
-    def apply(self, R: Sequence[Vector], v: Vector) -> Vector:
+    def apply(self, R: Sequence[Sequence[Expr]], v: Sequence[Expr]) -> Vector:
         """R v"""
         x, y, z = (self.dot(row, v) for row in R)
         return (x, y, z)
 
-    def applied_transposed(self, R: Sequence[Vector], v: Vector) -> Vector:
+    def applied_transposed(self, R: Sequence[Sequence[Expr]], v: Sequence[Expr]) -> Vector:
         """R^T v"""
         x, y, z = (self.dot(column, v) for column in zip(*R, strict=True))
         return (x, y, z)
 
-    def scaled(self, v: Vector, x: Expr) -> Vector:
+    def scaled(self, v: Sequence[Expr], x: Expr) -> Vector:
         """x v"""
         a, b, c = (self.times(e, x) for e in v)
         return (a, b, c)

@@ -60,7 +60,7 @@ class Kinematics:
         self.start = np.array(scene.start()[0])
         self.tree = [body for body in assembly.bodies if body.joint]
         self.placed = [body for body in assembly.bodies if not body.joint]
-        # these hang on parameters only
+        # these depend on parameters only
         self.frames = {body.name: self.joint_frame(body) for body in self.tree}
         self.centers = {body.name: self.vector(body.center, self.values) for body in self.tree}
         self.roots = {body.name: self._roots(body) for body in assembly.bodies}

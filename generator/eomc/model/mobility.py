@@ -1,7 +1,7 @@
 """M = d(N - 1 - j) + sum f_i: how many freedoms a scene of bodies and joints has, and which.
 
 The count (Chebychev, Grübler, Kutzbach; e.g. Angeles, *Fundamentals of Robotic Mechanical
-Systems*) is held against ranks: of the poses of all bodies over the coordinates, which shows
+Systems*) is compared with ranks: of the poses of all bodies over the coordinates, which shows
 coordinates that move nothing or nothing of their own, and of the mass matrix of the bodies, which
 shows those that move nothing with inertia. Both are taken from plain forward kinematics, of bodies
 placed by formulas from its finite differences, at random states and at the start. Where the joints
@@ -12,13 +12,14 @@ thousands of bodies a matter of seconds.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from eomc.base.errors import EomcError, Problem
+from eomc.base.texts import listed, plural
 from eomc.model.kinematics import Array, Kinematics, Null
 from eomc.scene import formulas
 from eomc.scene.assembly import Assembly, Body, Damper, Spring
@@ -56,12 +57,12 @@ class Mobility:
         j, total = self.bodies, sum(n * _freedoms(k, self.d) for k, n in self.joints.items())
         where = "in the plane" if self.d == 3 else "in space"
         lines = [
-            f"{self.scene}: {self.M} {_plural('freedom', self.M)} {where}",
+            f"{self.scene}: {self.M} {plural('freedom', self.M)} {where}",
             f"  N = {self.bodies + 1} links, the world among them",
             f"  j = {j} joints: {kinds}",
             f"  M = d(N - 1 - j) + sum f = {self.d}({self.bodies + 1} - 1 - {j}) + {total} "
             f"= {self.M}",
-            f"  {self.coordinates} {_plural('coordinate', self.coordinates)}, {self.rank} of them "
+            f"  {self.coordinates} {plural('coordinate', self.coordinates)}, {self.rank} of them "
             "independent in how they move the bodies",
             *(f"  - {remark}" for remark in self.remarks),
         ]
@@ -165,7 +166,7 @@ def _freedoms(kind: str, d: int) -> int:
 def _fixed(assembly: Assembly) -> Iterator[str]:
     rigid = [body.name for body in assembly.bodies if body.joint == "fixed"]
     if rigid:
-        yield f"fixed (f = 0), moving as one with what they are fixed to: {_listed(rigid)}"
+        yield f"fixed (f = 0), moving as one with what they are fixed to: {listed(rigid)}"
 
 
 def _shared(assembly: Assembly) -> Iterator[str]:
@@ -176,7 +177,7 @@ def _shared(assembly: Assembly) -> Iterator[str]:
     for name, bodies in holders.items():
         if len(bodies) > 1:
             yield (
-                f"'{name}' moves {len(bodies)} joints, those of {_listed(bodies)}: M counts each, "
+                f"'{name}' moves {len(bodies)} joints, those of {listed(bodies)}: M counts each, "
                 f"they are {len(bodies) - 1} fewer"
             )
 
@@ -186,20 +187,20 @@ def _formulas_fix(
 ) -> Iterator[str]:
     if placed:
         yield (
-            f"{_listed(b.name for b in placed)}: M counts {d} freedoms for each body that is "
+            f"{listed([b.name for b in placed])}: M counts {d} freedoms for each body that is "
             f"placed by formulas; the formulas fix {M - rank} of the {M}, which leaves {rank}"
         )
 
 
 def _moves_nothing(at: Null, names: Sequence[str], by_hand: bool) -> Iterator[str]:
-    """Coordinates that no body hangs on, or that move bodies only in combinations."""
+    """Coordinates that no body depends on, or that move bodies only in combinations."""
     result = "D is singular" + (" unless [energy] gives it inertia" if by_hand else "")
     for row in at.moves:
         yield f"redundant: {_combination(row, names)} moves no body; {result}"
     known = at.moves
     for row in at.weighs:
         more = np.vstack([known, row])
-        if np.linalg.matrix_rank(more, tol=1e-4) > len(known):  # not a motion told above
+        if np.linalg.matrix_rank(more, tol=1e-4) > len(known):  # not a motion named above
             known = more
             what = _combination(row, names)
             yield f"without inertia: {what} moves nothing that has inertia against it; {result}"
@@ -244,7 +245,7 @@ def _singular_start(kinematics: Kinematics, generic: Null) -> Iterator[str]:
         (at_start.weighs, generic.weighs, "have inertia"),
     ):
         if len(null) > len(usual):
-            lost = _listed([_combination(row, names) for row in null])
+            lost = listed([_combination(row, names) for row in null])
             yield (
                 f"singular start: {len(names) - len(null)} coordinates {what} there, elsewhere "
                 f"{len(names) - len(usual)}: there {lost} does not. Start with another value of "
@@ -265,14 +266,3 @@ def _combination(row: Array, names: Sequence[str]) -> str:
 def _named(row: Array, names: Sequence[str]) -> list[str]:
     large = np.abs(row) > 1e-3 * np.abs(row).max()
     return [name for name, named in zip(names, large, strict=True) if named]
-
-
-def _listed(those: Iterable[str]) -> str:
-    names = list(those)
-    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-
-
-def _plural(word: str, n: int) -> str:
-    if n == 1:
-        return word
-    return word[:-1] + "ies" if word.endswith("y") else word + "s"

@@ -8,33 +8,15 @@ tree says the same body by body, for the recursive routes (derive/newton_euler.p
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import sympy
 from sympy import Add, Expr, S, Symbol
 
-from eomc.base.spatial import (
-    about_axis,
-    apply,
-    moved_inertia,
-    plus,
-    product,
-    rotated_inertia,
-    scaled,
-    transposed,
-)
-from eomc.base.spatial import dot as dot_product
-from eomc.model.exact import (
-    ONE,
-    ZERO,
-    Matrix,
-    Vector,
-    aligned_with,
-    clean,
-    numeric,
-    numeric_entry,
-    unit,
-)
+from eomc.base import spatial
+from eomc.base.spatial import apply, plus, product, scaled, transposed
+from eomc.model import exact
+from eomc.model.exact import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
 from eomc.model.symbols import dot, symbol
 from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Spring
 from eomc.scene.formulas import Formula
@@ -47,7 +29,7 @@ Value = Callable[[str, Formula], Expr]  # the expression of a formula that stand
 class Link:
     """An elementary joint and the mass that moves with it, in the frame that the joint moves.
 
-    The frame stands at `offset` in the parent's frame, turned by `rotation` (it takes vectors of
+    The frame stands at `offset` in the parent's frame, rotated by `rotation` (it takes vectors of
     the joint's frame to the parent's), and then turns about (`turns`) or slides along its own
     `axis` (0, 1, 2) by `q`. mass, moment (mass times centre of mass) and inertia (Ixx, Iyy, Izz,
     Ixy, Ixz, Iyz) are about the frame's origin.
@@ -61,10 +43,10 @@ class Link:
     qd: Symbol
     offset: Vector
     rotation: Matrix
-    mass: Expr
-    moment: Vector
-    inertia: tuple[Expr, ...]
-    armature: Expr
+    mass: Expr = S.Zero
+    moment: Vector = ZERO
+    inertia: tuple[Expr, ...] = (S.Zero,) * 6
+    armature: Expr = S.Zero
 
 
 @dataclass(frozen=True)
@@ -101,7 +83,7 @@ class Terms:
     gravity: Vector = ZERO
 
     def tree(self, kinetic: Expr, potential: Expr) -> Tree | None:
-        """The tree, beside energies that were written by hand; None where nothing is in it."""
+        """The tree, besides energies that were written by hand; None where it is empty."""
         if not self.links:
             return None
         return Tree(
@@ -140,13 +122,14 @@ class Builder:
     # --- the tree --------------------------------------------------------------------------------
 
     def build_tree(self) -> None:
-        """Every body that hangs on a joint."""
+        """Every body that is held by a joint."""
         for body in self.assembly.bodies:
             if body.joint:
-                self._hang(body)
-        self._collect_masses()
+                self._join(body)
+        for link in self.terms.links:
+            self.terms.tree_kinetic.append(link.armature * link.qd**2 / 2)
 
-    def _hang(self, body: Body) -> None:
+    def _join(self, body: Body) -> None:
         key = f"body.{body.name}"
         parent = self.places[body.parent]
         offset = self._vector(f"{key}.offset", body.offset) if body.offset else ZERO
@@ -159,7 +142,7 @@ class Builder:
         place = _Place(
             parent.link,
             plus(parent.offset, apply(parent.rotation, numeric(offset))),
-            clean(product(parent.rotation, clean(rotation))),
+            exact.clean(product(parent.rotation, exact.clean(rotation))),
             at,
             turned,
             angle,
@@ -171,7 +154,7 @@ class Builder:
             )
         if not self.assembly.plane and body.joint != "fixed":
             turned = self._entries(body.name, place.turned)
-            place = _Place(place.link, place.offset, place.rotation, place.at, turned)
+            place = replace(place, turned=turned)
         self.places[body.name] = place
         self._load(body, place)
 
@@ -182,14 +165,14 @@ class Builder:
         """The place behind one more elementary joint, which becomes a link."""
         terms = self.terms
         q, qd = symbol(coordinate), symbol(f"{coordinate}_dot")
-        k, aligned = aligned_with(axis)
-        direction = tuple(S(x) for x in unit(axis))
+        k, aligned = exact.aligned_with(axis)
+        direction = tuple(S(x) for x in exact.unit(axis))
+        rotation = exact.clean(product(place.rotation, aligned))
         terms.links.append(
             Link(
-                name, place.link, motion == "r", k, q, qd, place.offset,
-                clean(product(place.rotation, aligned)), S.Zero, ZERO, (S.Zero,) * 6, armature,
+                name, place.link, motion == "r", k, q, qd, place.offset, rotation, armature=armature
             )
-        )  # fmt: skip
+        )
         back = transposed(aligned)
         if motion == "t":
             way = scaled(apply(place.turned, direction), q)
@@ -216,50 +199,38 @@ class Builder:
         if place.link < 0:
             terms.still = plus(terms.still, moment)
         else:
-            about = rotated_inertia(place.rotation, [numeric_entry(x) for x in inertia])
+            about = spatial.rotated_inertia(place.rotation, [numeric_entry(x) for x in inertia])
             arm = plus(place.offset, apply(place.rotation, c))
-            about = moved_inertia([numeric_entry(x) for x in about], m, arm)
-            self._add_mass(place.link, m, moment, about)
+            about = spatial.moved_inertia([numeric_entry(x) for x in about], m, arm)
+            link = terms.links[place.link]
+            terms.links[place.link] = replace(
+                link,
+                mass=link.mass + m,
+                moment=plus(link.moment, moment),
+                inertia=tuple(a + b for a, b in zip(link.inertia, about, strict=True)),
+            )
             terms.tree_kinetic += self._kinetic(mass, inertia, position, place)
         terms.tree_potential.append(self._weight(mass, position))
 
-    def _add_mass(self, k: int, mass: Expr, moment: Vector, inertia: Sequence[Expr]) -> None:
-        link = self.terms.links[k]
-        self.terms.links[k] = Link(
-            link.name, link.parent, link.turns, link.axis, link.q, link.qd, link.offset,
-            link.rotation, link.mass + mass, plus(link.moment, moment),
-            tuple(a + b for a, b in zip(link.inertia, inertia, strict=True)), link.armature,
-        )  # fmt: skip
-
-    def _collect_masses(self) -> None:
-        """Armatures, which have kinetic energy of their own."""
-        for link in self.terms.links:
-            self.terms.tree_kinetic.append(link.armature * link.qd**2 / 2)
-
     def add_forces(self) -> None:
         """Damping, friction and actuators of the joints."""
+        terms = self.terms
         for body in self.assembly.bodies:
-            self._joint_forces(body)
-
-    def _joint_forces(self, body: Body) -> None:
-        key, terms = f"body.{body.name}", self.terms
-        width = (
-            self.value(f"{key}.friction_width", body.friction_width)
-            if body.friction_width
-            else S.One
-        )
-        for k, name in enumerate(body.coordinates):
-            rate = symbol(f"{name}_dot")
-            if body.damping:
-                terms.dissipation += self.value(f"{key}.damping", body.damping[k]) * rate**2 / 2
-            force = S.Zero
-            if body.friction:
-                friction = self.value(f"{key}.friction", body.friction[k])
-                force -= friction * sympy.tanh(rate / width)
-            if body.actuator:
-                force += self.value(f"{key}.actuator", body.actuator[k])
-            if force != 0:
-                terms.forces[name] = terms.forces.get(name, S.Zero) + force
+            key, width = f"body.{body.name}", S.One
+            if body.friction_width:
+                width = self.value(f"{key}.friction_width", body.friction_width)
+            for k, name in enumerate(body.coordinates):
+                rate = symbol(f"{name}_dot")
+                if body.damping:
+                    terms.dissipation += self.value(f"{key}.damping", body.damping[k]) * rate**2 / 2
+                force = S.Zero
+                if body.friction:
+                    friction = self.value(f"{key}.friction", body.friction[k])
+                    force -= friction * sympy.tanh(rate / width)
+                if body.actuator:
+                    force += self.value(f"{key}.actuator", body.actuator[k])
+                if force != 0:
+                    terms.forces[name] = terms.forces.get(name, S.Zero) + force
 
     # --- bodies placed by formulas, springs and dampers ------------------------------------------
 
@@ -315,10 +286,8 @@ class Builder:
             plus(place.at, apply(place.turned, self._vector(f"{key}.points", point)))
             for place, point in zip((one, other), end.points, strict=True)
         )
-        across = sum((x - y) ** 2 for x, y in zip(b, a, strict=True))
-        return (
-            self._named(name, sympy.sqrt(across), later=True) if not square else sympy.sqrt(across)
-        )
+        length = sympy.sqrt(sum((x - y) ** 2 for x, y in zip(b, a, strict=True)))
+        return length if square else self._named(name, length, later=True)
 
     # --- pieces ----------------------------------------------------------------------------------
 
@@ -341,7 +310,7 @@ class Builder:
         return energy + turning
 
     def _weight(self, mass: Expr, position: Vector) -> Expr:
-        return -mass * dot_product(self.terms.gravity, position)
+        return -mass * spatial.dot(self.terms.gravity, position)
 
     def _vector(self, key: str, formulas: Sequence[Formula]) -> Vector:
         x, y, z = (self.value(key, formula) for formula in formulas)
@@ -356,20 +325,14 @@ class Builder:
 
     def _position(self, name: str, at: Vector, later: bool = False) -> Vector:
         """The centre of mass, under the names that formulas may use."""
-        made = []
-        for letter, x in zip("xyz", at, strict=True):
-            if self.assembly.plane and letter == "z":
-                made.append(S.Zero)
-            elif later or not x.free_symbols:
-                made.append(self._named(f"{name}_{letter}", x, later))
-            else:
-                made.append(symbol(f"{name}_{letter}"))
-                self.terms.definitions.append((made[-1], x))
-        if not later:  # a name may be used even where it stands for a number
-            known = {s for s, _ in self.terms.definitions}
-            for letter, x in zip("xy" if self.assembly.plane else "xyz", at, strict=False):
-                if symbol(f"{name}_{letter}") not in known:
-                    self.terms.definitions.append((symbol(f"{name}_{letter}"), x))
+        made = [S.Zero] * 3
+        for k, x in enumerate(at[:2] if self.assembly.plane else at):
+            wish = f"{name}_{'xyz'[k]}"
+            if later:
+                made[k] = self._named(wish, x, later)
+            else:  # a name may be used even where it stands for a number
+                made[k] = symbol(wish) if x.free_symbols else x
+                self.terms.definitions.append((symbol(wish), x))
         x, y, z = made
         return (x, y, z)
 
@@ -378,11 +341,10 @@ class Builder:
         return (x, y, z)
 
     def _entries(self, name: str, turned: Matrix, later: bool = False) -> Matrix:
-        return tuple(  # type: ignore[return-value]
-            tuple(
-                self._named(f"{name}_r{i}{j}", entry, later) for j, entry in enumerate(row, start=1)
-            )
-            for i, row in enumerate(turned, start=1)
+        rows = enumerate(turned, start=1)
+        return spatial.matrix(
+            [self._named(f"{name}_r{i}{j}", e, later) for j, e in enumerate(row, start=1)]
+            for i, row in rows
         )
 
     def _named(self, wish: str, e: Expr, later: bool = False) -> Expr:
@@ -410,13 +372,13 @@ def _motions(body: Body) -> list[tuple[str, Sequence[float], str]]:
 
 def rotation_about(axis: int, angle: Expr) -> Matrix:
     """The rotation about a coordinate axis: takes vectors of the rotated frame to the old one."""
-    return about_axis(axis, sympy.cos(angle), sympy.sin(angle))
+    return spatial.about_axis(axis, sympy.cos(angle), sympy.sin(angle))
 
 
 def needed(
     definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
 ) -> list[tuple[Symbol, Expr]]:
-    """The definitions that `ends` hang on, in their order."""
+    """The definitions that `ends` depend on, in their order."""
     known: Mapping[Symbol, Expr] = dict(definitions)
     found: set[Symbol] = set()
     queue = [s for end in ends for s in end.free_symbols]

@@ -224,13 +224,9 @@ class _Against:
 
 
 def _line(
-    module: ModuleType,
-    against: _Against,
-    name: str,
-    values: Complex,
-    duration: float,
+    module: ModuleType, against: _Against, name: str, values: Complex, duration: float,
     longest: float,
-) -> Line:
+) -> Line:  # fmt: skip
     """All runs of one stepper, from steps too long to steps that rounding or time forbids."""
     method = METHODS[name]
     stable_to = stable_step(values, method.limits)

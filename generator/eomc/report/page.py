@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -53,12 +54,12 @@ def recommendations(report: Report) -> list[str]:
 
 def remarks(report: Report) -> list[str]:
     """What a person should know of this scene, in sentences."""
-    g, said = report.growth, []
-    said.append(
+    g = report.growth
+    said = [
         f"A small difference at the start grows {g.amplification[-1]:.2g}-fold in "
         f"{report.duration:g} s"
         + (f", at the end by a factor e in {_time(1 / g.rate)} (chaos)." if g.wild else ".")
-    )
+    ]
     if math.isfinite(g.horizon):
         said.append(
             f"Beyond t = {g.horizon:.3g} s no run in doubles means anything: the rounding of "
@@ -84,9 +85,7 @@ def remarks(report: Report) -> list[str]:
             f"Forces or energies jump or bend ({report.corners}): past a jump every fixed step "
             "is of order 1, whatever its method."
         )
-    for name, why in report.skipped.items():
-        said.append(f"{name} is not for this scene: {why}")
-    return said
+    return said + [f"{name} is not for this scene: {why}" for name, why in report.skipped.items()]
 
 
 def table(report: Report) -> str:
@@ -114,65 +113,33 @@ def rows(report: Report) -> list[tuple[str, ...]]:
     made: list[tuple[str, ...]] = []
     for line in report.lines:
         p = min(line.points, key=lambda p: p.along)
-        made.append(
-            (
-                line.method,
-                str(line.order),
-                _figure(line.observed, "{:.1f}"),
-                _time(line.usable_h),
-                "any" if math.isinf(line.stable_to) else _time(line.stable_to),
-                _figure(p.along, "{:.1e}"),
-                _time(p.h),
-                _time(p.seconds),
-                _time(line.rounding),
-            )
-        )
+        stable_to = "any" if math.isinf(line.stable_to) else _time(line.stable_to)
+        found = (line.method, str(line.order), _figure(line.observed, "{:.1f}"))
+        times = (_time(p.h), _time(p.seconds), _time(line.rounding))
+        made.append((*found, _time(line.usable_h), stable_to, _figure(p.along, "{:.1e}"), *times))
     return made
 
 
 def as_dict(report: Report) -> dict[str, Any]:
-    """For JSON; numbers that are not finite are None."""
-
-    def number(x: float | None) -> float | None:
-        return x if x is not None and math.isfinite(x) else None
-
-    def point(p: Point) -> dict[str, Any]:
-        return {
-            "method": p.method, "h": p.h, "steps": p.steps, "status": p.status,
-            "error_q": number(p.q), "error_qd": number(p.qd), "error_end": number(p.end),
-            "error_along": number(p.along), "error_energy": number(p.energy),
-            "seconds": p.seconds, "seconds_per_second": p.seconds / report.duration,
-            "evaluations": p.evaluations,
-        }  # fmt: skip
-
-    best = {str(d): report.best(d) for d in DIGITS}
-    condition, at, q = report.condition
-    return {
-        "scene": report.scene,
-        "duration": report.duration,
-        "reference_digits": report.digits,
-        "steppers": [
-            {
-                "method": line.method, "order": line.order, "observed": number(line.observed),
-                "usable_h": number(line.usable_h), "stable_to": number(line.stable_to),
-                "rounding_h": number(line.rounding), "runs": [point(p) for p in line.points],
-            }
-            for line in report.lines
-        ],
-        "best": {d: point(p) if p else None for d, p in best.items()},
+    """For JSON: the fields under their names, energies over time left out."""
+    best = {str(digits): report.best(digits) for digits in DIGITS}
+    found = asdict(report) | {
+        "best": {digits: asdict(p) if p else None for digits, p in best.items()},
         "recommendations": recommendations(report),
         "remarks": remarks(report),
-        "growth": {
-            "t": report.growth.t.tolist(),
-            "amplification": [number(x) for x in report.growth.amplification.tolist()],
-            "rate": number(report.growth.rate), "chaotic": report.growth.wild,
-            "horizon": number(report.growth.horizon),
-        },
-        "fastest_eigenvalue": [report.eigenvalue.real, report.eigenvalue.imag],
-        "condition": {"largest": number(condition), "t": at, "q": q.tolist()},
-        "corners": report.corners,
-        "skipped": dict(report.skipped),
-    }  # fmt: skip
+    }
+    return {key: _for_json(value) for key, value in found.items()}
+
+
+def _for_json(value: Any) -> Any:
+    """Numbers that are not finite become None, complex ones pairs."""
+    if isinstance(value, dict):
+        return {key: _for_json(inside) for key, inside in value.items() if key != "energies"}
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_for_json(inside) for inside in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def page(report: Report) -> str:
@@ -187,24 +154,21 @@ def page(report: Report) -> str:
         )
         for p in report.points
     ]  # fmt: skip
-    return (
-        environment()
-        .get_template("report/report.html.jinja")
-        .render(
-            report=report,
-            title=texts.html(report.title),
-            rows=rows(report),
-            recommendations=recommendations(report),
-            remarks=remarks(report),
-            explained=EXPLAINED,
-            runs=runs,
-            work=_svg(lambda axes: _work(axes, report), (8.6, 5.0)),
-            energy=_svg(lambda axes: _energy(axes, report, shown), (8.6, 3.6)),
-            growth=_svg(lambda axes: _grown(axes, report), (8.6, 3.0)),
-            shown=_time(shown.seconds),
-            digits=f"{report.digits:.0f}",
-            duration=f"{report.duration:g}",
-        )
+    template = environment().get_template("report/report.html.jinja")
+    return template.render(
+        report=report,
+        title=texts.html(report.title),
+        rows=rows(report),
+        recommendations=recommendations(report),
+        remarks=remarks(report),
+        explained=EXPLAINED,
+        runs=runs,
+        work=_svg(lambda axes: _work(axes, report), (8.6, 5.0)),
+        energy=_svg(lambda axes: _energy(axes, report, shown), (8.6, 3.6)),
+        growth=_svg(lambda axes: _grown(axes, report), (8.6, 3.0)),
+        shown=_time(shown.seconds),
+        digits=f"{report.digits:.0f}",
+        duration=f"{report.duration:g}",
     )
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy
 from numpy.typing import NDArray
+from sympy.printing.latex import translate
 
 from eomc.base import names, texts
 from eomc.base.errors import EomcError
@@ -37,15 +38,9 @@ SAMPLES = 20_000  # of a run that are drawn, at most
 
 
 def draw(
-    system: System,
-    t: Array,
-    q: Array,
-    qd: Array,
-    energy: Array,
-    path: str | Path,
-    *,
+    system: System, t: Array, q: Array, qd: Array, energy: Array, path: str | Path, *,
     title: str | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Write the figure of a run to `path`; its suffix says how: .png, .svg or .pdf.
 
     t: (n,), s; q, qd: (n, nq); energy: (n,). Raises EomcError without matplotlib, with another
@@ -66,12 +61,7 @@ def draw(
 
 
 def figure(
-    system: System,
-    t: Array,
-    q: Array,
-    qd: Array,
-    energy: Array,
-    title: str | None = None,
+    system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None = None
 ) -> Figure:
     """The figure of a run. t: (n,), s; q, qd: (n, nq); energy: (n,)."""
     try:
@@ -79,12 +69,10 @@ def figure(
     except ImportError:
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
-        return _figure(system, t, q, qd, energy, title)
+        return _figure(system, t, q, qd, energy, title or system.title or system.name)
 
 
-def _figure(
-    system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None
-) -> Figure:
+def _figure(system: System, t: Array, q: Array, qd: Array, energy: Array, title: str) -> Figure:
     from matplotlib.figure import Figure
 
     every = max(len(t) // SAMPLES, 1)
@@ -94,8 +82,7 @@ def _figure(
     picture = _picture(system, t, q, qd)
     rows = len(groups) + 1
     made = Figure(figsize=(12, min(2.1 * rows + 0.5, 9)), layout="constrained")
-    shown = texts.figure(title or system.title or system.name)
-    made.suptitle(shown, fontsize=13, color=INK)
+    made.suptitle(texts.figure(title), fontsize=13, color=INK)
     widths = [1, 1, 1.35] if picture else [1, 1]
     grid = made.add_gridspec(rows, len(widths), width_ratios=widths)
 
@@ -104,7 +91,8 @@ def _figure(
         for column, values in enumerate((q, qd)):
             axes = made.add_subplot(grid[row, column], sharex=first)
             first = first or axes
-            _against_time(axes, t, values, group, system.coordinates, rate=column == 1)
+            shown = [system.coordinates[i] for i in group]
+            _against_time(axes, t, values[:, group], shown, rate=column == 1)
     axes = made.add_subplot(grid[-1, :2], sharex=first)
     _energy(axes, t, energy, "J" if any(c.unit for c in system.coordinates) else "")
     axes.set_xlabel("$t$ (s)")
@@ -117,12 +105,6 @@ def _figure(
 
 
 # --- names and units ------------------------------------------------------------------------------
-
-# the Greek letters that mathtext lacks look like Latin ones
-_LETTERS = {name: rf"\{name}" for name in names.GREEK.values()}
-_LETTERS |= dict(zip(("omicron", "Alpha", "Beta", "Epsilon"), "oABE", strict=True))
-_LETTERS |= dict(zip(("Zeta", "Eta", "Iota", "Kappa", "Mu", "Nu"), "ZHIKMN", strict=True))
-_LETTERS |= dict(zip(("Omicron", "Rho", "Tau", "Chi"), "OPTX", strict=True))
 
 
 def mathtext(name: str, rate: bool = False) -> str:
@@ -143,7 +125,9 @@ def mathtext(name: str, rate: bool = False) -> str:
 
 
 def _upright(word: str) -> str:
-    return _LETTERS.get(word) or (word if word.isdigit() else rf"\mathrm{{{word}}}")
+    if word in names.GREEK.values():
+        return str(translate(word))
+    return word if word.isdigit() else rf"\mathrm{{{word}}}"
 
 
 def _label(coordinate: Coordinate, rate: bool = False) -> str:
@@ -177,21 +161,17 @@ def _groups(system: System) -> list[list[int]]:
 
 
 def _against_time(
-    axes: Axes,
-    t: Array,
-    values: Array,
-    group: Sequence[int],
-    coordinates: Sequence[Coordinate],
-    rate: bool,
+    axes: Axes, t: Array, values: Array, coordinates: Sequence[Coordinate], rate: bool
 ) -> None:
-    for i, colour in zip(group, _colours(len(group)), strict=True):
-        axes.plot(t, values[:, i], color=colour, label=mathtext(coordinates[i].name, rate))
+    for c, x, colour in zip(coordinates, values.T, _colours(len(coordinates)), strict=True):
+        axes.plot(t, x, color=colour, label=mathtext(c.name, rate))
     _plain(axes)
-    if len(group) == 1:
-        axes.set_ylabel(_label(coordinates[group[0]], rate))
+    first = coordinates[0]
+    if len(coordinates) == 1:
+        axes.set_ylabel(_label(first, rate))
     else:
         kind = "velocities" if rate else "coordinates"
-        axes.set_ylabel(_with_unit(kind, _unit(coordinates[group[0]].unit, rate)))
+        axes.set_ylabel(_with_unit(kind, _unit(first.unit, rate)))
         lines = axes.get_lines()
         some = lines if len(lines) <= 8 else [lines[0], lines[len(lines) // 2], lines[-1]]
         axes.legend(handles=some, fontsize=8, frameon=False, ncols=1, loc="center left",
@@ -207,11 +187,8 @@ def _energy(axes: Axes, t: Array, energy: Array, unit: str) -> None:
     _plain(axes)
     axes.set_ylabel(_with_unit("$E - E(0)$" if conserved else "$E$", unit))
     start = _quantity(float(energy[0]), unit) if len(energy) else "?"
-    axes.set_title(
-        f"Energy: $E(0)$ = {start}, max $|E - E(0)|$ = {_quantity(drift, unit, 2)}",
-        fontsize=10,
-        color=INK,
-    )
+    title = f"Energy: $E(0)$ = {start}, max $|E - E(0)|$ = {_quantity(drift, unit, 2)}"
+    axes.set_title(title, fontsize=10, color=INK)
     if conserved and drift == 0:
         axes.set_ylim(-1, 1)
 
@@ -276,14 +253,10 @@ class _Plane:
 
     def _strobe(self, axes: Axes) -> str:
         """The rods at some instants; says when."""
-        rods = [
-            (parent, path)
-            for (_, path), parent in zip(self.points, self.parents, strict=True)
-            if parent is not None
-        ]
+        both = zip(self.points, self.parents, strict=True)
+        rods = [(parent, path) for (_, path), parent in both if parent is not None]
         if not rods:
-            if not any(parent is not None for parent in self.parents):
-                axes.plot(0, 0, "+", color=INK, markersize=7, zorder=4)
+            axes.plot(0, 0, "+", color=INK, markersize=7, zorder=4)
             return ""
         last = self._stretch()
         chosen = np.unique(np.linspace(0, last, INSTANTS).round().astype(int))

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus
 from eomc.robots.inertias import indefinite, nearest, principal, shown, unbalanced
-from eomc.robots.robot import Robot, RobotBody, free_motions, joined, listed, moved, without_dust
+from eomc.robots.robot import Robot, RobotBody, free_motions, joined, moved, without_dust
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_pitch_roll
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
@@ -24,7 +25,7 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
         if name not in owners:
             raise EomcError(
                 f"--lock {name}: no joint that moves is called '{name}'"
-                + (suggest(name, owners) or f"; there are {listed(tuple(owners))}")
+                + (suggest(name, owners) or f"; there are {texts.listed(tuple(owners))}")
             )
         body = owners[name]
         if len(body.motions) > 1:
@@ -57,7 +58,7 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
         if name and name not in by_name:
             raise EomcError(
                 f"{option} {name}: no body is called '{name}'"
-                + (suggest(name, by_name) or f"; there are {listed(tuple(by_name))}")
+                + (suggest(name, by_name) or f"; there are {texts.listed(tuple(by_name))}")
             )
     kept = set(by_name)
     if root:
@@ -80,7 +81,7 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
         if body.name == root and body.parent != WORLD:
             bodies[k] = replace(_fixed(body, *_stands(by_name, body)), parent=WORLD)
     gone = tuple(name for name in by_name if name not in kept)
-    left_out = ((f"cut off: {listed(gone)}",) if gone else ()) + robot.left_out
+    left_out = ((f"cut off: {texts.listed(gone)}",) if gone else ()) + robot.left_out
     return _without_loose_drives(replace(robot, bodies=tuple(bodies), left_out=left_out))
 
 
@@ -107,7 +108,7 @@ def based(robot: Robot, free: bool) -> Robot:
     """
     roots = [body for body in robot.bodies if body.parent == WORLD]
     if len(roots) != 1:
-        those = listed(tuple(body.name for body in roots))
+        those = texts.listed(tuple(body.name for body in roots))
         raise EomcError(f"--base: {len(roots)} bodies stand on the world ({those}), not one")
     root = roots[0]
     new = root

@@ -6,7 +6,7 @@ asks, scene_text.py makes it fit for a scene and writes that.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from eomc.base.spatial import apply, plus, scaled
@@ -123,9 +123,3 @@ def without_dust(body: RobotBody) -> Inertia:
 def joined(*notes: str) -> str:
     """Notes in a line."""
     return "; ".join(note for note in notes if note)
-
-
-def listed(those: Collection[str], most: int = 12) -> str:
-    """Names in a line, the first of many."""
-    shown = ", ".join(list(those)[:most]) or "none"
-    return shown + (f" and {len(those) - most} more" if len(those) > most else "")

@@ -7,11 +7,11 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from eomc.base import names
+from eomc.base import names, texts
 from eomc.base.errors import EomcError
 from eomc.base.texts import line, toml
 from eomc.robots.inertias import indefinite, unbalanced
-from eomc.robots.robot import Drive, Motion, Robot, RobotBody, joined, listed, without_dust
+from eomc.robots.robot import Drive, Motion, Robot, RobotBody, joined, without_dust
 from eomc.robots.rotations import SNAP, Vector, turns_of
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
@@ -49,7 +49,7 @@ def finished(robot: Robot) -> Robot:
     if rough:
         found += (
             "quarter turns to five digits or so, as 1.5708, which are kept as they are ("
-            f'{listed(rough, 4)}): "pi/2" in their place makes less code',
+            f'{texts.listed(rough, 4)}): "pi/2" in their place makes less code',
         )
     new = tuple(words for words in found if words not in robot.left_out)
     return replace(robot, left_out=(*robot.left_out, *new))
@@ -74,7 +74,7 @@ def _without_frames(robot: Robot) -> Robot:
             carried.add(body.parent)
     if not gone:
         return robot
-    words = f"frames without mass that carry nothing: {listed(gone[::-1], 1000)}"
+    words = f"frames without mass that carry nothing: {texts.listed(gone[::-1], 1000)}"
     return replace(robot, bodies=tuple(kept), left_out=(*robot.left_out, words))
 
 
@@ -137,7 +137,7 @@ def _without_inertia(robot: Robot) -> list[str]:
             has = any(b.mass or (kind == "r" and any(b.inertia)) for b in mine)
             if has or motion.armature:
                 continue
-            those = listed([b.name + (f" ({b.note})" if b.note else "") for b in mine], 4)
+            those = texts.listed([b.name + (f" ({b.note})" if b.note else "") for b in mine], 4)
             lacks = "mass" if kind == "t" else "inertia"
             faults.append(f"joint {motion.name} moves nothing that has {lacks}, only {those}")
             if len(body.motions) == 1:

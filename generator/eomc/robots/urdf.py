@@ -319,7 +319,7 @@ class _Reader:
             parts = [shape for link in links for part in link.findall(use) for shape in part.iter()]
             counts = Counter(str(shape.tag) for shape in parts if shape.tag in _SHAPES)
             if counts:
-                told = ", ".join(f"{n} {_plural(shape, n)}" for shape, n in counts.items())
+                told = ", ".join(f"{n} {texts.plural(shape, n)}" for shape, n in counts.items())
                 out.append(f"{what}: {told}" + (" (not opened)" if "mesh" in counts else ""))
         bare = [x.get("name", "") for x in links if x.find("inertial") is None and _shapes(x)]
         if bare:
@@ -339,7 +339,7 @@ class _Reader:
         rest = Counter(str(e.tag) for e in self.root if e.tag not in ("link", "joint"))
         for parts, known in ((links, _LINK_PARTS), (joints, _JOINT_PARTS)):
             rest.update(str(e.tag) for part in parts for e in part if e.tag not in known)
-        out += [f"<{tag}>, {n} {_plural('element', n)}" for tag, n in sorted(rest.items())]
+        out += [f"<{tag}>, {n} {texts.plural('element', n)}" for tag, n in sorted(rest.items())]
         for tag, those in self.strange.items():
             first, *others = self.places[tag]
             more = f" and {len(others)} more" if others else ""
@@ -396,7 +396,3 @@ def _macro(written: str) -> str:
 
 def _shapes(link: Element) -> list[str]:
     return [str(shape.tag) for shape in link.iter() if shape.tag in _SHAPES]
-
-
-def _plural(word: str, n: int) -> str:
-    return word if n == 1 else word + ("es" if word.endswith(("x", "sh")) else "s")

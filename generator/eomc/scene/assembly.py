@@ -1,7 +1,7 @@
 """Bodies, joints, springs and dampers of a scene: checked data. No SymPy, no C.
 
 Every vector has three entries and every inertia six; in a plane scene those out of the plane are
-zero. Formulas hang on numbers, constants and parameters, save where it is said otherwise.
+zero. Formulas depend on numbers, constants and parameters, save where it is said otherwise.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Vector = tuple[Formula, Formula, Formula]
 
 @dataclass(frozen=True)
 class Turn:
-    """A rotation by `angle` (rad) about an axis, "x", "y" or "z", of the frame turned so far."""
+    """A rotation by `angle` (rad) about an axis, "x", "y" or "z", of the frame rotated so far."""
 
     axis: str
     angle: Formula
@@ -29,7 +29,7 @@ class Body:
 
     parent: a body's name or "world". joint: a key of joints.JOINTS, with `coordinates` in its
     order and unit `axes` in the joint's frame, which stands at `offset` (m) in the parent's frame,
-    turned by `rotation`. The body's frame is the joint's frame, moved by the coordinates. A body
+    rotated by `rotation`. The body's frame is the joint's frame, moved by the coordinates. A body
     placed by formulas has joint "", no parent, the `position` (m) of its centre of mass in the
     world and the `rotation` of its frame there; these depend on coordinates, t and definitions too.
 
@@ -60,33 +60,34 @@ class Body:
     note: str = ""
 
 
-@dataclass(frozen=True)
-class Spring:
-    """A linear spring: along a coordinate, or between points of two bodies, or turning.
+@dataclass(frozen=True, kw_only=True)
+class Between:
+    """What a spring or damper acts on: a coordinate, or points of two bodies, or their angles.
 
     coordinate: the coordinate it acts on, "" where it is between `bodies`; then `points` (m) are
     its ends in their frames (the world's for "world"). turning: it acts on the difference of two
     bodies' angles in the plane, of the second over the first, and there are no points.
-    stiffness: N/m or N m/rad. length: the rest length, or the rest angle or position.
     """
+
+    coordinate: str = ""
+    bodies: tuple[str, str] | None = None
+    points: tuple[Vector, Vector] | None = None
+    turning: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spring(Between):
+    """stiffness: N/m or N m/rad. length: the rest length, or the rest angle or position."""
 
     stiffness: Formula
     length: Formula
-    coordinate: str = ""
-    bodies: tuple[str, str] | None = None
-    points: tuple[Vector, Vector] | None = None
-    turning: bool = False
 
 
-@dataclass(frozen=True)
-class Damper:
+@dataclass(frozen=True, kw_only=True)
+class Damper(Between):
     """As a spring, with the force -damping times the rate. damping: N s/m or N m s/rad."""
 
     damping: Formula
-    coordinate: str = ""
-    bodies: tuple[str, str] | None = None
-    points: tuple[Vector, Vector] | None = None
-    turning: bool = False
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ import hashlib
 import os
 from collections.abc import Mapping
 from functools import partial
-from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,21 @@ from eomc.base.errors import MOST, EomcError, SceneError
 from eomc.scene import formulas, messages, repeat, schema, toml_text, validate_bodies
 from eomc.scene.formulas import Formula, suggest
 from eomc.scene.scene import Coordinate, Input, Quantity, Run, Scene
-from eomc.scene.scope import DOUBT, INPUT, NOTHING, POSITION, TIME, VELOCITY, Checker
+from eomc.scene.scope import (
+    DOUBT,
+    INPUT,
+    NOTHING,
+    POSITION,
+    TIME,
+    VELOCITY,
+    Checker,
+    ring_text,
+    rings,
+)
 from eomc.scene.source_map import Places
 from eomc.scene.toml_text import MAX_BYTES
+
+_NOT_SI = "mm cm km g gram ms min rpm inch ft lb lbs".split()
 
 
 def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = None) -> Scene:
@@ -107,14 +118,7 @@ class _Check(Checker):
             definitions=tuple(self.definitions.items()),
             **energies,
             forces=forces,
-            run=Run(
-                doc.run.h,
-                doc.run.duration,
-                doc.run.method,
-                doc.run.real,
-                doc.run.batch,
-                doc.run.linearize,
-            ),
+            run=Run(**doc.run.model_dump()),
             assembly=assembly,
             places=self.places,
             warnings=tuple(self.problems),
@@ -193,20 +197,7 @@ class _Check(Checker):
             number = f"{start:g}" if isinstance(start, float) and start else "30"
             remedy = f'write {number} degrees as {messages.radians(number)}, with unit = "rad"'
             self.say((*path, "unit"), f"angles are in radians, nothing is converted: {remedy}")
-        elif plain in (
-            "mm",
-            "cm",
-            "km",
-            "g",
-            "gram",
-            "ms",
-            "min",
-            "rpm",
-            "inch",
-            "ft",
-            "lb",
-            "lbs",
-        ):
+        elif plain in _NOT_SI:
             message = (
                 f"'{unit}' is not an SI unit: numbers are taken as they stand, none is converted"
             )
@@ -267,28 +258,24 @@ class _Check(Checker):
                 self.kinds[name] = frozenset({DOUBT})
 
     def _circular(self, definitions: Mapping[str, Formula]) -> set[str]:
-        """The names that hang on themselves, each ring told once; beyond MOST, all."""
+        """The names that depend on themselves, each ring reported once; beyond MOST, all."""
         graph = {
             name: [n.id for n in formula.names() if n.id in definitions]
             for name, formula in definitions.items()
         }
         lost: set[str] = set()
-        for _ in range(MOST):
-            try:
-                TopologicalSorter(graph).prepare()
-                return lost
-            except CycleError as cycle:
-                ring = list(reversed(cycle.args[1]))
-                shown = ring if len(ring) <= 20 else [*ring[:10], "...", *ring[-9:]]
-                self.say(
-                    ("definitions", ring[0]),
-                    f"circular definition: {' -> '.join(shown)}; one of them must stand on its own",
-                    next(n for n in definitions[ring[0]].names() if n.id == ring[1]),
-                    definitions[ring[0]].text,
-                )
-                lost.update(ring)
-                graph |= {name: [] for name in ring}
-        return set(definitions)
+        for count, ring in enumerate(rings(graph)):
+            if count == MOST:
+                return set(definitions)
+            formula = definitions[ring[0]]
+            self.say(
+                ("definitions", ring[0]),
+                f"circular definition: {ring_text(ring)}; one of them must stand on its own",
+                next(n for n in formula.names() if n.id == ring[1]),
+                formula.text,
+            )
+            lost.update(ring)
+        return lost
 
     def _inputs(self) -> list[Input]:
         allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]

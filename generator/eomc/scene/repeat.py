@@ -145,34 +145,12 @@ class _Expansion:
     def _repeated(self, path: Path, key: Any, entry: dict[str, Any]) -> list[tuple[str, Any]]:
         """An entry with `repeat` written out: (name, entry) pairs."""
         key = key if isinstance(key, str) else ""
-        where = (*path, "repeat")
         text = entry["repeat"]
-        if not isinstance(text, str):
-            return self._none(where, f'must be text, such as "i = 1..n", here {text!r:.40}')
-        found = _REPEAT.fullmatch(text)
-        if not found:
-            return self._none(where, f"'{text}' is no repetition, which {_WRITTEN}", text=text)
-        index = found[1]
-        if why := self._index_fault(index):
-            return self._none(where, why, FormulaError("", found.start(1), len(index)), text)
         try:
-            first, last = (self._whole(found[k].strip(), {}) for k in (2, 3))
+            index, first, last = self._span(text)
         except FormulaError as fault:
-            return self._none(where, fault.message, text=text)
-        if last < first - 1:
-            return self._none(
-                where,
-                f"runs from {first} to {last}, and counts up only: exchange the ends",
-                text=text,
-            )
-        self.made += last - first + 1
-        if self.made > MAX_ENTRIES:
-            return self._none(
-                where,
-                f"repetition makes {self.made} entries up to here, and {MAX_ENTRIES} are the most: "
-                "let it end sooner",
-                text=text,
-            )
+            self._fault((*path, "repeat"), fault.message, fault, str(text))
+            return []
         kept = {k: v for k, v in entry.items() if k != "repeat"}
         out = []
         for number in range(first, last + 1):
@@ -182,16 +160,36 @@ class _Expansion:
                 return []
             out.append((name, made))
         if len(out) > 1 and key and out[0][0] == out[-1][0]:
-            return self._none(
-                path, f"each repetition needs a name of its own: write {key}[{index}]"
-            )
+            self._fault(path, f"each repetition needs a name of its own: write {key}[{index}]")
+            return []
         return out
 
-    def _none(
-        self, path: Path, message: str, at: FormulaError | None = None, text: str = ""
-    ) -> list[tuple[str, Any]]:
-        self._fault(path, message, at, text)
-        return []
+    def _span(self, text: Any) -> tuple[str, int, int]:
+        """The index of a repetition, and its ends. Raises FormulaError."""
+        if not isinstance(text, str):
+            raise FormulaError(f'must be text, such as "i = 1..n", here {text!r:.40}')
+        found, width = _REPEAT.fullmatch(text), len(text)
+        if not found:
+            raise FormulaError(f"'{text}' is no repetition, which {_WRITTEN}", 0, width)
+        index = found[1]
+        if why := self._index_fault(index):
+            raise FormulaError(why, found.start(1), len(index))
+        try:
+            first, last = (self._whole(found[k].strip(), {}) for k in (2, 3))
+        except FormulaError as fault:
+            raise FormulaError(fault.message, 0, width) from None
+        if last < first - 1:
+            why = f"runs from {first} to {last}, and counts up only: exchange the ends"
+            raise FormulaError(why, 0, width)
+        self.made += last - first + 1
+        if self.made > MAX_ENTRIES:
+            raise FormulaError(
+                f"repetition makes {self.made} entries up to here, and {MAX_ENTRIES} are the most: "
+                "let it end sooner",
+                0,
+                width,
+            )
+        return index, first, last
 
     def _index_fault(self, index: str) -> str:
         if index in self.declared:

@@ -78,7 +78,7 @@ def _linearized(value: object) -> bool | str:
 class _Run(_Table):
     h: _Positive = 0.001
     duration: _Positive = 10.0
-    method: _Methods = ("rk4",)
+    methods: _Methods = pydantic.Field(default=("rk4",), alias="method")
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
     linearize: Annotated[bool | str, pydantic.PlainValidator(_linearized)] = False
@@ -251,19 +251,12 @@ class Document(_Table):
     run: _Run = _Run()
 
 
-class _EnergyBesides(_Energy):
-    kinetic: _Value = 0.0
-
-
-class _DocumentOfBodies(Document):
-    """Bodies have energies of their own: none need be written."""
-
-    energy: _EnergyBesides = _EnergyBesides()
-
-
 def read(tree: Mapping[str, Any]) -> Document:
-    """The scene as it is written; pydantic.ValidationError tells what is laid out otherwise."""
-    return (_DocumentOfBodies if tree.get("body") else Document).model_validate(tree)
+    """The scene as it is written; pydantic.ValidationError says what is laid out otherwise."""
+    energy = tree.get("energy", {})
+    if tree.get("body") and isinstance(energy, dict):  # bodies have energies of their own
+        tree = {**tree, "energy": {"kinetic": 0.0, **energy}}
+    return Document.model_validate(tree)
 
 
 # --- faults in words ---
@@ -342,7 +335,7 @@ _OF_BRANCHES = ("float_type", "string_type", "finite_number")
 def _keys(path: tuple[str, ...]) -> list[str]:
     """The keys that may stand beside the last of `path`."""
     model = _MODELS[path[0]] if len(path) > 1 else Document
-    return list(model.model_fields)
+    return [field.alias or name for name, field in model.model_fields.items()]
 
 
 def meant(path: tuple[str, ...]) -> str:

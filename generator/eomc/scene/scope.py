@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 
 from eomc.base.errors import Problem
 from eomc.scene import formulas, messages
@@ -39,6 +40,25 @@ def value_of(formula: Formula, known: Mapping[str, float]) -> tuple[float, str]:
     given = {n.id: known[n.id] for n in formula.names()}
     where = ", ".join(f"{name} = {value:g}" for name, value in given.items())
     return math.nan, f"'{formula.shown}' {fault}" + (f" at {where}" if where else "")
+
+
+def rings(graph: dict[str, list[str]]) -> Iterator[list[str]]:
+    """Each ring of names that depend on one another, its first name again at its end.
+
+    graph: what each name depends on; rings are taken out of it.
+    """
+    while True:
+        try:
+            return TopologicalSorter(graph).prepare()
+        except CycleError as cycle:
+            ring = cycle.args[1][::-1]
+            yield ring
+            graph |= {name: [] for name in ring}
+
+
+def ring_text(ring: list[str]) -> str:
+    """A ring in a line, of a long one its ends."""
+    return " -> ".join(ring if len(ring) <= 20 else [*ring[:10], "...", *ring[-9:]])
 
 
 class Checker:

@@ -66,17 +66,14 @@ def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
         )
     if line := long_key(text):
         message = f"a key has more than {MOST_PARTS} parts: a scene's have three, a.b.c, at most"
-        source = text.split("\n")[line - 1].rstrip()
-        raise SceneError([Problem(message, "", file, line, 0, len(source), source)])
+        raise _in_line(message, text, line, file)
     headers = [found.start() for found in _HEADER.finditer(text)]
     if len(headers) > MOST_TABLES:
-        line = text.count("\n", 0, headers[MOST_TABLES]) + 1
-        source = text.split("\n")[line - 1].rstrip()
         message = (
             f"this is table {MOST_TABLES + 1:,} of {len(headers):,}, and a scene has "
             f'{MOST_TABLES:,} at most: write alike ones once, with repeat = "i = 1..n"'
         )
-        raise SceneError([Problem(message, "", file, line, 0, len(source), source)])
+        raise _in_line(message, text, text.count("\n", 0, headers[MOST_TABLES]) + 1, file)
     try:
         tree = tomllib.loads(text)
     except ValueError as fault:
@@ -86,6 +83,11 @@ def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
     if _has_huge(tree):
         raise SceneError([_huge_problem(text, file)])
     return text, tree
+
+
+def _in_line(message: str, text: str, line: int, file: str) -> SceneError:
+    source = text.split("\n")[line - 1].rstrip()
+    return SceneError([Problem(message, "", file, line, 0, len(source), source)])
 
 
 def _encoding_problem(data: bytes, at: int, file: str) -> Problem:

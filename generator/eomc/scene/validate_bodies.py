@@ -5,15 +5,18 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterable, Mapping
+from graphlib import TopologicalSorter
+from itertools import islice
 from typing import Any
 
 from eomc.base import names
+from eomc.base.errors import MOST
 from eomc.scene import formulas
 from eomc.scene.assembly import WORLD, Assembly, Body, Vector
 from eomc.scene.formulas import Formula, nearest, suggest
 from eomc.scene.joints import JOINTS, MEANT, Z
 from eomc.scene.schema import BodyTable, Document
-from eomc.scene.scope import Checker, Path
+from eomc.scene.scope import Checker, Path, ring_text, rings
 from eomc.scene.validate_springs import Springs
 from eomc.scene.validate_values import ORIGIN, ZERO
 
@@ -358,45 +361,28 @@ class _Bodies(Springs):
     # --- the tree ---------------------------------------------------------------------------------
 
     def _ordered(self) -> list[Body]:
-        """Parents before children, else as written; rings of parents are told."""
-        hung = {name: body for name, body in self.bodies.items() if body.joint}
-        self._loops(hung)
-        children: dict[str, list[str]] = {}
-        for name, body in hung.items():
-            children.setdefault(body.parent, []).append(name)
-        rank = {name: k for k, name in enumerate(self.bodies)}
-        ready = [
-            rank[name]
-            for name, body in self.bodies.items()
-            if not body.joint or body.parent == WORLD
-        ]
-        heapq.heapify(ready)
-        bodies, out = list(self.bodies.values()), []
-        while ready:
-            body = bodies[heapq.heappop(ready)]
-            out.append(body)
-            for child in children.get(body.name, ()):
-                heapq.heappush(ready, rank[child])
+        """Parents before children, else as written; rings of parents are reported."""
+        graph = {name: [b.parent] if b.joint else [] for name, b in self.bodies.items()}
+        for ring in islice(rings(graph), MOST):
+            self.check.say(
+                ("body", self.names[ring[0]], "parent"),
+                f"the parents form a loop: {ring_text(ring)}; let one of them be held by the "
+                "world, and close the loop with stiff springs",
+                text=ring[1],
+            )
+            for name in ring[1:]:
+                self.bodies.pop(name, None)
+        rank = {name: k for k, name in enumerate([WORLD, *self.bodies])}
+        tree, ready, out = TopologicalSorter(graph), list[tuple[int, str]](), []
+        tree.prepare()
+        while tree.is_active():
+            for name in tree.get_ready():
+                heapq.heappush(ready, (rank.get(name, -1), name))
+            _, name = heapq.heappop(ready)
+            tree.done(name)
+            if name in self.bodies:
+                out.append(self.bodies[name])
         return out
-
-    def _loops(self, hung: Mapping[str, Body]) -> None:
-        done: set[str] = set()
-        for name in hung:
-            way: dict[str, None] = {}
-            while name in hung and name not in done and name not in way:
-                way[name] = None
-                name = hung[name].parent
-            if name in way:
-                ring = list(way)
-                ring = [*ring[ring.index(name) :], name]
-                shown = ring if len(ring) < 8 else [*ring[:3], "...", *ring[-3:]]
-                self.check.say(
-                    ("body", self.names[name], "parent"),
-                    f"the parents form a loop: {' -> '.join(shown)}; let one of them hang on the "
-                    "world, and close the loop with stiff springs",
-                    text=hung[name].parent,
-                )
-            done |= {*way}
 
     def _inertia_of_joints(self, ordered: Iterable[Body]) -> None:
         """Every joint that moves needs something to move, unless energies are given besides."""
