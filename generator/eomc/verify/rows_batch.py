@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify.convergence import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_refusals import SINGULAR
 from eomc.verify.rows_runs import EVERY, LONG, TURNS, Runs, drive
@@ -91,26 +92,39 @@ class Batches:
         rows = self.random.normal(size=shape).astype(self.model.dtype)
         return [None, rows[:, 0], rows]
 
-    def beside(self, method: str) -> float:
-        """Each instance beside a single run of it, as far as a difference does not grow."""
-        errors, nudge = [], self.check.eps ** (1 / 3)
-        spread = np.array([self.runs.sampler.spread, self.runs.sampler.speed])
+    def beside(self, method: str) -> float | Finding:
+        """Each step of each instance beside a single step from where the batch had it.
+
+        Runs of seven steps may part as far as they go, where steps are too long for the motion.
+        """
+        errors: list[float | None] = []
         for u in self.tables():
             runs = self.simulate(method, self.instances, u)
             for k, s in enumerate(self.instances):
-                alone = replace(s, u=None if u is None else u[k])
-                run = drive(self.model, method, alone, self.h, STEPS)
-                x = np.array([s.q, s.qd]) + nudge * spread
-                moved = drive(self.model, method, replace(alone, q=x[0], qd=x[1]), self.h, STEPS)
-                if run.status or moved.status:
-                    continue
-                # what a change by all of the spread would make of each number
-                grown = np.max(np.abs(moved.rows - run.rows), axis=1) / nudge
-                wide = float(np.max(1 + np.abs(s.q) / spread[0]))  # of an angle, its last digit
-                size = STEPS * wide * (grown[:, None] + np.abs(run.rows))
-                found = np.stack([runs.q[k], runs.qd[k]])
-                errors.append(self.check.units(found, run.rows, size))
-        return float(np.max(errors, initial=0))
+                rows = np.stack([runs.q[k], runs.qd[k]])
+                for n in range(int(runs.steps[k])):
+                    row = u if u is None or u.ndim == 2 else u[:, n]
+                    at = replace(s, q=rows[0, n], qd=rows[1, n], t=s.t + n * self.h,
+                                 u=None if row is None else row[k])  # fmt: skip
+                    errors.append(self.step_off(method, at, rows[:, n + 1]))
+        return largest(errors, "no step of an instance has digits to compare")
+
+    def step_off(self, method: str, s: State, found: Vector) -> float | None:
+        """The end of a step beside that of a single one, in units; None where it has no digits."""
+        x, nudge = np.array([s.q, s.qd], float), self.check.eps ** (1 / 3)
+        spread = np.array([self.runs.sampler.spread, self.runs.sampler.speed])
+        wide = float(np.max(1 + np.abs(x) / spread))  # the last digit, of what would be 1 elsewhere
+        if wide * self.check.eps > nudge:
+            return None
+        alone = drive(self.model, method, s, self.h, 1)
+        q, qd = x + nudge * spread
+        moved = drive(self.model, method, replace(s, q=q, qd=qd), self.h, 1)
+        if alone.status or moved.status:
+            return None
+        # what a change by all of the spread would make of each number
+        grown = np.max(np.abs(moved.rows - alone.rows), axis=1) / nudge
+        size = wide * (grown + np.abs(alone.rows[:, 1]))
+        return self.check.units(found, alone.rows[:, 1], size)
 
     def places(self, method: str) -> float:
         """How many batches are not to the bit what their instances are elsewhere."""

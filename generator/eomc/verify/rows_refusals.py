@@ -31,6 +31,8 @@ ALONE = 8  # changes of all at random, of which one alone is negative
 SPREAD = 3.0  # of their logarithms
 MOST, FEWER = 1200, 240  # states that the reference is asked for; where it takes long
 LOST = 1e-6  # of the size of its entries: where D is so far from the reference's, rounding decides
+ABSORBED = 2.0**30  # times another: beyond, a sum of parameters may lose one of them
+ALONG = np.linspace(0, 1, 9)  # of a step: where its stages may lie
 MARK = -7.0  # what is to be left alone
 
 
@@ -76,14 +78,30 @@ class Refusals:
             found = np.asarray(self.check.reference.evaluate("D", t=0.0, u=None, **stacked))
         wrong = 0
         for s, D, least in zip(suspects, found, _least(found).tolist(), strict=True):
-            singular = least < -CLEAR or least == 0
+            singular = least < -CLEAR or (least == 0 and self.exact(s))
             if not (singular or least > CLEAR):
                 continue
             if (self.accelerate(s)[0] == SINGULAR) == singular:
                 (self.singular if singular else self.regular).append(s)
-            else:
+            elif singular or self.natural(s):
                 wrong += not self.lost(s, D)
         return float(wrong)
+
+    def exact(self, s: State) -> bool:
+        """Whether a D that is singular to the last digit is so before rounding.
+
+        Where one inertia is 2^60 times another, D has lost the other, which the module may keep.
+        """
+        sizes = [abs(x / (self.defaults[name] or 1.0)) for name, x in (s.params or {}).items()]
+        return all(x == 0 or 1 / ABSORBED < x < ABSORBED for x in sizes)
+
+    def natural(self, s: State) -> bool:
+        """Whether all parameters have the signs of their defaults.
+
+        Link multipliers divide by masses: they refuse one that is not positive, whatever D is.
+        """
+        pairs = [(x, self.defaults[name]) for name, x in (s.params or {}).items()]
+        return all(x * default > 0 or default == 0 for x, default in pairs)
 
     def lost(self, s: State, D: Vector) -> bool:
         """Whether the module's own D has lost the digits that decide, as where lengths are huge."""
@@ -193,14 +211,35 @@ class Refusals:
     def goes_on(self, method: str, s: State, steps: int) -> bool:
         """Whether a run has kept a state whose D is not positive definite."""
         run = drive(self.model, method, s, self.check.system.run.h, steps + 3)
-        last = run.rows[:, : run.done + 1]
-        if not np.all(np.isfinite(last)):
+        rows = run.rows[:, : run.done + 1].astype(float)
+        if not np.all(np.isfinite(rows)):
             return True
-        # the last state kept may be singular, but no step is made from it
-        q, qd = last[:, :-1].astype(float)
+        # an angle of 1e20 has no digit left that says what D is
+        digits = np.abs(rows[0]) * self.check.eps < CLEAR * self.check.sampler.spread
+        known = int(np.argmin([*np.all(digits, axis=1), False]))
+        if METHODS[method].c[0]:  # no stage is where the step begins
+            ends = rows[:, 1:known]
+            along = self.between(rows[:, : ends.shape[1]], ends)
+            least = np.max([self.least(q, s) for q in along], axis=0)
+        else:  # the last state kept may be singular, but no step is made from it
+            least = self.least(rows[0, : min(known, run.done)], s)
+        return bool(np.any(least < -CLEAR))
+
+    def between(self, starts: Vector, ends: Vector) -> list[Vector]:
+        """Positions along all steps, by the cubic through both ends of each: (n, nq) for ALONG."""
+        (q, qd), (r, v), h = starts, ends, self.check.system.run.h
+        return [
+            q + (r - q) * x**2 * (3 - 2 * x) + h * x * (1 - x) * (qd * (1 - x) - v * x)
+            for x in ALONG.tolist()
+        ]
+
+    def least(self, q: Vector, s: State) -> Vector:
+        """The least scaled eigenvalues of the reference's D at positions (n, nq)."""
+        if not len(q):
+            return np.zeros(0)
         with np.errstate(all="ignore"):
-            D = self.check.reference.evaluate("D", q, qd, 0.0, None, s.params) if len(q) else None
-        return D is not None and bool(np.any(_least(np.asarray(D)) < -CLEAR))
+            D = self.check.reference.evaluate("D", q, 0 * q, 0.0, None, s.params)
+        return _least(np.asarray(D))
 
     # what is not finite
 
