@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from eomc.model.system import System
-from eomc.verify import rows_plain
+from eomc.verify import rows_newton, rows_plain
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT, Report
 from eomc.verify.rows_batch import Batches
@@ -87,6 +87,7 @@ def compiled_rows(made: Comparison) -> None:
     """Add the rows about runs, refusals and, where the module has them, batches."""
     runs, refusals = Runs(made), Refusals(made)
     runs.report()
+    rows_newton.report(made)
     refusals.report()
     if hasattr(made.module, "simulate_batch"):
         Batches(runs, refusals.singular).report()

@@ -16,6 +16,8 @@ from eomc.verify.oracle import Vector
 
 SWEEPS = 20  # over the stages of an implicit method: they are to contract to a seventh
 SETTLED = 4 * 2.0**-52  # of a velocity: the stages are found
+ALL_BUT = 1e-10  # the same, where corrections are rounding and get no smaller
+WIDTH = 1e-5  # of differences
 
 Acceleration = Callable[[Vector, Vector, Any], Vector]
 
@@ -50,6 +52,49 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
         else:
             a = np.full_like(a, np.nan)
     return np.array([q + h * qd + h**2 * np.tensordot(b_a, a, 1), qd + h * np.tensordot(b, a, 1)])
+
+
+def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> Vector:
+    """(nq, 2 nq): da/dq and da/dqd at one state, by differences of WIDTH of scale (2, nq)."""
+    n = len(q)
+    by = np.diag(WIDTH * np.ravel(scale))
+    moved = np.concatenate([by, -by]) + np.concatenate([q, qd])
+    f = a(moved[:, :n], moved[:, n:], np.full(4 * n, t))
+    return np.asarray(((f[: 2 * n] - f[2 * n :]) / (2 * np.diag(by)[:, None])).T)
+
+
+def by_newton(
+    m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: float, h: float
+) -> tuple[Vector, int]:
+    """(2, nq): q and qd (nq,) at t + h by an implicit method, and how many sweeps it took.
+
+    By Newton's method with the derivatives at the start, from the acceleration there. nan where
+    corrections do not get small, which is after SWEEPS.
+    """
+    n, S = len(q), m.stages
+    A, AA = (_square(rows, S) for rows in (m.a, m.a_squared))
+    b, b_a, c = (np.array([float(x) for x in row]) for row in (m.b, m.b_a, m.c))
+    first = acceleration(q[None], qd[None], np.array([t]))[0]
+    scale = np.array([np.abs(q) + 1, np.abs(qd) + 1])
+    J = slopes(acceleration, q, qd, t, scale)
+    M = np.eye(S * n) - h * np.kron(A, J[:, n:]) - h**2 * np.kron(AA, J[:, :n])
+    a, count, last = np.tile(first, (S, 1)), 0, np.inf
+    while count < SWEEPS:
+        places = q + h * np.outer(c, qd) + h**2 * AA @ a
+        f = acceleration(places, qd + h * A @ a, t + c * h)
+        if not np.all(np.isfinite(f)):
+            break
+        d = np.linalg.solve(M, np.ravel(f - a)).reshape(S, n)
+        a, count = a + d, count + 1
+        change = float(np.max(np.abs(d)))
+        size = np.max(np.abs(qd)) / h + np.max(np.abs(q)) / h**2 + np.max(np.abs(a))
+        if change <= SETTLED * float(size) or (
+            change <= ALL_BUT * float(size) and change > last / 2
+        ):
+            ends = [q + h * qd + h**2 * b_a @ a, qd + h * b @ a]
+            return np.array(ends), count
+        last = change
+    return np.full((2, n), np.nan), SWEEPS
 
 
 def _square(rows: tuple[tuple[Any, ...], ...], n: int) -> Vector:

@@ -1,0 +1,130 @@
+"""Rows of `check` about Newton's method, by which implicit steppers find the stages of long steps.
+
+Steps that are long against the fastest mode, beside an equilibrium, where forces are all but
+linear: there Newton's method needs a few sweeps, plain ones do not get there, and one that solves
+the wrong equations is slow or lost. Compared with Newton's method in NumPy on the reference's
+accelerations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eomc.integrators.tableaux import METHODS
+from eomc.verify import one_step
+from eomc.verify.convergence import Finding
+from eomc.verify.oracle import Vector
+from eomc.verify.rows_runs import drive
+from eomc.verify.sampling import State
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+
+LENGTHS = (1.5, 6.0, 15.0)  # steps, in times the fastest mode's own
+STEPS = 3
+NEAR = 1e-6  # of how far things go: the start beside the equilibrium, linear for two plain sweeps
+LINEAR = 0.1  # the same: as far as a run may go from there
+SEARCH = 40  # for an equilibrium
+MOST = 12  # sweeps of a step by the reference: more say that the motion is not linear
+EXTRA = 8.0  # sweeps a step: what the module may need more, to see that plain ones do not contract
+OFF = 1e4  # roundings of the end, magnified as the fastest mode does
+
+
+@dataclass(frozen=True)
+class _Place:
+    """An equilibrium, a state beside it, and the derivatives of the accelerations there."""
+
+    centre: State
+    start: State
+    slopes: Vector
+
+    @property
+    def fastest(self) -> float:
+        """The largest rate at which a difference turns, decays or grows; 1/s."""
+        n = len(self.slopes)
+        matrix = np.block([[np.zeros((n, n)), np.eye(n)], [self.slopes]])
+        return float(np.max(np.abs(np.linalg.eigvals(matrix))))
+
+
+def report(check: Comparison) -> None:
+    """Add the rows; single precision leaves a motion beside an equilibrium too few digits."""
+    newton = Newton(check)
+    for method in check.methods:
+        if METHODS[method].newton and check.dtype == np.float64:
+            unit = "sweeps a step more than Newton's method"
+            check.row(f"{method} in stiff steps", EXTRA, unit, partial(newton.beyond, method))
+
+
+class Newton:
+    """What the rows compare."""
+
+    def __init__(self, check: Comparison) -> None:
+        self.check = check
+        self.scale = np.array([check.sampler.spread, check.sampler.speed])
+
+    def beyond(self, method: str) -> float | Finding:
+        """The most sweeps that the module needs beyond the reference's; inf where it ends wrong."""
+        place = self.place()
+        if place is None or not place.fastest:
+            return Finding(math.inf if place else math.nan, "no mode turns or decays")
+        found = [self.sweeps(method, place, x / place.fastest) for x in LENGTHS]
+        known = [x for x in found if x is not None]
+        return float(np.max(known)) if known else Finding(math.nan, "no stiff motion is linear")
+
+    def sweeps(self, method: str, place: _Place, h: float) -> float | None:
+        """The same for one step size; None where the reference's motion is not linear."""
+        m, s = METHODS[method], place.start
+        x, counts = np.array([s.q, s.qd]), []
+        rows = [x]
+        for n in range(STEPS):
+            with np.errstate(all="ignore"):
+                x, count = one_step.by_newton(m, self.accelerations, x[0], x[1], s.t + n * h, h)
+            far = np.abs(x - [place.centre.q, place.centre.qd]) / self.reach(place)
+            if count > MOST or not np.all(far < LINEAR):
+                return None
+            counts.append(count)
+            rows.append(x)
+        run = drive(self.check.module._model, method, s, h, STEPS)
+        if run.status:
+            return math.inf
+        off = np.max(np.abs(run.rows[:, -1] - x) / self.reach(place))
+        grown = (1 + h * place.fastest) ** 2 * STEPS
+        size = float(np.max(np.abs([place.centre.q, place.centre.qd]) / self.reach(place))) + 1
+        if not off <= OFF * grown * size * self.check.eps:
+            return math.inf
+        work = self.check.simulate(s, method=method, h=h, steps=STEPS).evaluations
+        return float(work / m.stages - sum(counts)) / STEPS
+
+    def reach(self, place: _Place) -> Vector:
+        """How far things go, (2, nq): velocities as the fastest mode has them."""
+        return np.array([self.scale[0], np.maximum(self.scale[1], self.scale[0] * place.fastest)])
+
+    def accelerations(self, q: Vector, qd: Vector, t: Vector) -> Vector:
+        """The reference's, with the scene's own parameters and signals: all (n, nq), t (n,)."""
+        return self.check.reference.acceleration(q, qd, t)
+
+    def place(self) -> _Place | None:
+        """Beside an equilibrium that Newton's method finds from the start; None: there is none."""
+        s = self.check.sampler.start
+        q, rest = s.q.copy(), np.zeros_like(s.q)
+        n = len(q)
+        with np.errstate(all="ignore"):
+            for _ in range(SEARCH):
+                a = self.accelerations(q[None], rest[None], np.array([s.t]))[0]
+                slopes = one_step.slopes(self.accelerations, q, rest, s.t, self.scale)
+                if not (np.all(np.isfinite(a)) and np.all(np.isfinite(slopes))):
+                    return None
+                step = np.linalg.lstsq(slopes[:, :n], -a, rcond=1e-10)[0]
+                step /= max(1.0, 4 * float(np.max(np.abs(step) / self.scale[0])))
+                q = q + step
+                if np.max(np.abs(step) / self.scale[0]) < NEAR**2:
+                    break
+        centre = State(q, rest, s.t)
+        signs = np.random.default_rng(4).choice([-1.0, 1.0], (2, n)) * NEAR
+        start = State(q + signs[0] * self.scale[0], signs[1] * self.scale[1], s.t)
+        return _Place(centre, start, slopes)

@@ -1,0 +1,74 @@
+"""Steps that are long against the fastest mode: Newton's method is needed, and has to be right."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import tiers
+from instrument import Shipped, in_a_fork
+from mutants import variant
+
+from eomc.integrators.tableaux import METHODS
+from eomc.verify import one_step, rows_newton
+from eomc.verify.comparison import Comparison
+
+MADE = variant("pendulum_dp8_gauss8")
+
+# what the C says, and what it is made to say
+WRONG = {
+    "the diagonal of the substitution": ("x[i] *= M[n*i + i];", "x[i] *= M[n*i - i];"),
+    "a sum of the substitution": (
+        "for (int j = i + 1; j < n; j++)\n            x[i] -=",
+        "for (int j = i + 1; j < n; j++)\n            x[i] +=",
+    ),
+    "no derivatives": ("for (int l = 0; l < NQ; l++)", "for (int l = 0; l >= NQ; l++)"),
+    "their weights": ("+ h*AA[i][j]*", "+ h*AA[j][i]*"),
+    "the exchange of rows": ("x[row[k]] = x[k];", "x[k] = x[row[k]];"),
+    "a factor": ("M[n*i + j] -= factor*M[n*k + j];", "M[n*i + j] += factor*M[n*k + j];"),
+}
+
+
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
+    """The C of the double pendulum."""
+    return Shipped(MADE, tmp_path_factory.mktemp("newton"))
+
+
+def sweeps(shipped: Shipped, source: str) -> float:
+    """What the row finds of a changed source; inf where it ends wrong."""
+
+    def measure() -> float:
+        made = Comparison(MADE, shipped.load(), np.random.default_rng(0), 4)
+        found = rows_newton.Newton(made).beyond("gauss8")
+        assert isinstance(found, float)
+        return found if math.isfinite(found) else 1e9
+
+    assert shipped.compile(("-O0", "-march=native"), source) is None
+    kind, value = in_a_fork(measure, 60)
+    assert kind == "done" and isinstance(value, float), value
+    return value
+
+
+def test_right_ones_need_few_sweeps(shipped: Shipped) -> None:
+    assert -1 <= sweeps(shipped, shipped.source) < 3
+
+
+@pytest.mark.parametrize("what", tiers(WRONG, "the diagonal of the substitution"))
+def test_wrong_ones_do_not(shipped: Shipped, what: str) -> None:
+    right, wrong = WRONG[what]
+    assert shipped.source.count(right) == 1
+    assert sweeps(shipped, shipped.source.replace(right, wrong)) > rows_newton.EXTRA
+
+
+def test_newtons_method_takes_the_step_that_sweeps_take() -> None:
+    def a(q: Any, qd: Any, t: Any) -> Any:
+        return -np.sin(q) - qd**3 / 5 + np.cos(3 * t)[..., None]
+
+    q, qd, m = np.array([0.5, -0.3]), np.array([0.2, 0.7]), METHODS["gauss6"]
+    sweeps = one_step.step(m, lambda q, qd, t: a(q, qd, np.asarray(t)), q, qd, 0.2, 0.3)
+    ends, count = one_step.by_newton(m, a, q, qd, 0.2, 0.3)
+    assert np.allclose(ends, sweeps, rtol=0, atol=1e-14)
+    assert 1 < count < 10
