@@ -15,14 +15,15 @@ import pytest
 from cases import SCENES
 
 import eomc
-from eomc.model import from_scene as system
-from eomc.scene import read as scene
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.scene.read import parse
 
 # in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-pytest_plugins = ["builds"]  # fixtures of tests/toolchain
+pytest_plugins = ["builds"]
 
 ROOT = Path(__file__).parent.parent
 MODULES = ROOT / "build" / "tests" / "modules"  # kept from one run of the tests to the next
@@ -78,12 +79,19 @@ duration = 2.0
 
 @cache
 def _loaded(name: str) -> ModuleType:
-    return eomc.load(SCENES / f"{name}.toml", MODULES)
+    return _optimised(SCENES / f"{name}.toml")
 
 
 @cache
 def _from_text(text: str) -> ModuleType:
-    return eomc.load(system.from_scene(scene.parse(text, "test.toml")), MODULES)
+    return _optimised(from_scene(parse(text, "test.toml")))
+
+
+def _optimised(made: Path | System) -> ModuleType:
+    """As it is usually built, whatever flags a test has set for modules of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("EOMC_CFLAGS", raising=False)
+        return eomc.load(made, MODULES)
 
 
 class Modules:

@@ -51,6 +51,15 @@ from eomc.model.system import System
 from eomc.report import equations_text
 from eomc.scene import read as scene
 
+# one of a kind
+FEW = [
+    PAYLOADS[name]
+    for name in (
+        "docstring", "comment", "backslash at the end", "trigraph at the end", "template", "N",
+        "spliced", "lines", "controls", "NUL", "half a character",
+    )
+]  # fmt: skip
+
 
 @pytest.fixture(autouse=True)
 def harmless() -> Iterator[None]:
@@ -142,7 +151,7 @@ def plain_tokens(folder: Path) -> str:
     return tokens(plain_files(), folder)
 
 
-@payloads
+@pytest.mark.parametrize("given", tiers(PAYLOADS.values(), *FEW), ids=PAYLOADS)
 def test_texts_change_no_code(given: str, tmp_path: Path, tmp_path_factory: Any) -> None:
     files, folder = generated(given), tmp_path_factory.getbasetemp()
     assert tokens(files, tmp_path) == plain_tokens(folder)
@@ -262,7 +271,7 @@ def test_each_payload_builds_imports_and_runs(
     assert title == given and units == dict.fromkeys(("x", "m", "g", "u"), given)
 
 
-@payloads
+@pytest.mark.parametrize("given", tiers(PAYLOADS.values(), *FEW), ids=PAYLOADS)
 def test_systems_made_in_python(given: str) -> None:
     x, m = sympy.Symbol(given), sympy.Symbol(given + "m")
     v = sympy.Symbol(f"{given}_dot")

@@ -65,6 +65,7 @@ def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
         assert re.search(rf"cartpole\.c:{k}:\d+: optimized: loop vectorized using 32 byte", said)
 
 
+@pytest.mark.slow
 def test_no_loop_over_a_tile_has_a_rest(tmp_path: Path) -> None:
     """gcc sees that they end at a multiple of a block; where it can't it writes one."""
     scene = tmp_path / "cartpole.toml"

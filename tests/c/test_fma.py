@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from cases import fast_kit
-from conftest import ROOT, needs
+from conftest import ROOT, needs, tiers
 
 import eomc
 from eomc.model import from_scene as system
@@ -170,7 +170,7 @@ def texts() -> dict[str, str]:
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-@pytest.mark.parametrize("name", texts())
+@pytest.mark.parametrize("name", tiers(texts(), "pendulum"))
 def test_self_test_finds_a_multiply_add_of_two_roundings(
     name: str, real: str, tmp_path: Path
 ) -> None:

@@ -15,7 +15,7 @@ import jinja2.meta
 import numpy as np
 import pytest
 from cases import SCENES, fast_kit
-from conftest import EVERYTHING, MODULES, ROOT, Modules, needs
+from conftest import EVERYTHING, ROOT, Modules, needs, tiers
 
 import eomc
 from eomc.base import resources
@@ -32,6 +32,7 @@ from eomc.verify.check import check
 
 STRICT = """-std=c99 -pedantic -Wall -Wextra -Wconversion -Wdouble-promotion -Wshadow
 -Werror""".split()
+PLAIN = ROOT / "build" / "tests" / "plain"
 STEPPERS = 'method = ["rk4", "dp8", "euler", "gauss4", "gauss6", "gauss8", "gauss16"]\n'
 NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
 # by name: the scene, and what it has under [run] besides
@@ -43,8 +44,10 @@ WISHES = {
     "single": ("suspension", 'real = "float"\nlinearize = true\nmethod = ["rk4", "gauss4"]\n'),
     "everything": ("", 'method = ["rk4", "dp8", "euler"]\n'),
 }
-QUICK = ("cartpole_driven", "kapitza_pendulum", "steppers", "driven", "single", "everything")
+QUICK = ("driven", "single", "everything")
 FEW = ("cartpole", "chain", "steppers", "driven", "many", "single", "everything")
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 @cache
@@ -66,7 +69,7 @@ def generated(name: str) -> Sources:
 
 def both(name: str) -> tuple[ModuleType, ModuleType]:
     """The modules of the fast and of the plain form."""
-    return eomc.load(made(name), MODULES), eomc.load(made(name), MODULES, form="plain")
+    return eomc.load(made(name), PLAIN), eomc.load(made(name), PLAIN, form="plain")
 
 
 def kit(name: str, folder: Path) -> str:
@@ -87,7 +90,7 @@ def run(*command: str, cwd: Path) -> str:
 # --- compilers ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [*NAMES, *WISHES])
+@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], *FEW))
 def test_strict_gcc_has_nothing_to_say(name: str, tmp_path: Path) -> None:
     name = kit(name, tmp_path)
     (tmp_path / "twice.c").write_text(f'#include "{name}.h"\n#include "{name}.h"\n')
@@ -95,9 +98,7 @@ def test_strict_gcc_has_nothing_to_say(name: str, tmp_path: Path) -> None:
     run(needs("gcc"), *STRICT, "-O1", "-I.", "-c", *files, cwd=tmp_path)
 
 
-@pytest.mark.parametrize(
-    "name", [*FEW, *(pytest.param(n, marks=pytest.mark.slow) for n in NAMES if n not in FEW)]
-)
+@pytest.mark.parametrize("name", tiers(dict.fromkeys([*FEW, *NAMES]), *FEW))
 def test_strict_clang_and_cpp_have_nothing_to_say(name: str, tmp_path: Path) -> None:
     name = kit(name, tmp_path)
     run(needs("clang"), *STRICT, "-O1", "-c", f"{name}.c", cwd=tmp_path)
@@ -105,7 +106,7 @@ def test_strict_clang_and_cpp_have_nothing_to_say(name: str, tmp_path: Path) -> 
     run(needs("g++"), *cpp, f"{name}.c", cwd=tmp_path)
 
 
-@pytest.mark.parametrize("name", [*NAMES, *WISHES])
+@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], *FEW))
 def test_both_forms_have_the_same_prototypes(name: str) -> None:
     def prototypes(header: str) -> set[str]:
         bare = re.sub(r"/\*.*?\*/", "", header, flags=re.DOTALL)
@@ -118,7 +119,7 @@ def test_both_forms_have_the_same_prototypes(name: str) -> None:
     assert len(plain) > 8
 
 
-@pytest.mark.parametrize("name", ["cartpole", "driven", "everything"])
+@pytest.mark.parametrize("name", tiers(["cartpole", "driven", "everything"], "driven"))
 def test_the_object_has_the_public_names_and_no_other(name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
     run("cc", "-std=c99", "-O2", "-c", f"{title}.c", cwd=tmp_path)
@@ -135,7 +136,7 @@ def test_the_object_has_the_public_names_and_no_other(name: str, tmp_path: Path)
     assert {f"{title}_{what}" for what in ("D", "acceleration", "defaults", "q0", "qd0")} <= public
 
 
-@pytest.mark.parametrize("name", ["cartpole", "chain", "driven"])
+@pytest.mark.parametrize("name", tiers(["cartpole", "chain", "driven"], "cartpole"))
 def test_it_is_smaller_than_the_fast_form(name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
     sizes = []
@@ -165,10 +166,7 @@ def test_header_and_source_of_the_two_forms_do_not_go_together(tmp_path: Path) -
 # --- what it computes -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name",
-    [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in NAMES if n not in QUICK)],
-)
+@pytest.mark.parametrize("name", tiers([*NAMES, "steppers", *QUICK], *QUICK))
 def test_it_agrees_with_the_reference_and_the_fast_form(name: str) -> None:
     fast, plain = both(name)
     report = check(made(name), fast, plain=plain, states=6)
@@ -221,7 +219,7 @@ def test_a_run_is_its_steps_bit_by_bit_however_it_is_cut() -> None:
         assert np.array_equal(np.hstack([q, qd]), whole.x[-1]), method
 
 
-@pytest.mark.parametrize("name", ["many", "verlet"])
+@pytest.mark.parametrize("name", tiers(["many", "verlet"], "verlet"))
 def test_a_batch_is_a_loop_over_instances(name: str) -> None:
     fast, plain = both(name)
     random = np.random.default_rng(5)
@@ -256,7 +254,7 @@ duration = 1.0
 method = ["gauss4", "gauss6", "gauss8"]
 """
     stiff = system.from_scene(scene.parse(text, "plain_stiff.toml"))
-    fast, plain = (eomc.load(stiff, MODULES, form=form) for form in ("fast", "plain"))
+    fast, plain = (eomc.load(stiff, PLAIN, form=form) for form in ("fast", "plain"))
     for method in plain.methods:
         one, other = (m.simulate(steps=100, method=method) for m in (fast, plain))
         assert str(other.status) == "ok"
@@ -334,7 +332,7 @@ def test_what_is_refused_leaves_the_arguments_as_they_were(tmp_path: Path) -> No
 # --- large systems --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["everything", "single", "driven"])
+@pytest.mark.parametrize("name", tiers(["everything", "single", "driven"], "single"))
 def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Into static functions that hand values on in a struct; the self-test passes."""
     monkeypatch.setattr(outline, "LARGE", 5)
@@ -363,7 +361,7 @@ def test_a_chain_of_thirty_links_by_columns(tmp_path: Path) -> None:
     text = re.sub(r"^name *= .*", 'name = "plain_links"', text, count=1, flags=re.MULTILINE)
     text = text.replace("[run]\n", "[run]\nlinearize = true\n")
     links = system.from_scene(scene.parse(text, "plain_links.toml"))
-    fast, plain = (eomc.load(links, MODULES, form=form) for form in ("fast", "plain"))
+    fast, plain = (eomc.load(links, PLAIN, form=form) for form in ("fast", "plain"))
     source = eomc.sources(links).files["plain_links.c"]
     assert "plain_links_D_column(" in source
     q, qd = np.random.default_rng(3).standard_normal((2, len(links.q)))

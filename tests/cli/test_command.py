@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import sympy
 from click.testing import CliRunner, Result
-from conftest import MODULES
 
 from eomc import pipeline
 from eomc.cli.main import main
@@ -23,7 +22,7 @@ SCENES = Path(__file__).parents[2] / "scenes"
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quickly_compiled: None) -> Path:
     """An empty directory with two scenes, in which the command is run."""
     for name in ("cartpole", "kapitza_pendulum"):
         shutil.copy(SCENES / f"{name}.toml", tmp_path)
@@ -70,9 +69,8 @@ sys.exit(", ".join(slow & set(sys.modules)) or 0)
 
 def test_what_does_nothing_imports_nothing_slow(here: Path) -> None:
     """Help, and a build that is there, in a tenth of a second."""
-    scene = str(SCENES / "cartpole.toml")
-    pipeline.build(scene, MODULES)
-    for words in (["--help"], ["build", scene, "--build", str(MODULES)]):
+    pipeline.build("cartpole.toml")
+    for words in (["--help"], ["build", "cartpole.toml"]):
         command = [sys.executable, "-c", LIGHT, *words]
         done = subprocess.run(command, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (0, "")

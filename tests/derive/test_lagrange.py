@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import sympy
 from cases import scene_system
+from conftest import tiers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -31,10 +32,11 @@ from eomc.verify import check
 from eomc.verify.symbolic import Reference
 from eomc.verify.symbolic import derive as plainly
 
-ALL = settings(
-    derandomize=True, deadline=None, max_examples=24, database=None,
+FEW = settings(
+    derandomize=True, deadline=None, max_examples=6, database=None,
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
+MANY = settings(FEW, max_examples=48)
 
 A, B = symbol("a"), symbol("b")  # parameters
 U = symbol("u")  # an input
@@ -176,16 +178,27 @@ def assert_agree(made: System) -> None:
             )
 
 
-@ALL
+@FEW
 @given(systems())
 def test_a_random_system_is_derived_as_by_the_textbook(made: System) -> None:
     assert_agree(made)
 
 
+@pytest.mark.slow
+@MANY
+@given(systems())
+def test_many_random_systems_are_derived_as_by_the_textbook(made: System) -> None:
+    assert_agree(made)
+
+
 @pytest.mark.parametrize("route", ["lagrange", "expanded", "cancelled"])
+@pytest.mark.parametrize(
+    "name",
+    tiers(["cartpole", "double_pendulum", "foucault_pendulum", "heavy_top"], "foucault_pendulum"),
+)
 def test_every_route_is_the_same_motion(
-    route: str, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
+    name: str, route: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whichever is cheapest is kept, so each is looked at by itself."""
     right = program.cheapest
 
@@ -193,10 +206,9 @@ def test_every_route_is_the_same_motion(
         return right(name, made, {route: routes[route]} if route in routes else routes)
 
     monkeypatch.setattr(program, "cheapest", this_one)
-    for name in ("cartpole", "double_pendulum", "foucault_pendulum", "heavy_top"):
-        made = scene_system(name)
-        assert compiled(made)["acceleration"].route == route
-        assert_agree(made)
+    made = scene_system(name)
+    assert compiled(made)["acceleration"].route == route
+    assert_agree(made)
 
 
 def test_a_wrong_sign_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,6 +61,7 @@ def differences(m: ModuleType, q: Any, qd: Any, t: float, u: Any) -> list[Any]:
         "tumbling_box",
     ),
 )
+@pytest.mark.usefixtures("quickly_compiled")
 def test_against_differences(scene: str) -> None:
     m = eomc.load(variant(scene, f"lin_{scene}", linearize="true"), MODULES)
     rng = np.random.default_rng(3)
@@ -117,6 +118,7 @@ def test_jumping_forces_are_refused() -> None:
 @pytest.mark.parametrize(
     "name", tiers(("cartpole", "cartpole_driven", "heavy_top", "chain"), "cartpole_driven")
 )
+@pytest.mark.usefixtures("quickly_compiled")
 def test_derivatives_by_parameters(name: str, tmp_path: Path) -> None:
     """Against central differences, whose own error is that of h^2 and of rounding over h."""
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")

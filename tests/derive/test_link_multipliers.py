@@ -14,7 +14,7 @@ import pytest
 import sympy
 import trees
 from cases import scene_system
-from conftest import Modules
+from conftest import Modules, tiers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -33,9 +33,10 @@ EPS = 2.0**-52
 sin, cos = sympy.sin, sympy.cos
 
 FEW = settings(
-    derandomize=True, deadline=None, max_examples=24, database=None,
+    derandomize=True, deadline=None, max_examples=4, database=None,
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
+MANY = settings(FEW, max_examples=24)
 
 
 def made_of(text: str) -> System:
@@ -141,7 +142,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", tiers(SHAPES, "pendulum", "fork"))
 @pytest.mark.parametrize("equal", [True, False], ids=["equal", "unequal"])
 @pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
 def test_masses_on_links(shape: str, equal: bool, relative: bool) -> None:
@@ -175,6 +176,17 @@ def test_positions_may_be_written_out(relative: bool) -> None:
 @FEW
 @given(st.data())
 def test_any_tree_of_links(data: Any) -> None:
+    look_at_a_tree(data)
+
+
+@pytest.mark.slow
+@MANY
+@given(st.data())
+def test_many_trees_of_links(data: Any) -> None:
+    look_at_a_tree(data)
+
+
+def look_at_a_tree(data: Any) -> None:
     n = data.draw(st.integers(1, 6))
     parents = [data.draw(st.integers(-1, k - 1)) for k in range(n)]
     equal, relative, written = (data.draw(st.booleans()) for _ in range(3))
@@ -268,7 +280,9 @@ def test_bodies_that_are_points_in_relative_angles() -> None:
 BATCH = "\n[run]\nbatch = true\n"
 
 
-@pytest.mark.parametrize("n, equal, unequal", [(5, 82, 104), (10, 177, 224), (20, 367, 464)])
+@pytest.mark.parametrize(
+    "n, equal, unequal", tiers([(5, 82, 104), (10, 177, 224), (20, 367, 464)], 10)
+)
 def test_flops_of_a_chain(n: int, equal: int, unequal: int) -> None:
     """19 a link, and five more where masses and lengths differ; up to 24 where none is to wait."""
     chain = [k - 1 for k in range(n)]
@@ -318,7 +332,7 @@ def test_divisions_do_not_wait_for_one_another() -> None:
     assert max(map(divisions_in_a_row, made)) == 1
 
 
-@pytest.mark.parametrize("size", [1e-34, 1e34])
+@pytest.mark.parametrize("size", tiers([1e-34, 1e34], 1e-34))
 def test_masses_of_any_size(size: float) -> None:
     """Products of pivots stay in the range of a double; only ratios of masses count."""
     n = 40
@@ -330,7 +344,7 @@ def test_masses_of_any_size(size: float) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-11)
 
 
-@pytest.mark.parametrize("n", [9, 20])
+@pytest.mark.parametrize("n", tiers([9, 20], 9))
 def test_products_of_pivots_lose_nothing(n: int) -> None:
     """In 40 digits; 20 links leave five products on one side of the last pivot, four on the other,
     more than there may be in one."""
@@ -352,10 +366,10 @@ def test_a_float_has_no_room_for_products_of_pivots() -> None:
     assert plain == many
 
 
-def test_it_is_taken_where_it_is_the_cheapest() -> None:
-    for n in (3, 5, 10):
-        made = made_of(links([k - 1 for k in range(n)]))
-        assert program.build(lagrange.derive(made))["acceleration"].route == "multipliers"
+@pytest.mark.parametrize("n", tiers((3, 5, 10), 5))
+def test_it_is_taken_where_it_is_the_cheapest(n: int) -> None:
+    made = made_of(links([k - 1 for k in range(n)]))
+    assert program.build(lagrange.derive(made))["acceleration"].route == "multipliers"
 
 
 # --- where it is not ------------------------------------------------------------------------------
@@ -420,6 +434,7 @@ def test_a_mass_or_link_of_nothing_is_singular(gone: str) -> None:
     assert not regular
 
 
+@pytest.mark.slow
 def test_singular_and_regular_in_c(modules: Modules) -> None:
     made = modules.of_text(links([-1, 0, 1, 2], more='potential = "0"'))
     q, qd = np.array([0.1, 0.4, -0.3, 0.8]), np.array([1.0, -0.5, 0.7, 0.2])
@@ -434,6 +449,7 @@ def test_singular_and_regular_in_c(modules: Modules) -> None:
             made.acceleration(q, qd, t=0.0, u=[0.0], params={gone: 0.0})
 
 
+@pytest.mark.slow
 def test_a_scene_with_a_massless_link_keeps_the_way_by_d() -> None:
     """D is regular with m0 = 0 where the links are not in line; 1/m0 is nothing to go by."""
     text = links([-1, 0, 1, 2], equal=False)

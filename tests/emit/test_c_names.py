@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from conftest import tiers
 
 import eomc
 from eomc.model.from_scene import from_scene
@@ -45,10 +46,15 @@ potential = "cos(w2) + exp(-w5**2) + k1**2*(1 + sin(w2)**2)/2"
 [forces]
 w5 = "-0.1*w5_dot + w3"
 """
+BATCH = "batch = true"
+IMPLICIT = 'method = "gauss4"\nlinearize = "parameters"'
 
 
-@pytest.mark.parametrize("run", ["", "batch = true", 'method = "gauss4"\nlinearize = "parameters"'])
-@pytest.mark.parametrize("text", [UNUSED, COORDINATES])
+@pytest.mark.parametrize(
+    "run", tiers([BATCH, "", IMPLICIT], BATCH), ids=["batch", "plain", "implicit"]
+)
+@pytest.mark.parametrize("text", [UNUSED, COORDINATES], ids=["unused", "coordinates"])
+@pytest.mark.usefixtures("quickly_compiled")
 def test_names_that_temporaries_have_too(text: str, run: str, tmp_path: Path) -> None:
     """A parameter that a function does not read once had its name taken, and its value too."""
     made = from_scene(parse(f"{text}[run]\nduration = 2\nh = 0.01\n{run}\n"))

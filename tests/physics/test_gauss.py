@@ -20,6 +20,8 @@ from eomc.integrators import tableaux
 from eomc.integrators.tableaux import METHODS
 from eomc.verify.check import check
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
 GAUSS = ("gauss4", "gauss6", "gauss8")
 ALL = '["gauss8", "gauss4", "gauss6", "rk4"]'
 

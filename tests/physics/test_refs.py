@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cases import ALIKE, case_system, cases, error_of
-from conftest import ROOT, Modules
+from conftest import ROOT, Modules, tiers
 
 from eomc.report import cost_of_digits
 
@@ -27,6 +27,8 @@ CASES = ROOT / "build" / "tests" / "cases"
 
 # mass_spring has tests of its own
 SCENES = {scene: case for scene, case in ALIKE.items() if scene != "mass_spring"}
+# those that other tests of the quick tier have built
+QUICK = ("cartpole", "cartpole_driven", "kapitza_pendulum", "kepler_orbit", "heavy_top")
 MOST_STEPS = 11_000_000  # about half a second
 
 # The quickest stepper and number of steps, of powers of two, that come down to the floor and stay
@@ -158,7 +160,7 @@ def compiled(name: str) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize(("name", "case"), SCENES.items())
+@pytest.mark.parametrize(("name", "case"), tiers(SCENES.items(), *QUICK))
 def test_scene_makes_the_error_of_rk4(modules: Modules, name: str, case: str) -> None:
     for h, steps, error in listed(case):
         assert_error_of_rk4(case, modules(name), h, steps, error)

@@ -11,6 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from cases import cases, scene_text
+from conftest import tiers
 
 import eomc
 from eomc.emit.c_expression import DOUBLE, FLOAT, Real
@@ -22,6 +23,7 @@ from eomc.verify.check import check
 SCENES = Path(__file__).parents[2] / "scenes"
 MODULES = Path("build/tests/modules")
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 # Runge-Kutta methods proper: those with an `end` of their own are Nystrom's
 EXPLICIT = [m for m in METHODS.values() if not m.implicit and not m.end]
@@ -82,7 +84,9 @@ REACHED = {
 }
 
 
-@pytest.mark.parametrize(("name", "h"), REACHED.items())
+@pytest.mark.parametrize(
+    ("name", "h"), tiers(REACHED.items(), "cartpole_torque_physicalP", "double_pendulum_regular")
+)
 def test_dp8_reaches_what_doubles_allow(name: str, h: float) -> None:
     m, case = case_module(name)
     t_end = float(case["t_end"])
@@ -116,11 +120,10 @@ def test_a_wrong_coefficient_is_found_by_check(
     assert {row.name for row in report.rows if not row.passed} >= {"order of dp8"}
 
 
-def test_a_method_that_is_not_there_is_refused_by_name() -> None:
-    m = eomc.load(SCENES / "cartpole.toml", MODULES)
-    assert m.methods == ("rk4",)
+def test_a_method_that_is_not_there_is_refused_by_name(cartpole: ModuleType) -> None:
+    assert cartpole.methods == ("rk4",)
     with pytest.raises(ValueError, match=r"method: 'dp8' is not in this module, which has rk4"):
-        m.simulate(method="dp8")
+        cartpole.simulate(method="dp8")
     source = (MODULES / "cartpole" / "cartpole.c").read_text(encoding="utf-8")
     assert "dp8" not in source
 

@@ -359,7 +359,7 @@ def by_columns(made: Program) -> Program:
 @pytest.mark.parametrize(
     "name", tiers(("cartpole", "furuta_pendulum", "kapitza_pendulum"), "furuta_pendulum")
 )
-@pytest.mark.parametrize("small", [False, True])
+@pytest.mark.parametrize("small", tiers([False, True], True))
 def test_matrices_by_columns_are_the_matrices(
     name: str, small: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

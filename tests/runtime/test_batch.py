@@ -17,7 +17,7 @@ import eomc
 NAMES = ["cartpole", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum"]
 
 
-@pytest.mark.parametrize("name", tiers(NAMES, "cartpole_driven", "kapitza_pendulum"))
+@pytest.mark.parametrize("name", tiers(NAMES, "cartpole_driven"))
 def test_each_instance_moves_as_it_would_alone(name: str) -> None:
     m = module(name)
     q0, qd0 = starts(m, 130)
@@ -146,6 +146,7 @@ def test_starts_of_any_layout_are_read_and_left_alone() -> None:
         assert np.array_equal(runs.q, wanted.q) and np.array_equal(runs.qd, wanted.qd)
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_long_rows_start_where_they_should(tmp_path: Path) -> None:
     """Nine masses in a row, on springs."""
     names = [f"x{k}" for k in range(9)]
@@ -222,17 +223,18 @@ def test_progress_reaches_the_end() -> None:
 
 
 def test_single_precision() -> None:
-    m = module("double_pendulum", real='"float"')
+    m = module("cartpole", real='"float"')
     assert m.dtype == np.float32
     q0, qd0 = starts(m, 10)
     runs = m.simulate_batch(q0, qd0, steps=STEPS)
     assert runs.q.dtype == np.float32
-    exact = module("double_pendulum").simulate_batch(q0, qd0, steps=STEPS)
+    exact = module("cartpole").simulate_batch(q0, qd0, steps=STEPS)
     error = np.max(np.abs(runs.q - exact.q))
     assert 1e-9 < error < 1e-4  # that of single precision, no more and no less
 
 
 @pytest.mark.parametrize("inputs", [True, False])
+@pytest.mark.usefixtures("quickly_compiled")
 def test_a_scene_without_parameters(tmp_path: Path, inputs: bool) -> None:
     file = tmp_path / "bare.toml"
     given = "[inputs]\nf = { signal = 0.5 }\n[forces]\nx = 'f'\n" if inputs else ""

@@ -66,7 +66,7 @@ def test_turns_by_accelerations_are_as_good_as_computed_sines(h: float, real: st
         assert np.max(np.abs(runs.qd[k] - alone.qd)) < some * (1 + 20 * h)
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
 def test_turns_by_velocities_are_as_good_as_computed_sines(real: str, tmp_path: Path) -> None:
     """A heavy rotor turns evenly, by up to 2.4 rad a step, and pushes a mass by its sine."""
     (tmp_path / "rotor.toml").write_text(

@@ -52,6 +52,7 @@ def test_a_singular_instance_is_reported_though_its_numbers_are_finite(m_c: floa
 
 
 @pytest.mark.parametrize("method", ["rk4", "dp8"])
+@pytest.mark.usefixtures("quickly_compiled")
 def test_positions_and_velocities_overflow_each_alone(method: str, tmp_path: Path) -> None:
     """Under a force, near the largest double; what the other makes of it is finite."""
     (tmp_path / "push.toml").write_text(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cases import SCENES, case_system, cases, error_of
-from conftest import ROOT, Modules
+from conftest import ROOT, Modules, tiers
 
 import eomc
 from eomc.runtime import estimate
@@ -108,6 +108,7 @@ QUICK = (
     "coulomb_friction",
     "slider_crank_near_changepoint",
 )
+FIRST = ("pendulum_large_swing", "coulomb_friction")
 
 
 def judged(name: str, most: int) -> list[tuple[float, bool]]:
@@ -127,7 +128,7 @@ def judged(name: str, most: int) -> list[tuple[float, bool]]:
     return out
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", tiers(QUICK, *FIRST))
 def test_estimate_is_within_a_factor_of_ten(name: str) -> None:
     found = judged(name, 100_000)
     assert len(found) >= 3

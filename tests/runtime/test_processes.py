@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import batches
 import numpy as np
 import pytest
 from cases import SCENES
@@ -41,12 +42,7 @@ def copied(request: pytest.FixtureRequest) -> Callable[[Any], Any]:
 @pytest.fixture(scope="session")
 def batch() -> ModuleType:
     """Many cart-poles."""
-    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
-    from eomc.model import from_scene as system
-    from eomc.scene import read as scene
-
-    made = scene.parse(text.replace("[run]\n", "[run]\nbatch = true\n"), "many.toml")
-    return eomc.load(system.from_scene(made), MODULES)
+    return batches.module("cartpole")
 
 
 # --- copies ---------------------------------------------------------------------------------------
@@ -214,6 +210,7 @@ def test_a_module_imported_by_its_own_name_needs_no_eomc(cartpole: ModuleType) -
     assert "cartpole.trajectory 4.0 (6,)" in done.stdout.decode()
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_a_run_of_another_version_of_the_scene_says_so(tmp_path: Path) -> None:
     file = tmp_path / "cartpole.toml"
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
@@ -227,15 +224,11 @@ def test_a_run_of_another_version_of_the_scene_says_so(tmp_path: Path) -> None:
     )
     made = subprocess.run(
         [sys.executable, "-c", code, str(file), str(tmp_path / "build")],
-        capture_output=True, check=True, env={**os.environ, "EOMC_CFLAGS": "-O0"},
+        capture_output=True, check=True,
     ).stdout  # fmt: skip
     run, fault = pickle.loads(made)
-    os.environ["EOMC_CFLAGS"] = "-O0"
-    try:
-        file.write_text(text + "# a comment\n", encoding="utf-8")
-        eomc.build(file, tmp_path / "build")
-    finally:
-        del os.environ["EOMC_CFLAGS"]
+    file.write_text(text + "# a comment\n", encoding="utf-8")
+    eomc.build(file, tmp_path / "build")
     with pytest.warns(RuntimeWarning, match="pickled from another version of the scene"):
         assert len(pickle.loads(run)) == 6
     for name in [name for name in sys.modules if name.startswith("_eomc_cartpole_")]:
@@ -308,6 +301,7 @@ def test_a_parameter_called_like_a_function(cartpole: ModuleType) -> None:
         cartpole.m_c  # noqa: B018 - it raises
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_what_is_no_name_of_the_scene_may_be_assigned(tmp_path: Path) -> None:
     x = sympy_symbol("x")
     made = System.make("free", {x: 1.0}, sympy_symbol("x_dot") ** 2 / 2, x**2 / 2)

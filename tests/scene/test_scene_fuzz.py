@@ -15,7 +15,8 @@ from eomc.scene import formulas
 from eomc.scene import read as scene
 from eomc.scene.formulas import FormulaError
 
-fuzz = settings(max_examples=150, deadline=None, derandomize=True, database=None)
+few = settings(max_examples=25, deadline=None, derandomize=True, database=None)
+many = settings(few, max_examples=150)
 
 CARTPOLE = Path(__file__).parents[2].joinpath("scenes/cartpole.toml").read_text(encoding="utf-8")
 SMALL = """eomc = 1
@@ -150,6 +151,11 @@ def warm():
         system.from_scene(scene.parse(text))
 
 
+def in_two_tiers(examples, test):
+    """A test with few examples, and one of the slow tier with many."""
+    return few(examples(test)), pytest.mark.slow(many(examples(test)))
+
+
 edits = st.tuples(
     st.sampled_from(["delete", "double", "insert", "token", "line", "double line", "cut"]),
     st.floats(0, 1, exclude_max=True),
@@ -174,15 +180,17 @@ def edited(text, edit):
     }[kind]
 
 
-@fuzz
-@given(st.sampled_from(TEXTS), st.lists(edits, min_size=1, max_size=4))
-def test_broken_scenes(text, changes):
+def broken_scenes(text, changes):
     for change in changes:
         text = edited(text, change)
     harmless(text)
 
 
-@fuzz
+broken = given(st.sampled_from(TEXTS), st.lists(edits, min_size=1, max_size=4))
+test_broken_scenes, test_many_broken_scenes = in_two_tiers(broken, broken_scenes)
+
+
+@many
 @given(st.lists(st.sampled_from(TOKENS), min_size=1, max_size=8), st.booleans(), st.data())
 def test_random_formulas_in_scenes(tokens, blank, data):
     formula = (" " if blank else "").join(tokens)
@@ -210,14 +218,18 @@ damping friction friction_width actuator coordinate bodies points turning stiffn
 repeat""".split()
 
 
-@fuzz
-@given(st.lists(st.tuples(st.sampled_from([*tables, "x", "float", "m"]), values), max_size=5))
-def test_values_of_any_type_anywhere(entries):
+def values_anywhere(entries):
     harmless("\n".join(f"{key} = {value}" for key, value in dict(entries).items()))
     inside = "\n".join(f"{key} = {value}" for key, value in dict(entries).items())
     for table in ("coordinates", "parameters", "energy", "definitions", "run"):
         harmless(SMALL + f"[{table}]\n{inside}\n")
         harmless(f"eomc = 1\nname = 'n'\n[{table}]\n{inside}\n")
+
+
+keyed = st.tuples(st.sampled_from([*tables, "x", "float", "m"]), values)
+test_values_of_any_type_anywhere, test_many_values_of_any_type_anywhere = in_two_tiers(
+    given(st.lists(keyed, max_size=5)), values_anywhere
+)
 
 
 sized = st.recursive(
@@ -229,14 +241,7 @@ sized = st.recursive(
 )  # fmt: skip
 
 
-@fuzz
-@given(
-    st.sampled_from([BODIES, SPACE]),
-    st.sampled_from(["body", "spring", "damper"]),
-    st.dictionaries(st.sampled_from(keys), sized, max_size=6),
-    sized,
-)
-def test_bodies_with_values_of_any_type(text, array, entries, value):
+def values_in_bodies(text, array, entries, value):
     entry = "\n".join(f"{key} = {value}" for key, value in entries.items())
     harmless(f"{text}[[{array}]]\n{entry}\n")
     harmless("\n".join(line for line in text.split("\n") if line.split(" =")[0] not in entries))
@@ -246,7 +251,18 @@ def test_bodies_with_values_of_any_type(text, array, entries, value):
         harmless(f"{at_top} = {value}\n" + text.replace("gravity", "#", 1))
 
 
-@fuzz
+test_bodies_with_values_of_any_type, test_many_bodies_with_values_of_any_type = in_two_tiers(
+    given(
+        st.sampled_from([BODIES, SPACE]),
+        st.sampled_from(["body", "spring", "damper"]),
+        st.dictionaries(st.sampled_from(keys), sized, max_size=6),
+        sized,
+    ),
+    values_in_bodies,
+)
+
+
+@many
 @given(st.text(st.sampled_from("xtabc019.eE+-*/()^, _'\"\\#=<[]{}θ\n\t"), max_size=40))
 def test_random_formula_texts(text):
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib.util
 import os
 import shutil
 import signal
@@ -15,10 +16,11 @@ from pathlib import Path
 
 import pytest
 from builds import CHANGED, TEXT, gravity, leftovers, script
-from conftest import needs
+from conftest import needs, tiers
 
 import eomc
 from eomc.base import resources
+from eomc.emit import render
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.toolchain import cache, compiler
@@ -67,36 +69,41 @@ def test_nothing_is_built_where_nothing_has_changed(
     assert marks(second.folder) == before
 
 
-def test_what_is_found_is_found_without_sympy(scene: Path, root: Path) -> None:
+def test_what_is_found_is_found_without_sympy(scene: Path, root: Path, found: None) -> None:
     """That is what makes it take a tenth of a second."""
-    eomc.build(scene, root)
+    assert not eomc.build(scene, root).fresh
     code = "import sys, eomc; eomc.load(*sys.argv[1:]).D([0.0]); sys.exit('sympy' in sys.modules)"
     subprocess.run([sys.executable, "-c", code, str(scene), str(root)], check=True)
 
 
+@pytest.fixture
+def bytecode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder in which Python keeps bytecode; those of the package are there."""
+    monkeypatch.setattr(sys, "pycache_prefix", str(tmp_path / "kept"))
+    Path(importlib.util.cache_from_source(render.__file__)).parent.mkdir(parents=True)
+    return tmp_path / "kept"
+
+
 def test_templates_are_compiled_once_and_kept_with_pythons_bytecode(
-    scene: Path, tmp_path: Path
+    scene: Path, bytecode: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kept, before = tmp_path / "kept", None
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    system, made = eomc.read(scene), []
     for k in range(3):
-        root = tmp_path / f"build{k}"
-        keeps = {"PYTHONPYCACHEPREFIX": str(kept), "PYTHONDONTWRITEBYTECODE": ""}
-        process = started(scene, root, **keeps)
-        assert process.communicate()[0].strip() == "True"
-        text = (root / "simple_pendulum" / "simple_pendulum.c").read_bytes()
-        assert text == (before or text)
-        before = text
-        files = list(kept.rglob("eomc-template-*.cache"))
+        made.append(eomc.sources(system).files)
+        files = list(bytecode.rglob("eomc-template-*.cache"))
         assert len(files) > 5
         for file in files:  # whatever happens to them
             file.write_bytes(b"nonsense" if k else file.read_bytes()[:-40])
+    assert made[0] == made[1] == made[2]
 
 
-def test_no_bytecode_is_written_where_python_may_write_none(scene: Path, tmp_path: Path) -> None:
-    kept = tmp_path / "kept"
-    keeps = {"PYTHONPYCACHEPREFIX": str(kept), "PYTHONDONTWRITEBYTECODE": "1"}
-    assert started(scene, tmp_path / "build", **keeps).communicate()[0].strip() == "True"
-    assert not kept.exists()
+def test_no_bytecode_is_written_where_python_may_write_none(
+    scene: Path, bytecode: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    eomc.sources(eomc.read(scene))
+    assert not [path for path in bytecode.rglob("*") if path.is_file()]
 
 
 def test_garbage_is_collected_again(scene: Path, tmp_path: Path) -> None:
@@ -150,9 +157,9 @@ def test_what_a_build_depends_on(
         cache._generator_digest.cache_clear()
 
 
-def test_a_damaged_build_is_mended(scene: Path, root: Path) -> None:
+def test_a_damaged_build_is_mended(scene: Path, root: Path, found: None) -> None:
     """A file that is empty or gone is noticed, be it the library or the header."""
-    folder = eomc.build(scene, root).folder
+    folder = root / "simple_pendulum"
     next(folder.glob("_simple_pendulum_*")).write_text("", encoding="utf-8")
     assert eomc.build(scene, root).fresh
     assert gravity(root) == pytest.approx(8.2548, abs=1e-3)
@@ -250,7 +257,9 @@ def wait_for(file: Path, lines: int) -> None:
     raise AssertionError("the compiler was never called")
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "how", tiers([signal.SIGKILL, signal.SIGINT], signal.SIGKILL), ids=["SIGKILL", "SIGINT"]
+)
 def test_a_build_that_is_killed_leaves_the_old_module(
     scene: Path, root: Path, built: float, tmp_path: Path, how: signal.Signals
 ) -> None:
@@ -300,6 +309,7 @@ def test_two_builds_at_once_both_end_well(scene: Path, root: Path) -> None:
     assert gravity(root) == pytest.approx(8.2548, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_two_scenes_of_one_name_built_at_once(scene: Path, root: Path, tmp_path: Path) -> None:
     """The last one stays, and it is whole."""
     other = tmp_path / "other.toml"
@@ -350,7 +360,7 @@ def test_a_compiler_that_is_not_there(
         eomc.build(scene, root)
 
 
-@pytest.mark.parametrize("cc", ["clang", "gcc -m64"])
+@pytest.mark.parametrize("cc", tiers(["clang", "gcc -m64"], "gcc -m64"))
 def test_the_compiler_that_was_asked_for(
     scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch, cc: str
 ) -> None:
@@ -362,8 +372,7 @@ def test_the_compiler_that_was_asked_for(
     assert cc.split()[-1] in (root / "simple_pendulum" / "build.json").read_text()
 
 
-def test_a_faulty_scene_is_not_built(scene: Path, root: Path) -> None:
-    eomc.build(scene, root)
+def test_a_faulty_scene_is_not_built(scene: Path, root: Path, found: None) -> None:
     before = marks(root / "simple_pendulum")
     scene.write_text(TEXT.replace('"m*g*y"', '"m*gg*y"'), encoding="utf-8")
     with pytest.raises(eomc.SceneError, match="'gg'"):

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
 from fractions import Fraction
+from functools import cached_property
 from math import comb, inf, lcm
 
 Row = tuple[Fraction, ...]
@@ -46,7 +47,7 @@ class Method:
         """Accelerations a step."""
         return len(self.b)
 
-    @property
+    @cached_property
     def implicit(self) -> bool:
         """Whether the stages depend on one another."""
         return any(any(row[i:]) for i, row in enumerate(self.a))
@@ -56,32 +57,32 @@ class Method:
         """Whether the stages are found with derivatives, however stiff the motion is."""
         return self.implicit and not self.sweeps
 
-    @property
+    @cached_property
     def c(self) -> Row:
         """The nodes, sum_k a_ik."""
         return self.nodes or tuple(sum(row, Fraction(0)) for row in self.a)
 
-    @property
+    @cached_property
     def a_squared(self) -> tuple[Row, ...]:
         """A A: what accelerations add to the positions of the stages, over h^2."""
         return tuple(_times(row, self.a) for row in self.a)
 
-    @property
+    @cached_property
     def b_a(self) -> Row:
         """b A: what they add to the position at the end, over h^2."""
         return self.end or _times(self.b, self.a)
 
-    @property
+    @cached_property
     def ahead(self) -> tuple[Row, ...]:
         """E: accelerations at the next step's nodes, E a, by the polynomial through this step's."""
         return tuple(tuple(_value(basis, 1 + x) for basis in _lagrange(self.c)) for x in self.c)
 
-    @property
+    @cached_property
     def a_ahead(self) -> tuple[Row, ...]:
         """A E: `a` for the accelerations of the step before."""
         return tuple(_times(row, self.ahead) for row in self.a)
 
-    @property
+    @cached_property
     def a_squared_ahead(self) -> tuple[Row, ...]:
         """A A E."""
         return tuple(_times(row, self.ahead) for row in self.a_squared)

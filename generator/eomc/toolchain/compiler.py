@@ -83,14 +83,24 @@ def flags(form: str = "fast", wide: bool = False) -> tuple[str, ...]:
     AVX-512's registers. Straight-line code is shorter there: a chain of five takes 0.85 of the
     time, a Panda 0.94.
     """
-    given = os.environ.get("EOMC_CFLAGS")
+    given = _given_flags()
     if given is not None:
-        return tuple(_words("EOMC_CFLAGS", given))
+        return given
     if form == "plain":
         return PLAIN_FLAGS
     if "avx512f" not in processor():
         return FLAGS
     return (*FLAGS, f"-mprefer-vector-width={512 if wide else 256}")
+
+
+def binding_flags() -> tuple[str, ...]:
+    """Those of the binding: $EOMC_CFLAGS or -O1, since its speed is that of the calls in it."""
+    return _given_flags() or ("-O1",)
+
+
+def _given_flags() -> tuple[str, ...] | None:
+    given = os.environ.get("EOMC_CFLAGS")
+    return None if given is None else tuple(_words("EOMC_CFLAGS", given))
 
 
 def standard(form: str) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError
-from eomc.toolchain.compiler import STANDARD, Compiler, flags, standard
+from eomc.toolchain.compiler import STANDARD, Compiler, binding_flags, flags, standard
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
@@ -38,8 +38,7 @@ def build(
     common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
     jobs = [
         [*common, standard(form), *flags(form, made.wide), "-c", f"{at}{name}.c", "-o", "scene.o"],
-        # the wrapper's speed is that of the calls in it
-        [*common, STANDARD, "-O1", *include, "-c", f"{at}binding.c", "-o", "binding.o"],
+        [*common, STANDARD, *binding_flags(), *include, "-c", f"{at}binding.c", "-o", "binding.o"],
     ]
     running = []
     try:
