@@ -10,7 +10,7 @@ import mpmath
 import numpy as np
 import pytest
 from cases import SCENES, fast_kit
-from conftest import MODULES, ROOT, needs, tiers
+from conftest import MODULES, ROOT, Modules, needs, tiers
 from sympy import Rational, S
 
 import eomc
@@ -71,7 +71,9 @@ def test_angles_that_are_linear_in_coordinates_are_found() -> None:
 
 
 @pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.3), 0.02))
-def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path) -> None:
+def test_steps_short_and_long_are_those_of_the_textbook(
+    h: float, tmp_path: Path, modules: Modules
+) -> None:
     """Turns of some 1e-6, 1e-4 and, beyond what is rotated, 1e-1."""
     (tmp_path / "odd.toml").write_text(ODD, encoding="utf-8")
     links = range(1, 7)
@@ -82,21 +84,20 @@ def test_steps_short_and_long_are_those_of_the_textbook(h: float, tmp_path: Path
     many += f'kinetic = "{energy} + a1_dot*a2_dot*sin(a1)/5"\npotential = "{springs}"\n'
     (tmp_path / "many.toml").write_text(many, encoding="utf-8")
     own = (tmp_path / "odd.toml", tmp_path / "many.toml")
-    for path in (*own, SCENES / "cartpole.toml", SCENES / "double_pendulum.toml"):
-        module = eomc.load(path, tmp_path)
+    built = [eomc.load(path, tmp_path) for path in own]
+    for module in (*built, modules("cartpole"), modules("double_pendulum")):
         run = module.simulate(h=h, steps=20)
         for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, 20), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_steps_leave_their_predictions_and_come_back(tmp_path: Path) -> None:
+def test_steps_leave_their_predictions_and_come_back(cartpole: ModuleType) -> None:
     """A pole that falls: it turns by h^2 a/8 from the predicted angles, up to 2^-12.5 is close."""
     h, steps = 0.016, 800
-    module = eomc.load(SCENES / "cartpole.toml", tmp_path)
-    run = module.simulate(h=h, steps=steps)
-    turns = h**2 / 8 * np.abs(module.acceleration(run.q, run.qd)[:, 1])
+    run = cartpole.simulate(h=h, steps=steps)
+    turns = h**2 / 8 * np.abs(cartpole.acceleration(run.q, run.qd)[:, 1])
     assert turns.max() > 1.2 * 2.0**-12.5 and turns.min() < 0.5 * 2.0**-12.5
-    for found, expected in zip((run.q[-1], run.qd[-1]), stepped(module, h, steps), strict=True):
+    for found, expected in zip((run.q[-1], run.qd[-1]), stepped(cartpole, h, steps), strict=True):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
 
 
