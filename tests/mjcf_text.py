@@ -32,6 +32,6 @@ BALL = '<geom size="0.1"/>'
 BODY = f'<body name="a"><joint name="j"/>{BALL}</body>'
 
 
-def told(robot: Robot, *words: str) -> bool:
+def reported(robot: Robot, *words: str) -> bool:
     """Whether one line of what is left out holds all the words."""
     return any(all(word in line for word in words) for line in robot.left_out)

@@ -146,6 +146,6 @@ def name_and_digest(path: Path) -> tuple[str, str]:
     try:
         tree, digest = tree_and_digest(path)
     except (OSError, ValueError):
-        return "", ""  # the reader tells what is wrong
+        return "", ""  # the reader says what is wrong
     name = tree.get("name", "")
     return name if isinstance(name, str) and name.isidentifier() else "", digest

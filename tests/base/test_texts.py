@@ -247,8 +247,8 @@ def runs(made: System, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[An
         subprocess.run([*command, *parts], cwd=built.folder, check=True)
         printed = subprocess.run([f"./{file[:-2]}"], cwd=built.folder, capture_output=True)
         assert printed.returncode == 0 and not RAW.search(printed.stdout.decode())
-    told: list[Any] = json.loads(done.stdout)
-    return told
+    reported: list[Any] = json.loads(done.stdout)
+    return reported
 
 
 def test_all_payloads_at_once_build_import_and_run(

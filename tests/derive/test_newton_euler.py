@@ -129,13 +129,13 @@ def assert_every_route_agrees(made: System, answer: Answer, some: bool = True) -
     belongs to the state. What a solution of D x = b may be off grows with D's condition.
     """
     routes = every_route(made)
-    told = 0
+    positive = 0
     for state in states(made):
         right = Asked(answer, state)
         condition = np.linalg.cond(right["D"])
         if not condition < WORST:
             continue
-        told += 1
+        positive += 1
         size = 1 + max(np.max(np.abs(right[n])) for n in ("D", "bias", "tau", "energy"))
         for (name, route), function in routes.items():
             theirs = right[VALUES.get(name.removesuffix("_column"), name)].ravel()
@@ -145,7 +145,7 @@ def assert_every_route_agrees(made: System, answer: Answer, some: bool = True) -
                 assert rounding < 1e-9
             off = np.max(np.abs(value(function, state, made) - theirs))
             assert off <= rounding * scale, f"{name} by {route} is off by {off:.1e} of {scale:.1e}"
-    assert told or not some
+    assert positive or not some
 
 
 # --- every tree of up to three joints -------------------------------------------------------------
@@ -255,10 +255,10 @@ def test_where_angles_are_singular_no_acceleration_is_given(joint: str, number: 
             continue
         for off, regular in ((0.0, False), (1e-9, False), (1e-3, True)):
             try:
-                _, told = evaluate(function, {**state, pitch: np.pi / 2 - off})
+                _, positive = evaluate(function, {**state, pitch: np.pi / 2 - off})
             except ArithmeticError:  # a pivot that is zero, or no finite result
-                told = False
-            assert told is regular, (route, off)
+                positive = False
+            assert positive is regular, (route, off)
 
 
 @pytest.mark.slow

@@ -84,7 +84,7 @@ def test_the_plane_counts_three() -> None:
     assert (found.d, found.M, found.rank) == (3, 2, 2)
 
 
-def test_turns_about_the_same_line_are_told() -> None:
+def test_turns_about_the_same_line_are_reported() -> None:
     found = count(
         body("a", "revolute", "p"),
         body("mount", "fixed", parent="a", offset="[0, 0, 1]", rotation='[["x", "pi"]]'),
@@ -102,7 +102,7 @@ def test_turns_about_the_same_line_are_told() -> None:
     assert not apart.remarks
 
 
-def test_slides_along_the_same_direction_are_told() -> None:
+def test_slides_along_the_same_direction_are_reported() -> None:
     found = count(
         body("a", "prismatic", "p", axis="[1, 0, 0]"),
         body("b", "prismatic", "q", "a", axis="[0, 1, 0]", rotation='[["z", "-pi/2"]]'),
@@ -111,7 +111,7 @@ def test_slides_along_the_same_direction_are_told() -> None:
     assert any("'p' and 'q' slide along the same direction" in r for r in found.remarks)
 
 
-def test_a_massless_spin_is_told() -> None:
+def test_a_massless_spin_is_reported() -> None:
     """A point mass on the axis of a joint: its turn costs nothing."""
     found = count(
         body("arm", "revolute", "p", axis="[0, 1, 0]", center="[0.5, 0, 0]"),
@@ -135,8 +135,8 @@ def test_massless_between_the_same_lines() -> None:
         body("b", "revolute", "q", "a", center="[0.3, 0, 0]"),
         coordinates="p q",
     )
-    told = next(r for r in found.remarks if r.startswith("without inertia"))
-    assert "p_dot = 1, q_dot = -1" in told
+    reported = next(r for r in found.remarks if r.startswith("without inertia"))
+    assert "p_dot = 1, q_dot = -1" in reported
 
 
 def test_a_body_placed_by_formulas_has_the_freedoms_that_its_formulas_leave() -> None:
@@ -164,8 +164,8 @@ mass = 1.0
 """
     found = count(bob, coordinates="a:m b:m c:m")
     assert (found.coordinates, found.rank) == (3, 2)
-    told = next(r for r in found.remarks if r.startswith("redundant"))
-    assert "a_dot = 1, b_dot = -0.5" in told and "D is singular" in told
+    reported = next(r for r in found.remarks if r.startswith("redundant"))
+    assert "a_dot = 1, b_dot = -0.5" in reported and "D is singular" in reported
 
 
 def test_a_coordinate_that_moves_no_body() -> None:
@@ -175,7 +175,7 @@ def test_a_coordinate_that_moves_no_body() -> None:
     assert "redundant: 'lone' moves no body; D is singular unless [energy]" in found.remarks[0]
 
 
-def test_a_singular_start_is_told() -> None:
+def test_a_singular_start_is_reported() -> None:
     """Polar coordinates at the centre: the angle moves nothing there."""
     bob = """
 [[body]]
@@ -188,7 +188,7 @@ mass = 1.0
     assert any("singular start" in r and "phi" in r for r in found.remarks)
 
 
-def test_gimbal_lock_at_the_start_is_told() -> None:
+def test_gimbal_lock_at_the_start_is_reported() -> None:
     head = 'eomc = 1\nname = "top_1"\ngravity = [0, 0, 0]\n[coordinates]\nyaw = {}\n'
     head += 'pitch = { start = "pi/2" }\nroll = {}\n'
     found = mobility.count(scene.parse(head + body("a", "spherical", "yaw pitch roll")))
@@ -234,8 +234,8 @@ def test_a_joint_behind_a_fixed_body_is_followed_through_its_frame() -> None:
             body("b", "revolute", "q", "mount", offset=offset, axis="[-1, 0, 0]"),
             coordinates="p q",
         )
-        told = any("turn about the same line" in remark for remark in found.remarks)
-        assert told is same
+        reported = any("turn about the same line" in remark for remark in found.remarks)
+        assert reported is same
 
 
 def suspended(start: str, rest: str) -> str:
@@ -253,7 +253,7 @@ def suspended(start: str, rest: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("start", "rest", "told"),
+    ("start", "rest", "reported"),
     [
         ("0.2", "0.1", []),
         ("1", "0.1", ["spring.1", "damper.1", "damper.2"]),
@@ -261,14 +261,16 @@ def suspended(start: str, rest: str) -> str:
         ("1", "0", ["damper.1", "damper.2"]),
     ],
 )
-def test_ends_that_meet_at_the_start_are_told(start: str, rest: str, told: list[str]) -> None:
+def test_ends_that_meet_at_the_start_are_reported(
+    start: str, rest: str, reported: list[str]
+) -> None:
     made = scene.parse(suspended(start, rest))
     found = mobility.meeting(made)
-    assert [problem.key for problem in found] == told
+    assert [problem.key for problem in found] == reported
     warnings = system.from_scene(made).warnings[len(made.warnings) :]
-    assert [problem.key for problem in warnings] == told
+    assert [problem.key for problem in warnings] == reported
     remarks = [r for r in mobility.count(made).remarks if "its ends meet at the start" in r]
-    assert [r.partition(":")[0] for r in remarks] == told
+    assert [r.partition(":")[0] for r in remarks] == reported
 
 
 def test_thousands_of_bodies_take_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,7 +343,7 @@ def test_a_long_chain_has_all_its_freedoms() -> None:
     assert (found.M, found.rank) == (n, n) and not found.remarks
 
 
-def test_scenes_without_bodies_are_told_so() -> None:
+def test_scenes_without_bodies_are_reported_so() -> None:
     text = 'eomc = 1\nname = "s_1"\n[coordinates]\nx = {}\n[energy]\nkinetic = "x_dot**2"\n'
     with pytest.raises(EomcError, match=r"the scene has no \[\[body\]\]"):
         mobility.count(scene.parse(text))
@@ -356,5 +358,5 @@ def test_the_command(tmp_path: Path) -> None:
     )
     done = CliRunner().invoke(main, ["dof", str(path)])
     assert done.exit_code == 0 and "arm: 1 freedom in space" in done.output
-    told = json.loads(CliRunner().invoke(main, ["dof", str(path), "--json"]).output)
-    assert (told["M"], told["rank"], told["joints"]) == (1, 1, {"revolute": 1})
+    reported = json.loads(CliRunner().invoke(main, ["dof", str(path), "--json"]).output)
+    assert (reported["M"], reported["rank"], reported["joints"]) == (1, 1, {"revolute": 1})

@@ -66,7 +66,7 @@ def test_inputs_forces_dissipation_and_units() -> None:
     assert wheel.acceleration([0.0], [2.0], u=[3.0]) == pytest.approx([(3.0 - 0.6) / 2])
 
 
-def test_names_that_c_cannot_bear_are_mapped_and_told() -> None:
+def test_names_that_c_cannot_bear_are_mapped_and_reported() -> None:
     theta = dynamicsymbols(r"\theta_{1}")
     double = sympy.Symbol("lambda")
     system = System.make("mapped", [theta], double * theta.diff() ** 2 / 2, parameters={double: 1})

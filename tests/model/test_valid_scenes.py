@@ -124,9 +124,9 @@ def test_python_keeps_the_names_of_the_author() -> None:
 def test_what_has_no_meaning_is_refused_at_its_line(
     change: dict[str, str], key: str, words: str
 ) -> None:
-    with pytest.raises(SceneError) as told:
+    with pytest.raises(SceneError) as reported:
         made(text("refused", **change))
-    (problem,) = told.value.problems
+    (problem,) = reported.value.problems
     assert problem.key == key and words in problem.message and problem.line > 0
 
 
@@ -140,9 +140,9 @@ def test_a_number_beyond_doubles_is_refused_in_words() -> None:
              "math", "sys", "cffi", "eomc", "test", "r"],
 )  # fmt: skip
 def test_scenes_that_would_hide_files_or_modules_are_refused(name: str) -> None:
-    with pytest.raises(SceneError) as told:
+    with pytest.raises(SceneError) as reported:
         made(text(name))
-    (problem,) = told.value.problems
+    (problem,) = reported.value.problems
     assert problem.key == "name" and f"use {name}_scene" in problem.message and problem.line == 2
 
 

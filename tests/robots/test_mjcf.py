@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mjcf_text import BALL, BODY, CLOSE, PI, model, told
+from mjcf_text import BALL, BODY, CLOSE, PI, model, reported
 
 from eomc.robots.rotations import IDENTITY
 
@@ -121,14 +121,14 @@ def test_armature_of_a_free_joint_is_mass_along_and_inertia_about(tmp_path: Path
     assert "0.5" in a.note
 
 
-def test_what_acts_on_balls_that_is_not_the_same_is_told(tmp_path: Path) -> None:
+def test_what_acts_on_balls_that_is_not_the_same_is_reported(tmp_path: Path) -> None:
     ball = f'<body><joint name="b" type="ball" armature="2" damping="3"/>{BALL}</body>'
     robot = model(tmp_path, f'<body name="a"><joint name="j"/>{BALL}{ball}</body>')
     assert [(m.armature, m.damping) for m in robot.bodies[1].motions] == [(2, 3)] * 3
-    assert told(robot, "damping of whole turns", "b")
-    assert told(robot, "exact armature of ball joints", "b")
+    assert reported(robot, "damping of whole turns", "b")
+    assert reported(robot, "exact armature of ball joints", "b")
     robot = model(tmp_path, ball)  # on the world: the armature is exact
-    assert not told(robot, "armature")
+    assert not reported(robot, "armature")
     assert robot.bodies[0].inertia[0] > 2
 
 
@@ -182,8 +182,8 @@ def test_motors_become_drives_with_their_gear(tmp_path: Path) -> None:
         ("p", "j", 4),
     ]
     assert robot.drives[0].note == "input from -1 to 1"
-    assert told(robot, "laws of actuators", "p (position)")
-    assert told(robot, "actuators on tendons", ": t")
+    assert reported(robot, "laws of actuators", "p (position)")
+    assert reported(robot, "actuators on tendons", ": t")
 
 
 def test_armature_and_damping_of_actuators_count_by_the_gear_squared(tmp_path: Path) -> None:
@@ -198,8 +198,8 @@ def test_a_shortcut_does_not_inherit_the_law_of_another(tmp_path: Path) -> None:
     actuators = '<actuator><motor name="m" joint="j"/><general name="g" joint="j"/></actuator>'
     robot = model(tmp_path, BODY, defaults, actuators)
     assert [d.gear for d in robot.drives] == [5, 5]
-    assert told(robot, "laws of actuators", "g (position)")
-    assert not told(robot, "laws of actuators", "m (")
+    assert reported(robot, "laws of actuators", "g (position)")
+    assert not reported(robot, "laws of actuators", "m (")
 
 
 HOME = """<keyframe> <key name="other" qpos="1"/>
@@ -211,18 +211,18 @@ def test_the_key_frame_home_is_the_start(tmp_path: Path) -> None:
       <body><joint name="h"/>{BALL}<body><joint name="b" type="ball"/>{BALL}
       <body><joint name="s" type="slide"/>{BALL}</body></body></body></body>"""
     with_short = model(tmp_path, text, after=HOME.replace(" -0.25", ""))
-    assert told(with_short, "key frame home", "13 numbers")
+    assert reported(with_short, "key frame home", "13 numbers")
     assert with_short.motions[0].start == 9
     robot = model(tmp_path, text, after=HOME)
     starts = [m.start for m in robot.motions]
     assert starts == pytest.approx(
         [0.1, 0.2, 0.3, PI / 2, 0, 0, 0.5, 0, PI / 2, 0, -0.25], abs=1e-15
     )
-    assert told(robot, "key frames", "other")
-    assert told(robot, "singular at the start", "b")
+    assert reported(robot, "key frames", "other")
+    assert reported(robot, "singular at the start", "b")
 
 
-def test_everything_that_is_not_read_is_told(tmp_path: Path) -> None:
+def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
     inside = """<light/><camera name="cam"/><site name="s1"/><site name="s2"/>
       <geom name="floor" type="plane" size="1 1 1"/>
       <body name="a" gravcomp="1"><joint name="j" stiffness="1 2" springdamper="1 1" range="0 9"/>
@@ -260,13 +260,13 @@ def test_everything_that_is_not_read_is_told(tmp_path: Path) -> None:
         ("sensors", "c"),
         ("settings", "size"),
     ):
-        assert told(robot, *words), words
+        assert reported(robot, *words), words
 
 
 def test_many_names_are_cut_and_counted(tmp_path: Path) -> None:
     sites = "".join(f'<site name="s{i}"/>' for i in range(30))
     robot = model(tmp_path, BODY + sites)
-    assert told(robot, "sites (30): s0, s1", "s11 and 18 more")
+    assert reported(robot, "sites (30): s0, s1", "s11 and 18 more")
 
 
 def test_gravity(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_faults_say_where_what_and_what_to_do(
         assert word in text
 
 
-def test_faults_are_told_all_at_once_with_their_lines(tmp_path: Path) -> None:
+def test_faults_are_reported_all_at_once_with_their_lines(tmp_path: Path) -> None:
     text = refused(
         tmp_path,
         '\n<body name="a"><joint axis="0 0 0"/>\n<geom size="-1"/>\n</body>',
@@ -141,7 +141,7 @@ def test_no_file_outside_the_models_folder_is_opened(tmp_path: Path) -> None:
             read.read(main, include=True)
 
 
-def test_a_file_that_is_missing_or_included_twice_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_missing_or_included_twice_is_reported(tmp_path: Path) -> None:
     main = write(tmp_path, main='<mujoco><include file="none.xml"/></mujoco>')
     with pytest.raises(SceneError, match=r'no file "none.xml"'):
         read.read(main, include=True)

@@ -91,13 +91,13 @@ def test_a_turned_tensor_keeps_its_energy() -> None:
     assert np.allclose([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], expected, rtol=0, atol=1e-15)
 
 
-def test_tensors_that_no_body_has_are_told_with_one_that_would_do() -> None:
+def test_tensors_that_no_body_has_are_reported_with_one_that_would_do() -> None:
     assert not inertias.unbalanced((1.0, 1.0, 2.0, 0, 0, 0))
     assert not inertias.indefinite((0.0, 0.0, 0.0, 0, 0, 0))
-    told = inertias.unbalanced((1.0, 1.0, 2.1, 0, 0, 0))
+    reported = inertias.unbalanced((1.0, 1.0, 2.1, 0, 0, 0))
     assert (
-        "1, 1, 2.1 break the triangle inequality" in told
-        and "[1.0333333, 1.0333333, 2.0666667, 0, 0, 0] would do" in told
+        "1, 1, 2.1 break the triangle inequality" in reported
+        and "[1.0333333, 1.0333333, 2.0666667, 0, 0, 0] would do" in reported
     )
     assert "-1" in inertias.indefinite((1.0, 1.0, -1.0, 0, 0, 0))
 

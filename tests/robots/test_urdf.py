@@ -1,4 +1,4 @@
-"""URDF files: what is read, what is told, what is refused."""
+"""URDF files: what is read, what is reported, what is refused."""
 
 from __future__ import annotations
 
@@ -92,22 +92,22 @@ def test_an_arm_is_read(read: Reader) -> None:
     assert "at most 40 N m" in robot.drives[0].note
 
 
-def test_what_is_not_modelled_is_told(read: Reader) -> None:
-    told = "\n".join(scene_text.finished(read(ARM)).left_out)
+def test_what_is_not_modelled_is_reported(read: Reader) -> None:
+    reported = "\n".join(scene_text.finished(read(ARM)).left_out)
     for words in (
         "1 mesh (not opened)", "1 box", "extend mimics shoulder (times 2, plus 0.5)",
         "limits of 2 joints", "<safety_controller>", "<transmission>", "<gazebo>", "<material>",
         "frames without mass that carry nothing: tool",
     ):  # fmt: skip
-        assert words in told
+        assert words in reported
 
 
-def test_attributes_that_are_not_read_are_told(read: Reader) -> None:
+def test_attributes_that_are_not_read_are_reported(read: Reader) -> None:
     """A stiffness in <dynamics>, a misspelt axis: without them it is another robot."""
     text = ARM.replace('damping="0.4"', 'damping="0.4" K="30"').replace("<axis xyz", "<axis xzy")
-    told = read(text).left_out
-    assert "attributes that URDF does not give <dynamics>: K (joint shoulder)" in told
-    assert any("<axis>: xzy (joint shoulder" in words for words in told)
+    reported = read(text).left_out
+    assert "attributes that URDF does not give <dynamics>: K (joint shoulder)" in reported
+    assert any("<axis>: xzy (joint shoulder" in words for words in reported)
     assert not any("attributes" in words for words in read(ARM).left_out)
     floats = ARM.replace('type="revolute"', 'type="floating"')
     assert "<dynamics> of floating joints: shoulder" in read(floats).left_out
@@ -172,13 +172,13 @@ def joint(name: str, parent: str, child: str, rest: str = "") -> str:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "reported"),
     [
         ("</robot>", joint("back", "slide", "upper-arm") + "</robot>",
-         "joint back: its child link 'upper-arm' hangs on joint 'shoulder' already: a closed loop"),
+         "joint back: its child link 'upper-arm' is held by joint 'shoulder' already: a closed"),
         ('<parent link="base"/>', '<parent link="tool"/>',
-         "the links hang on one another in a loop (upper-arm on slide on upper-arm)"),
-        ("</robot>", '<link name="lonely"/></robot>', "2 links hang on nothing (base, lonely)"),
+         "the links hold one another in a loop (upper-arm on slide on upper-arm)"),
+        ("</robot>", '<link name="lonely"/></robot>', "2 links have no parent (base, lonely)"),
         ('<parent link="base"/>', '<parent link="bass"/>', "did you mean 'base'?"),
         ('<child link="slide"/>', "", "joint extend: it has no child link"),
         ('"0 3 4"', '"0 0 0"', "joint shoulder: its axis has length zero"),
@@ -205,7 +205,7 @@ def joint(name: str, parent: str, child: str, rest: str = "") -> str:
     ],
 )  # fmt: skip
 def test_faults_name_the_link_or_joint_and_the_remedy(
-    read: Reader, old: str, new: str, told: str
+    read: Reader, old: str, new: str, reported: str
 ) -> None:
     assert old in ARM
     text = ARM.replace(old, new, 1)
@@ -213,10 +213,10 @@ def test_faults_name_the_link_or_joint_and_the_remedy(
         text = text.replace('<parent link="tool"/>', '<parent link="slide"/>')
     with pytest.raises(EomcError) as fault:
         read(text)
-    assert told in str(fault.value)
+    assert reported in str(fault.value)
 
 
-def test_all_faults_are_told_at_once(read: Reader) -> None:
+def test_all_faults_are_reported_at_once(read: Reader) -> None:
     text = ARM.replace('"0 3 4"', '"0 0 0"').replace('value="2"', 'value="-2"')
     with pytest.raises(EomcError) as fault:
         read(text)
@@ -228,7 +228,7 @@ OUTSIDE = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot name="&a
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("", "the file is empty"),
         ("<robot", "not XML"),
@@ -244,10 +244,10 @@ OUTSIDE = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot name="&a
         ("<robot><xacro:macro/></robot>", "run xacro first"),
     ],
 )
-def test_what_is_not_a_urdf(read: Reader, text: str, told: str) -> None:
+def test_what_is_not_a_urdf(read: Reader, text: str, reported: str) -> None:
     with pytest.raises(EomcError) as fault:
         read(text)
-    assert told in str(fault.value)
+    assert reported in str(fault.value)
 
 
 def test_files_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -375,7 +375,7 @@ def test_the_options_of_import(here: Path, words: list[str], coordinates: int, i
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (["--lock", "extent=0"], "did you mean 'extend'?"),
         (["--lock", "extend"], "write --lock NAME=VALUE"),
@@ -389,9 +389,9 @@ def test_the_options_of_import(here: Path, words: list[str], coordinates: int, i
         (["--out", "no/such/folder.toml"], "can't be written"),
     ],
 )
-def test_bad_options_change_nothing(here: Path, words: list[str], told: str) -> None:
+def test_bad_options_change_nothing(here: Path, words: list[str], reported: str) -> None:
     done = CliRunner().invoke(main, ["import", "crane.urdf", *words])
-    assert done.exit_code == 2 and told in done.output, done.output
+    assert done.exit_code == 2 and reported in done.output, done.output
     assert not list(here.glob("*.toml"))
 
 

@@ -28,7 +28,7 @@ BAD_VALUES = [
     ("D", ([1, NAN],), {}, r"q: .*nan.* is not finite"),
     ("D", ([1, math.inf],), {}, r"q: .*inf.* is not finite"),
     ("C", (Q, [1, 2, 3]), {}, r"qd: shape \(3,\)"),
-    ("C", ([Q, Q], QD), {}, r"qd: shape \(2,\) beside q of shape \(2, 2\)"),
+    ("C", ([Q, Q], QD), {}, r"qd: shape \(2,\) with q of shape \(2, 2\)"),
     ("bias", (Q, [NAN, 0]), {}, r"qd: .*nan.* is not finite"),
     ("acceleration", (Q, None), {}, r"qd: "),
     ("step", (Q, None), {}, r"qd: "),
@@ -172,6 +172,6 @@ def test_velocities_left_out_are_refused_not_read_from_nowhere() -> None:
     assert done.returncode == 0, done.stderr or f"ended by signal {-done.returncode}"
 
 
-def test_too_many_rows_are_told_before_the_run(cartpole: ModuleType) -> None:
+def test_too_many_rows_are_reported_before_the_run(cartpole: ModuleType) -> None:
     with pytest.raises(MemoryError, match=r"rows of 4 numbers don't fit in memory.*every="):
         cartpole.simulate(steps=10**15)

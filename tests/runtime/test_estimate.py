@@ -149,7 +149,7 @@ def test_estimates_of_the_library() -> None:
 # --- what is not resolved -------------------------------------------------------------------------
 
 
-def test_a_motion_beyond_doubles_is_told() -> None:
+def test_a_motion_beyond_doubles_is_reported() -> None:
     """Errors grow by 1.7e11 in 15 s."""
     run = compiled("double_pendulum_chaotic").simulate(h=0.005, steps=3000, estimate=True)
     assert not run.error.resolved and "exceeds a tenth" in run.error.verdict
@@ -189,7 +189,7 @@ def test_a_run_that_stopped_read_as_much_of_its_inputs(driven: ModuleType) -> No
     assert np.array_equal(run.error.q, before.error.q)
 
 
-def test_no_convergence_is_told(modules: Modules) -> None:
+def test_no_convergence_is_reported(modules: Modules) -> None:
     """x'' = -4e4 x^3 in steps of 800 radians: no iteration finds the stages of an implicit step."""
     text = SPRING.format(name="stiff_implicit", k=1e4, dissipation="0")
     module: Any = modules.of_text(text.replace("k*x**2/2", "k*x**4") + 'method = ["gauss4"]\n')
@@ -224,7 +224,7 @@ def test_held_inputs_are_held_in_shorter_steps_too(driven: ModuleType) -> None:
 # --- the stability limit --------------------------------------------------------------------------
 
 
-def test_a_step_beyond_the_limit_is_told_once(modules: Modules) -> None:
+def test_a_step_beyond_the_limit_is_reported_once(modules: Modules) -> None:
     """RK4 of an undamped spring is stable up to h omega = 2.83; measured on both sides."""
     module = spring(modules, 1e4)
     words = r"h = 0.03 s is beyond rk4's stability limit of about 0.028 s here \(fastest mode 100"

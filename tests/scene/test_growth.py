@@ -36,7 +36,7 @@ except EomcError as fault:
 
 
 def outcome(text: str, built: bool = False) -> str:
-    """What is told of a scene; "ok" where it is sound. Fails beyond the bounds."""
+    """What is reported of a scene; "ok" where it is sound. Fails beyond the bounds."""
     done = subprocess.run(
         [sys.executable, "-c", WORK, "built" if built else "read"],
         input=text.encode(), capture_output=True,
@@ -102,9 +102,9 @@ NUMBERS = {
 @pytest.mark.parametrize("name", NUMBERS)
 def test_exact_numbers_are_bounded_and_the_definition_is_named(name: str) -> None:
     first, each, key, words = NUMBERS[name]
-    told = outcome(chain(first, each, 30))
-    assert told.startswith("growth.toml:") and told.count("error") == 1
-    assert f"error: {key}: " in told and words in told
+    reported = outcome(chain(first, each, 30))
+    assert reported.startswith("growth.toml:") and reported.count("error") == 1
+    assert f"error: {key}: " in reported and words in reported
 
 
 @pytest.mark.slow
@@ -178,9 +178,9 @@ HOSTILE: dict[str, tuple[str, str]] = {
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_texts_are_refused_in_words(name: str) -> None:
     text, words = HOSTILE[name]
-    told = outcome(text)
-    assert told.startswith("growth.toml") and words in told
-    assert len(told) < 30_000
+    reported = outcome(text)
+    assert reported.startswith("growth.toml") and words in reported
+    assert len(reported) < 30_000
 
 
 def test_a_key_of_many_dots_in_a_text_is_no_key() -> None:

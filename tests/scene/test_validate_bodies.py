@@ -249,7 +249,7 @@ def test_a_repetition_may_be_empty():
     assert len(scene.parse(text.replace("value = 5", "value = 50")).assembly.bodies) == 50
 
 
-def test_problems_are_told_where_the_repeated_entry_stands():
+def test_problems_are_reported_where_the_repeated_entry_stands():
     made = scene.read(SCENES / "chain.toml")
     lines = (SCENES / "chain.toml").read_text(encoding="utf-8").split("\n")
     third = made.assembly.bodies[2]
@@ -297,12 +297,12 @@ friction = 0.2
 friction_width = "w"
 """
     assert scene.parse(text, parameters={"w": 0.3}).start()[0] == [0.3]
-    for values, told in (
+    for values, reported in (
         ({"w": 0}, "body.bob.friction_width: is 0, and must be greater than zero"),
         ({"w": -1}, "body.bob.friction_width: is -1"),
         ({"m": -2}, "body.bob.mass: is -2 kg"),
     ):
-        with pytest.raises(SceneError, match=told):
+        with pytest.raises(SceneError, match=reported):
             scene.parse(text, parameters=values)
 
 

@@ -82,10 +82,10 @@ class SceneError(EomcError):
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(sorted(problems, key=lambda p: (p.line, p.column)))
-        told = [str(p) for p in self.problems[:MOST]]
+        shown = [str(p) for p in self.problems[:MOST]]
         if len(self.problems) > MOST:
-            told.append(f"... and {len(self.problems) - MOST} more")
-        super().__init__("\n".join(told))
+            shown.append(f"... and {len(self.problems) - MOST} more")
+        super().__init__("\n".join(shown))
 
     def __reduce__(self) -> tuple[type[SceneError], tuple[Sequence[Problem]]]:
         return type(self), (self.problems,)

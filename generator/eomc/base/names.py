@@ -27,7 +27,7 @@ remainder remquo rint round scalbln scalbn tgamma trunc sincos fpclassify isfini
 isnormal signbit isgreater isgreaterequal isless islessequal islessgreater isunordered
 float_t double_t linux unix i386""".split()
 
-# scenes that would be files of a build beside theirs, and those whose functions would be macros
+# scenes that would be files of a build next to theirs, and those whose functions would be macros
 _FILES = frozenset("main selftest binding".split())
 _MACROS = re.compile(r"U?INT(8|16|32|64|MAX)|Py_\w+|(?i:SIG|PYMACCONFIG|HAVE_\w+)")
 

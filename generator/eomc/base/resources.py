@@ -20,7 +20,7 @@ def text(kind: str, name: str) -> str:
 
 
 def runtime(batch: bool) -> dict[str, str]:
-    """The files of runtime/ that are copied beside a built module; batch: those for many at once.
+    """The files of runtime/ that are copied next to a built module; batch: those for many at once.
 
     Their text by name.
     """

@@ -163,9 +163,6 @@ class FreeText:
     def __str__(self) -> NoReturn:
         raise TypeError("free text is printed as .comment, .line or .python")
 
-    def __format__(self, how: str) -> NoReturn:
-        raise TypeError("free text is printed as .comment, .line or .python")
-
     def __repr__(self) -> str:
         return "FreeText(...)"  # what prints a list of them
 

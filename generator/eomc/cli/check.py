@@ -36,10 +36,8 @@ def command(scenes: Sequence[Path], root: Path, seed: int, quiet: bool, as_json:
     with progress_bar("checking", quiet or as_json) as progress:
         for k, scene in enumerate(scenes):
             system = pipeline.read(scene)
-            module, plain = (
-                pipeline.load(scene, root, warn=warn),
-                pipeline.load(scene, root, form="plain"),
-            )
+            module = pipeline.load(scene, root, warn=warn)
+            plain = pipeline.load(scene, root, form="plain")
             report = checked(system, module, plain=plain, seed=seed)
             progress(k + 1, len(scenes))
             reports.append(report)

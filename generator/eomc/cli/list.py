@@ -37,7 +37,11 @@ def command(folders: Sequence[Path], root: Path, as_json: bool) -> None:
             try:
                 text, _ = tree_and_digest(path)
             except (OSError, ValueError):
-                text = {"eomc": 0, "name": path.stem, "title": "(can't be read: eomc build tells)"}
+                text = {
+                    "eomc": 0,
+                    "name": path.stem,
+                    "title": "(can't be read: eomc build says why)",
+                }
             if "eomc" not in text or not isinstance(text.get("name"), str):
                 continue
             name, digest = pipeline.name_and_digest(path)

@@ -96,10 +96,7 @@ class _Articulated:
         return self._outwards(columns, inverse, left), tuple(pivots)
 
     def _outwards(
-        self,
-        columns: Sequence[Column],
-        inverse: Sequence[Expr],
-        left: Sequence[Expr],
+        self, columns: Sequence[Column], inverse: Sequence[Expr], left: Sequence[Expr]
     ) -> list[Expr]:
         """qdd_k = (u - U . a) / d on the way outwards."""
         r = self.r
@@ -183,7 +180,7 @@ class _Articulated:
         """To the parent's frame and about its origin."""
         r = self.r
         if self.links[k].turns:
-            x = _Inertia(*(self._turned(k, m) for m in (x.J, x.H, x.M)))
+            x = _Inertia(*(self._by_angle(k, m) for m in (x.J, x.H, x.M)))
         R = r.rotation[k]
         if not all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
             x = _Inertia(
@@ -201,7 +198,7 @@ class _Articulated:
         )
         return _Inertia(J, H, x.M)
 
-    def _turned(self, k: int, m: Rows) -> Rows:
+    def _by_angle(self, k: int, m: Rows) -> Rows:
         """R m R^T for the joint's angle."""
         r = self.r
         i, j = AXES[self.links[k].axis]
@@ -213,14 +210,14 @@ class _Articulated:
         out[i][i], out[j][j] = r.add(m[i][i], r.minus(t)), r.add(m[j][j], t)
         out[i][j], out[j][i] = r.add(m[i][j], change), r.add(m[j][i], change)
 
-        def turned(x: Expr, y: Expr) -> tuple[Expr, Expr]:
+        def rotated(x: Expr, y: Expr) -> tuple[Expr, Expr]:
             v = list(ZERO)
             v[i], v[j] = x, y
             v = list(r.turn(k, (v[0], v[1], v[2])))
             return v[i], v[j]
 
-        out[a][i], out[a][j] = turned(m[a][i], m[a][j])
-        out[i][a], out[j][a] = turned(m[i][a], m[j][a])
+        out[a][i], out[a][j] = rotated(m[a][i], m[a][j])
+        out[i][a], out[j][a] = rotated(m[i][a], m[j][a])
         return out
 
     def _rotated(self, R: Matrix, m: Rows, symmetric: bool) -> Rows:

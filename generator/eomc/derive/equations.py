@@ -107,13 +107,6 @@ def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool)
     return tuple(tuple(column[i] for column in columns) for i in range(len(columns)))
 
 
-def refuse_massless(system: System, D: Sequence[Sequence[Expr]]) -> None:
-    """Raise SceneError where a row of D is zero."""
-    for c, row in zip(system.coordinates, D, strict=True):
-        if all(entry == 0 for entry in row):
-            no_inertia(system, c.name)
-
-
 def no_inertia(system: System, name: str) -> NoReturn:
     """Raise SceneError for a coordinate that nothing resists."""
     links = system.tree.links if system.tree else ()

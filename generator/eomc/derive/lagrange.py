@@ -27,14 +27,7 @@ from eomc.base.errors import SceneError
 from eomc.derive import link_multipliers
 from eomc.derive.articulated_body import MasslessError, accelerations
 from eomc.derive.energies import Energies, on_tape
-from eomc.derive.equations import (
-    Equations,
-    Motion,
-    along,
-    equations,
-    no_inertia,
-    refuse_massless,
-)
+from eomc.derive.equations import Equations, Motion, along, equations, no_inertia
 from eomc.derive.ldl import Rows, Solution, Vector, Way, solve, work
 from eomc.derive.newton_euler import Recursion
 from eomc.derive.tape import RoughError, Stage, Tape
@@ -93,7 +86,7 @@ def _by_lagrange(system: System) -> tuple[Equations, Way, Way]:
     """The equations, and accelerations by L D L^T and by multipliers."""
     e = on_tape(system, system.kinetic, system.potential)
     motion = _lagrange(system, e)
-    refuse_massless(system, motion.D)
+    _refuse_massless(system, motion.D)
     multipliers, operations = _by_multipliers(system), work(motion.D)
     ldl: Way = f"{operations} flops for elimination alone"
     if (
@@ -131,13 +124,10 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, Way, Way]:
     else:
         rows = recursion.mass_matrix()
         D = tuple(
-            tuple(
-                tape.total([rest.D[i][j], rows[at[x]][at[y]] if {x, y} <= at.keys() else S.Zero])
-                for j, y in enumerate(q)
-            )
+            _sums(tape, rest.D[i], placed(rows[at[x]]) if x in at else [S.Zero] * len(q))
             for i, x in enumerate(q)
         )
-        refuse_massless(system, D)
+        _refuse_massless(system, D)
     composite: Way = f"{operations} flops for elimination alone"
     if not long:
         composite = solve(tape, D, motion.balance)
@@ -178,6 +168,12 @@ def _column(system: System, recursion: Recursion, at: Mapping[Symbol, int]) -> R
     direction = dict(zip(system.q, along(system), strict=True))
     found = recursion.mass_times([direction[link.q] for link in recursion.links])
     return (tuple(found[at[x]] for x in system.q),)
+
+
+def _refuse_massless(system: System, D: Rows) -> None:
+    for c, row in zip(system.coordinates, D, strict=True):
+        if all(entry == 0 for entry in row):
+            no_inertia(system, c.name)
 
 
 def _sums(tape: Tape, one: Sequence[Expr], other: Sequence[Expr]) -> Vector:
@@ -232,10 +228,7 @@ def _lagrange(system: System, e: Energies) -> Motion:
 
 
 def _mass_matrix(
-    system: System,
-    e: Energies,
-    momenta: list[Expr],
-    projected: Callable[[list[Expr]], list[Expr]],
+    system: System, e: Energies, momenta: list[Expr], projected: Callable[[list[Expr]], list[Expr]]
 ) -> Rows:
     """D_ij = d(dF/dqd_i)/dqd_j + sum_k d(dF/dw_k)/dqd_j dy_k/dq_i, a column a sweep."""
     tape, n = e.tape, len(system.q)

@@ -28,7 +28,8 @@ from sympy.polys.matrices.exceptions import DMNonInvertibleMatrixError
 
 from eomc.derive.energies import Energies, on_tape
 from eomc.derive.ldl import Pairs, Solution, Vector, solve
-from eomc.derive.tape import Stage, Tape, is_negative, split
+from eomc.derive.tape import Stage, is_negative, split
+from eomc.derive.vectors import Vectors
 from eomc.model.system import System, dot, t
 
 Row = dict[int, Expr]  # the entries of a sparse row that are not zero, by column
@@ -78,13 +79,13 @@ def solution(system: System) -> Solution:
     return _Links(system, on_tape(system, system.kinetic, system.potential)).solution()
 
 
-class _Links:
+class _Links(Vectors):
     """The points, increments and groups of a system, and the equations of its multipliers."""
 
     def __init__(self, system: System, e: Energies) -> None:
+        super().__init__(e.tape)
         self.system = system
         self.e = e
-        self.tape: Tape = e.tape
         self.sums: dict[Symbol, dict[Symbol, Expr]] = {}
         self.divisors: list[Expr] = []
         self.points = self._points()
@@ -109,12 +110,6 @@ class _Links:
     def _moves(self, symbol: Symbol) -> bool:
         """Whether it depends on coordinates, not on time alone."""
         return self.tape.stage[symbol] > Stage.TIME
-
-    def _dot(self, a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
-        return self.tape.total([self.tape.times(x, y) for x, y in zip(a, b, strict=True)])
-
-    def _less(self, atom: Expr) -> Expr:
-        return self.tape.scaled(S.NegativeOne, atom)
 
     # --- points ----------------------------------------------------------------------------------
 
@@ -212,7 +207,7 @@ class _Links:
     def _across(self, slopes: Sequence[Expr]) -> tuple[tuple[Expr, ...], ...]:
         """A basis of what is perpendicular to the slopes."""
         if len(slopes) == 2:
-            return ((self._less(slopes[1]), slopes[0]),)
+            return ((self.minus(slopes[1]), slopes[0]),)
         constant = [k for k, x in enumerate(slopes) if self.tape.stage_of(x) <= Stage.PARAMETER]
         if not constant:
             if len(slopes) == 1:
@@ -244,7 +239,7 @@ class _Links:
             parts: dict[int, list[Expr]] = {k: [S.One]}
             for a, c in row.items():
                 for j, b in B.get(a, {}).items():
-                    parts.setdefault(j, []).append(self._less(tape.times(c, b)))
+                    parts.setdefault(j, []).append(self.minus(tape.times(c, b)))
             self.divisors.append(row[new[0]])
             inverse = tape.define(1 / row[new[0]])
             made = {j: tape.times(inverse, tape.total(cs)) for j, cs in parts.items()}
@@ -264,12 +259,12 @@ class _Links:
         n = len(names)
         at = [
             tape.total(
-                [loads.get(name, S.Zero), self._less(tape.define(p / factor)), self._less(r)]
+                [loads.get(name, S.Zero), self.minus(tape.define(p / factor)), self.minus(r)]
             )
             for (factor, _), name, p, r in zip(places, names, pull[:n], drag[:n], strict=True)
         ]
         on = [
-            S.Zero if x in names else tape.total([loads[x], self._less(p), self._less(r)])
+            S.Zero if x in names else tape.total([loads[x], self.minus(p), self.minus(r)])
             for x, p, r in zip(q, pull[n:], drag[n:], strict=True)
         ]
         return at, on
@@ -280,7 +275,7 @@ class _Links:
         for point, force, terms in zip(self.points, forces, self.driven, strict=True):
             rates = tape.forward(tape.forward(list(terms), {t: S.One}), {t: S.One})
             lost = [
-                self._less(tape.times(c, r)) for c, r in zip(terms.values(), rates, strict=True)
+                self.minus(tape.times(c, r)) for c, r in zip(terms.values(), rates, strict=True)
             ]
             free.append(tape.total([tape.define(force / point.mass), *lost]))
         return [tape.total([tape.times(b, free[k]) for k, b in row.items()]) for row in self.B]
@@ -312,8 +307,8 @@ class _Links:
         if len(one) == len(other):  # most masses resist alike in all directions
             first, size = T[0][0], range(len(one))
             if all(T[i][j] == (first if i == j else 0) for i, j in product(size, size)):
-                return self.tape.times(first, self._dot(x, y))
-        return self._dot(x, [self._dot(row, y) for row in T])
+                return self.tape.times(first, self.dot(x, y))
+        return self.dot(x, [self.dot(row, y) for row in T])
 
     # --- the multipliers -------------------------------------------------------------------------
 
@@ -324,7 +319,7 @@ class _Links:
         free = self._free(forces)
         back = self._back()
         slopes = [g.slopes for g in groups]
-        squares = [self._dot(u, u) for u in slopes]
+        squares = [self.dot(u, u) for u in slopes]
         pushes = [
             tape.define(self.unit * load / square)
             for load, square in zip(self._through_rows(back, loads), squares, strict=True)
@@ -338,14 +333,14 @@ class _Links:
                 for h, push in enumerate(pushes)
                 if push != 0 and (g, h) in near
             ]
-            return [self._dot(x, [free[a] for a in groups[g].members]), *pushed]
+            return [self.dot(x, [free[a] for a in groups[g].members]), *pushed]
 
         matrix = tuple(
             tuple(self._through(g, x, h, y) if (g, h) in near else S.Zero for h, y in rows)
             for g, x in rows
         )
         right = [
-            tape.total([self._dot(x, groups[g].beta), *map(self._less, given(g, x))])
+            tape.total([self.dot(x, groups[g].beta), *map(self.minus, given(g, x))])
             for g, x in rows
         ]
         solved = solve(tape, matrix, right, kept=tape.whole, prompt=is_prompt(self.system))
@@ -356,7 +351,7 @@ class _Links:
                 for (h, y), multiplier in zip(rows, solved.acceleration, strict=True)
                 if (g, h) in near
             ]
-            whole = [*drawn, *given(g, u), self._less(self._dot(u, groups[g].beta))]
+            whole = [*drawn, *given(g, u), self.minus(self.dot(u, groups[g].beta))]
             turning.append(tape.define(tape.total(whole) / square))
         acceleration = tuple(
             tape.total([tape.scaled(c, x) for c, x in zip(row, turning, strict=True)])

@@ -21,6 +21,7 @@ from itertools import combinations_with_replacement
 import sympy
 from sympy import Expr, S
 
+from eomc.base.spatial import ENTRIES
 from eomc.derive.tape import Tape
 from eomc.derive.vectors import AXES, ZERO, Vector, Vectors
 from eomc.model.exact import Matrix
@@ -31,7 +32,7 @@ from eomc.model.multibody import Link, Tree
 class Inertia:
     """Mass, its moment and its inertia (symmetric, by (i, j) with i <= j) about a frame's origin.
 
-    As Gautier and Khalil group it: what a joint can't tell from a part of its parent is there.
+    As Gautier and Khalil group it: what a joint can't tell from its parent's is there.
     """
 
     mass: Expr
@@ -114,8 +115,7 @@ class Recursion(Vectors):
     # --- inertial parameters ---------------------------------------------------------------------
 
     def _own(self, link: Link) -> Inertia:
-        names = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-        inertia = dict(zip(names, map(self.define, link.inertia), strict=True))
+        inertia = dict(zip(ENTRIES, map(self.define, link.inertia), strict=True))
         return Inertia(self.define(link.mass), self.vector(link.moment), inertia)
 
     def _sum(self, one: Inertia, other: Inertia) -> Inertia:
@@ -151,7 +151,7 @@ class Recursion(Vectors):
                 kept[i, i] = self.add(mine.entry(i, i), self.minus(across))
                 kept[j, j] = S.Zero
                 own[k] = Inertia(S.Zero, (moment[0], moment[1], moment[2]), kept)
-                there = self._carried(k, given, turned=False)
+                there = self._carried(k, given, rotated=False)
             else:
                 own[k] = Inertia(mine.mass, mine.moment, {})
                 given = Inertia(S.Zero, ZERO, mine.inertia)
@@ -173,10 +173,10 @@ class Recursion(Vectors):
         inertia = {(i, j): self.dot(R[j], columns[i]) for i, j in pairs}
         return Inertia(x.mass, self.apply(R, x.moment), inertia)
 
-    def _carried(self, k: int, x: Inertia, turned: bool = True) -> Inertia:
+    def _carried(self, k: int, x: Inertia, rotated: bool = True) -> Inertia:
         """An inertia of link k, about its origin, in the parent's frame and about its origin."""
-        if turned and self.links[k].turns:
-            x = self._turned(k, x)
+        if rotated and self.links[k].turns:
+            x = self._by_angle(k, x)
         x = self._rotated(self.rotation[k], x)
         r = self.arm[k]
         if r == ZERO:
@@ -190,8 +190,8 @@ class Recursion(Vectors):
             inertia[i, j] = self.add(x.entry(i, j), more, twice if i == j else S.Zero)
         return Inertia(x.mass, self.plus(x.moment, shift), inertia)
 
-    def _turned(self, k: int, x: Inertia) -> Inertia:
-        """By the joint's angle."""
+    def _by_angle(self, k: int, x: Inertia) -> Inertia:
+        """Rotated by the joint's angle."""
         i, j = AXES[self.links[k].axis]
         a = self.links[k].axis
         inertia = dict(x.inertia)
@@ -214,7 +214,7 @@ class Recursion(Vectors):
         return self.tape.scaled(S(2), x)
 
     def half_turn(self, k: int, first: Expr, second: Expr, across: Expr) -> tuple[Expr, Expr]:
-        """(t, c e) of a turned 2 x 2 matrix [[first, b], [b', second]], across = b + b'.
+        """(t, c e) of a rotated 2 x 2 matrix [[first, b], [b', second]], across = b + b'.
 
         With e = s (first - second) + c across, t = s e: first - t, second + t, and the entries off
         the diagonal change by c e - across.

@@ -58,16 +58,12 @@ def unit(axis: Sequence[float]) -> list[Expr]:
 
 
 def aligned_with(axis: Sequence[float]) -> tuple[int, Matrix]:
-    """(k, R) with R e_k = axis: frames are turned so that every joint has a coordinate axis."""
+    """(k, R) with R e_k = axis: frames are rotated so that every joint has a coordinate axis."""
     along = unit(axis)
     for k, x in enumerate(along):
         if abs(x) == 1:
-            if x == 1:
-                return k, ONE
-            rows = [[S.Zero] * 3 for _ in range(3)]
-            for i in range(3):  # half a turn about another axis
-                rows[i][i] = S.One if i == (k + 1) % 3 else S.NegativeOne
-            return k, matrix(rows)
+            half_turn = spatial.about_axis((k + 1) % 3, S.NegativeOne, S.Zero)
+            return k, ONE if x == 1 else half_turn
     # Gram and Schmidt, from the coordinate axis that is farthest from it
     far = min(range(3), key=lambda i: (abs(along[i]), i))
     first = [-along[far] * x for x in along]

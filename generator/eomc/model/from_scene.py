@@ -19,18 +19,14 @@ from eomc.scene.scene import Scene
 
 
 def _number(text: str) -> Expr:
-    return (
-        sympy.Rational(text)
-        if text[:2].lower() not in ("0x", "0o", "0b")
-        else sympy.Integer(int(text, 0))
-    )
+    whole = text[:2].lower() in ("0x", "0o", "0b")
+    return sympy.Integer(int(text, 0)) if whole else sympy.Rational(text)
 
 
 _ALGEBRA: Mapping[str, Any] = {
     "number": _number,
     "pi": sympy.pi,
-    **{n: getattr(sympy, n) for n in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")},
-    **{n: getattr(sympy, n) for n in ("sinh", "cosh", "tanh", "exp", "log", "sqrt", "sign")},
+    **{name: getattr(sympy, name) for name in (*formulas.ELEMENTARY, "sign")},
     "abs": sympy.Abs,
     "heaviside": lambda x: sympy.Heaviside(x),
     "min": sympy.Min,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import sympy
 from sympy import Expr, Symbol
@@ -15,6 +15,9 @@ from eomc.base.errors import EomcError
 from eomc.model import given
 from eomc.model.symbols import Coordinate, Input, Parameter, dot, symbol, t
 from eomc.scene.scene import Run
+
+if TYPE_CHECKING:
+    from eomc.model.system import System
 
 _UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
 
@@ -49,15 +52,10 @@ class Maker:
         expr = expr.replace(
             lambda e: isinstance(e, sympy.Derivative), lambda e: self.map.get(e, e)
         ).xreplace(self.map)
-        strange = sorted(
-            map(str, expr.atoms(AppliedUndef, sympy.Derivative) - expr.atoms(dot))
-            if expr.has(AppliedUndef, sympy.Derivative)
-            else []
-        ) + sorted(s.name for s in expr.free_symbols if s not in self.known)
-        if any(
-            isinstance(d, sympy.Derivative) and d.derivative_count > 1
-            for d in expr.atoms(sympy.Derivative)
-        ):
+        functions = expr.atoms(AppliedUndef, sympy.Derivative) - expr.atoms(dot)
+        strange = sorted(map(str, functions))
+        strange += sorted(s.name for s in expr.free_symbols if s not in self.known)
+        if any(d.derivative_count > 1 for d in expr.atoms(sympy.Derivative)):
             raise given.fault(role, "accelerations are what is solved for, none can be used")
         if strange == ["t"]:
             raise given.fault(
@@ -76,11 +74,11 @@ class Maker:
         return expr
 
     def make(
-        self, coordinates: Any, kinetic: Any, potential: Any, parameters: Mapping[Any, float],
-        dissipation: Any, forces: Mapping[Any, Any], inputs: Any, definitions: Mapping[Any, Any],
-        units: Mapping[Any, str], title: str, run: Run,
-    ) -> dict[str, Any]:  # fmt: skip
-        """The fields of a System, by name."""
+        self, of: type[System], coordinates: Any, kinetic: Any, potential: Any,
+        parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
+        definitions: Mapping[Any, Any], units: Mapping[Any, str], title: str, run: Run,
+    ) -> System:  # fmt: skip
+        """The system, of the class `of`."""
         starts = given.symbols(coordinates, "coordinates", 0.0)
         parameters = given.mapping(parameters, "parameters", "{m: 2.0}")
         forces = given.mapping(forces, "forces", "{x: F}")
@@ -103,12 +101,10 @@ class Maker:
             else:
                 self.map[Symbol(f"{one}_dot", **one.assumptions0)] = c.qd
             made.append(c)
-        declared = [
-            Parameter(
-                self._declare(p, "parameter"), given.number(v, f"parameter {p}"), units.get(p, "")
-            )
-            for p, v in parameters.items()
-        ]
+        declared = []
+        for p, v in parameters.items():
+            value = given.number(v, f"parameter {p}")
+            declared.append(Parameter(self._declare(p, "parameter"), value, units.get(p, "")))
         pending = given.symbols(inputs, "inputs", 0)
         given_inputs = [(i, self._declare(i, "input")) for i in pending]
         self.known = {c.q for c in made} | {c.qd for c in made} | {t}
@@ -123,11 +119,8 @@ class Maker:
         if unknown:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
         expression = self._expression
-        energies = {
-            "kinetic": expression(kinetic, "kinetic"),
-            "potential": expression(potential, "potential"),
-            "dissipation": expression(dissipation, "dissipation"),
-        }
+        given_energies = {"kinetic": kinetic, "potential": potential, "dissipation": dissipation}
+        energies = {role: expression(energy, role) for role, energy in given_energies.items()}
         fixed = {p.symbol for p in declared}
         for role, energy in energies.items():
             given.check_smooth(energy, role, dict(ordered), fixed)
@@ -146,7 +139,7 @@ class Maker:
             "title": title or self.name.replace("_", " ").capitalize(),
         }
         digest = hashlib.sha256(sympy.srepr(sorted(made_of.items())).encode()).hexdigest()
-        return made_of | {"digest": digest, "renamed": tuple(self.renamed)}
+        return of(**made_of, digest=digest, renamed=tuple(self.renamed))
 
     def _declare(self, one: Any, role: str) -> str:
         used = self._name_of(one, role)

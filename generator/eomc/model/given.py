@@ -141,9 +141,7 @@ def is_symbol(given: Any) -> bool:
     return isinstance(given, (Symbol, AppliedUndef))
 
 
-def run(
-    h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any
-) -> Run:  # fmt: skip
+def run(h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any) -> Run:
     """How the system is run. Raises EomcError where that is not possible."""
     for name, value in (("h", h), ("duration", duration)):
         if number(value, name) <= 0:

@@ -96,9 +96,9 @@ class Kinematics:
         inertia: dict[str, Array] = {}  # of what is beyond a joint, in the world's directions
         size: dict[str, float] = {}  # of what went into it
         for body in reversed(self.tree):
-            (at, turned), motions = frames[body.name]
+            (at, R), motions = frames[body.name]
             mass, root = self.roots[body.name]
-            own = _spatial(mass**2, turned @ self.centers[body.name], root @ turned.T)
+            own = _spatial(mass**2, R @ self.centers[body.name], root @ R.T)
             beyond = own + inertia.pop(body.name, 0)
             scale = max(float(np.abs(beyond).max()), size.pop(body.name, 0.0))
             for _, kind, axis, point in reversed(motions):
@@ -128,19 +128,19 @@ class Kinematics:
         index = {name: k for k, name in enumerate(self.coordinates)}
         out: dict[str, tuple[Pose, list[Motion]]] = {WORLD: ((np.zeros(3), np.eye(3)), [])}
         for body in self.tree:
-            at, turned = out[body.parent][0]
+            at, R = out[body.parent][0]
             offset, rotation = self.frames[body.name]
-            at, turned = at + turned @ offset, turned @ rotation
+            at, R = at + R @ offset, R @ rotation
             motions = []
             kinds = JOINTS[body.joint].motions
             for kind, axis, name in zip(kinds, self.axes(body), body.coordinates, strict=True):
                 k = index[name]
-                motions.append((k, kind, turned @ axis, at))
+                motions.append((k, kind, R @ axis, at))
                 if kind == "t":
-                    at = at + turned @ axis * q[k]
+                    at = at + R @ axis * q[k]
                 else:
-                    turned = turned @ _turn(axis, q[k])
-            out[body.name] = (at, turned), motions
+                    R = R @ _about(axis, q[k])
+            out[body.name] = (at, R), motions
         return out
 
     def jacobian(self, q: Array, t: float) -> Jacobian | None:
@@ -150,10 +150,10 @@ class Kinematics:
         except (ArithmeticError, ValueError, TypeError):
             return None
         moves, weighs = [], []
-        for body, turned, v, omega in found:
+        for body, R, v, omega in found:
             mass, inertia = self.roots[body.name]
             moves += [v, omega]
-            weighs += [mass * v, inertia @ turned.T @ omega]
+            weighs += [mass * v, inertia @ R.T @ omega]
         return Jacobian(np.vstack(moves), np.vstack([*weighs, self.armature]))
 
     def _tree_rates(self, q: Array) -> Iterator[tuple[Body, Array, Array, Array]]:
@@ -161,9 +161,9 @@ class Kinematics:
         frames = self._frames(q)
         above: dict[str, list[Motion]] = {WORLD: []}  # all between a body and the world
         for body in self.tree:
-            (at, turned), own = frames[body.name]
+            (at, R), own = frames[body.name]
             above[body.name] = [*above[body.parent], *own]
-            center = at + turned @ self.centers[body.name]
+            center = at + R @ self.centers[body.name]
             v, omega = np.zeros((3, len(q))), np.zeros((3, len(q)))
             for k, kind, axis, point in above[body.name]:
                 if kind == "t":
@@ -171,7 +171,7 @@ class Kinematics:
                 else:
                     v[:, k] += np.cross(axis, center - point)
                     omega[:, k] += axis
-            yield body, turned, v, omega
+            yield body, R, v, omega
 
     def _placed_rates(self, q: Array, t: float) -> Iterator[tuple[Body, Array, Array, Array]]:
         """The same of bodies placed by formulas, by central differences."""
@@ -183,11 +183,11 @@ class Kinematics:
         for k in range(len(q)):
             step = np.zeros(len(q))
             step[k] = STEP
-            ahead, behind = self._placed_at(q + step, t), self._placed_at(q - step, t)
+            after, before = self._placed_at(q + step, t), self._placed_at(q - step, t)
             for name in here:
-                v[name][:, k] = (ahead[name][0] - behind[name][0]) / (2 * STEP)
+                v[name][:, k] = (after[name][0] - before[name][0]) / (2 * STEP)
                 # R(q + h) R(q - h)^T = 1 + 2 h [omega] + ..., antisymmetric up to h^3
-                turn = ahead[name][1] @ behind[name][1].T / (4 * STEP)
+                turn = after[name][1] @ before[name][1].T / (4 * STEP)
                 skew = turn - turn.T
                 omega[name][:, k] = skew[2, 1], skew[0, 2], skew[1, 0]
         for body in self.placed:
@@ -196,14 +196,14 @@ class Kinematics:
     def _placed_at(self, q: Array, t: float) -> dict[str, Pose]:
         """Centre of mass and rotation of each body that is placed by formulas."""
         known = {**self.values, **dict(zip(self.coordinates, map(float, q), strict=True)), "t": t}
-        for name, ((at, turned), _) in self._frames(q).items():
+        for name, ((at, R), _) in self._frames(q).items():
             if name != WORLD:
-                center = at + turned @ self.centers[name]
+                center = at + R @ self.centers[name]
                 known |= {f"{name}_{x}": float(c) for x, c in zip("xyz", center, strict=True)}
         return {
             body.name: (
                 self.vector(body.position or (), known),
-                self._turned(body.rotation, known),
+                self._rotation(body.rotation, known),
             )
             for body in self.placed
         }
@@ -211,7 +211,7 @@ class Kinematics:
     def joint_frame(self, body: Body) -> Pose:
         """Where the joint's frame stands in the parent's."""
         offset = self.vector(body.offset, self.values) if body.offset else np.zeros(3)
-        return offset, self._turned(body.rotation, self.values)
+        return offset, self._rotation(body.rotation, self.values)
 
     def axes(self, body: Body) -> list[Array]:
         """The axis of each coordinate of a joint, in the frame that those before it moved."""
@@ -236,11 +236,11 @@ class Kinematics:
         """The values of formulas, where the names have those in `known`."""
         return np.array([self._number(formula, known) for formula in formulas_])
 
-    def _turned(self, turns: Iterable[Turn], known: dict[str, float]) -> Array:
+    def _rotation(self, turns: Iterable[Turn], known: dict[str, float]) -> Array:
         rotation = np.eye(3)
         for turn in turns:
             axis = np.eye(3)["xyz".index(turn.axis)]
-            rotation = rotation @ _turn(axis, self._number(turn.angle, known))
+            rotation = rotation @ _about(axis, self._number(turn.angle, known))
         return rotation
 
     def _number(self, formula: Formula, known: dict[str, float]) -> float:
@@ -270,7 +270,7 @@ def _spatial(mass: float, center: Array, root: Array) -> Array:
     return np.block([[root.T @ root - coupled @ c, coupled], [-coupled, mass * np.eye(3)]])
 
 
-def _turn(axis: Array, angle: float) -> Array:
+def _about(axis: Array, angle: float) -> Array:
     """The rotation by an angle about a unit axis."""
     return np.array(spatial.about(axis.tolist(), math.cos(angle), math.sin(angle)))
 

@@ -230,7 +230,7 @@ def _in_a_row(assembly: Assembly, kinematics: Kinematics) -> Iterator[str]:
         pair = above.coordinates[0], body.coordinates[0]
         yield (
             f"'{pair[0]}' and '{pair[1]}' {how}, one behind the other: only what lies between the "
-            f"two joints tells them apart, {above.name} needs inertia of its own"
+            f"two joints distinguishes them, {above.name} needs inertia of its own"
         )
 
 

@@ -103,7 +103,7 @@ class _Place:
     offset: Vector  # in the link's frame
     rotation: Matrix
     at: Vector  # in the world
-    turned: Matrix
+    R: Matrix
     angle: Expr = S.Zero  # in the plane
 
 
@@ -137,14 +137,14 @@ class Builder:
         angle = parent.angle
         if self.assembly.plane:
             angle += sum(self.value(f"{key}.rotation", turn.angle) for turn in body.rotation)
-        at = self._world(f"{body.name}_joint", plus(parent.at, apply(parent.turned, offset)))
-        turned = product(parent.turned, rotation)
+        at = self._world(f"{body.name}_joint", plus(parent.at, apply(parent.R, offset)))
+        R = product(parent.R, rotation)
         place = _Place(
             parent.link,
             plus(parent.offset, apply(parent.rotation, numeric(offset))),
             exact.clean(product(parent.rotation, exact.clean(rotation))),
             at,
-            turned,
+            R,
             angle,
         )
         armature = [self.value(f"{key}.armature", a) for a in body.armature]
@@ -153,8 +153,8 @@ class Builder:
                 body.name, place, motion, axis, name, armature[k] if armature else S.Zero
             )
         if not self.assembly.plane and body.joint != "fixed":
-            turned = self._entries(body.name, place.turned)
-            place = replace(place, turned=turned)
+            R = self._entries(body.name, place.R)
+            place = replace(place, R=R)
         self.places[body.name] = place
         self._load(body, place)
 
@@ -175,16 +175,16 @@ class Builder:
         )
         back = transposed(aligned)
         if motion == "t":
-            way = scaled(apply(place.turned, direction), q)
+            way = scaled(apply(place.R, direction), q)
             at = self._world(f"{name}_joint", plus(place.at, way))
-            return _Place(len(terms.links) - 1, ZERO, back, at, place.turned, place.angle)
+            return _Place(len(terms.links) - 1, ZERO, back, at, place.R, place.angle)
         if self.assembly.plane:
             angle = self._named(f"{name}_angle", place.angle + q)
-            turned = rotation_about(2, angle)
-            return _Place(len(terms.links) - 1, ZERO, back, place.at, turned, angle)
+            R = rotation_about(2, angle)
+            return _Place(len(terms.links) - 1, ZERO, back, place.at, R, angle)
         turn = product(product(aligned, rotation_about(k, q)), back)
-        turned = self._entries(name, product(place.turned, turn))
-        return _Place(len(terms.links) - 1, ZERO, back, place.at, turned)
+        R = self._entries(name, product(place.R, turn))
+        return _Place(len(terms.links) - 1, ZERO, back, place.at, R)
 
     def _load(self, body: Body, place: _Place) -> None:
         """The body's mass, on its link and in the energies."""
@@ -192,7 +192,7 @@ class Builder:
         mass = self.value(f"{key}.mass", body.mass)
         inertia = [self.value(f"{key}.inertia", entry) for entry in body.inertia]
         center = self._vector(f"{key}.center", body.center)
-        middle = plus(place.at, apply(place.turned, center))
+        middle = plus(place.at, apply(place.R, center))
         position = self._position(body.name, middle)
         m, c = numeric((mass, S.Zero, S.Zero))[0], numeric(center)
         moment = scaled(plus(place.offset, apply(place.rotation, c)), m)
@@ -251,14 +251,14 @@ class Builder:
         inertia = [self.value(f"{key}.inertia", entry) for entry in body.inertia]
         at = self._vector(f"{key}.position", body.position)
         position = self._position(body.name, at, later=True)
-        turned, angle = self._rotation(f"{key}.rotation", body), S.Zero
+        R, angle = self._rotation(f"{key}.rotation", body), S.Zero
         if self.assembly.plane:
             angle = sum((self.value(f"{key}.rotation", t.angle) for t in body.rotation), S.Zero)
             angle = self._named(f"{body.name}_angle", angle, later=True)
-            turned = rotation_about(2, angle)
+            R = rotation_about(2, angle)
         else:
-            turned = self._entries(body.name, turned, later=True)
-        place = _Place(-1, ZERO, ONE, position, turned, angle)
+            R = self._entries(body.name, R, later=True)
+        place = _Place(-1, ZERO, ONE, position, R, angle)
         self.places[body.name] = place
         terms.kinetic += Add(*self._kinetic(mass, inertia, position, place))
         terms.potential += self._weight(mass, position)
@@ -283,7 +283,7 @@ class Builder:
             return self._named(name, other.angle - one.angle, later=True)
         assert end.points is not None
         a, b = (
-            plus(place.at, apply(place.turned, self._vector(f"{key}.points", point)))
+            plus(place.at, apply(place.R, self._vector(f"{key}.points", point)))
             for place, point in zip((one, other), end.points, strict=True)
         )
         length = sympy.sqrt(sum((x - y) ** 2 for x, y in zip(b, a, strict=True)))
@@ -303,7 +303,7 @@ class Builder:
             (0, 0): (yy + zz - xx) / 2, (1, 1): (xx + zz - yy) / 2, (2, 2): (xx + yy - zz) / 2,
             (0, 1): -2 * xy, (0, 2): -2 * xz, (1, 2): -2 * yz,
         }  # fmt: skip
-        rates = [[_rate(entry) for entry in row] for row in place.turned]
+        rates = [[_rate(entry) for entry in row] for row in place.R]
         turning = [
             J * row[a] * row[b] / 2 for (a, b), J in second.items() if J != 0 for row in rates
         ]
@@ -317,11 +317,11 @@ class Builder:
         return (x, y, z)
 
     def _rotation(self, key: str, body: Body) -> Matrix:
-        turned = ONE
+        R = ONE
         for turn in body.rotation:
             angle = self.value(key, turn.angle)
-            turned = product(turned, rotation_about("xyz".index(turn.axis), angle))
-        return turned
+            R = product(R, rotation_about("xyz".index(turn.axis), angle))
+        return R
 
     def _position(self, name: str, at: Vector, later: bool = False) -> Vector:
         """The centre of mass, under the names that formulas may use."""
@@ -340,8 +340,8 @@ class Builder:
         x, y, z = (self._named(f"{name}_{letter}", e) for letter, e in zip("xyz", at, strict=True))
         return (x, y, z)
 
-    def _entries(self, name: str, turned: Matrix, later: bool = False) -> Matrix:
-        rows = enumerate(turned, start=1)
+    def _entries(self, name: str, R: Matrix, later: bool = False) -> Matrix:
+        rows = enumerate(R, start=1)
         return spatial.matrix(
             [self._named(f"{name}_r{i}{j}", e, later) for j, e in enumerate(row, start=1)]
             for i, row in rows

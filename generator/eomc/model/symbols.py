@@ -49,30 +49,28 @@ class Coordinate:
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """A number that may change at run time."""
-
+class _Named:
     name: str
-    value: float
-    unit: str = ""
-    note: str = ""
 
     @property
     def symbol(self) -> Symbol:
-        """The parameter's symbol."""
+        """The symbol of its name."""
         return symbol(self.name)
 
 
 @dataclass(frozen=True)
-class Input:
+class Parameter(_Named):
+    """A number that may change at run time."""
+
+    value: float
+    unit: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Input(_Named):
     """A quantity given from outside at every step; `signal` is its value by default."""
 
-    name: str
     unit: str = ""
     signal: Expr = sympy.S.Zero
     note: str = ""
-
-    @property
-    def symbol(self) -> Symbol:
-        """The input's symbol."""
-        return symbol(self.name)

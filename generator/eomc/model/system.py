@@ -30,7 +30,7 @@ class System:
 
     `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
     `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate. `tree`: the bodies
-    that hang on joints, whose energies are part of K and P. `digest` names what the system was
+    that are held by joints, whose energies are part of K and P. `digest` names what the system was
     made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
     was read from, where it was.
     """
@@ -124,11 +124,10 @@ class System:
         (theta_dot,)
         """
         run = given.run(h, duration, methods, real, batch, linearize)
-        parts = from_sympy.Maker(name).make(
-            coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
+        system = from_sympy.Maker(name).make(
+            cls, coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
             inputs, definitions or {}, units or {}, title, run,
         )  # fmt: skip
-        system = cls(**parts)
         if faults := system.beyond_float():
             raise SceneError(faults)
         return system

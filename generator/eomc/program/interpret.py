@@ -12,18 +12,12 @@ from sympy import Rational
 
 from eomc.model.system import System, t
 from eomc.program.ir import Function, Operand, Product, Sum
-
-_NAMES = "sin cos tan asin acos atan atan2 sinh cosh tanh exp log sqrt".split()
+from eomc.scene import formulas
 
 _DOUBLES: Mapping[str, Callable[..., Any]] = {
-    **{name: getattr(math, name) for name in _NAMES},
+    **formulas.NUMERIC,
     "number": float,
     "pow": math.pow,
-    "abs": abs,
-    "sign": lambda x: (x > 0) - (x < 0),
-    "heaviside": lambda x: 0.5 + 0.5 * ((x > 0) - (x < 0)),
-    "min": min,
-    "max": max,
     "reciprocal": lambda x: 1 / x,
 }
 
@@ -34,7 +28,7 @@ def _many_digits() -> Mapping[str, Callable[..., Any]]:
     mp.dps = 40
     return {
         **_DOUBLES,
-        **{name: getattr(mp, name) for name in _NAMES},
+        **{name: getattr(mp, name) for name in formulas.ELEMENTARY},
         "number": lambda x: mp.mpf(x.p) / x.q if isinstance(x, Rational) else mp.mpf(x.evalf(40)),
         "pow": mp.power,
     }

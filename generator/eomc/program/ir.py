@@ -67,7 +67,7 @@ Value = Sum | Product | Call
 
 @dataclass(frozen=True)
 class Assignment:
-    """name = value, known from `stage` on; `named` where the name tells what it is."""
+    """name = value, known from `stage` on; `named` where the name says what it is."""
 
     name: str
     value: Value

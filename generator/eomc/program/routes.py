@@ -78,25 +78,19 @@ class Route:
 def _functions(e: Equations | None) -> Functions | None:
     if e is None:
         return None
-    by_rows = {"D": e.D, "C": e.C}
-    wanted: dict[str, list[Expr]] = {
-        **{
-            name if len(rows) == len(e.g) else f"{name}_column": [x for row in rows for x in row]
-            for name, rows in by_rows.items()
-        },
-        "g": list(e.g),
-        "bias": list(e.bias),
-        "tau": list(e.tau),
-        "kinetic_energy": [e.kinetic],
-        "potential_energy": [e.potential],
-        "energy": [e.tape.define(e.kinetic + e.potential)],
+    wanted: dict[str, Sequence[Expr]] = {
+        name if len(rows) == len(e.g) else f"{name}_column": [x for row in rows for x in row]
+        for name, rows in (("D", e.D), ("C", e.C))
     }
+    wanted |= {"g": e.g, "bias": e.bias, "tau": e.tau}
+    wanted |= {"kinetic_energy": [e.kinetic], "potential_energy": [e.potential]}
+    wanted["energy"] = [e.tape.define(e.kinetic + e.potential)]
     if e.jacobi is not None:
         wanted["jacobi"] = [e.jacobi]
     if e.power != 0:
         wanted["power"] = [e.power]
     if e.signals:
-        wanted["signal"] = list(e.signals)
+        wanted["signal"] = e.signals
     return Functions(e.tape, wanted, e.notes)
 
 

@@ -393,8 +393,8 @@ def _polar(system: System, t: Array, q: Array) -> _Plane | None:
     if radius is None or angle is None or len(index) != 2:
         return None
     potential = system.potential.xreplace(_bodies(system))
-    turned = potential.subs(system.q[radius], 1)
-    fall = sympy.N(turned.subs(system.q[angle], 0) - turned.subs(system.q[angle], sympy.pi))
+    at_one = potential.subs(system.q[radius], 1)
+    fall = sympy.N(at_one.subs(system.q[angle], 0) - at_one.subs(system.q[angle], sympy.pi))
     downwards = bool(fall.is_negative)
     r, phi = (mathtext(system.coordinates[i].name).strip("$") for i in (radius, angle))
     across, along = q[:, radius] * np.sin(q[:, angle]), q[:, radius] * np.cos(q[:, angle])

@@ -119,10 +119,8 @@ def of(
     except (OSError, ValueError, KeyError, TypeError):
         pass
     made = _computed(system, span, rows)
-    kept = {
-        "key": wanted, "t": made.t.tolist(), "q": made.q.tolist(), "qd": made.qd.tolist(),
-        "digits": made.digits.tolist(), "plain": made.plain,
-    }  # fmt: skip
+    kept = {name: np.asarray(value).tolist() for name, value in vars(made).items()}
+    kept["key"] = wanted
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         written = file.with_suffix(f".{os.getpid()}")
@@ -134,13 +132,9 @@ def of(
 
 
 def _from_json(kept: dict[str, Any]) -> Reference:
-    return Reference(
-        t=np.array(kept["t"]),
-        q=np.array(kept["q"]),
-        qd=np.array(kept["qd"]),
-        digits=np.array(kept["digits"]),
-        plain=tuple(kept["plain"]) if kept["plain"] else None,
-    )
+    plain = tuple(kept["plain"]) if kept["plain"] else None
+    arrays = {name: np.array(kept[name]) for name in ("t", "q", "qd", "digits")}
+    return Reference(**arrays, plain=plain)
 
 
 # --- the program in __float128 ------------------------------------------------------------------
@@ -306,10 +300,10 @@ def _plainly(system: System, rows: Text, spacing: float) -> tuple[float, float, 
         x = found[0][: 2 * n]
         sizes = np.max(np.abs(rows[:, : 2 * n].astype(float)), axis=0)
         for k in range(1, len(rows)):
-            ahead = plain.over(x, mpmath.mpf(spacing) * (k - 1), mpmath.mpf(spacing), deadline)
-            if ahead is None:
+            after = plain.over(x, mpmath.mpf(spacing) * (k - 1), mpmath.mpf(spacing), deadline)
+            if after is None:
                 break
-            x, until = ahead, spacing * k
+            x, until = after, spacing * k
             for i in range(2 * n):
                 motion = min(motion, _digits(x[i] - found[k][i], sizes[i]))
         return digits, motion if until else 0.0, until

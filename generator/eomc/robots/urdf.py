@@ -22,6 +22,7 @@ from eomc.robots.robot import Drive, Motion, Robot, RobotBody, free_motions
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, times, toward, unit
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
+from eomc.scene.scope import rings
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -246,7 +247,7 @@ class _Reader:
             if other := holds.get(joint.child):
                 self.say(
                     f"joint {joint.name}",
-                    f"its child link '{joint.child}' hangs on joint '{other.name}' already: a "
+                    f"its child link '{joint.child}' is held by joint '{other.name}' already: a "
                     "closed loop of bodies is not modelled, remove one of the two joints",
                 )
             else:
@@ -258,32 +259,23 @@ class _Reader:
         if len(roots) > 1:
             self.say(
                 f"link {roots[1]}",
-                f"{len(roots)} links hang on nothing ({', '.join(roots[:8])}): a robot has one "
+                f"{len(roots)} links have no parent ({', '.join(roots[:8])}): a robot has one "
                 "root, connect the others to it by fixed joints",
             )
         out: list[RobotBody] = []
         waiting = roots[:1]
-        seen = set(roots)
         while waiting:
             name = waiting.pop()
-            seen.add(name)
             out += self._held(bodies[name], holds.get(name))
             waiting += [joint.child for joint in reversed(carries[name])]
-        if not self.faults and len(seen) < len(bodies):
-            name = next(name for name in bodies if name not in seen)
-            way = [name]
-            while (name := holds[name].parent) not in way:
-                way.append(name)
-            loop = [*way[way.index(name) :], name]
+        loop = next(rings({name: [joint.parent] for name, joint in holds.items()}), [])
+        if loop and not self.faults:
             self.say(
                 f"joint {holds[loop[0]].name}",
-                f"the links hang on one another in a loop ({' on '.join(loop)}): "
-                "one of them hangs on the root",
+                f"the links hold one another in a loop ({' on '.join(loop)}): "
+                "one of them belongs to the root",
             )
-        first = out[0] if out else None
-        if first and first.name == WORLD:  # many files call the ground so
-            out = out[1:]
-        return out
+        return out[1:] if out and out[0].name == WORLD else out  # many files call the ground so
 
     def _held(self, body: RobotBody, joint: _Joint | None) -> list[RobotBody]:
         """The link on its joint; a planar joint needs a frame whose z is the plane's normal."""
@@ -319,8 +311,8 @@ class _Reader:
             parts = [shape for link in links for part in link.findall(use) for shape in part.iter()]
             counts = Counter(str(shape.tag) for shape in parts if shape.tag in _SHAPES)
             if counts:
-                told = ", ".join(f"{n} {texts.plural(shape, n)}" for shape, n in counts.items())
-                out.append(f"{what}: {told}" + (" (not opened)" if "mesh" in counts else ""))
+                shown = ", ".join(f"{n} {texts.plural(shape, n)}" for shape, n in counts.items())
+                out.append(f"{what}: {shown}" + (" (not opened)" if "mesh" in counts else ""))
         bare = [x.get("name", "") for x in links if x.find("inertial") is None and _shapes(x)]
         if bare:
             out.append(

@@ -1,1 +1,1 @@
-"""What is copied beside a built module, batch*.py for batches only. Imports NumPy, and no eomc."""
+"""What is copied next to a built module, batch*.py for batches only. Imports NumPy, and no eomc."""

@@ -134,7 +134,7 @@ class Arguments:
         """A state (nq,) as a list, which C takes soonest; None for all that needs a closer look."""
         if type(x) is ndarray and x.dtype is self.dtype and x.shape == self._shape:
             numbers = x.tolist()
-            if isfinite(sum(numbers)):  # tells soonest; it may overflow all the same
+            if isfinite(sum(numbers)):  # is quickest; it may overflow all the same
                 return numbers
         return None
 
@@ -169,7 +169,7 @@ class Arguments:
         else:
             array = self._numbers(value, name)
         if array.ndim == 1 and array.size == width <= _FEW and isfinite(sum(array.tolist())):
-            return array  # of few numbers the sum tells soonest; it may overflow all the same
+            return array  # of few numbers the sum is quickest; it may overflow all the same
         if array.shape[-1:] != (width,) or array.ndim > 2:
             raise ValueError(
                 f"{name}: shape {np.shape(value)}, expected ({width},) or (n, {width}): "
@@ -187,7 +187,7 @@ class Arguments:
     def _state(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
         at, moving = self._array(q, "q", self.nq), self._array(qd, "qd", self.nq)
         if at.shape != moving.shape:
-            raise ValueError(f"qd: shape {moving.shape} beside q of shape {at.shape}")
+            raise ValueError(f"qd: shape {moving.shape} with q of shape {at.shape}")
         return at, moving
 
     def _one(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:

@@ -1,13 +1,13 @@
 """Many trajectories of one scene at once: what a scene with `batch = true` adds in Python.
 
-Copied beside the compiled extension where the scene asks for it. Instances run in the lanes of
+Copied next to the compiled extension where the scene asks for it. Instances run in the lanes of
 vector registers and in threads; no result depends on either.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from copy import deepcopy
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,7 @@ from .trajectory import STATUS, Interrupted
 _NAMES = np.array([*STATUS, "interrupted"])
 
 
+@dataclass(eq=False, repr=False)
 class BatchRun:
     """Trajectories: t (n,), q and qd (batch, n, nq), status and steps (batch,).
 
@@ -31,13 +32,14 @@ class BatchRun:
     has made. Equal where all of these are, bit by bit; a pickled one keeps all of them.
     """
 
-    def __init__(
-        self, t0: float, q: Array, qd: Array, h: float, steps: Array, codes: Array, every: int,
-        wanted: int,
-    ) -> None:  # fmt: skip
-        self.t0, self.q, self.qd = t0, q, qd
-        self.h, self.steps, self.every = h, steps, every
-        self._codes, self._wanted = codes, wanted
+    t0: float
+    q: Array
+    qd: Array
+    h: float
+    steps: Array
+    _codes: Array
+    every: int
+    _wanted: int
 
     @cached_property
     def t(self) -> Array:
@@ -63,15 +65,7 @@ class BatchRun:
         return reduced("batch.BatchRun", *self._all())
 
     def _all(self) -> tuple[Any, ...]:
-        return (
-            self.t0, self.q, self.qd, self.h, self.steps, self._codes, self.every, self._wanted
-        )  # fmt: skip
-
-    def __copy__(self) -> BatchRun:
-        return BatchRun(*self._all())
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> BatchRun:
-        return BatchRun(*deepcopy(self._all(), memo))
+        return tuple(getattr(self, each.name) for each in fields(self))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, BatchRun):

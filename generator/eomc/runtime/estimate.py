@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 _FINEST = 16  # h/16 is the shortest step taken to see a run converge
 _LONG = 2_000_000  # steps of a run beyond which no more than h/4 is taken
-_ROWS = 200  # from which on a run's own rows tell how large each coordinate becomes
+_ROWS = 200  # from which on a run's own rows show how large each coordinate becomes
 _TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
 _FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
 _SMOOTH = 1e6  # growth beyond which a difference may as well have met a jump of the forces

@@ -1,6 +1,6 @@
 """What every compiled scene offers in Python: arrays in, arrays out, the loop in C.
 
-This file and its neighbours are copied beside each compiled extension, so that a built scene needs
+This file and its neighbours are copied next to each compiled extension, so that a built scene needs
 NumPy and cffi only. Angles in rad, everything in SI units.
 """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from time import perf_counter
 
-_SECONDS = 0.05  # a slice, as far as its predecessor tells
+_SECONDS = 0.05  # a slice, as its predecessor suggests
 _FASTER = 16.0  # slices grow by this at most, since the first rows may be the cheap ones
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -66,6 +67,7 @@ class _Half:
         return half
 
 
+@dataclass(eq=False, repr=False)
 class Run:
     """A trajectory: t (n,), q (n, nq), qd (n, nq), status.
 
@@ -79,26 +81,21 @@ class Run:
     Where it is read again, it finds the built module as it was found here.
     """
 
-    q, qd = _Half(0), _Half(1)
-    error: Estimate | None = None
-    _energy: Array | None = None
+    _model: Model
+    t0: float
+    _rows: Array | tuple[Array, Array]  # q and qd, in one array (2, n, nq) or two
+    h: float
+    steps: int
+    status: str
+    _params: Array
+    every: int
+    _u: Any
+    method: str
+    evaluations: int
+    error: Estimate | None = field(default=None, init=False)
+    _energy: Array | None = field(default=None, init=False)
 
-    def __init__(
-        self, model: Model, t0: float, rows: Array | tuple[Array, Array], h: float, steps: int,
-        status: str, params: Array, every: int, u: Any, method: str, evaluations: int,
-    ) -> None:  # fmt: skip
-        """rows: q and qd, in one array (2, n, nq) or two."""
-        self.t0 = t0
-        self.h = h
-        self.steps = steps
-        self.status = status
-        self.every = every
-        self.method = method
-        self.evaluations = evaluations
-        self._model = model
-        self._rows = rows
-        self._params = params
-        self._u = u
+    q, qd = _Half(0), _Half(1)
 
     @cached_property
     def t(self) -> Array:

@@ -1,6 +1,6 @@
 """Formula text to a checked syntax tree, and a tree to a value in any algebra.
 
-Scene text is data: it is parsed with `ast`, every node is held against a whitelist, and the
+Scene text is data: it is parsed with `ast`, every node is compared with a whitelist, and the
 tree is walked by `evaluate`; nothing is ever executed. The same tree gives a float with
 `NUMERIC` and a SymPy expression with the table in `system.py`.
 """
@@ -27,11 +27,11 @@ MAX_DIGITS = 1_000  # of a number as it is written
 MANY = 1_000  # names, among which near ones are looked for
 MAX_LOG10 = 300  # no number in a formula, folded or written, may pass 1e300
 
+# called the same in Python's math, in SymPy and in C
+ELEMENTARY = "sin cos tan asin acos atan sinh cosh tanh exp log sqrt atan2".split()
 # name -> (fewest, most) arguments
 FUNCTIONS: Mapping[str, tuple[int, int]] = {
-    **dict.fromkeys(("sin", "cos", "tan", "asin", "acos", "atan"), (1, 1)),
-    **dict.fromkeys(("sinh", "cosh", "tanh", "exp", "log", "sqrt"), (1, 1)),
-    **dict.fromkeys(("abs", "sign", "heaviside", "dot"), (1, 1)),
+    **dict.fromkeys((*ELEMENTARY[:-1], "abs", "sign", "heaviside", "dot"), (1, 1)),
     "atan2": (2, 2),
     "min": (2, 32),
     "max": (2, 32),
@@ -238,7 +238,7 @@ def _fault(node: ast.expr, message: str) -> FormulaError:
 
 
 def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> None:
-    """Hold `node` against the whitelist; `power` is the product of the exponents around it."""
+    """Compare `node` with the whitelist; `power` is the product of the exponents around it."""
     if depth > MAX_DEPTH:
         raise FormulaError(
             f"the formula is nested more than {MAX_DEPTH} deep, each term of a sum counted: "
@@ -297,8 +297,8 @@ def _check(formula: Formula, node: ast.expr, depth: int, power: float = 1) -> No
             )
         case _:
             kinds = (type(node), type(getattr(node, "op", None)))
-            told = next((_FOREIGN[k] for k in kinds if k in _FOREIGN), None)
-            raise _fault(node, told or f"only {_ALLOWED} are used here")
+            remedy = next((_FOREIGN[k] for k in kinds if k in _FOREIGN), None)
+            raise _fault(node, remedy or f"only {_ALLOWED} are used here")
 
 
 def _check_call(func: ast.Name, call: ast.Call) -> None:
@@ -395,9 +395,7 @@ def _literal(text: str) -> float:
 NUMERIC: Mapping[str, Any] = {
     "number": _literal,
     "pi": math.pi,
-    **{name: getattr(math, name) for name in ("sin", "cos", "tan", "asin", "acos", "atan")},
-    **{name: getattr(math, name) for name in ("sinh", "cosh", "tanh", "exp", "log", "sqrt")},
-    "atan2": math.atan2,
+    **{name: getattr(math, name) for name in ELEMENTARY},
     "abs": abs,
     "sign": lambda x: float((x > 0) - (x < 0)),
     "heaviside": lambda x: 0.5 * ((x > 0) - (x < 0)) + 0.5,

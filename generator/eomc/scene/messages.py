@@ -18,7 +18,7 @@ _FREE = (
     "its coordinates are independent. Choose as many as there are freedoms, or hold together by a "
     "stiff [[spring]] what must not part"
 )
-_START = "starts stand beside their coordinates: theta = { start = 0.5, rate = 0 }"
+_START = "starts stand with their coordinates: theta = { start = 0.5, rate = 0 }"
 _RUN = "how a scene is run stands in [run]: h, duration, method"
 _LOSS = (
     "friction is a force, -b*x_dot in [forces], or b*x_dot**2/2 as dissipation in [energy]; "
@@ -73,7 +73,7 @@ def one_table(name: str, meant: str) -> str:
 
 
 def tables(tree: dict[str, Any], check: Checker) -> None:
-    """Tell of tables that scenes do not have, once each; take them out, or put them in place."""
+    """Report tables that scenes do not have, once each; take them out, or put them in place."""
     for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
         if found := array(name, tree[name]):
             meant, entries = found

@@ -27,7 +27,7 @@ from eomc.scene.scope import (
     ring_text,
     rings,
 )
-from eomc.scene.source_map import Places
+from eomc.scene.source_map import SourceMap
 from eomc.scene.toml_text import MAX_BYTES
 
 _NOT_SI = "mm cm km g gram ms min rpm inch ft lb lbs".split()
@@ -62,7 +62,7 @@ def parse(
     if isinstance(data, str):
         data = data.encode(errors="surrogatepass")
     text, tree = toml_text.text_and_tree(data, file)
-    check = _Check(tree, Places(text, file), parameters or {})
+    check = _Check(tree, SourceMap(text, file), parameters or {})
     return check.scene(hashlib.sha256(data).hexdigest())
 
 
@@ -70,7 +70,7 @@ class _Check(Checker):
     """Everything that is checked in one scene, faults collected on the way."""
 
     def __init__(
-        self, tree: dict[str, Any], places: Places, parameters: Mapping[str, float]
+        self, tree: dict[str, Any], places: SourceMap, parameters: Mapping[str, float]
     ) -> None:
         super().__init__(places)
         self.values = parameters
@@ -78,7 +78,7 @@ class _Check(Checker):
         if not repeat.expand(tree, self):
             raise SceneError(self.problems)
         self.bodies = bool(tree.get("body"))
-        self.doc = self._layout(tree)
+        self.doc = self._document(tree)
         self.tables = self._names()
 
     def scene(self, digest: str) -> Scene:
@@ -124,10 +124,10 @@ class _Check(Checker):
             warnings=tuple(self.problems),
         )
 
-    # layout and names
+    # document and names
 
-    def _layout(self, tree: dict[str, Any]) -> schema.Document:
-        """The document; faulty entries are told, taken out or mended, and the rest checked on."""
+    def _document(self, tree: dict[str, Any]) -> schema.Document:
+        """The document; faulty entries are reported, taken out or mended, the rest is checked."""
         for _ in range(100):
             try:
                 return schema.read(tree)
@@ -135,12 +135,12 @@ class _Check(Checker):
                 errors = fault.errors()
             # misspelt keys first: what is missing may only be misspelt
             errors.sort(key=lambda error: error["type"] != "extra_forbidden")
-            told: set[tuple[str, ...]] = set()
+            reported: set[tuple[str, ...]] = set()
             for error in errors:
                 path = schema.place(error)
-                if path in told or (error["type"] == "missing" and schema.has(tree, path)):
+                if path in reported or (error["type"] == "missing" and schema.has(tree, path)):
                     continue
-                told.add(path)
+                reported.add(path)
                 self.say(path, schema.say(error, path))
                 if error["type"] == "extra_forbidden":
                     self._misspelt(tree, path)
@@ -148,7 +148,7 @@ class _Check(Checker):
                     self.mended.add(path)
                     schema.mend(tree, path)
             if ("coordinates",) in self.mended:
-                break  # everything else hangs on them
+                break  # everything else depends on them
         raise SceneError(self.problems)
 
     def _misspelt(self, tree: dict[str, Any], path: tuple[str, ...]) -> None:
@@ -191,7 +191,7 @@ class _Check(Checker):
         return seen
 
     def _unit(self, path: tuple[str, ...], unit: str, start: float | str = 0) -> None:
-        """Units are texts; those that show that something was meant to be converted are told."""
+        """Units are texts; those that were meant to be converted are reported."""
         plain = unit.strip().lower()
         if plain in ("deg", "degree", "degrees", "°", "deg/s", "°/s"):
             number = f"{start:g}" if isinstance(start, float) and start else "30"
@@ -212,7 +212,7 @@ class _Check(Checker):
             "parameters": (
                 list(known),
                 "a parameter's value is made of numbers and constants; "
-                "what hangs on other parameters is a definition",
+                "what depends on other parameters is a definition",
             ),
         }[table]
         out = []
@@ -279,7 +279,7 @@ class _Check(Checker):
 
     def _inputs(self) -> list[Input]:
         allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]
-        rule = "a signal can't hang on inputs"
+        rule = "a signal can't depend on inputs"
         out = []
         for name, entry in self.doc.inputs.items():
             signal = self.formula(("inputs", name, "signal"), entry.signal, allowed, rule)

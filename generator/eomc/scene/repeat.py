@@ -37,7 +37,7 @@ _WRITTEN = 'is written repeat = "i = 1..n"'
 
 
 def expand(tree: dict[str, Any], check: Checker) -> bool:
-    """Write out all repetition in `tree`. Tells the faults; False where the rest hangs on them."""
+    """Write out all repetition in `tree`. Reports faults; False where the rest depends on them."""
     return _Expansion(tree, check).run()
 
 
@@ -86,7 +86,7 @@ class _Expansion:
                 made = [(name, self._once(path, value))]
             else:
                 if table in _PLAIN and "value" not in value:
-                    self._fault(path, 'missing: add value = "..." beside repeat')
+                    self._fault(path, 'missing: add value = "..." to repeat')
                     continue
                 made = self._repeated(path, key, value)
                 if table in _PLAIN:
@@ -101,7 +101,7 @@ class _Expansion:
         return out
 
     def _learn(self, name: str, entry: Any) -> None:
-        """Keep a constant's value; what has none is told later."""
+        """Keep a constant's value; what has none is reported later."""
         value = entry.get("value") if isinstance(entry, dict) else entry
         try:
             formula = formulas.parse(value if isinstance(value, str) else repr(value))
@@ -204,7 +204,7 @@ class _Expansion:
         return value if made is None else made
 
     def _written(self, path: Path, value: Any, index: Mapping[str, int], bare: bool = True) -> Any:
-        """The value with its indices written out; None where that fails, which is told."""
+        """The value with its indices written out; None where that fails, which is reported."""
         if isinstance(value, str):
             try:
                 text = self._text(value, index, bare)
@@ -232,7 +232,7 @@ class _Expansion:
     def _text(self, text: str, index: Mapping[str, int], bare: bool) -> str:
         """A formula or a name; raises FormulaError."""
         if len(text) > formulas.MAX_LENGTH or not (index or "[" in text):
-            return text  # too long ones are told later
+            return text  # too long ones are reported later
 
         def number_behind(found: re.Match[str]) -> str:
             name, inside = found[1], found[2]

@@ -9,7 +9,7 @@ from eomc.base.errors import EomcError, Problem
 from eomc.scene.assembly import Assembly
 from eomc.scene.formulas import Formula
 from eomc.scene.scope import value_of
-from eomc.scene.source_map import Places
+from eomc.scene.source_map import SourceMap
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Scene:
     forces: Mapping[str, Formula]
     run: Run
     assembly: Assembly | None
-    places: Places = field(repr=False, compare=False)
+    places: SourceMap = field(repr=False, compare=False)
     warnings: tuple[Problem, ...] = ()
 
     def start(

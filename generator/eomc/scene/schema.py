@@ -333,7 +333,7 @@ _OF_BRANCHES = ("float_type", "string_type", "finite_number")
 
 
 def _keys(path: tuple[str, ...]) -> list[str]:
-    """The keys that may stand beside the last of `path`."""
+    """The keys that may stand next to the last of `path`."""
     model = _MODELS[path[0]] if len(path) > 1 else Document
     return [field.alias or name for name, field in model.model_fields.items()]
 

@@ -1,4 +1,4 @@
-"""Formulas of a scene held against the names declared: what each may use, and faults in words."""
+"""Formulas of a scene compared with the names declared: what each may use, and faults in words."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from graphlib import CycleError, TopologicalSorter
 from eomc.base.errors import Problem
 from eomc.scene import formulas, messages
 from eomc.scene.formulas import Formula, FormulaError, suggest
-from eomc.scene.source_map import Places
+from eomc.scene.source_map import SourceMap
 
-# the kinds of thing a formula can hang on; what hangs on something faulty is in doubt
+# the kinds of thing a formula can depend on; what depends on something faulty is in doubt
 TIME, INPUT, POSITION, VELOCITY = "the time", "inputs", "coordinates", "velocities"
 DOUBT = "something faulty"
 
@@ -64,16 +64,16 @@ def ring_text(ring: list[str]) -> str:
 class Checker:
     """The names of a scene, as they become known, and the faults found so far.
 
-    tables: every declared name and its table. kinds: what each name that may be used so far hangs
-    on. centers: the names made by bodies, link_x. mended: places that hold something harmless
-    instead of what is written.
+    tables: every declared name and its table. kinds: what each name that may be used so far
+    depends on. centers: the names made by bodies, link_x. mended: places that hold something
+    harmless instead of what is written.
     """
 
-    def __init__(self, places: Places) -> None:
+    def __init__(self, places: SourceMap) -> None:
         self.places = places
         self.problems: list[Problem] = []
-        self.faults = 0  # told, each repetition of one counted
-        self.told: set[tuple[Path, str]] = set()
+        self.faults = 0  # reported, each repetition of one counted
+        self.reported: set[tuple[Path, str]] = set()
         self.used: set[str] = set()
         self.mended: set[Path] = set()
         self.tables: dict[str, str] = {}
@@ -93,12 +93,12 @@ class Checker:
         self.faults += severity == "error"
         origin = self.places.origin(path)
         same = (origin, re.sub(r"\d+", "", message))
-        if origin == path or same not in self.told:
-            self.told.add(same)
+        if origin == path or same not in self.reported:
+            self.reported.add(same)
             self.problems.append(self.places.problem(path, message, at, text, severity))
 
     def parse(self, path: Path, value: float | str) -> Formula | None:
-        """A formula that has passed the whitelist; None where it has a fault, which is told."""
+        """A formula that has passed the whitelist; None where it has a fault, which is reported."""
         text = value if isinstance(value, str) else repr(value)
         if re.search(r"[\t\n]", text) and re.search(r"\\[tn]", self.places.source(path)):
             # "\theta" is a tab and 'heta', "\nu" a line break and 'u'
@@ -109,8 +109,8 @@ class Checker:
         except FormulaError as found:
             # a parameter is no product of others: "2 m" is a length
             declared = () if path[0] in ("parameters", "constants") else {*self.tables, *self.kinds}
-            told = messages.quantity(text, declared)
-            fault = FormulaError(told, 0, len(text)) if told else found
+            meant = messages.quantity(text, declared)
+            fault = FormulaError(meant, 0, len(text)) if meant else found
             self.say(path, fault.message, fault, text)
             return None
 
@@ -121,7 +121,7 @@ class Checker:
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> Formula | None:
-        """Parse a formula and check its names; None where it has a fault, which is told.
+        """Parse a formula and check its names; None where it has a fault, which is reported.
 
         `rule` says in words which names are `allowed`, where not all are.
         """
@@ -135,7 +135,7 @@ class Checker:
         allowed: Collection[str] | None = None,
         rule: str = "",
     ) -> bool:
-        """Whether the formula uses only names that it may; what it may not is told."""
+        """Whether the formula uses only names that it may; what it may not is reported."""
         before = self.faults
         for node in formula.names():
             self.used.add(node.id)
@@ -181,7 +181,7 @@ class Checker:
         return f"{start}: add it to [parameters], [constants], [inputs] or [definitions]"
 
     def _no_rate(self, inside: ast.expr) -> str:
-        """Why dot(inside) can't be had, or the empty string."""
+        """Why there is no dot(inside), or the empty string."""
         kinds = self.kinds_of(inside)
         if INPUT in kinds:
             return "it holds inputs, whose rate nobody knows; add the rate as a further input"
@@ -190,7 +190,7 @@ class Checker:
         return ""
 
     def kinds_of(self, node: ast.AST) -> frozenset[str]:
-        """What the value hangs on; dot(e) brings velocities where e moves."""
+        """What the value depends on; dot(e) brings velocities where e moves."""
         if isinstance(node, ast.Name):
             return self.kinds.get(node.id, NOTHING)
         kinds = NOTHING.union(*map(self.kinds_of, ast.iter_child_nodes(node)))
@@ -206,9 +206,9 @@ class Checker:
         return min(found, key=lambda part: part.col_offset, default=formula.tree)
 
     def number(self, path: Path, formula: Formula | None, known: Mapping[str, float]) -> float:
-        """The formula's value; nan where it has none, which is told."""
+        """The formula's value; nan where it has none, which is reported."""
         if formula is None or any(math.isnan(known[n.id]) for n in formula.names()):
-            return math.nan  # told already
+            return math.nan  # reported already
         value, fault = value_of(formula, known)
         if fault:
             self.say(path, fault, text=formula.text)

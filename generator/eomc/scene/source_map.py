@@ -20,7 +20,7 @@ ARRAYS = ("body", "spring", "damper")  # tables that may stand many times, in [[
 Path = tuple[str, ...]
 
 
-class Places:
+class SourceMap:
     """Line numbers of keys, found by giving tomllib one statement at a time."""
 
     def __init__(self, text: str, file: str) -> None:
@@ -82,24 +82,22 @@ class Places:
         """Let `meant` and what is under it stand where the misspelt `given` stands."""
         for path in list(self._under.get(given[:2], ())):
             if path[: len(given)] == given:
-                self._put(meant + path[len(given) :], self._line[path])
-                self._key.setdefault(meant + path[len(given) :], self._key.get(path, path[-1]))
+                self._stand(meant + path[len(given) :], path)
 
     def repeat(self, given: Path, made: Sequence[Path]) -> None:
         """Let each of `made` and what is under it stand where the entry `given` stands."""
         under = list(self._under.get(given, ()))
         named = (*given, "name")
-        for path in made:
-            if path == given:
-                continue
+        for path in (path for path in made if path != given):
             self._from[path] = given
             if named in self._line and given[0] in ARRAYS:
-                # an entry of an array stands where its name stands
-                self._put(path, self._line[named])
-                self._key.setdefault(path, "name")
+                self._stand(path, named)  # an entry of an array stands where its name stands
             for old in under:
-                self._put(path + old[len(given) :], self._line[old])
-                self._key.setdefault(path + old[len(given) :], old[-1])
+                self._stand(path + old[len(given) :], old)
+
+    def _stand(self, made: Path, written: Path) -> None:
+        self._put(made, self._line[written])
+        self._key.setdefault(made, self._key.get(written, written[-1]))
 
     def rewrite(self, made: str, written: str) -> None:
         """Let a text made by repetition be looked for as it is written."""
@@ -151,7 +149,7 @@ def _spot(
     text: str | None,
     before: str | None = None,
 ) -> tuple[int, int]:
-    """Where in a statement the fault stands, and how wide it is; -1 where it can't be told.
+    """Where in a statement the fault stands, and how wide it is; -1 where it can't be found.
 
     before: the text as it was before repetition.
     """

@@ -142,9 +142,9 @@ def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
         remedy = ": a [table] stands once, put its entries together"
         column, width = 0, len(source)
     else:
-        told = messages.bare(source)
+        meant = messages.bare(source)
         remedy = next((r for m, r in _TOML_REMEDIES.items() if m in message), "")
-        remedy = f": {told}" if told else remedy
+        remedy = f": {meant}" if meant else remedy
     return Problem(f"not TOML: {message}{remedy}", "", file, line, column, width, source)
 
 

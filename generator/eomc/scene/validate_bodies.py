@@ -42,7 +42,7 @@ def centers(doc: Document) -> set[str]:
 def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assembly | None:
     """The bodies of a scene and what acts between them; None where there is nothing of it.
 
-    known: the values of constants and parameters. Faults are told to `check`; with faults the
+    known: the values of constants and parameters. Faults are reported to `check`; with faults the
     assembly is not to be used.
     """
     if not (doc.body or doc.spring or doc.damper):
@@ -69,7 +69,7 @@ class _Bodies(Springs):
         for label in labels:
             entry, path = self.doc.body[label], ("body", label)
             if entry.position is None:
-                self._hung(path, entry)
+                self._jointed(path, entry)
             else:
                 self._placed(path, entry)
         ordered = self._ordered()
@@ -137,7 +137,7 @@ class _Bodies(Springs):
         if entry.joint is not None:
             self.check.say(
                 (*path, "position"),
-                "a body hangs on a joint or is placed by 'position', not both: remove one of the "
+                "a body is held by a joint or placed by 'position', not both: remove one of the "
                 "two (a joint's place in the parent's frame is 'offset')",
             )
             return
@@ -161,8 +161,8 @@ class _Bodies(Springs):
             note=entry.note,
         )
 
-    def _hung(self, path: Path, entry: BodyTable) -> None:
-        """A body on a joint."""
+    def _jointed(self, path: Path, entry: BodyTable) -> None:
+        """A body held by a joint."""
         check = self.check
         joint = self._joint(path, entry)
         parent = self._parent((*path, "parent"), entry)
@@ -191,7 +191,7 @@ class _Bodies(Springs):
                     text=width.text,
                 )
             if entry.friction is None:
-                check.say((*path, "friction_width"), "there is no 'friction' beside it: add it")
+                check.say((*path, "friction_width"), "there is no 'friction' with it: add it")
         if parent is None or coordinates is None:
             return
         self.bodies[entry.name] = Body(
@@ -216,7 +216,7 @@ class _Bodies(Springs):
         known = [k for k, kind in JOINTS.items() if kind.plane or self.wide != 2]
         if joint is None:
             if {(*path, "joint"), (*path, "position")} & check.mended:
-                return ""  # told already
+                return ""  # reported already
             check.say(
                 path,
                 'say how the body is held: joint = "revolute" or another, or position = [...] with '
@@ -247,12 +247,12 @@ class _Bodies(Springs):
             self.check.say(path, f"there is no body '{parent}'{remedy}", text=parent)
         elif parent == entry.name:
             self.check.say(
-                path, f"'{parent}' hangs on itself: name another body, or world", text=parent
+                path, f"'{parent}' is its own parent: name another body, or world", text=parent
             )
         elif self.doc.body[self.names[parent]].position is not None:
             self.check.say(
                 path,
-                f"'{parent}' is placed by formulas, and nothing can hang on it: give it a joint, "
+                f"'{parent}' is placed by formulas, and can't be a parent: give it a joint, "
                 "or place this body by formulas too",
                 text=parent,
             )
@@ -394,11 +394,16 @@ class _Bodies(Springs):
         for body in reversed(ordered):
             if body.parent in carries:
                 carries[body.parent] |= carries[body.name]
-        told: set[str] = set()
+        reported: set[str] = set()
         for body in ordered:
-            if carries[body.name] or body.parent in told or not body.coordinates or body.armature:
+            if (
+                carries[body.name]
+                or body.parent in reported
+                or not body.coordinates
+                or body.armature
+            ):
                 continue
-            told.add(body.name)
+            reported.add(body.name)
             self.check.say(
                 ("body", self.names[body.name]),
                 f"nothing that {' and '.join(body.coordinates)} would move has mass or inertia: "

@@ -28,7 +28,7 @@ class Values:
         self.doc = doc
         self.known = known
         self.names: dict[str, str] = {}  # of each body, and the label of its entry
-        # entries of a vector; None where gravity doesn't tell whether the scene is plane
+        # entries of a vector; None where gravity doesn't say whether the scene is plane
         self.wide: int | None = 2
         self.values: dict[float | str, tuple[Formula, float]] = {}  # sound formulas, by text
         self.heavy: dict[str, bool] = {}

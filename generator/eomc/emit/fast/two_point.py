@@ -309,12 +309,12 @@ def _unread(names: Sequence[str], lines: Sequence[str]) -> list[str]:
 
 
 def _whole(count: int) -> int:
-    """Places for so many numbers, a multiple of four."""
+    """SourceMap for so many numbers, a multiple of four."""
     return -(-count // FOUR) * FOUR
 
 
 def width(target: Target, parts: Parts) -> int:
-    """Places in a vector: loops over whole registers go up to there, behind the coordinates over
+    """SourceMap in a vector: loops over whole registers go up to there, behind the coordinates over
     zeros; angles that are coordinates are read from there too."""
     first = target.names.index(parts.angles[0].terms[0][1])
     return max(_whole(len(target.names)), _whole(first + _whole(len(parts.angles))))

@@ -51,7 +51,7 @@ ACTUATORS = set(
 PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
 LAW = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}  # an actuator's force
 
-TRUTH = ("false", "true")
+BOOLEAN = ("false", "true")
 
 Attributes = dict[str, str]
 Classes = dict[str, dict[str, Attributes]]
@@ -154,9 +154,9 @@ class Given:
         self.fault(f'{key}="{word}" is not one of {", ".join(choices)}')
         return default
 
-    def truth(self, key: str, default: bool = False) -> bool:
+    def is_true(self, key: str, default: bool = False) -> bool:
         """Whether it is "true"."""
-        return self.choice(key, TRUTH, TRUTH[default]) == "true"
+        return self.choice(key, BOOLEAN, BOOLEAN[default]) == "true"
 
 
 @dataclass(frozen=True)
@@ -313,14 +313,14 @@ def _compiler(s: Settings, a: Given) -> Settings:
         s,
         degrees=angle == "degree",
         eulerseq=seq,
-        autolimits=a.truth("autolimits", s.autolimits),
-        inertia=a.choice("inertiafromgeom", ("auto", *TRUTH), s.inertia),
+        autolimits=a.is_true("autolimits", s.autolimits),
+        inertia=a.choice("inertiafromgeom", ("auto", *BOOLEAN), s.inertia),
         groups=(groups[0], groups[1]) if groups else s.groups,
         boundmass=a.number("boundmass", s.boundmass),
         boundinertia=a.number("boundinertia", s.boundinertia),
         totalmass=a.number("settotalmass", s.totalmass),
-        balance=a.truth("balanceinertia", s.balance),
-        alignfree=a.truth("alignfree", s.alignfree),
+        balance=a.is_true("balanceinertia", s.balance),
+        alignfree=a.is_true("alignfree", s.alignfree),
     )
 
 

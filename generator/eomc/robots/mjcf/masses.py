@@ -230,7 +230,7 @@ def _geom_mass(placed: Placed, reader: Reader) -> Mass | None:
         return None
     if mass == 0 or (mass is None and density == 0):
         return None
-    shell = a.truth("shellinertia")
+    shell = a.is_true("shellinertia")
     if kind in FORMLESS or "mesh" in a:
         remedy = (
             'give the body an <inertial> (MuJoCo\'s compiler writes it with saveinertial="true")'

@@ -142,7 +142,7 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
                 a.fault("only a body in <worldbody> can have a free joint")
             if len(own) > 1:
                 a.fault("a body with a free joint has no other joints; leave one")
-        if a.truth("mocap"):
+        if a.is_true("mocap"):
             report.leave("motions of mocap bodies, which stand still here", name)
         if a.number("gravcomp"):
             report.leave("compensation of gravity (gravcomp) of bodies", name)
