@@ -50,7 +50,7 @@ def command(
     from eomc.robots.mjcf import read
     from eomc.scene.toml_text import MAX_BYTES
 
-    element = xml.root(file).tag
+    element = xml.root(file).kind
     if element == "mujoco":
         robot = read.read(file, include)
     elif include:

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from eomc.base import texts
 from eomc.base.errors import EomcError, Problem, SceneError
@@ -20,12 +19,10 @@ from eomc.robots import xml
 from eomc.robots.inertias import NO_INERTIA, rotated_inertia
 from eomc.robots.robot import Drive, Motion, Robot, RobotBody, free_motions
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, times, toward, unit
+from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
 from eomc.scene.scope import rings
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
 
 GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
 
@@ -54,15 +51,11 @@ def read(file: str | os.PathLike[str]) -> Robot:
     Raises SceneError with every fault of the robot, EomcError for what is not a URDF.
     """
     root, shown = xml.root(file), texts.line(str(file))
-    if any(_is_xacro(e) for e in root.iter()):
+    if any("xacro}" in tag.kind for tag in root.all()):
         raise EomcError(f"{shown}: {xml.RUN_XACRO}")
-    if root.tag != "robot":
-        raise EomcError(f"{shown}: not a URDF: its root element is <{root.tag}>, not <robot>")
+    if root.kind != "robot":
+        raise EomcError(f"{shown}: not a URDF: its root element is <{root.kind}>, not <robot>")
     return _Reader(root, Path(file), shown).robot()
-
-
-def _is_xacro(element: Element) -> bool:
-    return isinstance(element.tag, str) and "xacro}" in element.tag
 
 
 @dataclass(frozen=True)
@@ -83,11 +76,12 @@ class _Joint:
 class _Reader:
     """One file; faults collected on the way."""
 
-    def __init__(self, root: Element, path: Path, shown: str) -> None:
+    def __init__(self, root: Tag, path: Path, shown: str) -> None:
         self.root = root
         self.path = path
         self.shown = shown
         self.faults: list[Problem] = []
+        self.lines: dict[str, int] = {}  # of links and joints, by key
         self.strange: dict[str, dict[str, None]] = {}  # attributes that are not read, by tag
         self.places: dict[str, dict[str, None]] = {}  # and where they stand
 
@@ -113,26 +107,27 @@ class _Reader:
 
     def say(self, key: str, message: str) -> None:
         """Note a fault of a link or joint."""
-        self.faults.append(Problem(message, key, self.shown))
+        self.faults.append(Problem(message, key, self.shown, self.lines.get(key, 0)))
 
-    def _parts(self, element: Element, tags: Sequence[str], key: str) -> None:
+    def _parts(self, element: Tag, tags: Sequence[str], key: str) -> None:
         """Report parts that are there twice; attributes that do not belong there are for later."""
         for tag in tags:
-            parts = element.findall(tag)
+            parts = [*element.each(tag)]
             if len(parts) > 1:
                 self.say(key, f"it has {len(parts)} <{tag}>: leave the one that is meant")
-            for attribute in (a for part in parts for a in part.attrib):
+            for attribute in (a for part in parts for a in part.attributes):
                 if attribute not in _ATTRIBUTES[tag]:
                     self.strange.setdefault(tag, {})[attribute] = None
                     self.places.setdefault(tag, {})[key] = None
 
     # --- links
 
-    def _named(self, tag: str) -> dict[str, Element]:
+    def _named(self, tag: str) -> dict[str, Tag]:
         """The elements of the robot with this tag, by name."""
-        out: dict[str, Element] = {}
-        for k, element in enumerate(self.root.findall(tag)):
-            name = element.get("name", "").strip()
+        out: dict[str, Tag] = {}
+        for k, element in enumerate(self.root.each(tag)):
+            name = element.get("name").strip()
+            self.lines.setdefault(f"{tag} {name or k + 1}", element.line)
             if not name:
                 self.say(f"{tag} {k + 1}", f'it has no name: write <{tag} name="...">')
             elif name in out:
@@ -141,16 +136,16 @@ class _Reader:
                 out[name] = element
         return out
 
-    def _link(self, name: str, link: Element) -> RobotBody:
+    def _link(self, name: str, link: Tag) -> RobotBody:
         key = f"link {name}"
         self._parts(link, ("inertial",), key)
-        inertial = link.find("inertial")
+        inertial = link.first("inertial")
         if inertial is None:
             shapes = _shapes(link)
             note = f"a {shapes[0]} only, no <inertial>" if shapes else "no <inertial>"
             return RobotBody(name, note=note)
         self._parts(inertial, ("origin", "mass", "inertia"), key)
-        mass, tensor = inertial.find("mass"), inertial.find("inertia")
+        mass, tensor = inertial.first("mass"), inertial.first("inertia")
         if mass is None or tensor is None:
             lacks = '<mass value="..."/>' if mass is None else '<inertia ixx="..." .../>'
             self.say(key, f"its <inertial> has no mass or no inertia: add {lacks}")
@@ -167,9 +162,9 @@ class _Reader:
 
     # --- joints
 
-    def _joint(self, name: str, joint: Element, bodies: dict[str, RobotBody]) -> _Joint | None:
+    def _joint(self, name: str, joint: Tag, bodies: dict[str, RobotBody]) -> _Joint | None:
         key = f"joint {name}"
-        kind = joint.get("type", "")
+        kind = joint.get("type")
         if kind not in _TYPES:
             known = f"known are {', '.join(_TYPES)}"
             found = f"unknown type '{kind}'" if kind else "it has no type"
@@ -178,7 +173,7 @@ class _Reader:
         ends = [self._end(joint, end, key, bodies) for end in ("parent", "child")]
         offset, rotation = self._origin(joint, key)
         axis: Vector = (1.0, 0.0, 0.0)
-        given = joint.find("axis")
+        given = joint.first("axis")
         if given is not None and kind not in ("fixed", "floating"):
             axis = self._vector(given, "xyz", key, axis)
             try:
@@ -191,16 +186,16 @@ class _Reader:
         drive = None
         if len(motions) == 1:
             word, newton = ("torque", "N m") if motions[0].unit == "rad" else ("force", "N")
-            limit = joint.find("limit")
+            limit = joint.first("limit")
             effort = 0.0 if limit is None else self._number(limit, "effort", key)
             note = f"along {name}" + (f", at most {effort:g} {newton}" if effort > 0 else "")
             drive = Drive(f"{name}_{word}", name, note=note)
         return _Joint(name, kind, ends[0], ends[1], offset, rotation, axis, motions, drive)
 
-    def _end(self, joint: Element, end: str, key: str, bodies: dict[str, RobotBody]) -> str:
+    def _end(self, joint: Tag, end: str, key: str, bodies: dict[str, RobotBody]) -> str:
         """The link at one end of a joint, or "" where it is at fault."""
-        found = joint.find(end)
-        link = "" if found is None else found.get("link", "").strip()
+        found = joint.first(end)
+        link = "" if found is None else found.get("link").strip()
         if not link:
             self.say(key, f'it has no {end} link: add <{end} link="..."/>')
         elif link not in bodies:
@@ -209,13 +204,13 @@ class _Reader:
             return ""
         return link
 
-    def _motions(self, name: str, kind: str, joint: Element, key: str) -> tuple[Motion, ...]:
+    def _motions(self, name: str, kind: str, joint: Tag, key: str) -> tuple[Motion, ...]:
         if kind == "floating":
             return free_motions(name)
         if kind not in ("revolute", "continuous", "prismatic", "planar"):
             return ()
         damping = friction = 0.0
-        dynamics = joint.find("dynamics")
+        dynamics = joint.first("dynamics")
         if dynamics is not None:
             damping = self._number(dynamics, "damping", key)
             friction = self._number(dynamics, "friction", key)
@@ -227,13 +222,13 @@ class _Reader:
             slide = Motion(f"x_{name}", "m", damping=damping, friction=friction)
             return slide, replace(slide, name=f"y_{name}"), Motion(f"turn_{name}", "rad")
         start, note = 0.0, "turns without end" if kind == "continuous" else ""
-        limit = joint.find("limit")
+        limit = joint.first("limit")
         if limit is not None and kind != "continuous":
             lower, upper = (self._number(limit, end, key) for end in ("lower", "upper"))
             if lower or upper:
                 note = f"{lower:g} to {upper:g}"
                 start = min(max(0.0, lower), upper) if lower <= upper else 0.0
-        if (mimic := joint.find("mimic")) is not None:
+        if (mimic := joint.first("mimic")) is not None:
             note = "; ".join(filter(None, (note, f"mimics {mimic.get('joint', '?')} in the file")))
         return (Motion(name, of, start, note, damping, friction),)
 
@@ -306,71 +301,71 @@ class _Reader:
     def _besides(self) -> list[str]:
         """What the file has besides bodies and joints, in words."""
         out = []
-        links, joints = self.root.findall("link"), self.root.findall("joint")
+        links, joints = [*self.root.each("link")], [*self.root.each("joint")]
         for use, what in (("visual", "shapes to be seen"), ("collision", "contact between shapes")):
-            parts = [shape for link in links for part in link.findall(use) for shape in part.iter()]
-            counts = Counter(str(shape.tag) for shape in parts if shape.tag in _SHAPES)
+            parts = [shape for link in links for part in link.each(use) for shape in part.all()]
+            counts = Counter(shape.kind for shape in parts if shape.kind in _SHAPES)
             if counts:
                 shown = ", ".join(f"{n} {texts.plural(shape, n)}" for shape, n in counts.items())
                 out.append(f"{what}: {shown}" + (" (not opened)" if "mesh" in counts else ""))
-        bare = [x.get("name", "") for x in links if x.find("inertial") is None and _shapes(x)]
+        bare = [x.get("name") for x in links if x.first("inertial") is None and _shapes(x)]
         if bare:
             out.append(
                 "links with a shape but without <inertial>, taken as massless: " + ", ".join(bare)
             )
         for joint in joints:
-            if (mimic := joint.find("mimic")) is not None:
+            if (mimic := joint.first("mimic")) is not None:
                 gear, shift = mimic.get("multiplier", "1"), mimic.get("offset", "0")
                 out.append(
                     f"joint {joint.get('name')} mimics {mimic.get('joint')} (times {gear}, plus "
                     f"{shift}): it moves by itself here, --lock freezes it"
                 )
-        limited = [j for j in joints if j.find("limit") is not None and j.get("type") != "fixed"]
+        limited = [j for j in joints if j.first("limit") is not None and j.get("type") != "fixed"]
         if limited:
             out.append(f"limits of {len(limited)} joints: their values are in the notes")
-        rest = Counter(str(e.tag) for e in self.root if e.tag not in ("link", "joint"))
+        rest = Counter(e.kind for e in self.root.children if e.kind not in ("link", "joint"))
         for parts, known in ((links, _LINK_PARTS), (joints, _JOINT_PARTS)):
-            rest.update(str(e.tag) for part in parts for e in part if e.tag not in known)
+            rest.update(e.kind for part in parts for e in part.children if e.kind not in known)
         out += [f"<{tag}>, {n} {texts.plural('element', n)}" for tag, n in sorted(rest.items())]
         for tag, those in self.strange.items():
             first, *others = self.places[tag]
             more = f" and {len(others)} more" if others else ""
             what = f"attributes that URDF does not give <{tag}>: {', '.join(those)}"
             out.append(f"{what} ({first}{more})")
-        floating = [j.get("name", "") for j in joints if j.get("type") == "floating"
-                    and j.find("dynamics") is not None]  # fmt: skip
+        floating = [j.get("name") for j in joints if j.get("type") == "floating"
+                    and j.first("dynamics") is not None]  # fmt: skip
         if floating:
             out.append(f"<dynamics> of floating joints: {', '.join(floating)}")
         return out
 
     # --- numbers
 
-    def _origin(self, element: Element, key: str) -> tuple[Vector, Matrix]:
-        origin = element.find("origin")
+    def _origin(self, element: Tag, key: str) -> tuple[Vector, Matrix]:
+        origin = element.first("origin")
         if origin is None:
             return ORIGIN, IDENTITY
         offset = self._vector(origin, "xyz", key, ORIGIN)
         return offset, from_rpy(*self._vector(origin, "rpy", key, ORIGIN))
 
-    def _vector(self, element: Element, attribute: str, key: str, default: Vector) -> Vector:
-        written = element.get(attribute)
+    def _vector(self, element: Tag, attribute: str, key: str, default: Vector) -> Vector:
+        written = element.attributes.get(attribute)
         if written is None:
             return default
         words = written.split()
         if len(words) != 3:
-            what = f'{attribute}="{written}" of <{element.tag}> is not three numbers'
+            what = f'{attribute}="{written}" of <{element.kind}> is not three numbers'
             self.say(key, what + _macro(written))
             return default
-        x, y, z = (self._value(word, f"{attribute} of <{element.tag}>", key) for word in words)
+        x, y, z = (self._value(word, f"{attribute} of <{element.kind}>", key) for word in words)
         return x, y, z
 
-    def _number(self, element: Element, attribute: str, key: str, required: bool = False) -> float:
-        written = element.get(attribute)
+    def _number(self, element: Tag, attribute: str, key: str, required: bool = False) -> float:
+        written = element.attributes.get(attribute)
         if written is None:
             if required:
-                self.say(key, f'<{element.tag}> has no {attribute}: add {attribute}="..."')
+                self.say(key, f'<{element.kind}> has no {attribute}: add {attribute}="..."')
             return 0.0
-        return self._value(written, f"{attribute} of <{element.tag}>", key)
+        return self._value(written, f"{attribute} of <{element.kind}>", key)
 
     def _value(self, word: str, what: str, key: str) -> float:
         """The number; 0 where it is none, so that the rest is read too."""
@@ -386,5 +381,5 @@ def _macro(written: str) -> str:
     return "; " + xml.RUN_XACRO if "${" in written or "$(" in written else ""
 
 
-def _shapes(link: Element) -> list[str]:
-    return [str(shape.tag) for shape in link.iter() if shape.tag in _SHAPES]
+def _shapes(link: Tag) -> list[str]:
+    return [shape.kind for shape in link.all() if shape.kind in _SHAPES]

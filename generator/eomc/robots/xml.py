@@ -6,32 +6,90 @@ import math
 import os
 import re
 import stat
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 from xml.etree.ElementTree import ParseError
 
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.scene.formulas import suggest
 
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
 MAX_BYTES = 20_000_000  # the largest robot files without their meshes have one or two million
 LARGE = 1e100  # numbers beyond it, and sizes below 1/LARGE, overflow when they are multiplied
 
 
-def root(file: str | os.PathLike[str]) -> Element:
+@dataclass(frozen=True, eq=False)
+class Tag:
+    """An element of the file: what it is, where it stands, what it has and holds."""
+
+    kind: str
+    attributes: dict[str, str]
+    line: int
+    file: Path
+    children: list[Tag] = field(default_factory=list)
+
+    def get(self, key: str, default: str = "") -> str:
+        """An attribute as it is written."""
+        return self.attributes.get(key, default)
+
+    def each(self, kind: str) -> Iterator[Tag]:
+        """The children of a kind."""
+        return (child for child in self.children if child.kind == kind)
+
+    def first(self, kind: str) -> Tag | None:
+        """The first child of a kind."""
+        return next(self.each(kind), None)
+
+    def all(self) -> Iterator[Tag]:
+        """This and every tag in it, in the file's order."""
+        waiting = [self]
+        while waiting:
+            yield (tag := waiting.pop())
+            waiting += reversed(tag.children)
+
+
+class _Builder:
+    """Puts tags together as the parser comes to them."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.parser: Any = None
+        self.root: Tag | None = None
+        self.stack: list[Tag] = []
+
+    def start(self, kind: str, attributes: dict[str, str]) -> None:
+        tag = Tag(kind, dict(attributes), self.parser.parser.CurrentLineNumber, self.file)
+        if self.stack:
+            self.stack[-1].children.append(tag)
+        self.root = self.root or tag
+        self.stack.append(tag)
+
+    def end(self, kind: str) -> None:
+        self.stack.pop()
+
+    def data(self, text: str) -> None:
+        pass
+
+    def close(self) -> Tag | None:
+        return self.root
+
+
+def root(file: str | os.PathLike[str]) -> Tag:
     """The root element of an XML file. Raises EomcError with what is wrong and what to do."""
     from defusedxml import DefusedXmlException
-    from defusedxml.ElementTree import fromstring
+    from defusedxml.ElementTree import DefusedXMLParser
 
     shown = texts.line(str(file))
     data = _bytes(Path(file), shown)
     if not data.strip():
         raise EomcError(f"{shown}: the file is empty")
+    builder = _Builder(Path(file))
+    builder.parser = DefusedXMLParser(target=builder, forbid_dtd=True)
     try:
-        found: Element = fromstring(data, forbid_dtd=True)
+        builder.parser.feed(data)
+        found: Tag = builder.parser.close()
     except ParseError as fault:
         if b"xacro:" in data and "unbound prefix" in str(fault):
             raise EomcError(f"{shown}: {RUN_XACRO}") from None

@@ -6,11 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from eomc.robots.mjcf.file import ACTUATORS, Given, Report, Tag
+from eomc.robots.mjcf.file import ACTUATORS, Given, Report
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
 from eomc.robots.robot import Drive, joined
 from eomc.robots.rotations import from_quaternion, yaw_pitch_roll
+from eomc.robots.xml import Tag
 
 
 def actuated(

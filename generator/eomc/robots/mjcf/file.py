@@ -8,14 +8,14 @@ asked for included files; entities and document types are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from eomc.base.errors import Problem
 from eomc.robots import xml
 from eomc.robots.rotations import Vector
+from eomc.robots.xml import Tag
 
 SHOWN = 12  # names in one line of what is left out
 
@@ -55,21 +55,6 @@ BOOLEAN = ("false", "true")
 
 Attributes = dict[str, str]
 Classes = dict[str, dict[str, Attributes]]
-
-
-@dataclass(frozen=True, eq=False)
-class Tag:
-    """An element of the file: what it is, where it stands, what it has and holds."""
-
-    kind: str
-    attributes: Attributes
-    line: int
-    file: Path
-    children: list[Tag] = field(default_factory=list)
-
-    def each(self, kind: str) -> Iterator[Tag]:
-        """The children of a kind."""
-        return (child for child in self.children if child.kind == kind)
 
 
 @dataclass
@@ -185,7 +170,7 @@ class Settings:
 
 def load(path: Path, include: bool, report: Report) -> Tag:
     """The file as tags, with what it includes in the place of <include>."""
-    root = _parse(path)
+    root = xml.root(path)
     folder = path.resolve().parent
     opened = {path.resolve()}
     waiting = [root]
@@ -225,42 +210,13 @@ def _included(
         a.fault(f'there is no file "{name}" in the folder of the model')
     else:
         opened.add(target)
-        return _parse(target).children
+        return xml.root(target).children
     return []
-
-
-def _parse(path: Path) -> Tag:
-    """The elements of one file, with their lines. Raises EomcError for what is not XML."""
-    from defusedxml.ElementTree import DefusedXMLParser
-
-    xml.root(path)  # raises whatever is wrong with the file; what follows adds the lines
-    roots: list[Tag] = []
-    stack: list[Tag] = []
-
-    class Builder:
-        def start(self, kind: str, attributes: Attributes) -> None:
-            tag = Tag(kind, dict(attributes), parser.parser.CurrentLineNumber, path)
-            (stack[-1].children if stack else roots).append(tag)
-            stack.append(tag)
-
-        def end(self, kind: str) -> None:
-            stack.pop()
-
-        def data(self, text: str) -> None:
-            pass
-
-        def close(self) -> None:
-            pass
-
-    parser: Any = DefusedXMLParser(target=Builder(), forbid_dtd=True)
-    parser.feed(path.read_bytes())
-    parser.close()
-    return roots[0]
 
 
 def called(tag: Tag) -> str:
     """A tag as errors call it."""
-    name = tag.attributes.get("name", "")
+    name = tag.get("name")
     return f'{tag.kind} "{name}"' if name else tag.kind
 
 
@@ -332,7 +288,7 @@ def classes_of(root: Tag, report: Report) -> Classes:
     """
     classes: Classes = {"main": {}}
     for top in root.each("default"):
-        name = top.attributes.get("class", "main")
+        name = top.get("class", "main")
         waiting = [(top, "main")]
         if name != "main":
             classes[name] = classes["main"]

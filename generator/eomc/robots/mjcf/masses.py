@@ -17,18 +17,10 @@ from eomc.robots.inertias import (
     rotated_inertia,
     unbalanced,
 )
-from eomc.robots.mjcf.file import (
-    ORIENTATION,
-    Classes,
-    Given,
-    Report,
-    Settings,
-    Tag,
-    merged,
-    unknown,
-)
+from eomc.robots.mjcf.file import ORIENTATION, Classes, Given, Report, Settings, merged, unknown
 from eomc.robots.robot import RobotBody
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, toward, unit
+from eomc.robots.xml import Tag
 
 ROUNDING = 1e-15  # what is smaller, relative to its neighbours, becomes zero
 
@@ -83,7 +75,7 @@ class Reader:
     def given(self, placed: Placed, kind: str) -> Given:
         """What a tag has, with what its class gives: its own, or the childclass around it."""
         tag = placed.tag
-        default = self.class_of(tag.attributes.get("class", placed.childclass), tag)
+        default = self.class_of(tag.get("class", placed.childclass), tag)
         return Given(merged(default.get(kind, {}), tag), tag, self.report)
 
     def class_of(self, name: str, tag: Tag) -> dict[str, dict[str, str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +10,12 @@ from eomc.base.errors import SceneError
 from eomc.base.spatial import plus, scaled, six
 from eomc.robots.mjcf import masses
 from eomc.robots.mjcf.actuators import actuated, started
-from eomc.robots.mjcf.file import Given, Report, Tag, classes_of, load, settings_of, unknown
+from eomc.robots.mjcf.file import Given, Report, classes_of, load, settings_of, unknown
 from eomc.robots.mjcf.joints import Found, fresh, joint_of, named
 from eomc.robots.mjcf.masses import STILL, Mass, Placed, Pose, Reader
 from eomc.robots.robot import Robot, RobotBody, joined
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector
+from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
 
 # tags in a body that say nothing about its motion, and those that would
@@ -66,7 +67,7 @@ def read(path: str | Path, include: bool = False) -> Robot:
     _sections(root, report)
     if report.faults:
         raise SceneError(report.faults)
-    name = root.attributes.get("model", "") or path.stem
+    name = root.get("model") or path.stem
     return Robot(
         name=name,
         title=f"{name}, from the MJCF file {path.name}",
@@ -96,9 +97,9 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
     """
     report, settings = reader.report, reader.settings
     worlds = list(root.each("worldbody"))
-    below = [tag for world in worlds for tag in _below(world)]
+    below = [tag for world in worlds for tag in world.all()]
     names = {
-        kind: {t.attributes["name"] for t in below if t.kind in of and "name" in t.attributes}
+        kind: {t.get("name") for t in below if t.kind in of}
         for kind, of in (("body", {"body"}), ("joint", {"joint", "freejoint"}))
     }
     inner = [placed for world in worlds for placed in _contents(world, WORLD, "", reader)]
@@ -116,7 +117,7 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
     seen: dict[str, set[str]] = {"body": {WORLD}, "joint": set()}
 
     def called(tag: Tag, kind: str, otherwise: str) -> str:
-        name = tag.attributes.get("name", "")
+        name = tag.get("name")
         if name and name in seen[kind]:
             reader.own(tag).fault(f'there are two called "{name}"; rename one')
         name = name or fresh(otherwise, names[kind] | seen[kind])
@@ -163,15 +164,6 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
     return bodies, named(joints)
 
 
-def _below(tag: Tag) -> Iterator[Tag]:
-    """Every tag in `tag`."""
-    waiting = [tag]
-    while waiting:
-        inner = waiting.pop().children
-        yield from inner
-        waiting += inner
-
-
 def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Placed]:
     """What a body holds, frames resolved, in the file's order; what is not read is reported."""
     report = reader.report
@@ -183,11 +175,11 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
     while waiting:
         placed = waiting.pop()
         inner = placed.tag
-        name = inner.attributes.get("name", inner.attributes.get("prefix", ""))
+        name = inner.get("name", inner.get("prefix"))
         if inner.kind == "frame":
             unknown(inner, report)
             around = placed.pose.of(masses.pose_of(reader.own(inner), reader.settings))
-            default = inner.attributes.get("childclass", placed.childclass)
+            default = inner.get("childclass", placed.childclass)
             waiting += [Placed(child, body, around, default) for child in reversed(inner.children)]
         elif inner.kind in {"body", "joint", "freejoint", "geom", "inertial"}:
             found.append(placed)
