@@ -211,6 +211,29 @@ def test_right_modules_pass(tmp_path: Path, what: str) -> None:
     assert all(row.judged for row in report.rows), report.table()
 
 
+WOUND = """eomc = 1
+name = "wound"
+[coordinates]
+x = { unit = "m", start = 0.5 }
+a = { unit = "rad", start = 0.3, rate = 0.4 }
+[parameters]
+k = 1.3e4
+[energy]
+kinetic = "x_dot**2/2 + a_dot**2/2"
+potential = "k*x*atan(x) + x*a/10"
+dissipation = "x_dot**4/12"
+[run]
+h = 0.01
+duration = 5.0
+"""
+
+
+@pytest.mark.slow
+def test_an_angle_that_is_wound_up_may_throw_another_coordinate(tmp_path: Path) -> None:
+    report = checked(WOUND, tmp_path)
+    assert report.passed, report.table()
+
+
 @pytest.mark.parametrize("potential", ["x**2", "max(-x, 0)**2"])
 def test_rounding_is_not_judged_where_steps_leap_over_a_bend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, potential: str

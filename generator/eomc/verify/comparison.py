@@ -51,6 +51,7 @@ class Comparison:
         self.sampler = Sampler(self.reference, random, self.effort)
         self.expected = self.sampler.states(self.effort.states if states is None else states)
         self.rows: list[Row] = []
+        self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector]] = {}
 
     def convergence_rows(self) -> None:
         """Orders, advised steps, the balance of power: see `convergence`."""
@@ -232,9 +233,25 @@ class Comparison:
 
     def run(self, s: State, h: float = 0.0, steps: int = 0) -> float | None:
         """As far as a difference at the start, in units of the spread, grows by GROWTH_LIMIT."""
-        own = self.system.run.h
-        h = h or own
+        h = h or self.system.run.h
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
+        key = id(s), h, steps  # the states of `expected` live as long
+        if key not in self.motions:
+            self.motions[key] = self._motion(s, h, steps)
+        t, x, growth = self.motions[key]
+        if len(t) < 2:
+            return None
+        spread = np.array([self.sampler.spread, self.sampler.speed])
+        run = self.simulate(s, h=h, steps=len(t) - 1)
+        size = np.arange(1, len(t) + 1)[:, None, None] * (growth * spread + np.abs(x))
+        if str(getattr(run.status, "value", run.status)) != "ok":
+            raise RuntimeError(f"the run ended with status {run.status}")
+        off_time = self.units(run.t, t, np.abs(t) + h)
+        return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
+
+    def _motion(self, s: State, h: float, steps: int) -> tuple[Vector, Vector, Vector]:
+        """The reference's run as far as it is sure: t (n,), states (n, 2, nq), growth (n, 1, 1)."""
+        own = self.system.run.h
         spread = np.array([self.sampler.spread, self.sampler.speed])
 
         # of alternating signs, as what is rounded excites the fastest modes too
@@ -249,16 +266,8 @@ class Comparison:
             far = np.max(np.abs(x - x[:1]) / spread, axis=(1, 2))
             growth = np.where(far < FARTHEST, growth, math.inf)
         growth = np.maximum.accumulate(growth)
-        honest = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
-        if honest < 2:
-            return None
-        t, x, growth = t[:honest], x[:honest], growth[:honest, None, None]
-        run = self.simulate(s, h=h, steps=honest - 1)
-        size = np.arange(1, honest + 1)[:, None, None] * (growth * spread + np.abs(x))
-        if str(getattr(run.status, "value", run.status)) != "ok":
-            raise RuntimeError(f"the run ended with status {run.status}")
-        off_time = self.units(run.t, t, np.abs(t) + h)
-        return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
+        sure = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
+        return t[:sure], x[:sure], growth[:sure, None, None]
 
     def simulate(self, s: State, **how: Any) -> Any:
         """The module's run from a state."""

@@ -126,8 +126,15 @@ class Answer(ABC):
     def _acceleration(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Vector:
+        D, force = self._motion(q, qd, t, u, values)
+        return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
+
+    def _motion(
+        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> tuple[Vector, Vector]:
+        """D and tau - bias."""
         D, bias, tau = (self._value(name, q, qd, t, u, values) for name in ("D", "bias", "tau"))
-        return np.asarray(np.linalg.solve(D, (tau - bias)[..., None])[..., 0])
+        return D, tau - bias
 
     def _step(
         self, q: Vector, qd: Vector, h: float, t: Any, u: ArrayLike | None, values: Values

@@ -32,6 +32,12 @@ SPREAD = 3.0  # of their logarithms
 MOST, FEWER = 1200, 240  # states that the reference is asked for; where it takes long
 LOST = 1e-6  # of the size of its entries: where D is so far from the reference's, rounding decides
 ABSORBED = 2.0**30  # times another: beyond, a sum of parameters may lose one of them
+AWAY = (
+    -0.1,
+    0.1,
+    -0.4,
+    0.4,
+)  # of how far a coordinate goes: from a singular state to a regular one
 ALONG = np.linspace(0, 1, 9)  # of a step: where its stages may lie
 MARK = -7.0  # what is to be left alone
 
@@ -202,11 +208,26 @@ class Refusals:
                 if tried == 24:
                     break
                 tried += 1
-                for parts in (0.5, 20.5):
-                    at = replace(start, qd=(s.q - start.q) / (parts * h))
+                ways = [(start, 0.5), (start, 20.5), *((x, 20.5) for x in self.beside(s, tried))]
+                for begin, parts in ways:
+                    at = replace(begin, qd=(s.q - begin.q) / (parts * h))
                     for method in self.check.methods:
                         wrong += self.goes_on(method, at, math.ceil(parts))
         return float(wrong)
+
+    def beside(self, s: State, turn: int) -> list[State]:
+        """A regular state that differs from a singular one in one coordinate, if one is found.
+
+        From there a run may come gently to where D is singular: nothing else moves.
+        """
+        i = turn % len(s.q)
+        for by in AWAY:
+            q = s.q.copy()
+            q[i] += by * self.check.sampler.spread[i]
+            at = replace(s, q=q, qd=np.zeros_like(q))
+            if self.accelerate(at)[0] == OK:
+                return [at]
+        return []
 
     def goes_on(self, method: str, s: State, steps: int) -> bool:
         """Whether a run has kept a state whose D is not positive definite."""
@@ -217,12 +238,12 @@ class Refusals:
         # an angle of 1e20 has no digit left that says what D is
         digits = np.abs(rows[0]) * self.check.eps < CLEAR * self.check.sampler.spread
         known = int(np.argmin([*np.all(digits, axis=1), False]))
-        if METHODS[method].c[0]:  # no stage is where the step begins
-            ends = rows[:, 1:known]
-            along = self.between(rows[:, : ends.shape[1]], ends)
+        # the last state kept may be singular, but no step is made from it
+        least = self.least(rows[0, : min(known, run.done)], s)
+        if METHODS[method].c[0]:  # no stage is where the step begins: all along it then
+            begun = np.flatnonzero(least[: max(0, known - 1)] < -CLEAR)
+            along = self.between(rows[:, begun], rows[:, begun + 1])
             least = np.max([self.least(q, s) for q in along], axis=0)
-        else:  # the last state kept may be singular, but no step is made from it
-            least = self.least(rows[0, : min(known, run.done)], s)
         return bool(np.any(least < -CLEAR))
 
     def between(self, starts: Vector, ends: Vector) -> list[Vector]:
@@ -309,6 +330,13 @@ class Refusals:
             wrong += bool(run.status == OK) != (run.done == 12)
             wrong += run.status == NO_CONVERGENCE and not METHODS[method].implicit
             ended.append(run.status)
+        # one coordinate leaves the finite numbers at the very end, if forces let it
+        huge = float(np.finfo(self.model.dtype).max) / 2
+        for unit in np.eye(len(s.q)):
+            run = drive(
+                self.model, method, replace(s, q=huge * unit, qd=1.01 * huge * unit), 1.0, 1
+            )
+            wrong += run.status == OK or not np.all(np.isfinite(run.rows[:, 0]))
         return float(wrong + (ended[-1] == OK))
 
 

@@ -38,6 +38,7 @@ FEW, FEWER = 6, 3  # long steps, or steps with a row of u each; where the refere
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
 FAR = ("D", "g", "bias", "tau", "kinetic_energy", "potential_energy", "acceleration")
+FARTHEST = 100.0  # of how far things go: steps that lead further are not compared
 # parts of h, of runs that differ by rounding alone; the second where the first are too long
 FINE = ((1024, 8192), (8192, 65536))
 EXACT = 4  # order from which on their steps are short enough
@@ -221,8 +222,12 @@ class Runs:
     def far_steps(self, s: State, acceleration: Vector) -> float:
         """Some steps from there; acceleration: the size of what is rounded in one."""
         h, x = self.h, (s.q, s.qd)
-        for n in range(self.few):
-            x = self.sampler.reference.step(*x, h=h, t=s.t + n * h, u=s.u, params=s.params)
+        spread = np.array([self.sampler.spread, self.sampler.speed])
+        with np.errstate(all="ignore"):
+            for n in range(self.few):
+                x = self.sampler.reference.step(*x, h=h, t=s.t + n * h, u=s.u, params=s.params)
+            if not np.all(np.abs(np.subtract(x, (s.q, s.qd))) < FARTHEST * spread):
+                return 0.0  # as where a force that is wound up throws another coordinate
         gain = self.few * h * acceleration
         size = np.abs([s.q, s.qd]) + np.array([self.few * h * (np.abs(s.qd) + gain), gain])
         return self.check.units(

@@ -8,8 +8,9 @@ solved with NumPy and stepped in a Python loop. Slow, short, and meant to be bel
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -170,6 +171,11 @@ class Reference(Answer):
         default_factory=dict, init=False, repr=False, compare=False
     )
 
+    @cached_property
+    def motion(self) -> ImmutableMatrix:
+        """D by rows, bias and tau, which an acceleration needs together: (nq^2 + 2 nq, 1)."""
+        return ImmutableMatrix([*self.D, *self.bias, *self.tau])
+
     def simplified(self) -> Reference:
         """The same in shorter forms, for people to read; what would take SymPy long stays."""
         names = ("D", "C", "g", "tau")
@@ -194,15 +200,29 @@ class Reference(Answer):
     ) -> Any:
         if q.ndim == 1:
             return self._one(name, q, qd, float(t), u, values)
+        states = self._states(q, qd, t, u, values)
+        return np.array([self._one(name, *state) for state in states])
+
+    def _motion(
+        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> tuple[Vector, Vector]:
+        """D and tau - bias, of one evaluation."""
+        n, one = q.shape[-1], q.ndim == 1
+        states = [(q, qd, float(t), u, values)] if one else self._states(q, qd, t, u, values)
+        found = np.array([self._one("motion", *state) for state in states])
+        D, bias, tau = np.split(found, [n * n, n * n + n], axis=1)
+        D, force = D.reshape(-1, n, n), tau - bias
+        return (D[0], force[0]) if one else (D, force)
+
+    def _states(
+        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> Iterator[tuple[Vector, Vector, float, ArrayLike | None, Values]]:
+        """The rows of arguments that have them, as those of single states."""
         rows = len(q)
-        times = np.broadcast_to(t, rows).tolist()
+        times, *each = (np.broadcast_to(x, rows).tolist() for x in (t, *values))
         us: Any = [None] * rows if u is None else np.asarray(u, float)
-        each = np.array([np.broadcast_to(value, rows) for value in values]).reshape(-1, rows).T
-        found = [
-            self._one(name, q[i], qd[i], times[i], us[i], tuple(each[i].tolist()))
-            for i in range(rows)
-        ]
-        return np.array(found)
+        params = zip(*each, strict=True) if each else [()] * rows
+        return zip(q, qd, times, us, params, strict=True)
 
     def _one(
         self, name: str, q: Vector, qd: Vector, t: float, u: ArrayLike | None, values: Values
@@ -218,9 +238,10 @@ class Reference(Answer):
             found = self._function(name)(*q.tolist(), *qd.tolist(), t, *np.asarray(u), *values)
         except (ArithmeticError, ValueError):
             return np.full(shape, math.nan)[()]
-        if any(isinstance(each, complex) for each in found):  # Python's power of a negative number
+        made = np.array(found)
+        if np.iscomplexobj(made):  # Python's power of a negative number
             return np.full(shape, math.nan)[()]
-        return np.array(found, float).reshape(shape)[()]
+        return made.astype(float).reshape(shape)[()]
 
     def _function(self, name: str) -> Callable[..., Any]:
         if name not in self._functions:
