@@ -6,6 +6,7 @@ import csv
 import json
 import sys
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,7 +61,9 @@ def command(
         unstable = module.advice(q0, qd0, h, params=values, method=method)
         with progress_bar("running", quiet or as_json) as progress:
             begun = time.perf_counter()
-            done = _simulated(module, q0, qd0, every=every, progress=progress, **options)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # reported below
+                done = module.simulate(q0, qd0, every=every, progress=progress, **options)
             seconds = time.perf_counter() - begun
     except module.Interrupted as stop:  # what was done is kept
         done, seconds = stop.run, time.perf_counter() - begun
@@ -121,15 +124,6 @@ def _overrides(
         array, k = states[name]
         array[k] = value
     return values, q0, qd0
-
-
-def _simulated(module: Any, q0: Any, qd0: Any, **options: Any) -> Run:
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # reported by the caller
-        done: Run = module.simulate(q0, qd0, **options)
-        return done
 
 
 def _error(done: Run) -> dict[str, Any] | None:

@@ -117,18 +117,18 @@ class _Articulated:
             origins.append(at if link.turns else r.plus(at, own))
         return out
 
-    def _own_size(self, k: int) -> Expr:
-        """The link's own inertia along its joint: where there is some, no pivot can vanish."""
-        link = self.links[k]
-        return link.inertia[link.axis] if link.turns else link.mass
-
     def _size(self, k: int, body: _Inertia) -> Expr:
-        """For a parent without inertia of its own: the size of what k hands on unreduced."""
+        """The size of what k hands on unreduced, to a parent without inertia of its own.
+
+        With some along its joint no pivot can vanish.
+        """
         r, p = self.r, self.links[k].parent
-        if self._own_size(p) != 0 or r.armature[p] != 0:
+        parent = self.links[p]
+        own = parent.inertia[parent.axis] if parent.turns else parent.mass
+        if own != 0 or r.armature[p] != 0:
             return S.Zero
         mass = [body.M[i][i] for i in range(3)]
-        if not self.links[p].turns:
+        if not parent.turns:
             return r.add(*mass)
         across = r.dot(r.arm[k], r.arm[k])
         return r.add(*(body.J[i][i] for i in range(3)), *(r.times(across, m) for m in mass))

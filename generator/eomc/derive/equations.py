@@ -10,11 +10,10 @@ import sympy
 from sympy import Expr, S, Symbol
 
 from eomc.base.errors import SceneError
-from eomc.derive.energies import Energies
+from eomc.derive.energies import Energies, directions
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import Tape
-from eomc.model.symbols import ALONG
-from eomc.model.system import System, symbol, t
+from eomc.model.system import System, t
 
 WRITTEN_OUT = 2500  # names on the tape, about, from which C is computed column by column
 
@@ -24,8 +23,8 @@ class Motion:
     """What Lagrange's equations give, as atoms of a tape; shapes as in the field: D, C (nq, nq).
 
     D: by rows, or where that would be long a single column, D e, for a direction e whose entries
-    are `along`. g: the part of bias at rest. balance: b in D qdd = b. notes: where unusual terms of
-    K went.
+    are `directions`. g: the part of bias at rest. balance: b in D qdd = b. notes: where unusual
+    terms of K went.
     """
 
     D: Rows
@@ -52,11 +51,6 @@ class Equations(Motion):
     potential: Expr
     jacobi: Expr | None
     power: Expr
-
-
-def along(system: System) -> list[Symbol]:
-    """The entries of a direction e, for D e and C e."""
-    return [symbol(f"{c.name}{ALONG}") for c in system.coordinates]
 
 
 def equations(system: System, e: Energies, motion: Motion) -> Equations:
@@ -102,7 +96,8 @@ def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool)
         return [tape.define((a + b) / 2) for a, b in zip(slope, still, strict=True)]
 
     if len(bias) * len(tape.live(bias)) > WRITTEN_OUT:
-        return (tuple(column(dict(zip(system.qd, along(system), strict=True)))),)
+        entries = directions(system)
+        return (tuple(column({qd: entries[q] for q, qd in zip(system.q, system.qd, strict=True)})),)
     columns = [column({velocity: S.One}) for velocity in system.qd]
     return tuple(tuple(column[i] for column in columns) for i in range(len(columns)))
 

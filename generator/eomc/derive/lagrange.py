@@ -26,8 +26,8 @@ from sympy import Expr, S, Symbol
 from eomc.base.errors import SceneError
 from eomc.derive import link_multipliers
 from eomc.derive.articulated_body import MasslessError, accelerations
-from eomc.derive.energies import Energies, on_tape
-from eomc.derive.equations import Equations, Motion, along, equations, no_inertia
+from eomc.derive.energies import Energies, directions, on_tape
+from eomc.derive.equations import Equations, Motion, equations, no_inertia
 from eomc.derive.ldl import Rows, Solution, Vector, Way, solve, work
 from eomc.derive.newton_euler import Recursion
 from eomc.derive.tape import RoughError, Stage, Tape
@@ -165,8 +165,8 @@ def _length(solution: Solution) -> int:
 
 def _column(system: System, recursion: Recursion, at: Mapping[Symbol, int]) -> Rows:
     """D e for a direction e."""
-    direction = dict(zip(system.q, along(system), strict=True))
-    found = recursion.mass_times([direction[link.q] for link in recursion.links])
+    entries = directions(system)
+    found = recursion.mass_times([entries[link.q] for link in recursion.links])
     return (tuple(found[at[x]] for x in system.q),)
 
 

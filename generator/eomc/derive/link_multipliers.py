@@ -92,8 +92,9 @@ class _Links(Vectors):
         places = [self._sum_of(p.place) for p in self.points]
         # an increment has the sign with which it first stands, so that neighbours are alike
         signs: dict[Symbol, Expr] = {}
-        for b, c in (pair for place in places for pair in place.items() if self._moves(pair[0])):
-            signs.setdefault(b, S.NegativeOne if is_negative(split(c)[0]) else S.One)
+        for b, c in (pair for place in places for pair in place.items()):
+            if self.tape.stage[b] > Stage.TIME:
+                signs.setdefault(b, S.NegativeOne if is_negative(split(c)[0]) else S.One)
         self.increments = [self.tape.scaled(sign, b) for b, sign in signs.items()]
         self.groups = self._groups()
         self.group_of = {a: k for k, g in enumerate(self.groups) for a in g.members}
@@ -106,10 +107,6 @@ class _Links(Vectors):
         self.B = self._inverse(rows)
         self.T, self.unit = self._flexibility()
         self.near = {(self.group_of[a], self.group_of[b]) for a, b in self.T}
-
-    def _moves(self, symbol: Symbol) -> bool:
-        """Whether it depends on coordinates, not on time alone."""
-        return self.tape.stage[symbol] > Stage.TIME
 
     # --- points ----------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ from itertools import combinations_with_replacement
 import sympy
 from sympy import Expr, S
 
-from eomc.base.spatial import ENTRIES
+from eomc.base.spatial import ENTRIES, transposed
 from eomc.derive.tape import Tape
 from eomc.derive.vectors import AXES, ZERO, Vector, Vectors
 from eomc.model.exact import Matrix
@@ -95,7 +95,7 @@ class Recursion(Vectors):
 
     def outwards(self, k: int, v: Vector) -> Vector:
         """A vector of the parent's frame in link k's frame."""
-        return self.turn(k, self.applied_transposed(self.rotation[k], v), back=True)
+        return self.turn(k, self.apply(transposed(self.rotation[k]), v), back=True)
 
     def _arm(self, k: int) -> Vector:
         """From the parent's origin to link k's, in the parent's frame."""

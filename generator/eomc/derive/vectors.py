@@ -62,11 +62,6 @@ class Vectors:
         x, y, z = (self.dot(row, v) for row in R)
         return (x, y, z)
 
-    def applied_transposed(self, R: Sequence[Sequence[Expr]], v: Sequence[Expr]) -> Vector:
-        """R^T v"""
-        x, y, z = (self.dot(column, v) for column in zip(*R, strict=True))
-        return (x, y, z)
-
     def scaled(self, v: Sequence[Expr], x: Expr) -> Vector:
         """x v"""
         a, b, c = (self.times(e, x) for e in v)

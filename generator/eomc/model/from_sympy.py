@@ -36,7 +36,7 @@ class Maker:
         self.renamed: list[tuple[str, str]] = []
 
     def _name_of(self, one: Any, role: str) -> str:
-        if not given.is_symbol(one):
+        if not isinstance(one, (Symbol, AppliedUndef)):
             raise given.fault(role, f"{one!r} is not a symbol")
         text = one.func.__name__ if isinstance(one, AppliedUndef) else str(one)
         used = names.plain(text) if names.fault(text) else text

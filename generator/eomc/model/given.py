@@ -8,7 +8,6 @@ from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
-from sympy.core.function import AppliedUndef
 
 from eomc.base.errors import EomcError
 from eomc.integrators.tableaux import METHODS
@@ -134,11 +133,6 @@ def symbol_of(given: Any, role: str) -> Any:
     if isinstance(given, str):
         raise fault(role, f"give a symbol, sympy.Symbol({given!r}), not the text {given!r}")
     return given
-
-
-def is_symbol(given: Any) -> bool:
-    """Whether it is a symbol or a function of time."""
-    return isinstance(given, (Symbol, AppliedUndef))
 
 
 def run(h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any) -> Run:

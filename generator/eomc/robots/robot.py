@@ -88,18 +88,13 @@ class Robot:
 def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
     """Where the body's frame stands in its parent's: offset (m) and rotation, at `values`."""
     offset, rotation = body.offset, body.rotation
-    kinds = JOINTS[body.joint].motions
-    for kind, axis, value in zip(kinds, motion_axes(body), values, strict=True):
+    joint = JOINTS[body.joint]
+    for kind, axis, value in zip(joint.motions, joint.along(body.axes), values, strict=True):
         if kind == "t":
             offset = plus(offset, apply(rotation, scaled(axis, value)))
         else:
             rotation = times(rotation, from_axis_angle(axis, value))
     return offset, rotation
-
-
-def motion_axes(body: RobotBody) -> tuple[Vector, ...]:
-    """The axis of each coordinate of the joint, in the frame that those before it have moved."""
-    return JOINTS[body.joint].along(body.axes)
 
 
 def free_motions(of: str = "") -> tuple[Motion, ...]:
