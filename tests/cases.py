@@ -12,8 +12,9 @@ import numpy as np
 
 from eomc.base import names
 from eomc.emit.render import Sources
-from eomc.model import from_scene as system
-from eomc.scene import read as scene
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.scene.read import parse, read
 
 DATA = Path(__file__).parent / "data" / "cases.json"
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -37,6 +38,13 @@ ALIKE = {
     "kepler_orbit": "kepler_e0.9_cartesian",
     "heavy_top": "lagrange_top_nutation",
 }
+
+
+# of these the quick tier looks at
+FEW_ALIKE = (
+    "mass_spring", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum",
+    "heavy_top",
+)  # fmt: skip
 
 
 def fast_kit(made: Sources) -> dict[str, str]:
@@ -84,15 +92,15 @@ def scene_text(name: str) -> str:
 
 
 @cache
-def case_system(name: str) -> system.System:
+def case_system(name: str) -> System:
     """A case as a System, with the coarsest measured step size and t_end as its run."""
-    return system.from_scene(scene.parse(scene_text(name), f"{name}.toml"))
+    return from_scene(parse(scene_text(name), f"{name}.toml"))
 
 
 @cache
-def scene_system(name: str) -> system.System:
+def scene_system(name: str) -> System:
     """The System of scenes/<name>.toml."""
-    return system.from_scene(scene.read(SCENES / f"{name}.toml"))
+    return from_scene(read(SCENES / f"{name}.toml"))
 
 
 def error_of(name: str, q: Any) -> float:

@@ -131,10 +131,10 @@ import sys, tomllib
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from eomc.verify import check
-from eomc.scene import read as scene
-from eomc.model import from_scene as system
+from eomc.scene.read import parse
+from eomc.model.from_scene import from_scene
 from instrument import Shipped
-made = system.from_scene(scene.parse(Path({scene!r}).read_text(), "scene.toml"))
+made = from_scene(parse(Path({scene!r}).read_text(), "scene.toml"))
 shipped = Shipped(made, Path({folder!r}))
 said = shipped.compile({flags!r})
 assert said is None, said

@@ -28,9 +28,9 @@ import numpy as np
 from cases import SCENES
 from instrument import Shipped, in_a_fork
 
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 from eomc.verify import check as checking
 from eomc.verify import comparison
 from eomc.verify.comparison import Comparison
@@ -100,7 +100,7 @@ def variant(name: str) -> System:
     """A scene, or one of VARIANTS, as a system."""
     base, more = VARIANTS.get(name, (name, ""))
     text = (SCENES / f"{base}.toml").read_text(encoding="utf-8")
-    return system.from_scene(scene.parse(text.replace("[run]\n", "[run]\n" + more), f"{name}.toml"))
+    return from_scene(parse(text.replace("[run]\n", "[run]\n" + more), f"{name}.toml"))
 
 
 def mutants(source: str) -> list[Mutant]:

@@ -21,11 +21,11 @@ from conftest import needs
 
 from eomc.derive import lagrange
 from eomc.emit import render
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.program import program
 from eomc.program.program import Program
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 
 CANARY = Path(__file__).parent.parent / "build" / "tests" / f"canary{os.getpid()}"
 TOUCH = f"touch {CANARY}"
@@ -169,7 +169,7 @@ def filled(given: dict[int, str]) -> str:
 
 @cache
 def derived() -> Program:
-    made = system.from_scene(scene.parse(SCENE.replace('"@"', '""'), "f.toml"))
+    made = from_scene(parse(SCENE.replace('"@"', '""'), "f.toml"))
     return program.build(lagrange.derive(made))
 
 

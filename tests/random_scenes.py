@@ -31,8 +31,8 @@ from scene_author import scene_text
 import eomc
 from eomc.base.errors import EomcError
 from eomc.emit.render import Sources
-from eomc.model import from_scene as system
-from eomc.scene import read as scene
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
 from eomc.toolchain import compiler
 from eomc.verify.check import check
 
@@ -65,7 +65,7 @@ def outcome(seed: int, negate: bool, root: Path) -> Outcome:
     began = time.perf_counter()
     made, module = None, None
     try:
-        made = system.from_scene(scene.parse(scene_text(seed), f"{seed}.toml"))
+        made = from_scene(parse(scene_text(seed), f"{seed}.toml"))
         module = _built(eomc.sources(made, EXTENSION), root / "right")
     except Exception as fault:
         return Outcome(seed, "not built", _words(fault))

@@ -46,10 +46,10 @@ from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
 from eomc.emit.fast import context
 from eomc.emit.plain import steppers
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.report import equations_text
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 
 # one of a kind
 FEW = [
@@ -101,7 +101,7 @@ def test_the_reader_refuses_hidden_characters_and_names_line_and_key(which: int,
     for name, given in PAYLOADS.items():
         written = filled({which: given})
         try:
-            scene.parse(written, "f.toml")
+            parse(written, "f.toml")
             refused = False
         except SceneError as fault:
             refused = True
@@ -119,10 +119,10 @@ def test_the_reader_refuses_hidden_characters_and_names_line_and_key(which: int,
 def test_ordinary_texts_and_notes_of_several_lines_pass() -> None:
     note = "first line\nsecond *line*,\n\n\tindented: θ"
     for which, key in fields():
-        scene.parse(filled({which: ORDINARY}), "f.toml")
+        parse(filled({which: ORDINARY}), "f.toml")
         if key.endswith("note"):
-            scene.parse(filled({which: note}), "f.toml")
-    made = system.from_scene(scene.parse(filled({1: note, 3: note}), "f.toml"))
+            parse(filled({which: note}), "f.toml")
+    made = from_scene(parse(filled({1: note, 3: note}), "f.toml"))
     files = eomc.sources(made).files
     assert " * first line second *line*, indented: θ\n" in files["fields.h"]
     assert "/* plain, first line second *line*, indented: θ */" in files["fields.h"]

@@ -30,6 +30,24 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quickly_compiled: None
     return tmp_path
 
 
+@pytest.fixture(scope="session")
+def build(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder `build` with the cart-pole."""
+    folder = tmp_path_factory.mktemp("command") / "build"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EOMC_CFLAGS", "-O0")
+        patch.delenv("CC", raising=False)
+        pipeline.build(SCENES / "cartpole.toml", folder)
+    return folder
+
+
+@pytest.fixture
+def there(here: Path, build: Path) -> Path:
+    """As `here`, the cart-pole built."""
+    shutil.copytree(build, here / "build")
+    return here
+
+
 def eomc(*words: str) -> Result:
     return CliRunner().invoke(main, words)
 
@@ -67,9 +85,8 @@ sys.exit(", ".join(slow & set(sys.modules)) or 0)
 """
 
 
-def test_what_does_nothing_imports_nothing_slow(here: Path) -> None:
+def test_what_does_nothing_imports_nothing_slow(there: Path) -> None:
     """Help, and a build that is there, in a tenth of a second."""
-    pipeline.build("cartpole.toml")
     for words in (["--help"], ["build", "cartpole.toml"]):
         command = [sys.executable, "-c", LIGHT, *words]
         done = subprocess.run(command, capture_output=True, text=True)
@@ -77,7 +94,7 @@ def test_what_does_nothing_imports_nothing_slow(here: Path) -> None:
     assert "is up to date" in done.stdout
 
 
-def test_parameters_and_start_on_the_command_line(here: Path) -> None:
+def test_parameters_and_start_on_the_command_line(there: Path) -> None:
     words = ["--set", "m_c=1+2", "--start", "theta=pi/3", "--start", "x_dot=-l", "--json"]
     summary = json.loads(eomc("run", "cartpole.toml", "--duration", "0", *words).output)
     assert summary["q"] == {"x": 0.0, "theta": pytest.approx(np.pi / 3)}
@@ -100,8 +117,10 @@ def test_parameters_and_start_on_the_command_line(here: Path) -> None:
         (["list", "nowhere"], "is not a folder"),
     ],
 )
-def test_bad_input_is_status_2_and_says_what_to_do(here: Path, words: list[str], said: str) -> None:
-    shutil.copy(SCENES / "cartpole_bodies.toml", here)
+def test_bad_input_is_status_2_and_says_what_to_do(
+    there: Path, words: list[str], said: str
+) -> None:
+    shutil.copy(SCENES / "cartpole_bodies.toml", there)
     done = eomc(*words)
     assert done.exit_code == 2, done.output
     assert said in done.output
@@ -114,7 +133,7 @@ def test_two_scenes_of_one_name_do_not_replace_each_other(here: Path) -> None:
     assert not (here / "build").exists()
 
 
-def test_a_run_that_cannot_go_on_is_status_1(here: Path) -> None:
+def test_a_run_that_cannot_go_on_is_status_1(there: Path) -> None:
     done = eomc("run", "cartpole.toml", "--h", "3", "--duration", "30")
     assert done.exit_code == 1 and "would no longer be finite" in done.output
 

@@ -21,13 +21,13 @@ from hypothesis import strategies as st
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive.lagrange import derive
 from eomc.derive.ldl import Solution
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System, dot, symbol, t
 from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.program.ir import Call
 from eomc.program.program import Program
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 from eomc.verify import check
 from eomc.verify.symbolic import Reference
 from eomc.verify.symbolic import derive as plainly
@@ -254,7 +254,7 @@ def chain(links: int) -> str:
 
 
 def test_ten_links_are_derived_in_two_seconds_at_1800_flops() -> None:
-    made = system.from_scene(scene.parse(chain(10), "chain_10.toml"))
+    made = from_scene(parse(chain(10), "chain_10.toml"))
 
     def derived() -> tuple[float, Program]:
         begun = time.process_time()
@@ -269,8 +269,9 @@ def test_ten_links_are_derived_in_two_seconds_at_1800_flops() -> None:
     assert spent < 2  # of CPU time; usual was 1.2
 
 
+@pytest.mark.slow
 def test_three_links_are_right() -> None:
-    assert_agree(system.from_scene(scene.parse(chain(3), "chain_3.toml")))
+    assert_agree(from_scene(parse(chain(3), "chain_3.toml")))
 
 
 def test_what_is_constant_costs_nothing_at_run_time() -> None:
@@ -360,8 +361,8 @@ def test_a_derivative_of_a_jump_is_refused() -> None:
 
 @pytest.mark.parametrize("mass", ["m/2 + 1/4", "m/2 + sqrt(2)", "m*sqrt(3) + sqrt(2) + 1/3"])
 def test_irrational_constants_beside_parameters_stay(mass: str) -> None:
-    made = system.from_scene(
-        scene.parse(
+    made = from_scene(
+        parse(
             f"""
             eomc = 1
             name = "irrational"

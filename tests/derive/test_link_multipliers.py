@@ -20,13 +20,13 @@ from hypothesis import strategies as st
 
 from eomc.derive import lagrange, link_multipliers
 from eomc.derive.ldl import Solution
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System, dot, symbol, t
 from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.program.ir import Call, Function
 from eomc.program.lower import lower
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 from eomc.verify.taylor import Jets
 
 EPS = 2.0**-52
@@ -40,7 +40,7 @@ MANY = settings(FEW, max_examples=24)
 
 
 def made_of(text: str) -> System:
-    return system.from_scene(scene.parse(text, "links.toml"))
+    return from_scene(parse(text, "links.toml"))
 
 
 def by_multipliers(made: System) -> Function:

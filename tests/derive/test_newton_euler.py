@@ -20,14 +20,14 @@ from hypothesis import strategies as st
 from eomc.base.errors import EomcError
 from eomc.derive import lagrange
 from eomc.derive.newton_euler import Recursion
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
 from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.program.ir import Function
 from eomc.program.program import Program
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 from eomc.verify import check, symbolic
 from eomc.verify.oracle import Answer
 from eomc.verify.taylor import Jets
@@ -44,7 +44,7 @@ WORST = 1e5  # condition of D beyond which a state tells little: rounding alone 
 
 
 def made_of(text: str) -> System:
-    return system.from_scene(scene.parse(text, "tree.toml"))
+    return from_scene(parse(text, "tree.toml"))
 
 
 def built(made: System) -> Program:

@@ -53,7 +53,9 @@ IMPLICIT = 'method = "gauss4"\nlinearize = "parameters"'
 @pytest.mark.parametrize(
     "run", tiers([BATCH, "", IMPLICIT], BATCH), ids=["batch", "plain", "implicit"]
 )
-@pytest.mark.parametrize("text", [UNUSED, COORDINATES], ids=["unused", "coordinates"])
+@pytest.mark.parametrize(
+    "text", tiers([UNUSED, COORDINATES], COORDINATES), ids=["unused", "coordinates"]
+)
 @pytest.mark.usefixtures("quickly_compiled")
 def test_names_that_temporaries_have_too(text: str, run: str, tmp_path: Path) -> None:
     """A parameter that a function does not read once had its name taken, and its value too."""

@@ -71,6 +71,7 @@ def test_angles_that_are_linear_in_coordinates_are_found() -> None:
 
 
 @pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.3), 0.02))
+@pytest.mark.usefixtures("quickly_compiled")
 def test_steps_short_and_long_are_those_of_the_textbook(
     h: float, tmp_path: Path, modules: Modules
 ) -> None:
@@ -104,6 +105,7 @@ def test_steps_leave_their_predictions_and_come_back(cartpole: ModuleType) -> No
 @pytest.mark.parametrize(
     "signal", tiers(("2*sin(3*t)", "2*cos(t)*a - a_dot", "0.7"), "2*cos(t)*a - a_dot")
 )
+@pytest.mark.usefixtures("quickly_compiled")
 def test_signals_and_held_inputs_reach_steps_near_predictions(signal: str, tmp_path: Path) -> None:
     """Signals of time, of the state and constant ones; and inputs held over a step each."""
     scene = ODD.replace("[energy]", f'[inputs]\nu = {{ signal = "{signal}" }}\n[energy]')

@@ -11,10 +11,10 @@ from click.testing import CliRunner
 
 from eomc.base.errors import EomcError
 from eomc.cli.main import main
-from eomc.model import from_scene as system
 from eomc.model import kinematics, mobility
+from eomc.model.from_scene import from_scene
 from eomc.model.mobility import Mobility
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 
 
 def count(*parts: str, gravity: str = "[0, 0, -9.81]", coordinates: str = "") -> Mobility:
@@ -24,7 +24,7 @@ def count(*parts: str, gravity: str = "[0, 0, -9.81]", coordinates: str = "") ->
         name, _, unit = word.partition(":")
         entries.append(f'{name} = {{ unit = "{unit or "rad"}" }}')
     head = f'eomc = 1\nname = "scene_1"\ngravity = {gravity}\n[coordinates]\n'
-    return mobility.count(scene.parse(head + "\n".join(entries) + "\n" + "\n".join(parts)))
+    return mobility.count(parse(head + "\n".join(entries) + "\n" + "\n".join(parts)))
 
 
 def body(name: str, joint: str, coordinates: str = "", parent: str = "world", **keys: str) -> str:
@@ -191,7 +191,7 @@ mass = 1.0
 def test_gimbal_lock_at_the_start_is_reported() -> None:
     head = 'eomc = 1\nname = "top_1"\ngravity = [0, 0, 0]\n[coordinates]\nyaw = {}\n'
     head += 'pitch = { start = "pi/2" }\nroll = {}\n'
-    found = mobility.count(scene.parse(head + body("a", "spherical", "yaw pitch roll")))
+    found = mobility.count(parse(head + body("a", "spherical", "yaw pitch roll")))
     assert found.rank == 3 and any("singular start" in r and "yaw" in r for r in found.remarks)
 
 
@@ -201,7 +201,7 @@ def test_the_mass_matrix_behind_the_ranks_is_that_of_a_pendulum() -> None:
         + body("a", "revolute", "q", mass="2", center="[0.5, 0, 0]", inertia="[0.1, 0.2, 0.3]",
                armature="0.05")
     )  # fmt: skip
-    checked = scene.parse(text)
+    checked = parse(text)
     assert checked.assembly
     at = kinematics.Kinematics(checked, checked.assembly).jacobian(np.array([0.4]), 0.0)
     assert at is not None
@@ -216,7 +216,7 @@ def test_the_mass_matrix_behind_the_ranks_has_the_signs_of_a_cart_pole() -> None
         + body("cart", "prismatic", "x", axis="[1, 0]", mass="3", inertia="")
         + body("pole", "revolute", "q", "cart", mass="2", center="[0, -0.5]", inertia="0.1")
     )
-    checked = scene.parse(text)
+    checked = parse(text)
     assert checked.assembly
     at = kinematics.Kinematics(checked, checked.assembly).jacobian(np.array([0.2, 0.4]), 0.0)
     assert at is not None
@@ -264,10 +264,10 @@ def suspended(start: str, rest: str) -> str:
 def test_ends_that_meet_at_the_start_are_reported(
     start: str, rest: str, reported: list[str]
 ) -> None:
-    made = scene.parse(suspended(start, rest))
+    made = parse(suspended(start, rest))
     found = mobility.meeting(made)
     assert [problem.key for problem in found] == reported
-    warnings = system.from_scene(made).warnings[len(made.warnings) :]
+    warnings = from_scene(made).warnings[len(made.warnings) :]
     assert [problem.key for problem in warnings] == reported
     remarks = [r for r in mobility.count(made).remarks if "its ends meet at the start" in r]
     assert [r.partition(":")[0] for r in remarks] == reported
@@ -298,7 +298,7 @@ mass = 1
 center = [1, 0]
 """
     monkeypatch.delattr(kinematics, "_null")
-    found = mobility.count(scene.parse(text))
+    found = mobility.count(parse(text))
     assert (found.M, found.rank) == (1501, 1501) and not found.remarks
 
 
@@ -311,7 +311,7 @@ def test_elimination_does_not_judge_what_may_be_rounding() -> None:
             + body("bob", "revolute", "q", "arm", offset="[1, 0.3, 0]", axis="[0.2, 0.3, 0.7]",
                    center="[0.2, 0.3, 0.7]", inertia=inertia)
         )  # fmt: skip
-        checked = scene.parse(text)
+        checked = parse(text)
         assert checked.assembly
         found = kinematics.Kinematics(checked, checked.assembly)
         assert found.is_regular(np.array([0.4, 1.0])) is regular
@@ -326,7 +326,7 @@ def test_elimination_knows_where_a_mass_is(center: str, regular: bool) -> None:
         + body("bob", "fixed", "", "post", offset="[0.3, 0, 1]", center=f"[{center}, 0, 0]",
                inertia="")
     )  # fmt: skip
-    checked = scene.parse(text)
+    checked = parse(text)
     assert checked.assembly
     found = kinematics.Kinematics(checked, checked.assembly)
     assert found.is_regular(np.array([0.4])) is regular
@@ -346,7 +346,7 @@ def test_a_long_chain_has_all_its_freedoms() -> None:
 def test_scenes_without_bodies_are_reported_so() -> None:
     text = 'eomc = 1\nname = "s_1"\n[coordinates]\nx = {}\n[energy]\nkinetic = "x_dot**2"\n'
     with pytest.raises(EomcError, match=r"the scene has no \[\[body\]\]"):
-        mobility.count(scene.parse(text))
+        mobility.count(parse(text))
 
 
 def test_the_command(tmp_path: Path) -> None:

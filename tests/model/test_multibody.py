@@ -16,9 +16,9 @@ import trees
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 from eomc.verify.taylor import Jets
 
 Array = NDArray[np.float64]
@@ -116,7 +116,7 @@ class Arm:
             tool["axis"] = axis
         gravity = GRAVITY[: self.wide].tolist()
         text = trees.text([base, tool], gravity, {"k": 30.0, "c": 0.7}, more.pop("tables", ()))
-        self.made = system.from_scene(scene.parse(text, "arm.toml"))
+        self.made = from_scene(parse(text, "arm.toml"))
 
     def poses(self, q: Array) -> list[Pose]:
         """Of the frames of both bodies."""
@@ -255,7 +255,7 @@ def test_a_body_placed_by_formulas_is_its_points(plane: bool) -> None:
     body = {"name": "bob", "position": position[: 2 if plane else 3], "rotation": turns, **keys}
     text = trees.text([body], GRAVITY[: 2 if plane else 3].tolist(), {"l": 0.8})
     text = text.replace("[coordinates]", "[coordinates]\nx = {}\na = {}\nb = {}")
-    made = system.from_scene(scene.parse(text, "bob.toml"))
+    made = from_scene(parse(text, "bob.toml"))
 
     def places(q: Array) -> Array:
         x, a, b = q

@@ -8,8 +8,9 @@ import pytest
 
 import eomc
 from eomc.base.errors import EomcError, SceneError
-from eomc.model import from_scene as system
-from eomc.scene import read as scene
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.scene.read import parse
 from eomc.verify.check import check
 
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "valid"
@@ -42,8 +43,8 @@ duration = 0.2
 """
 
 
-def made(scene_text: str) -> system.System:
-    return system.from_scene(scene.parse(scene_text, "valid.toml"))
+def made(scene_text: str) -> System:
+    return from_scene(parse(scene_text, "valid.toml"))
 
 
 SENSITIVE = 'linearize = "parameters"'

@@ -19,9 +19,9 @@ import pytest
 from cases import SCENES, scene_text
 from conftest import ROOT, Modules
 
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.report import cost_of_digits, reference_solution
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 
 BUILDS = ROOT / "build" / "tests" / "extremes"
 ORBITS = 500
@@ -44,7 +44,7 @@ potential = "-m*mu/r"
 @cache
 def with_methods(text: str, *methods: str) -> ModuleType:
     module, skipped = cost_of_digits.variant(
-        system.from_scene(scene.parse(text, "extreme.toml")), methods, BUILDS
+        from_scene(parse(text, "extreme.toml")), methods, BUILDS
     )
     assert not skipped
     return module
@@ -228,7 +228,7 @@ def test_accelerations_lose_what_the_condition_of_D_takes(m1: str, m2: str) -> N
 def test_motions_of_mass_ratios(m1: str, m2: str, duration: float, steps: int, most: float) -> None:
     """Against 25 digits, all along. Inner: a mode of 1,000 rad/s grows and dies, cond D = 1e5."""
     text = double_pendulum(m1, m2, duration)
-    exact = reference_solution.of(system.from_scene(scene.parse(text, "ratio.toml")), root=BUILDS)
+    exact = reference_solution.of(from_scene(parse(text, "ratio.toml")), root=BUILDS)
     assert exact.digits[-1] > 25
     run = with_methods(text, "rk4", "gauss8").simulate(
         h=duration / steps, steps=steps, every=steps // 256, method="gauss8"

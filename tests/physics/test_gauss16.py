@@ -101,6 +101,7 @@ def test_order_by_check(name: str) -> None:
     assert {"order of gauss16", "gauss16 beside rk4"} <= {row.name for row in report.rows}
 
 
+@pytest.mark.slow
 def test_a_wrong_coefficient_is_found_by_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

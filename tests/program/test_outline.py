@@ -41,6 +41,8 @@ from eomc.program.program import Program
 from eomc.scene import read as scene
 from eomc.toolchain import cache
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
 STEPS = 40
 
 

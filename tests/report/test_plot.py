@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sympy
 
 from eomc.base.errors import EomcError
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System, symbol
 from eomc.report import plot
-from eomc.scene import read as scene
+from eomc.scene.read import read
 
 pytest.importorskip("matplotlib")
 
@@ -18,7 +19,7 @@ SCENES = Path(__file__).parents[2] / "scenes"
 
 
 def cartpole():
-    made = system.from_scene(scene.read(SCENES / "cartpole.toml"))
+    made = from_scene(read(SCENES / "cartpole.toml"))
     t = np.linspace(0, 2, 201)
     q = np.column_stack([0.1 * np.sin(t), np.pi / 2 + t])
     return made, t, q, np.gradient(q, t, axis=0), 5 + 1e-6 * t
@@ -103,7 +104,7 @@ def test_polar_coordinates_hang_where_gravity_pulls():
     kinetic = (symbol("r_dot") ** 2 + r**2 * symbol("theta_dot") ** 2) / 2
     t = np.linspace(0, 1, 11)
     q = np.column_stack([np.ones(11), np.zeros(11)])
-    for potential, end in ((-g * r * system.sympy.cos(theta), (0, -1)), (-1 / r, (1, 0))):
+    for potential, end in ((-g * r * sympy.cos(theta), (0, -1)), (-1 / r, (1, 0))):
         made = System.make("polar", [r, theta], kinetic, potential)
         plane = plot.figure(made, t, q, 0 * q, 0 * t).axes[-1]
         assert any(np.allclose(line.get_xydata()[-1], end) for line in plane.get_lines())

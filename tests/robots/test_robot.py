@@ -16,7 +16,7 @@ from eomc.base.errors import EomcError
 from eomc.robots import edit, inertias, rotations, scene_text
 from eomc.robots.inertias import Inertia
 from eomc.robots.robot import Drive, Motion, Robot, RobotBody, moved
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 
 angles = st.one_of(
     st.floats(-math.pi, math.pi),
@@ -140,7 +140,7 @@ def test_tensors_that_no_body_has_are_mended_where_it_is_asked_for() -> None:
     assert "# - body boom: its inertia [0.1, 0.1, 0.3, 0, 0, 0] is that of no body" in text
     inertias = [b["inertia"] for b in tomllib.loads(text)["body"] if "inertia" in b]
     assert inertias[1] == pytest.approx([0.4 / 3, 0.4 / 3, 0.8 / 3])
-    scene.parse(text)
+    parse(text)
     assert edit.mended(arm()) == arm()
 
 

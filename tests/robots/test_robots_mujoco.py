@@ -27,13 +27,13 @@ from conftest import Modules
 from numpy.typing import NDArray
 
 from eomc.derive.lagrange import derive
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.robots import edit, scene_text, urdf
 from eomc.robots.mjcf import read
 from eomc.robots.robot import Robot
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 
 WANTED = "robots are compared with MuJoCo where it is there: pip install 'eomc[robots]'"
 mujoco = pytest.importorskip("mujoco", reason=WANTED)
@@ -243,7 +243,7 @@ Ask = Callable[[str, Array, Array, Array], Array]
 
 def in_python(text: str) -> Ask:
     """The program, evaluated without a compiler."""
-    made = system.from_scene(scene.parse(text, "robot.toml"))
+    made = from_scene(parse(text, "robot.toml"))
     quick = program.build(derive(made))
 
     def ask(name: str, q: Array, qd: Array, u: Array) -> Array:

@@ -14,7 +14,10 @@ from cases import SCENES, case_system, cases, error_of
 from conftest import ROOT, Modules, tiers
 
 import eomc
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
 from eomc.runtime import estimate
+from eomc.scene.read import parse
 
 SPRING = """
 eomc = 1
@@ -47,16 +50,22 @@ duration = 10.0
 """
 
 
+def quickly_built(made: System, flags: str) -> ModuleType:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EOMC_CFLAGS", flags)  # it is the compiling that takes the time here
+        return eomc.load(made, ROOT / "build" / "tests" / "cases")
+
+
 @cache
 def compiled(name: str) -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("EOMC_CFLAGS", "-O1")  # it is the compiling that takes the time here
-        return eomc.load(case_system(name), ROOT / "build" / "tests" / "cases")
+    return quickly_built(case_system(name), "-O1")
 
 
-def spring(modules: Modules, k: float, dissipation: str = "0") -> Any:
+@cache
+def spring(k: float, dissipation: str = "0") -> Any:
     name = f"spring_{k:g}_{len(dissipation)}".replace("+", "")
-    return modules.of_text(SPRING.format(name=name, k=k, dissipation=dissipation))
+    text = SPRING.format(name=name, k=k, dissipation=dissipation)
+    return quickly_built(from_scene(parse(text, "spring.toml")), "-O0")
 
 
 def quiet(module: Any, **how: Any) -> Any:
@@ -164,16 +173,16 @@ def test_jumps_lower_the_observed_order(modules: Modules) -> None:
     assert run.error.observed < 3 and "forces jump" in run.error.verdict
 
 
-def test_steps_that_damp_a_fast_mode_away_are_found_out(modules: Modules) -> None:
+def test_steps_that_damp_a_fast_mode_away_are_found_out() -> None:
     """h omega = 2: at h and at h/2 the oscillation dies alike, and alike is not right."""
-    run = quiet(spring(modules, 1e6), h=2e-3, duration=10.0, every=50)
+    run = quiet(spring(1e6), h=2e-3, duration=10.0, every=50)
     assert np.abs(run.q[-1, 0]) < 1e-6  # where the exact one goes on with amplitude 1
     assert run.estimate().q[-1, 0] == pytest.approx(abs(math.cos(1e4) - run.q[-1, 0]), rel=0.2)
     assert not run.error.resolved
 
 
-def test_a_run_that_stopped_has_an_error_as_far_as_it_went(modules: Modules) -> None:
-    run = quiet(spring(modules, 1e6), h=0.01, duration=10.0)
+def test_a_run_that_stopped_has_an_error_as_far_as_it_went() -> None:
+    run = quiet(spring(1e6), h=0.01, duration=10.0)
     assert run.status == "not finite"
     error = run.estimate()
     assert len(error.q) == len(run) and "the run stopped" in error.verdict
@@ -224,9 +233,9 @@ def test_held_inputs_are_held_in_shorter_steps_too(driven: ModuleType) -> None:
 # --- the stability limit --------------------------------------------------------------------------
 
 
-def test_a_step_beyond_the_limit_is_reported_once(modules: Modules) -> None:
+def test_a_step_beyond_the_limit_is_reported_once() -> None:
     """RK4 of an undamped spring is stable up to h omega = 2.83; measured on both sides."""
-    module = spring(modules, 1e4)
+    module = spring(1e4)
     words = r"h = 0.03 s is beyond rk4's stability limit of about 0.028 s here \(fastest mode 100"
     with pytest.warns(RuntimeWarning, match=words):
         run = module.simulate(h=0.03, steps=1000)
@@ -241,9 +250,9 @@ def test_a_step_beyond_the_limit_is_reported_once(modules: Modules) -> None:
     assert module.advice(h=0.031, params={"k": 5e3}) is None
 
 
-def test_fast_decay_has_a_limit_too(modules: Modules) -> None:
+def test_fast_decay_has_a_limit_too() -> None:
     """x'' = -k x - 1000 x': the fast eigenvalue is -1000 1/s, RK4's limit 2.79."""
-    module = spring(modules, 1.0, "500*x_dot**2")
+    module = spring(1.0, "500*x_dot**2")
     assert "limit of about 0.0028 s here (fastest decay 1e+03 1/s" in module.advice(h=0.003)
     assert module.advice(h=0.0027) is None
     assert abs(quiet(module, h=0.003, qd0=[1.0], steps=1000).q[-1, 0]) > 10

@@ -60,10 +60,10 @@ def test_every_value_agrees_with_the_reference(everything: ModuleType) -> None:
 
 
 def scene_of_everything() -> System:
-    from eomc.model import from_scene as system
-    from eomc.scene import read as scene
+    from eomc.model.from_scene import from_scene
+    from eomc.scene.read import parse
 
-    return system.from_scene(scene.parse(EVERYTHING, "everything.toml"))
+    return from_scene(parse(EVERYTHING, "everything.toml"))
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from conftest import MODULES
 from test_interrupts import ctrl_c_after
 
 import eomc
-from eomc.model import from_scene as system
-from eomc.scene import read as scene
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
 
 MANY = 10_000_000  # rows
 STIFF = 'method = "gauss8"\n'
@@ -30,7 +30,7 @@ def loaded(name: str, run: str = "", repeat: int = 0) -> ModuleType:
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8").replace("[run]\n", "[run]\n" + run)
     if repeat:
         text = text.replace("n = { value = 5,", f"n = {{ value = {repeat},")
-    return eomc.load(system.from_scene(scene.parse(text, "test.toml")), MODULES)
+    return eomc.load(from_scene(parse(text, "test.toml")), MODULES)
 
 
 @pytest.fixture(scope="session")

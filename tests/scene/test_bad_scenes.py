@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model import from_scene as system
-from eomc.scene import read as scene
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import read
 
 BAD = Path(__file__).parent / "bad"
 SCENES = sorted(BAD.glob("*.toml"))
@@ -18,14 +18,14 @@ SCENES = sorted(BAD.glob("*.toml"))
 
 def problems(file: Path) -> tuple[Problem, ...]:
     try:
-        return system.from_scene(scene.read(file)).warnings
+        return from_scene(read(file)).warnings
     except SceneError as fault:
         return fault.problems
 
 
 def message(file: Path) -> str:
     try:
-        text = "\n".join(map(str, system.from_scene(scene.read(file)).warnings))
+        text = "\n".join(map(str, from_scene(read(file)).warnings))
     except SceneError as fault:
         text = str(fault)
     return text.replace(str(file), file.name) + "\n"

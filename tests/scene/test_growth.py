@@ -23,10 +23,10 @@ from eomc import EomcError
 from eomc.derive import lagrange
 from eomc.program import program
 from eomc.emit import render
-from eomc.scene import read as scene
-from eomc.model import from_scene as system
+from eomc.scene.read import parse
+from eomc.model.from_scene import from_scene
 try:
-    made = system.from_scene(scene.parse(sys.stdin.buffer.read(), "growth.toml"))
+    made = from_scene(parse(sys.stdin.buffer.read(), "growth.toml"))
     if sys.argv[1] == "built":
         render.render(program.build(lagrange.derive(made)), "_extension")
     print("ok")
@@ -184,11 +184,11 @@ def test_hostile_texts_are_refused_in_words(name: str) -> None:
 
 
 def test_a_key_of_many_dots_in_a_text_is_no_key() -> None:
-    from eomc.scene import read as scene
+    from eomc.scene.read import parse
 
     note = "see " + "a.b.c." * 20 + "d"
     text = BASE.replace('name = "growth"', f'name = "growth"\nnote = "{note}"\ntitle = "..."')
-    assert scene.parse(text).note == note
+    assert parse(text).note == note
 
 
 @pytest.mark.slow

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eomc.base.errors import EomcError
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.scene import formulas
-from eomc.scene import read as scene
 from eomc.scene.formulas import FormulaError
+from eomc.scene.read import parse
 
 few = settings(max_examples=25, deadline=None, derandomize=True, database=None)
 many = settings(few, max_examples=150)
@@ -137,7 +137,7 @@ def harmless(text):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            system.from_scene(scene.parse(text, "fuzz.toml"))
+            from_scene(parse(text, "fuzz.toml"))
     except EomcError as fault:
         assert str(fault).startswith("fuzz.toml")
     finally:
@@ -148,7 +148,7 @@ def harmless(text):
 @pytest.fixture(scope="module", autouse=True)
 def warm():
     for text in TEXTS:  # SymPy imports some of its modules late
-        system.from_scene(scene.parse(text))
+        from_scene(parse(text))
 
 
 def in_two_tiers(examples, test):

@@ -17,7 +17,7 @@ from conftest import Modules, tiers
 
 from eomc.model.from_scene import from_scene as system_of
 from eomc.model.system import System, symbol
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 from eomc.verify import sampling
 from eomc.verify import symbolic as references
 from eomc.verify.check import check
@@ -243,16 +243,16 @@ def test_what_is_right_passes(name: str) -> None:
     assert order.error == pytest.approx(4, abs=0.2)
 
 
-# rows of runs of several steps, which take most of the time
-OF_RUNS = {"order of rk4", "power balance", "h of rk4"}
+# rows of runs of several step sizes, which take most of the time
+OF_RUNS = {"order of rk4", "power balance"}
 LONG = {what for what, (_, _, rows) in BROKEN.items() if rows & OF_RUNS}
 QUICK = (BROKEN.keys() - LONG) | {"a sign in an acceleration", "weights of order 1", "no power"}
 
 
 @pytest.mark.parametrize("what", tiers(BROKEN, *QUICK))
 def test_what_is_wrong_fails(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if what not in LONG:
-        monkeypatch.setattr(Comparison, "convergence_rows", lambda _: None)
+    without = "advice_row" if what in LONG else "convergence_rows"
+    monkeypatch.setattr(Comparison, without, lambda *_: None)
     name, break_, rows = BROKEN[what]
     module = StandIn(reference(name))
     break_(module)
@@ -420,7 +420,10 @@ linearize = "parameters"
 
 
 @pytest.mark.parametrize("wrong", ["", "A", "B", "sensitivity"])
-def test_derivatives_are_compared_with_differences(modules: Modules, wrong: str) -> None:
+def test_derivatives_are_compared_with_differences(
+    modules: Modules, wrong: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Comparison, "convergence_rows", lambda _: None)
     module = modules.of_text(SLOPES)
 
     class Bent:
@@ -434,7 +437,7 @@ def test_derivatives_are_compared_with_differences(modules: Modules, wrong: str)
         def sensitivity(self, *place: Any, **how: Any) -> Any:
             return module.sensitivity(*place, **how) * (-1 if wrong == "sensitivity" else 1)
 
-    report = check(system_of(scene.parse(SLOPES)), Bent(), states=4)
+    report = check(system_of(parse(SLOPES)), Bent(), states=4)
     row = "sensitivity" if wrong == "sensitivity" else "linearize"
     assert failed(report) == ({row} if wrong else set()), report.table()
     assert {"linearize", "sensitivity"} <= {row.name for row in report.rows}

@@ -11,9 +11,9 @@ import trees
 from instrument import in_a_fork
 from mutants import Bench, Mutant, variant
 
-from eomc.model import from_scene as system
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 
 # a pivot, and what it is compared with: nothing, or rounding of the diagonal entry that it was
 PIVOT = re.compile(r"((?:\w+->)?[dD]_\w+|-?w\d+) <= (0|[\d.]+e-\d+\*([\w>.-]*\w))(?=[;) ?|])")
@@ -29,7 +29,7 @@ def chain(links: int, run: str = "") -> System:
     ]  # fmt: skip
     masses = {f"m{k}": 1 + k / 10 for k in range(1, links + 1)}
     text = trees.text(bodies, [0, "-g"], {**masses, "l": 0.7, "g": 9.81}, start=0.1)
-    return system.from_scene(scene.parse(f"{text}\n[run]\nh = 0.001\n{run}", "rods.toml"))
+    return from_scene(parse(f"{text}\n[run]\nh = 0.001\n{run}", "rods.toml"))
 
 
 def changes(source: str) -> Iterator[Mutant]:

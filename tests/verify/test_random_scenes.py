@@ -14,8 +14,8 @@ from random_scenes import outcome
 from scene_author import scene_text
 
 import eomc
-from eomc.model import from_scene as system
-from eomc.scene import read as scene
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
 from eomc.verify.check import check
 from eomc.verify.report import Report
 from eomc.verify.rows_runs import Runs
@@ -200,7 +200,7 @@ def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def checked(text: str, root: Path) -> Report:
-    made = system.from_scene(scene.parse(text, "test.toml"))
+    made = from_scene(parse(text, "test.toml"))
     return check(made, eomc.load(made, root))
 
 

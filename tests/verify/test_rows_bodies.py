@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from test_check import StandIn
 from trees import SHAPES, trees
 
-from eomc.model import from_scene as system
 from eomc.model import multibody as building
-from eomc.scene import read as scene
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse, read
 from eomc.verify import rows_bodies
 from eomc.verify.comparison import Comparison
 from eomc.verify.rows_bodies import Bodies
@@ -31,7 +31,7 @@ NAMES = ("kinetic_energy", "potential_energy", "power")
 
 def compared(text: str, states: int = 4) -> dict[str, float]:
     """How far the reference's energies are off from those of point masses."""
-    made = system.from_scene(scene.parse(text, "test.toml"))
+    made = from_scene(parse(text, "test.toml"))
     assert made.scene is not None
     module = StandIn(Jets(made))  # type: ignore[arg-type]  # which answers alike
     check = Comparison(made, module, np.random.default_rng(0), states)
@@ -188,7 +188,7 @@ def test_quaternions_are_scipys() -> None:
 
 
 def test_point_masses_have_the_inertia_of_the_body() -> None:
-    made = system.from_scene(scene.read(SCENES / "tumbling_box.toml"))
+    made = from_scene(read(SCENES / "tumbling_box.toml"))
     assert made.scene is not None and made.scene.assembly is not None
     start = State(*np.array([(c.start, c.rate) for c in made.coordinates]).T)
     line = rows_bodies.Line(made.scene, start, 0.1)

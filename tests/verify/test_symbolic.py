@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import sympy
-from cases import ALIKE, SCENES, case_system, cases, error_of, scene_system
+from cases import ALIKE, FEW_ALIKE, SCENES, case_system, cases, error_of, scene_system
+from conftest import tiers
 from sympy import cos, sin
 
 from eomc.base.errors import EomcError
@@ -64,7 +65,7 @@ def test_rk4_converges_with_order_4() -> None:
     assert math.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.1)
 
 
-@pytest.mark.parametrize(("name", "case"), ALIKE.items())
+@pytest.mark.parametrize(("name", "case"), tiers(ALIKE.items(), *FEW_ALIKE))
 def test_scene_has_the_physics_of_the_case(name: str, case: str) -> None:
     scene, trusted = scene_system(name), case_system(case)
     mine, theirs = derive(scene), derive(trusted)
@@ -83,7 +84,7 @@ def test_every_scene_is_compared_with_a_case_or_made_of_bodies() -> None:
         assert file.stem in ALIKE or "[[body]]" in file.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ALIKE)
+@pytest.mark.parametrize("name", tiers(ALIKE, *FEW_ALIKE))
 def test_what_must_be_true(name: str) -> None:
     """D = D^T > 0; bias = C qd + g; Ddot - 2C + dD/dt is skew; d jacobi/dt = power."""
     reference = derive(scene_system(name))

@@ -12,8 +12,8 @@ import mpmath
 import numpy as np
 import pytest
 import sympy
-from cases import ALIKE, scene_system
-from conftest import EVERYTHING
+from cases import ALIKE, FEW_ALIKE, scene_system
+from conftest import EVERYTHING, tiers
 from hypothesis import given as drawn
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -22,7 +22,7 @@ from sympy import atan2, cos, sin
 from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
 from eomc.model.system import Coordinate, Parameter, System, dot, symbol, t
-from eomc.scene import read as scene
+from eomc.scene.read import parse
 from eomc.verify import symbolic, taylor, taylor_rules
 from eomc.verify.symbolic import Reference, derive
 from eomc.verify.taylor import Jets
@@ -71,7 +71,7 @@ def assert_alike(system: System, tolerance: float = 1e-12, rows: int = 4) -> Non
 
 
 def everything() -> System:
-    return from_scene(scene.parse(EVERYTHING, "everything.toml"))
+    return from_scene(parse(EVERYTHING, "everything.toml"))
 
 
 def chain(links: int) -> System:
@@ -96,7 +96,7 @@ def chain(links: int) -> System:
 # --- against equations written out ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ALIKE)
+@pytest.mark.parametrize("name", tiers(ALIKE, *FEW_ALIKE))
 def test_every_value_of_every_scene(name: str) -> None:
     assert_alike(scene_system(name))
 
