@@ -43,12 +43,12 @@ def test_formulas_are_not_numbers_with_units(text: str) -> None:
     thetadot thetap theta_d theta_v theta_prime theta_velocity""".split(),
 )
 def test_velocities_of_others(name: str) -> None:
-    assert messages.velocity(name, ["x", "theta"]) == "theta_dot"
+    assert messages.velocity(name, {"x": "coordinates", "theta": "coordinates"}) == "theta_dot"
 
 
 @pytest.mark.parametrize("name", ["theta", "omega", "dot", "d", "theta_0", "phi_dot"])
 def test_other_names_are_no_velocities(name: str) -> None:
-    assert messages.velocity(name, ["x", "theta"]) == ""
+    assert messages.velocity(name, {"x": "coordinates", "theta": "coordinates"}) == ""
 
 
 def test_long_texts_cost_nothing() -> None:

@@ -171,10 +171,11 @@ _VELOCITY = (
 )  # fmt: skip
 
 
-def velocity(name: str, coordinates: Collection[str]) -> str:
+def velocity(name: str, tables: Mapping[str, str]) -> str:
     """The velocity that `dot_theta`, `dtheta`, `thetadot` may mean, or the empty string."""
     found = (re.fullmatch(pattern, name) for pattern in _VELOCITY)
-    return next((f"{match[1]}_dot" for match in found if match and match[1] in coordinates), "")
+    owners = (match[1] for match in found if match)
+    return next((f"{owner}_dot" for owner in owners if tables.get(owner) == "coordinates"), "")
 
 
 # --- files ----------------------------------------------------------------------------------------

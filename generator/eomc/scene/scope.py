@@ -169,8 +169,7 @@ class Checker:
                 return f"{start}: nobody knows the rate of an input; add it as a further input"
             case "parameters" | "constants" as table:
                 return f"{start}: '{owner}' stands in [{table}], so it doesn't move"
-        coordinates = [n for n, table in self.tables.items() if table == "coordinates"]
-        if meant := messages.velocity(name, coordinates):
+        if meant := messages.velocity(name, self.tables):
             return f"{start}; did you mean '{meant}'?"
         if name == "time":
             return f"{start}; did you mean 't'?"
