@@ -6,14 +6,21 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trees
 from instrument import in_a_fork
 from mutants import Bench, Mutant, variant
 
+from eomc.derive import lagrange
+from eomc.derive.ldl import Solution
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
+from eomc.program.interpret import evaluator, nearby
+from eomc.program.lower import lower
+from eomc.program.routes import ROUTES, Material
 from eomc.scene.read import parse
+from eomc.verify import symbolic
 
 # a pivot, and what it is compared with: nothing, or rounding of the diagonal entry that it was
 PIVOT = re.compile(r"((?:\w+->)?[dD]_\w+|-?w\d+) <= (0|[\d.]+e-\d+\*([\w>.-]*\w))(?=[;) ?|])")
@@ -71,3 +78,31 @@ def test_pivots_of_scenes(name: str, least: int, tmp_path: Path) -> None:
 )
 def test_pivots_of_trees(links: int, run: str, least: int, tmp_path: Path) -> None:
     assert unnoticed(chain(links, run), f"rods{links}", tmp_path, least) == []
+
+
+@pytest.mark.parametrize("name", ["cartpole", "heavy_top", "tumbling_box", "rods3"])
+def test_pivots_are_schur_complements_of_D(name: str) -> None:
+    """Beside the diagonal entries that they were; by the articulated route beside a trace."""
+    made = chain(3) if name == "rods3" else variant(name)
+    reference, material = symbolic.of(made), Material(lagrange.derive(made))
+    ways = {r.name: r.accelerations(material) for r in ROUTES.values()}
+    solved = {r: way for r, way in ways.items() if isinstance(way, Solution) and way.matrix == "D"}
+    assert solved
+    values = nearby(made, 3)
+    place = [[values[f"{c.name}{end}"] for c in made.coordinates] for end in ("", "_dot")]
+    given = {p.name: values[p.name] for p in made.parameters}
+    D = reference.evaluate("D", *place, 0.0, None, given)
+    for route, way in solved.items():
+        pairs = [x for pair in way.pivots for x in pair]
+        computed = evaluator(lower("pivots", way.tape, pairs, (), (), made.names))(values)[0]
+        assert len(way.order) == len(way.pivots) == len(D)
+        for n, (k, pivot, size) in enumerate(
+            zip(way.order, computed[::2], computed[1::2], strict=True)
+        ):
+            part = D[np.ix_(way.order[: n + 1], way.order[: n + 1])]
+            schur = 1 / np.linalg.inv(part)[-1, -1]
+            if route != "articulated":
+                assert pivot / size == pytest.approx(schur / D[k, k], rel=1e-9)
+                continue
+            assert pivot == pytest.approx(schur, rel=1e-9)
+            assert size == pivot or D[k, k] <= size <= 4 * D[k, k]
