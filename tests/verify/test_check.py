@@ -419,12 +419,16 @@ linearize = "parameters"
 """
 
 
-@pytest.mark.parametrize("wrong", ["", "A", "B", "sensitivity"])
+@pytest.mark.parametrize(
+    "real, wrong",
+    [*(("double", what) for what in ("", "A", "B", "sensitivity")), ("float", ""), ("float", "A")],
+)
 def test_derivatives_are_compared_with_differences(
-    modules: Modules, wrong: str, monkeypatch: pytest.MonkeyPatch
+    modules: Modules, monkeypatch: pytest.MonkeyPatch, real: str, wrong: str
 ) -> None:
     monkeypatch.setattr(Comparison, "convergence_rows", lambda _: None)
-    module = modules.of_text(SLOPES)
+    text = f'{SLOPES}real = "{real}"\n'
+    module = modules.of_text(text)
 
     class Bent:
         def __getattr__(self, name: str) -> Any:
@@ -437,7 +441,7 @@ def test_derivatives_are_compared_with_differences(
         def sensitivity(self, *place: Any, **how: Any) -> Any:
             return module.sensitivity(*place, **how) * (-1 if wrong == "sensitivity" else 1)
 
-    report = check(system_of(parse(SLOPES)), Bent(), states=4)
+    report = check(system_of(parse(text)), Bent(), states=4)
     row = "sensitivity" if wrong == "sensitivity" else "linearize"
     assert failed(report) == ({row} if wrong else set()), report.table()
     assert {"linearize", "sensitivity"} <= {row.name for row in report.rows}

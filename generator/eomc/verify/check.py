@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from eomc.model.system import System
-from eomc.verify import rows_newton, rows_plain
+from eomc.verify import rows_newton, rows_plain, rows_sines
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT, Report
 from eomc.verify.rows_batch import Batches
@@ -22,7 +22,7 @@ from eomc.verify.rows_refusals import Refusals
 from eomc.verify.rows_runs import Runs
 from eomc.verify.sampling import VALUES
 
-SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences
+SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference
 SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
 
 
@@ -75,11 +75,12 @@ def property_rows(made: Comparison) -> None:
     row("D > 0", 0, "least eigenvalue of D, scaled", made.definiteness, least=True)
     row("bias = C qd + g", LIMIT, rounding, made.bias)
     row("D qdd + bias = tau", LIMIT, rounding, made.motion)
-    if made.dtype == np.float64:  # single precision leaves differences too few digits
+    slope_limit = max(SLOPE_LIMIT, LIMIT * made.eps)
+    for name in ("linearize", "sensitivity"):
+        if made.has(name):
+            row(name, slope_limit, "of the largest derivative", partial(made.slopes, name))
+    if made.dtype == np.float64:  # single precision leaves its differences too few digits
         row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", made.skewness)
-        for name in ("linearize", "sensitivity"):
-            if made.has(name):
-                row(name, SLOPE_LIMIT, "of the largest derivative", partial(made.slopes, name))
         made.convergence_rows()
 
 
@@ -87,6 +88,7 @@ def compiled_rows(made: Comparison) -> None:
     """Add the rows about runs, refusals and, where the module has them, batches."""
     runs, refusals = Runs(made), Refusals(made)
     runs.report()
+    rows_sines.report(made)
     rows_newton.report(made)
     refusals.report()
     if hasattr(made.module, "simulate_batch"):

@@ -194,13 +194,13 @@ class Comparison:
         Shorter where the stages of an implicit one are else not found.
         """
         errors = (
-            self._step_by(method, e, h)
+            self.one_step_of(method, e, h)
             for e in self.few(self.effort.few)
             for h in (self.system.run.h, LONGER * self.system.run.h)
         )
         return largest(errors, "no step from any state is finite")
 
-    def _step_by(self, method: str, e: Expected, longest: float) -> float | None:
+    def one_step_of(self, method: str, e: Expected, longest: float) -> float | None:
         """None where there is no such step, in the reference or in the module."""
         s, gain = e.state, e.size["acceleration"]
         spread = np.array([self.sampler.spread, self.sampler.speed])

@@ -217,6 +217,9 @@ class Runs:
             if self.check.methods[0] == "rk4" and not wound:
                 gain = wide * e.size["acceleration"] + far.size["acceleration"]
                 errors.append(self.far_steps(at, gain))
+            for method in self.check.methods if not wound else ():
+                if method != "rk4":
+                    errors.append(self.check.one_step_of(method, far, self.h) or 0.0)
         return float(np.max(errors, initial=0))
 
     def far_steps(self, s: State, acceleration: Vector) -> float:

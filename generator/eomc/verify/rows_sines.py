@@ -1,0 +1,77 @@
+"""A row of `check` about sines and cosines where they all but vanish, up to where they are inlined.
+
+Beside a multiple of a quarter turn an error of the reduction by 1e-17 is lost in most sums, but not
+in an entry of D or g that is one sine times something else. The reference says which are: at
+neighbouring doubles they are in proportion to the sine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eomc.verify.convergence import Finding
+from eomc.verify.oracle import Vector
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+
+LIMIT = 100.0  # units; a constant of the reduction that is off makes 1e9
+QUARTERS = (1, 2, -3, 4, -7, 1024, -99_999, 667_542)  # the last ones near 2^20 rad
+NEIGHBOURS = range(-2, 3)  # doubles beside each
+ALIKE = 1e-6  # an entry over its sine, at neighbours
+CLEAR = 0.1  # of an error: what neighbours may differ by, where it is no rounding of a sum
+
+
+def report(check: Comparison) -> None:
+    """Add it, where there are angles; single precision takes its sines from double."""
+    if np.any(check.sampler.angles) and check.dtype == np.float64:
+        check.row("sines that vanish", LIMIT, "units of rounding", lambda: vanishing(check))
+
+
+def vanishing(check: Comparison) -> float | Finding:
+    """The largest error of an entry that is one sine times something, in roundings of itself."""
+    errors = [
+        error
+        for i in np.flatnonzero(check.sampler.angles)
+        for quarters in QUARTERS
+        for error in _beside(check, int(i), quarters)
+    ]
+    if not errors:
+        return Finding(math.inf, "no entry of D or g is one sine times something")
+    return max(errors)
+
+
+def _beside(check: Comparison, i: int, quarters: int) -> Iterator[float]:
+    """The errors with coordinate i at so many quarter turns."""
+    s = check.few(2)[-1].state
+    angle = quarters * (math.pi / 2)
+    angles = angle + np.array(NEIGHBOURS) * math.ulp(angle)
+    sines = np.array([math.cos(x) if quarters % 2 else math.sin(x) for x in angles.tolist()])
+    states = [replace(s, q=np.where(np.arange(len(s.q)) == i, x, s.q)) for x in angles]
+    for name in ("D", "g"):
+        with np.errstate(all="ignore"):
+            known = [check.reference.evaluate(name, x.q, x.qd, x.t, None, x.params) for x in states]
+            expected = np.reshape(known, (len(states), -1))
+            parts = expected / sines[:, None]
+            found = np.reshape([check.ask(name, x) for x in states], expected.shape)
+            for part, entry, value in zip(parts.T, expected.T, found.T, strict=True):
+                if np.all(part) and np.ptp(part) <= ALIKE * np.max(np.abs(part)):
+                    yield _error(value - entry, entry, check.eps)
+
+
+def _error(off: Vector, entry: Vector, eps: float) -> float:
+    """In units; 0 where it is neither the same at all neighbours nor in proportion to the entry.
+
+    That is a module's way to the same entry by a sum that cancels.
+    """
+    errors = [
+        float(np.max(np.abs(x))) if np.ptp(x) <= CLEAR * np.max(np.abs(x)) else 0.0
+        for x in (off / np.max(np.abs(entry)), off / entry)
+    ]
+    small = float(np.max(np.abs(off / entry)))
+    return small / eps if small <= LIMIT * eps else max(errors) / eps

@@ -1,0 +1,61 @@
+"""Sines and cosines where they all but vanish: a reduction that is off by 1e-17 shows there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from cases import scene_system
+from conftest import Modules
+
+from eomc.verify.comparison import Comparison
+from eomc.verify.convergence import Finding
+from eomc.verify.rows_sines import LIMIT, vanishing
+
+
+class Bent:
+    """A module whose D is another."""
+
+    def __init__(self, module: Any, bend: Callable[[np.ndarray, float], np.ndarray]) -> None:
+        self.module, self.bend = module, bend
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.module, name)
+
+    def D(self, q: Any, **how: Any) -> Any:
+        return self.bend(np.array(self.module.D(q, **how)), float(q[1]))
+
+
+def shifted(D: np.ndarray, _: float) -> np.ndarray:
+    return D + np.array([[0, 3e-17], [3e-17, 0]])
+
+
+def stretched(D: np.ndarray, _: float) -> np.ndarray:
+    return np.asarray(D * [[1, 1.0001], [1.0001, 1]])
+
+
+def noisy(D: np.ndarray, theta: float) -> np.ndarray:
+    by = 1e-16 * (math.frexp(theta)[0] * 2**53 % 3 - 1)
+    return D + np.array([[0, by], [by, 0]])
+
+
+@pytest.mark.parametrize(
+    "bend, wrong", [(lambda D, _: D, False), (shifted, True), (stretched, True), (noisy, False)]
+)
+def test_an_entry_that_is_one_cosine_is_judged_by_itself(
+    modules: Modules, bend: Callable[[np.ndarray, float], np.ndarray], wrong: bool
+) -> None:
+    """Noise of a sum that cancels is none of the sine's."""
+    module = Bent(modules("cartpole"), bend)
+    found = vanishing(Comparison(scene_system("cartpole"), module, np.random.default_rng(0), 4))
+    assert isinstance(found, float)
+    assert found > 1e6 * LIMIT if wrong and bend is shifted else (found > LIMIT) == wrong
+
+
+def test_where_no_entry_is_a_sine_alone_nothing_is_judged(modules: Modules) -> None:
+    made = Comparison(scene_system("chain"), modules("chain"), np.random.default_rng(0), 4)
+    found = vanishing(made)
+    assert isinstance(found, Finding) and found.why
