@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,23 +13,42 @@ from mutants import variant
 from eomc.verify.comparison import Comparison
 from eomc.verify.rows_runs import Runs
 
+MADE = variant("pendulum_gauss16")
 STAGE = "at.theta1 = q->theta1 + (c_[i]*h*qd->theta1"
 
 
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
+    """The C of the double pendulum with rk4 and gauss16."""
+    return Shipped(MADE, tmp_path_factory.mktemp("runs"))
+
+
+def found(shipped: Shipped, source: str, row: Callable[[Comparison], object]) -> float:
+    """The number of a row of a changed source."""
+
+    def measure() -> float:
+        value = row(Comparison(MADE, shipped.load(), np.random.default_rng(0), 4))
+        assert isinstance(value, float)
+        return value if math.isfinite(value) else 1e300
+
+    assert shipped.compile(("-O0", "-march=native"), source) is None
+    kind, value = in_a_fork(measure, 60)
+    assert kind == "done" and isinstance(value, float), value
+    return value
+
+
 @pytest.mark.slow
-def test_steps_of_every_method_are_compared_at_angles_far_out(tmp_path: Path) -> None:
+def test_steps_of_every_method_are_compared_at_angles_far_out(shipped: Shipped) -> None:
     """There stages of gauss16 are computed one by one, which stands last in its sweep."""
-    made = variant("pendulum_gauss16")
-    shipped = Shipped(made, tmp_path)
     start, end = shipped.source.rsplit(STAGE, 1)
+    wrong = start + STAGE.replace("+", "-") + end
+    assert found(shipped, shipped.source, lambda check: Runs(check).far()) < 10
+    assert found(shipped, wrong, lambda check: Runs(check).far()) > Runs.limit
 
-    def far() -> float:
-        found = Comparison(made, shipped.load(), np.random.default_rng(0), 4)
-        error = Runs(found).far()
-        return error if math.isfinite(error) else 1e300
 
-    for source, right in ((shipped.source, True), (start + STAGE.replace("+", "-") + end, False)):
-        assert shipped.compile(("-O0", "-march=native"), source) is None
-        kind, value = in_a_fork(far, 60)
-        assert kind == "done" and isinstance(value, float), value
-        assert (value < 10) if right else (value > Runs.limit)
+def test_a_stepper_that_refuses_what_it_could_do_fails(shipped: Shipped) -> None:
+    right, wrong = "double most = 0, change = 0, size;", "double most = 0, change = 1, size;"
+    assert shipped.source.count(right) == 1
+    assert found(shipped, shipped.source, lambda check: check.step_by("gauss16")) < 10
+    refusing = shipped.source.replace(right, wrong)
+    assert found(shipped, refusing, lambda check: check.step_by("gauss16")) == 1e300

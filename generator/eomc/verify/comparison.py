@@ -201,10 +201,14 @@ class Comparison:
         return largest(errors, "no step from any state is finite")
 
     def one_step_of(self, method: str, e: Expected, longest: float) -> float | None:
-        """None where there is no such step, in the reference or in the module."""
-        s, gain = e.state, e.size["acceleration"]
+        """None where the reference has no such step; inf where the module refuses what it has.
+
+        That is, its shortest; or two in a row whose stages the module does not find.
+        """
+        s, gain, lost, refused = e.state, e.size["acceleration"], 0, False
         spread = np.array([self.sampler.spread, self.sampler.speed])
         for h in (part * longest for part in SHORTER):
+            refused = False
 
             def reference(q: Vector, qd: Vector, t: Vector, h: float = h, **given: Any) -> Vector:
                 def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
@@ -221,10 +225,15 @@ class Comparison:
             if h > self.system.run.h and not np.all(np.abs(expected - [s.q, s.qd]) < spread):
                 continue
             run = self.simulate(s, method=method, h=h, steps=1, t0=s.t)
-            if np.all(np.isfinite(expected)) and run.status == "ok":
+            if not np.all(np.isfinite(expected)):
+                continue
+            if run.status == "ok":
                 size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain])
                 return self.units([run.q[-1], run.qd[-1]], expected, size)
-        return None
+            refused, lost = True, lost + (run.status == "no convergence")
+            if lost == 2:
+                break
+        return math.inf if lost == 2 or refused else None
 
     def runs(self) -> float | Finding:
         """A short run from the start, and one from a random state with random parameters."""
