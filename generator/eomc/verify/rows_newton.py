@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 LENGTHS = (1.5, 6.0, 15.0)  # steps, in times the fastest mode's own
 STEPS = 3
 NEAR = 1e-6  # of how far things go: the start beside the equilibrium, linear for two plain sweeps
-LINEAR = 0.1  # the same: as far as a run may go from there
+LINEAR = 0.01  # the same: as far as a run may go from there
 SEARCH = 40  # for an equilibrium
 MOST = 12  # sweeps of a step by the reference: more say that the motion is not linear
 EXTRA = 8.0  # sweeps a step: what the module may need more, to see that plain ones do not contract

@@ -74,7 +74,7 @@ def drive(
 ) -> Driven:  # fmt: skip
     """A run of the C function from s, in calls that end at `cuts`; s.u (nu,) or (steps, nu).
 
-    moved: what is added to the state's first number at every cut, as if it came from elsewhere.
+    moved: the part by which a state's first number is changed at a cut, as if from elsewhere.
     anew: every call has a memory of its own.
     """
     _, run, _, _, work_type, _ = model._loops[method]
@@ -86,7 +86,8 @@ def drive(
     done, status, p = 0, 0, parameters(model, s)
     for end in (*(c for c in cuts if c < steps), steps):
         if moved and done:
-            rows[0, -(-done // every), 0] += moved
+            row = rows[0, -(-done // every)]
+            row[0] += moved * (1 + abs(row[0]))  # also where it has been thrown far out
         if anew and done:
             work = model._ffi.new(work_type)
             work.done = done
