@@ -246,7 +246,10 @@ class Comparison:
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
         key = id(s), h, steps  # the states of `expected` live as long
         if key not in self.motions:
-            self.motions[key] = self._motion(s, h, steps)
+            try:
+                self.motions[key] = self._motion(s, h, steps)
+            except np.linalg.LinAlgError:  # of the reference: it comes to where D is singular
+                return None
         t, x, growth = self.motions[key]
         if len(t) < 2:
             return None
