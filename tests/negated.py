@@ -135,17 +135,16 @@ def _as(wrong: Method) -> Iterator[None]:
         METHODS[wrong.name] = right  # type: ignore[index]
 
 
-_SIGN = re.compile(r"(?<=[\w)]) ([+-]) (?=[\w(])")
+_SIGN = re.compile(r"(?<=[\w)\]]) ([+-])(?==? [\w(])")
 
 
 def _text(made: Sources, choice: random.Random) -> tuple[Sources, str]:
     """One `+` or `-` in the lines of rk4's step that add up states and accelerations."""
     name = f"fast/{made.name}.c"
     text = made.files[name]
-    begin = re.search(rf"^[^\n;]*{made.name}_rk4\([^;]*?\)\n\{{", text, re.M)
-    assert begin is not None
-    end = text.index("\n}\n", begin.end())
-    signs = [s for s in _SIGN.finditer(text, begin.end(), end) if _adds(text, s)]
+    parts = rf"^[^\n;]*{made.name}_rk4_(?:position|stage|end)\(.*?\n}}\n"
+    spans = [part.span() for part in re.finditer(parts, text, re.M | re.S)]
+    signs = [s for span in spans for s in _SIGN.finditer(text, *span) if _adds(text, s)]
     sign = choice.choice(signs)
     other = "-" if sign[1] == "+" else "+"
     wrong = text[: sign.start(1)] + other + text[sign.end(1) :]

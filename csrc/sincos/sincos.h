@@ -38,10 +38,12 @@
 
 /* Inlined for certain: gcc would stop at some ten of them in one loop, and the loop would no longer
  * be put into vector registers. */
+#ifndef EOMC_INLINE
 #ifdef __GNUC__
 #define EOMC_INLINE static inline __attribute__((always_inline))
 #else
 #define EOMC_INLINE static inline
+#endif
 #endif
 
 /* a b + c: one rounding where the hardware has it, two elsewhere.  It is written out

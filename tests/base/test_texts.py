@@ -44,7 +44,7 @@ from eomc.base.errors import EomcError, SceneError
 from eomc.emit import package, render, selftest
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
-from eomc.emit.fast import context
+from eomc.emit.fast import files
 from eomc.emit.plain import steppers
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
@@ -197,7 +197,7 @@ def test_templates_are_given_free_text_only_as_free_text() -> None:
     whole = derived()
     marked = replace(whole, system=with_texts(whole.system, "MARKED"))
     target = Target(marked, DOUBLE)
-    given = [context.values(target), package.main(target), package.face(target, "_x")]
+    given: list[Any] = [package.main(target), package.face(target, "_x")]
     given += [package.binding(target), selftest.view(target)]
 
     def show(view: Any) -> str:
@@ -205,7 +205,8 @@ def test_templates_are_given_free_text_only_as_free_text() -> None:
         return ""
 
     steppers.files(marked, show)
-    assert len(given) > 7
+    files.files(target, show)
+    assert len(given) > 12
     for view in given:
         assert not [s for s in strings(view) if "MARKED" in s], type(view)
 

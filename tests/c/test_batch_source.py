@@ -6,11 +6,12 @@ import platform
 import re
 import shutil
 import subprocess
+from collections import Counter
 from pathlib import Path
 
 import pytest
 from cases import SCENES, fast_kit
-from conftest import needs, tiers
+from conftest import tiers
 
 import eomc
 
@@ -43,50 +44,28 @@ def test_only_scenes_that_ask_have_it() -> None:
     shutil.which("gcc") is None or platform.system() != "Linux" or platform.machine() != "x86_64",
     reason="asks gcc about AVX2",
 )
-def test_single_precision_is_taken_at_full_width(tmp_path: Path) -> None:
-    """Nothing is wider than a float and nothing is called from a tile's loop."""
+@pytest.mark.parametrize(("real", "scalar"), [("float", "ss"), ("double", "sd")])
+def test_a_step_of_a_tile_is_vectors_alone(real: str, scalar: str, tmp_path: Path) -> None:
+    """Nothing is wider than asked for, nothing is called, and sums are of whole registers."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     file = tmp_path / "cartpole.toml"
-    file.write_text(text.replace("[run]\n", '[run]\nreal = "float"\nbatch = true\n'))
+    file.write_text(text.replace("[run]\n", f'[run]\nreal = "{real}"\nbatch = true\n'))
     for name, content in fast_kit(eomc.sources(eomc.read(file))).items():
         (tmp_path / name).write_text(content, encoding="utf-8")
-    said = subprocess.run(
-        ["gcc", "-std=c99", "-O3", "-mavx2", "-mfma", "-fno-math-errno", "-fno-trapping-math",
-         "-fno-tree-slp-vectorize", "-fopt-info-vec-optimized", "-Wdouble-promotion",
-         "-Wconversion", "-Werror", "-c", "cartpole.c"],
-        cwd=tmp_path, check=True, capture_output=True, text=True,
-    ).stderr  # fmt: skip
-    lines = (tmp_path / "cartpole.c").read_text(encoding="utf-8").splitlines()
-    at = next(k for k, line in enumerate(lines) if "_rk4_stages(" in line)
-    end = lines.index("}", at)
-    loops = [k for k, line in enumerate(lines[:end], 1) if k > at and "for (int i" in line]
-    assert len(loops) == 10  # four of angles, four stages, the end, and who was no good
-    for k in loops:
-        assert re.search(rf"cartpole\.c:{k}:\d+: optimized: loop vectorized using 32 byte", said)
-
-
-@pytest.mark.slow
-def test_no_loop_over_a_tile_has_a_rest(tmp_path: Path) -> None:
-    """gcc sees that they end at a multiple of a block; where it can't it writes one."""
-    scene = tmp_path / "cartpole.toml"
-    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
-    scene.write_text(text.replace("[run]\n", "[run]\nbatch = true\n"), encoding="utf-8")
-    sources = eomc.sources(eomc.read(scene))
-    for file, content in fast_kit(sources).items():
-        (tmp_path / file).write_text(content, encoding="utf-8")
-    text = fast_kit(sources)[f"{sources.name}.c"]
-    rounded = "used = (int)(m + CARTPOLE_BLOCK - 1) & -CARTPOLE_BLOCK"
-    assert rounded in text
-    (tmp_path / "blind.c").write_text(text.replace(rounded, "used = (int)m"), encoding="utf-8")
-    sizes = []
-    for file in (f"{sources.name}.c", "blind.c"):
-        subprocess.run(
-            [needs("gcc"), "-std=gnu99", "-O3", "-mavx2", "-mfma", "-fno-math-errno",
-             "-fno-trapping-math", "-fno-tree-slp-vectorize", "-c", file, "-o", "made.o"],
-            cwd=tmp_path, check=True,
-        )  # fmt: skip
-        sizes.append((tmp_path / "made.o").stat().st_size)
-    assert sizes[0] < 0.9 * sizes[1]
+    subprocess.run(
+        ["gcc", "-std=gnu99", "-O3", "-mavx2", "-mfma", "-fno-math-errno", "-fno-trapping-math",
+         "-fno-tree-slp-vectorize", "-S", "cartpole.c"],
+        cwd=tmp_path, check=True,
+    )  # fmt: skip
+    lines = (tmp_path / "cartpole.s").read_text(encoding="utf-8").splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("cartpole_rk4_tile"))
+    step = lines[at : next(k for k in range(at, len(lines)) if ".cfi_endproc" in lines[k])]
+    found = Counter(line.split()[0] for line in step if line.startswith("\t"))
+    assert not [name for name in found if name.startswith(("call", "vcvt"))]
+    packed = {name: n for name, n in found.items() if name.endswith("p" + scalar[1])}
+    sums = rf"v(f?n?madd|f?n?msub|add|mul).*{scalar}$"
+    alone = [n for name, n in found.items() if re.match(sums, name)]
+    assert sum(packed.values()) > 100 and sum(alone) < 20  # h/6, and what it lacks
 
 
 @pytest.mark.parametrize("name", tiers(("cartpole", "kepler_orbit", "furuta_pendulum"), "cartpole"))

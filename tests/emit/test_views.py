@@ -1,9 +1,11 @@
-"""The views of the templates beside both forms of C, and the calls in them."""
+"""The views of the templates, and the calls in them; no C in the Python that makes them."""
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import re
+from pathlib import Path
 from typing import Any
 
 import jinja2.meta
@@ -16,25 +18,67 @@ from eomc.derive import lagrange
 from eomc.emit import render, views
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
+from eomc.emit.fast import views as fast_views
+from eomc.emit.plain import views as plain_views
 from eomc.emit.public import Public
 from eomc.program import program
 
-VIEWS = [v for v in vars(views).values() if dataclasses.is_dataclass(v) and hasattr(v, "TEMPLATE")]
+MODULES = (views, plain_views, fast_views)
+FOUND = {v for m in MODULES for v in vars(m).values() if dataclasses.is_dataclass(v)}
+VIEWS = sorted((v for v in FOUND if hasattr(v, "TEMPLATE")), key=lambda v: str(v.TEMPLATE))
+INCLUDED = "c/evaluations.c"  # by the sources of both forms
+# modules that hold C
+MAY = ("c_function.py", "c_expression.py")
 
 
-@pytest.mark.parametrize("view", VIEWS)
+def asked(template: str) -> set[str]:
+    """The variables that a template and what it includes ask for."""
+    source = resources.text("templates", f"{template}.jinja")
+    tree = render.environment().parse(source)
+    found = jinja2.meta.find_undeclared_variables(tree)
+    for name in jinja2.meta.find_referenced_templates(tree):
+        assert name is not None
+        found |= asked(name.removesuffix(".jinja"))
+    return found
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=lambda v: str(v.TEMPLATE))
 def test_a_view_has_what_its_template_asks_for(view: Any) -> None:
-    source = resources.text("templates", f"{view.TEMPLATE}.jinja")
-    asked = jinja2.meta.find_undeclared_variables(render.environment().parse(source))
-    assert asked == {field.name for field in dataclasses.fields(view)}
+    assert asked(view.TEMPLATE) == {field.name for field in dataclasses.fields(view)}
     assert view.__dataclass_params__.frozen
 
 
-def test_every_template_beside_the_forms_has_a_view() -> None:
+def test_every_template_of_c_and_python_has_a_view() -> None:
     root = resources.folder("templates")
-    there = [*(root / "python").iterdir(), *(root / "c").glob("*.jinja")]
+    there = [p for part in ("c", "python") for p in (root / part).rglob("*.jinja")]
     names = {p.relative_to(root).as_posix().removesuffix(".jinja") for p in there}
-    assert names == {view.TEMPLATE for view in VIEWS}
+    shown = {view.TEMPLATE for view in VIEWS if not view.TEMPLATE.startswith("report/")}
+    assert names == shown | {INCLUDED}
+
+
+EMIT = Path(render.__file__).parent
+
+
+@pytest.mark.parametrize(
+    "module", sorted(p.relative_to(EMIT).as_posix() for p in EMIT.rglob("*.py"))
+)
+def test_no_c_syntax_in_python(module: str) -> None:
+    """Semicolons, arrows, braces and const: in two files alone."""
+    if module in MAY:
+        return
+    tree = ast.parse((EMIT / module).read_text(encoding="utf-8"))
+    prose = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))
+        and isinstance(node.body[0], ast.Expr)
+    }
+    texts = [
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose
+    ]
+    assert not [t for t in texts if re.search(r"->|\bconst\b|;$|\{$", t)]
 
 
 @pytest.mark.parametrize("name", ["cartpole", "cartpole_driven", "chain", "suspension"])

@@ -56,7 +56,7 @@ def counted(path: Path, method: str, h: float, steps: int) -> tuple[int, list[fl
     name, n = system.name, len(system.coordinates)
     files = fast_kit(eomc.sources(system))
     source = re.sub(
-        rf"((?:static|[A-Z_]+_INLINE) (?:inline )?int {name}_solve(?:_at)?\([^)]*\)\n{{)",
+        rf"([A-Z_]+INLINE int {name}_accelerations\([^)]*\)\n{{)",
         r"long evaluations;\n\1\n    evaluations++;", files[f"{name}.c"], count=1,
     )  # fmt: skip
     assert "evaluations++" in source

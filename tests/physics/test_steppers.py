@@ -14,8 +14,8 @@ from cases import cases, scene_text
 from conftest import tiers
 
 import eomc
+from eomc.emit import coefficients
 from eomc.emit.c_expression import DOUBLE, FLOAT, Real
-from eomc.emit.fast import integrators
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import DP8, METHODS, Method
 from eomc.verify.check import check
@@ -54,7 +54,7 @@ def test_order_conditions(method: Method) -> None:
 @pytest.mark.parametrize("method", METHODS.values(), ids=lambda m: m.name)
 def test_weights_as_they_are_in_c_add_up_to_one(method: Method, real: Real) -> None:
     """Each a number of C's type, off by no more than all of them are if rounded one by one."""
-    found = integrators.rounded(method.b, real)
+    found = coefficients.rounded(method.b, real)
     kind = np.dtype(real.dtype).type
     assert [Fraction(float(kind(float(x)))) for x in found] == list(found)
     assert sum(found) == 1

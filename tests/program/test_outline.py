@@ -74,7 +74,6 @@ def in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nearly every function is long."""
     monkeypatch.setattr(outline, "LARGE", 20)
     monkeypatch.setattr(outline, "PIECE", 25)
-    monkeypatch.setattr(outline, "LANE_PIECE", 25)
 
 
 # --- where functions are cut ---------------------------------------------------------------------
@@ -189,9 +188,9 @@ def test_pieces_are_clean_for_strict_compilers(
     made = render(derived(everything(run)), "_everything")
     source = written(made, tmp_path)
     paired = "float" not in run and run != 'method = "dp8"'
-    parts = ("_configuration_2(", "_velocity_2(") if paired else ("_solve_4(",)
+    parts = ("_configurations_2_two(", "_velocities_2(") if paired else ("_rates_4(",)
     assert all(part in fast_kit(made)[source] for part in (*parts, "_C_4("))
-    assert ("_solve_tile_4(" in fast_kit(made)[source]) == ("batch" in run)
+    assert ("_rates_4_wide(" in fast_kit(made)[source]) == ("batch" in run)
     for command in ("gcc", "clang"):
         compiled(
             needs(command),
@@ -222,7 +221,6 @@ from eomc.derive import lagrange
 from eomc.program import outline
 from eomc.program import program
 from eomc.emit.render import render
-outline.LARGE, outline.PIECE, outline.LANE_PIECE = 20, 25, 25
 for name in sys.argv[1:]:
     print(render(program.build(lagrange.derive(read(name))), "_x").files)
 """
@@ -277,7 +275,6 @@ def test_a_system_in_pieces_moves_as_it_does_whole(
     whole = module(plain, tmp_path / "whole")
     monkeypatch.setattr(outline, "LARGE", 20)
     monkeypatch.setattr(outline, "PIECE", 25)
-    monkeypatch.setattr(outline, "LANE_PIECE", 25)
     cut = module(plain, tmp_path / "cut")
     random_state = np.random.default_rng(3)
     q0, qd0 = (x + 0.1 * random_state.standard_normal((75, 3)) for x in whole.start)
@@ -317,12 +314,14 @@ def test_a_bad_instance_leaves_the_others_alone_in_pieces_too(
 
 
 def test_signals_and_held_inputs_reach_a_batch_in_pieces(
-    in_small_pieces: None, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    monkeypatch.setattr(outline, "LARGE", 8)
+    monkeypatch.setattr(outline, "PIECE", 8)
     made = scene_system("cartpole_driven")
     m = module(derived(replace(made, run=replace(made.run, batch=True))), tmp_path)
     source = tmp_path / made.name / "fast" / f"{made.name}.c"
-    assert "_solve_tile_2(" in source.read_text(encoding="utf-8")
+    assert "_rates_2_wide(" in source.read_text(encoding="utf-8")
     q0, qd0 = (np.tile(x, (9, 1)) for x in m.start)
     q0[:, 1] += np.linspace(-1, 1, 9)
     for u in (None, [0.5]):
@@ -370,7 +369,6 @@ def test_matrices_by_columns_are_the_matrices(
     if small:
         monkeypatch.setattr(outline, "LARGE", 5)
         monkeypatch.setattr(outline, "PIECE", 8)
-        monkeypatch.setattr(outline, "LANE_PIECE", 8)
     made = render(by_columns(plain), "_x")
     source = written(made, tmp_path)
     assert f"By {len(plain.system.q)} columns, each: " in made.files[f"{name}.h"]

@@ -21,8 +21,6 @@ from conftest import needs, tiers
 import eomc
 from eomc.base import resources
 from eomc.emit import render
-from eomc.model.from_scene import from_scene
-from eomc.scene.read import parse
 from eomc.toolchain import cache, compiler
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -90,6 +88,7 @@ def test_templates_are_compiled_once_and_kept_with_pythons_bytecode(
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     system, made = eomc.read(scene), []
     for k in range(3):
+        render.environment.cache_clear()
         made.append(eomc.sources(system).files)
         files = list(bytecode.rglob("eomc-template-*.cache"))
         assert len(files) > 5
@@ -101,6 +100,7 @@ def test_templates_are_compiled_once_and_kept_with_pythons_bytecode(
 def test_no_bytecode_is_written_where_python_may_write_none(
     scene: Path, bytecode: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    render.environment.cache_clear()
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     eomc.sources(eomc.read(scene))
     assert not [path for path in bytecode.rglob("*") if path.is_file()]
@@ -380,19 +380,15 @@ def test_a_faulty_scene_is_not_built(scene: Path, root: Path, found: None) -> No
     assert marks(root / "simple_pendulum") == before
 
 
-@pytest.mark.parametrize(
-    ("run", "width"), [("", 256), ("batch = true", 512), ('method = ["rk4", "gauss16"]', 512)]
-)
-def test_registers_are_as_wide_as_loops_have_use_for(
-    run: str, width: int, monkeypatch: pytest.MonkeyPatch
+def test_what_compilers_vectorise_goes_into_half_of_the_widest_registers(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """512 bits for loops over instances or stages; straight-line code is faster in 256."""
+    """Straight-line code is faster so; lanes are as wide as they are asked to be."""
     monkeypatch.delenv("EOMC_CFLAGS", raising=False)
-    made = eomc.sources(from_scene(parse(TEXT + f"{run}\n")))
     monkeypatch.setattr(compiler, "processor", lambda: "flags : fma avx2 avx512f")
-    assert compiler.flags(wide=made.wide)[-1] == f"-mprefer-vector-width={width}"
+    assert compiler.flags()[-1] == "-mprefer-vector-width=256"
     monkeypatch.setattr(compiler, "processor", lambda: "flags : fma avx2")
-    assert compiler.flags(wide=made.wide) == compiler.FLAGS
+    assert compiler.flags() == compiler.FLAGS
 
 
 def test_a_relative_root_survives_another_current_folder(

@@ -20,7 +20,7 @@ import eomc
 from eomc.base import resources
 from eomc.derive import lagrange
 from eomc.derive.equations import Equations
-from eomc.emit import c_expression
+from eomc.emit import c_expression, render
 from eomc.model.system import System
 from eomc.program import admissible, program
 from eomc.program.ir import Sum
@@ -82,6 +82,7 @@ def text(right: str, wrong: str) -> Breakage:
         places = [part for part in TEMPLATES if right in part.read_text(encoding="utf-8")]
         assert places, f"{right!r} stands in no template any more"
         patch.setattr(resources, "text", lambda *where: read(*where).replace(right, wrong))
+        patch.setattr(render, "environment", render.environment.__wrapped__)  # read anew
 
     return breakage
 
@@ -150,11 +151,11 @@ BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
         {"one step", "run", "order of rk4"},
     ),
     "a sign in the stepper": (
-        text("h_2*a1.$;", "-h_2*a1.$;"),
+        text("moving[i] += node*w->a", "moving[i] -= node*w->a"),
         {"one step", "run", "order of rk4"},
     ),
     "the time in a stage": (
-        text('"t + h_2")', '"t - h_2")'),
+        text("k == 3 ? h : h/2;", "k == 3 ? h : -h/2;"),
         {"one step", "run"},
     ),
     "the time of a step in a run": (

@@ -18,7 +18,8 @@ from eomc.program.trig import pair_of
 
 MOST_INLINE = 5  # operations; longer expressions get a name of their own
 
-_FUNCTIONS = {
+# what C calls the functions of a program
+C_NAMES = {
     "abs": "fabs",
     **{n: n for n in ("tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")},
     **{n: n for n in ("exp", "log", "sqrt", "pow", "sin", "cos")},
@@ -38,6 +39,7 @@ class Real:
     """A floating-point type: its name in C and Python, the suffix of its literals and functions.
 
     reach: the largest angle that the sincos of csrc/ takes; 0 where there is none for the type.
+    lane: where it is a vector of numbers, what its functions' names end in.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Real:
     dtype: str
     epsilon: float
     reach: float
+    lane: str = ""
 
 
 DOUBLE = Real("double", "", "", "float64", 2.0**-52, 2.0**20)
@@ -174,18 +177,17 @@ class Printer:
         return sign + "*".join(factors), 2
 
     def _call(self, value: Call) -> tuple[str, int]:
-        args = [self.operand(a) for a in value.args]
         one = "1.0" + self.real.suffix
         if value.function == "reciprocal":
             return f"{one}/{self.operand(value.args[0], 4)}", 2
-        if value.function == "sign":
-            x = self.operand(value.args[0], 4)
-            return f"{self._real()}(({x} > 0) - ({x} < 0))", 4
-        if value.function == "heaviside":
-            x = self.operand(value.args[0], 4)
+        if value.function in ("sign", "heaviside"):
+            sign = self._sign(value.args[0])
             half = "0.5" + self.real.suffix
-            return f"{half} + {half}*{self._real()}(({x} > 0) - ({x} < 0))", 1
-        c_name = _FUNCTIONS[value.function] + self.real.function_suffix
+            return (sign, 4) if value.function == "sign" else (f"{half} + {half}*{sign}", 1)
+        c_name = C_NAMES[value.function] + self.real.function_suffix
+        if self.real.lane:
+            c_name = f"{self.prefix}_{c_name}_{self.real.lane}"
+        args = [self.in_lane(a) for a in value.args]
         text = f"{c_name}({args[0]})" if len(args) == 1 else ""
         if not text:  # min and max of several: pair by pair
             text = args[0]
@@ -193,8 +195,18 @@ class Printer:
                 text = f"{c_name}({text}, {arg})"
         return text, 4
 
-    def _real(self) -> str:
-        return f"({self.real.name})"
+    def _sign(self, argument: Operand) -> str:
+        if self.real.lane:
+            return f"{self.prefix}_sign_{self.real.lane}({self.in_lane(argument)})"
+        x = self.operand(argument, 4)
+        return f"({self.real.name})(({x} > 0) - ({x} < 0))"
+
+    def in_lane(self, o: Operand, binding: int = 1) -> str:
+        """An operand; a number alone in every lane."""
+        text = self.operand(o, binding)
+        if self.real.lane and not o.name:
+            return f"{self.prefix}_same_{self.real.lane}({text})"
+        return text
 
 
 @dataclass(frozen=True)
@@ -222,7 +234,6 @@ def body(
     real: Real = DOUBLE,
     keep: Callable[[str], str] | None = None,
     parameters: Sequence[str] = (),
-    branchless: bool = False,
     stored: Mapping[str, str] | None = None,
     pivots: int = 0,
     in_order: bool = False,
@@ -232,7 +243,7 @@ def body(
 
     where: how each name from outside is written (`m_c` -> `p->m_c`).
     keep: how the rest reads what parameters decide, where that lives in a struct; `parameters`
-    are kept there too where the rest reads them. branchless: for a loop over many.
+    are kept there too where the rest reads them.
     stored: where values go that are no locals. pivots: how many the whole has, if this is a part.
     in_order: terms of sums stay in their order. reserved: names that no value gets.
     """
@@ -278,7 +289,7 @@ def body(
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             if names := angles.pop(a.value.args, None):
-                lines[a.stage] += _sincos(printer, a.value.args[0], names, branchless, stored)
+                lines[a.stage] += _sincos(printer, a.value.args[0], names, stored)
             continue
         text, strength = printer.value(a.value)
         if a.name in inline:
@@ -288,7 +299,7 @@ def body(
     return Body(
         early=(Block("parameters alone", tuple(early_lines)),) if early_lines else (),
         blocks=tuple(Block(_STAGE_COMMENTS[s], tuple(text)) for s, text in lines.items() if text),
-        results=tuple(printer.operand(o) for o in function.outputs),
+        results=tuple(printer.in_lane(o) for o in function.outputs),
         early_failures=early_failures,
         failures=_failures(printer, [pair for e, pair in checks if not e], tolerance),
         kept=tuple(kept),
@@ -310,10 +321,13 @@ def _fails(printer: Printer, pair: tuple[Operand, Operand], tolerance: float) ->
     Not a number passes: the state behind it is reported as not finite.
     """
     pivot, diagonal = pair
+    limit = _decimal(float(f"{tolerance:.1e}")) + printer.real.suffix
     text = printer.operand(pivot, 2)
+    if lane := printer.real.lane:
+        less = "" if pivot == diagonal else f" - {limit}*{printer.operand(diagonal, 4)}"
+        return f"{printer.prefix}_not_positive_{lane}({text}{less})"
     if pivot == diagonal:
         return f"{text} <= 0"
-    limit = _decimal(float(f"{tolerance:.1e}")) + printer.real.suffix
     return f"{text} <= {limit}*{printer.operand(diagonal, 4)}"
 
 
@@ -321,7 +335,6 @@ def _sincos(
     printer: Printer,
     angle: Operand,
     names: Mapping[str, str],
-    branchless: bool,
     stored: Mapping[str, str],
 ) -> list[str]:
     real = printer.real
@@ -335,8 +348,8 @@ def _sincos(
     both = ", ".join(f"&{stored.get(n, n)}" for n in (one, other))
     return [
         *([f"{real.name} {', '.join(local)};"] if local else []),
-        f"{printer.prefix}_sincos{suffix}_branchless({argument}, {both}, failed);"
-        if branchless
+        f"{printer.prefix}_sincos_{real.lane}({argument}, {both}, &failed);"
+        if real.lane
         else f"{printer.prefix}_sincos{suffix}({argument}, {both});",
     ]
 

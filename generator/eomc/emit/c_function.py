@@ -127,6 +127,11 @@ def result(value: str) -> str:
     return f"return {value};"
 
 
+def note(conditions: Iterable[str]) -> tuple[str, ...]:
+    """Conditions into a mask."""
+    return tuple(f"failed |= {text};" for text in conditions)
+
+
 def unless(conditions: Iterable[str], value: str) -> tuple[str, ...]:
     """Return `value` where one of the conditions holds; nothing where there are none."""
     text = " || ".join(conditions)
@@ -148,9 +153,19 @@ def member(of: str, name: str) -> str:
     return f"{of}->{name}"
 
 
+def cast(type: str, name: str) -> str:
+    """A pointer as one to another type, to be read."""
+    return f"(const {type} *){name}"
+
+
 def struct(type: str, real: str, members: Sequence[str]) -> str:
     """A struct of numbers."""
     return f"typedef struct {{\n    {real} {', '.join(members)};\n}} {type};"
+
+
+def copied(to: str, array: str, first: int, count: str) -> tuple[str, ...]:
+    """Numbers of an array from `first` on into another, in a loop."""
+    return (f"for (int k = 0; k < {count}; k++)", f"    {to}[k] = {array}[{first} + k];")
 
 
 def in_braces(rows: Iterable[Sequence[str]]) -> tuple[str, ...]:

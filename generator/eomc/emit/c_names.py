@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from eomc.emit import c_expression
+from eomc.emit import c_expression, c_function
 from eomc.emit.c_expression import Body, Real
 from eomc.emit.c_safe_names import may_be_enumerator_of_others
 from eomc.model.symbols import ALONG
 from eomc.model.system import System
-from eomc.program import outline
 from eomc.program.ir import Call, Function, rename
 from eomc.program.program import TIME, Program
 
@@ -27,23 +25,11 @@ _OURS = frozenset(
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
 # that is called so has another name in C
 OWN = frozenset(
-    "ALIGNED ALONE BLOCK FAST_FMA FAST_FMAF FORCE_INLINE H INLINE NOINLINE NOT_FINITE "
-    "NO_CONVERGENCE NQ NU OK ROLLED SINGULAR STAMP TILE".split()
+    "AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE NOINLINE NOT_FINITE NO_CONVERGENCE NQ NU "
+    "OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
 )
 
-FAILED = "*failed"  # where an instance notes its failure, as a name that an argument brings
-COUNT = "*count"  # how many instances of a tile are to be taken, likewise
-
 Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C
-
-
-@dataclass(frozen=True)
-class Argument:
-    """One of an outlined function: its declaration, what is passed, the names that it brings."""
-
-    declared: str
-    passed: str
-    names: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -126,21 +112,6 @@ class Target:
         )
 
     @property
-    def p_arg(self) -> str:
-        """The parameters as an argument, where there are any."""
-        return f"const {self.prefix}_params *p" if self.needs_p else ""
-
-    @property
-    def p_call(self) -> str:
-        """The parameters as they are passed on."""
-        return "p" if self.needs_p else ""
-
-    @property
-    def p_cast(self) -> str:
-        """The parameters where they come as plain numbers."""
-        return f"(const {self.prefix}_params *)p" if self.needs_p else ""
-
-    @property
     def zero(self) -> str:
         """The number 0."""
         return "0.0" + self.real.suffix
@@ -152,21 +123,12 @@ class Target:
             text if "." in text or "e" in text or "n" in text else text + ".0"
         ) + self.real.suffix
 
-    def signal_call(self, out: str, q: str, qd: str) -> str:
-        """The call that computes the scene's own inputs."""
-        if "signal" not in self.program:
-            return ""
-        given = arguments(
-            out, "t" if self.signal_t else "", *((q, qd) if self.signal_state else ()), self.p_call
-        )
-        return f"{self.prefix}_signal({given});"
-
     # bodies
 
     def where(self) -> dict[str, str]:
         """How names from outside are written: p->m_c for parameters, theta_ where theta is ours."""
         s = self.system
-        out = {x.name: f"p->{x.name}" for x in s.parameters}
+        out = {x.name: c_function.member("p", x.name) for x in s.parameters}
         mine = [*(x.name for x in s.q), *(x.name for x in s.qd), *self.input_names]
         return out | {n: local(n) for n in mine}
 
@@ -191,7 +153,9 @@ class Target:
         read += [(c.qd.name + ALONG, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
         read += [(name + ALONG, f"along[2*{NQ} + {self.enum[name]}]") for name in self.input_names]
         return [
-            f"const {real} {local(name)} = {element};" for name, element in read if name in uses
+            c_function.constant(real, local(name), element)
+            for name, element in read
+            if name in uses
         ]
 
     def element(self, array: str, name: str) -> str:
@@ -210,116 +174,6 @@ class Target:
             "along": frozenset(x.name + ALONG for x in (*s.q, *s.qd, *s.u)),
         }
 
-    # outlined functions
-
-    def outlined(
-        self,
-        function: Function,
-        what: str,
-        given: Sequence[Argument],
-        results: Sequence[str],
-        out: Argument,
-        loads: Callable[[Function], list[str]],
-        where: Mapping[str, str] | None = None,
-        tile: bool = False,
-        pair: bool = False,
-        inline: bool = False,
-        in_order: bool = False,
-    ) -> dict[str, Any]:
-        """A long function outlined to several static ones, for outlined.c.jinja.
-
-        what: its name in C, behind the prefix. given: the arguments; each has those that it
-        reads, and `out` where results are ready, which go to the places `results`. tile, pair: each
-        of them is a loop over a tile, or over two. inline: no function of its own in the end.
-        in_order: terms of sums stay in their order.
-        """
-        function = unclashed(function)
-        small = outline.LANE_PIECE if tile else outline.PIECE
-        piece = small if outline.is_large(function) else outline.LARGE
-        parts = outline.split(function, piece)
-        end = "count" if tile else "2" if pair else ""
-        size = f"{self.PREFIX}_TILE" if tile else end
-        at = "[i]" if end else ""
-        values = f"{self.prefix}_{what}_values"
-        crossing = [name for part in parts for name in part.keeps]
-        struct = Argument(
-            f"{values} *{self.PREFIX + '_ALONE ' if end else ''}s", "&s", frozenset(crossing)
-        )
-        handed = {name: f"s->{name}{at}" for name in crossing}
-        kind = "INLINE" if inline else "NOINLINE"
-        made, calls = [], []
-        pivots = len(function.checks)
-        for k, part in enumerate(parts, 1):
-            f = part.function
-            body = self.body(
-                f,
-                dict(where or {}) | {name: handed[name] for name in part.reads},
-                stored={name: handed[name] for name in part.keeps},
-                pivots=pivots,
-                branchless=tile,
-                in_order=in_order,
-            )
-            failures = [*body.early_failures, *body.failures]
-            checks = bool(failures)
-            fails = bool(end) and (checks or (tile and body.sincos))
-            read = f.uses | {COUNT, *([FAILED] if fails else [])}
-            needed = [a for a in given if a.names & read]
-            if crossing and (part.reads or part.keeps):
-                needed.insert(0, struct)
-            if part.outputs:
-                needed.insert(0, out)
-            name = f"{self.prefix}_{what}_{k}"
-            call = f"{name}({arguments(*(a.passed for a in needed))});"
-            calls.append(f"good &= {call}" if checks and not end else call)
-            one = f"1.0{self.real.suffix}"
-            ends = [f"return {none_of(failures)};"] if checks else []
-            if end:
-                ends = [f"*failed = {x} ? {one} : *failed;" for x in failures]
-            found = dict(zip(part.outputs, body.results, strict=True))
-            made.append(
-                {
-                    "comment": _about(k, part, len(parts), what),
-                    "prototype": f"{self.PREFIX}_{kind} {'int' if checks and not end else 'void'} "
-                    f"{name}({arguments(*(a.declared for a in needed)) or 'void'})",
-                    "failed": fails,
-                    "loads": loads(f),
-                    "blocks": [*body.early, *body.blocks],
-                    "results": found,
-                    "stores": [f"{results[place]} = {text};" for place, text in found.items()],
-                    "ends": ends,
-                }
-            )
-        checked = any(call.startswith("good") for call in calls)
-        return {
-            "what": what,
-            "type": values,
-            "members": [name + (f"[{size}]" if end else "") for name in crossing],
-            "loop": end,
-            "width": 8 if end else 4,
-            "functions": made,
-            "calls": calls,
-            "fails": any(m["failed"] for m in made),
-            "locals": [
-                *([f"{values} s;"] if crossing else []),
-                *(["int good = 1;"] if checked else []),
-            ],
-            "outcome": "good" if checked else "1",
-        }
-
-
-def _about(k: int, part: outline.Piece, count: int, what: str) -> str:
-    """What an outlined function computes from what, in a sentence, as lines of a comment."""
-    named = [n for n in part.keeps if not (n[0] == "w" and n[1:].isdigit())]
-    made = ", ".join(named[:8]) + (", ..." if len(part.keeps) > 8 else "")
-    told = [f"{what}, {k} of {count}: {outline.weight(part.function)} operations"]
-    if part.reads:
-        told.append(f"from {len(part.reads)} values of those before")
-    if part.keeps:
-        told.append(f"{len(part.keeps)} for those after" + (f" ({made})" if named else ""))
-    if part.outputs:
-        told.append(f"{len(part.outputs)} results")
-    return textwrap.fill(", ".join(told) + ".", 94, subsequent_indent=" * ")
-
 
 def unclashed(function: Function) -> Function:
     """The function with other names for its values that are called like something of ours."""
@@ -330,16 +184,6 @@ def unclashed(function: Function) -> Function:
 def arguments(*parts: str) -> str:
     """An argument list of those parts that are there."""
     return ", ".join(p for p in parts if p)
-
-
-def after(*parts: str) -> str:
-    """What follows in an argument list, each part with its comma."""
-    return "".join(f", {part}" for part in parts if part)
-
-
-def none_of(conditions: Sequence[str]) -> str:
-    """That no condition holds."""
-    return f"!({' || '.join(conditions)})" if conditions else "1"
 
 
 def local(name: str) -> str:

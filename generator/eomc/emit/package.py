@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 from eomc.base.texts import FreeText
+from eomc.emit.c_function import cast, member
 from eomc.emit.c_names import Target
 from eomc.emit.evaluations import KINDS, takes_t
-from eomc.emit.fast.context import stamp, words
+from eomc.emit.heading import stamp, words
 from eomc.emit.public import Public
 from eomc.emit.views import Binding, Bound, BoundMethod, Declarations, Face, Main, Named
 from eomc.integrators.tableaux import METHODS
@@ -57,15 +58,21 @@ def _bound(target: Target) -> tuple[Bound, ...]:
     return tuple(found)
 
 
+def _parameters(target: Target) -> str:
+    """The parameters, which come as plain numbers."""
+    return cast(f"{target.prefix}_params", "p") if target.needs_p else ""
+
+
 def _rows(target: Target) -> dict[str, str]:
     """q and qd of row k, and the parameters, which come as plain numbers."""
     NQ = f"{target.PREFIX}_NQ"
-    return {"q": f"q + {NQ}*k", "qd": f"qd + {NQ}*k", "p": target.p_cast}
+    return {"q": f"q + {NQ}*k", "qd": f"qd + {NQ}*k", "p": _parameters(target)}
 
 
 def _methods(target: Target) -> tuple[BoundMethod, ...]:
     """The calls of step, run and batch."""
-    public, p, NQ = Public(target), target.p_cast, f"{target.PREFIX}_NQ"
+    public, p, NQ = Public(target), _parameters(target), f"{target.PREFIX}_NQ"
+    memory = f"work ? &{member('work', 'memory')} : NULL"
     return tuple(
         BoundMethod(
             name,
@@ -73,7 +80,7 @@ def _methods(target: Target) -> tuple[BoundMethod, ...]:
             public.step(name).call(q="at", qd="moving", p=p),
             public.run(name).call(
                 u="u ? u + first*u_stride : u", q_rows=f"q_rows + {NQ}*(row + 1)",
-                qd_rows=f"qd_rows + {NQ}*(row + 1)", p=p, memory="work ? &work->memory : NULL",
+                qd_rows=f"qd_rows + {NQ}*(row + 1)", p=p, memory=memory,
                 status="&found",
             ),
             public.batch(name).call(p=p),

@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from importlib.util import cache_from_source
 from pathlib import Path
 
@@ -21,10 +22,10 @@ from eomc.emit import package, selftest, views
 from eomc.emit.c_expression import REALS, indent
 from eomc.emit.c_names import Target
 from eomc.emit.c_safe_names import borne
-from eomc.emit.fast.context import values
+from eomc.emit.fast import files as fast
+from eomc.emit.fast import views as fast_views
 from eomc.emit.plain import steppers
 from eomc.emit.plain import views as plain_views
-from eomc.integrators.tableaux import METHODS
 from eomc.program.outline import weight
 from eomc.program.program import Program
 
@@ -36,8 +37,7 @@ class Sources:
     """The text of the generated files by name, and what the extension is made of besides.
 
     binding: C between the scene's functions and Python, with its cdef. operations: how many all
-    functions have together, which tells how long a compiler takes. wide: whether there are loops
-    over instances or stages, for the widest vector registers.
+    functions have together, which tells how long a compiler takes.
     """
 
     name: str
@@ -45,9 +45,9 @@ class Sources:
     binding: str
     cdef: str
     operations: int
-    wide: bool = False
 
 
+@cache
 def environment() -> jinja2.Environment:
     """Jinja as it is used here: a missing variable stops the build, free text as it stands too.
 
@@ -79,6 +79,12 @@ def _bytecode() -> jinja2.BytecodeCache | None:
     return jinja2.FileSystemBytecodeCache(str(folder), "eomc-template-%s.cache")
 
 
+def show(view: views.View | plain_views.View | fast_views.View) -> str:
+    """A view by its template."""
+    given = {field.name: getattr(view, field.name) for field in fields(view)}
+    return environment().get_template(view.TEMPLATE + ".jinja").render(given)
+
+
 def render(program: Program, extension: str) -> Sources:
     """The generated files of a program, its Python face importing `extension`.
 
@@ -90,24 +96,13 @@ def render(program: Program, extension: str) -> Sources:
     program, written = borne(program)
     run = s.run
     target = Target(program, REALS[run.real], written)
-    context = values(target)
     binding = package.binding(target)
-    jinja = environment()
     name = program.system.name
-
-    def text(template: str) -> str:
-        return jinja.get_template(template + ".jinja").render(context)
-
-    def show(view: views.View | plain_views.View) -> str:
-        given = {field.name: getattr(view, field.name) for field in fields(view)}
-        return jinja.get_template(view.TEMPLATE + ".jinja").render(given)
-
     return Sources(
         name=name,
         files={
             **steppers.files(program, show),
-            f"{FAST}/{name}.h": text("c/fast/header.h"),
-            f"{FAST}/{name}.c": text("c/fast/source.c"),
+            **{f"{FAST}/{file}": text for file, text in fast.files(target, show).items()},
             "main.c": show(package.main(target)),
             "selftest.c": show(selftest.view(target)),
             "__init__.py": show(package.face(target, extension)),
@@ -116,5 +111,4 @@ def render(program: Program, extension: str) -> Sources:
         binding=show(binding),
         cdef=show(package.declarations(binding)),
         operations=sum(map(weight, program.functions.values())),
-        wide=run.batch or any(METHODS[method].sweeps for method in run.methods),
     )

@@ -11,7 +11,7 @@ from itertools import chain, islice
 from eomc.base.texts import FreeText
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
-from eomc.emit.fast.context import stamp
+from eomc.emit.heading import stamp
 from eomc.emit.public import Public
 from eomc.emit.views import SelfTest, State
 from eomc.program.interpret import evaluate, nearby

@@ -143,4 +143,15 @@ class Face:
     functions: tuple[str, ...]
 
 
-View = Main | SelfTest | Binding | Declarations | Face
+@dataclass(frozen=True)
+class Quad:
+    """report/reference_solution.c.jinja: a motion in __float128. parameters: how many."""
+
+    TEMPLATE: ClassVar[str] = "report/reference_solution.c"
+    prefix: str
+    PREFIX: str
+    parameters: int
+    call: str
+
+
+View = Main | SelfTest | Binding | Declarations | Face | Quad

@@ -19,7 +19,6 @@ from eomc.program.ir import Assignment, Call, Function, Operand
 
 LARGE = 1000  # weight from which a function is cut
 PIECE = 500  # weight of an outlined function, up to a third more or less
-LANE_PIECE = 180  # the same in loops over a tile: the processor is to see a few instances at once
 
 
 @dataclass(frozen=True)

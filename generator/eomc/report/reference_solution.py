@@ -31,10 +31,12 @@ from eomc import pipeline
 from eomc.base.errors import EomcError, FolderError
 from eomc.derive import lagrange
 from eomc.emit.c_expression import QUAD
-from eomc.emit.c_names import Target, arguments
+from eomc.emit.c_names import Target
 from eomc.emit.c_safe_names import borne
-from eomc.emit.fast.context import values
-from eomc.emit.render import environment
+from eomc.emit.functions import Functions
+from eomc.emit.plain import steppers as plain
+from eomc.emit.render import show
+from eomc.emit.views import Quad
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
@@ -158,19 +160,14 @@ def _computed(system: System, span: float, rows: int) -> Reference:
 def _compiled(system: System, folder: Path) -> Path:
     """The program in __float128 with its integrator, as an executable."""
     system = replace(system, run=replace(system.run, methods=("rk4",), batch=False, real="double"))
-    target = Target(borne(program.build(lagrange.derive(system)))[0], QUAD)
-    call = arguments(
-        "a", "q", "qd", "t" if target.driven else "", "NULL" if system.inputs else "",
-        f"(const {target.prefix}_params *)p" if target.needs_p else "",
-    )  # fmt: skip
-    given = {**values(target), "call": f"{target.prefix}_acceleration({call})"}
-    jinja = environment()
-    for name, template in (
-        (f"{system.name}.h", "c/fast/header.h"),
-        (f"{system.name}.c", "c/fast/source.c"),
-        ("quad.c", "report/reference_solution.c"),
-    ):
-        text = jinja.get_template(template + ".jinja").render(given)
+    made = borne(program.build(lagrange.derive(system)))[0]
+    shown = plain.files(made, show, QUAD)
+    functions = Functions(Target(made, QUAD))
+    call = functions.acceleration.function.call(
+        qdd="a", u="NULL", p=f"(const {system.name}_params *)p"
+    )
+    main = show(Quad(system.name, system.name.upper(), len(system.parameters), call))
+    for name, text in (*shown.items(), ("quad.c", main)):
         (folder / name).write_text("#include <quadmath.h>\n" + text, encoding="utf-8")
     missing = (
         f"{system.name}: the reference solution needs gcc with libquadmath "
@@ -180,9 +177,9 @@ def _compiled(system: System, folder: Path) -> Path:
     if gcc is None:
         raise EomcError(missing)
     command = [gcc, "-std=gnu99", "-O1", "-w", "quad.c", "-o", "quad", "-lquadmath", "-lm"]
-    made = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    if made.returncode:
-        raise EomcError(f"{missing}; {gcc} said:\n{made.stderr.rstrip()[:2000]}")
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise EomcError(f"{missing}; {gcc} said:\n{done.stderr.rstrip()[:2000]}")
     return folder / "quad"
 
 

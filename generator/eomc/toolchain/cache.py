@@ -185,7 +185,7 @@ def _build(
         "name": name,
         "eomc": __version__,
         "compiler": " ".join(compiler.command),
-        "flags": " ".join((standard(form), *flags(form, made.wide))),
+        "flags": " ".join((standard(form), *flags(form))),
         "files": {file: _digest(new / file) for file in kept},
     }
     (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")

@@ -76,21 +76,18 @@ def _identity(path: str) -> str:
     return f"{real} {state.st_size} {state.st_mtime_ns}"
 
 
-def flags(form: str = "fast", wide: bool = False) -> tuple[str, ...]:
+def flags(form: str = "fast") -> tuple[str, ...]:
     """The optimisation flags: $EOMC_CFLAGS where it is set, else those of the form of C.
 
-    wide: for batches and stage-parallel methods, which take 1.1 to 1.7 times as long in half of
-    AVX-512's registers. Straight-line code is shorter there: a chain of five takes 0.85 of the
-    time, a Panda 0.94.
+    Vector registers that the C asks for are as wide as there are; what compilers put into some by
+    themselves is quicker in half of AVX-512's: a chain of five takes 0.85 of the time.
     """
     given = _given_flags()
     if given is not None:
         return given
     if form == "plain":
         return PLAIN_FLAGS
-    if "avx512f" not in processor():
-        return FLAGS
-    return (*FLAGS, f"-mprefer-vector-width={512 if wide else 256}")
+    return (*FLAGS, "-mprefer-vector-width=256") if "avx512f" in processor() else FLAGS
 
 
 def binding_flags() -> tuple[str, ...]:

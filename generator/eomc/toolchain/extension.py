@@ -37,7 +37,7 @@ def build(
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
     common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
     jobs = [
-        [*common, standard(form), *flags(form, made.wide), "-c", f"{at}{name}.c", "-o", "scene.o"],
+        [*common, standard(form), *flags(form), "-c", f"{at}{name}.c", "-o", "scene.o"],
         [*common, STANDARD, *binding_flags(), *include, "-c", f"{at}binding.c", "-o", "binding.o"],
     ]
     running = []

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from fractions import Fraction
 from math import isfinite, sqrt
 
 from eomc.base.texts import FreeText
 from eomc.emit import c_function as c
+from eomc.emit import heading
+from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
+from eomc.emit.coefficients import matrix, numbers, rounded
 from eomc.emit.evaluations import source
-from eomc.emit.fast import context
-from eomc.emit.fast.integrators import literal, rounded
-from eomc.emit.plain.functions import Plain, handshake, indexed, of, parameters
+from eomc.emit.functions import Functions, handshake, indexed, of, parameters
 from eomc.emit.plain.views import (
     Computed,
     Declared,
@@ -28,7 +28,7 @@ from eomc.emit.plain.views import (
     Source,
     View,
 )
-from eomc.integrators.tableaux import METHODS, RK4, Method, Row
+from eomc.integrators.tableaux import METHODS, RK4, Method
 from eomc.program.program import Program
 
 Show = Callable[[View], str]  # a view by its template
@@ -36,9 +36,9 @@ Show = Callable[[View], str]  # a view by its template
 SWEEPS = {True: 50, False: 60}  # at most, with Newton's method and without
 
 
-def files(program: Program, show: Show) -> dict[str, str]:
-    """Header and source of the plain form by file name."""
-    plain = of(program)
+def files(program: Program, show: Show, real: Real | None = None) -> dict[str, str]:
+    """Header and source of the plain form by file name; real: other numbers than the scene's."""
+    plain = of(program, real)
     name = plain.prefix
     methods = [METHODS[m] for m in plain.target.system.run.methods]
     loops = [loop(plain, m) for m in methods]
@@ -49,45 +49,56 @@ def files(program: Program, show: Show) -> dict[str, str]:
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
     texts = (
-        show(header(plain, slopes, loops)),
+        show(header(plain, slopes, handshake(plain))),
         show(source_view(plain, show(slopes).rstrip("\n") if slopes else "", steppers)),
     )
     return {f"{name}.{end}": c.laid_out(text) for end, text in zip("hc", texts, strict=True)}
 
 
-def header(plain: Plain, slopes: Slopes | None, loops: Sequence[Loop]) -> Header:
-    """The header's view."""
+def header(
+    plain: Functions,
+    slopes: Slopes | None,
+    stamp: str,
+    rooms: Sequence[int] | None = None,
+) -> Header:
+    """The header's view. rooms: of the fast form the numbers that each method's memory keeps."""
     target, s = plain.target, plain.target.system
+    methods = [METHODS[name] for name in s.run.methods]
+    rooms, fast = rooms or [0] * len(methods), rooms is not None
     found = [*plain.evaluations, plain.acceleration]
     return Header(
         title=FreeText(s.title),
-        stamp=tuple(context.stamp(target)),
-        notes=tuple(context.notes(target)),
-        description=tuple(context.description(target)),
+        stamp=tuple(heading.stamp(target)),
+        notes=tuple(heading.notes(target)),
+        description=tuple(heading.description(target)),
         prefix=plain.prefix,
         PREFIX=plain.PREFIX,
         real=plain.real,
-        handshake=handshake(plain),
+        handshake=stamp,
+        fast=fast,
         coordinates=indexed(plain),
         inputs=indexed(plain, inputs=True),
         parameters=parameters(plain),
-        implicit=any(x.implicit for x in loops),
+        implicit=any(m.implicit for m in methods),
         timed=target.driven,
         functions=tuple(x.function for x in found),
         linearization=slopes.linearization if slopes else None,
         methods=tuple(
-            Declared(m.name, _titled(m), m.implicit, step(plain, m), x.run, x.batch)
-            for m, x in zip(map(METHODS.__getitem__, s.run.methods), loops, strict=True)
+            Declared(
+                m.name, _titled(m), m.implicit, room, plain.public.step(m.name),
+                plain.public.run(m.name), plain.public.batch(m.name) if s.run.batch else None,
+            )
+            for m, room in zip(methods, rooms, strict=True)
         ),
-    )
+    )  # fmt: skip
 
 
-def source_view(plain: Plain, slopes: str, steppers: Sequence[str]) -> Source:
+def source_view(plain: Functions, slopes: str, steppers: Sequence[str]) -> Source:
     """The source's view."""
     target, s = plain.target, plain.target.system
     return Source(
         title=FreeText(s.title),
-        stamp=tuple(context.stamp(target)),
+        stamp=tuple(heading.stamp(target)),
         prefix=plain.prefix,
         PREFIX=plain.PREFIX,
         real=plain.real,
@@ -97,7 +108,7 @@ def source_view(plain: Plain, slopes: str, steppers: Sequence[str]) -> Source:
         qd0=tuple(target.literal(x.rate) for x in s.coordinates),
         evaluations=plain.evaluations,
         acceleration=plain.acceleration,
-        solved=tuple(context.solved(target)),
+        solved=tuple(heading.solved(target)),
         slopes=slopes,
         steppers=tuple(steppers),
     )
@@ -106,7 +117,7 @@ def source_view(plain: Plain, slopes: str, steppers: Sequence[str]) -> Source:
 # --- the derivatives of the accelerations ---------------------------------------------------------
 
 
-def linearization(plain: Plain) -> Slopes | None:
+def linearization(plain: Functions) -> Slopes | None:
     """A_q, A_qd and B, where the program has them."""
     target = plain.target
     function = source(target, "linearization")
@@ -128,7 +139,6 @@ def linearization(plain: Plain) -> Slopes | None:
         )  # fmt: skip
         slopes = Computed(made, (*one.parts, one.function), one.values, one.function.call())
         told = f"By {width} columns, each: {told[0].lower()}{told[1:]}"
-    out = (("A_q", NQ), ("A_qd", NQ), *([("B", plain.NU)] if inputs else []))
     arguments = plain.usual(*plain.state, "u", "p")
     read = plain.read(function)
     reads_u = plain.reads_u(function) and plain.signal is not None
@@ -139,12 +149,7 @@ def linearization(plain: Plain) -> Slopes | None:
         inputs=inputs,
         width=width,
         slopes=slopes,
-        linearization=CFunction(
-            f"{plain.prefix}_linearization",
-            plain.status,
-            (*(c.filled(plain.real, n, f"{NQ}*{w}") for n, w in out), *arguments),
-            doc=(told,),
-        ),
+        linearization=replace(plain.public.linearization, doc=(told,)),
         unread=tuple(a.name for a in arguments if a.name not in read),
         signal_call=plain.signal.call(u="now") if reads_u and plain.signal else "",
         slopes_call=slopes.function.call(),
@@ -173,20 +178,7 @@ def _about(m: Method) -> tuple[str, ...]:
     )
 
 
-def step(plain: Plain, m: Method) -> CFunction:
-    """The prototype of one step."""
-    return CFunction(
-        f"{plain.prefix}_{m.name}_step",
-        plain.status,
-        (
-            c.filled(plain.real, "q", plain.NQ),
-            c.filled(plain.real, "qd", plain.NQ),
-            *plain.usual(*plain.state[2:], "h", "u", "p"),
-        ),
-    )
-
-
-def stepper(plain: Plain, m: Method) -> RungeKutta4 | Explicit | Gauss:
+def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
     """The view of the function that computes one step."""
     if m.implicit:
         return _gauss(plain, m)
@@ -197,7 +189,7 @@ def stepper(plain: Plain, m: Method) -> RungeKutta4 | Explicit | Gauss:
             PREFIX=plain.PREFIX,
             real=plain.real,
             about=_about(m),
-            step=step(plain, m),
+            step=plain.public.step(m.name),
             first=accelerate(qdd="a1"),
             second=accelerate(qdd="a2", q="r", qd="v", t="t + h/2"),
             third=accelerate(qdd="a3", q="r", qd="v", t="t + h/2"),
@@ -208,28 +200,18 @@ def stepper(plain: Plain, m: Method) -> RungeKutta4 | Explicit | Gauss:
         PREFIX=plain.PREFIX,
         real=plain.real,
         about=_about(m),
-        step=step(plain, m),
+        step=plain.public.step(m.name),
         stages=m.stages,
-        c=_numbers(plain, m.c),
-        A=_matrix(plain, m.a),
-        AA=_matrix(plain, m.a_squared),
-        b=_numbers(plain, rounded(m.b, plain.target.real)),
-        bA=_numbers(plain, m.b_a),
+        c=numbers(m.c, plain.target.real),
+        A=matrix(m.a, plain.target.real),
+        AA=matrix(m.a_squared, plain.target.real),
+        b=numbers(rounded(m.b, plain.target.real), plain.target.real),
+        bA=numbers(m.b_a, plain.target.real),
         stage=accelerate(qdd="a[i]", q="r", qd="v", t="t + c[i]*h"),
     )
 
 
-def _numbers(plain: Plain, row: Row) -> tuple[str, ...]:
-    return tuple(literal(x, plain.target.real) for x in row)
-
-
-def _matrix(plain: Plain, rows: Sequence[Row]) -> tuple[str, ...]:
-    """The rows of a square matrix, zeros where a triangle ends."""
-    whole = [(*row, *[Fraction(0)] * (len(rows) - len(row))) for row in rows]
-    return c.in_braces(_numbers(plain, row) for row in whole)
-
-
-def implicit(plain: Plain, methods: Sequence[Method]) -> Implicit:
+def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
     """What the implicit methods share."""
     real, accelerate = plain.target.real, plain.acceleration.function.call
     return Implicit(
@@ -252,7 +234,7 @@ def implicit(plain: Plain, methods: Sequence[Method]) -> Implicit:
     )
 
 
-def _gauss(plain: Plain, m: Method) -> Gauss:
+def _gauss(plain: Functions, m: Method) -> Gauss:
     """A method of Gauss and Legendre."""
     accelerate = plain.acceleration.function.call
     method = f"{plain.prefix}_{m.name}"
@@ -267,13 +249,13 @@ def _gauss(plain: Plain, m: Method) -> Gauss:
         ),
         qualifier="static",
     )  # fmt: skip
-    matrix = CFunction(
+    matrix_function = CFunction(
         f"{method}_matrix",
         plain.status,
         (c.filled(plain.real, "M"), c.filled("int", "row"), *around),
         qualifier="static",
     )
-    one = step(plain, m)
+    one = plain.public.step(m.name)
     count = CArgument("long *", "evaluations")
     solve = CFunction(method, plain.status, (*one.arguments, count), qualifier="static")
     return Gauss(
@@ -285,16 +267,16 @@ def _gauss(plain: Plain, m: Method) -> Gauss:
         newton=m.newton,
         sweeps=SWEEPS[m.newton],
         stages=m.stages,
-        c=_numbers(plain, m.c),
-        A=_matrix(plain, m.a),
-        AA=_matrix(plain, m.a_squared),
-        b=_numbers(plain, rounded(m.b, plain.target.real)),
-        bA=_numbers(plain, m.b_a),
+        c=numbers(m.c, plain.target.real),
+        A=matrix(m.a, plain.target.real),
+        AA=matrix(m.a_squared, plain.target.real),
+        b=numbers(rounded(m.b, plain.target.real), plain.target.real),
+        bA=numbers(m.b_a, plain.target.real),
         eps=plain.target.literal(plain.target.real.epsilon),
         tenth=plain.target.literal(0.1),
         half=plain.target.literal(0.5),
         stages_function=stages,
-        matrix=matrix,
+        matrix=matrix_function,
         about=_about(m),
         solve=solve,
         step=one,
@@ -302,40 +284,16 @@ def _gauss(plain: Plain, m: Method) -> Gauss:
         slopes_call=shared.slopes.call(),
         start=accelerate(qdd="a"),
         sweep=stages.call(),
-        matrix_start=matrix.call(),
-        matrix_mid=matrix.call(q="q_mid", qd="qd_mid", t="t + h/2"),
+        matrix_start=matrix_function.call(),
+        matrix_mid=matrix_function.call(q="q_mid", qd="qd_mid", t="t + h/2"),
         solve_call=solve.call(evaluations="&evaluations"),
     )
 
 
-def loop(plain: Plain, m: Method) -> Loop:
+def loop(plain: Functions, m: Method) -> Loop:
     """The view of a method's step, run and batch."""
-    target, real = plain.target, plain.real
-    has_u, P, NQ = bool(target.system.inputs), plain.prefix, plain.NQ
-    state = (c.filled(real, "q", NQ), c.filled(real, "qd", NQ))
-    t0 = (CArgument(real, "t0"),) if target.driven else ()
-    h, first, steps = CArgument(real, "h"), CArgument("long", "first"), CArgument("long", "steps")
-    rows = (CArgument("long", "every"), c.filled(real, "q_rows"), c.filled(real, "qd_rows"))
-    u, p = plain.usual("u"), plain.usual("p")
-    strides = [CArgument("long", n) for n in ("u_stride", "u_instance", "u_step", "p_instance")]
-    count, row_count = CArgument("long", "count"), CArgument("long", "row_count")
-    memory = CArgument(f"{P}_{m.name}_memory *", "memory")
-    status = CArgument(f"{plain.status} *", "status")
-    held = strides[:1] if has_u else []
-    run = CFunction(
-        f"{P}_{m.name}_run", "long",
-        (*state, *t0, h, first, steps, *u, *held, *rows, *p, memory, status),
-    )  # fmt: skip
-    batch = CFunction(
-        f"{P}_{m.name}_batch",
-        "void",
-        (
-            count, c.filled(real, "q"), c.filled(real, "qd"), *t0, h, first, steps, *u,
-            *(strides[1:3] if has_u else []), *rows, row_count, *p,
-            *(strides[3:] if target.needs_p else []),
-            CArgument("long *", "done"), CArgument("int *", "status"),
-        ),
-    )  # fmt: skip
+    P, NQ, real = plain.prefix, plain.NQ, plain.real
+    run = plain.public.run(m.name)
     one = stepper(plain, m)
     advance = one.solve if isinstance(one, Gauss) else one.step
     return Loop(
@@ -344,7 +302,7 @@ def loop(plain: Plain, m: Method) -> Loop:
         real=real,
         implicit=m.implicit,
         run=run,
-        batch=batch if target.system.run.batch else None,
+        batch=plain.public.batch(m.name) if plain.target.system.run.batch else None,
         one_step=advance.call(t=f"t0 + ({real})(first + n)*h", u="u ? u + u_stride*n : 0"),
         run_one=run.call(
             q=f"q + {NQ}*k", qd=f"qd + {NQ}*k", u="u ? u + u_instance*k : 0", u_stride="u_step",

@@ -41,14 +41,24 @@ class Computed:
     out: str = ""
     symmetric: bool = False
 
+    @property
+    def text(self) -> str:
+        """All of it, where it is no loop over columns."""
+        texts = (self.values, *(f.definition for f in self.parts), self.function.definition)
+        return "\n\n".join(filter(None, texts))
+
 
 @dataclass(frozen=True)
 class Declared:
-    """A method of integration in the header: step, run and, where the scene wants it, batch."""
+    """A method of integration in the header: step, run and, where the scene wants it, batch.
+
+    kept: the numbers that its memory has room for.
+    """
 
     name: str
     title: str
     implicit: bool
+    kept: int
     step: CFunction
     run: CFunction
     batch: CFunction | None
@@ -56,9 +66,9 @@ class Declared:
 
 @dataclass(frozen=True)
 class Header:
-    """c/plain/header.h.jinja. functions: those of mechanics. timed: whether steps take t."""
+    """c/header.h.jinja. functions: those of mechanics. timed: whether steps take t."""
 
-    TEMPLATE: ClassVar[str] = "c/plain/header.h"
+    TEMPLATE: ClassVar[str] = "c/header.h"
     title: FreeText
     stamp: tuple[FreeText, ...]
     notes: tuple[str, ...]
@@ -67,6 +77,7 @@ class Header:
     PREFIX: str
     real: str
     handshake: str
+    fast: bool
     coordinates: tuple[Indexed, ...]
     inputs: tuple[Indexed, ...]
     parameters: tuple[Parameter, ...]
@@ -100,9 +111,9 @@ class Source:
 
 @dataclass(frozen=True)
 class Slopes:
-    """c/plain/slopes.c.jinja. width: of a row [da/dq, da/dqd, da/du]. unread: unused arguments."""
+    """c/slopes.c.jinja. width: of a row [da/dq, da/dqd, da/du]. unread: unused arguments."""
 
-    TEMPLATE: ClassVar[str] = "c/plain/slopes.c"
+    TEMPLATE: ClassVar[str] = "c/slopes.c"
     prefix: str
     PREFIX: str
     real: str

@@ -1,0 +1,164 @@
+"""What each trick of the fast form is worth: the same scene with it and without, in turns.
+
+    python benchmarks/tricks.py [--rounds 15]
+
+A trick is taken away by changing the generator in this process, so both modules come from the same
+tree. Ratios are without/with, medians of the ratios within the rounds, in processor time of the
+thread; below 1.1 a trick is worth nothing in that row. Both ends agree to 1e-9 of their size.
+`gauss16` is taken away as a user would: the quickest of the other methods takes its place, each at
+its longest step that ends within 1e-9, or 1e-12, of `gauss16` in steps of an eighth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest.mock import PropertyMock, patch
+
+import numpy as np
+import work
+
+import eomc
+from eomc.derive import link_multipliers
+from eomc.emit.fast.accelerations import Accelerations
+from eomc.emit.fast.steppers import Steppers
+
+SPAN = 5.0  # s, of the runs for an error
+METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "gauss16")
+Change = Callable[[], Any]
+
+
+def without_prediction() -> Any:
+    return patch.object(Steppers, "predicted", new_callable=PropertyMock, return_value=False)
+
+
+def without_two_points() -> Any:
+    return patch.object(Accelerations, "parts", new_callable=PropertyMock, return_value=None)
+
+
+def without_multipliers() -> Any:
+    unsuited = link_multipliers.UnsuitedError("left out")
+    return patch.object(link_multipliers, "solution", side_effect=unsuited)
+
+
+# trick, what takes it away, the cases that it could change, what else is asked for under [run]
+TRICKS: tuple[tuple[str, Change, tuple[str, ...], str], ...] = (
+    ("predicted angles", without_prediction, ("cart-pole", "double pendulum"), ""),
+    ("two points", without_two_points, ("chain of 5", "chain of 10", "chain of 20"), ""),
+    ("link multipliers", without_multipliers, ("chain of 5", "chain of 10", "chain of 20"), ""),
+    ("link multipliers, 4,096 at once", without_multipliers, ("chain of 5", "chain of 10"),
+     "batch = true\n"),
+)  # fmt: skip
+
+
+@contextmanager
+def built(case: work.Case, change: Any, extra: str, name: str) -> Iterator[ModuleType]:
+    """A module of the case under another name, with the generator changed while it is made."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.toml"
+        lines = case.scene.splitlines()
+        at = next(k for k, line in enumerate(lines) if line.startswith("name"))
+        lines[at] = f'name = "{name}"'
+        path.write_text("\n".join(lines) + "\n" + extra, encoding="utf-8")
+        with change:
+            yield eomc.load(path, folder)
+
+
+def seconds(job: Callable[[], Any]) -> float:
+    begun = time.thread_time()
+    job()
+    return time.thread_time() - begun
+
+
+def ratio(one: Callable[[], Any], other: Callable[[], Any], rounds: int) -> float:
+    """The time of `one` over that of `other`."""
+    pairs = []
+    for k in range(rounds):
+        jobs = (one, other) if k % 2 else (other, one)
+        times = [seconds(job) for job in jobs]
+        pairs.append(times if k % 2 else times[::-1])
+    return float(np.median([a / b for a, b in pairs]))
+
+
+def run(module: ModuleType, case: work.Case, many: bool) -> Callable[[], Any]:
+    """A run of the case, or short ones of 4,096 instances."""
+    n = len(case.x0) // 2
+    if many:
+        q, qd = np.tile(case.x0[:n], (4096, 1)), np.tile(case.x0[n:], (4096, 1))
+        q += np.linspace(0, 1e-3, 4096)[:, None]
+        return lambda: module.simulate_batch(q, qd, case.h, steps=20, every=20, threads=1)
+    steps = min(case.steps, 4000)
+    return lambda: module.simulate(case.x0[:n], case.x0[n:], case.h, steps=steps, every=steps)
+
+
+def tricks(rounds: int) -> Iterator[str]:
+    for k, (trick, change, names, extra) in enumerate(TRICKS):
+        for name in names:
+            case = work.CASES[name]
+            with (
+                built(case, nullcontext(), extra, f"with_{k}") as full,
+                built(case, change(), extra, f"without_{k}") as less,
+            ):
+                jobs = [run(module, case, bool(extra)) for module in (less, full)]
+                ends = [np.asarray(job().q)[..., -1, :] for job in jobs]
+                apart = float(np.max(np.abs(ends[0] - ends[1])))
+                if not apart < 1e-9 * max(1.0, float(np.max(np.abs(ends[0])))):
+                    raise SystemExit(f"{trick}, {name}: ends {apart:.1e} apart")
+                yield f"| {trick} | {name} | {ratio(*jobs, rounds):.2f} |"
+
+
+def end(m: ModuleType, case: work.Case, method: str, steps: int) -> np.ndarray:
+    """The state after SPAN seconds."""
+    n = len(case.x0) // 2
+    made = m.simulate(
+        case.x0[:n], case.x0[n:], SPAN / steps, steps=steps, every=steps, method=method
+    )
+    return np.asarray(made.x[-1])
+
+
+def longest(m: ModuleType, case: work.Case, sure: np.ndarray, limit: float) -> dict[str, int]:
+    """For each method the fewest steps that end within the limit."""
+    found = {}
+    for method in METHODS:
+        for steps in np.unique(np.geomspace(16, 200_000, 120).astype(int)):
+            off = np.max(np.abs(end(m, case, method, int(steps)) - sure)) / np.max(np.abs(sure))
+            if off < limit:
+                found[method] = int(steps)
+                break
+    return found
+
+
+def gauss16(rounds: int) -> Iterator[str]:
+    extra = "method = [" + ", ".join(f'"{m}"' for m in METHODS) + "]\n"
+    for name in ("cart-pole", "double pendulum", "chain of 5"):
+        case = work.CASES[name]
+        with built(case, nullcontext(), extra, "methods") as m:
+            sure = end(m, case, "gauss16", 4096)
+            for limit in (1e-9, 1e-12):
+                steps = longest(m, case, sure, limit)
+                ways = {w: partial(end, m, case, w, n) for w, n in steps.items()}
+                others = [w for w in ways if w != "gauss16"]
+                best = min(others, key=lambda w, ways=ways: seconds(ways[w]))  # type: ignore[misc]
+                found = ratio(ways[best], ways["gauss16"], rounds)
+                yield f"| gauss16 | {name}, error {limit:.0e}, else {best} | {found:.2f} |"
+
+
+def main() -> None:
+    asked = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    asked.add_argument("--rounds", type=int, default=15)
+    rounds = asked.parse_args().rounds
+    print("| trick | row | time without, over with |\n|---|---|---|")
+    for rows in (tricks(rounds), gauss16(rounds)):
+        for row in rows:
+            print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,230 @@
+"""The fast form of C: a program as the views that its templates print, and all of its files.
+
+For gcc and clang. What a step calls is printed over a lane type: one number for a trajectory, a
+vector register for a batch and for the stages of sweeps, two points for what is long.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+
+from eomc.base import resources
+from eomc.base.texts import FreeText
+from eomc.emit import c_function as c
+from eomc.emit import heading
+from eomc.emit.c_expression import C_NAMES, DOUBLE
+from eomc.emit.c_names import Target
+from eomc.emit.fast import views
+from eomc.emit.fast.accelerations import Accelerations
+from eomc.emit.fast.lanes import INLINE, Lane
+from eomc.emit.fast.steppers import FEWEST_OPERATIONS, Steppers, ahead_count
+from eomc.emit.functions import Functions, parameters
+from eomc.emit.plain import steppers as plain
+from eomc.emit.plain import views as plain_views
+from eomc.integrators.tableaux import RK4
+from eomc.program import outline
+
+Show = Callable[[views.View | plain_views.View], str]  # a view by its template
+
+# what stands in csrc for names, types and sizes of a lane
+PLACEHOLDERS = ("BITS_OF_SIZE", "INTEGER", "LANE_ALIGNED", "LANE_BYTES", "LANE_COUNT", "REAL")
+TWO = ("atan2", "pow", "min", "max")  # of two arguments
+
+
+def files(target: Target, show: Show) -> dict[str, str]:
+    """Header and source of the fast form by file name."""
+    functions, accelerations = Functions(target), Accelerations(target)
+    slopes = plain.linearization(functions)
+    made = Steppers(accelerations, functions, slopes)
+    stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"
+    rooms = [made.kept(m) for m in made.methods]
+    header = show(plain.header(functions, slopes, stamp, rooms))
+    source = show(
+        views.Source(
+            title=FreeText(target.system.title),
+            stamp=tuple(heading.stamp(target)),
+            prefix=target.prefix,
+            PREFIX=target.PREFIX,
+            real=target.real.name,
+            rolled=made.two_point,
+            unroll=made.one.unroll,
+            extent=made.one.extent,
+            inline=made.one.qualifiers[INLINE],
+            handshake=stamp,
+            wide=_wide(made),
+            csrc=tuple(_csrc(made)),
+            parameters=parameters(functions),
+            q0=tuple(target.literal(x.start) for x in target.system.coordinates),
+            qd0=tuple(target.literal(x.rate) for x in target.system.coordinates),
+            evaluations=functions.evaluations,
+            acceleration=functions.acceleration,
+            solved=tuple(heading.solved(target)),
+            slopes=show(slopes).rstrip("\n") if slopes else "",
+            lanes=tuple(_lanes(made, show)),
+            steppers=tuple(_steppers(made, show)),
+        )
+    )
+    name = target.prefix
+    return {f"{name}.h": c.laid_out(header), f"{name}.c": c.laid_out(source)}
+
+
+def _wide(made: Steppers) -> bool:
+    """Whether the lane of a register is needed."""
+    return made.accelerations.target.system.run.batch or any(m.sweeps for m in made.methods)
+
+
+def _csrc(made: Steppers) -> Iterator[str]:
+    """The hand-written C that this scene needs, under its own prefix."""
+    target = made.accelerations.target
+    end = target.real.function_suffix
+    size = 8 if target.real is DOUBLE else 4
+    rotates = bool(made.accelerations.angles) and RK4 in made.methods
+    lanes = [("wide", f"{target.PREFIX}_WIDE_BYTES", True)] * _wide(made)
+    if made.two_point:
+        lanes += [("two", str(2 * size), False), ("four", str(4 * size), True)]
+    if RK4 in made.methods and made.predicted:
+        bytes_ahead = size * ahead_count(len(made.accelerations.angles))
+        lanes += [("ahead", str(bytes_ahead), False)]
+    texts = [(f"sincos/sincos{end}.h", "", "")] if target.sincos else []
+    if rotates:
+        texts += [("lanes/scalar.h", "", ""), (f"lanes/rotate{end}.h", "", "")]
+    for name, width, turns in lanes:
+        texts += [("lanes/vector.h", name, width)]
+        texts += [(f"lanes/sincos{end}.h", name, width)] * target.sincos
+        texts += [(f"lanes/rotate{end}.h", name, width)] * (turns and rotates)
+        texts += [("lanes/four.h", name, width)] * (name == "four")
+    for file, name, width in texts:
+        text = resources.text("csrc", file).replace("#include <math.h>\n", "")
+        integer, bits = ("long long", "0x7fffffffffffffff") if size == 8 else ("int", "0x7fffffff")
+        for old, new in (
+            ("EOMC_BITS_OF_SIZE", bits),
+            ("EOMC_INTEGER", integer),
+            # compilers change how they pass what is aligned to more than a register has
+            ("EOMC_LANE_ALIGNED", width if name == "wide" else "16"),
+            ("EOMC_LANE_BYTES", width),
+            ("EOMC_LANE_COUNT", f"{target.PREFIX}_{name.upper()}_COUNT"),
+            ("fabs_REAL", f"fabs{end}"),
+            ("EOMC_REAL", target.real.name),
+            *(
+                (("_LANE", f"_{name}"),)
+                if name
+                else (("eomc_LANE", target.real.name), ("_LANE", ""))
+            ),
+            ("eomc_", f"{target.prefix}_"),
+            ("EOMC_", f"{target.PREFIX}_"),
+        ):
+            text = text.replace(old, new)
+        yield text.strip()
+
+
+def _lanes(made: Steppers, show: Show) -> Iterator[str]:
+    """The accelerations over each lane, and RK4 or another explicit method over the register."""
+    yield _lane(made, made.one, show)
+    batch = made.accelerations.target.system.run.batch
+    if batch or any(m.sweeps for m in made.methods):
+        yield _lane(made, made.wide, show)
+    if batch:
+        weight = outline.weight(made.accelerations.rotated[1])
+        yield show(
+            views.Blocks(
+                prefix=made.one.prefix,
+                PREFIX=made.one.target.PREFIX,
+                lane=made.wide.real.name,
+                constants=made.wide.constants if made.accelerations.constants else "",
+                inputs=bool(made.accelerations.target.system.inputs),
+                blocks=1 if weight > FEWEST_OPERATIONS else 4,
+            )
+        )
+
+
+def _lane(made: Steppers, lane: Lane, show: Show) -> str:
+    """The accelerations over one lane."""
+    s, target = made.accelerations, lane.target
+    signal = lane.signal
+    names = sorted(set(lane.calls)) if lane.name else []
+    constants = c.struct(lane.constants, lane.real.name, s.constants) if s.constants else ""
+    parts = s.parts if not lane.name else None
+    rates = lane.rates.text if parts is None else show(_two_points(made)).rstrip("\n")
+    computed = lane.compute_constants.text if not lane.name and made.constants_call else ""
+    text = show(
+        views.LaneText(
+            prefix=target.prefix,
+            PREFIX=target.PREFIX,
+            unroll=lane.unroll,
+            inline=lane.qualifiers[INLINE],
+            lane=lane.real.name,
+            mask=lane.mask,
+            clear=lane.clear,
+            L=lane.end,
+            calls=tuple(_library(s, n) for n in names),
+            constants="\n\n".join(filter(None, (constants, computed))),
+            angles=lane.angle_count if s.angles else "",
+            count=len(s.angles),
+            angles_at=lane.linear("angles_at", "q", offset=True),
+            changes=lane.linear("changes", "d", offset=False),
+            sincos=lane.sincos,
+            signal=signal,
+            signal_call=signal.function.call(u="now") if signal else "",
+            rates=rates,
+            rates_call=lane.velocity.function.call(k="&k", point="0")
+            if parts
+            else lane.rates.function.call(),
+            accelerations=lane.all_in_one,
+            two_point=parts is not None,
+            takes_c=bool(s.constants),
+        )
+    )
+    return text
+
+
+def _library(s: Accelerations, name: str) -> views.Library:
+    """A function of the mathematics library."""
+    called = C_NAMES.get(name, name)
+    return views.Library(called, called + s.target.real.function_suffix, name in TWO)
+
+
+def _two_points(made: Steppers) -> views.TwoPoints:
+    """The accelerations of one trajectory in the two-point form."""
+    s, one = made.accelerations, made.one
+    two = Lane(s, "two")
+    assert s.parts is not None
+    configuration = two.configuration
+    return views.TwoPoints(
+        prefix=one.prefix,
+        real=one.real.name,
+        extent=one.extent,
+        inline=one.qualifiers[INLINE],
+        members=c.struct(f"{one.prefix}_configuration", two.real.name, s.parts.handed),
+        angles=one.angle_count,
+        configuration=configuration,
+        constants=bool(s.constants),
+        call=configuration.function.call(),
+        velocity=one.velocity,
+    )
+
+
+def _steppers(made: Steppers, show: Show) -> Iterator[str]:
+    """The methods: their state, one step, run and batch."""
+    real = made.one.real
+    batch = made.accelerations.target.system.run.batch
+    if any(m.newton for m in made.methods):
+        fabs = f"fabs{real.function_suffix}"
+        yield show(views.Factors(made.one.prefix, made.one.real.name, fabs, real.suffix))
+    for m in made.methods:
+        lanes = [made.one, *([made.wide] if batch else [])]
+        if m is RK4:
+            yield from (show(made.rk4(lane)) for lane in lanes)
+        elif not m.implicit:
+            yield from (show(made.explicit(lane, m)) for lane in lanes)
+        if made.predicts(m):
+            prediction, state = show(made.prediction()), show(made.state(m))
+            at = prediction.index("/*\n * Steps of RK4")
+            yield prediction[:at] + state + "\n" + prediction[at:]
+        else:
+            yield show(made.state(m))
+        if m.implicit:
+            yield show(made.sweeps(m) if m.sweeps else made.gauss(m))
+        yield show(made.loop(m))
+        if batch:
+            yield show(made.batch(m))

@@ -1,0 +1,471 @@
+"""Methods of integration in the fast form: their views, and the calls in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from math import isfinite, sqrt
+
+from eomc.emit import c_function as c
+from eomc.emit.c_expression import DOUBLE
+from eomc.emit.c_function import CArgument, CFunction
+from eomc.emit.coefficients import literal, matrix, numbers, rounded
+from eomc.emit.fast import views
+from eomc.emit.fast.accelerations import Accelerations
+from eomc.emit.fast.lanes import INLINE, NOINLINE, Lane
+from eomc.emit.functions import Functions
+from eomc.emit.plain.views import Slopes
+from eomc.integrators.tableaux import METHODS, RK4, Method, Row
+
+FEWEST_OPERATIONS = 300  # of accelerations from which on a tile has one block
+
+
+@dataclass(frozen=True)
+class Steppers:
+    """The methods of a scene. accelerations: what they integrate, one number at a time or wide."""
+
+    accelerations: Accelerations
+    functions: Functions
+    slopes: Slopes | None
+
+    @cached_property
+    def one(self) -> Lane:
+        """The lane of one number."""
+        return Lane(self.accelerations)
+
+    @cached_property
+    def wide(self) -> Lane:
+        """The lane of a register."""
+        return Lane(self.accelerations, "wide")
+
+    @property
+    def two_point(self) -> bool:
+        """Whether one trajectory goes by the two-point form."""
+        return self.accelerations.parts is not None
+
+    @property
+    def predicted(self) -> bool:
+        """Whether RK4 predicts the angles of one trajectory."""
+        s = self.accelerations
+        return bool(s.angles) and s.target.real is DOUBLE and not self.two_point
+
+    @property
+    def methods(self) -> tuple[Method, ...]:
+        """Those that the scene asks for."""
+        return tuple(METHODS[name] for name in self.accelerations.target.system.run.methods)
+
+    @property
+    def shared_signals(self) -> bool:
+        """Whether the signals are of time alone, so that stages share them."""
+        target = self.accelerations.target
+        return "signal" in target.program and not target.signal_state
+
+    def accelerate(self, lane: Lane, **passed: str) -> str:
+        """A call of the accelerations of a lane, with other expressions for some arguments."""
+        if self.accelerations.angles:
+            passed = {"s": "NULL"} | passed
+        return lane.all_in_one.call(**passed)
+
+    def common(self, lane: Lane) -> dict[str, str]:
+        """What the templates of all methods name."""
+        target = lane.target
+        return {
+            "prefix": target.prefix, "PREFIX": target.PREFIX,
+            "real": self.accelerations.target.real.name,
+        }  # fmt: skip
+
+    def looping(self, lane: Lane) -> dict[str, str]:
+        """The same, of those with loops over coordinates."""
+        return self.common(lane) | {"unroll": lane.unroll}
+
+    def extended(self, lane: Lane) -> dict[str, str]:
+        """The same, of those with vectors of coordinates that accelerations take."""
+        return self.common(lane) | {"extent": lane.extent}
+
+    # what a step takes
+
+    def stepping(self, lane: Lane) -> tuple[CArgument, ...]:
+        """q, qd, t, h, u and the constants: those that this scene has."""
+        real = self.accelerations.target.real.name
+        names = [n for n in lane.there if n != "s"]
+        found = [lane.argument(n) for n in names]
+        place = next((k for k, n in enumerate(names) if n in "uc"), len(names))
+        return (*found[:place], CArgument(real, "h"), *found[place:])
+
+    def advanced(self, lane: Lane, name: str, *more: CArgument) -> CFunction:
+        """A function that computes what a step adds."""
+        out = tuple(c.filled(lane.real.name, n) for n in "rv")
+        return CFunction(
+            f"{lane.prefix}_{name}{lane.end}", lane.mask, (*out, *self.stepping(lane), *more)
+        )
+
+    # methods
+
+    def rk4(self, lane: Lane) -> views.RungeKutta4:
+        """RK4 over a lane."""
+        s, target = self.accelerations, lane.target
+        double, one = s.target.real is DOUBLE, not lane.name
+        two_point = one and self.two_point
+        count = len(s.angles)
+        signal = lane.signal.function if lane.signal else None
+        known = c.member("w", "k")
+        here = {"a": c.member("w", "a[k]"), "q": "at", "qd": "moving", "t": "t + node"}
+        return views.RungeKutta4(
+            **self.looping(lane),
+            extent=lane.extent,
+            inline=lane.qualifiers[INLINE],
+            noinline=lane.qualifiers[NOINLINE],
+            lane=lane.real.name,
+            mask=lane.mask,
+            L=lane.end,
+            timed=target.driven,
+            inputs=bool(target.system.inputs),
+            constants=bool(s.constants),
+            constants_type=lane.constants,
+            title=RK4.title,
+            source=RK4.source,
+            stability=stability(RK4),
+            angles=lane.angle_count if count else "",
+            count=count,
+            across=two_point,
+            sincos=lane.sincos,
+            largest=s.target.literal(0.125 if double else 0.25),
+            small=s.target.literal(0.015625 if double else 0.0625),
+            shared_signals=self.shared_signals,
+            signal_call=signal.call(u=c.member("w", "u[j]"), t="t + j*(h/2)") if signal else "",
+            signal_now=signal.call(u="now", q="at", qd="moving", t="t + node") if signal else "",
+            two_point=two_point,
+            velocity_call=lane.velocity.function.call(**here, k=f"&{known}", point="k % 2")
+            if two_point
+            else "",
+            stage_call=lane.all_in_one.call(**here),
+        )
+
+    def prediction(self) -> views.Predicted:
+        """The loop of RK4 whose angles are predicted."""
+        lane, s = self.one, self.accelerations
+        signal = lane.signal.function if lane.signal else None
+        shared = self.shared_signals
+
+        def stage(k: int) -> str:
+            names = ["&w", *(a.name for a in self.stepping(lane))]
+            named = {"q": "x.q", "qd": "x.qd", "u": "w.u[0]" if shared else "given"}
+            given = [str(k), "1", *(named.get(n, n) for n in names)]
+            return f"{lane.prefix}_rk4_stage({', '.join(given)})"
+
+        def signalled(place: str, time: str) -> str:
+            return signal.call(u=place, t=time) if signal and shared else ""
+
+        real = s.target.real.name
+        return views.Predicted(
+            **self.looping(lane),
+            inline=lane.qualifiers[INLINE],
+            noinline=lane.qualifiers[NOINLINE],
+            angles=len(s.angles),
+            timed=lane.target.driven,
+            inputs=bool(lane.target.system.inputs),
+            constants=bool(s.constants),
+            shared_signals=shared,
+            signal_first=signalled("w.u[2]", f"t0 + ({real})(first + n)*h"),
+            signal_mid=signalled("w.u[1]", "t + h/2"),
+            signal_end=signalled("w.u[2]", f"t0 + ({real})(first + n + 1)*h"),
+            stage=tuple(map(stage, range(4))),
+        )
+
+    def explicit(self, lane: Lane, m: Method) -> views.Explicit:
+        """An explicit method over a lane; RK4 has a text of its own."""
+        s, target, real = self.accelerations, lane.target, self.accelerations.target.real
+
+        def total(row: Row) -> str:
+            terms = [f"{literal(x, real)}*a[{k}][i]" for k, x in enumerate(row) if x]
+            return " + ".join(terms).replace("+ -", "- ") or literal(Fraction(0), real)
+
+        def stage(k: int, node: Fraction, positions: Row, velocities: Row) -> views.Stage:
+            here = {"q": "at", "qd": "moving", "t": f"t + {literal(node, real)}*h"}
+            start = k == 0 and not node
+            call = self.accelerate(lane, a=f"a[{k}]", **({} if start else here))
+            return views.Stage(
+                "" if start else literal(node, real), total(positions), total(velocities), call
+            )
+
+        found = zip(m.c, m.a_squared, m.a, strict=True)
+        return views.Explicit(
+            prefix=lane.prefix,
+            real=real.name,
+            unroll=lane.unroll,
+            extent=lane.extent,
+            inline=lane.qualifiers[INLINE if m.stages < 4 else NOINLINE],
+            lane=lane.real.name,
+            mask=lane.mask,
+            clear=lane.clear,
+            L=lane.end,
+            timed=target.driven,
+            inputs=bool(target.system.inputs),
+            constants=bool(s.constants),
+            constants_type=lane.constants,
+            name=m.name,
+            title=m.title,
+            source=m.source,
+            order=m.order,
+            notes=m.notes,
+            stability=stability(m),
+            stages=tuple(stage(k, *rest) for k, rest in enumerate(found)),
+            position=total(m.b_a),
+            velocity=total(rounded(m.b, real)),
+        )
+
+    def implicit(self, m: Method) -> CFunction:
+        """The step of an implicit method."""
+        lane = self.one
+        state = c.filled(f"{lane.prefix}_{m.name}_state", "m")
+        more = (self.functions.argument("p"),) if self.newton_p and m.newton else ()
+        made = self.advanced(lane, m.name, *more, state)
+        return CFunction(made.name, f"{lane.prefix}_status", made.arguments, qualifier="static")
+
+    @property
+    def newton_p(self) -> bool:
+        """Whether Newton's derivatives take the parameters."""
+        slopes = self.slopes
+        if slopes is None or not self.accelerations.target.needs_p:
+            return False
+        read = {a.name for a in slopes.slopes.function.arguments}
+        return "p" in read or bool(slopes.signal_call) or self.follows
+
+    @property
+    def follows(self) -> bool:
+        """Whether the signals answer the state."""
+        return self.accelerations.target.signal_state
+
+    def gauss(self, m: Method) -> views.Gauss:
+        """A method of Gauss and Legendre by Newton's iteration."""
+        lane, target, real, slopes = self.one, self.one.target, self.one.real, self.slopes
+        assert slopes is not None
+        f = self.functions
+        signal = f.signal if slopes.signal_call or self.follows else None
+        state = lane.argument
+        taken = [n for n in ("t", "u") if n in lane.there]
+        factor = CFunction(
+            f"{lane.prefix}_{m.name}_factor",
+            "void",
+            (
+                c.filled(f"{lane.prefix}_{m.name}_state", "m"), CArgument(real.name, "h"),
+                *map(state, ("q", "qd")), *map(state, taken),
+                *([f.argument("p")] if self.newton_p else []),
+            ),
+            qualifier="static",
+        )  # fmt: skip
+        read = {a.name for a in slopes.slopes.function.arguments}
+        read |= {a.name for a in signal.arguments} | {"u"} if signal else set()
+        return views.Gauss(
+            **self.extended(lane),
+            **self._literals,
+            nudge=target.literal(sqrt(real.epsilon)),
+            title=m.title,
+            source=m.source,
+            order=m.order,
+            notes=m.notes,
+            stages=m.stages,
+            c=numbers(m.c, real),
+            A=matrix(m.a, real),
+            AA=matrix(m.a_squared, real),
+            b=numbers(rounded(m.b, real), real),
+            bA=numbers(m.b_a, real),
+            extrapolation=matrix(m.ahead, real),
+            width=slopes.width,
+            factor=factor,
+            factor_unread=tuple(a.name for a in factor.arguments[2:] if a.name not in read),
+            signal_call=slopes.signal_call,
+            follows=signal.call(u="near_u", q="near_q", qd="near_qd")
+            if signal and self.follows
+            else "",
+            slopes_call=slopes.slopes_call,
+            solve=self.implicit(m),
+            factor_now=factor.call(),
+            factor_mid=factor.call(q="mid_q", qd="mid_qd", t="t + h/2"),
+            start=self.accelerate(lane, a="f"),
+            stage=self.accelerate(lane, a="f", q="at", qd="moving", t="t + c_[i]*h"),
+        )
+
+    @property
+    def _literals(self) -> dict[str, str]:
+        real = self.one.real
+        end = real.function_suffix
+        return {
+            "f": real.suffix, "fabs": f"fabs{end}", "fmax": f"fmax{end}",
+            "eps": self.one.target.literal(real.epsilon),
+        }  # fmt: skip
+
+    def sweeps(self, m: Method) -> views.Sweeps:
+        """A method of few sweeps, its stages in a lane each."""
+        lane, wide, real = self.one, self.wide, self.one.real
+        P = f"{lane.prefix}_{m.name}"
+        state = c.filled(f"{P}_state", "m")
+        values = c.filled(f"{P}_stages", "a")
+        given = self.stepping(lane)
+        sweep = CFunction(
+            f"{P}_sweep", "int",
+            (c.filled(f"{P}_stages", "b"), c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"),
+             *given),
+            qualifier="static",
+        )  # fmt: skip
+        settle = CFunction(
+            f"{P}_settle", f"{lane.prefix}_status",
+            (values, CArgument("int", "fresh"), *given, state), qualifier="static",
+        )  # fmt: skip
+
+        def by_stage(rows: Sequence[Row]) -> tuple[str, ...]:
+            return c.in_braces(numbers(column, real) for column in zip(*rows, strict=True))
+
+        within, before = f"&{P}_within", f"&{P}_extrapolated"
+        return views.Sweeps(
+            **self.extended(lane),
+            **self._literals,
+            # steps that five sweeps do not do are long, and err by more than this
+            enough=lane.target.literal(max(1e-8, real.epsilon)),
+            loose=f"{max(1e-6, 512 * real.epsilon):.0e}{real.suffix}",
+            inputs=bool(lane.target.system.inputs),
+            constants=bool(self.accelerations.constants),
+            members=self.accelerations.constants,
+            name=m.name,
+            title=m.title,
+            source=m.source,
+            notes=m.notes,
+            stability=stability(m),
+            stages=m.stages,
+            sweeps=m.sweeps,
+            padded=f"{max(m.stages, 64 // (8 if real is DOUBLE else 4))}",
+            c=numbers(m.c, real),
+            A=by_stage(m.a),
+            AA=by_stage(m.a_squared),
+            A_extrapolated=by_stage(m.a_ahead),
+            AA_extrapolated=by_stage(m.a_squared_ahead),
+            b=numbers(rounded(m.b, real), real),
+            bA=numbers(m.b_a, real),
+            sweep=sweep,
+            together=self.accelerate(
+                wide, a="f", q="at", qd="moving", t="t + nodes", u="u ? given : NULL", c="&wide"
+            ),
+            alone=self.accelerate(lane, a="one", q="x", qd="v", t="t + c_[i + j]*h"),
+            settle=settle,
+            settle_call=settle.call(a="&a", fresh="!smooth"),
+            sweep_settling=sweep.call(b="&b", a="a", w=within),
+            sweep_first=sweep.call(b="&a", a="&b", w=before),
+            sweep_back=sweep.call(b="&b", a="&a", w=within),
+            sweep_forth=sweep.call(b="&a", a="&b", w=within),
+            start=self.accelerate(lane, a="f"),
+            solve=self.implicit(m),
+        )
+
+    # runs and batches
+
+    def predicts(self, m: Method) -> bool:
+        """Whether a method predicts angles."""
+        return m is RK4 and self.predicted
+
+    def state(self, m: Method) -> views.State:
+        """What a run carries."""
+        lane = self.one
+        return views.State(
+            **self.extended(lane),
+            name=m.name,
+            title=m.title,
+            stages=m.stages,
+            predicted=self.predicts(m),
+            newton=m.newton,
+            sweeps=m.sweeps,
+            implicit=m.implicit,
+            inputs=bool(lane.target.system.inputs),
+        )
+
+    def kept(self, m: Method) -> int:
+        """Numbers of the state that the header gives room for."""
+        n, angles, s = len(self.one.target.names), len(self.accelerations.angles), m.stages
+        size = 4 * self.one.width + 32
+        if self.predicts(m):
+            size += n + 2 * angles + 5 * ahead_count(angles)
+        if m.newton:
+            size += s * n * (s * n + 2)
+        if m.sweeps:
+            size += s * n + len(self.one.target.input_names)
+        return size
+
+    @cached_property
+    def constants_call(self) -> str:
+        """The constants computed, where there is something to compute."""
+        made = self.one.compute_constants.function
+        idle = not self.accelerations.constants and sum(len(b.lines) for b in made.body) == 2
+        return "" if idle else made.call(c="&constants")
+
+    def loop(self, m: Method) -> views.Loop:
+        """A method's step and run."""
+        lane, s, public = self.one, self.accelerations, self.functions.public
+        run = public.run(m.name)
+        here = {"q": "x.q", "qd": "x.qd", "u": "given", "m": "&x"}
+        advance = self.implicit(m) if m.implicit else self.advanced(lane, m.name)
+        alone = self.advanced(lane, f"{m.name}_alone")
+        first = {"q": "x.q", "qd": "x.qd", "s": "&x.s", "u": "given", "a": "x.a"}
+        zeros = dict.fromkeys(("first", "every", "q_rows", "qd_rows", "memory", "u_stride"), "0")
+        predicted = ["&x", *(["t0"] if lane.target.driven else []), "h", "first", "n", "steps"]
+        predicted += ["u", "u_stride"] if lane.target.system.inputs else []
+        predicted += ["every", "q_rows", "qd_rows", *(["c"] if s.constants else [])]
+        return views.Loop(
+            **self.extended(lane),
+            name=m.name,
+            step=public.step(m.name),
+            run_once=run.call(**zeros, t0="t", steps="1", status="&status"),
+            run=run,
+            timed=lane.target.driven,
+            inputs=bool(lane.target.system.inputs),
+            constants=bool(s.constants),
+            unread_p=lane.target.needs_p
+            and not self.constants_call
+            and "p" not in {a.name for a in advance.arguments},
+            compute_constants=self.constants_call,
+            newton=m.newton,
+            implicit=m.implicit,
+            predicted=self.predicts(m),
+            start_call=lane.all_in_one.call(**first),
+            predicted_call=f"{lane.prefix}_rk4_predicted({', '.join(predicted)})",
+            advance=advance.call(**here),
+            otherwise=alone.call(**here) if m is RK4 and s.angles else "",
+        )
+
+    def batch(self, m: Method) -> views.Batch:
+        """A method's batch."""
+        lane, s = self.one, self.accelerations
+        rk4 = m is RK4
+        alone = self.advanced(lane, "rk4_alone" if rk4 and s.angles else m.name)
+        own = bool(self.constants_call) and lane.target.needs_p
+        return views.Batch(
+            **self.extended(lane),
+            noinline=lane.qualifiers[NOINLINE],
+            name=m.name,
+            batch=self.functions.public.batch(m.name),
+            rk4=rk4,
+            angles=bool(s.angles),
+            timed=lane.target.driven,
+            inputs=bool(lane.target.system.inputs),
+            shared_signals=self.shared_signals,
+            constants=bool(s.constants),
+            members=s.constants,
+            unread_p=lane.target.needs_p and not own,
+            own=own,
+            compute_constants=self.constants_call,
+            compute_own=lane.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
+            alone=alone.call(q="at", qd="moving", u="given"),
+        )
+
+
+def stability(m: Method) -> str:
+    """Up to which step a method is stable."""
+    undamped, decay = m.limits
+    return f"h omega <= {undamped:.3g} undamped" + (
+        f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."
+    )
+
+
+def ahead_count(angles: int) -> int:
+    """Numbers of the lane for predicted angles: two each, to a power of two."""
+    return 1 << (2 * angles - 1).bit_length()

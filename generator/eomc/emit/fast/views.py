@@ -1,0 +1,376 @@
+"""What the templates of the fast form of C ask for: one frozen view each, values only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from eomc.base.texts import FreeText
+from eomc.emit.c_function import CFunction
+from eomc.emit.plain.views import Computed, Parameter
+
+
+@dataclass(frozen=True)
+class Library:
+    """A function of the mathematics library over a lane. two: of two arguments."""
+
+    name: str
+    c: str
+    two: bool
+
+
+@dataclass(frozen=True)
+class Source:
+    """c/fast/source.c.jinja. slopes, lanes, steppers: the finished texts of the views below."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/source.c"
+    title: FreeText
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    PREFIX: str
+    real: str
+    rolled: bool
+    unroll: str
+    extent: str
+    inline: str
+    handshake: str
+    wide: bool
+    csrc: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+    q0: tuple[str, ...]
+    qd0: tuple[str, ...]
+    evaluations: tuple[Computed, ...]
+    acceleration: Computed
+    solved: tuple[str, ...]
+    slopes: str
+    lanes: tuple[str, ...]
+    steppers: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class LaneText:
+    """c/fast/lane.c.jinja. angles: their number, in C. rates: finished text."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/lane.c"
+    prefix: str
+    PREFIX: str
+    unroll: str
+    inline: str
+    lane: str
+    mask: str
+    clear: str
+    L: str
+    calls: tuple[Library, ...]
+    constants: str
+    angles: str
+    count: int
+    angles_at: CFunction
+    changes: CFunction
+    sincos: str
+    signal: Computed | None
+    signal_call: str
+    rates: str
+    rates_call: str
+    accelerations: CFunction
+    two_point: bool
+    takes_c: bool
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """c/fast/blocks.c.jinja: instances of a batch that are stepped together."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/blocks.c"
+    prefix: str
+    PREFIX: str
+    lane: str
+    inputs: bool
+    constants: str
+    blocks: int
+
+
+@dataclass(frozen=True)
+class TwoPoints:
+    """c/fast/two_point.c.jinja. coordinates: whether the configuration reads q itself."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/two_point.c"
+    prefix: str
+    extent: str
+    real: str
+    inline: str
+    members: str
+    angles: str
+    configuration: Computed
+    constants: bool
+    call: str
+    velocity: Computed
+
+
+@dataclass(frozen=True)
+class RungeKutta4:
+    """c/fast/rk4.c.jinja. across: angles go into the registers of the wide lane together."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/rk4.c"
+    prefix: str
+    PREFIX: str
+    unroll: str
+    extent: str
+    real: str
+    inline: str
+    noinline: str
+    lane: str
+    mask: str
+    L: str
+    timed: bool
+    inputs: bool
+    constants: bool
+    constants_type: str
+    title: str
+    source: str
+    stability: str
+    angles: str
+    count: int
+    across: bool
+    sincos: str
+    largest: str
+    small: str
+    shared_signals: bool
+    signal_call: str
+    signal_now: str
+    two_point: bool
+    velocity_call: str
+    stage_call: str
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """c/fast/predicted.c.jinja. stage: the calls of the four stages."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/predicted.c"
+    prefix: str
+    PREFIX: str
+    unroll: str
+    real: str
+    inline: str
+    noinline: str
+    angles: int
+    timed: bool
+    inputs: bool
+    constants: bool
+    shared_signals: bool
+    signal_first: str
+    signal_mid: str
+    signal_end: str
+    stage: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of an explicit method: its node, the sums over earlier ones, its call."""
+
+    node: str
+    positions: str
+    velocities: str
+    call: str
+
+
+@dataclass(frozen=True)
+class Explicit:
+    """c/fast/explicit.c.jinja."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/explicit.c"
+    prefix: str
+    unroll: str
+    extent: str
+    real: str
+    inline: str
+    lane: str
+    mask: str
+    clear: str
+    L: str
+    timed: bool
+    inputs: bool
+    constants: bool
+    constants_type: str
+    name: str
+    title: str
+    source: str
+    order: int
+    notes: tuple[str, ...]
+    stability: str
+    stages: tuple[Stage, ...]
+    position: str
+    velocity: str
+
+
+@dataclass(frozen=True)
+class Factors:
+    """c/fast/lu.c.jinja."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/lu.c"
+    prefix: str
+    real: str
+    fabs: str
+    f: str
+
+
+@dataclass(frozen=True)
+class Gauss:
+    """c/fast/gauss.c.jinja: tableau, functions, calls. f: the suffix of literals."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/gauss.c"
+    prefix: str
+    PREFIX: str
+    extent: str
+    real: str
+    f: str
+    fabs: str
+    fmax: str
+    eps: str
+    nudge: str
+    title: str
+    source: str
+    order: int
+    notes: tuple[str, ...]
+    stages: int
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    extrapolation: tuple[str, ...]
+    width: str
+    factor: CFunction
+    factor_unread: tuple[str, ...]
+    signal_call: str
+    follows: str
+    slopes_call: str
+    solve: CFunction
+    factor_now: str
+    factor_mid: str
+    start: str
+    stage: str
+
+
+@dataclass(frozen=True)
+class Sweeps:
+    """c/fast/sweeps.c.jinja: tableau, functions, calls. padded: stages, to whole registers."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/sweeps.c"
+    prefix: str
+    PREFIX: str
+    extent: str
+    real: str
+    f: str
+    fabs: str
+    fmax: str
+    eps: str
+    enough: str
+    loose: str
+    inputs: bool
+    constants: bool
+    members: tuple[str, ...]
+    name: str
+    title: str
+    source: str
+    notes: tuple[str, ...]
+    stability: str
+    stages: int
+    sweeps: int
+    padded: str
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    A_extrapolated: tuple[str, ...]
+    AA_extrapolated: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    sweep: CFunction
+    together: str
+    alone: str
+    settle: CFunction
+    settle_call: str
+    sweep_settling: str
+    sweep_first: str
+    sweep_back: str
+    sweep_forth: str
+    start: str
+    solve: CFunction
+
+
+@dataclass(frozen=True)
+class State:
+    """c/fast/state.c.jinja: what a run of a method carries."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/state.c"
+    prefix: str
+    PREFIX: str
+    extent: str
+    real: str
+    name: str
+    title: str
+    stages: int
+    predicted: bool
+    newton: bool
+    sweeps: int
+    implicit: bool
+    inputs: bool
+
+
+@dataclass(frozen=True)
+class Loop:
+    """c/fast/run.c.jinja. advance: one step; otherwise: where that failed, without shortcuts."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/run.c"
+    prefix: str
+    PREFIX: str
+    extent: str
+    real: str
+    name: str
+    step: CFunction
+    run_once: str
+    run: CFunction
+    timed: bool
+    inputs: bool
+    constants: bool
+    unread_p: bool
+    compute_constants: str
+    newton: bool
+    implicit: bool
+    predicted: bool
+    start_call: str
+    predicted_call: str
+    advance: str
+    otherwise: str
+
+
+@dataclass(frozen=True)
+class Batch:
+    """c/fast/batch.c.jinja. own: whether instances may have constants of their own."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/batch.c"
+    prefix: str
+    PREFIX: str
+    extent: str
+    real: str
+    noinline: str
+    name: str
+    batch: CFunction
+    rk4: bool
+    angles: bool
+    timed: bool
+    inputs: bool
+    shared_signals: bool
+    constants: bool
+    members: tuple[str, ...]
+    unread_p: bool
+    own: bool
+    compute_constants: str
+    compute_own: str
+    alone: str
+
+
+View = (
+    Source | LaneText | Blocks | TwoPoints | RungeKutta4 | Predicted | Explicit | Factors | Gauss
+    | Sweeps | State | Loop | Batch
+)  # fmt: skip

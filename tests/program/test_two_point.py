@@ -1,0 +1,318 @@
+"""Two-point RK4: an acceleration in two parts, one of them for two configurations at once."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import mpmath
+import numpy as np
+import pytest
+from cases import fast_kit, scene_system
+from conftest import Modules, tiers
+from sympy import S
+
+import eomc
+from eomc.derive import lagrange
+from eomc.derive.tape import Stage
+from eomc.emit.c_expression import DOUBLE
+from eomc.emit.c_names import Target
+from eomc.emit.fast.lanes import Accelerations
+from eomc.model import from_scene as system
+from eomc.program import program, two_point
+from eomc.program.ir import Assignment, Operand, Product, Sum
+from eomc.scene import read as scene
+from eomc.verify import symbolic
+
+# angles alone, as sums, with a number, with a parameter and times a coordinate; a coordinate that
+# is no angle; time, feedback and friction
+ODD = """
+eomc = 1
+name = "odd"
+[coordinates]
+x = { start = 0.3, rate = 0.2 }
+a = { start = 0.4, rate = -1.0 }
+b = { start = -0.7, rate = 0.6 }
+c = { start = 1.1 }
+d = { start = 2.0, rate = 0.4 }
+e = { start = -0.2 }
+[parameters]
+phase = 0.3
+m = 1.2
+[inputs]
+u = { signal = "0.3*sin(2*t) - 0.1*a_dot + 0.05*c - m*x/20" }
+w = { signal = "0.1*cos(t)" }
+[definitions]
+K1 = "m*x_dot**2*(2 + x**2/10)/2 + a_dot**2 + b_dot**2 + c_dot**2 + d_dot**2 + 2*e_dot**2"
+K2 = "a_dot*b_dot*cos(a - b)/3 + b_dot*c_dot*sin(b + 1/2)/4 + x_dot*c_dot*cos(c + phase)/5"
+P = "cos(2*a) + sin(b + 1/2) + cos(c + phase)/2"
+K3 = "c_dot*d_dot*cos(c - d)/3 + d_dot*e_dot*cos(2*e)/4 + t*x_dot/9"
+[energy]
+kinetic = "K1 + K2 + K3"
+potential = "P + sin(a*b)/4 + x**2*(1 + cos(3*t)/5) + cos(d)"
+[forces]
+a = "u"
+e = "w - 0.1*e_dot*abs(e_dot)"
+x = "-x_dot*u/10"
+[run]
+h = 0.01
+"""
+
+
+# without inertia about f where a is 0
+POLES = """
+eomc = 1
+name = "poles"
+[coordinates]
+a = { start = 0.0 }
+b = { start = 0.7 }
+c = { start = 0.9 }
+d = { start = 1.1 }
+e = { start = 1.3 }
+f = { start = 0.0, rate = 1.0 }
+[energy]
+kinetic = "a_dot**2 + b_dot**2 + c_dot**2 + d_dot**2 + e_dot**2 + sin(a)**2*f_dot**2 + K"
+potential = "cos(b) + cos(c) + cos(d) + cos(e)"
+[definitions]
+K = "b_dot*c_dot*cos(b - c)/2 + c_dot*d_dot*cos(c - d)/2 + d_dot*e_dot*cos(d - e)/2"
+"""
+
+
+@cache
+def odd(run: str = "") -> system.System:
+    return system.from_scene(scene.parse(ODD + run, "odd.toml"))
+
+
+def chain(links: int) -> str:
+    """Point masses on links with absolute angles, let go at rest."""
+    numbers = range(1, links + 1)
+    angles = "".join(f"a{k} = {{ start = {0.3 + 0.1 * k:.1f} }}\n" for k in numbers)
+    places = 'x0 = "0"\ny0 = "0"\n'
+    for k in numbers:
+        places += f'x{k} = "x{k - 1} + l*sin(a{k})"\ny{k} = "y{k - 1} - l*cos(a{k})"\n'
+    kinetic = " + ".join(f"dot(x{k})**2 + dot(y{k})**2" for k in numbers)
+    height = " + ".join(f"y{k}" for k in numbers)
+    return (
+        f'eomc = 1\nname = "links{links}"\n[coordinates]\n{angles}'
+        f"[parameters]\nm = 1.0\nl = 1.0\ng = 9.81\n[definitions]\n{places}"
+        f'[energy]\nkinetic = "m*({kinetic})/2"\npotential = "m*g*({height})"\n'
+    )
+
+
+def with_run(text: str, name: str, run: str) -> str:
+    """The scene under a name of its own, with this under [run]."""
+    head = text.partition("[run]")[0].replace('name = "', f'name = "{name}')
+    return f"{head}[run]\n{run}\n"
+
+
+def many(text: str) -> str:
+    """The scene with batches, and with a method of order 8."""
+    return with_run(text, "many_", 'batch = true\nmethod = ["rk4", "dp8"]')
+
+
+def test_parts_are_the_whole() -> None:
+    """What stands in the first part hangs on neither time, inputs nor velocities."""
+    accelerations = Accelerations(Target(program.build(lagrange.derive(odd())), DOUBLE))
+    function, parts = accelerations.whole, accelerations.parts
+    assert parts is not None and len(accelerations.angles) >= two_point.FEWEST
+    sines = {name for a in accelerations.angles for name in (a.sine, a.cosine)}
+    early = {"phase", "m", *(a.name for a in function.early)}
+    assert parts.configuration.uses <= {"x", "a", "b", "c", "d", "e"} | sines | early
+    place = {"x", "a", "b", "c", "d", "e"} | sines | {a.name for a in parts.configuration.body}
+    for a in parts.velocity.body:
+        assert not place.issuperset(set(a.value.names) - early)
+        if isinstance(a.value, Product):  # one factor of all that the place decides
+            known = [name for name in a.value.factors if name in place | early]
+            assert len(known) <= 1 or place.isdisjoint(known)
+            assert abs(a.value.coefficient) == 1 or place.isdisjoint(known)
+    assert {o.name for o in parts.configuration.outputs} == set(parts.handed)
+    assert set(parts.handed) <= parts.velocity.uses
+    assert len(parts.configuration.checks) + len(parts.velocity.checks) <= len(function.checks)
+
+
+def test_what_is_known_last_comes_last() -> None:
+    """And of two products the one known later stands first, where it is fused with the sum."""
+    u, v, late, last = ((S.One, name) for name in ("u", "v", "late", "last"))
+    values = {
+        "late": Product(S.One, ("u", "v")),
+        "last": Sum((late, v)),
+        "sum": Sum((last, u, late)),
+        "soon": Product(S.One, ("u", "u")),
+        "then": Product(S.One, ("last", "v")),
+        "both": Sum(((S.One, "soon"), (S.NegativeOne, "then"))),
+    }
+    function = Target(program.build(lagrange.derive(odd())), DOUBLE).program["acceleration"]
+    body = tuple(Assignment(name, value, Stage.VELOCITY) for name, value in values.items())
+    outputs = (Operand(S.One, "sum"), Operand(S.One, "both"))
+    made = two_point._last_come_last(replace(function, body=body, outputs=outputs))
+    found = {a.name: a.value for a in made.body}
+    assert found["sum"] == Sum((u, late, last))
+    assert found["both"] == Sum(((S.NegativeOne, "then"), (S.One, "soon")))
+
+
+MORE = """
+eomc = 1
+name = "more"
+[coordinates]
+a = { start = 0.3, rate = 0.7 }
+b = { start = -0.4, rate = 0.2 }
+c = { start = 1.2 }
+d = { start = 0.9, rate = -0.6 }
+e = { start = -1.3 }
+[energy]
+kinetic = "a_dot**2 + b_dot**2*(2 + cos(a)) + c_dot**2*(2 + cos(b)) + d_dot**2 + e_dot**2*L"
+potential = "cos(a) + cos(b) + cos(c) + cos(d) + cos(e) + sin(a + b)"
+[definitions]
+L = "2 + cos(d)*sin(c)/2"
+[run]
+h = 0.01
+"""
+
+
+def test_more_angles_than_coordinates(modules: Modules) -> None:
+    """Every coordinate is an angle, and a sum of two is one more."""
+    module = modules.of_text(MORE)
+    trusted = symbolic.of(system.from_scene(scene.parse(MORE, "more.toml")))
+    _, q, qd = trusted.simulate(h=0.01, steps=50)
+    run = module.simulate(h=0.01, steps=50)
+    np.testing.assert_allclose(run.q, q, rtol=1e-11)
+    np.testing.assert_allclose(run.qd, qd, rtol=1e-10, atol=1e-11)
+
+
+def test_few_angles_and_light_configurations_stay_whole() -> None:
+    def source(name: str) -> str:
+        return eomc.sources(scene_system(name)).files[f"fast/{name}.c"]
+
+    for name in ("cartpole", "double_pendulum", "tumbling_box", "suspension"):
+        assert "_configuration;" not in source(name)
+    assert "} chain_configuration;" in source("chain")
+
+
+@pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.2, 0.45), 0.02, 0.45))
+def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modules) -> None:
+    """Turned by little, by nearly what is allowed, by more: then sines are computed anew."""
+    module, trusted = modules.of_text(ODD), symbolic.derive(odd())
+    for u in (None, [0.2, -0.1]):
+        run = module.simulate(h=h, steps=12, u=u)
+        _, q, qd = trusted.simulate(h=h, steps=12, u=u)
+        scale = np.abs(qd).max() + 1
+        np.testing.assert_allclose(run.q, q, rtol=1e-11, atol=1e-12 * scale)
+        np.testing.assert_allclose(run.qd, qd, rtol=1e-11, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("links", tiers((5, 8), 5))
+def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
+    module = modules.of_text(chain(links))
+    made = system.from_scene(scene.parse(chain(links), "links.toml"))
+    trusted = symbolic.of(made)
+    _, q, qd = trusted.simulate(h=0.002, steps=50)
+    run = module.simulate(h=0.002, steps=50)
+    np.testing.assert_allclose(run.q, q, rtol=1e-11)
+    np.testing.assert_allclose(run.qd, qd, rtol=1e-10, atol=1e-11)
+
+
+def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
+    """Where reduction by pi/2 in parts has no digit left."""
+    module = modules.of_text(chain(5))
+    trusted = symbolic.of(system.from_scene(scene.parse(chain(5), "links.toml")))
+    q = np.array([3e15, -2e12, 1e9, 7e22, 0.5])
+    qd = np.linspace(-1, 1, 5)
+    expected = trusted.acceleration(q, qd)
+    np.testing.assert_allclose(module.acceleration(q, qd), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("at", [0, 4])
+def test_steps_at_an_angle_too_wide_to_move(at: int, modules: Modules) -> None:
+    """Of 7e22 rad, where numbers are 8e6 apart; the other links swing about it."""
+    module = modules.of_text(chain(5))
+    trusted = symbolic.of(system.from_scene(scene.parse(chain(5), "links.toml")))
+    start, rates = module.start
+    start[at] = 7e22
+    _, q, _ = trusted.simulate(start, rates, h=0.01, steps=20)
+    run = module.simulate(start, rates, h=0.01, steps=20)
+    assert (run.q[:, at] == 7e22).all()
+    # whether it has rotated by h^2 a inside a step its numbers do not tell; a wrong sine makes 0.1
+    np.testing.assert_allclose(run.q, q, rtol=0, atol=1e-4)
+
+
+def test_faults_are_told(modules: Modules) -> None:
+    """A singular D, by parameters or at a place; a state that is not finite: each with the last
+    good state."""
+    module = modules.of_text(chain(5))
+    q, qd = module.start
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        singular = module.simulate(h=0.01, steps=3, params={"m": 0.0})
+        fast = module.simulate(q, qd + 1e160, h=0.5, steps=20)
+        poles = modules.of_text(POLES).simulate(h=0.01, steps=3)
+    found = singular.status, poles.status, fast.status
+    assert found == ("singular", "singular", "not finite")
+    for run in (singular, poles, fast):
+        assert len(run.q) == 1
+        assert np.isfinite(run.q).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [ODD, chain(6)], ids=["odd", "chain"])
+def test_all_that_shares_it_agrees(text: str, modules: Modules) -> None:
+    """Batches and other steppers, over the same two parts."""
+    module = modules.of_text(many(text))
+    q, qd = module.start
+    starts = q + 0.02 * np.arange(40)[:, None] * np.linspace(-1, 1, len(q))
+    moving = np.tile(qd, (40, 1))
+    for h in (0.01, 0.05):
+        batch = module.simulate_batch(starts, moving, h, steps=20)
+        assert set(batch.status) == {"ok"}
+        for k in (0, 17, 39):
+            alone = module.simulate(starts[k], qd, h=h, steps=20)
+            np.testing.assert_allclose(batch.q[k, -1], alone.q[-1], rtol=1e-10, atol=1e-11)
+    stiff = with_run(text, "stiff_", 'method = ["rk4", "gauss8", "gauss16"]')
+    implicit = modules.of_text(stiff)
+    expected = module.simulate(h=0.005, steps=100, method="dp8").x[-1]
+    for method in ("gauss8", "gauss16"):
+        run = implicit.simulate(h=0.005, steps=100, method=method)
+        np.testing.assert_allclose(run.x[-1], expected, rtol=1e-9, atol=1e-10)
+
+
+def test_steps_take_it_and_predict_no_angles() -> None:
+    source = fast_kit(eomc.sources(system.from_scene(scene.parse(chain(10), "links.toml"))))
+    for name in ("links10.c", "links10.h"):
+        assert "predicted" not in source[name]
+    # stages 0 and 2, each for two points: in the step, and in all the accelerations for themselves
+    assert source["links10.c"].count("links10_both_configurations(&w->k, at, next") == 1
+    assert source["links10.c"].count("links10_both_configurations(&k, q, q, s, s") == 1
+
+
+@pytest.mark.slow
+def test_sums_are_compensated_in_the_two_point_form(modules: Modules) -> None:
+    """130,000 steps, so short that rounding is all of their error, beside 256 of order 8.
+
+    Both are then off by some units of rounding, 2^-53 of numbers near 1, that the motion makes five
+    or ten of in a second; with plain sums it is some hundreds, the root of the number of steps.
+    """
+    module = modules.of_text(many(chain(6)))
+    short = module.simulate(h=2.0**-17, steps=2**17, every=2**17)
+    few = module.simulate(h=2.0**-8, steps=2**8, method="dp8")
+    assert np.abs(short.x[-1] - few.x[-1]).max() < 60 * 2.0**-53
+
+
+def test_weights_add_up_to_one_in_the_two_point_form(modules: Modules) -> None:
+    """An oscillator beside five angles: a step of it is a linear map, its power the answer.
+
+    In 326 turns a relative error of h/6, 2^-54, makes 1e-13.
+    """
+    text = MORE.replace('"more"', '"beside"').replace("[energy]", "x = { start = 1.0 }\n[energy]")
+    text = text.replace('kinetic = "', 'kinetic = "x_dot**2/2 + ')
+    module = modules.of_text(text.replace('potential = "', 'potential = "2*x**2 + '))
+    steps = 2**20
+    with mpmath.workdps(50):
+        z = mpmath.matrix([[0, 1], [-4, 0]]) / 1024
+        step = mpmath.eye(2) + z + z**2 / 2 + z**3 / 6 + z**4 / 24
+        exact = step**steps * mpmath.matrix([1, 0])
+        run = module.simulate(h=1 / 1024, steps=steps, every=steps)
+        found = run.q[-1, -1], run.qd[-1, -1]
+        off = max(abs(mpmath.mpf(float(x)) - y) for x, y in zip(found, exact, strict=True))
+    fma = "fma" in Path("/proc/cpuinfo").read_text(encoding="utf-8")  # for what h/6 lacks
+    assert off < (1e-14 if fma else 2e-13)
