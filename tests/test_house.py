@@ -99,3 +99,15 @@ def test_what_lies_beside_a_built_module_needs_no_eomc() -> None:
     for name in modules():
         if room(name) == "runtime":
             assert not list(imports(name)), name
+
+
+MODULE, FUNCTION = 450, 80  # lines
+
+
+@pytest.mark.parametrize("name", modules())
+def test_rooms_are_small(name: str) -> None:
+    text = modules()[name].read_text(encoding="utf-8")
+    assert text.count("\n") <= MODULE
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef) and node.end_lineno is not None:
+            assert node.end_lineno - node.lineno < FUNCTION, node.name

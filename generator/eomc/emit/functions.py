@@ -48,6 +48,11 @@ class Functions:
         return self.target.real.name
 
     @property
+    def names(self) -> dict[str, str]:
+        """What nearly every view begins with."""
+        return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
+
+    @property
     def NQ(self) -> str:
         """The number of coordinates, in C."""
         return f"{self.PREFIX}_NQ"

@@ -15,10 +15,11 @@ from eomc.emit import c_function as c
 from eomc.emit import heading
 from eomc.emit.c_expression import C_NAMES, DOUBLE
 from eomc.emit.c_names import Target
-from eomc.emit.fast import views
+from eomc.emit.fast import runs, views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, Lane
-from eomc.emit.fast.steppers import FEWEST_OPERATIONS, Steppers, ahead_count
+from eomc.emit.fast.runs import ahead_count
+from eomc.emit.fast.steppers import FEWEST_OPERATIONS, Steppers
 from eomc.emit.functions import Functions, parameters
 from eomc.emit.plain import steppers as plain
 from eomc.emit.plain import views as plain_views
@@ -38,7 +39,7 @@ def files(target: Target, show: Show) -> dict[str, str]:
     slopes = plain.linearization(functions)
     made = Steppers(accelerations, functions, slopes)
     stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"
-    rooms = [made.kept(m) for m in made.methods]
+    rooms = [runs.kept(made, m) for m in made.methods]
     header = show(plain.header(functions, slopes, stamp, rooms))
     source = show(
         views.Source(
@@ -146,7 +147,7 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
     constants = c.struct(lane.constants, lane.real.name, s.constants) if s.constants else ""
     parts = s.parts if not lane.name else None
     rates = lane.rates.text if parts is None else show(_two_points(made)).rstrip("\n")
-    computed = lane.compute_constants.text if not lane.name and made.constants_call else ""
+    computed = lane.compute_constants.text if not lane.name and runs.constants_call(made) else ""
     text = show(
         views.LaneText(
             prefix=target.prefix,
@@ -217,14 +218,14 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
             yield from (show(made.rk4(lane)) for lane in lanes)
         elif not m.implicit:
             yield from (show(made.explicit(lane, m)) for lane in lanes)
-        if made.predicts(m):
-            prediction, state = show(made.prediction()), show(made.state(m))
+        if runs.predicts(made, m):
+            prediction, state = show(made.prediction()), show(runs.state(made, m))
             at = prediction.index("/*\n * Steps of RK4")
             yield prediction[:at] + state + "\n" + prediction[at:]
         else:
-            yield show(made.state(m))
+            yield show(runs.state(made, m))
         if m.implicit:
             yield show(made.sweeps(m) if m.sweeps else made.gauss(m))
-        yield show(made.loop(m))
+        yield show(runs.loop(made, m))
         if batch:
-            yield show(made.batch(m))
+            yield show(runs.batch(made, m))

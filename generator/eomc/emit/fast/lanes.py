@@ -207,21 +207,33 @@ class Lane:
         where = dict(self.where if constants is None else constants)
         for _, names, form in extra:
             where |= {n: form.format(n) for n in names}
-        parts: tuple[outline.Piece, ...] = ()
+        whole = CFunction(
+            f"{self.prefix}_{what}{self.end}",
+            self.mask,
+            (*([out] if out else []), *(a for a, _ in given)),
+            qualifier=self.qualifiers[INLINE],
+            doc=(doc,) if doc else (),
+        )
         if outline.is_large(function):
-            parts = outline.split(function, outline.PIECE)
-        name = f"{self.prefix}_{what}{self.end}"
-        outs = [out] if out else []
-        arguments = (*outs, *(a for a, _ in given))
-        if not parts:
-            body = self.target.body(function, where, in_order=in_order)
-            return Computed(
-                CFunction(
-                    name, self.mask, arguments, self._statements(function, body, places),
-                    frozenset(a.name for a in outs) | self._read(function, given),
-                    self.qualifiers[INLINE], (doc,) if doc else (),
-                )
-            )  # fmt: skip
+            return self._in_pieces(whole, function, what, out, places, given, where, in_order)
+        body = self.target.body(function, where, in_order=in_order)
+        reads = {a.name for a in whole.arguments[:1] if a is out} | self._read(function, given)
+        statements = self._statements(function, body, places)
+        return Computed(replace(whole, body=statements, reads=frozenset(reads)))
+
+    def _in_pieces(
+        self,
+        whole: CFunction,
+        function: Function,
+        what: str,
+        out: CArgument | None,
+        places: Sequence[str],
+        given: Sequence[tuple[CArgument, frozenset[str]]],
+        where: Mapping[str, str],
+        in_order: bool,
+    ) -> Computed:
+        """A long function as a call of its pieces, which hand values on in a struct."""
+        parts = outline.split(function, outline.PIECE)
         handed = {n: c.member("v", n) for part in parts for n in part.keeps}
         values = f"{self.prefix}_{what}_values{self.end}"
         made: list[CFunction] = []
@@ -229,39 +241,34 @@ class Lane:
         for k, part in enumerate(parts, 1):
             f = part.function
             body = self.target.body(
-                f, where | {n: handed[n] for n in part.reads},
+                f, dict(where) | {n: handed[n] for n in part.reads},
                 stored={n: handed[n] for n in part.keeps}, pivots=len(function.checks),
                 in_order=in_order,
             )  # fmt: skip
-            needed = [a for a, names in given if names & f.uses]
             head = [c.filled(values, "v")] if part.reads or part.keeps else []
-            head += outs if part.outputs else []
+            head += [out] if out and part.outputs else []
+            arguments = (*head, *(a for a, names in given if names & f.uses))
             fails = self._fails(body)
             piece = CFunction(
                 f"{self.prefix}_{what}_{k}{self.end}",
                 self.mask if fails else "void",
-                (*head, *needed),
+                arguments,
                 self._statements(f, body, [places[n] for n in part.outputs], fails),
-                frozenset(a.name for a in (*head, *needed)),
+                frozenset(a.name for a in arguments),
                 self.qualifiers[NOINLINE],
                 (f"{what}, {k} of {len(parts)}: {outline.weight(f)} operations.",),
             )
             made.append(piece)
             calls += c.note([piece.call(v="&v")]) if fails else [c.do(piece.call(v="&v"))]
-        locals_ = Block(
-            "", (c.local(self.mask, f"failed = {self.clear}"), *(
-                [c.local(values, "v")] if handed else []))
-        )  # fmt: skip
         if self.padded and out == self.out:
             calls += [c.assign(f"a[{k}]", self.target.zero) for k in range(len(places), self.width)]
-        whole = CFunction(
-            name, self.mask, arguments,
-            (locals_, Block("", tuple(calls)), Block("", (c.result("failed"),))),
-            frozenset(a.name for f in made for a in f.arguments),
-            self.qualifiers[INLINE], (doc,) if doc else (),
-        )  # fmt: skip
+        locals_ = [c.local(self.mask, f"failed = {self.clear}")]
+        locals_ += [c.local(values, "v")] if handed else []
+        blocks = (locals_, calls, [c.result("failed")])
+        reads = frozenset(a.name for f in made for a in f.arguments)
         struct = c.struct(values, self.real.name, list(handed)) if handed else ""
-        return Computed(whole, tuple(made), struct)
+        body_ = tuple(Block("", tuple(lines)) for lines in blocks)
+        return Computed(replace(whole, body=body_, reads=reads), tuple(made), struct)
 
     def _fails(self, body: Body) -> bool:
         return bool(body.failures or body.early_failures or (self.name and body.sincos))

@@ -18,6 +18,7 @@ from eomc.emit.fast.lanes import INLINE, NOINLINE, Lane
 from eomc.emit.functions import Functions
 from eomc.emit.plain.views import Slopes
 from eomc.integrators.tableaux import METHODS, RK4, Method, Row
+from eomc.program import two_point
 
 FEWEST_OPERATIONS = 300  # of accelerations from which on a tile has one block
 
@@ -49,7 +50,8 @@ class Steppers:
     def predicted(self) -> bool:
         """Whether RK4 predicts the angles of one trajectory."""
         s = self.accelerations
-        return bool(s.angles) and s.target.real is DOUBLE and not self.two_point
+        few = 0 < len(s.angles) < two_point.FEWEST
+        return few and s.target.real is DOUBLE and not self.two_point
 
     @property
     def methods(self) -> tuple[Method, ...]:
@@ -68,21 +70,13 @@ class Steppers:
             passed = {"s": "NULL"} | passed
         return lane.all_in_one.call(**passed)
 
-    def common(self, lane: Lane) -> dict[str, str]:
-        """What the templates of all methods name."""
-        target = lane.target
-        return {
-            "prefix": target.prefix, "PREFIX": target.PREFIX,
-            "real": self.accelerations.target.real.name,
-        }  # fmt: skip
-
     def looping(self, lane: Lane) -> dict[str, str]:
-        """The same, of those with loops over coordinates."""
-        return self.common(lane) | {"unroll": lane.unroll}
+        """What templates with loops over coordinates name."""
+        return self.functions.names | {"unroll": lane.unroll}
 
     def extended(self, lane: Lane) -> dict[str, str]:
-        """The same, of those with vectors of coordinates that accelerations take."""
-        return self.common(lane) | {"extent": lane.extent}
+        """And those with vectors of coordinates that accelerations take."""
+        return self.functions.names | {"extent": lane.extent}
 
     # what a step takes
 
@@ -358,105 +352,6 @@ class Steppers:
             solve=self.implicit(m),
         )
 
-    # runs and batches
-
-    def predicts(self, m: Method) -> bool:
-        """Whether a method predicts angles."""
-        return m is RK4 and self.predicted
-
-    def state(self, m: Method) -> views.State:
-        """What a run carries."""
-        lane = self.one
-        return views.State(
-            **self.extended(lane),
-            name=m.name,
-            title=m.title,
-            stages=m.stages,
-            predicted=self.predicts(m),
-            newton=m.newton,
-            sweeps=m.sweeps,
-            implicit=m.implicit,
-            inputs=bool(lane.target.system.inputs),
-        )
-
-    def kept(self, m: Method) -> int:
-        """Numbers of the state that the header gives room for."""
-        n, angles, s = len(self.one.target.names), len(self.accelerations.angles), m.stages
-        size = 4 * self.one.width + 32
-        if self.predicts(m):
-            size += n + 2 * angles + 5 * ahead_count(angles)
-        if m.newton:
-            size += s * n * (s * n + 2)
-        if m.sweeps:
-            size += s * n + len(self.one.target.input_names)
-        return size
-
-    @cached_property
-    def constants_call(self) -> str:
-        """The constants computed, where there is something to compute."""
-        made = self.one.compute_constants.function
-        idle = not self.accelerations.constants and sum(len(b.lines) for b in made.body) == 2
-        return "" if idle else made.call(c="&constants")
-
-    def loop(self, m: Method) -> views.Loop:
-        """A method's step and run."""
-        lane, s, public = self.one, self.accelerations, self.functions.public
-        run = public.run(m.name)
-        here = {"q": "x.q", "qd": "x.qd", "u": "given", "m": "&x"}
-        advance = self.implicit(m) if m.implicit else self.advanced(lane, m.name)
-        alone = self.advanced(lane, f"{m.name}_alone")
-        first = {"q": "x.q", "qd": "x.qd", "s": "&x.s", "u": "given", "a": "x.a"}
-        zeros = dict.fromkeys(("first", "every", "q_rows", "qd_rows", "memory", "u_stride"), "0")
-        predicted = ["&x", *(["t0"] if lane.target.driven else []), "h", "first", "n", "steps"]
-        predicted += ["u", "u_stride"] if lane.target.system.inputs else []
-        predicted += ["every", "q_rows", "qd_rows", *(["c"] if s.constants else [])]
-        return views.Loop(
-            **self.extended(lane),
-            name=m.name,
-            step=public.step(m.name),
-            run_once=run.call(**zeros, t0="t", steps="1", status="&status"),
-            run=run,
-            timed=lane.target.driven,
-            inputs=bool(lane.target.system.inputs),
-            constants=bool(s.constants),
-            unread_p=lane.target.needs_p
-            and not self.constants_call
-            and "p" not in {a.name for a in advance.arguments},
-            compute_constants=self.constants_call,
-            newton=m.newton,
-            implicit=m.implicit,
-            predicted=self.predicts(m),
-            start_call=lane.all_in_one.call(**first),
-            predicted_call=f"{lane.prefix}_rk4_predicted({', '.join(predicted)})",
-            advance=advance.call(**here),
-            otherwise=alone.call(**here) if m is RK4 and s.angles else "",
-        )
-
-    def batch(self, m: Method) -> views.Batch:
-        """A method's batch."""
-        lane, s = self.one, self.accelerations
-        rk4 = m is RK4
-        alone = self.advanced(lane, "rk4_alone" if rk4 and s.angles else m.name)
-        own = bool(self.constants_call) and lane.target.needs_p
-        return views.Batch(
-            **self.extended(lane),
-            noinline=lane.qualifiers[NOINLINE],
-            name=m.name,
-            batch=self.functions.public.batch(m.name),
-            rk4=rk4,
-            angles=bool(s.angles),
-            timed=lane.target.driven,
-            inputs=bool(lane.target.system.inputs),
-            shared_signals=self.shared_signals,
-            constants=bool(s.constants),
-            members=s.constants,
-            unread_p=lane.target.needs_p and not own,
-            own=own,
-            compute_constants=self.constants_call,
-            compute_own=lane.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
-            alone=alone.call(q="at", qd="moving", u="given"),
-        )
-
 
 def stability(m: Method) -> str:
     """Up to which step a method is stable."""
@@ -464,8 +359,3 @@ def stability(m: Method) -> str:
     return f"h omega <= {undamped:.3g} undamped" + (
         f", h lambda <= {decay:.3g} for pure decay." if isfinite(decay) else "."
     )
-
-
-def ahead_count(angles: int) -> int:
-    """Numbers of the lane for predicted angles: two each, to a power of two."""
-    return 1 << (2 * angles - 1).bit_length()

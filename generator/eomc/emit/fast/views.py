@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.views import Computed, Parameter
+from eomc.emit.plain.views import Computed, Named, Parameter, Prefixed
 
 
 @dataclass(frozen=True)
@@ -20,15 +20,12 @@ class Library:
 
 
 @dataclass(frozen=True)
-class Source:
+class Source(Named):
     """c/fast/source.c.jinja. slopes, lanes, steppers: the finished texts of the views below."""
 
     TEMPLATE: ClassVar[str] = "c/fast/source.c"
     title: FreeText
     stamp: tuple[FreeText, ...]
-    prefix: str
-    PREFIX: str
-    real: str
     rolled: bool
     unroll: str
     extent: str
@@ -90,13 +87,11 @@ class Blocks:
 
 
 @dataclass(frozen=True)
-class TwoPoints:
+class TwoPoints(Prefixed):
     """c/fast/two_point.c.jinja. coordinates: whether the configuration reads q itself."""
 
     TEMPLATE: ClassVar[str] = "c/fast/two_point.c"
-    prefix: str
     extent: str
-    real: str
     inline: str
     members: str
     angles: str
@@ -107,15 +102,12 @@ class TwoPoints:
 
 
 @dataclass(frozen=True)
-class RungeKutta4:
+class RungeKutta4(Named):
     """c/fast/rk4.c.jinja. across: angles go into the registers of the wide lane together."""
 
     TEMPLATE: ClassVar[str] = "c/fast/rk4.c"
-    prefix: str
-    PREFIX: str
     unroll: str
     extent: str
-    real: str
     inline: str
     noinline: str
     lane: str
@@ -143,14 +135,11 @@ class RungeKutta4:
 
 
 @dataclass(frozen=True)
-class Predicted:
+class Predicted(Named):
     """c/fast/predicted.c.jinja. stage: the calls of the four stages."""
 
     TEMPLATE: ClassVar[str] = "c/fast/predicted.c"
-    prefix: str
-    PREFIX: str
     unroll: str
-    real: str
     inline: str
     noinline: str
     angles: int
@@ -175,14 +164,12 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Explicit:
+class Explicit(Prefixed):
     """c/fast/explicit.c.jinja."""
 
     TEMPLATE: ClassVar[str] = "c/fast/explicit.c"
-    prefix: str
     unroll: str
     extent: str
-    real: str
     inline: str
     lane: str
     mask: str
@@ -204,25 +191,20 @@ class Explicit:
 
 
 @dataclass(frozen=True)
-class Factors:
+class Factors(Prefixed):
     """c/fast/lu.c.jinja."""
 
     TEMPLATE: ClassVar[str] = "c/fast/lu.c"
-    prefix: str
-    real: str
     fabs: str
     f: str
 
 
 @dataclass(frozen=True)
-class Gauss:
+class Gauss(Named):
     """c/fast/gauss.c.jinja: tableau, functions, calls. f: the suffix of literals."""
 
     TEMPLATE: ClassVar[str] = "c/fast/gauss.c"
-    prefix: str
-    PREFIX: str
     extent: str
-    real: str
     f: str
     fabs: str
     fmax: str
@@ -253,14 +235,11 @@ class Gauss:
 
 
 @dataclass(frozen=True)
-class Sweeps:
+class Sweeps(Named):
     """c/fast/sweeps.c.jinja: tableau, functions, calls. padded: stages, to whole registers."""
 
     TEMPLATE: ClassVar[str] = "c/fast/sweeps.c"
-    prefix: str
-    PREFIX: str
     extent: str
-    real: str
     f: str
     fabs: str
     fmax: str
@@ -299,14 +278,11 @@ class Sweeps:
 
 
 @dataclass(frozen=True)
-class State:
+class State(Named):
     """c/fast/state.c.jinja: what a run of a method carries."""
 
     TEMPLATE: ClassVar[str] = "c/fast/state.c"
-    prefix: str
-    PREFIX: str
     extent: str
-    real: str
     name: str
     title: str
     stages: int
@@ -318,14 +294,11 @@ class State:
 
 
 @dataclass(frozen=True)
-class Loop:
+class Loop(Named):
     """c/fast/run.c.jinja. advance: one step; otherwise: where that failed, without shortcuts."""
 
     TEMPLATE: ClassVar[str] = "c/fast/run.c"
-    prefix: str
-    PREFIX: str
     extent: str
-    real: str
     name: str
     step: CFunction
     run_once: str
@@ -345,14 +318,11 @@ class Loop:
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(Named):
     """c/fast/batch.c.jinja. own: whether instances may have constants of their own."""
 
     TEMPLATE: ClassVar[str] = "c/fast/batch.c"
-    prefix: str
-    PREFIX: str
     extent: str
-    real: str
     noinline: str
     name: str
     batch: CFunction

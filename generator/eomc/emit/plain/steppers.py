@@ -71,9 +71,7 @@ def header(
         stamp=tuple(heading.stamp(target)),
         notes=tuple(heading.notes(target)),
         description=tuple(heading.description(target)),
-        prefix=plain.prefix,
-        PREFIX=plain.PREFIX,
-        real=plain.real,
+        **plain.names,
         handshake=stamp,
         fast=fast,
         coordinates=indexed(plain),
@@ -99,9 +97,7 @@ def source_view(plain: Functions, slopes: str, steppers: Sequence[str]) -> Sourc
     return Source(
         title=FreeText(s.title),
         stamp=tuple(heading.stamp(target)),
-        prefix=plain.prefix,
-        PREFIX=plain.PREFIX,
-        real=plain.real,
+        **plain.names,
         handshake=handshake(plain),
         parameters=parameters(plain),
         q0=tuple(target.literal(x.start) for x in s.coordinates),
@@ -143,9 +139,7 @@ def linearization(plain: Functions) -> Slopes | None:
     read = plain.read(function)
     reads_u = plain.reads_u(function) and plain.signal is not None
     return Slopes(
-        prefix=plain.prefix,
-        PREFIX=plain.PREFIX,
-        real=plain.real,
+        **plain.names,
         inputs=inputs,
         width=width,
         slopes=slopes,
@@ -185,9 +179,7 @@ def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
     accelerate = plain.acceleration.function.call
     if m is RK4:
         return RungeKutta4(
-            prefix=plain.prefix,
-            PREFIX=plain.PREFIX,
-            real=plain.real,
+            **plain.names,
             about=_about(m),
             step=plain.public.step(m.name),
             first=accelerate(qdd="a1"),
@@ -196,9 +188,7 @@ def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
             fourth=accelerate(qdd="a4", q="r", qd="v", t="t + h"),
         )
     return Explicit(
-        prefix=plain.prefix,
-        PREFIX=plain.PREFIX,
-        real=plain.real,
+        **plain.names,
         about=_about(m),
         step=plain.public.step(m.name),
         stages=m.stages,
@@ -215,9 +205,7 @@ def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
     """What the implicit methods share."""
     real, accelerate = plain.target.real, plain.acceleration.function.call
     return Implicit(
-        prefix=plain.prefix,
-        PREFIX=plain.PREFIX,
-        real=plain.real,
+        **plain.names,
         fabs=f"fabs{real.function_suffix}",
         fmax=f"fmax{real.function_suffix}",
         tiny=plain.target.literal(1e-30),
@@ -259,9 +247,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     count = CArgument("long *", "evaluations")
     solve = CFunction(method, plain.status, (*one.arguments, count), qualifier="static")
     return Gauss(
-        prefix=plain.prefix,
-        PREFIX=plain.PREFIX,
-        real=plain.real,
+        **plain.names,
         title=m.title,
         method=method,
         newton=m.newton,
@@ -292,14 +278,12 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
 
 def loop(plain: Functions, m: Method) -> Loop:
     """The view of a method's step, run and batch."""
-    P, NQ, real = plain.prefix, plain.NQ, plain.real
+    NQ, real = plain.NQ, plain.real
     run = plain.public.run(m.name)
     one = stepper(plain, m)
     advance = one.solve if isinstance(one, Gauss) else one.step
     return Loop(
-        prefix=P,
-        PREFIX=plain.PREFIX,
-        real=real,
+        **plain.names,
         implicit=m.implicit,
         run=run,
         batch=plain.public.batch(m.name) if plain.target.system.run.batch else None,

@@ -10,6 +10,21 @@ from eomc.emit.c_function import CFunction
 
 
 @dataclass(frozen=True)
+class Prefixed:
+    """What every template names: the scene's prefix, and the type of numbers."""
+
+    prefix: str
+    real: str
+
+
+@dataclass(frozen=True)
+class Named(Prefixed):
+    """And the prefix of macros and enumerators."""
+
+    PREFIX: str
+
+
+@dataclass(frozen=True)
 class Indexed:
     """A coordinate or an input: its enumerator, and unit and note."""
 
@@ -65,7 +80,7 @@ class Declared:
 
 
 @dataclass(frozen=True)
-class Header:
+class Header(Named):
     """c/header.h.jinja. functions: those of mechanics. timed: whether steps take t."""
 
     TEMPLATE: ClassVar[str] = "c/header.h"
@@ -73,9 +88,6 @@ class Header:
     stamp: tuple[FreeText, ...]
     notes: tuple[str, ...]
     description: tuple[FreeText, ...]
-    prefix: str
-    PREFIX: str
-    real: str
     handshake: str
     fast: bool
     coordinates: tuple[Indexed, ...]
@@ -89,15 +101,12 @@ class Header:
 
 
 @dataclass(frozen=True)
-class Source:
+class Source(Named):
     """c/plain/source.c.jinja. slopes, steppers: the finished texts of the views below."""
 
     TEMPLATE: ClassVar[str] = "c/plain/source.c"
     title: FreeText
     stamp: tuple[FreeText, ...]
-    prefix: str
-    PREFIX: str
-    real: str
     handshake: str
     parameters: tuple[Parameter, ...]
     q0: tuple[str, ...]
@@ -110,13 +119,10 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Slopes:
+class Slopes(Named):
     """c/slopes.c.jinja. width: of a row [da/dq, da/dqd, da/du]. unread: unused arguments."""
 
     TEMPLATE: ClassVar[str] = "c/slopes.c"
-    prefix: str
-    PREFIX: str
-    real: str
     inputs: bool
     width: str
     slopes: Computed
@@ -127,13 +133,10 @@ class Slopes:
 
 
 @dataclass(frozen=True)
-class RungeKutta4:
+class RungeKutta4(Named):
     """c/plain/rk4.c.jinja: the calls of the four accelerations."""
 
     TEMPLATE: ClassVar[str] = "c/plain/rk4.c"
-    prefix: str
-    PREFIX: str
-    real: str
     about: tuple[str, ...]
     step: CFunction
     first: str
@@ -143,13 +146,10 @@ class RungeKutta4:
 
 
 @dataclass(frozen=True)
-class Explicit:
+class Explicit(Named):
     """c/plain/explicit.c.jinja: a tableau, and the call of a stage's accelerations."""
 
     TEMPLATE: ClassVar[str] = "c/plain/explicit.c"
-    prefix: str
-    PREFIX: str
-    real: str
     about: tuple[str, ...]
     step: CFunction
     stages: int
@@ -162,13 +162,10 @@ class Explicit:
 
 
 @dataclass(frozen=True)
-class Implicit:
+class Implicit(Named):
     """c/plain/implicit.c.jinja: what implicit methods share. here, near: calls of accelerations."""
 
     TEMPLATE: ClassVar[str] = "c/plain/implicit.c"
-    prefix: str
-    PREFIX: str
-    real: str
     fabs: str
     fmax: str
     tiny: str
@@ -180,13 +177,10 @@ class Implicit:
 
 
 @dataclass(frozen=True)
-class Gauss:
+class Gauss(Named):
     """c/plain/gauss.c.jinja: a tableau, functions, calls. method: what its C names begin with."""
 
     TEMPLATE: ClassVar[str] = "c/plain/gauss.c"
-    prefix: str
-    PREFIX: str
-    real: str
     title: str
     method: str
     newton: bool
@@ -215,13 +209,10 @@ class Gauss:
 
 
 @dataclass(frozen=True)
-class Loop:
+class Loop(Named):
     """c/plain/run.c.jinja: run and batch of one method, and the calls in them."""
 
     TEMPLATE: ClassVar[str] = "c/plain/run.c"
-    PREFIX: str
-    prefix: str
-    real: str
     implicit: bool
     run: CFunction
     batch: CFunction | None
