@@ -18,7 +18,17 @@ from eomc.verify import derivatives, one_step
 from eomc.verify.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Finding, Place, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import Row
-from eomc.verify.sampling import LARGE, NUDGE, SMALL, Expected, Sampler, State, ask, units
+from eomc.verify.sampling import (
+    LARGE,
+    NUDGE,
+    SMALL,
+    Expected,
+    Sampler,
+    State,
+    ask,
+    nudged,
+    units,
+)
 from eomc.verify.symbolic import of
 from eomc.verify.taylor import Jets
 
@@ -378,20 +388,41 @@ class Comparison:
         known: list[float | None] = []
         for e in self.few(self.effort.few):
             s, size = e.state, e.size["acceleration"]
-            held = {"u": s.u, "t": s.t, "params": s.params}
-            if name == "linearize":
-                A, B = self.module.linearize(s.q, s.qd, **held)
-                if not np.array_equal(A[:n], np.eye(n, 2 * n, n)) or np.any(B[:n]):
-                    return math.inf  # dq/dt = qd
-                found, part = np.hstack([A[n:], B[n:]]), slice(0, 2 * n + nu)
-            else:
-                found, part = self.module.sensitivity(s.q, s.qd, **held), slice(2 * n + nu, None)
+            found = self._slopes(name, s)
+            if found is None:
+                return math.inf  # not even dq/dt = qd
+            part = slice(0, 2 * n + nu) if name == "linearize" else slice(2 * n + nu, None)
             with np.errstate(all="ignore"):
                 exact = derivatives.by_differences(self.reference, s, scale, self.sampler.defaults)
                 off = [derivatives.apart(found, J[:, part], by[part], size) for J, by in exact]
             least = np.fmin.reduce(off)  # each entry's: what is wrong is so at every width
+            if self.dtype != np.float64:
+                least /= max(1.0, self._growth(name, e, found))
             known.append(float(np.max(least, initial=0)) if np.all(least >= 0) else None)
         return largest(known, "no state has finite differences")
+
+    def _slopes(self, name: str, s: State) -> Vector | None:
+        """What the module has of a state; None where dq/dt is not qd."""
+        n, held = len(self.system.q), {"u": s.u, "t": s.t, "params": s.params}
+        if name == "sensitivity":
+            return np.asarray(self.module.sensitivity(s.q, s.qd, **held))
+        A, B = self.module.linearize(s.q, s.qd, **held)
+        if not np.array_equal(A[:n], np.eye(n, 2 * n, n)) or np.any(B[:n]):
+            return None
+        return np.hstack([A[n:], B[n:]])
+
+    def _growth(self, name: str, e: Expected, found: Vector) -> float:
+        """How many roundings single precision makes of the derivatives, of the largest.
+
+        As many as a rounding of every input makes, and as the accelerations have lost there, to
+        sums that cancel.
+        """
+        near = [self._slopes(name, x) for x in nudged(e.state, self.sampler.defaults)]
+        moved = sum(np.abs(x - found) for x in near if x is not None)
+        sure = e.value["acceleration"]
+        lost = np.abs(ask(self.module, "acceleration", e.state) - sure) / self.eps
+        parts = (moved / NUDGE, found), (lost, sure)
+        return float(max(np.max(x, initial=0) / (np.max(np.abs(y)) + 1e-300) for x, y in parts))
 
     def bias(self) -> float:
         """bias = C qd + g."""
