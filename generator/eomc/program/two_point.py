@@ -37,6 +37,12 @@ class Parts:
     velocity: Function
     handed: tuple[str, ...]
 
+    @property
+    def short(self) -> bool:
+        """Whether both are inlined, by the operations of a step."""
+        weight = 2 * outline.weight(self.configuration) + 4 * outline.weight(self.velocity)
+        return weight <= SHORT
+
 
 def apart(rest: Function, angles: Sequence[Angle], system: System, fixed: Set[str]) -> Parts | None:
     """The two parts of an acceleration that reads the sines of `angles`; None: they bring nothing.

@@ -13,6 +13,8 @@ from eomc.program import outline, trig, two_point
 from eomc.program.ir import Function, Operand
 from eomc.program.trig import Angle
 
+SHORT = 300  # operations of accelerations that are inlined into every stage
+
 
 @dataclass(frozen=True)
 class Accelerations:
@@ -73,6 +75,6 @@ class Accelerations:
         return two_point.apart(self.rotated[1], self.angles, target.system, {*self.own, *early})
 
     @property
-    def large(self) -> bool:
-        """Whether they are long enough to be outlined."""
-        return outline.is_large(self.rotated[1])
+    def long(self) -> bool:
+        """Whether they are called rather than inlined: that bounds compile time."""
+        return outline.weight(self.rotated[1]) > SHORT

@@ -19,12 +19,11 @@ from eomc.emit.fast import runs, views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, Lane
 from eomc.emit.fast.runs import ahead_count
-from eomc.emit.fast.steppers import FEWEST_OPERATIONS, Steppers
+from eomc.emit.fast.steppers import Steppers
 from eomc.emit.functions import Functions, parameters
 from eomc.emit.plain import steppers as plain
 from eomc.emit.plain import views as plain_views
 from eomc.integrators.tableaux import RK4
-from eomc.program import outline
 
 Show = Callable[[views.View | plain_views.View], str]  # a view by its template
 
@@ -126,7 +125,6 @@ def _lanes(made: Steppers, show: Show) -> Iterator[str]:
     if batch or any(m.sweeps for m in made.methods):
         yield _lane(made, made.wide, show)
     if batch:
-        weight = outline.weight(made.accelerations.rotated[1])
         yield show(
             views.Blocks(
                 prefix=made.one.prefix,
@@ -134,7 +132,7 @@ def _lanes(made: Steppers, show: Show) -> Iterator[str]:
                 lane=made.wide.real.name,
                 constants=made.wide.constants if made.accelerations.constants else "",
                 inputs=bool(made.accelerations.target.system.inputs),
-                blocks=1 if weight > FEWEST_OPERATIONS else 4,
+                blocks=1 if made.accelerations.long else 4,
             )
         )
 

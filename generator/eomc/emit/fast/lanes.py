@@ -192,6 +192,7 @@ class Lane:
         takes: Sequence[str] | None = None,
         constants: Mapping[str, str] | None = None,
         in_order: bool = False,
+        inline: bool = True,
     ) -> Computed:
         """A function whose results go to `places` of `out`, and that returns what failed.
 
@@ -211,7 +212,7 @@ class Lane:
             f"{self.prefix}_{what}{self.end}",
             self.mask,
             (*([out] if out else []), *(a for a, _ in given)),
-            qualifier=self.qualifiers[INLINE],
+            qualifier=self.qualifiers[INLINE if inline else NOINLINE],
             doc=(doc,) if doc else (),
         )
         if outline.is_large(function):
@@ -396,10 +397,10 @@ class Lane:
     def all_in_one(self) -> CFunction:
         """The accelerations with sines and signals, where those are not given."""
         arguments = (self.out, *map(self.argument, self.there))
-        large = self.accelerations.large
+        called = self.padded or self.accelerations.long
         return CFunction(
             f"{self.prefix}_accelerations{self.end}", self.mask, arguments,
-            qualifier=self.qualifiers[NOINLINE if large else INLINE],
+            qualifier=self.qualifiers[NOINLINE if called else INLINE],
         )  # fmt: skip
 
     # two points
@@ -413,8 +414,9 @@ class Lane:
         takes = [n for n in self.there if n in ("q", "s", "c")]
         places = [c.member("k", n) for n in parts.handed]
         return self.computed(
-            parts.configuration, "configurations", out, places, takes=takes, in_order=True
-        )
+            parts.configuration, "configurations", out, places, takes=takes, in_order=True,
+            inline=parts.short,
+        )  # fmt: skip
 
     @cached_property
     def velocity(self) -> Computed:
@@ -426,5 +428,6 @@ class Lane:
         extra = [(known, handed, form), (CArgument("int", "point"), handed, form)]
         doc = "The accelerations at point 0 or 1 of k."
         return self.computed(
-            parts.velocity, "velocities", self.out, self.places, extra, doc=doc, in_order=True
-        )
+            parts.velocity, "velocities", self.out, self.places, extra, doc=doc, in_order=True,
+            inline=parts.short,
+        )  # fmt: skip

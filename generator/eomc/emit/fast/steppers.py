@@ -20,8 +20,6 @@ from eomc.emit.plain.views import Slopes
 from eomc.integrators.tableaux import METHODS, RK4, Method, Row
 from eomc.program import two_point
 
-FEWEST_OPERATIONS = 300  # of accelerations from which on a tile has one block
-
 
 @dataclass(frozen=True)
 class Steppers:
