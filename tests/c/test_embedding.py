@@ -259,7 +259,7 @@ def test_enumerators_are_none_of_our_own_macros() -> None:
     assert found | lanes | {"ROLLED", "UNROLL"} == c_names.OWN
 
 
-@pytest.mark.parametrize("name", tiers(["rolled", "aligned", "fast_fma", "block"], "fast_fma"))
+@pytest.mark.parametrize("name", tiers(["rolled", "tile", "fast_fma", "unroll"], "fast_fma"))
 def test_coordinates_may_be_called_like_our_own_macros(name: str, tmp_path: Path) -> None:
     text = (ROOT / "scenes" / "cartpole.toml").read_text(encoding="utf-8")
     text = re.sub(r"\bx(?=\b|_dot)", name, text).replace("[run]\n", "[run]\nbatch = true\n")

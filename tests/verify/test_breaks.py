@@ -147,7 +147,7 @@ BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
     "lowering": (lowered, {"acceleration", MOTION, "run"}),
     "printing": (printed, {"acceleration", "one step"}),
     "a weight of the stepper": (
-        text('lit("2.0") ~ "*(a2', 'lit("1.0") ~ "*(a2'),
+        text("+ 2*inner)", "+ 1*inner)"),
         {"one step", "run", "order of rk4"},
     ),
     "a sign in the stepper": (

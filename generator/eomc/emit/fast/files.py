@@ -61,7 +61,7 @@ def files(target: Target, show: Show) -> dict[str, str]:
             acceleration=functions.acceleration,
             solved=tuple(heading.solved(target)),
             slopes=show(slopes).rstrip("\n") if slopes else "",
-            lanes=tuple(_lanes(made, show)),
+            lanes=tuple(filter(None, _lanes(made, show))),
             steppers=tuple(_steppers(made, show)),
         )
     )
@@ -120,9 +120,12 @@ def _csrc(made: Steppers) -> Iterator[str]:
 
 def _lanes(made: Steppers, show: Show) -> Iterator[str]:
     """The accelerations over each lane, and RK4 or another explicit method over the register."""
+    if made.two_point:
+        yield _library_text(Lane(made.accelerations, "two"), show)
     yield _lane(made, made.one, show)
     batch = made.accelerations.target.system.run.batch
     if batch or any(m.sweeps for m in made.methods):
+        yield _library_text(made.wide, show)
         yield _lane(made, made.wide, show)
     if batch:
         yield show(
@@ -141,7 +144,6 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
     """The accelerations over one lane."""
     s, target = made.accelerations, lane.target
     signal = lane.signal
-    names = sorted(set(lane.calls)) if lane.name else []
     constants = c.struct(lane.constants, lane.real.name, s.constants) if s.constants else ""
     parts = s.parts if not lane.name else None
     rates = lane.rates.text if parts is None else show(_two_points(made)).rstrip("\n")
@@ -156,7 +158,6 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             mask=lane.mask,
             clear=lane.clear,
             L=lane.end,
-            calls=tuple(_library(s, n) for n in names),
             constants="\n\n".join(filter(None, (constants, computed))),
             angles=lane.angle_count if s.angles else "",
             count=len(s.angles),
@@ -172,9 +173,25 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             accelerations=lane.all_in_one,
             two_point=parts is not None,
             takes_c=bool(s.constants),
+            alone=not lane.name or any(m is not RK4 for m in made.methods),
         )
     )
     return text
+
+
+def _library_text(lane: Lane, show: Show) -> str:
+    """The functions of the mathematics library over a lane of several numbers."""
+    return show(
+        views.LibraryText(
+            prefix=lane.prefix,
+            real=lane.accelerations.target.real.name,
+            inline=lane.qualifiers[INLINE],
+            lane=lane.real.name,
+            L=lane.end,
+            count=f"{lane.target.PREFIX}_{lane.name.upper()}_COUNT",
+            calls=tuple(_library(lane.accelerations, n) for n in lane.calls),
+        )
+    )
 
 
 def _library(s: Accelerations, name: str) -> views.Library:

@@ -380,7 +380,7 @@ class Lane:
             for a in (*f.early, *f.body)
             if isinstance(a.value, Call)
         } - {"sin", "cos", "reciprocal"}  # fmt: skip
-        return tuple(sorted("sign" if n == "heaviside" else n for n in names))
+        return tuple(sorted({"sign" if n == "heaviside" else n for n in names}))
 
     @property
     def sincos(self) -> str:

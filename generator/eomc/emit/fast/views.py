@@ -45,6 +45,20 @@ class Source(Named):
 
 
 @dataclass(frozen=True)
+class LibraryText:
+    """c/fast/library.c.jinja: the library's functions over a lane. count: numbers in it, in C."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/library.c"
+    prefix: str
+    real: str
+    inline: str
+    lane: str
+    L: str
+    count: str
+    calls: tuple[Library, ...]
+
+
+@dataclass(frozen=True)
 class LaneText:
     """c/fast/lane.c.jinja. angles: their number, in C. rates: finished text."""
 
@@ -57,7 +71,6 @@ class LaneText:
     mask: str
     clear: str
     L: str
-    calls: tuple[Library, ...]
     constants: str
     angles: str
     count: int
@@ -71,6 +84,7 @@ class LaneText:
     accelerations: CFunction
     two_point: bool
     takes_c: bool
+    alone: bool
 
 
 @dataclass(frozen=True)
@@ -341,6 +355,6 @@ class Batch(Named):
 
 
 View = (
-    Source | LaneText | Blocks | TwoPoints | RungeKutta4 | Predicted | Explicit | Factors | Gauss
-    | Sweeps | State | Loop | Batch
+    Source | LibraryText | LaneText | Blocks | TwoPoints | RungeKutta4 | Predicted | Explicit
+    | Factors | Gauss | Sweeps | State | Loop | Batch
 )  # fmt: skip
