@@ -165,14 +165,14 @@ e = { start = -1.3 }
 kinetic = "a_dot**2 + b_dot**2*(2 + cos(a)) + c_dot**2*(2 + cos(b)) + d_dot**2 + e_dot**2*L"
 potential = "cos(a) + cos(b) + cos(c) + cos(d) + cos(e) + sin(a + b)"
 [definitions]
-L = "2 + cos(d)*sin(c)/2"
+L = "2 + cos(d)*sin(c)/2 + tanh(b)/9 + max(a, b)/20"
 [run]
 h = 0.01
 """
 
 
 def test_more_angles_than_coordinates(modules: Modules) -> None:
-    """Every coordinate is an angle, and a sum of two is one more."""
+    """Every coordinate is an angle, and a sum of two is one more; other functions beside them."""
     module = modules.of_text(MORE)
     trusted = symbolic.of(system.from_scene(scene.parse(MORE, "more.toml")))
     _, q, qd = trusted.simulate(h=0.01, steps=50)
