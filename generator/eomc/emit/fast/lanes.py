@@ -217,7 +217,7 @@ class Lane:
         )
         if outline.is_large(function):
             return self._in_pieces(whole, function, what, out, places, given, where, in_order)
-        body = self.target.body(function, where, in_order=in_order)
+        body = self.target.body(function, where, pivots=self.pivots, in_order=in_order)
         reads = {a.name for a in whole.arguments[:1] if a is out} | self._read(function, given)
         statements = self._statements(function, body, places)
         return Computed(replace(whole, body=statements, reads=frozenset(reads)))
@@ -243,7 +243,7 @@ class Lane:
             f = part.function
             body = self.target.body(
                 f, dict(where) | {n: handed[n] for n in part.reads},
-                stored={n: handed[n] for n in part.keeps}, pivots=len(function.checks),
+                stored={n: handed[n] for n in part.keeps}, pivots=self.pivots,
                 in_order=in_order,
             )  # fmt: skip
             head = [c.filled(values, "v")] if part.reads or part.keeps else []
@@ -270,6 +270,11 @@ class Lane:
         struct = c.struct(values, self.real.name, list(handed)) if handed else ""
         body_ = tuple(Block("", tuple(lines)) for lines in blocks)
         return Computed(replace(whole, body=body_, reads=reads), tuple(made), struct)
+
+    @property
+    def pivots(self) -> int:
+        """How many the whole has: what rounding leaves of one grows with them."""
+        return len(self.accelerations.whole.checks)
 
     def _fails(self, body: Body) -> bool:
         return bool(body.failures or body.early_failures or (self.name and body.sincos))
