@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -216,10 +216,8 @@ class Body:
     early: tuple[Block, ...]
     blocks: tuple[Block, ...]
     results: tuple[str, ...]
-    early_failures: tuple[str, ...]  # conditions under which D can't be inverted
-    failures: tuple[str, ...]
-    kept: tuple[str, ...]  # what goes into the struct, where there is one
-    sincos: bool
+    failures: tuple[str, ...]  # conditions under which D can't be inverted
+    sincos: bool  # whether some angle is reduced by our own code
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -232,8 +230,6 @@ def body(
     prefix: str,
     where: Mapping[str, str],
     real: Real = DOUBLE,
-    keep: Callable[[str], str] | None = None,
-    parameters: Sequence[str] = (),
     stored: Mapping[str, str] | None = None,
     pivots: int = 0,
     in_order: bool = False,
@@ -242,21 +238,13 @@ def body(
     """The statements of a function.
 
     where: how each name from outside is written (`m_c` -> `p->m_c`).
-    keep: how the rest reads what parameters decide, where that lives in a struct; `parameters`
-    are kept there too where the rest reads them.
     stored: where values go that are no locals. pivots: how many the whole has, if this is a part.
     in_order: terms of sums stay in their order. reserved: names that no value gets.
     """
     stored = stored or {}
-    stages = {a.name: a.stage for a in (*function.early, *function.body)}
-    late_checks = [c for c in function.checks if stages.get(c[0].name, 0) > Stage.PARAMETER]
-    late_ends = [*function.outputs, *(o for pair in late_checks for o in pair)]
-    late_reads = {n for a in function.body for n in a.value.names} | {o.name for o in late_ends}
-    early_names = [*parameters, *(a.name for a in function.early)]
-    kept = [n for n in early_names if n in late_reads] if keep else []
-    inline = _inlined(function, frozenset(kept))
+    inline = _inlined(function)
     new = _numbered(function, inline, reserved)
-    function, kept = rename(function, new), [new.get(n, n) for n in kept]
+    function = rename(function, new)
     inline = frozenset(new[n] for n in inline)
     # a value may bear the name of something outside that is not read here
     uses = function.uses
@@ -274,17 +262,11 @@ def body(
             printer.inline[a.name] = (text, strength)
         else:
             early_lines.append(set_to(a.name, text))
-    early = {a.name for a in function.early}
-    is_early = [not c[0].name or c[0].name in {*early, *parameters} for c in function.checks]
-    checks = [(e, pair) for e, pair in zip(is_early, function.checks, strict=True)]
-    early_failures = _failures(printer, [pair for e, pair in checks if e], tolerance)
-    if keep is not None:
-        printer.where |= {name: keep(name) for name in kept}
-
     angles: dict[tuple[Operand, ...], dict[str, str]] = {}
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             angles.setdefault(a.value.args, {})[a.value.function] = a.name
+    sincos = real.reach > 0 and bool(angles)
     lines: dict[Stage, list[str]] = {stage: [] for stage in _STAGE_COMMENTS}
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
@@ -300,10 +282,8 @@ def body(
         early=(Block("parameters alone", tuple(early_lines)),) if early_lines else (),
         blocks=tuple(Block(_STAGE_COMMENTS[s], tuple(text)) for s, text in lines.items() if text),
         results=tuple(printer.in_lane(o) for o in function.outputs),
-        early_failures=early_failures,
-        failures=_failures(printer, [pair for e, pair in checks if not e], tolerance),
-        kept=tuple(kept),
-        sincos=real.reach > 0 and any("_sincos" in x for text in lines.values() for x in text),
+        failures=_failures(printer, function.checks, tolerance),
+        sincos=sincos,
     )
 
 
@@ -354,7 +334,7 @@ def _sincos(
     ]
 
 
-def _inlined(function: Function, kept: frozenset[str]) -> frozenset[str]:
+def _inlined(function: Function) -> frozenset[str]:
     """Short values that are read once, at their own stage, and whose name says nothing."""
     uses: Counter[str] = Counter()
     stage_of_reader: dict[str, Stage] = {}
@@ -377,7 +357,7 @@ def _inlined(function: Function, kept: frozenset[str]) -> frozenset[str]:
         weight[a.name] = own + sum(weight[n] for n in a.value.names if n in inline)
         sine = isinstance(a.value, Call) and a.value.function in ("sin", "cos", "reciprocal")
         same = stage_of_reader.get(a.name) == a.stage
-        if uses[a.name] == 1 and same and not a.named and not sine and a.name not in kept:
+        if uses[a.name] == 1 and same and not a.named and not sine:
             if weight[a.name] <= MOST_INLINE:
                 inline.add(a.name)
     return frozenset(inline)

@@ -181,11 +181,6 @@ def unclashed(function: Function) -> Function:
     return rename(function, clash) if clash else function
 
 
-def arguments(*parts: str) -> str:
-    """An argument list of those parts that are there."""
-    return ", ".join(p for p in parts if p)
-
-
 def local(name: str) -> str:
     """A coordinate, velocity or input as a local variable."""
     return name + "_" if name in _OURS else name

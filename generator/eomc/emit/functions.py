@@ -184,7 +184,7 @@ class Functions:
                 f, {n: handed[n] for n in part.reads}, stored={n: handed[n] for n in part.keeps},
                 pivots=len(function.checks),
             )  # fmt: skip
-            failures = c.unless((*body.early_failures, *body.failures), self.singular)
+            failures = c.unless(body.failures, self.singular)
             found = zip(part.outputs, body.results, strict=True)
             ends = (*(c.assign(f"{out}[{place}]", x) for place, x in found), *failures)
             ends += (c.result(self.ok),) if failures else ()
@@ -270,7 +270,7 @@ class Functions:
             values, parts, blocks = self.cut(function, what, out, ("along", *usual))
         else:
             blocks, body = self.straight(function, out)
-            failures = c.unless((*body.early_failures, *body.failures), self.singular)
+            failures = c.unless(body.failures, self.singular)
         if fails:
             blocks += (Block("", (*failures, c.result(self.ok))),)
         along = (c.given(self.real, "along"),) if out == "column" else ()
@@ -303,7 +303,7 @@ class Functions:
         else:
             body = self.target.body(function)
             array = c.listed(self.real, "a", self.NQ, body.results)
-            failures = c.unless((*body.early_failures, *body.failures), self.singular)
+            failures = c.unless(body.failures, self.singular)
             *most, last = self.statements(function, body)
             last = Block(last.comment, (*last.lines, array))
             blocks = (*most, last, Block("", failures))

@@ -234,11 +234,10 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
         elif not m.implicit:
             yield from (show(made.explicit(lane, m)) for lane in lanes)
         if runs.predicts(made, m):
-            prediction, state = show(made.prediction()), show(runs.state(made, m))
-            at = prediction.index("/*\n * Steps of RK4")
-            yield prediction[:at] + state + "\n" + prediction[at:]
-        else:
-            yield show(runs.state(made, m))
+            yield show(made.predictions())
+        yield show(runs.state(made, m))
+        if runs.predicts(made, m):
+            yield show(made.prediction())
         if m.implicit:
             yield show(made.sweeps(m) if m.sweeps else made.gauss(m))
         yield show(runs.loop(made, m))

@@ -277,7 +277,7 @@ class Lane:
         return len(self.accelerations.whole.checks)
 
     def _fails(self, body: Body) -> bool:
-        return bool(body.failures or body.early_failures or (self.name and body.sincos))
+        return bool(body.failures or (self.name and body.sincos))
 
     def _statements(
         self, function: Function, body: Body, places: Sequence[str], fails: bool = True
@@ -287,7 +287,7 @@ class Lane:
             sets = self._stored("a", body.results, self.width)
         else:
             sets = tuple(c.assign(to, x) for to, x in zip(places, body.results, strict=True))
-        noted = c.note((*body.early_failures, *body.failures))
+        noted = c.note(body.failures)
         if not fails:
             return (self._loads(function), *body.early, *body.blocks, Block("", sets))
         head = Block("", (c.local(self.mask, f"failed = {self.clear}"),))

@@ -135,6 +135,14 @@ class Steppers:
             stage_call=lane.all_in_one.call(**here),
         )
 
+    def predictions(self) -> views.Predictions:
+        """The angles of the next step, predicted."""
+        lane, angles = self.one, len(self.accelerations.angles)
+        return views.Predictions(
+            prefix=lane.prefix, real=lane.real.name, unroll=lane.unroll,
+            inline=lane.qualifiers[INLINE], angles=angles,
+        )  # fmt: skip
+
     def prediction(self) -> views.Predicted:
         """The loop of RK4 whose angles are predicted."""
         lane, s = self.one, self.accelerations
@@ -153,7 +161,6 @@ class Steppers:
         real = s.target.real.name
         return views.Predicted(
             **self.looping(lane),
-            inline=lane.qualifiers[INLINE],
             noinline=lane.qualifiers[NOINLINE],
             angles=len(s.angles),
             timed=lane.target.driven,

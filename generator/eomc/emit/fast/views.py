@@ -149,12 +149,21 @@ class RungeKutta4(Named):
 
 
 @dataclass(frozen=True)
+class Predictions(Prefixed):
+    """c/fast/predictions.c.jinja: sines and cosines at predicted angles, and near them."""
+
+    TEMPLATE: ClassVar[str] = "c/fast/predictions.c"
+    unroll: str
+    inline: str
+    angles: int
+
+
+@dataclass(frozen=True)
 class Predicted(Named):
     """c/fast/predicted.c.jinja. stage: the calls of the four stages."""
 
     TEMPLATE: ClassVar[str] = "c/fast/predicted.c"
     unroll: str
-    inline: str
     noinline: str
     angles: int
     timed: bool
@@ -355,6 +364,6 @@ class Batch(Named):
 
 
 View = (
-    Source | LibraryText | LaneText | Blocks | TwoPoints | RungeKutta4 | Predicted | Explicit
-    | Factors | Gauss | Sweeps | State | Loop | Batch
+    Source | LibraryText | LaneText | Blocks | TwoPoints | RungeKutta4 | Predictions
+    | Predicted | Explicit | Factors | Gauss | Sweeps | State | Loop | Batch
 )  # fmt: skip
