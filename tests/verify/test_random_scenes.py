@@ -6,7 +6,9 @@ Many more of both: python tests/random_scenes.py --count 2000 [--negate].
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import scene_author
 from conftest import tiers
@@ -17,8 +19,10 @@ import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify.check import check
+from eomc.verify.comparison import Comparison
 from eomc.verify.report import Report
 from eomc.verify.rows_runs import Runs
+from eomc.verify.sampling import State
 
 # Right modules of which a row about orders, advised steps or balances once said FAILED.
 DRAG = """eomc = 1
@@ -227,6 +231,41 @@ dissipation = "x_dot**4/12"
 h = 0.01
 duration = 5.0
 """
+
+
+FAR = """eomc = 1
+name = "far"
+[coordinates]
+x = { unit = "m", rate = 0.178 }
+[parameters]
+w = 1.1
+[energy]
+kinetic = "8*x_dot**2/6 + w*dot(sqrt(1 + x**2))**2/2"
+potential = "-16*cos(x) + 9*sqrt(1 + x**2)"
+[run]
+duration = 0.5
+linearize = true
+"""
+
+
+def test_derivatives_are_compared_where_small_terms_count(tmp_path: Path) -> None:
+    """A term of order x**4 beside 1, in a motion that stays within 1e-2 for what is drawn."""
+    made = from_scene(parse(FAR, "test.toml"))
+    comparison = Comparison(made, eomc.load(made, tmp_path), np.random.default_rng(0), None)
+    near = max(abs(float(e.state.q[0])) for e in comparison.expected)
+    (far,) = comparison.sampler.farther()
+    assert abs(float(far.state.q[0])) > 2 * near
+    assert comparison.slopes("linearize") < 1e-8
+
+    right = comparison._slopes
+
+    def wrong(name: str, s: State) -> Any:
+        found = right(name, s)
+        assert found is not None
+        return found + 1e-3 * (s.q[0] / 0.3) ** 6
+
+    comparison._slopes = wrong
+    assert comparison.slopes("linearize") > 1e-7
 
 
 @pytest.mark.slow

@@ -72,3 +72,15 @@ def test_newtons_method_takes_the_step_that_sweeps_take() -> None:
     ends, count = one_step.by_newton(m, a, q, qd, 0.2, 0.3)
     assert np.allclose(ends, sweeps, rtol=0, atol=1e-14)
     assert 1 < count < 10
+
+
+def test_states_of_which_one_overflows_have_no_step() -> None:
+    """Sweeps that diverge are not answers of the states that have not overflowed yet."""
+
+    def acceleration(q: Any, qd: Any, t: Any) -> Any:
+        return -1e13 * qd
+
+    qd = np.array([[1e200], [1.0]])
+    with np.errstate(all="ignore"):
+        ends = one_step.step(METHODS["gauss4"], acceleration, 0 * qd, qd, 0.0, 1e-2)
+    assert np.all(np.isnan(ends))

@@ -386,7 +386,7 @@ class Comparison:
         scale = np.array([self.sampler.spread, self.sampler.speed])
         n, nu = len(self.system.q), len(self.system.inputs)
         known: list[float | None] = []
-        for e in self.few(self.effort.few):
+        for e in (*self.few(self.effort.few), *self.sampler.farther()):
             s, size = e.state, e.size["acceleration"]
             found = self._slopes(name, s)
             if found is None:

@@ -47,10 +47,12 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
             change = float(np.max(np.abs(new - a)))
             size = np.abs(qd) / h + np.max(np.abs(new), axis=0)
             a = new
-            if not np.isfinite(change) or change <= SETTLED * float(np.max(size)):
+            if not np.isfinite(change):  # a row has overflowed: others may be on their way
+                a[:] = np.nan
+            if not change > SETTLED * float(np.max(size)):
                 break
         else:
-            a = np.full_like(a, np.nan)
+            a[:] = np.nan
     return np.array([q + h * qd + h**2 * np.tensordot(b_a, a, 1), qd + h * np.tensordot(b, a, 1)])
 
 

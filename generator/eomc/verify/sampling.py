@@ -22,6 +22,7 @@ CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state say
 NUDGE = 1e-6  # relative change of an input from which its influence is estimated
 MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
+FARTHER = 8.0  # times as far from the start, where a term that is small near it counts
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 
 
@@ -164,6 +165,14 @@ class Sampler:
                 found.append(expected)
                 nearness = 1.0
         return found
+
+    def farther(self) -> list[Expected]:
+        """A state FARTHER times as far from the start as the others; none where it is no state."""
+        drawn = [self.draw(FARTHER, True, False) for _ in range(4)]
+        state = max(drawn, key=lambda s: float(np.min(np.abs(s.q - self.start.q) / self.spread)))
+        with np.errstate(all="ignore"):
+            expected = self.expected(state) if self.regular(state) else None
+        return [] if expected is None else [expected]
 
     def draw(self, nearness: float, usual: bool, given: bool) -> State:
         """A random state; `usual`: default parameters; `given`: inputs from outside."""
