@@ -89,6 +89,7 @@ def _csrc(made: Steppers) -> Iterator[str]:
     texts = [(f"sincos/sincos{end}.h", "", "")] if target.sincos else []
     if rotates:
         texts += [("lanes/scalar.h", "", ""), (f"lanes/rotate{end}.h", "", "")]
+    texts += [("lanes/larger.h", "", "")] * any(m.implicit for m in made.methods)
     for name, width, turns in lanes:
         texts += [("lanes/vector.h", name, width)]
         texts += [(f"lanes/sincos{end}.h", name, width)] * target.sincos
@@ -98,6 +99,8 @@ def _csrc(made: Steppers) -> Iterator[str]:
         text = resources.text("csrc", file).replace("#include <math.h>\n", "")
         integer, bits = ("long long", "0x7fffffffffffffff") if size == 8 else ("int", "0x7fffffff")
         for old, new in (
+            # for many angles, gcc takes half as long again where it has inlined each one's
+            *([("static inline void", "static void")] if made.accelerations.long else ()),
             ("EOMC_BITS_OF_SIZE", bits),
             ("EOMC_INTEGER", integer),
             # compilers change how they pass what is aligned to more than a register has

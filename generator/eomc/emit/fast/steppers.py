@@ -292,7 +292,7 @@ class Steppers:
         real = self.one.real
         end = real.function_suffix
         return {
-            "f": real.suffix, "fabs": f"fabs{end}", "fmax": f"fmax{end}",
+            "f": real.suffix, "fabs": f"fabs{end}",
             "eps": self.one.target.literal(real.epsilon),
         }  # fmt: skip
 

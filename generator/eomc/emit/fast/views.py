@@ -230,7 +230,6 @@ class Gauss(Named):
     extent: str
     f: str
     fabs: str
-    fmax: str
     eps: str
     nudge: str
     title: str
@@ -265,7 +264,6 @@ class Sweeps(Named):
     extent: str
     f: str
     fabs: str
-    fmax: str
     eps: str
     enough: str
     loose: str
