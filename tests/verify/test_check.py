@@ -22,7 +22,8 @@ from eomc.verify import sampling
 from eomc.verify import symbolic as references
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
-from eomc.verify.convergence import Convergence, Finding
+from eomc.verify.convergence import Convergence
+from eomc.verify.finding import Finding
 from eomc.verify.report import Report
 from eomc.verify.sampling import LARGE
 from eomc.verify.symbolic import Reference, derive

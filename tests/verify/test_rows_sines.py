@@ -12,7 +12,7 @@ from cases import scene_system
 from conftest import Modules
 
 from eomc.verify.comparison import Comparison
-from eomc.verify.convergence import Finding
+from eomc.verify.finding import Finding
 from eomc.verify.rows_sines import LIMIT, vanishing
 
 

@@ -15,7 +15,8 @@ import sympy
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import System
 from eomc.verify import derivatives, one_step
-from eomc.verify.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Finding, Place, largest
+from eomc.verify.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Place
+from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import Row
 from eomc.verify.sampling import (

@@ -1,7 +1,6 @@
 """What a module's runs say of its steppers: orders, balances of power, advice on h.
 
-Each finding is a number, or the reason why none can be had: `Finding.why`. A number is judged by
-the row that shows it. The rules are such that a right module is not blamed where nothing can be
+The rules are such that a right module is not blamed where nothing can be
 seen, and a wrong one is wherever it can be:
 
 - An order is that of the best of several halvings of h, over spans from short to long. A wrong
@@ -27,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ COUNTS = (6, 12, 24, 48, 96)  # steps of a span
 FIRST = (0, -1, 1, -2, 2)  # log2 of spans over 48 h that are looked at first
 LOWER, MOST = (-2, -4, -7, -10, -14, -20), 8  # then down to where all is rounding, and up
 BALANCE_SPANS = (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11)  # powers of 2, of h
+BESIDE = (1 - 1e-9, 1 + 1e-9)  # times a state: hardly changes what is smooth, but its roundings
 CLOSED = 1e3  # roundings of the energy: a balance is closed
 RESOLVED = 1e-3  # of the motion: two methods are compared where halving h changes no more
 NUDGE = 1e-6  # relative change at the start, from which growth is estimated
@@ -56,25 +57,6 @@ LINEAR = 1e-9  # of the motion: a difference this small grows in proportion, whe
 APART = 2.0  # times the limit of the eigenvalues: an advised h further off is wrong
 PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
 AHEAD = 2000  # steps of the scene's h in which these lie
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What was found; inf where there is nothing to measure. why: nothing is judged, and why.
-
-    unit, limit: of another measure than the row's own, at most the limit.
-    """
-
-    value: float
-    why: str = ""
-    unit: str = ""
-    limit: float = math.inf
-
-
-def largest(errors: Iterable[float | None], why: str) -> float | Finding:
-    """The largest of those that there are, nan before all; with none, not judged and why."""
-    known = [x for x in errors if x is not None]
-    return float(np.max(known)) if known else Finding(math.nan, why)
 
 
 @dataclass(frozen=True)
@@ -276,7 +258,8 @@ class Convergence:
     def _closing(self, at: Place) -> float:
         """From spans that are short enough upwards, until a rest of the balance shows.
 
-        A rest that two halvings leave as it is, in two spans in a row, is a wrong power: 0.
+        A rest that two halvings leave as it is, in two spans in a row, is a wrong power, 0, or
+        rounding within formulas, which is another beside the state.
         """
         rest, closed = 0.0, False
         for power in BALANCE_SPANS:
@@ -287,7 +270,8 @@ class Convergence:
                 continue
             a, b, c = gaps
             if abs(c - b) <= 0.1 * abs(c) and abs(b - a) <= 0.3 * abs(b):
-                if rest and 1.2 < c / rest < 20:  # it grows with the span, or with its square
+                grows = rest and 1.2 < c / rest < 20  # with the span, or with its square
+                if grows and self._is_left(at, self.h * 2.0**power, c):
                     return math.log2(abs(a / c)) / 2
                 rest = c
                 continue
@@ -296,6 +280,13 @@ class Convergence:
             if order >= self.closing_limit and abs(b) < abs(a):
                 return order
         return math.inf if closed else math.nan
+
+    def _is_left(self, at: Place, span: float, rest: float) -> bool:
+        """Whether as much is left of the balance beside that state."""
+        s = at.state
+        near = (replace(at, state=replace(s, q=s.q * k, qd=s.qd * k)) for k in BESIDE)
+        found = [self._gaps(x, span)[0][-1:] for x in near]
+        return all(x and abs(x[0] - rest) <= 0.1 * abs(rest) for x in found)
 
     def _gaps(self, at: Place, span: float) -> tuple[list[float], bool]:
         """What is left of the balance with 16, 32 and 64 steps; whether one of them closes it."""

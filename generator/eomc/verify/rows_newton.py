@@ -17,7 +17,7 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
-from eomc.verify.convergence import Finding
+from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_runs import drive
 from eomc.verify.sampling import State

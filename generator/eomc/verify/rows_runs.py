@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
-from eomc.verify.convergence import Finding, largest
+from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 
 if TYPE_CHECKING:
@@ -31,8 +31,13 @@ EVERY = 3  # no divisor of STEPS
 # an angle to be predicted, and then too far for its sine to be rotated.
 LONG = (0.02, 0.2, 0.7)
 TURNED = 0.3  # radians: where a polynomial for rotations by 2^-6 is off by millions of roundings
+# radians: nearly the most that sines are rotated by, at half of a step and from there on
+ROTATED, ON = 0.11, 0.012
+SHORT = 2.0**-14  # radians: of steps whose angles are predicted
+SPEEDS = (0.1, 1.0, 4.0)  # times a state's own: at which the one or the other is what bounds a step
 LADDER = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.7)  # between them: rotations by all they may be
 ANGLES = 48  # around the circle, at which sines are looked at
+SHORT_LIMIT = 20.0  # units; wrong terms of predicted sines make hundreds
 SINES = 20.0  # units; their last terms make hundreds
 FEW, FEWER = 6, 3  # long steps, or steps with a row of u each; where the reference takes long
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
@@ -111,12 +116,15 @@ class Runs:
         self.sampler, self.random = check.sampler, np.random.default_rng(7)
         self.states = [e.state for e in check.few(2)]
         self.few = FEWER if check.large else FEW
+        self.turning = [replace(s, qd=k * s.qd) for s in self.states for k in SPEEDS]
 
     def report(self) -> None:
         """Add them."""
         row, rounding = self.check.row, "units of rounding"
         if self.check.methods[0] == "rk4":
-            row("long steps", self.limit, rounding + ", times steps and growth", self.long)
+            unit = rounding + ", times steps and growth"
+            row("long steps", self.limit, unit, self.long)
+            row("short steps", SHORT_LIMIT, unit, self.short)
         if np.any(self.sampler.angles):
             row("sines around the circle", SINES, rounding, self.sines)
         if np.any(self.sampler.angles) or self.model._timed:
@@ -149,21 +157,33 @@ class Runs:
             h = np.minimum(spread / np.abs(s.qd), np.sqrt(spread / np.abs(a)))
         return float(min(np.min(h), 100 * self.h)) or self.h
 
-    def turning_step(self, s: State) -> float:
-        """An h in which accelerations alone turn some angle by TURNED at half of it."""
+    def turning_step(self, s: State, turned: float = TURNED, moved: float = math.inf) -> float:
+        """An h at half of which accelerations turn some angle by `turned`, or rates by `moved`."""
         a = np.asarray(self.check.module.acceleration(s.q, s.qd, s.t, s.u, s.params), float)
-        fastest = float(np.max(np.abs(a[self.sampler.angles]), initial=0))
-        return min(math.sqrt(4 * TURNED / fastest), 100 * self.h) if fastest > 0 else self.h
+        fastest, rate = (
+            float(np.max(np.abs(x[self.sampler.angles]), initial=0)) for x in (a, s.qd)
+        )
+        steps = [math.sqrt(4 * turned / fastest)] if fastest > 0 else []
+        steps += [2 * moved / rate] if rate > 0 else []
+        return min([*steps, 100 * self.h]) if steps else self.h
 
     def long(self) -> float | Finding:
         """Long steps beside the reference's."""
         parts = ((), LONG) if self.check.large else (LONG, LADDER)
-        found = (
-            self.check.run(s, h=h, steps=self.few)
+        pairs = [
+            (s, h)
             for s, some in zip(self.states, parts, strict=False)
             for h in (self.turning_step(s), *(self.large_step(s, part) for part in some))
-        )
+        ]
+        pairs += [(s, self.turning_step(s, ON, ROTATED)) for s in self.turning]
+        found = (self.check.run(s, h=h, steps=self.few) for s, h in pairs)
         return largest(found, "a difference grows too much in one long step")
+
+    def short(self) -> float | Finding:
+        """Steps in which angles hardly turn beside the reference's."""
+        states = [e.state for e in self.check.few(2 if self.check.large else 8)]
+        found = (self.check.run(s, self.turning_step(s, SHORT), self.few) for s in states)
+        return largest(found, "a difference grows too much in one short step")
 
     def sines(self) -> float:
         """D, g and bias all around the circle, where sines need all of their terms."""
@@ -268,6 +288,7 @@ class Runs:
         wrong = 0
         for s in self.states:
             steps = [self.h, *(self.large_step(s, part) for part in LONG)]
+            steps += [self.turning_step(s, part) for part in (SHORT, SHORT / 64)]
             for h in steps:
                 for at in (s, *([self.table(s)] if self.model.nu else [])):
                     wrong += self.differ(method, at, h)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eomc.verify.convergence import Finding
+from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
 
 if TYPE_CHECKING:

@@ -136,16 +136,21 @@ class Sampler:
         self.rejected = 0
         start = self.start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
         # how far things go: from the start, from what happens next, else 1 of the unit
-        with np.errstate(all="ignore"):
-            try:
-                h = effort.stride * system.run.h
-                _, q, qd = reference.simulate(h=h, steps=effort.ahead)
-            except np.linalg.LinAlgError:
-                q, qd = start.q[None], start.qd[None]
-        far, fast = (np.nan_to_num(np.max(np.abs(x), axis=0), posinf=0) for x in (q, qd))
         self.angles = np.array([c.unit == "rad" for c in system.coordinates])
+        turned = start.q + self.angles  # as what rests where it starts moves from elsewhere
+        far, fast = np.max([self._ahead(q, effort) for q in (start.q, turned)], axis=0)
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
         self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
+
+    def _ahead(self, q: Vector, effort: Effort) -> Vector:
+        """(2, nq): how far coordinates and velocities get from there, 0 where it is not finite."""
+        start, h = self.start, effort.stride * self.system.run.h
+        try:
+            with np.errstate(all="ignore"):
+                _, *x = self.reference.simulate(q, start.qd, h=h, steps=effort.ahead)
+        except np.linalg.LinAlgError:
+            x = [start.q[None], start.qd[None]]
+        return np.array([np.nan_to_num(np.max(np.abs(y), axis=0), posinf=0) for y in x])
 
     def states(self, count: int) -> list[Expected]:
         """The start, some states with the parameters' defaults, then all at random."""

@@ -1,0 +1,28 @@
+"""What a row of `check` finds: a number, or the reason why none can be had."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found; inf where there is nothing to measure. why: nothing is judged, and why.
+
+    unit, limit: of another measure than the row's own, at most the limit.
+    """
+
+    value: float
+    why: str = ""
+    unit: str = ""
+    limit: float = math.inf
+
+
+def largest(errors: Iterable[float | None], why: str) -> float | Finding:
+    """The largest of those that there are, nan before all; with none, not judged and why."""
+    known = [x for x in errors if x is not None]
+    return float(np.max(known)) if known else Finding(math.nan, why)
