@@ -19,14 +19,14 @@ from eomc.program.program import TIME, Program
 _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
-    "moving constants along column slopes count failures point E".split()
+    "moving constants along column slopes outputs count failures point E".split()
 )
 
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
 # that is called so has another name in C
 OWN = frozenset(
     "AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE NOINLINE NOT_FINITE NO_CONVERGENCE NQ NU "
-    "OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
+    "NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
 )
 
 Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C
@@ -64,11 +64,12 @@ class Target:
 
     @cached_property
     def enum(self) -> dict[str, str]:
-        """The enumerator of every coordinate and input."""
+        """The enumerator of every coordinate and input, and of each output, as OUT_name."""
         taken = {f"{self.PREFIX}_{w}" for w in OWN}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
-        wishes = [f"{self.PREFIX}_{name}" for name in indexed]
-        return dict(zip(indexed, _unique(wishes, taken), strict=True))
+        outputs = [f"OUT_{o.name}" for o in self.system.outputs]
+        wishes = [f"{self.PREFIX}_{name}" for name in (*indexed, *outputs)]
+        return dict(zip((*indexed, *outputs), _unique(wishes, taken), strict=True))
 
     @property
     def input_names(self) -> list[str]:
@@ -129,7 +130,7 @@ class Target:
         """How names from outside are written: p->m_c for parameters, theta_ where theta is ours."""
         s = self.system
         out = {x.name: c_function.member("p", x.name) for x in s.parameters}
-        mine = [*(x.name for x in s.q), *(x.name for x in s.qd), *self.input_names]
+        mine = [x.name for x in (*s.q, *s.qd, *(s.qdd if s.outputs else ()), *s.u)]
         return out | {n: local(n) for n in mine}
 
     def body(
@@ -148,6 +149,8 @@ class Target:
         NQ = f"{self.PREFIX}_NQ"
         read = [(c.q.name, state("q", c.name)) for c in s.coordinates]
         read += [(c.qd.name, state("qd", c.name)) for c in s.coordinates]
+        if s.outputs:
+            read += [(c.qdd.name, state("qdd", c.name)) for c in s.coordinates]
         read += [(name, inputs("u", name)) for name in self.input_names]
         read += [(c.q.name + ALONG, state("along", c.name)) for c in s.coordinates]
         read += [(c.qd.name + ALONG, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
@@ -163,11 +166,12 @@ class Target:
         return f"{array}[{self.enum[name]}]"
 
     def groups(self) -> dict[str, frozenset[str]]:
-        """The names that each argument brings: those of q, qd, t, u, p, along."""
+        """The names that each argument brings: those of q, qd, qdd, t, u, p, along."""
         s = self.system
         return {
             "q": frozenset(x.name for x in s.q),
             "qd": frozenset(x.name for x in s.qd),
+            "qdd": frozenset(x.name for x in s.qdd) if s.outputs else frozenset(),
             "t": frozenset({TIME}),
             "u": frozenset(self.input_names),
             "p": frozenset(p.name for p in s.parameters),

@@ -15,11 +15,12 @@ class Kind:
     """What is known of a function before it is looked at: results, arguments, meaning."""
 
     out: str
-    shape: str  # "", "n", "n*n", "n*p" or "m"
+    shape: str  # "", "n", "n*n", "n*p", "m", "y" or "y*x"
     qd: bool
     u: bool
     doc: str
     symmetric: bool = False
+    qdd: bool = False  # whether it may read accelerations
 
 
 KINDS: Mapping[str, Kind] = {
@@ -48,6 +49,17 @@ KINDS: Mapping[str, Kind] = {
         True,
         "E = dqdd/dp at held inputs, nq rows, a column for each parameter in its order.",
     ),
+    "outputs": Kind(
+        "outputs", "y", True, True, "What the scene asks for, in the order above.", qdd=True
+    ),
+    "output_slopes": Kind(
+        "slopes",
+        "y*x",
+        True,
+        True,
+        "[dy/dq, dy/dqd, dy/du, dy/dqdd] of the outputs y, by rows, each at the others held.",
+        qdd=True,
+    ),
     "signal": Kind("u", "m", True, False, "u: the scene's own signals for the inputs."),
 }
 
@@ -56,6 +68,12 @@ def source(target: Target, name: str) -> Function | None:
     """The function that `name` is computed by: its own, or one that gives a column at a time."""
     of = target.program.functions
     return of.get(name) or of.get(f"{name}_column")
+
+
+def takes_qdd(target: Target, name: str) -> bool:
+    """Whether a function reads accelerations."""
+    function = source(target, name)
+    return bool(KINDS[name].qdd and function and function.uses & target.groups()["qdd"])
 
 
 def takes_t(target: Target, name: str) -> bool:

@@ -18,11 +18,13 @@ from eomc.emit.c_names import Target, sentence, unclashed
 from eomc.emit.evaluations import KINDS, source
 from eomc.emit.plain.views import Computed, Indexed, Parameter
 from eomc.emit.public import Public
+from eomc.model.symbols import Coordinate, Input, Output
 from eomc.program import outline
 from eomc.program.ir import Function
 from eomc.program.program import Program
 
 STATE = ("q", "qd")
+READ = (*STATE, "qdd", "t", "u", "p")
 FEW = 16  # statements that are read at a glance, without comments between them
 
 
@@ -89,7 +91,7 @@ class Functions:
 
     def argument(self, name: str) -> CArgument:
         """One of the usual arguments: q, qd, t, h, u, p."""
-        if name in STATE:
+        if name in (*STATE, "qdd"):
             return c.given(self.real, name, self.NQ)
         if name == "u":
             return c.given(self.real, name)
@@ -110,7 +112,7 @@ class Functions:
     def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:
         """The arguments that a static function needs, arrays as pointers."""
         needed = [n for n in names if function.uses & self.brought[n]]
-        arrays = (*STATE, "along")
+        arrays = (*STATE, "qdd", "along")
         return tuple(c.given(self.real, n) if n in arrays else self.argument(n) for n in needed)
 
     # the scene's signals
@@ -234,7 +236,7 @@ class Functions:
             return summed
         if outline.is_large(function):
             out = kind.out or ("power" if name == "power" else "energy")
-            values, parts, calls = self.cut(function, name, out, ("q", "qd", "t", "u", "p"))
+            values, parts, calls = self.cut(function, name, out, READ)
             if not kind.out:
                 one = Block("", (c.local(self.real, f"{out}[1]"), *calls[0].lines))
                 calls = (one, calls[1], Block("", (c.result(f"{out}[0]"),)))
@@ -264,10 +266,10 @@ class Functions:
         self, function: Function, what: str, out: str, doc: str, fails: bool = False
     ) -> Computed:
         """A static function that fills `out`; one that `fails` has pivots, and returns a status."""
-        values, parts, usual = "", tuple[CFunction, ...](), ("q", "qd", "t", "u", "p")
+        values, parts = "", tuple[CFunction, ...]()
         failures: tuple[str, ...] = ()
         if outline.is_large(function):
-            values, parts, blocks = self.cut(function, what, out, ("along", *usual))
+            values, parts, blocks = self.cut(function, what, out, ("along", *READ))
         else:
             blocks, body = self.straight(function, out)
             failures = c.unless(body.failures, self.singular)
@@ -277,7 +279,7 @@ class Functions:
         made = CFunction(
             f"{self.prefix}_{what}",
             self.status if fails else "void",
-            (c.filled(self.real, out), *along, *self.pointers(function, *usual)),
+            (c.filled(self.real, out), *along, *self.pointers(function, *READ)),
             blocks,
             self.read(function, follows=False) | {out},
             "static",
@@ -295,9 +297,7 @@ class Functions:
         values, parts = "", tuple[CFunction, ...]()
         unfinite = c.unless([f"!{self.prefix}_finite(a, {self.NQ})"], f"{self.PREFIX}_NOT_FINITE")
         if outline.is_large(function):
-            values, parts, blocks = self.cut(
-                function, "acceleration", "a", ("q", "qd", "t", "u", "p")
-            )
+            values, parts, blocks = self.cut(function, "acceleration", "a", READ)
             first = Block("", (c.local(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
             blocks = (first, *blocks[1:])
         else:
@@ -323,13 +323,12 @@ def of(program: Program, real: Real | None = None) -> Functions:
     return Functions(Target(program, replace(real or REALS[program.system.run.real], reach=0.0)))
 
 
-def indexed(plain: Functions, inputs: bool = False) -> tuple[Indexed, ...]:
-    """Coordinates, or inputs, with their enumerators."""
-    s = plain.target.system
-    return tuple(
-        Indexed(plain.target.enum[x.name], heading.words(x.unit, x.note))
-        for x in (s.inputs if inputs else s.coordinates)
-    )
+def indexed(
+    plain: Functions, some: Sequence[Coordinate | Input | Output], prefix: str = ""
+) -> tuple[Indexed, ...]:
+    """Coordinates, inputs or outputs with their enumerators."""
+    enum = plain.target.enum
+    return tuple(Indexed(enum[prefix + x.name], heading.words(x.unit, x.note)) for x in some)
 
 
 def parameters(plain: Functions) -> tuple[Parameter, ...]:

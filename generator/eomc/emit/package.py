@@ -7,16 +7,17 @@ import math
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import cast, member
 from eomc.emit.c_names import Target
-from eomc.emit.evaluations import KINDS, takes_t
+from eomc.emit.evaluations import KINDS, takes_qdd, takes_t
 from eomc.emit.heading import stamp, words
 from eomc.emit.public import Public
 from eomc.emit.views import Binding, Bound, BoundMethod, Declarations, Face, Main, Named
 from eomc.integrators.tableaux import METHODS
 
+TIMED = ("energy", "jacobi", "outputs")  # what runs ask for at each of their rows
 ROWS = 200  # of main.c, about
 FUNCTIONS = (
-    "C D acceleration advice bias energy g jacobi kinetic_energy linearize potential_energy power "
-    "rhs sensitivity signal simulate simulate_batch step step_batch tau"
+    "C D acceleration advice bias energy g jacobi kinetic_energy linearize output potential_energy "
+    "power rhs sensitivity signal simulate simulate_batch step step_batch tau"
 ).split()
 
 
@@ -54,7 +55,8 @@ def _bound(target: Target) -> tuple[Bound, ...]:
         name = function.name.removeprefix(f"{target.prefix}_")
         kind, out = KINDS[name], function.arguments[0].extent
         call = function.call(**at | ({kind.out: f"out + {out}*k"} if kind.out else {}))
-        found.append(Bound(name, call if kind.out else f"out[k] = {call}"))
+        solve = Public(target).acceleration.call(**at) if takes_qdd(target, name) else ""
+        found.append(Bound(name, call if kind.out else f"out[k] = {call}", solve))
     return tuple(found)
 
 
@@ -118,11 +120,15 @@ def declarations(bound: Binding) -> Declarations:
     )
 
 
+def _timed(target: Target, name: str) -> bool:
+    return takes_t(target, name) or (target.driven and takes_qdd(target, name))
+
+
 def face(target: Target, extension: str) -> Face:
     """The Python package's __init__."""
     s, written = target.system, target.as_written
     units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
-    units |= {i.name: i.unit for i in s.inputs}
+    units |= {i.name: i.unit for i in s.inputs} | {o.name: o.unit for o in s.outputs}
     return Face(
         title=FreeText(s.title),
         stamp=tuple(stamp(target)),
@@ -135,14 +141,16 @@ def face(target: Target, extension: str) -> Face:
             Named(written(p.name), words(p.unit, p.note), repr(p.value)) for p in s.parameters
         ),
         inputs=tuple(Named(written(i.name), words(i.unit, i.note)) for i in s.inputs),
+        outputs=tuple(Named(o.name, words(o.unit, o.note)) for o in s.outputs),
         coordinate_units=FreeText({written(c.name): c.unit for c in s.coordinates}),
         parameter_values={written(p.name): p.value for p in s.parameters},
         input_units=FreeText({written(i.name): i.unit for i in s.inputs}),
+        output_units=FreeText({o.name: o.unit for o in s.outputs}),
         units=FreeText({written(name): unit for name, unit in units.items() if unit}),
         start=([c.start for c in s.coordinates], [c.rate for c in s.coordinates]),
         h=s.run.h,
         duration=s.run.duration,
-        timed=tuple(n for n in ("energy", "jacobi") if n in target.program and takes_t(target, n)),
+        timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,
         methods=tuple(METHODS[name] for name in s.run.methods),
         functions=tuple(n for n in FUNCTIONS if s.run.batch or not n.endswith("_batch")),

@@ -62,10 +62,14 @@ class SelfTest:
 
 @dataclass(frozen=True)
 class Bound:
-    """A function of the scene in the binding: its name, and its call for row k of many."""
+    """A function of the scene in the binding: its name, and its call for row k of many.
+
+    solve: the call for the accelerations that it reads, if it does.
+    """
 
     name: str
     call: str
+    solve: str
 
 
 @dataclass(frozen=True)
@@ -130,9 +134,11 @@ class Face:
     coordinates: tuple[Named, ...]
     parameters: tuple[Named, ...]
     inputs: tuple[Named, ...]
+    outputs: tuple[Named, ...]
     coordinate_units: FreeText
     parameter_values: Mapping[str, float]
     input_units: FreeText
+    output_units: FreeText
     units: FreeText
     start: tuple[list[float], list[float]]
     h: float

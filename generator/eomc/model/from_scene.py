@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import sympy
@@ -11,11 +11,12 @@ from sympy import Expr, Symbol
 from eomc.base.errors import Problem, SceneError
 from eomc.model import growth
 from eomc.model.multibody import Builder, Terms
-from eomc.model.symbols import Coordinate, Input, Parameter, dot, symbol, t
+from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
 from eomc.model.system import System
 from eomc.scene import formulas
 from eomc.scene.formulas import Formula, FormulaError
 from eomc.scene.scene import Scene
+from eomc.scene.scope import ENERGIES
 
 
 def _number(text: str) -> Expr:
@@ -88,6 +89,18 @@ class _Formulas:
             made += builder.terms.later
         return made, builder.terms if builder else Terms()
 
+    def outputs(self, kinetic: Expr, potential: Expr) -> Iterator[Output]:
+        """The outputs, which may use accelerations and energies."""
+        accelerations = (f"{c.name}_ddot" for c in self.scene.coordinates)
+        energies = (kinetic, potential, kinetic + potential)
+        self.known = {
+            **dict(zip(ENERGIES, energies, strict=True)),
+            **{name: symbol(name) for name in accelerations},
+            **self.known,
+        }
+        for o in self.scene.outputs:
+            yield Output(o.name, self.value(f"outputs.{o.name}.formula", o.formula), o.unit, o.note)
+
 
 def from_scene(scene: Scene) -> System:
     """The scene's formulas as SymPy expressions, constants folded in. Raises SceneError."""
@@ -99,25 +112,29 @@ def from_scene(scene: Scene) -> System:
     start, rate = scene.start()
     forces = {name: value(f"forces.{name}", formula) for name, formula in scene.forces.items()}
     zero = sympy.S.Zero
+    kinetic_energy = sympy.Add(kinetic, more.kinetic, *more.tree_kinetic)
+    potential_energy = sympy.Add(potential, more.potential, *more.tree_potential)
+    inputs = tuple(
+        Input(i.name, i.unit, value(f"inputs.{i.name}.signal", i.signal), i.note)
+        for i in scene.inputs
+    )
     system = System(
         name=scene.name,
         coordinates=tuple(
             Coordinate(c.name, c.unit, q, qd, c.note)
             for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
         ),
-        kinetic=sympy.Add(kinetic, more.kinetic, *more.tree_kinetic),
-        potential=sympy.Add(potential, more.potential, *more.tree_potential),
+        kinetic=kinetic_energy,
+        potential=potential_energy,
         dissipation=value("energy.dissipation", scene.dissipation) + more.dissipation,
         forces=tuple(
             more.forces.get(c.name, zero) + forces.get(c.name, zero) for c in scene.coordinates
         ),
         tree=more.tree(kinetic, potential),
         parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
-        inputs=tuple(
-            Input(i.name, i.unit, value(f"inputs.{i.name}.signal", i.signal), i.note)
-            for i in scene.inputs
-        ),
+        inputs=inputs,
         definitions=tuple(definitions),
+        outputs=tuple(made.outputs(kinetic_energy, potential_energy)),
         run=scene.run,
         title=scene.title,
         note=scene.note,

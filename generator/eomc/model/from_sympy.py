@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import sympy
@@ -13,7 +13,7 @@ from sympy.core.function import AppliedUndef
 from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.model import given
-from eomc.model.symbols import Coordinate, Input, Parameter, dot, symbol, t
+from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
 from eomc.scene.scene import Run
 
 if TYPE_CHECKING:
@@ -76,7 +76,8 @@ class Maker:
     def make(
         self, of: type[System], coordinates: Any, kinetic: Any, potential: Any,
         parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
-        definitions: Mapping[Any, Any], units: Mapping[Any, str], title: str, run: Run,
+        definitions: Mapping[Any, Any], outputs: Mapping[str, Any], units: Mapping[Any, str],
+        title: str, run: Run,
     ) -> System:  # fmt: skip
         """The system, of the class `of`."""
         starts = given.symbols(coordinates, "coordinates", 0.0)
@@ -135,11 +136,31 @@ class Maker:
                 for one, used in given_inputs
             ),
             "definitions": tuple(ordered),
+            "outputs": tuple(self._outputs(outputs, starts, made, units)),
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
         }
         digest = hashlib.sha256(sympy.srepr(sorted(made_of.items())).encode()).hexdigest()
         return of(**made_of, digest=digest, renamed=tuple(self.renamed))
+
+    def _outputs(
+        self, outputs: Any, starts: Iterable[Any], made: Sequence[Coordinate],
+        units: Mapping[Any, str],
+    ) -> Iterator[Output]:  # fmt: skip
+        """The outputs, which may use accelerations."""
+        for one, c in zip(starts, made, strict=True):
+            if isinstance(one, AppliedUndef):
+                self.map[sympy.Derivative(one, (one.args[0], 2))] = c.qdd
+            else:
+                self.map[Symbol(f"{one}_ddot", **one.assumptions0)] = c.qdd
+            self.known.add(c.qdd)
+        for name, formula in given.mapping(outputs, "outputs", '{"tip_x": l*sin(theta)}').items():
+            if not isinstance(name, (str, Symbol)):
+                raise given.fault("outputs", f"{name!r} is not a name")
+            if why := names.fault(str(name)):
+                raise EomcError(f"System.make: outputs: {why}")
+            expr = self._expression(formula, f"output {name}")
+            yield Output(str(name), expr, units.get(name, ""))
 
     def _declare(self, one: Any, role: str) -> str:
         used = self._name_of(one, role)

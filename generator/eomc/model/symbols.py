@@ -47,6 +47,11 @@ class Coordinate:
         """The velocity's symbol, `<name>_dot`."""
         return symbol(f"{self.name}_dot")
 
+    @property
+    def qdd(self) -> Symbol:
+        """The acceleration's symbol, `<name>_ddot`, which outputs alone have."""
+        return symbol(f"{self.name}_ddot")
+
 
 @dataclass(frozen=True)
 class _Named:
@@ -63,6 +68,15 @@ class Parameter(_Named):
     """A number that may change at run time."""
 
     value: float
+    unit: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Output(_Named):
+    """A quantity that is asked for; its formula is over everything, accelerations too."""
+
+    formula: Expr
     unit: str = ""
     note: str = ""
 

@@ -16,12 +16,12 @@ from sympy import Expr, Symbol
 from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
 from eomc.model.multibody import Tree
-from eomc.model.symbols import Coordinate, Input, Parameter, dot, symbol, t
+from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
 from eomc.scene.scene import Run, Scene
 
 LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision, in C
 
-__all__ = ["Coordinate", "Input", "Parameter", "System", "dot", "symbol", "t"]
+__all__ = ["Coordinate", "Input", "Output", "Parameter", "System", "dot", "symbol", "t"]
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ class System:
     parameters: tuple[Parameter, ...] = ()
     inputs: tuple[Input, ...] = ()
     definitions: tuple[tuple[Symbol, Expr], ...] = ()
+    outputs: tuple[Output, ...] = ()
     tree: Tree | None = None
     run: Run = field(default_factory=Run)
     title: str = ""
@@ -65,6 +66,11 @@ class System:
         """The velocities' symbols, in scene order."""
         return tuple(c.qd for c in self.coordinates)
 
+    @property
+    def qdd(self) -> tuple[Symbol, ...]:
+        """The accelerations' symbols, in scene order."""
+        return tuple(c.qdd for c in self.coordinates)
+
     def problem(self, key: str, message: str, severity: str = "error") -> Problem:
         """A problem at a key such as `energy.kinetic`, with its line where there is a scene."""
         if self.place is None:
@@ -78,8 +84,9 @@ class System:
 
     @property
     def names(self) -> frozenset[str]:
-        """Those of coordinates, velocities, inputs and parameters, which no value may take."""
-        given = (*self.q, *self.qd, *self.u)
+        """Those of coordinates, velocities, inputs, parameters, and of accelerations where outputs
+        may read them: no value may take one."""
+        given = (*self.q, *self.qd, *self.u, *(self.qdd if self.outputs else ()))
         return frozenset([*(x.name for x in given), *(p.name for p in self.parameters)])
 
     @property
@@ -100,6 +107,7 @@ class System:
         forces: Mapping[Any, Any] | None = None,
         inputs: Mapping[Any, Any] | Sequence[Any] = (),
         definitions: Mapping[Any, Any] | None = None,
+        outputs: Mapping[str, Any] | None = None,
         units: Mapping[Any, str] | None = None,
         title: str = "",
         h: float = 0.001,
@@ -114,8 +122,9 @@ class System:
         coordinates: symbols or dynamicsymbols, or a mapping to their start (or (start, rate)).
         With plain symbols the velocity of `theta` is the symbol `theta_dot`; with dynamicsymbols
         it is `theta.diff()`. parameters, inputs (to their default signal) and definitions are
-        mappings from symbols. Names that C can't bear (`\theta`, `lambda`) are replaced, and
-        `renamed` says how. Raises EomcError where something is undeclared.
+        mappings from symbols, outputs from names; `theta_ddot`, or the second derivative of a
+        dynamicsymbol, is an acceleration there. Names that C can't bear (`\theta`, `lambda`) are
+        replaced, and `renamed` says how. Raises EomcError where something is undeclared.
 
         >>> from sympy.physics.mechanics import dynamicsymbols
         >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
@@ -126,7 +135,7 @@ class System:
         run = given.run(h, duration, methods, real, batch, linearize)
         system = from_sympy.Maker(name).make(
             cls, coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
-            inputs, definitions or {}, units or {}, title, run,
+            inputs, definitions or {}, outputs or {}, units or {}, title, run,
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
@@ -148,6 +157,7 @@ class System:
             ("energy.dissipation", self.dissipation),
             *((f"forces.{c.name}", e) for c, e in zip(self.coordinates, self.forces, strict=True)),
             *((f"inputs.{i.name}.signal", i.signal) for i in self.inputs),
+            *((f"outputs.{o.name}", o.formula) for o in self.outputs),
         ]
         numbers += [(key, n) for key, e in expressions for n in e.atoms(sympy.Number)]
         for key, n in numbers:

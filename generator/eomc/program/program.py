@@ -9,6 +9,7 @@ from eomc.base.errors import Problem, SceneError
 from eomc.derive.lagrange import Derivation
 from eomc.derive.ldl import Solution
 from eomc.derive.linearize import linearization, sensitivity
+from eomc.derive.outputs import outputs
 from eomc.derive.tape import Stage
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG
@@ -77,6 +78,7 @@ def build(derived: Derivation) -> Program:
     taken = candidates[best.route]
     for made in _derivatives(system, taken):
         functions[made.name] = replace(made, route=best.route)
+    functions |= {made.name: made for made in _outputs(system)}
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     notes = next(f.notes for f in found.values())
@@ -106,6 +108,17 @@ def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
     if run.linearize == "parameters" and system.parameters:
         rows = sensitivity(system, taken.tape, taken.outputs)
         yield lower("sensitivity", taken.tape, [x for row in rows for x in row], (), (), names)
+
+
+def _outputs(system: System) -> Iterator[Function]:
+    """The outputs, and their derivatives where those of the accelerations are asked for."""
+    if not system.outputs:
+        return
+    made = outputs(system, sloped=bool(system.run.linearize))
+    labels = [o.name for o in system.outputs]
+    yield lower("outputs", made.tape, made.values, (), labels, system.names)
+    if rows := [x for row in made.slopes for x in row]:
+        yield lower("output_slopes", made.tape, rows, (), (), system.names)
 
 
 def _unsuited(program: Program) -> list[Problem]:

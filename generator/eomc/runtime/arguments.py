@@ -80,7 +80,7 @@ class Arguments:
     def __init__(
         self, extension: Any, *, name: str, title: str, dtype: str,
         coordinates: Mapping[str, str], parameters: Mapping[str, float],
-        inputs: Mapping[str, str], units: Mapping[str, str],
+        inputs: Mapping[str, str], outputs: Sequence[str], units: Mapping[str, str],
         start: tuple[Sequence[float], Sequence[float]], timed: Sequence[str], digest: str,
     ) -> None:  # fmt: skip
         # thirty attributes at most with those of Model: with more CPython 3.11 looks up each slowly
@@ -91,7 +91,7 @@ class Arguments:
         self.name, self.title, self.digest = name, title, digest
         self.dtype = np.dtype(dtype)
         self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
-        self.parameters = tuple(parameters)
+        self.parameters, self.outputs = tuple(parameters), tuple(outputs)
         self.defaults = Defaults(parameters)
         self.units = dict(units)
         self.nq, self.nu = len(self.coordinates), len(self.inputs)

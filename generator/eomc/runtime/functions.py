@@ -141,6 +141,19 @@ class Functions(Arguments):
         """The scene's own inputs at a state and time, (nu,)."""
         return self._evaluate("signal", (self.nu,), q, qd, t, None, params, None)
 
+    def output(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
+        params: Parameters = None, out: Any = None,
+    ) -> Array:  # fmt: skip
+        """The scene's outputs, (ny,), in the order of `outputs`. u None: the scene's signals.
+
+        nan where one needs accelerations and D is singular. Raises ValueError where there are none.
+        """
+        if not self.outputs:
+            raise ValueError(f"output: {self.name} has none: a scene names them in [outputs]")
+        values: Array = self._evaluate("outputs", (len(self.outputs),), q, qd, t, u, params, out)
+        return values
+
     def acceleration(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
@@ -181,9 +194,12 @@ class Functions(Arguments):
         return hasattr(self._lib, "linearization")
 
     def linearize(
-        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Parameters = None
-    ) -> tuple[Array, Array]:
+        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0,
+        params: Parameters = None, *, outputs: bool = False,
+    ) -> tuple[Array, ...]:  # fmt: skip
         """d[q; qd]/dt = A dx + B du near a state, x = [q; qd]: A (2 nq, 2 nq), B (2 nq, nu).
+
+        With outputs=True also C (ny, 2 nq) and D (ny, nu) of the outputs, dy = C dx + D du.
 
         Upper rows of A: [0, 1]; lower ones [dqdd/dq, dqdd/dqd], in rad or m per s^2 and per rad,
         m or their rates; of B: 0, then dqdd/du. Exact derivatives, to rounding. u None: held at
@@ -211,7 +227,14 @@ class Functions(Arguments):
         A, B = np.zeros((2 * n, 2 * n), self.dtype), np.zeros((2 * n, m), self.dtype)
         A[:n, n:] = np.eye(n)
         A[n:, :n], A[n:, n:], B[n:] = A_q, A_qd, B_u
-        return A, B
+        if not outputs:
+            return A, B
+        if not self.outputs:
+            raise ValueError(f"linearize: {self.name} has no outputs: name them in [outputs]")
+        shape = (len(self.outputs), 3 * n + m)
+        slopes = self._evaluate("output_slopes", shape, at, moving, t, u, params, None)
+        by_state, by_u, by_qdd = np.split(slopes, [2 * n, 2 * n + m], axis=1)
+        return A, B, by_state + by_qdd @ A[n:], by_u + by_qdd @ B[n:]
 
     def sensitivity(
         self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Parameters = None

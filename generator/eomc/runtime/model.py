@@ -12,7 +12,7 @@ from math import ceil, isfinite
 from time import perf_counter
 from typing import Any
 
-from numpy import empty
+from numpy import array, empty
 from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, as_count, as_number, as_step_size, machine_memory
@@ -42,10 +42,19 @@ class Model(Functions):
         super().__init__(extension, **scene)
         self.h, self.duration = h, duration
         self.methods = tuple(methods)
-        self.orders = {name: order for name, (order, *_) in methods.items()}
-        self.limits = {name: (turn, decay) for name, (_, _, turn, decay) in methods.items()}
+        self._facts = dict(methods)
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
         self._warned: set[Any] = set()  # methods with a step size, and u
+
+    @property
+    def orders(self) -> dict[str, int]:
+        """The order of each method."""
+        return {name: order for name, (order, *_) in self._facts.items()}
+
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """The stability limits of each method: h omega undamped, h lambda decaying."""
+        return {name: (turn, decay) for name, (_, _, turn, decay) in self._facts.items()}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("_model._again", self.digest)
@@ -255,6 +264,7 @@ class Model(Functions):
         done, chunk = 0, 1 if law else _CHUNK // (nq**3 if counted else nq) or 1
         # what goes from one call to the next, and what is counted; a single call may do without
         single = steps <= chunk and counted is None
+        applied: list[Array] = []  # by a law, at the rows
         work = null if single else self._ffi.new(work_type)
         try:
             while True:
@@ -266,6 +276,8 @@ class Model(Functions):
                     if held is None:
                         raise ValueError("u: the function returned None, not the inputs")
                     at_u = address(real, held)
+                    if done % every == 0:
+                        applied.append(held)
                 count = steps - done
                 if count > chunk:
                     count, begun = chunk, perf_counter()
@@ -291,7 +303,7 @@ class Model(Functions):
         evaluations = counted(work) if counted else stages * done
         return Run(
             self, t0, both, h, done, said, p, every, u if law else held, method,
-            evaluations,
+            evaluations, array(applied) if law else None,
         )  # fmt: skip
 
     def _bytes(self, rows: int) -> int:

@@ -92,6 +92,7 @@ class Run:
     _u: Any
     method: str
     evaluations: int
+    _applied: Array | None = None  # inputs at the rows, where a function gave them
     error: Estimate | None = field(default=None, init=False)
     _energy: Array | None = field(default=None, init=False)
 
@@ -114,10 +115,43 @@ class Run:
         """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic."""
         return self._values("jacobi")
 
-    def _values(self, name: str) -> Array:
-        function = getattr(self._model, name)
+    @property
+    def u(self) -> Array:
+        """The inputs at the rows, (n, nu): of the step that begins there, at the end the last ones.
+
+        The scene's signals are followed within steps; this is what they are at the rows.
+        """
+        model, n = self._model, len(self.q)
+        given = self._u if self._applied is None else self._applied
+        if given is None:
+            each = zip(self.q, self.qd, self.t.tolist(), strict=True)
+            rows = [model.signal(q, qd, t, self._params) for q, qd, t in each if model.nu]
+            return np.reshape(rows, (n, model.nu)).astype(model.dtype)
+        if given.ndim == 1:
+            return np.tile(given, (n, 1))
+        step = 1 if given is self._applied else self.every
+        return given[np.minimum(step * np.arange(n), max(0, len(given) - 1))]
+
+    @cached_property
+    def outputs(self) -> dict[str, Array]:
+        """The scene's outputs along the run by their names, (n,) each.
+
+        nan where one needs accelerations and D is singular.
+        """
+        model = self._model
+        if not model.outputs:
+            return {}
+        if self._u is None or (self._applied is None and self._u.ndim == 1):
+            values = self._values("outputs", model.output, u=self._u)
+        else:
+            each = zip(self.q, self.qd, self.t.tolist(), self.u, strict=True)
+            values = np.array([model.output(*row, self._params) for row in each])
+        return dict(zip(model.outputs, np.ascontiguousarray(values.T), strict=True))
+
+    def _values(self, name: str, function: Callable[..., Any] | None = None, **held: Any) -> Array:
+        function = function or getattr(self._model, name)
         values = [
-            np.atleast_1d(function(q, qd, t=float(self.t[k]), params=self._params))
+            np.atleast_1d(function(q, qd, t=float(self.t[k]), params=self._params, **held))
             for k, q, qd in self._model._by_time(name, self.t, self.q, self.qd)
         ]
         return np.concatenate(values)
@@ -158,7 +192,7 @@ class Run:
 
     def _state(self) -> dict[str, Any]:
         """All but what is made when it is asked for."""
-        made = ("t", "q", "qd")
+        made = ("t", "q", "qd", "outputs")
         return {name: value for name, value in self.__dict__.items() if name not in made}
 
     @classmethod

@@ -15,7 +15,7 @@ from eomc.base import names, texts
 from eomc.base.errors import MOST, EomcError, SceneError
 from eomc.scene import formulas, messages, repeat, schema, toml_text, validate_bodies
 from eomc.scene.formulas import Formula, suggest
-from eomc.scene.scene import Coordinate, Input, Quantity, Run, Scene
+from eomc.scene.scene import Coordinate, Input, Output, Quantity, Run, Scene
 from eomc.scene.scope import (
     DOUBT,
     INPUT,
@@ -102,6 +102,7 @@ class _Check(Checker):
         energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
+        outputs = self._outputs()
         self._unused()
         if any(p.severity == "error" for p in self.problems):
             raise SceneError(self.problems)
@@ -118,6 +119,7 @@ class _Check(Checker):
             definitions=tuple(self.definitions.items()),
             **energies,
             forces=forces,
+            outputs=tuple(outputs),
             run=Run(**doc.run.model_dump()),
             assembly=assembly,
             places=self.places,
@@ -185,7 +187,10 @@ class _Check(Checker):
                     (seen[velocity], velocity),
                     f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
                 )
-        for table in ("coordinates", "parameters", "constants", "inputs"):
+        for name in doc.outputs:
+            if why := names.fault(name):
+                self.say(("outputs", name), why)
+        for table in ("coordinates", "parameters", "constants", "inputs", "outputs"):
             for name, entry in getattr(doc, table).items():
                 self._unit((table, name), entry.unit, getattr(entry, "start", 0))
         return seen
@@ -331,6 +336,16 @@ class _Check(Checker):
                 self.say(("forces", name), f"'{name}' is not a coordinate{remedy}")
             elif formula:
                 out[name] = formula
+        return out
+
+    def _outputs(self) -> list[Output]:
+        """Formulas over everything, the accelerations and energies too."""
+        self.solve([f"{name}_ddot" for name in self.doc.coordinates])
+        out = []
+        for name, entry in self.doc.outputs.items():
+            formula = self.formula(("outputs", name, "formula"), entry.formula)
+            if formula:
+                out.append(Output(name, entry.unit, formula, entry.note))
         return out
 
     def _unused(self) -> None:

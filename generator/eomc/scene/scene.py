@@ -45,6 +45,16 @@ class Input:
 
 
 @dataclass(frozen=True)
+class Output:
+    """A quantity that is asked for: a formula over everything that a motion has."""
+
+    name: str
+    unit: str
+    formula: Formula
+    note: str
+
+
+@dataclass(frozen=True)
 class Run:
     """How the scene is run unless the caller says otherwise: step size h and duration in s.
 
@@ -79,6 +89,7 @@ class Scene:
     potential: Formula
     dissipation: Formula
     forces: Mapping[str, Formula]
+    outputs: tuple[Output, ...]
     run: Run
     assembly: Assembly | None
     places: SourceMap = field(repr=False, compare=False)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import pydantic
 
 from eomc.base import texts
 from eomc.integrators.tableaux import METHODS
-from eomc.scene import messages
+from eomc.scene import messages, spelling
 from eomc.scene.formulas import nearest
 
 REALS = ("double", "float")
@@ -49,6 +49,14 @@ class _Input(_Table):
     note: _Note = ""
 
 
+class OutputTable(_Table):
+    """An output as it is written."""
+
+    formula: _Value
+    unit: _Line = ""
+    note: _Note = ""
+
+
 class _Energy(_Table):
     kinetic: _Value
     potential: _Value = 0.0
@@ -72,7 +80,7 @@ def _linearized(value: object) -> bool | str:
     """Whether derivatives are wanted, those along the parameters too."""
     if isinstance(value, bool) or value == "parameters":
         return value
-    raise ValueError(f'must be true, false or "parameters", here {_toml(value)}')
+    raise ValueError(f'must be true, false or "parameters", here {spelling.toml(value)}')
 
 
 class _Run(_Table):
@@ -84,105 +92,24 @@ class _Run(_Table):
     linearize: Annotated[bool | str, pydantic.PlainValidator(_linearized)] = False
 
 
-def _spelled_out(value: object) -> object:
+def _spelled_out(key: str, value: object) -> object:
     """`m = 2.0` says the same as `m = { value = 2.0 }`."""
-    return value if isinstance(value, dict) else {"value": value}
+    return value if isinstance(value, dict) else {key: value}
 
 
-_Short = Annotated[QuantityTable, pydantic.BeforeValidator(_spelled_out)]
+_Short = Annotated[QuantityTable, pydantic.BeforeValidator(partial(_spelled_out, "value"))]
+_Formula = Annotated[OutputTable, pydantic.BeforeValidator(partial(_spelled_out, "formula"))]
 
 
-# --- bodies: what may be written in several ways; ValueErrors say what is wrong ---
-
-
-def _entry(value: object) -> float | str:
-    """A number or a formula."""
-    if isinstance(value, str):
-        return value
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        try:
-            if math.isfinite(number := float(value)):
-                return number
-        except OverflowError:
-            pass
-        raise ValueError(f"must be a finite number, here {_toml(value)}")
-    raise ValueError(f"must be a number or a formula in quotes, here {_toml(value)}")
-
-
-def _vector(value: object) -> tuple[float | str, ...]:
-    if not isinstance(value, list) or not value:
-        raise ValueError(
-            f"must be a list of numbers and formulas, such as [0, 1.5], here {_toml(value)}"
-        )
-    return tuple(map(_entry, value))
-
-
-def _each(value: object) -> float | str | tuple[float | str, ...]:
-    """One for all, or a list of one each."""
-    return tuple(map(_entry, value)) if isinstance(value, list) else _entry(value)
-
-
-def _rotation(value: object) -> float | str | tuple[tuple[str, float | str], ...]:
-    """An angle, or a list of turns: an axis and an angle each."""
-    if not isinstance(value, list):
-        return _entry(value)
-    turns = []
-    for turn in value:
-        if not (isinstance(turn, list) and len(turn) == 2 and turn[0] in ("x", "y", "z")):
-            raise ValueError(
-                'must be a list of turns, each an axis and an angle, such as [["z", "pi/2"]], '
-                f"here {_toml(value)}"
-            )
-        turns.append((turn[0], _entry(turn[1])))
-    return tuple(turns)
-
-
-def _axes(value: object) -> tuple[tuple[float, ...], ...]:
-    """Axes; one may be written without the outer brackets."""
-    axes: list[Any] = [value]
-    if isinstance(value, list) and value and isinstance(value[0], list):
-        axes = value
-    for axis in axes:
-        if not (isinstance(axis, list) and axis and all(map(_is_number, axis))):
-            raise ValueError(f"must be a list of numbers, such as [0, 0, 1], here {_toml(value)}")
-    return tuple(tuple(float(entry) for entry in axis) for axis in axes)
-
-
-def _is_number(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    return abs(value) < 1e100
-
-
-def _names(value: object) -> tuple[str, ...]:
-    given = value if isinstance(value, list) else [value]
-    if not all(isinstance(name, str) for name in given):
-        raise ValueError(f"must be a name in quotes, or a list of names, here {_toml(value)}")
-    return tuple(given)
-
-
-def _two_names(value: object) -> tuple[str, ...]:
-    names = _names(value)
-    if len(names) != 2:
-        raise ValueError(f'must name two bodies, such as ["world", "cart"], here {_toml(value)}')
-    return names
-
-
-def _points(value: object) -> tuple[tuple[float | str, ...], ...]:
-    if not (isinstance(value, list) and len(value) == 2):
-        raise ValueError(f'must be two points, such as [[0, 0], ["l", 0]], here {_toml(value)}')
-    return tuple(map(_vector, value))
-
-
-_Vector = Annotated[tuple[float | str, ...], pydantic.PlainValidator(_vector)]
-_Each = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(_each)]
+_Vector = Annotated[tuple[float | str, ...], pydantic.PlainValidator(spelling.vector)]
+_Each = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(spelling.each)]
 _Rotation = Annotated[
-    float | str | tuple[tuple[str, float | str], ...], pydantic.PlainValidator(_rotation)
+    float | str | tuple[tuple[str, float | str], ...], pydantic.PlainValidator(spelling.rotation)
 ]
-_Axes = Annotated[tuple[tuple[float, ...], ...], pydantic.PlainValidator(_axes)]
-_Names = Annotated[tuple[str, ...], pydantic.PlainValidator(_names)]
-_TwoNames = Annotated[tuple[str, ...], pydantic.PlainValidator(_two_names)]
-_Points = Annotated[tuple[tuple[float | str, ...], ...], pydantic.PlainValidator(_points)]
+_Axes = Annotated[tuple[tuple[float, ...], ...], pydantic.PlainValidator(spelling.axes)]
+_Names = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.names)]
+_TwoNames = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.two_names)]
+_Points = Annotated[tuple[tuple[float | str, ...], ...], pydantic.PlainValidator(spelling.points)]
 
 
 class BodyTable(_Table):
@@ -245,6 +172,7 @@ class Document(_Table):
     definitions: dict[str, _Value] = {}
     energy: _Energy
     forces: dict[str, _Value] = {}
+    outputs: dict[str, _Formula] = {}
     body: dict[str, BodyTable] = {}
     spring: dict[str, SpringTable] = {}
     damper: dict[str, DamperTable] = {}
@@ -261,11 +189,13 @@ def read(tree: Mapping[str, Any]) -> Document:
 
 # --- faults in words ---
 
+_FIRST_KEY = {"coordinates": "start", "inputs": "signal", "outputs": "formula"}
 _MODELS: Mapping[str, type[_Table]] = {
     "coordinates": _Coordinate,
     "parameters": QuantityTable,
     "constants": QuantityTable,
     "inputs": _Input,
+    "outputs": OutputTable,
     "energy": _Energy,
     "body": BodyTable,
     "spring": SpringTable,
@@ -349,21 +279,10 @@ def meant(path: tuple[str, ...]) -> str:
     return "" if far else near
 
 
-def _toml(value: object) -> str:
-    """A value as TOML writes it, shortened."""
-    if isinstance(value, bool):
-        text = str(value).lower()
-    elif isinstance(value, dict):
-        text = "a table"
-    else:
-        text = repr(value) if isinstance(value, (str, list, float, int)) else str(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
 def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
     """One of pydantic's faults in our words, with the remedy."""
     kind, given, last = str(error["type"]), error.get("input"), path[-1]
-    here = _toml(given)
+    here = spelling.toml(given)
     if kind == "missing":
         where = (path[0], last) if path[0] in _ALIASES_OF else path
         return "missing: " + _MISSING.get(where, f"add {last} = ...")
@@ -388,7 +307,7 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
     if kind in ("dict_type", "model_type", "model_attributes_type"):
         if len(path) == 1:
             return f"'{last}' is a table: write [{last}] and its entries below"
-        key = {"coordinates": "start", "inputs": "signal"}.get(path[0], "value")
+        key = _FIRST_KEY.get(path[0], "value")
         value = here if isinstance(given, (int, float, str)) else "..."
         return f"'{last}' is a table: write {last} = {{ {key} = {value} }}"
     if kind == "bool_type":
@@ -426,7 +345,7 @@ def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
         table[last] = "0"
     elif len(path) == 2 and path[0] in ("coordinates", "inputs"):
         table[last] = {}
-    elif last == "value":
+    elif last in ("value", "formula"):
         table_at(tree, path[:1])[path[1]] = 1.0
     else:
         table.pop(last, None)

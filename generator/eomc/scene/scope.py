@@ -15,9 +15,13 @@ from eomc.scene.source_map import SourceMap
 
 # the kinds of thing a formula can depend on; what depends on something faulty is in doubt
 TIME, INPUT, POSITION, VELOCITY = "the time", "inputs", "coordinates", "velocities"
+ACCELERATION = "accelerations"
 DOUBT = "something faulty"
 
 NOTHING: frozenset[str] = frozenset()
+
+# what outputs can use besides all other names, unless the scene has these for something else
+ENERGIES = ("kinetic_energy", "potential_energy", "energy")
 
 SUGGESTED = 20  # faults, the first, for which near names are looked for
 
@@ -80,6 +84,17 @@ class Checker:
         self.kinds: dict[str, frozenset[str]] = {}
         self.centers: set[str] = set()
         self.definitions: dict[str, Formula] = {}
+        self.solved = False  # whether formulas may use accelerations
+
+    def solve(self, accelerations: Collection[str]) -> None:
+        """From here on formulas may use accelerations and energies: they are computed last."""
+        self.solved = True
+        moving = frozenset({POSITION, VELOCITY})
+        self.kinds = {
+            **dict.fromkeys(ENERGIES, moving),
+            **dict.fromkeys(accelerations, frozenset({ACCELERATION})),
+            **self.kinds,
+        }
 
     def say(
         self,
@@ -158,7 +173,7 @@ class Checker:
             return f"'{name}' is defined further down: move its line above this one"
         start = f"'{name}' is not declared"
         if name.endswith(("_ddot", "_dot_dot")):
-            return f"{start}: accelerations are what is solved for, no formula can use them"
+            return f"{start}: accelerations are what is solved for, only [outputs] can use them"
         owner = name.removesuffix("_dot")
         if owner != name and owner in self.centers:
             return f"{start}: write dot({owner}) for the velocity of a body"
@@ -184,7 +199,9 @@ class Checker:
         kinds = self.kinds_of(inside)
         if INPUT in kinds:
             return "it holds inputs, whose rate nobody knows; add the rate as a further input"
-        if VELOCITY in kinds:
+        if ACCELERATION in kinds:
+            return "it holds accelerations, whose rate is not computed"
+        if VELOCITY in kinds and not self.solved:
             return "it holds velocities, and their rates are what is solved for"
         return ""
 
@@ -196,6 +213,8 @@ class Checker:
         dot = (
             isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "dot"
         )
+        if dot and VELOCITY in kinds:
+            kinds |= {ACCELERATION}
         return kinds | {VELOCITY} if dot and POSITION in kinds else kinds
 
     def where(self, formula: Formula, kind: str) -> ast.expr:

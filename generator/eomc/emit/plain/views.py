@@ -92,6 +92,7 @@ class Header(Named):
     fast: bool
     coordinates: tuple[Indexed, ...]
     inputs: tuple[Indexed, ...]
+    outputs: tuple[Indexed, ...]
     parameters: tuple[Parameter, ...]
     implicit: bool
     timed: bool

@@ -1,0 +1,69 @@
+"""Outputs on a tape: formulas over the state, the inputs and the accelerations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sympy import Expr, S, Symbol
+
+from eomc.base.errors import EomcError, SceneError
+from eomc.derive.ldl import Rows, Vector
+from eomc.derive.tape import RoughError, Stage, Tape
+from eomc.model.multibody import needed
+from eomc.model.symbols import dot
+from eomc.model.system import System, t
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """values: (ny,), atoms of a tape. slopes: along q, qd, u and qdd, (ny, 3 nq + nu), by rows."""
+
+    tape: Tape
+    values: Vector
+    slopes: Rows
+
+
+def outputs(system: System, sloped: bool) -> Outputs:
+    """The system's outputs, with slopes where it is `sloped`.
+
+    Raises SceneError where a derivative is needed that does not exist.
+    """
+    try:
+        return _outputs(system, sloped)
+    except RoughError:
+        message = (
+            "a derivative of something that jumps is needed (sign or heaviside, in dot(...) or for "
+            "linearize): make it smooth, say tanh(x/width)"
+        )
+        raise SceneError([system.problem("outputs", message)]) from None
+
+
+def _outputs(system: System, sloped: bool) -> Outputs:
+    leaves: dict[Symbol, Stage] = {t: Stage.TIME}
+    leaves |= {p.symbol: Stage.PARAMETER for p in system.parameters}
+    leaves |= dict.fromkeys(system.u, Stage.TIME)
+    leaves |= dict.fromkeys(system.q, Stage.POSITION)
+    leaves |= dict.fromkeys((*system.qd, *system.qdd), Stage.VELOCITY)
+    tape = Tape(leaves)
+    state = (*system.q, *system.qd)
+    rates = {**dict(zip(state, (*system.qd, *system.qdd), strict=True)), t: S.One}
+    known: dict[Symbol, Expr] = {}
+
+    def value(expr: Expr) -> Expr:
+        """The expression's atom; dot(...) by the chain rule, from the innermost."""
+        found: dict[Expr, Expr] = {}
+        for moving in expr.atoms(dot):
+            position = value(moving.args[0])
+            if unknown := tape.leaves_of([position]) & {*system.u, *system.qdd}:
+                raise EomcError(
+                    f"{system.file or system.name}: {moving} is the rate of something that depends "
+                    f"on {', '.join(sorted(map(str, unknown)))}, whose rate is not known"
+                )
+            (found[moving],) = tape.forward([position], rates)
+        return tape.define(expr.xreplace(found).xreplace(known))
+
+    for defined, expr in needed(system.definitions, [o.formula for o in system.outputs]):
+        known[defined] = tape.named(value(expr), defined.name)
+    values = tuple(tape.named(value(o.formula), o.name) for o in system.outputs)
+    along = (*state, *system.u, *system.qdd) if sloped else ()
+    return Outputs(tape, values, tuple(tuple(tape.gradient([(y, S.One)], along)) for y in values))

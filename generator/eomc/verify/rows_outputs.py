@@ -1,0 +1,170 @@
+"""Rows of `check` about outputs: in eighty digits, their rates by differences along the motion.
+
+Nothing is differentiated as a formula: q(s) = q + qd s + qdd s^2/2, formulas and definitions are
+evaluated as they stand, and dot(e) is (e(h) - e(-h))/2h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import mpmath
+import numpy as np
+import sympy
+from sympy import Expr, Symbol
+
+from eomc.model.system import System, dot, symbol, t
+from eomc.verify.oracle import Vector
+from eomc.verify.report import LIMIT
+from eomc.verify.sampling import NUDGE, State, ask, nudged
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import Expected
+
+DIGITS = 80  # three differences leave some thirty
+WIDTH = mpmath.mpf(10) ** -15  # of differences
+SLOPE_LIMIT = 1e-9  # of a row's largest derivative
+STATES = 4
+
+_NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x == 0 else +(x > 0)}
+
+
+def report(of: Comparison, plain: Any) -> None:
+    """Add the rows of a scene that has outputs. plain: the module of the plain form, or None."""
+    formulas = Formulas(of.system)
+    for module, form in ((of.module, ""), (plain, "plain C: ")):
+        if module is None:
+            continue
+        of.row(f"{form}outputs", LIMIT, "units of rounding", partial(_values, of, module, formulas))
+        if of.system.run.linearize:
+            unit, slopes = "of the largest derivative", partial(_slopes, of, module, formulas)
+            of.row(f"{form}outputs: C, D", max(SLOPE_LIMIT, LIMIT * of.eps), unit, slopes)
+
+
+def _values(of: Comparison, module: Any, formulas: Formulas) -> float:
+    """The outputs at some states, with the module's own accelerations."""
+
+    def found(s: State) -> Vector:
+        return np.asarray(module.output(s.q, s.qd, s.t, s.u, s.params), float)
+
+    def error(e: Expected) -> float:
+        s = _held(of, module, e.state)
+        value = found(s)
+        near = [found(x) for x in nudged(s, of.sampler.defaults)]
+        size = np.abs(value) + sum(np.abs(x - value) / NUDGE for x in near)
+        return of.units(value, formulas.at(s, ask(module, "acceleration", s)), size)
+
+    return float(np.max([error(e) for e in of.few(STATES)]))
+
+
+def _slopes(of: Comparison, module: Any, formulas: Formulas) -> float:
+    """C and D beside differences of the outputs, through the module's own A and B."""
+
+    def error(e: Expected) -> float:
+        s = _held(of, module, e.state)
+        n, held = len(s.q), {"u": s.u, "t": s.t, "params": s.params}
+        A, B, C, D = (
+            np.asarray(x, float) for x in module.linearize(s.q, s.qd, outputs=True, **held)
+        )
+        slopes = formulas.slopes(s, ask(module, "acceleration", s))
+        by_state, by_u, by_qdd = np.split(slopes, [2 * n, slopes.shape[1] - n], axis=1)
+        terms = [(by_state, by_qdd, A[n:]), (by_u, by_qdd, B[n:])]
+        exact = np.hstack([own + other @ of_qdd for own, other, of_qdd in terms])
+        sizes = np.hstack([abs(own) + abs(other) @ abs(of_qdd) for own, other, of_qdd in terms])
+        off = np.abs(np.hstack([C, D]) - exact)
+        return float(np.max(off / (np.max(sizes, axis=1, keepdims=True) + 1e-300), initial=0))
+
+    return float(np.max([error(e) for e in of.few(2)]))
+
+
+def _held(of: Comparison, module: Any, s: State) -> State:
+    """The state with inputs that don't follow it."""
+    if s.u is not None or not of.system.inputs:
+        return s
+    return replace(s, u=np.asarray(module.signal(s.q, s.qd, s.t, s.params), float))
+
+
+@dataclass
+class Formulas:
+    """The outputs of a system, evaluated as they stand."""
+
+    system: System
+    _compiled: dict[Expr, tuple[Callable[..., Any], Sequence[Symbol], Sequence[Expr]]] = field(
+        default_factory=dict
+    )
+
+    def at(self, s: State, qdd: Vector) -> Vector:
+        """(ny,): at a state with inputs and accelerations."""
+        with mpmath.workdps(DIGITS):
+            return np.array([float(y) for y in self._values(self._given(s, qdd))])
+
+    def slopes(self, s: State, qdd: Vector) -> Vector:
+        """(ny, 3 nq + nu): along q, qd, u and qdd, by differences."""
+        system = self.system
+        with mpmath.workdps(DIGITS):
+            given, columns = self._given(s, qdd), []
+            for x in (*system.q, *system.qd, *system.u, *system.qdd):
+                ends = [self._values({**given, x: given[x] + h}) for h in (WIDTH, -WIDTH)]
+                columns.append([float((a - b) / (2 * WIDTH)) for a, b in zip(*ends, strict=True)])
+        return np.array(columns).T
+
+    def _given(self, s: State, qdd: Vector) -> dict[Symbol, Any]:
+        system = self.system
+        given = dict(zip((*system.q, *system.qd, *system.qdd), (*s.q, *s.qd, *qdd), strict=True))
+        given |= dict(zip(system.u, () if s.u is None else s.u, strict=True))
+        given |= {symbol(n): v for n, v in (s.params or self._defaults).items()} | {t: s.t}
+        return {name: mpmath.mpf(float(value)) for name, value in given.items()}
+
+    @property
+    def _defaults(self) -> dict[str, float]:
+        return {p.name: p.value for p in self.system.parameters}
+
+    def _values(self, given: Mapping[Symbol, Any]) -> list[Any]:
+        motion = _Motion(self, given)
+        return [motion.value(o.formula, mpmath.mpf(0)) for o in self.system.outputs]
+
+    def compiled(self, e: Expr) -> tuple[Callable[..., Any], Sequence[Symbol], Sequence[Expr]]:
+        """A formula as a function of its symbols and of the rates in it."""
+        if e not in self._compiled:
+            rates = [d for d in e.atoms(dot) if not any(d != o and o.has(d) for o in e.atoms(dot))]
+            stand_ins = [sympy.Dummy() for _ in rates]
+            bare = e.xreplace(dict(zip(rates, stand_ins, strict=True)))
+            symbols = sorted(bare.free_symbols - set(stand_ins), key=str)
+            f = sympy.lambdify([*symbols, *stand_ins], bare, modules=[_NAMES, "mpmath"])
+            self._compiled[e] = f, symbols, [d.args[0] for d in rates]
+        return self._compiled[e]
+
+
+class _Motion:
+    """What formulas are near one state, as functions of the time since then."""
+
+    def __init__(self, formulas: Formulas, given: Mapping[Symbol, Any]) -> None:
+        self.formulas, self.given, system = formulas, given, formulas.system
+        self.definitions = dict(system.definitions)
+        self.rates = dict(zip((*system.q, *system.qd), (*system.qd, *system.qdd), strict=True))
+        self.known: dict[tuple[Symbol, Any], Any] = {}
+
+    def value(self, e: Expr, time: Any) -> Any:
+        """Of a formula."""
+        f, symbols, rates = self.formulas.compiled(e)
+        ends = [[self.value(x, time + h) for h in (WIDTH, -WIDTH)] for x in rates]
+        slopes = ((a - b) / (2 * WIDTH) for a, b in ends)
+        return f(*(self.symbol(x, time) for x in symbols), *slopes)
+
+    def symbol(self, x: Symbol, time: Any) -> Any:
+        """Of a name."""
+        if (x, time) not in self.known:
+            if x in self.definitions:
+                found = self.value(self.definitions[x], time)
+            elif x in self.rates:  # at constant accelerations
+                rate = self.rates[x]
+                half = self.given[self.rates[rate]] * time / 2 if rate in self.rates else 0
+                found = self.given[x] + (self.given[rate] + half) * time
+            else:
+                found = self.given[x] + (time if x == t else 0)
+            self.known[x, time] = found
+        return self.known[x, time]
