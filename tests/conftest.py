@@ -71,6 +71,10 @@ dissipation = "zeta*theta_dot**2/2 + gamma*dot(py)**2/2"
 x     = "u - zeta*x_dot*abs(x_dot)"
 theta = "-gamma*sign(theta_dot)/10 + push*heaviside(x) + pi/100"
 q     = "min(x, theta, 0.3)/5 - max(q_dot, 0.1)/7"
+[outputs]
+tip   = { formula = "py + dot(px)", unit = "m" }
+pull  = "m*(dot(dot(px)) + g) + theta_ddot*push"
+whole = "energy + t"
 [run]
 h        = 0.01
 duration = 2.0

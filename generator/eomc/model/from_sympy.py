@@ -154,7 +154,9 @@ class Maker:
             else:
                 self.map[Symbol(f"{one}_ddot", **one.assumptions0)] = c.qdd
             self.known.add(c.qdd)
-        for name, formula in given.mapping(outputs, "outputs", '{"tip_x": l*sin(theta)}').items():
+        if not isinstance(outputs, Mapping):
+            raise given.fault("outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}')
+        for name, formula in outputs.items():
             if not isinstance(name, (str, Symbol)):
                 raise given.fault("outputs", f"{name!r} is not a name")
             if why := names.fault(str(name)):

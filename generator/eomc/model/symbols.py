@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
@@ -19,6 +20,10 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
 
     nargs = 1
     is_real = True
+
+    def _latex(self, printer: Any, exp: str = "") -> str:
+        rate = rf"\frac{{d}}{{dt}} \left({printer._print(self.args[0])}\right)"
+        return rf"\left({rate}\right)^{{{exp}}}" if exp else rate
 
 
 @lru_cache(maxsize=10_000)  # SymPy takes ten times as long to find one that it has

@@ -102,7 +102,18 @@ def _text(system: System, values: dict[str, Expr]) -> str:
         shown = sympy.pretty(value.xreplace(names), use_unicode=True, wrap_line=False)
         head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}:"
         parts.append(head + "\n" + "\n".join("    " + line for line in shown.splitlines()))
+    if system.outputs:
+        lines = (f"    {name} = {formula}" for name, formula in _outputs(system))
+        parts.append("outputs, dot(...) the rate:\n" + "\n".join(lines))
     return "\n\n".join(parts)
+
+
+def _outputs(system: System) -> list[tuple[str, Expr]]:
+    """The outputs' formulas over coordinates, without definitions."""
+    known: dict[sympy.Symbol, Expr] = {}
+    for name, formula in system.definitions:
+        known[name] = formula.xreplace(known)
+    return [(o.name, o.formula.xreplace(known)) for o in system.outputs]
 
 
 def _dotted(name: str) -> str:
@@ -118,7 +129,16 @@ def _latex(system: System, values: dict[str, Expr]) -> str:
         rf"  {symbols.get(name, name)} &= {sympy.latex(value, symbol_names=names)} \\"
         for name, value in values.items()
     ]
+    names |= {c.qdd: rf"\ddot{{{sympy.latex(c.q)}}}" for c in system.coordinates}
+    lines += [
+        rf"  \mathrm{{{_escaped(name)}}} &= {sympy.latex(value, symbol_names=names)} \\"
+        for name, value in _outputs(system)
+    ]
     return "\n".join([r"\begin{align*}", *lines, r"\end{align*}"])
+
+
+def _escaped(name: str) -> str:
+    return name.replace("_", r"\_")
 
 
 class _Exact(StrPrinter):  # type: ignore[misc]

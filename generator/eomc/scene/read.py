@@ -187,13 +187,24 @@ class _Check(Checker):
                     (seen[velocity], velocity),
                     f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
                 )
-        for name in doc.outputs:
-            if why := names.fault(name):
-                self.say(("outputs", name), why)
+        self._output_names(seen)
         for table in ("coordinates", "parameters", "constants", "inputs", "outputs"):
             for name, entry in getattr(doc, table).items():
                 self._unit((table, name), entry.unit, getattr(entry, "start", 0))
         return seen
+
+    def _output_names(self, seen: Mapping[str, str]) -> None:
+        """They stand beside t, coordinates, velocities, inputs and energy in tables and plots."""
+        columns = {n: f"in [{t}]" for n, t in seen.items() if t in ("coordinates", "inputs")}
+        columns |= {n: "a parameter" for n, t in seen.items() if t == "parameters"}
+        columns |= {f"{c}_dot": f"the velocity of '{c}'" for c in self.doc.coordinates}
+        columns |= {"t": "the time", "energy": "K + P"}
+        for name in self.doc.outputs:
+            if name in columns:
+                message = f"'{name}' is {columns[name]} already: give the output a name of its own"
+                self.say(("outputs", name), message)
+            elif why := names.fault(name):
+                self.say(("outputs", name), why)
 
     def _unit(self, path: tuple[str, ...], unit: str, start: float | str = 0) -> None:
         """Units are texts; those that were meant to be converted are reported."""

@@ -1,0 +1,143 @@
+"""Outputs of runs and states: by name, whatever inputs were, to the last row."""
+
+from __future__ import annotations
+
+import pickle
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Modules, tiers
+
+SCENE = """eomc = 1
+name = "crane"
+[coordinates]
+x = { unit = "m", start = 0.1 }
+theta = { unit = "rad", start = 0.5, rate = 0.2 }
+[parameters]
+m = 1.0
+M = 2.0
+l = 0.7
+g = 9.81
+[inputs]
+F = { unit = "N", signal = "sin(3*t) - x_dot/5" }
+[definitions]
+px = "x + l*sin(theta)"
+py = "-l*cos(theta)"
+[energy]
+kinetic = "M*x_dot**2/2 + m*(dot(px)**2 + dot(py)**2)/2"
+potential = "m*g*py"
+[forces]
+x = "F"
+[outputs]
+tip_x = { formula = "px", unit = "m", note = "of the load" }
+speed = "sqrt(dot(px)**2 + dot(py)**2)"
+pull = { formula = "m*(cos(theta)*(dot(dot(py)) + g) - sin(theta)*dot(dot(px)))", unit = "N" }
+E = "energy"
+push = "F*(1 + t)"
+cart = "x_ddot"
+[run]
+linearize = true
+h = 0.01
+duration = 1.0
+"""
+TABLE = np.linspace(-1, 1, 100)[:, None]
+INPUTS = {
+    "signals": None,
+    "held": [0.3],
+    "a row a step": TABLE,
+    "a function": lambda t, q, qd: [np.cos(t)],
+}
+
+
+@pytest.fixture(scope="module")
+def crane(modules: Modules) -> ModuleType:
+    return modules.of_text(SCENE)
+
+
+def expected(crane: ModuleType, run: Any) -> dict[str, Any]:
+    """The formulas, by hand."""
+    rows = zip(run.q, run.qd, run.t.tolist(), run.u, strict=True)
+    qdd = np.array([crane.acceleration(*row) for row in rows])
+    m, length, g = (crane.defaults[name] for name in "mlg")
+    (x, theta), (v, w), (a, alpha) = run.q.T, run.qd.T, qdd.T
+    far, low = length * np.sin(theta), length * np.cos(theta)
+    ax, ay = a + low * alpha - far * w**2, far * alpha + low * w**2
+    return {
+        "tip_x": x + far,
+        "speed": np.hypot(v + low * w, far * w),
+        "pull": m * (np.cos(theta) * (ay + g) - np.sin(theta) * ax),
+        "E": run.energy,
+        "push": run.u[:, 0] * (1 + run.t),
+        "cart": a,
+    }
+
+
+@pytest.mark.parametrize("every", tiers([1, 7], 7))
+@pytest.mark.parametrize("given", INPUTS)
+@pytest.mark.filterwarnings("ignore:.*Python function")
+def test_a_run_has_them_by_name(crane: ModuleType, given: str, every: int) -> None:
+    run = crane.simulate(u=INPUTS[given], every=every)
+    assert list(run.outputs) == list(crane.outputs)
+    for name, values in expected(crane, run).items():
+        assert run.outputs[name].shape == run.t.shape
+        assert run.outputs[name] == pytest.approx(values, rel=1e-12, abs=1e-12), name
+
+
+@pytest.mark.filterwarnings("ignore:.*Python function")
+def test_inputs_can_be_read_as_they_were_applied(crane: ModuleType) -> None:
+    at = np.minimum(7 * np.arange(16), 99)
+    run = crane.simulate(u=TABLE, every=7)
+    assert np.array_equal(run.u, TABLE[at])
+    run = crane.simulate(u=INPUTS["a function"], every=7)
+    assert run.u[:-1, 0] == pytest.approx(np.cos(run.t[:-1]), abs=1e-15)
+    assert run.u[-1] == run.u[-2]
+    again = pickle.loads(pickle.dumps(run))
+    assert np.array_equal(again.u, run.u) and np.array_equal(
+        again.outputs["pull"], run.outputs["pull"]
+    )
+    run = crane.simulate()
+    signals = np.sin(3 * run.t) - run.qd[:, 0] / 5
+    assert run.u[:, 0] == pytest.approx(signals, abs=1e-15)
+    assert np.array_equal(crane.simulate(u=[0.3]).u, np.full((101, 1), 0.3))
+
+
+def test_a_state_and_many(crane: ModuleType) -> None:
+    q, qd = crane.start
+    one = crane.output(q, qd, 0.3, [0.2], {"l": 0.9})
+    many = crane.output(np.array([q, 2 * q]), np.array([qd, qd]), 0.3, [0.2], {"l": 0.9})
+    assert np.array_equal(many[0], one) and not np.array_equal(many[1], one)
+    assert one[0] == pytest.approx(0.1 + 0.9 * np.sin(0.5)) and one[4] == pytest.approx(0.26)
+    assert crane.units["tip_x"] == "m" and crane.units["pull"] == "N"
+
+
+def test_they_are_nan_where_there_is_no_acceleration(crane: ModuleType) -> None:
+    found = dict(zip(crane.outputs, crane.output(*crane.start, 0, [0.0], {"l": 0.0}), strict=True))
+    assert np.isnan(found["pull"]) and np.isnan(found["cart"])
+    assert found["tip_x"] == pytest.approx(0.1) and found["push"] == 0
+
+
+def test_their_linearization_is_that_of_the_motion(crane: ModuleType) -> None:
+    q, qd = (np.array(x) for x in crane.start)
+    A, B, C, D = crane.linearize(q, qd, [0.4], outputs=True)
+    assert C.shape == (6, 4) and D.shape == (6, 1)
+    x, e = np.hstack([q, qd]), 1e-6
+
+    def slope(to: Any) -> Any:
+        return (to(e) - to(-e)) / (2 * e)
+
+    for k in range(4):
+        found = slope(lambda d, k=k: crane.output(*np.split(x + d * np.eye(4)[k], 2), u=[0.4]))
+        assert C[:, k] == pytest.approx(found, abs=1e-7)
+    assert D[:, 0] == pytest.approx(slope(lambda d: crane.output(q, qd, u=[0.4 + d])), abs=1e-7)
+    assert all(
+        np.array_equal(a, b) for a, b in zip((A, B), crane.linearize(q, qd, [0.4]), strict=True)
+    )
+
+
+def test_a_scene_without_has_nothing_of_it(cartpole: ModuleType, crane: ModuleType) -> None:
+    assert cartpole.outputs == () and cartpole.simulate(steps=3).outputs == {}
+    assert not hasattr(cartpole._model._lib, "outputs") and hasattr(crane._model._lib, "outputs")
+    with pytest.raises(ValueError, match=r"names them in \[outputs\]"):
+        cartpole.output(*cartpole.start)

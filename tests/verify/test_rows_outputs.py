@@ -1,0 +1,65 @@
+"""The check compares outputs with formulas in eighty digits, and finds wrong ones."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+from eomc.verify import rows_outputs
+from eomc.verify.comparison import Comparison
+
+SCENE = """eomc = 1
+name = "swing"
+[coordinates]
+a = { unit = "rad", start = 0.5 }
+b = { unit = "rad", start = 0.2, rate = 0.3 }
+[inputs]
+u = { signal = "sin(t) - a_dot" }
+[definitions]
+y = "sin(a) + cos(a - b)/2"
+[energy]
+kinetic = "a_dot**2 + b_dot**2/2 + a_dot*b_dot*cos(a - b)/3"
+potential = "-cos(a) - cos(b)"
+[forces]
+a = "u"
+[outputs]
+far = "dot(dot(y)) + u*t"
+near = "y*exp(-b_dot)"
+[run]
+linearize = true
+"""
+
+
+class Wrong:
+    """The module with something added to outputs, or to C."""
+
+    def __init__(self, module: ModuleType, output: float = 0.0, C: float = 0.0) -> None:
+        self._module, self._output, self._C = module, output, C
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._module, name)
+
+    def output(self, *state: Any) -> Any:
+        return self._module.output(*state) * [1, 1 + self._output]
+
+    def linearize(self, *state: Any, **how: Any) -> Any:
+        A, B, *CD = self._module.linearize(*state, **how)
+        return A, B, *([CD[0] + self._C, CD[1]] if CD else [])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "failed"),
+    [({}, []), ({"output": 1e-11}, ["outputs"]), ({"C": 1e-7}, ["outputs: C, D"])],
+)
+def test_wrong_ones_fail(modules: Modules, wrong: dict[str, float], failed: list[str]) -> None:
+    made, module = from_scene(parse(SCENE, "test.toml")), modules.of_text(SCENE)
+    comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
+    rows_outputs.report(comparison, None)
+    assert [row.name for row in comparison.rows] == ["outputs", "outputs: C, D"]
+    assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
