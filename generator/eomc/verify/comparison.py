@@ -36,8 +36,7 @@ from eomc.verify.taylor import Jets
 FARTHEST = 100.0  # of the spread: how far long steps may lead
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
 LONGER = 16.0  # times the scene's h: a long step
-# parts of it, until stages are found by sweeps
-SHORTER = tuple(4.0**-k for k in range(7))
+SHORTER = tuple(4.0**-k for k in range(7))  # parts of it, until stages are found by sweeps
 
 
 def _rows(run: Any, s: State) -> list[State]:
@@ -175,9 +174,14 @@ class Comparison:
 
     def value(self, name: str) -> float:
         """One of VALUES or the acceleration."""
-        return self.largest(
-            lambda e: self.units(ask(self.module, name, e.state), e.value[name], e.size[name])
-        )
+        # energies in units of what they usually are: k - k cos(q) may be 0 at a state
+        usual = np.median([e.size[name] for e in self.expected]) if "energy" in name else 0.0
+
+        def error(e: Expected) -> float:
+            size = np.maximum(e.size[name], usual)
+            return self.units(ask(self.module, name, e.state), e.value[name], size)
+
+        return self.largest(error)
 
     def steps(self) -> float | Finding:
         """One step of the scene's h from a few states."""
