@@ -1,6 +1,7 @@
 """The figure of a run says what is drawn, in which unit, and shows the mechanism in the plane."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import sympy
 
 from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
-from eomc.model.system import System, symbol
+from eomc.model.system import Output, System, symbol
 from eomc.report import plot
 from eomc.scene.read import read
 
@@ -48,6 +49,17 @@ def test_files_are_written(tmp_path, run, suffix):
     file = tmp_path / f"picture{suffix}"
     plot.draw(*run(), file)
     assert file.stat().st_size > 5_000
+
+
+def test_outputs_have_axes_of_their_own_or_by_unit():
+    made, t, q, *rest = cartpole()
+    for count, labels in ((2, ["$y_{0}$ (m)", "$y_{1}$ (m)"]), (6, ["outputs (m)"])):
+        asked = tuple(Output(f"y_{k}", sympy.S.One, "m") for k in range(count))
+        drawn = {o.name: t + k for k, o in enumerate(asked)}
+        axes = plot.figure(replace(made, outputs=asked), t, q, *rest, outputs=drawn).axes
+        assert [a.get_ylabel() for a in axes[4:-2]] == labels
+        lines = [line for a in axes[4:-2] for line in a.get_lines()]
+        assert [line.get_ydata()[0] for line in lines] == list(range(count))
 
 
 def test_same_run_same_bytes(tmp_path):

@@ -81,7 +81,9 @@ def command(
     if plot:
         from eomc.report import plot as plots
 
-        plots.draw(pipeline.read(scene).at(values), done.t, done.q, done.qd, done.energy, plot)
+        system = pipeline.read(scene).at(values)
+        rows = done.t, done.q, done.qd, done.energy
+        plots.draw(system, *rows, plot, outputs=done.outputs)
     summary = _summary(module, done, seconds, unstable, plot=plot, out=out)
     if as_json:
         say(json.dumps(summary, indent=1))

@@ -6,7 +6,7 @@ Needs matplotlib, an optional extra, and no display: figures are made without py
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,13 +18,15 @@ from sympy.printing.latex import translate
 
 from eomc.base import names, texts
 from eomc.base.errors import EomcError
-from eomc.model.system import Coordinate, System, dot, t
+from eomc.model.system import Coordinate, Output, System, dot, t
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+Outputs = Mapping[str, Array]
+_NONE: Outputs = {}
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -39,17 +41,17 @@ SAMPLES = 20_000  # of a run that are drawn, at most
 
 def draw(
     system: System, t: Array, q: Array, qd: Array, energy: Array, path: str | Path, *,
-    title: str | None = None,
+    title: str | None = None, outputs: Outputs = _NONE,
 ) -> None:  # fmt: skip
     """Write the figure of a run to `path`; its suffix says how: .png, .svg or .pdf.
 
-    t: (n,), s; q, qd: (n, nq); energy: (n,). Raises EomcError without matplotlib, with another
-    suffix, or where the file can't be written.
+    t: (n,), s; q, qd: (n, nq); energy: (n,); outputs: (n,) by name. Raises EomcError without
+    matplotlib, with another suffix, or where the file can't be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise EomcError(f"{path}: a picture is written as {', '.join(SUFFIXES)}: end its name so")
-    made = figure(system, t, q, qd, energy, title)
+    made = figure(system, t, q, qd, energy, title, outputs)
     import matplotlib
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
@@ -61,26 +63,29 @@ def draw(
 
 
 def figure(
-    system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None = None
-) -> Figure:
-    """The figure of a run. t: (n,), s; q, qd: (n, nq); energy: (n,)."""
+    system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None = None,
+    outputs: Outputs = _NONE,
+) -> Figure:  # fmt: skip
+    """The figure of a run. t: (n,), s; q, qd: (n, nq); energy: (n,); outputs: (n,) by name."""
     try:
         import matplotlib.figure
     except ImportError:
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
-        return _figure(system, t, q, qd, energy, title or system.title or system.name)
+        return _figure(system, t, q, qd, energy, title or system.title or system.name, outputs)
 
 
-def _figure(system: System, t: Array, q: Array, qd: Array, energy: Array, title: str) -> Figure:
+def _figure(
+    system: System, t: Array, q: Array, qd: Array, energy: Array, title: str, outputs: Outputs
+) -> Figure:
     from matplotlib.figure import Figure
 
     every = max(len(t) // SAMPLES, 1)
     t, q, qd, energy = (np.asarray(a, dtype=float)[::every] for a in (t, q, qd, energy))
 
-    groups = _groups(system)
+    groups, asked = _groups(system), _by_unit(system, outputs)
     picture = _picture(system, t, q, qd)
-    rows = len(groups) + 1
+    rows = len(groups) + len(asked) + 1
     made = Figure(figsize=(12, min(2.1 * rows + 0.5, 9)), layout="constrained")
     made.suptitle(texts.figure(title), fontsize=13, color=INK)
     widths = [1, 1, 1.35] if picture else [1, 1]
@@ -93,6 +98,10 @@ def _figure(system: System, t: Array, q: Array, qd: Array, energy: Array, title:
             first = first or axes
             shown = [system.coordinates[i] for i in group]
             _against_time(axes, t, values[:, group], shown, rate=column == 1)
+    for row, some in enumerate(asked, len(groups)):
+        axes = made.add_subplot(grid[row, :2], sharex=first)
+        values = np.column_stack([np.asarray(outputs[o.name], float)[::every] for o in some])
+        _against_time(axes, t, values, some, rate=False, kind="outputs")
     axes = made.add_subplot(grid[-1, :2], sharex=first)
     _energy(axes, t, energy, "J" if any(c.unit for c in system.coordinates) else "")
     axes.set_xlabel("$t$ (s)")
@@ -130,7 +139,7 @@ def _upright(word: str) -> str:
     return word if word.isdigit() else rf"\mathrm{{{word}}}"
 
 
-def _label(coordinate: Coordinate, rate: bool = False) -> str:
+def _label(coordinate: Coordinate | Output, rate: bool = False) -> str:
     return _with_unit(mathtext(coordinate.name, rate), _unit(coordinate.unit, rate))
 
 
@@ -160,9 +169,18 @@ def _groups(system: System) -> list[list[int]]:
     return groups
 
 
+def _by_unit(system: System, outputs: Outputs) -> list[list[Output]]:
+    """Which outputs share axes: none up to ROWS, beyond that those of one unit."""
+    mine = [o for o in system.outputs if o.name in outputs]
+    if len(mine) <= ROWS:
+        return [[o] for o in mine]
+    return [[o for o in mine if o.unit == unit] for unit in dict.fromkeys(o.unit for o in mine)]
+
+
 def _against_time(
-    axes: Axes, t: Array, values: Array, coordinates: Sequence[Coordinate], rate: bool
-) -> None:
+    axes: Axes, t: Array, values: Array, coordinates: Sequence[Coordinate | Output], rate: bool,
+    kind: str = "coordinates",
+) -> None:  # fmt: skip
     for c, x, colour in zip(coordinates, values.T, _colours(len(coordinates)), strict=True):
         axes.plot(t, x, color=colour, label=mathtext(c.name, rate))
     _plain(axes)
@@ -170,8 +188,7 @@ def _against_time(
     if len(coordinates) == 1:
         axes.set_ylabel(_label(first, rate))
     else:
-        kind = "velocities" if rate else "coordinates"
-        axes.set_ylabel(_with_unit(kind, _unit(first.unit, rate)))
+        axes.set_ylabel(_with_unit("velocities" if rate else kind, _unit(first.unit, rate)))
         lines = axes.get_lines()
         some = lines if len(lines) <= 8 else [lines[0], lines[len(lines) // 2], lines[-1]]
         axes.legend(handles=some, fontsize=8, frameon=False, ncols=1, loc="center left",
