@@ -24,6 +24,7 @@ class Energies:
     forces: list[Expr]
     signals: list[Expr]
     points: dict[Symbol, Expr]  # w -> y
+    applied: list[tuple[Expr, Expr]]  # the velocity of a position, and the force there
 
 
 def directions(system: System) -> dict[Symbol, Symbol]:
@@ -64,7 +65,9 @@ def on_tape(system: System, kinetic: Expr, potential: Expr) -> Energies:
         return tape.define(expr.xreplace(velocities).xreplace(known))
 
     forces = system.forces or (S.Zero,) * len(system.coordinates)
+    applied = [(dot(y), force) for y, force in system.applied]
     ends = [kinetic, potential, system.dissipation, *forces, *(i.signal for i in system.inputs)]
+    ends += [e for pair in applied for e in pair]
     for defined, expr in needed(system.definitions, ends):
         known[defined] = tape.named(value(expr), defined.name)
     return Energies(
@@ -75,6 +78,7 @@ def on_tape(system: System, kinetic: Expr, potential: Expr) -> Energies:
         [value(force) for force in forces],
         [value(i.signal) for i in system.inputs],
         points,
+        [(value(v), value(force)) for v, force in applied],
     )
 
 

@@ -68,6 +68,8 @@ def equations(system: System, e: Energies, motion: Motion) -> Equations:
     explicit = tape.forward([e.kinetic, e.potential], {t: S.One})
     (lost,) = tape.forward([e.dissipation], euler)
     works = [tape.define(force * v) for force, v in zip(e.forces, qd, strict=True)]
+    moved = tape.forward([v for v, _ in e.applied], euler)
+    works += [tape.define(f * v) for v, (_, f) in zip(moved, e.applied, strict=True)]
     power = add(*works, -lost, explicit[1], -explicit[0])
     return Equations(
         **vars(motion),

@@ -191,7 +191,8 @@ def _lagrange(system: System, e: Energies) -> Motion:
     p, p_w = momenta[: len(q)], momenta[len(q) :]
     moving = tape.forward(momenta, rates)
     p_dot, p_w_dot = moving[: len(q)], moving[len(q) :]
-    friction = tape.gradient([(e.dissipation, S.One)], [*qd, *w], stop)
+    against = [(e.dissipation, S.One), *((v, -force) for v, force in e.applied)]
+    friction = tape.gradient(against, [*qd, *w], stop)
     r, r_w = friction[: len(q)], friction[len(q) :]
 
     def projected(at_points: list[Expr], *energies: tuple[Expr, Expr]) -> list[Expr]:
@@ -214,7 +215,7 @@ def _lagrange(system: System, e: Energies) -> Motion:
     g = tape.gradient([(e.potential, S.One)], q) if quadratic else tape.substitute(bias, at_rest)
 
     # D qdd = b, the forces projected in one sweep
-    if e.dissipation == 0:
+    if e.dissipation == 0 and not e.applied:
         b = [add(force, -c) for force, c in zip(e.forces, bias, strict=True)]
     else:
         seeds = [add(i, f) for i, f in zip(p_w_dot, r_w, strict=True)]

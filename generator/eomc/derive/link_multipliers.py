@@ -76,6 +76,8 @@ def solution(system: System) -> Solution:
     speeds = system.kinetic.atoms(dot) | (system.kinetic.free_symbols & {*system.qd})
     if len(speeds) > most:
         raise UnsuitedError(f"{len(speeds)} velocities in K, more than {most}")
+    if system.applied:
+        raise UnsuitedError("forces at points")
     return _Links(system, on_tape(system, system.kinetic, system.potential)).solution()
 
 

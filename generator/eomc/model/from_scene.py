@@ -130,6 +130,7 @@ def from_scene(scene: Scene) -> System:
         forces=tuple(
             more.forces.get(c.name, zero) + forces.get(c.name, zero) for c in scene.coordinates
         ),
+        applied=tuple(more.applied),
         tree=more.tree(kinetic, potential),
         parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
         inputs=inputs,

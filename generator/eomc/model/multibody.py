@@ -18,7 +18,7 @@ from eomc.base.spatial import apply, plus, product, scaled, transposed
 from eomc.model import exact
 from eomc.model.exact import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
 from eomc.model.symbols import dot, symbol
-from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Spring
+from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 
@@ -78,6 +78,7 @@ class Terms:
     potential: Expr = S.Zero  # theirs and the springs'
     dissipation: Expr = S.Zero
     forces: dict[str, Expr] = field(default_factory=dict)
+    applied: list[tuple[Expr, Expr]] = field(default_factory=list)  # forces at positions
     links: list[Link] = field(default_factory=list)
     still: Vector = ZERO
     gravity: Vector = ZERO
@@ -243,6 +244,26 @@ class Builder:
             self._spring(f"spring.{k + 1}", spring)
         for k, damper in enumerate(self.assembly.dampers):
             self._damper(f"damper.{k + 1}", damper)
+        for k, force in enumerate(self.assembly.forces):
+            self._apply(f"force.{k + 1}", force)
+
+    def _apply(self, key: str, force: Force) -> None:
+        """A force at a point of a body, a torque on it; virtual work is F.dp + tau.(dR R^T)."""
+        place, applied = self.places[force.body], self.terms.applied
+        F, torque = (
+            self._vector(f"{key}.{name}", getattr(force, name)) for name in ("force", "torque")
+        )
+        if force.in_body:
+            F, torque = (apply(place.R, x) for x in (F, torque))
+        point = plus(place.at, apply(place.R, self._vector(f"{key}.point", force.point)))
+        applied += zip(point, F, strict=True)
+        if self.assembly.plane:
+            applied.append((place.angle, torque[2]))
+        else:
+            for axis in range(3):
+                row, other = place.R[(axis + 2) % 3], place.R[(axis + 1) % 3]
+                applied += ((y, torque[axis] * x) for y, x in zip(row, other, strict=True))
+        applied[:] = [(y, f) for y, f in applied if f != 0 and y.free_symbols]
 
     def _put(self, body: Body) -> None:
         assert body.position is not None

@@ -29,7 +29,8 @@ class System:
     """d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, over named definitions.
 
     `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
-    `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate. `tree`: the bodies
+    `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate; to it come the forces
+    F that are `applied` at positions y, pairs (y, F), each with F dy/dq. `tree`: the bodies
     that are held by joints, whose energies are part of K and P. `digest` names what the system was
     made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
     was read from, where it was.
@@ -45,6 +46,7 @@ class System:
     inputs: tuple[Input, ...] = ()
     definitions: tuple[tuple[Symbol, Expr], ...] = ()
     outputs: tuple[Output, ...] = ()
+    applied: tuple[tuple[Expr, Expr], ...] = ()
     tree: Tree | None = None
     run: Run = field(default_factory=Run)
     title: str = ""
@@ -157,6 +159,7 @@ class System:
             ("energy.dissipation", self.dissipation),
             *((f"forces.{c.name}", e) for c, e in zip(self.coordinates, self.forces, strict=True)),
             *((f"inputs.{i.name}.signal", i.signal) for i in self.inputs),
+            *(("force", e) for pair in self.applied for e in pair),
             *((f"outputs.{o.name}", o.formula) for o in self.outputs),
         ]
         numbers += [(key, n) for key, e in expressions for n in e.atoms(sympy.Number)]

@@ -310,6 +310,7 @@ def corners(system: System) -> str:
     """The functions in the scene that jump or bend, by name; "" where all is smooth."""
     exprs = (
         *(system.kinetic, system.potential, system.dissipation, *system.forces),
+        *(force for _, force in system.applied),
         *(e for _, e in system.definitions),
         *(i.signal for i in system.inputs),
     )

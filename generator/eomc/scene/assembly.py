@@ -91,6 +91,20 @@ class Damper(Between):
 
 
 @dataclass(frozen=True)
+class Force:
+    """What acts on a body: a force (N) at a `point` (m, in the body's frame) and a torque (N m).
+
+    Formulas of all names, along the world's axes, or where `in_body` the body's.
+    """
+
+    body: str
+    point: Vector
+    force: Vector
+    torque: Vector
+    in_body: bool = False
+
+
+@dataclass(frozen=True)
 class Assembly:
     """The bodies, parents before children, and what acts between them; gravity in m/s^2."""
 
@@ -99,3 +113,4 @@ class Assembly:
     bodies: tuple[Body, ...]
     springs: tuple[Spring, ...] = ()
     dampers: tuple[Damper, ...] = ()
+    forces: tuple[Force, ...] = ()

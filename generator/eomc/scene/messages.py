@@ -47,6 +47,7 @@ _ONE_TABLE: Mapping[str, str] = {
     "definitions": 'y = "l*cos(theta)"',
     "forces": 'x = "F - b*x_dot"',
 }
+_OF_FORCES = {"body", "point", "force", "torque", "frame"}
 
 
 def array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
@@ -54,6 +55,8 @@ def array(name: str, entries: Any) -> tuple[str, dict[str, Any]] | None:
     meant = next((t for t in _ONE_TABLE if name.lower() in (t, t.removesuffix("s"))), None)
     if meant is None or not isinstance(entries, list) or not entries:
         return None
+    if name == "force" and any(isinstance(e, dict) and e.keys() & _OF_FORCES for e in entries):
+        return None  # on a body
     merged: dict[str, Any] = {}
     for entry in entries:
         if not isinstance(entry, dict):

@@ -23,7 +23,8 @@ MAX_TEXT = 5_000_000  # characters of these
 _TABLES = ("constants", "parameters", "coordinates", "inputs", "definitions", "forces")
 _PLAIN = ("definitions", "forces")  # whose entries are formulas, not tables
 _WORDS = ("unit", "note", "title", "repeat")  # keys whose texts are for people
-_NAMES = ("name", "parent", "joint", "coordinates", "coordinate", "bodies")  # no formulas
+# no formulas
+_NAMES = ("name", "parent", "joint", "coordinates", "coordinate", "bodies", "body", "frame")
 _ARRAYS_MEANT = {
     "bodies": "body", "Body": "body", "link": "body", "links": "body", "springs": "spring",
     "Spring": "spring", "dampers": "damper", "Damper": "damper",

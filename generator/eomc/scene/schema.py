@@ -109,6 +109,7 @@ _Rotation = Annotated[
 _Axes = Annotated[tuple[tuple[float, ...], ...], pydantic.PlainValidator(spelling.axes)]
 _Names = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.names)]
 _TwoNames = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.two_names)]
+_Torque = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(spelling.each)]
 _Points = Annotated[tuple[tuple[float | str, ...], ...], pydantic.PlainValidator(spelling.points)]
 
 
@@ -157,6 +158,17 @@ class DamperTable(_Between):
     damping: _Value
 
 
+class ForceTable(_Table):
+    """A [[force]] as it is written."""
+
+    body: pydantic.StrictStr
+    point: _Vector | None = None
+    force: _Vector | None = None
+    torque: _Torque | None = None
+    frame: Literal["world", "body"] = "world"
+    note: _Note = ""
+
+
 class Document(_Table):
     """A whole scene as it is written."""
 
@@ -176,6 +188,7 @@ class Document(_Table):
     body: dict[str, BodyTable] = {}
     spring: dict[str, SpringTable] = {}
     damper: dict[str, DamperTable] = {}
+    force: dict[str, ForceTable] = {}
     run: _Run = _Run()
 
 
@@ -200,6 +213,7 @@ _MODELS: Mapping[str, type[_Table]] = {
     "body": BodyTable,
     "spring": SpringTable,
     "damper": DamperTable,
+    "force": ForceTable,
     "run": _Run,
 }
 
@@ -234,6 +248,10 @@ _ALIASES_OF = {
         "c": "damping", "b": "damping", "d": "damping", "coefficient": "damping",
         "torsional": "turning", "angular": "turning", "rotational": "turning",
         "between": "bodies", "joint": "coordinate", "ends": "points", "anchors": "points",
+    },
+    "force": {
+        "at": "point", "position": "point", "place": "point", "offset": "point", "link": "body",
+        "F": "force", "direction": "force", "moment": "torque", "M": "torque", "axes": "frame",
     },
 }  # fmt: skip
 
@@ -314,6 +332,8 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
         return f"must be true or false, here {here}"
     if path[0] == "run":
         return f"must be a number, here {here}{messages.number(given)}"
+    if last == "frame":
+        return f'must be "world" or "body", whose axes the entries are along, here {here}'
     if last in ("unit", "note", "name", "title", "parent", "joint", "coordinate"):
         return f"must be text in quotes, here {here}"
     return f"must be a number or a formula in quotes, here {here}"
@@ -328,6 +348,8 @@ _MISSING: Mapping[tuple[str, ...], str] = {
     ("body", "name"): 'give the body a name: name = "..."',
     ("spring", "stiffness"): 'add stiffness = "..."',
     ("damper", "damping"): 'add damping = "..."',
+    ("force", "body"): 'name the body that it acts on, body = "..."; a force along a coordinate '
+    'stands in [forces], x = "F - b*x_dot"',
 }
 
 
@@ -341,6 +363,8 @@ def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
         table[last] = _HARMLESS[path]
     elif len(path) == 3 and path[0] in _ALIASES_OF and last in ("name", "stiffness", "damping"):
         table[last] = f"body_{path[1]}" if last == "name" else 1.0
+    elif len(path) == 3 and (path[0], last) == ("force", "body"):
+        table[last] = next((b["name"] for b in tree.get("body", {}).values() if "name" in b), "")
     elif len(path) == 2 and path[0] in ("definitions", "forces"):
         table[last] = "0"
     elif len(path) == 2 and path[0] in ("coordinates", "inputs"):

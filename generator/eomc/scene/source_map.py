@@ -15,7 +15,8 @@ MAX_STATEMENT = 500  # lines
 MAX_TRIED = 4_000_000  # characters given to tomllib, some seconds
 MAX_SEARCHED = 20_000_000  # characters searched for the columns of faults; then lines do
 
-ARRAYS = ("body", "spring", "damper")  # tables that may stand many times, in [[two brackets]]
+# tables that may stand many times, in [[two brackets]]
+ARRAYS = ("body", "spring", "damper", "force")
 
 Path = tuple[str, ...]
 

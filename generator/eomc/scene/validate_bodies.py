@@ -45,7 +45,7 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
     known: the values of constants and parameters. Faults are reported to `check`; with faults the
     assembly is not to be used.
     """
-    if not (doc.body or doc.spring or doc.damper):
+    if not (doc.body or doc.spring or doc.damper or doc.force):
         if doc.gravity is not None:
             check.say(
                 ("gravity",),
@@ -76,12 +76,14 @@ class _Bodies(Springs):
         self._inertia_of_joints(ordered)
         springs = [self._spring(("spring", k), e) for k, e in self.doc.spring.items()]
         dampers = [self._damper(("damper", k), e) for k, e in self.doc.damper.items()]
+        forces = [self._force(("force", k), e) for k, e in self.doc.force.items()]
         return Assembly(
             plane=self.wide == 2,
             gravity=gravity,
             bodies=tuple(ordered),
             springs=tuple(springs),
             dampers=tuple(dampers),
+            forces=tuple(forces),
         )
 
     # --- the scene ------------------------------------------------------------------------------

@@ -143,7 +143,7 @@ class Comparison:
         """The functions in the scene that jump or bend."""
         s = self.system
         exprs = (
-            *(s.kinetic, s.potential, s.dissipation, *s.forces),
+            *(s.kinetic, s.potential, s.dissipation, *s.forces, *(e for x in s.applied for e in x)),
             *(e for _, e in s.definitions),
             *(i.signal for i in s.inputs),
         )

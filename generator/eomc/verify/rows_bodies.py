@@ -19,7 +19,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from eomc.scene import formulas
-from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Spring
+from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Spring
 from eomc.scene.formulas import Formula
 from eomc.verify.oracle import Vector
 
@@ -290,7 +290,28 @@ class Line:
                     power = power - self.of(body.friction[k]) * np.tanh(rate / width) * rate
                 if body.actuator:
                     power = power + self.of(body.actuator[k]) * rate
+        if self.assembly.forces:  # what moves with time alone is none of the coordinates' work
+            still = Line(self.scene, self.state, self.width, 0.0)
+            power = power + sum(self.work(f, still) for f in self.assembly.forces)
         return power
+
+    def work(self, force: Force, still: Line) -> Vector:
+        """F.v + torque.omega of a force on a body, less that of what moves at rest."""
+        frame, zero = self.frames[force.body], 0 * self.nodes
+        F, torque = (
+            np.stack([self.of(x) + zero for x in given], axis=1)
+            for given in (force.force, force.torque)
+        )
+        if force.in_body:
+            F, torque = rotated(frame.turn, F), rotated(frame.turn, torque)
+        point = self.vector(force.point)
+        (v, w), (v0, w0) = (line.motion(line.frames[force.body], point) for line in (self, still))
+        return np.asarray(np.sum(F * (v - v0) + torque * (w - w0), axis=1))
+
+    def motion(self, frame: Frame, point: Vector) -> tuple[Vector, Vector]:
+        """The velocity of a point of a frame, and the frame's angular velocity, 2 dq/dt q*."""
+        turning = multiplied(self.rate @ frame.turn, frame.turn * [1, -1, -1, -1])
+        return self.rate @ frame.point(point), 2 * turning[:, 1:]
 
     def loss(self) -> float:
         """dR/dqd . qd, by R at velocities that are a little larger and smaller."""

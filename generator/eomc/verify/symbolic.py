@@ -66,6 +66,8 @@ def derive(system: System) -> Reference:
     bias = p.jacobian(q) * qd + p.diff(t) - gradient(K, q) + gradient(P, q)
     forces = system.forces or (sympy.S.Zero,) * len(q)
     tau = ImmutableMatrix([expand(e) for e in forces]) - gradient(R, system.qd)
+    for y, force in system.applied:
+        tau += gradient(expand(y), q) * expand(force)
     return Reference(
         system=system,
         D=D,

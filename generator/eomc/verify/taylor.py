@@ -46,14 +46,14 @@ _WANTED: Mapping[str, Mapping[str, str]] = {
     "C": {"K": "vvs N"},
     "g": {"K": "vs x", "P": "x"},
     "bias": {"K": "vs x", "P": "x"},
-    "tau": {"Q": "value", "R": "v"},
+    "tau": {"Q": "value", "R": "v", "y": "x", "F": "value"},
     "kinetic": {"K": "value"},
     "potential": {"P": "value"},
     "energy": {"K": "value", "P": "value"},
     "jacobi": {"K": "value v", "P": "value"},
-    "power": {"K": "x", "P": "x", "Q": "value", "R": "v"},
+    "power": {"K": "x", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
     "signals": {"u": "value"},
-    "motion": {"K": "vs x vv", "P": "x", "Q": "value", "R": "v"},
+    "motion": {"K": "vs x vv", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
 }
 
 
@@ -133,7 +133,10 @@ class Jets(Answer):
             return np.concatenate([np.zeros((b, 0)), *found], axis=1)
 
         def tau() -> Vector:
-            return each("Q") - part("R", "v", nq)
+            found = each("Q") - part("R", "v", nq)
+            for y, force in zip(roots["y"], roots["F"], strict=True):
+                found = found + jets[force]["value"] * jets[y]["x"][:, :nq]
+            return found
 
         def bias() -> Vector:
             slope = part("P", "x", nq + 1) - part("K", "x", nq + 1)
@@ -214,7 +217,8 @@ class _List:
             self.known[name] = self.node(body)
         forces = s.forces or (sympy.S.Zero,) * len(s.q)
         roots = {"K": [s.kinetic], "P": [s.potential], "R": [s.dissipation], "Q": forces}
-        roots["u"] = [i.signal for i in s.inputs]
+        roots |= {"u": [i.signal for i in s.inputs]}
+        roots |= {"y": [y for y, _ in s.applied], "F": [force for _, force in s.applied]}
         self.roots = {name: [self.node(e) for e in exprs] for name, exprs in roots.items()}
 
     def add(self, op: Op) -> int:
