@@ -89,14 +89,14 @@ class Refusals:
                 continue
             if (self.accelerate(s)[0] == SINGULAR) == singular:
                 (self.singular if singular else self.regular).append(s)
-            elif singular or self.natural(s):
+            elif singular or (self.natural(s) and self.exact(s)):
                 wrong += not self.lost(s, D)
         return float(wrong)
 
     def exact(self, s: State) -> bool:
-        """Whether a D that is singular to the last digit is so before rounding.
+        """Whether a D that is singular, or regular, to the last digit is so before rounding.
 
-        Where one inertia is 2^60 times another, D has lost the other, which the module may keep.
+        Where one inertia is 2^60 times another, D may have lost the other, or a pivot may.
         """
         sizes = [abs(x / (self.defaults[name] or 1.0)) for name, x in (s.params or {}).items()]
         return all(x == 0 or 1 / ABSORBED < x < ABSORBED for x in sizes)

@@ -136,7 +136,8 @@ class Sampler:
         self.rejected = 0
         start = self.start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
         # how far things go: from the start, from what happens next, else 1 of the unit
-        self.angles = np.array([c.unit == "rad" for c in system.coordinates])
+        slides = {link.q for link in system.tree.links if not link.turns} if system.tree else set()
+        self.angles = np.array([c.unit == "rad" and c.q not in slides for c in system.coordinates])
         turned = start.q + self.angles  # as what rests where it starts moves from elsewhere
         far, fast = np.max([self._ahead(q, effort) for q in (start.q, turned)], axis=0)
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
