@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 import time
@@ -77,7 +76,7 @@ def command(
         except module.Interrupted:  # the run itself is whole
             stopped = True
     if out:
-        _write(out, module, done)
+        _write(out, done)
     if plot:
         from eomc.report import plot as plots
 
@@ -221,24 +220,9 @@ def _print_error(module: Any, error: Estimate) -> None:
         say(f"  this motion is not resolved: {error.verdict}")
 
 
-def _write(path: Path, module: Any, done: Run) -> None:
-    """The rows as CSV (17 digits, so that they read back as they were) or as NPZ arrays."""
-    import numpy as np
-
-    names = [*module.coordinates, *(f"{c}_dot" for c in module.coordinates)]
+def _write(path: Path, done: Run) -> None:
+    """The rows as CSV (17 digits, so that they read back as they were) or the run as NPZ."""
     try:
-        if path.suffix == ".npz":
-            np.savez(
-                path, t=done.t, q=done.q, qd=done.qd, energy=done.energy,
-                coordinates=np.array(module.coordinates),
-            )  # fmt: skip
-            return
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["t", *names, "energy"])
-            writer.writerows(
-                [repr(float(x)) for x in row]
-                for row in np.column_stack([done.t, done.q, done.qd, done.energy])
-            )
+        done.save(path)
     except OSError as fault:
         raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None

@@ -15,8 +15,8 @@ from eomc.integrators.tableaux import METHODS
 
 ROWS = 200  # of main.c, about
 FUNCTIONS = (
-    "C D acceleration advice bias energy g jacobi kinetic_energy linearize potential_energy power "
-    "rhs sensitivity signal simulate simulate_batch step step_batch tau"
+    "C D acceleration advice bias energy g jacobi kinetic_energy linearize load_run "
+    "potential_energy power rhs sensitivity signal simulate simulate_batch step step_batch tau"
 ).split()
 
 

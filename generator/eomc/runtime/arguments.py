@@ -70,8 +70,8 @@ class Params:
         return values
 
     def __repr__(self) -> str:
-        inside = ", ".join(f"{n}={v:g}" for n, v in zip(self._names, self._array, strict=True))
-        return f"Params({inside})"
+        both = zip(self._names, self._array, strict=True)
+        return in_a_line("Params(", [f"{n}={v:g}" for n, v in both], ")")
 
 
 class Arguments:
@@ -317,5 +317,21 @@ def machine_memory() -> float:
 
 
 def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
-    """What is wrong with a name, and what there is."""
-    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}"
+    """What is wrong with a name, what there is, and what may be meant."""
+    import difflib  # of use here alone
+
+    near = [k for k in known if k.lower() == str(name).lower()]
+    near = near or difflib.get_close_matches(str(name), known, n=1)
+    meant = f"; did you mean '{near[0]}'?" if near else ""
+    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}{meant}"
+
+
+def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:
+    """start, the parts and end; as many of the parts as a line has room for."""
+    whole = start + ", ".join(parts) + end
+    if len(whole) <= width:
+        return whole
+    used, room = 0, width - len(f"{start}..., {len(parts)} more{end}")
+    while used < len(parts) and (room := room - len(parts[used]) - 2) >= 0:
+        used += 1
+    return f"{start}{', '.join([*parts[:used], f'... {len(parts) - used} more'])}{end}"

@@ -12,10 +12,13 @@ from math import ceil, isfinite
 from time import perf_counter
 from typing import Any
 
+import numpy as np
 from numpy import empty
 from numpy.typing import ArrayLike
 
+from . import saved
 from .arguments import Array, Parameters, as_count, as_number, as_step_size, machine_memory
+from .columns import File
 from .estimate import advice
 from .functions import Functions
 from .package import reduced
@@ -29,6 +32,30 @@ LARGE = 2**24  # positions from which a look at the memory is worth its time
 _CHUNK = 16_384  # steps times coordinates before the first look, some ms
 RARELY = 2**48  # steps from row to row, more than any run makes
 _MOST = 2**60  # steps, so that C can return four times as many
+
+
+class Law:
+    """A function u(t, q, qd) that a run calls before each step; keeps what it gave at the rows."""
+
+    def __init__(self, law: Callable[..., Any], inputs: Callable[[Any], Any], every: int) -> None:
+        self.law, self.inputs, self.every = law, inputs, every
+        self.calls, self.kept = 0, list[Array]()
+        self.last: Any = None
+
+    def __call__(self, t: float, q: Array, qd: Array) -> Array:
+        """What the function gives at a step's start."""
+        self.last = self.inputs(self.law(t, q.copy(), qd.copy()))
+        if self.last is None:
+            raise ValueError("u: the function returned None, not the inputs")
+        if self.calls % self.every == 0:
+            self.kept.append(self.last.copy())
+        self.calls += 1
+        return self.last  # type: ignore[no-any-return]
+
+    def rows(self, count: int, width: int) -> Array:
+        """What was applied from each row of the run on, (count, width)."""
+        last = np.full(width, np.nan) if self.last is None else self.last
+        return np.array([*self.kept, last][:count], last.dtype)
 
 
 class Model(Functions):
@@ -50,16 +77,29 @@ class Model(Functions):
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("_model._again", self.digest)
 
-    def _again(self, digest: str) -> Model:
-        """Itself, found by a value that was pickled; a warning where the scene was another then."""
+    def _again(self, digest: str, what: str = "this was pickled") -> Model:
+        """Itself, found by a value that was kept; a warning where the scene was another then."""
         if digest != self.digest:
             warnings.warn(
-                f"{self.name}: this was pickled from another version of the scene; what is "
+                f"{self.name}: {what} from another version of the scene; what is "
                 "computed from it now is of the present version",
                 RuntimeWarning,
                 stacklevel=2,
             )
         return self
+
+    def load_run(self, file: File) -> Run:
+        """A run, or a batch, that `save` has written to an .npz file; its columns are the same.
+
+        Raises ValueError where the file is none of this scene's, OSError where it can't be read;
+        warns where it is of another version of the scene.
+        """
+        kind, kept = saved.read(self, file)
+        if kind != "Run":
+            raise ValueError(
+                f"{file}: is a run of many at once, which a scene has by [run] batch = true"
+            )
+        return Run._of_kept(self, kept)
 
     def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
         """A method's step and loop in C, steps at once, stages; what is kept and counted."""
@@ -188,7 +228,7 @@ class Model(Functions):
         every = min(as_count(every, "every", 1), RARELY)
         if steps >= _MANY and (method, h) not in self._warned:
             self._warned.add((method, h))
-            first = self._table(u, steps)[1]
+            first = self._table(u, steps, every)[1]
             if first is not None and first.ndim == 2:
                 first = first[0]
             if words := advice(self, q, qd, h, t0, first, p, method):
@@ -234,7 +274,7 @@ class Model(Functions):
         """A run from checked arguments, whatever its status; C reads from_q, from_qd and at_p."""
         _, run, _, stages, work_type, counted = self._loops[method]
         nq, (address, real, null) = self.nq, self._c
-        law, held, stride = (None, None, 0) if u is None else self._table(u, steps)
+        law, held, stride = (None, None, 0) if u is None else self._table(u, steps, every)
         rows = 1 - -steps // every
         both: Any = out
         try:
@@ -262,9 +302,7 @@ class Model(Functions):
                     if done:  # else the start is not among the rows yet
                         row = -(-done // every)
                         q, qd = q_rows[row], qd_rows[row]
-                    held = self._inputs(law(t0 + done * h, q.copy(), qd.copy()))
-                    if held is None:
-                        raise ValueError("u: the function returned None, not the inputs")
+                    held = law(t0 + done * h, q, qd)
                     at_u = address(real, held)
                 count = steps - done
                 if count > chunk:
@@ -289,15 +327,16 @@ class Model(Functions):
             kept = 1 - -done // every
             both = q_rows[:kept], qd_rows[:kept]
         evaluations = counted(work) if counted else stages * done
-        return Run(
-            self, t0, both, h, done, said, p, every, u if law else held, method,
-            evaluations,
-        )  # fmt: skip
+        given = law.law if law else None if held is None else held.copy()
+        made = Run(self, t0, both, h, done, said, p, every, given, method, evaluations)
+        if law:
+            made._applied = law.rows(len(made), self.nu)
+        return made
 
     def _bytes(self, rows: int) -> int:
         return rows * 2 * self.nq * self.dtype.itemsize
 
-    def _table(self, u: Any, steps: int) -> tuple[Callable[..., Any] | None, Array | None, int]:
+    def _table(self, u: Any, steps: int, every: int) -> tuple[Law | None, Array | None, int]:
         """(function, held values, values from one step to the next)."""
         if u is None:
             return None, None, 0
@@ -312,7 +351,7 @@ class Model(Functions):
                     RuntimeWarning,
                     stacklevel=4,
                 )
-            return u, None, 0
+            return Law(u, self._inputs, every), None, 0
         array = self._numbers(u, "u")
         if self.nu == 1 and array.ndim < 2 and array.size:
             array = array.reshape((-1, 1) if array.size > 1 else 1)

@@ -56,6 +56,14 @@ class Package(ModuleType):
             return f"a start is given to a call: {call}(q0=..., qd0=...), or eomc run --start"
         return "belongs to the module and stays as it is" if name in self.__all__ else ""
 
+    def __repr__(self) -> str:
+        model = self.__dict__.get("_model")
+        if model is None:  # not imported yet
+            return super().__repr__()
+        counts = {"coordinate": model.nq, "input": model.nu, "parameter": len(model.parameters)}
+        said = ", ".join(f"{n} {what}{'s' * (n != 1)}" for what, n in counts.items())
+        return f"<compiled scene {model.name}: {said}>"
+
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("_self")
 

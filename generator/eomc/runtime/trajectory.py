@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .arguments import Array
+from .columns import Columns
 from .estimate import Estimate, estimate
 from .package import reduced
 
@@ -25,7 +26,7 @@ SAID = {
     "no convergence": "the iteration for the step does not converge: take a smaller h",
     "interrupted": "interrupted",
 }
-_LEFT_OUT = "u was a function, which a pickled run doesn't keep: simulate again"
+_LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
 
 
 class MotionError(ArithmeticError):
@@ -68,8 +69,8 @@ class _Half:
 
 
 @dataclass(eq=False, repr=False)
-class Run:
-    """A trajectory: t (n,), q (n, nq), qd (n, nq), status.
+class Run(Columns):
+    """A trajectory: t (n,), q (n, nq), qd (n, nq), u (n, nu), status; by name run["theta_dot"].
 
     status: "ok", "singular", "not finite", "no convergence" or "interrupted"; a run that is not ok
     ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
@@ -94,6 +95,7 @@ class Run:
     evaluations: int
     error: Estimate | None = field(default=None, init=False)
     _energy: Array | None = field(default=None, init=False)
+    _applied: Array | None = field(default=None, init=False)  # where u is a function
 
     q, qd = _Half(0), _Half(1)
 
@@ -103,15 +105,37 @@ class Run:
         return self.t0 + self.h * np.minimum(self.every * np.arange(len(self.q)), self.steps)
 
     @property
+    def u(self) -> Array:
+        """The inputs at each row, (n, nu): the signals there, or what was held from there on.
+
+        The last row has what was held over the last step.
+        """
+        if self._applied is not None:
+            return self._applied
+        shape = (len(self), self._model.nu)
+        if self._u is None:
+            signal: Any = self._model.signal
+            return np.asarray(signal(self.q, self.qd, self.t, self._params))
+        if self._u.ndim == 1:
+            return np.broadcast_to(self._u, shape).copy()
+        if not len(self._u):  # no step, and so nothing held
+            return np.full(shape, np.nan, self._u.dtype)
+        rows: Array = self._u[np.minimum(np.arange(len(self)) * self.every, self.steps - 1)]
+        return rows
+
+    @property
     def energy(self) -> Array:
-        """K + P along the run, (n,), J."""
+        """K + P along the run, (n,), J. What is conserved may be `jacobi` instead."""
         if self._energy is None:
             self._energy = self._values("energy")
         return self._energy
 
     @property
     def jacobi(self) -> Array:
-        """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic."""
+        """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic.
+
+        Else, as in a frame that is turned, this is what is conserved where there is no power.
+        """
         return self._values("jacobi")
 
     def _values(self, name: str) -> Array:
@@ -155,6 +179,26 @@ class Run:
             self._params, model._pointer(self._params), self.method, float(self.t[0]), None,
             progress,
         )  # fmt: skip
+
+    def _kept(self) -> dict[str, Any]:
+        """What a saved run keeps of it besides its columns; None: nothing."""
+        held = None if callable(self._u) or isinstance(self._u, str) else self._u
+        return {
+            "q": self.q, "qd": self.qd, "t0": self.t0, "h": self.h, "steps": self.steps,
+            "status": self.status, "params": self._params, "every": self.every, "held": held,
+            "method": self.method, "evaluations": self.evaluations, "applied": self._applied,
+        }  # fmt: skip
+
+    @classmethod
+    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> Run:
+        applied = kept.get("applied")
+        u = kept.get("held") if applied is None else _LEFT_OUT
+        run = cls(
+            model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
+            kept["params"], kept["every"], u, kept["method"], kept["evaluations"],
+        )  # fmt: skip
+        run._applied = applied
+        return run
 
     def _state(self) -> dict[str, Any]:
         """All but what is made when it is asked for."""
@@ -213,7 +257,8 @@ class Run:
         return len(self.q)
 
     def __repr__(self) -> str:
-        return f"<Run of {self._model.name}: {self.message}>"
+        how = "" if self.status == "ok" else f"{self.status} after "
+        return f"<Run of {self._model.name}: {how}{self.steps} steps of {self.h:g} s>"
 
 
 def held_law(law: Callable[..., Any], parts: int) -> Callable[..., Any]:
