@@ -226,10 +226,40 @@ class Arguments:
             return None
         if not self.nu:
             raise ValueError("u: this scene has no inputs")
+        if type(u) is not ndarray and isinstance(u, Mapping):
+            u = self._by_name(u)
         array = self._array(u.reshape(1) if type(u) is ndarray and not u.ndim else u, "u", self.nu)
         if array.ndim != 1:
             raise ValueError(f"u: shape {array.shape}, expected ({self.nu},): one value an input")
         return array
+
+    def _by_name(self, u: Mapping[str, Any]) -> Array:
+        """Inputs by name as arrays have them, (..., nu).
+
+        All are to be given: held inputs and signals, which go on through a step, can't be mixed.
+        """
+        for name in u:
+            if name not in self.inputs:
+                raise ValueError(not_one_of("u", name, self.inputs))
+        if missing := [name for name in self.inputs if name not in u]:
+            raise ValueError(
+                f"u: no value for {', '.join(missing)}: give all inputs, or None for the signals "
+                "of the scene"
+            )
+        columns = [self._numbers(u[name], f"u: {name}") for name in self.inputs]
+        shapes = [np.shape(u[name]) for name in self.inputs]
+        most = max(map(len, shapes))
+        lined = [  # (batch,) beside (batch, steps) is one number a row
+            c.reshape(shape + (1,) * (most - len(shape) if shape else 0))
+            for c, shape in zip(columns, shapes, strict=True)
+        ]
+        try:
+            return np.stack(np.broadcast_arrays(*lined), axis=-1)
+        except ValueError:
+            raise ValueError(
+                "u: "
+                + ", ".join(f"{n} has shape {s}" for n, s in zip(self.inputs, shapes, strict=True))
+            ) from None
 
     def _out(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
         if out is None:

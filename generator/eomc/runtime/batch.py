@@ -175,7 +175,8 @@ class BatchModel(Model):
 
         q0, qd0: (batch, nq), or (nq,) for all alike. params: a dict of numbers or (batch,)
         arrays, Params, or an array (batch, np). u: None, the scene's signals; (nu,) or
-        (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step.
+        (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step; a
+        dict of all inputs by name, numbers, (batch,), (batch, steps) or (1, steps).
         threads: as many as there are processors where None. An instance that can't go on has its
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
         """
@@ -358,6 +359,8 @@ class BatchModel(Model):
             raise ValueError("u: this scene has no inputs")
         if callable(u):
             raise ValueError("u: a Python function can't be called for many at once: give a table")
+        if type(u) is not np.ndarray and isinstance(u, Mapping):
+            u = self._by_name(u)
         if type(u) is np.ndarray and u.dtype is self.dtype and u.flags.carray:
             array = u
         else:

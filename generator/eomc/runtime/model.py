@@ -25,7 +25,7 @@ from .package import reduced
 from .slices import longer
 from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
 
-Inputs = ArrayLike | Callable[[float, Array, Array], ArrayLike] | None
+Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
 _MANY = 1000  # steps from which a look at the stability limit is worth its time
 LARGE = 2**24  # positions from which a look at the memory is worth its time
@@ -114,7 +114,7 @@ class Model(Functions):
         params: Parameters = None, method: str | None = None,
         out: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """(q, qd) one step of size h later; u is held over the step.
+        """(q, qd) one step of size h later; u, (nu,) or a dict, is held over the step.
 
         u None: the scene's signals, followed through the step. Raises MotionError where the step
         can't be made; `out` is untouched then.
@@ -186,8 +186,9 @@ class Model(Functions):
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration.
         every: a row is kept of every so many steps, and the first and last state always.
         method: one of `methods`, the first of them where None.
-        u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; or
-        a function u(t, q, qd) called before each step, which is some hundred times slower.
+        u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; a
+        dict of all inputs by name, numbers or (steps,); or a function u(t, q, qd) called before
+        each step, which is some hundred times slower.
         out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
         estimate: whether to find the run's own error, `run.error`, by doing it again in shorter
         steps, which takes some nine times as long.
@@ -352,6 +353,8 @@ class Model(Functions):
                     stacklevel=4,
                 )
             return Law(u, self._inputs, every), None, 0
+        if isinstance(u, Mapping):
+            u = self._by_name(u)
         array = self._numbers(u, "u")
         if self.nu == 1 and array.ndim < 2 and array.size:
             array = array.reshape((-1, 1) if array.size > 1 else 1)
