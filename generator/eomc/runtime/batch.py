@@ -18,7 +18,7 @@ from . import saved
 from .arguments import Array, Params, as_count, as_number, as_step_size, machine_memory, unmasked
 from .batch_work import WORTH, Work
 from .columns import Columns, File
-from .model import LARGE, RARELY, Model
+from .model import LARGE, RARELY, SOME, Model
 from .package import reduced
 from .trajectory import STATUS, Interrupted, Run
 
@@ -213,9 +213,14 @@ class BatchModel(Model):
                 work.status[(work.status == 0) & short] = len(_NAMES) - 1
         if held is not None and held.shape[1] > 1:  # a copy, as the caller's table may change
             held = held[:, np.minimum(np.arange(rows) * every, steps - 1)]
+        method = self._method(method)
+        if steps >= SOME and (method, h) not in self._warned:
+            first = q_rows[0, 0], qd_rows[0, 0]
+            u0 = None if held is None else held[0, 0]
+            self._look(*first, h, t0, u0, table[0], method, "the first instance: ")
         run = BatchRun(
             self, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
-            held, self._method(method),
+            held, method,
         )  # fmt: skip
         if not whole:
             raise Interrupted(run)

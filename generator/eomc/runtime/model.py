@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from . import saved
 from .arguments import Array, Parameters, as_count, as_number, as_step_size, machine_memory
 from .columns import File
-from .estimate import advice
+from .estimate import advice, beyond_end
 from .functions import Functions
 from .package import reduced
 from .slices import longer
@@ -27,7 +27,8 @@ from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
 
 Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
-_MANY = 1000  # steps from which a look at the stability limit is worth its time
+_MANY = 1000  # steps from which a run is not taken in one call
+SOME = 20  # steps from which a look at the stability limit is worth its time, once a method and h
 LARGE = 2**24  # positions from which a look at the memory is worth its time
 _CHUNK = 16_384  # steps times coordinates before the first look, some ms
 RARELY = 2**48  # steps from row to row, more than any run makes
@@ -164,6 +165,8 @@ class Model(Functions):
                 raise ValueError(f"steps: {count:.3g} are more than a run can count, {_MOST:.3g}")
             return count
         time = self.duration if duration is None else as_number(duration, "duration")
+        if words := beyond_end(h, time):
+            warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=3)
         if time < 0:
             raise ValueError(f"duration: {duration} is not a time in s")
         if time / h > _MOST:
@@ -214,7 +217,7 @@ class Model(Functions):
         ):  # fmt: skip
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
-            if 0 <= steps <= short:
+            if 0 <= steps <= short and (steps < SOME or (method, h) in self._warned):
                 address, real, null = self._c
                 rows = empty((2, 1 - -steps // every, self.nq), self.dtype)
                 if run(
@@ -227,13 +230,11 @@ class Model(Functions):
         t0 = as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
-        if steps >= _MANY and (method, h) not in self._warned:
-            self._warned.add((method, h))
+        if steps >= SOME and (method, h) not in self._warned:
             first = self._table(u, steps, every)[1]
             if first is not None and first.ndim == 2:
                 first = first[0]
-            if words := advice(self, q, qd, h, t0, first, p, method):
-                warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=2)
+            self._look(q, qd, h, t0, first, p, method)
         result = self._trajectory(
             q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress
         )
@@ -242,8 +243,17 @@ class Model(Functions):
                 raise Interrupted(result)
             warnings.warn(f"{self.name}: {result.message}", RuntimeWarning, stacklevel=2)
         if estimate:
-            result.estimate()
+            result._judged(None, 3)
         return result
+
+    def _look(
+        self, q: Array, qd: Array, h: float, t: float, u: Array | None, p: Array, method: str,
+        whose: str = "",
+    ) -> None:  # fmt: skip
+        """Warn, once a method and step size, where h is beyond the stability limit at a state."""
+        self._warned.add((method, h))
+        if words := advice(self, q, qd, h, t, u, p, method):
+            warnings.warn(f"{self.name}: {whose}{words}", RuntimeWarning, stacklevel=3)
 
     def advice(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,

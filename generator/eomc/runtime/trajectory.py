@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -150,14 +151,21 @@ class Run(Columns):
         """The run's own error, by doing it again in shorter steps; kept in `error`.
 
         Where u is a function, it is called again, as often as in the run for each finer one.
-        Raises ValueError where the run was pickled and lost that function.
+        Warns where the motion is not resolved. Raises ValueError where the run was pickled and lost
+        that function.
         """
+        return self._judged(progress, 3)
+
+    def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
+        """`estimate`, its warning given to whoever called so many levels above."""
         if isinstance(self._u, str):
             raise ValueError(f"estimate: {self._u}")
         try:
             self.error = estimate(self, progress)
         except KeyboardInterrupt:
             raise Interrupted(self) from None
+        if words := self.error.warning:
+            warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
         return self.error
 
     def _again(
