@@ -117,7 +117,8 @@ def test_a_motion_error_is_copied(cartpole: ModuleType, copied: Callable[[Any], 
 
 
 def test_modules_and_their_functions_are_pickled_as_themselves(cartpole: ModuleType) -> None:
-    for value in (cartpole, cartpole._model, cartpole.D, cartpole.simulate):
+    classes = (cartpole.Params, cartpole.Run, cartpole.MotionError)
+    for value in (cartpole, cartpole._model, cartpole.D, cartpole.simulate, *classes):
         assert pickle.loads(pickle.dumps(value)) == value
         assert copy.deepcopy(value) == value
     assert pickle.loads(pickle.dumps(cartpole)) is cartpole
@@ -183,6 +184,47 @@ def test_a_pool_of_processes(how: str, loaded: str, tmp_path: Path, cartpole: Mo
         "SceneError ",
         "<Run of cartpole: 5 steps of 0.005 s> 5.0 4 True",
         "7.0 6",
+    ], done.stderr
+
+
+JOBS = """
+import sys
+import numpy as np
+import eomc
+from joblib import Parallel, delayed
+
+m = eomc.load(*sys.argv[1:3])
+many = eomc.load(*sys.argv[3:5])
+
+def runs(k):
+    p = m.Params(m_c=k)
+    return m.simulate(steps=5, params=p), many.simulate_batch(params={"m_c": [1, k]}, steps=3), p, m
+
+if __name__ == "__main__":
+    for run, batch, p, module in Parallel(n_jobs=2)(delayed(runs)(k) for k in (2.0, 3.0)):
+        mine = runs(p.m_c)
+        assert (run, batch, p) == mine[:3] and module is m
+        assert np.array_equal(batch.energy, mine[1].energy)
+        print(p.m_c, run["theta"][-1] == mine[0]["theta"][-1])
+    print(Parallel(n_jobs=2)(delayed(m.simulate)(steps=k) for k in (1, 2)))
+"""
+
+
+@pytest.mark.slow
+def test_jobs_of_joblib(tmp_path: Path, cartpole: ModuleType, batch: ModuleType) -> None:
+    """Functions of the script go by value, what they use of a module by where it lies."""
+    pytest.importorskip("joblib")
+    script = tmp_path / "jobs.py"
+    script.write_text(JOBS, encoding="utf-8")
+    scenes = [str(SCENES / "cartpole.toml"), str(MODULES), "build/tests/many_cartpole.toml"]
+    done = subprocess.run(
+        [sys.executable, str(script), *scenes, "build/tests/modules"],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == [
+        "2.0 True",
+        "3.0 True",
+        "[<Run of cartpole: 1 steps of 0.005 s>, <Run of cartpole: 2 steps of 0.005 s>]",
     ], done.stderr
 
 

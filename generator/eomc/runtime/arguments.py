@@ -104,6 +104,7 @@ class Arguments:
             "_names": self.parameters,
             "_defaults": tuple(parameters.values()),
             "_dtype": dtype,
+            "__module__": __package__,  # where pickle finds the class
         }
         self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
 
