@@ -321,6 +321,9 @@ def test_a_fork_has_threads_of_its_own(batch: ModuleType) -> None:
         ("duration", 3, r"simulate\(duration=3\)"),
         ("x", 1.0, r"a start .*simulate\(q0=..., qd0=...\)"),
         ("start", 1.0, r"a start "),
+        ("theta_dot", 1.0, r"a start "),
+        ("M_c", 50, r"is no name of the scene; did you mean 'm_c'\?; .*simulate\(params={...}\)"),
+        ("thetadot", 1.0, r"is no name of the scene; did you mean 'theta_dot'"),
         ("D", None, "belongs to the module"),
         ("simulate", None, "belongs to the module"),
         ("defaults", {}, "belongs to the module"),
@@ -333,8 +336,16 @@ def test_a_module_is_not_assigned_to(driven: ModuleType, name: str, value: Any, 
     assert vars(driven) == before
 
 
+def test_a_test_may_replace_a_function(driven: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is meant goes into the dictionary, or to the model."""
+    monkeypatch.setitem(vars(driven), "simulate", lambda: "another")
+    assert driven.simulate() == "another"
+    monkeypatch.undo()
+    assert driven.simulate(steps=1).steps == 1
+
+
 def test_an_input_is_not_assigned_to(driven: ModuleType) -> None:
-    with pytest.raises(AttributeError, match=r"an input .*simulate\(u=...\)"):
+    with pytest.raises(AttributeError, match=r'an input .*simulate\(u={"force": 1.0}\)'):
         setattr(driven, driven.inputs[0], 1.0)
 
 

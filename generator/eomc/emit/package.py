@@ -15,7 +15,7 @@ from eomc.integrators.tableaux import METHODS
 
 ROWS = 200  # of main.c, about
 FUNCTIONS = (
-    "C D acceleration advice bias energy g jacobi kinetic_energy linearize load_run "
+    "C D acceleration advice bias energy equilibrium g jacobi kinetic_energy linearize load_run "
     "potential_energy power rhs sensitivity signal simulate simulate_batch step step_batch tau"
 ).split()
 

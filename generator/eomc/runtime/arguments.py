@@ -16,7 +16,7 @@ import numpy as np
 from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
-from .package import Defaults, reduced
+from .package import Defaults, meant, reduced
 
 Array = NDArray[Any]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -349,12 +349,7 @@ def machine_memory() -> float:
 
 def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
     """What is wrong with a name, what there is, and what may be meant."""
-    import difflib  # of use here alone
-
-    near = [k for k in known if k.lower() == str(name).lower()]
-    near = near or difflib.get_close_matches(str(name), known, n=1)
-    meant = f"; did you mean '{near[0]}'?" if near else ""
-    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}{meant}"
+    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}{meant(name, known)}"
 
 
 def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:

@@ -7,7 +7,7 @@ NumPy and cffi only. Angles in rad, everything in SI units.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from math import ceil, isfinite
 from time import perf_counter
 from typing import Any
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from . import saved
 from .arguments import Array, Parameters, as_count, as_number, as_step_size, machine_memory
 from .columns import File
+from .equilibrium import equilibrium
 from .estimate import advice, beyond_end
 from .functions import Functions
 from .package import reduced
@@ -267,6 +268,25 @@ class Model(Functions):
         given, method = self._parameters(params), self._method(method)
         h = self.h if h is None else as_step_size(h, self.dtype)
         return advice(self, q, qd, h, as_number(t0, "t0"), u, given, method)
+
+    def equilibrium(
+        self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, u: Any = None,
+        free: Collection[str] | None = None, *, t: float = 0.0, params: Parameters = None,
+    ) -> tuple[Array, Array | None]:  # fmt: skip
+        """(q, u) where no force is left, so that q̈ = 0: by Newton's method from the guess q, u.
+
+        q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates and
+        inputs that are found, all coordinates where None; the others stay. u None: the scene's
+        signals. u comes back as (nu,), None where the scene has no inputs.
+        Raises MotionError, status "no convergence", where none is found.
+        """
+        if isinstance(free, str):
+            free = (free,)
+        moving = qd if np.ndim(qd) else np.full(self.nq, as_number(qd, "qd"))
+        at, moving = self._one(self._start[0] if q is None else q, moving)
+        found = self.coordinates if free is None else tuple(free)
+        held = self._inputs(u)
+        return equilibrium(self, at, moving, held, found, as_number(t, "t"), params)
 
     def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
         """A start, (nq,), and what C reads it from."""
