@@ -84,7 +84,9 @@ def command(
     if plot:
         from eomc.report import plot as plots
 
-        plots.draw(pipeline.read(scene).at(values), done.t, done.q, done.qd, done.energy, plot)
+        jacobi = done.jacobi if own.has_jacobi else None
+        system = pipeline.read(scene).at(values)
+        plots.draw(system, done.t, done.q, done.qd, done.energy, plot, jacobi=jacobi)
     summary = _summary(module, done, seconds, unstable, ends, plot=plot, out=out)
     if as_json:
         say(json.dumps(summary, indent=1))
