@@ -58,7 +58,7 @@ def test_a_new_scene_runs_as_it_is_written(here: Path) -> None:
     assert ran.exit_code == 0, ran.output
     assert "error at the end about" in ran.output and "steps a second" in ran.output
     rows = np.genfromtxt("run.csv", delimiter=",", names=True)
-    assert rows.dtype.names == ("t", "theta", "theta_dot", "energy") and len(rows) == 2001
+    assert rows.dtype.names == ("t", "theta", "theta_dot", "torque", "energy") and len(rows) == 2001
     assert (here / "run.png").read_bytes().startswith(b"\x89PNG")
     again = eomc("new", "crane")
     assert again.exit_code == 2 and "is there already" in again.output

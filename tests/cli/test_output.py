@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -50,6 +51,14 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
 def test_numbers_that_make_no_run(here: Path, words: list[str], said: str) -> None:
     done = eomc(*words)
     assert (done.exit_code, said in done.output) == (2, True), done.output
+
+
+def test_a_step_longer_than_the_run_is_said(here: Path) -> None:
+    done = eomc("run", "p.toml", "--h", "0.3", "--duration", "0.1")
+    assert done.exit_code == 0
+    assert "  h = 0.3 s is longer than the duration, 0.1 s: the run is one step of" in done.output
+    said = json.loads(eomc("run", "p.toml", "--h", "0.3", "--duration", "0.1", "--json").output)
+    assert said["beyond_duration"].startswith("h = 0.3 s") and said["beyond_stability"] is None
 
 
 def test_fewer_rows_than_one_in_all_steps(here: Path) -> None:

@@ -86,38 +86,37 @@ x, x_dot, u = sympy.symbols("x x_dot u")
     ("arguments", "options", "said"),
     [
         (("a", [x], sympy.Symbol("M") * x_dot**2), {}, "M not declared"),
-        (("a", [x], "x_dot**2"), {}, "SymPy expression, not the text"),
         (("a", [], x_dot**2), {}, "at least one coordinate"),
         (("class", [x], x_dot**2), {}, "class"),
         (("a", [x], x_dot**2), {"parameters": {x: 1.0}}, "'x' is taken already"),
         (("a", [x], x_dot**2), {"forces": {u: 1}}, "not among the coordinates"),
         (("a", [x], sympy.I * x_dot**2), {}, "not a real, finite expression"),
         ((3, [x], x_dot**2), {}, "name: must be text"),
-        (("a", ["x"], x_dot**2), {}, r"give a symbol, sympy\.Symbol\('x'\)"),
         (("a", x, x_dot**2), {}, "coordinates: give a list or dict"),
         (("a", [x**2], x_dot**2), {}, r"x\*\*2 is not a symbol"),
-        (("a", {x: "pi/2"}, x_dot**2), {}, "start of x: must be a number, here 'pi/2'"),
         (("a", {x: (1, 2, 3)}, x_dot**2), {}, r"pair \(start, rate\)"),
         (("a", {x: np.nan}, x_dot**2), {}, "start of x: must be a finite number"),
         (("a", [x], None), {}, "kinetic: None is not an expression"),
         (("a", [x], x_dot**2, x > 0), {}, "potential: x > 0 is not an expression"),
         (("a", [x], x_dot**2, sympy.erf(x)), {}, "potential: erf can't be used: write tanh"),
-        (("a", [x], x_dot**2, sympy.sec(x)), {}, r"sec can't be used: write 1/cos\(x\)"),
         (("a", [x], x_dot**2, sympy.besselj(0, x)), {}, "besselj can't be used; functions are sin"),
-        (
-            ("a", [x], x_dot**2, sympy.Piecewise((x, x > 0), (0, True))),
-            {},
-            "Piecewise can't be used: write Heaviside",
-        ),
         (("a", [x], x_dot**2), {"forces": {x: sympy.ceiling(x)}}, "force on x: ceiling can't"),
-        (("a", [x], x_dot**2), {"forces": {"x": 1}}, "forces: give a symbol"),
         (("a", [x], x_dot**2), {"forces": {x: sympy.Symbol("t")}}, r"not the time: write eomc\."),
         (("a", [x], x_dot**2), {"parameters": [u]}, "parameters: give a dict"),
-        (("a", [x], x_dot**2), {"parameters": {"u": 1}}, r"give a symbol, sympy\.Symbol\('u'\)"),
-        (("a", [x], x_dot**2), {"parameters": {u: "1"}}, "parameter u: must be a number, here '1'"),
         (("a", [x], x_dot**2), {"parameters": {u: x}}, "parameter u: must be a number, here x"),
         (("a", [x], x_dot**2), {"inputs": "u"}, "inputs: give a list or dict of symbols"),
-        (("a", [x], x_dot**2), {"definitions": {u: "x"}}, "definition u: give a SymPy expression"),
+        (("a", [x], "x_dot^2"), {}, r"kinetic: 'x_dot\^2' '\^' is not a power here"),
+        (("a", [x], "m_1*x_dot**2"), {"parameters": {"m1": 1}}, r"m_1 not .*did you mean 'm1'\?"),
+        (("a", ["x"], "Piecewise((x, 1))"), {}, r"kinetic: .*'Piecewise' is not used in formulas"),
+        (("a", {x: "pi/y"}, x_dot**2), {}, "start of x: y not declared"),
+        (("a", [x], x_dot**2, "1/0"), {}, "potential: '1/0' divides by zero"),
+        (("a", [x], sympy.Symbol("x", positive=True)), {}, "the 'x' declared .* is another symbol"),
+        (("a", [[x]], x_dot**2), {}, r"coordinates: \[x\] is not a symbol"),
+        (("a", np.array(1.0), x_dot**2), {}, "coordinates: give a list or dict of symbols"),
+        (("a", [x], x_dot**2), {"parameters": np.ones(2)}, "parameters: give a dict"),
+        (("a", [x], x_dot**2), {"methods": x}, "methods: known are rk4"),
+        (("a", [x], x_dot**2), {"forces": {x: sympy.Heaviside(x, 1)}}, "Heaviside.x. is 1/2 at 0"),
+        (("a", [x], x_dot**2), {"forces": {"y": 1}}, "forces: y not among the coordinates"),
         (("a", [x], x_dot**2), {"h": -0.1}, "h: must be greater than zero"),
         (("a", [x], x_dot**2), {"methods": ["ode45"]}, "methods: known are rk4"),
         (("a", [x], x_dot**2), {"real": "quad"}, "real: known are double, float"),
@@ -130,6 +129,92 @@ def test_what_is_wrong_is_said(
 ) -> None:
     with pytest.raises(EomcError, match=said):
         System.make(*arguments, **options)  # type: ignore[arg-type]
+
+
+def test_names_and_formulas_as_text() -> None:
+    """The same system as from symbols, and both may be mixed."""
+    made = System.make(
+        "texts", {"x": ("pi/2", 0.1), "theta": 0}, "m*x_dot**2/2 + m*dot(y)**2/2", "m*g*y + m*z",
+        parameters={"m": "1/2", "g": 9.81}, definitions={"y": "l*cos(theta)", "z": "abs(x)"},
+        inputs={"F": "sin(2*t)", "l": 2}, forces={"x": "F - max(x, 0)", "theta": 0},
+        units={"x": "m"}, dissipation="x_dot**2",
+    )  # fmt: skip
+    x, theta, m, g, y, z, F, l = sympy.symbols("x theta m g y z F l")  # noqa: E741
+    x_dot, t = sympy.Symbol("x_dot"), sympy.Symbol("t", real=True)
+    same = System.make(
+        "texts", {x: (sympy.pi / 2, 0.1), theta: 0}, m * x_dot**2 / 2 + m * dot(y) ** 2 / 2,
+        m * g * y + m * z, parameters={m: 0.5, g: 9.81},
+        definitions={y: l * sympy.cos(theta), z: sympy.Abs(x)}, inputs={F: sympy.sin(2 * t), l: 2},
+        forces={x: F - sympy.Max(x, 0)}, units={x: "m"}, dissipation=x_dot**2,
+    )  # fmt: skip
+    assert made == same and made.digest == same.digest
+    mixed = System.make("m", ["x"], x_dot**2 / 2, x * m, parameters={"m": 1}, forces={x: "-x"})
+    assert mixed == System.make("m", [x], x_dot**2 / 2, "x*m", parameters={m: 1}, forces={"x": -x})
+    q = dynamicsymbols("x")
+    by_time = System.make("m", [q], "x_dot**2/2", q * m, parameters={m: 1}, forces={"x": -q})
+    assert by_time == mixed
+
+
+def value(expr: sympy.Expr, at: float) -> float:
+    (free,) = expr.free_symbols
+    return float(expr.subs(free, sympy.Float(at, 30)))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [sympy.sec, sympy.csc, sympy.cot, sympy.sech, sympy.csch, sympy.coth, sympy.asec, sympy.acsc],
+)
+def test_functions_are_written_in_those_there_are(function: Any) -> None:
+    made = System.make("a", [x], x_dot**2 / 2, function(2 * x + 1)).potential
+    assert not made.has(function)
+    for at in (-1.7, 0.3, 2.0):
+        assert value(made, at) == pytest.approx(float(function(2 * at + 1)), rel=1e-14)
+
+
+PIECES = {
+    "ramp": ((x, x > 0), (0, True)),
+    "stop": ((0, x <= 0.5), (3 * (x - 0.5) ** 2 / 2, True)),
+    "dead band": ((x + 1, x < -1), (x - 1, x > 1), (0, True)),
+    "saturation": ((-1, x < -1), (1, x >= 1), (x, True)),
+    "first that holds": ((0, x < 0), (x, x < 1), (1, True)),
+    "size": ((-x, x < 0), (x, True)),
+    "cubic": ((x**3, x > 0), (sympy.sin(3 * x) * x, True)),
+}
+
+
+@pytest.mark.parametrize("pieces", PIECES.values(), ids=list(PIECES))
+def test_pieces_that_meet_are_sums_of_max(pieces: Any) -> None:
+    given = sympy.Piecewise(*pieces)
+    made = System.make("a", [x], x_dot**2 / 2, given).potential
+    assert not made.has(sympy.Piecewise, sympy.Heaviside)
+    for at in (-3.0, -1.0, -0.4, 0.0, 0.3, 0.5, 0.7, 1.0, 2.5):
+        assert value(made, at) == pytest.approx(float(given.subs(x, at)), rel=1e-14, abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("pieces", "said"),
+    [
+        (
+            ((1, x > 0), (0, True)),
+            r"jumps where x = 0, .* write Heaviside\(x\), which is 1/2",
+        ),
+        (((sympy.sqrt(x), x > 0), (0, True)), "jumps where x = 0"),
+        (((1 / x, x > 1), (x, True)), "can't be seen not to"),
+        (((x, x > 0),), "has no last piece"),
+        (((1, sympy.Eq(x, 0)), (x, True)), r"Eq\(x, 0\) in a Piecewise can't be used: write x > a"),
+        (((x, x > 1), (u * x, u > 0), (0, True)), "can't be seen not to"),
+    ],
+)
+def test_pieces_that_jump_are_refused(pieces: Any, said: str) -> None:
+    with pytest.raises(EomcError, match=f"force on x: .*{said}"):
+        System.make("a", [x], x_dot**2 / 2, inputs=[u], forces={x: sympy.Piecewise(*pieces)})
+
+
+def test_a_derivative_that_waits_is_done() -> None:
+    q, t = dynamicsymbols("x"), dynamicsymbols._t
+    made = System.make("a", [q], sympy.Derivative(q**2, t) ** 2)
+    at = made.coordinates[0]
+    assert made.kinetic == (2 * at.q * at.qd) ** 2
 
 
 @pytest.mark.parametrize("inside", [x_dot, dot(x), u * x])

@@ -102,6 +102,19 @@ def test_one_coordinate_has_a_phase_portrait_and_lost_energy_is_drawn_as_it_is()
     assert energy.get_ylabel() == "$E$ (J)"
 
 
+def test_jacobis_integral_is_drawn_beside_the_energy_where_it_is_another():
+    made, t, q, qd, energy = spring()
+    jacobi = 7 + 1e-9 * np.sin(t)
+    *_, axes, _ = plot.figure(made, t, q, qd, energy, jacobi=jacobi).axes
+    lines = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
+    assert np.array_equal(lines["energy"], energy - energy[0])
+    assert np.array_equal(lines["Jacobi's integral"], jacobi - jacobi[0])
+    assert axes.get_ylabel() == "$E - E(0)$, $J - J(0)$ (J)" and axes.get_legend()
+    assert r"Jacobi's integral: max $|J - J(0)|$ = $1\times10^{-9}$ J" in axes.get_title()
+    still = plot.figure(made, t, q, qd, 0 * energy, jacobi=jacobi).axes[-2]
+    assert still.get_ylim()[1] < 1e-8  # of the energy alone it would be 1
+
+
 @pytest.mark.parametrize("n", [2, 5, 9, 30])
 def test_many_coordinates_share_axes_and_every_one_is_drawn(n):
     made = plot.figure(*spring(n))

@@ -48,7 +48,7 @@ def test_tables_that_do_not_fit_are_refused_by_name() -> None:
         "params: not all numbers are": lambda: m.step_batch(q0, qd0, params=wrong),
         "u: not all numbers are finite": lambda: m.step_batch(q0, qd0, u=[nan]),
         "u: 'push' is not an array of": lambda: m.step_batch(q0, qd0, u="push"),
-        "u: {'force': 1} is not an array": lambda: m.step_batch(q0, qd0, u={"force": 1}),
+        "u: 'Force' is not one of force; did you": lambda: m.step_batch(q0, qd0, u={"Force": 1}),
         "u: 20 instances where q0 has 5: a table over time": lambda: m.simulate_batch(
             q0, qd0, steps=20, u=np.zeros((20, 1))
         ),

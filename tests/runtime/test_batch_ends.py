@@ -89,6 +89,14 @@ def test_an_instance_that_fails_on_the_way_keeps_its_last_state() -> None:
     assert np.isnan(runs.q[4, rows:]).all() and np.isfinite(runs.q[5]).all()
 
 
+def test_a_step_beyond_the_limit_of_the_first_instance_is_reported() -> None:
+    m = module("mass_spring")
+    words = "^many_mass_spring: the first instance: h = 0.012 s is beyond rk4's stability limit of"
+    with pytest.warns(RuntimeWarning, match=words) as said:
+        m.simulate_batch(h=0.012, steps=20, params={"k": [1e6, 1.0]})
+    assert said[0].filename == __file__
+
+
 def test_ctrl_c_stops_within_a_second_and_keeps_what_was_done() -> None:
     m = module("kepler_orbit")
     q0, qd0 = np.tile(m.start[0], (300, 1)), np.tile(m.start[1], (300, 1))

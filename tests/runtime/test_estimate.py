@@ -160,16 +160,22 @@ def test_estimates_of_the_library() -> None:
 
 def test_a_motion_beyond_doubles_is_reported() -> None:
     """Errors grow by 1.7e11 in 15 s."""
-    run = compiled("double_pendulum_chaotic").simulate(h=0.005, steps=3000, estimate=True)
+    words = "^double_pendulum_chaotic: this motion is not resolved: the error of .* exceeds a tenth"
+    with pytest.warns(RuntimeWarning, match=words) as said:
+        run = compiled("double_pendulum_chaotic").simulate(h=0.005, steps=3000, estimate=True)
+    assert said[-1].filename == __file__
+    with pytest.warns(RuntimeWarning, match=words) as said:
+        run.estimate()
+    assert said[-1].filename == __file__
     assert not run.error.resolved and "exceeds a tenth" in run.error.verdict
     assert run.error.amplification > 1e9
     assert min(run.error.digits.values()) == 0
-    run = compiled("double_pendulum_chaotic").simulate(h=1e-3, steps=25_000, estimate=True)
+    run = quiet(compiled("double_pendulum_chaotic"), h=1e-3, steps=25_000, estimate=True)
     assert "chaotic" in run.error.verdict and "no run in float64" in run.error.verdict
 
 
 def test_jumps_lower_the_observed_order(modules: Modules) -> None:
-    run = modules.of_text(JUMPING).simulate(estimate=True)
+    run = quiet(modules.of_text(JUMPING), estimate=True)
     assert run.error.observed < 3 and "forces jump" in run.error.verdict
 
 
@@ -243,7 +249,7 @@ def test_a_step_beyond_the_limit_is_reported_once() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         module.simulate(h=0.03, steps=1000)  # reported
-        module.simulate(h=0.031, steps=999)  # short
+        module.simulate(h=0.031, steps=19)  # short
         run = module.simulate(h=0.028, steps=1000)
     assert abs(run.q[-1, 0]) < 1
     assert "0.031 s" in module.advice(h=0.031) and module.advice(h=0.028) is None
@@ -257,6 +263,28 @@ def test_fast_decay_has_a_limit_too() -> None:
     assert module.advice(h=0.0027) is None
     assert abs(quiet(module, h=0.003, qd0=[1.0], steps=1000).q[-1, 0]) > 10
     assert abs(quiet(module, h=0.0027, qd0=[1.0], steps=1000).q[-1, 0]) < 2
+
+
+def test_it_is_reported_of_every_kind_of_run() -> None:
+    """Of some dozens of steps that go straight into C, of long ones, of many at once."""
+    module = spring(1e4)
+    words = r"^spring_.*: h = 0.0\d+ s is beyond rk4's stability limit"
+    for k, how in enumerate(({"steps": 20}, {"steps": 3000}, {"duration": 3.0})):
+        with pytest.warns(RuntimeWarning, match=words) as said:
+            module.simulate(h=0.04 + k / 1000, **how)
+        assert said[0].filename == __file__
+
+
+def test_a_step_longer_than_the_run_is_reported(cartpole: ModuleType) -> None:
+    words = "^cartpole: h = 0.5 s is longer than the duration, 0.2 s: the run is one step of 0.5 s$"
+    with pytest.warns(RuntimeWarning, match=words) as said:
+        run = cartpole.simulate(h=0.5, duration=0.2)
+    assert run.steps == 1 and said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cartpole.simulate(h=0.5, duration=0.5)
+        cartpole.simulate(h=0.5, duration=0)
+        cartpole.simulate(h=0.5, steps=1)
 
 
 def test_a_jump_is_no_fast_mode(modules: Modules) -> None:

@@ -117,7 +117,8 @@ def test_a_motion_error_is_copied(cartpole: ModuleType, copied: Callable[[Any], 
 
 
 def test_modules_and_their_functions_are_pickled_as_themselves(cartpole: ModuleType) -> None:
-    for value in (cartpole, cartpole._model, cartpole.D, cartpole.simulate):
+    classes = (cartpole.Params, cartpole.Run, cartpole.MotionError)
+    for value in (cartpole, cartpole._model, cartpole.D, cartpole.simulate, *classes):
         assert pickle.loads(pickle.dumps(value)) == value
         assert copy.deepcopy(value) == value
     assert pickle.loads(pickle.dumps(cartpole)) is cartpole
@@ -183,6 +184,47 @@ def test_a_pool_of_processes(how: str, loaded: str, tmp_path: Path, cartpole: Mo
         "SceneError ",
         "<Run of cartpole: 5 steps of 0.005 s> 5.0 4 True",
         "7.0 6",
+    ], done.stderr
+
+
+JOBS = """
+import sys
+import numpy as np
+import eomc
+from joblib import Parallel, delayed
+
+m = eomc.load(*sys.argv[1:3])
+many = eomc.load(*sys.argv[3:5])
+
+def runs(k):
+    p = m.Params(m_c=k)
+    return m.simulate(steps=5, params=p), many.simulate_batch(params={"m_c": [1, k]}, steps=3), p, m
+
+if __name__ == "__main__":
+    for run, batch, p, module in Parallel(n_jobs=2)(delayed(runs)(k) for k in (2.0, 3.0)):
+        mine = runs(p.m_c)
+        assert (run, batch, p) == mine[:3] and module is m
+        assert np.array_equal(batch.energy, mine[1].energy)
+        print(p.m_c, run["theta"][-1] == mine[0]["theta"][-1])
+    print(Parallel(n_jobs=2)(delayed(m.simulate)(steps=k) for k in (1, 2)))
+"""
+
+
+@pytest.mark.slow
+def test_jobs_of_joblib(tmp_path: Path, cartpole: ModuleType, batch: ModuleType) -> None:
+    """Functions of the script go by value, what they use of a module by where it lies."""
+    pytest.importorskip("joblib")
+    script = tmp_path / "jobs.py"
+    script.write_text(JOBS, encoding="utf-8")
+    scenes = [str(SCENES / "cartpole.toml"), str(MODULES), "build/tests/many_cartpole.toml"]
+    done = subprocess.run(
+        [sys.executable, str(script), *scenes, "build/tests/modules"],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == [
+        "2.0 True",
+        "3.0 True",
+        "[<Run of cartpole: 1 steps of 0.005 s>, <Run of cartpole: 2 steps of 0.005 s>]",
     ], done.stderr
 
 
@@ -279,6 +321,9 @@ def test_a_fork_has_threads_of_its_own(batch: ModuleType) -> None:
         ("duration", 3, r"simulate\(duration=3\)"),
         ("x", 1.0, r"a start .*simulate\(q0=..., qd0=...\)"),
         ("start", 1.0, r"a start "),
+        ("theta_dot", 1.0, r"a start "),
+        ("M_c", 50, r"is no name of the scene; did you mean 'm_c'\?; .*simulate\(params={...}\)"),
+        ("thetadot", 1.0, r"is no name of the scene; did you mean 'theta_dot'"),
         ("D", None, "belongs to the module"),
         ("simulate", None, "belongs to the module"),
         ("defaults", {}, "belongs to the module"),
@@ -291,8 +336,16 @@ def test_a_module_is_not_assigned_to(driven: ModuleType, name: str, value: Any, 
     assert vars(driven) == before
 
 
+def test_a_test_may_replace_a_function(driven: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is meant goes into the dictionary, or to the model."""
+    monkeypatch.setitem(vars(driven), "simulate", lambda: "another")
+    assert driven.simulate() == "another"
+    monkeypatch.undo()
+    assert driven.simulate(steps=1).steps == 1
+
+
 def test_an_input_is_not_assigned_to(driven: ModuleType) -> None:
-    with pytest.raises(AttributeError, match=r"an input .*simulate\(u=...\)"):
+    with pytest.raises(AttributeError, match=r'an input .*simulate\(u={"force": 1.0}\)'):
         setattr(driven, driven.inputs[0], 1.0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -39,6 +40,7 @@ push = "F*(1 + t)"
 cart = "x_ddot"
 [run]
 linearize = true
+batch = true
 h = 0.01
 duration = 1.0
 """
@@ -92,7 +94,7 @@ def test_inputs_can_be_read_as_they_were_applied(crane: ModuleType) -> None:
     assert np.array_equal(run.u, TABLE[at])
     run = crane.simulate(u=INPUTS["a function"], every=7)
     assert run.u[:-1, 0] == pytest.approx(np.cos(run.t[:-1]), abs=1e-15)
-    assert run.u[-1] == run.u[-2]
+    assert run.u[-1, 0] == pytest.approx(np.cos(0.99))  # over the last step
     again = pickle.loads(pickle.dumps(run))
     assert np.array_equal(again.u, run.u) and np.array_equal(
         again.outputs["pull"], run.outputs["pull"]
@@ -101,6 +103,32 @@ def test_inputs_can_be_read_as_they_were_applied(crane: ModuleType) -> None:
     signals = np.sin(3 * run.t) - run.qd[:, 0] / 5
     assert run.u[:, 0] == pytest.approx(signals, abs=1e-15)
     assert np.array_equal(crane.simulate(u=[0.3]).u, np.full((101, 1), 0.3))
+
+
+@pytest.mark.parametrize("u", [None, [0.3], np.linspace(-1, 1, 60).reshape(3, 20, 1)])
+def test_batches_have_them_too(crane: ModuleType, u: Any) -> None:
+    length = np.array([0.7, 0.8, 0.0])  # the last has no acceleration
+    q0, qd0 = (np.tile(x, (3, 1)) for x in crane.start)
+    runs = crane.simulate_batch(q0, qd0, steps=20, every=3, params={"l": length}, u=u)
+    for k in range(2):
+        row = u[k] if isinstance(u, np.ndarray) else u
+        run = crane.simulate(steps=20, every=3, params={"l": length[k]}, u=row)
+        for name, values in run.outputs.items():
+            assert runs.outputs[name][k] == pytest.approx(values, rel=1e-9, abs=1e-12), name
+    assert np.isnan(runs.outputs["pull"][2]).all() and np.isnan(runs["tip_x"][2, 1:]).all()
+
+
+def test_they_are_columns(crane: ModuleType, tmp_path: Path) -> None:
+    run = crane.simulate(steps=10)
+    assert np.array_equal(run["pull"], run.outputs["pull"]) and run.E is run.outputs["E"]
+    assert list(run.to_dict())[-7:] == [*crane.outputs, "energy"]
+    run.save(tmp_path / "run.csv")
+    header, first, *_ = (tmp_path / "run.csv").read_text(encoding="utf-8").splitlines()
+    found = dict(zip(header.split(","), map(float, first.split(",")), strict=True))
+    assert found["cart"] == run.outputs["cart"][0]
+    run.save(tmp_path / "run.npz")
+    again = crane.load_run(tmp_path / "run.npz")
+    assert np.array_equal(again.outputs["pull"], run.outputs["pull"])
 
 
 def test_a_state_and_many(crane: ModuleType) -> None:

@@ -10,7 +10,8 @@ import sympy
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from eomc.model.from_scene import _ALGEBRA, symbol
+from eomc.model.algebra import ALGEBRA
+from eomc.model.symbols import symbol
 from eomc.scene.formulas import FUNCTIONS, NUMERIC, FormulaError, evaluate, parse, suggest
 
 quick = settings(max_examples=150, deadline=None, derandomize=True, database=None)
@@ -75,7 +76,7 @@ def test_floats_and_sympy_agree(text):
     except (ArithmeticError, ValueError, TypeError):
         assume(False)
     assume(isinstance(number, float | int) and math.isfinite(number) and math.isfinite(spread))
-    expr = sympy.sympify(evaluate(formula, _ALGEBRA, symbol))
+    expr = sympy.sympify(evaluate(formula, ALGEBRA, symbol))
     exact = expr.xreplace({symbol(n): sympy.Rational(v) for n, v in NAMES.items()}).evalf(40)
     assume(exact.is_real and exact.is_finite)
     # what rounding of the leaves does to the value is not the algebra's fault
@@ -110,7 +111,7 @@ def test_python_reads_them_alike(text):
     ],
 )
 def test_decimals_are_exact(text, expected):
-    found = evaluate(parse(text), _ALGEBRA, symbol)
+    found = evaluate(parse(text), ALGEBRA, symbol)
     assert sympy.sympify(found) == sympy.Rational(expected.numerator, expected.denominator)
     assert evaluate(parse(text), NUMERIC, {}.get) == pytest.approx(float(expected), rel=1e-15)
 
@@ -139,7 +140,7 @@ def test_decimals_are_exact(text, expected):
 )
 def test_values(text, expected):
     assert evaluate(parse(text), NUMERIC, {}.get) == pytest.approx(expected, rel=1e-15)
-    assert float(sympy.sympify(evaluate(parse(text), _ALGEBRA, symbol))) == pytest.approx(expected)
+    assert float(sympy.sympify(evaluate(parse(text), ALGEBRA, symbol))) == pytest.approx(expected)
 
 
 def test_names_come_in_reading_order_without_functions_and_pi():

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +51,8 @@ def command(
     eomc run scenes/cartpole.toml --plot cartpole.png
     eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
     """
+    from eomc.runtime.estimate import beyond_end
+
     _known_suffix(out, (".csv", ".npz"), "--out")
     _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
     with status_line(f"building {scene.stem}", quiet or as_json):
@@ -59,10 +61,11 @@ def command(
     options: dict[str, Any] = {"h": h, "duration": duration, "params": values, "method": method}
     try:
         unstable = module.advice(q0, qd0, h, params=values, method=method)
+        own = module._model
+        ends = beyond_end(own.h if h is None else h, own.duration if duration is None else duration)
         with progress_bar("running", quiet or as_json) as progress:
             begun = time.perf_counter()
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # reported below
+            with _reported_below():
                 done = module.simulate(q0, qd0, every=every, progress=progress, **options)
             seconds = time.perf_counter() - begun
     except module.Interrupted as stop:  # what was done is kept
@@ -72,19 +75,19 @@ def command(
     stopped = done.status == "interrupted"
     if done.status == "ok" and seconds < 2:
         try:
-            with progress_bar("finding its error", quiet or as_json) as progress:
+            with progress_bar("finding its error", quiet or as_json) as progress, _reported_below():
                 done.estimate(progress)
         except module.Interrupted:  # the run itself is whole
             stopped = True
     if out:
-        _write(out, module, done)
+        _write(out, done)
     if plot:
         from eomc.report import plot as plots
 
-        system = pipeline.read(scene).at(values)
-        rows = done.t, done.q, done.qd, done.energy
-        plots.draw(system, *rows, plot, outputs=done.outputs)
-    summary = _summary(module, done, seconds, unstable, plot=plot, out=out)
+        jacobi = done.jacobi if own.has_jacobi else None
+        system, rows = pipeline.read(scene).at(values), (done.t, done.q, done.qd, done.energy)
+        plots.draw(system, *rows, plot, jacobi=jacobi, outputs=done.outputs)
+    summary = _summary(module, done, seconds, unstable, ends, plot=plot, out=out)
     if as_json:
         say(json.dumps(summary, indent=1))
     elif not quiet:
@@ -93,6 +96,14 @@ def command(
         say(f"eomc: {done.message}", err=True)
     if stopped or done.status != "ok":
         sys.exit(130 if stopped else 1)
+
+
+@contextmanager
+def _reported_below() -> Iterator[None]:
+    """No warnings: what they say is part of the summary."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield
 
 
 def _known_suffix(path: Path | None, known: Sequence[str], option: str) -> None:
@@ -150,8 +161,9 @@ def _error(done: Run) -> dict[str, Any] | None:
 
 
 def _summary(
-    module: Any, done: Run, seconds: float, unstable: str | None, **files: Path | None
-) -> dict[str, Any]:
+    module: Any, done: Run, seconds: float, unstable: str | None, ends: str | None,
+    **files: Path | None,
+) -> dict[str, Any]:  # fmt: skip
     import numpy as np
 
     energy, jacobi = done.energy, done.jacobi
@@ -175,6 +187,7 @@ def _summary(
         else float(np.max(np.abs(jacobi - jacobi[0]))),
         "error_estimate": _error(done),
         "beyond_stability": unstable,
+        "beyond_duration": ends,
         "seconds": seconds,
         "steps_per_second": done.steps / seconds if seconds else None,
         "files": [str(path) for path in files.values() if path],
@@ -195,8 +208,9 @@ def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
     also = "" if jacobi is None else f"; Jacobi's integral by {jacobi:.2g} J"
     end = summary["energy"]["end"]
     say(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J{also}")
-    if summary["beyond_stability"]:
-        say(f"  {summary['beyond_stability']}")
+    for words in (summary["beyond_stability"], summary["beyond_duration"]):
+        if words:
+            say(f"  {words}")
     if done.error is not None:
         _print_error(module, done.error)
     speed = summary["steps_per_second"] or 0.0
@@ -219,28 +233,13 @@ def _print_error(module: Any, error: Estimate) -> None:
         f"  right digits: {digits}; a difference at the start has become "
         f"{error.amplification:.2g} times as large"
     )
-    if not error.resolved:
-        say(f"  this motion is not resolved: {error.verdict}")
+    if error.warning:
+        say(f"  {error.warning}")
 
 
-def _write(path: Path, module: Any, done: Run) -> None:
-    """The rows as CSV (17 digits, so that they read back as they were) or as NPZ arrays."""
-    import numpy as np
-
-    names = [*module.coordinates, *(f"{c}_dot" for c in module.coordinates)]
+def _write(path: Path, done: Run) -> None:
+    """The rows as CSV (17 digits, so that they read back as they were) or the run as NPZ."""
     try:
-        if path.suffix == ".npz":
-            np.savez(
-                path, t=done.t, q=done.q, qd=done.qd, energy=done.energy,
-                coordinates=np.array(module.coordinates),
-            )  # fmt: skip
-            return
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["t", *names, "energy"])
-            writer.writerows(
-                [repr(float(x)) for x in row]
-                for row in np.column_stack([done.t, done.q, done.qd, done.energy])
-            )
+        done.save(path)
     except OSError as fault:
         raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None

@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import sympy
 from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model import growth
+from eomc.model import algebra, growth
 from eomc.model.multibody import Builder, Terms
-from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
+from eomc.model.symbols import Coordinate, Input, Output, Parameter, symbol, t
 from eomc.model.system import System
-from eomc.scene import formulas
 from eomc.scene.formulas import Formula, FormulaError
 from eomc.scene.scene import Scene
 from eomc.scene.scope import ENERGIES
-
-
-def _number(text: str) -> Expr:
-    whole = text[:2].lower() in ("0x", "0o", "0b")
-    return sympy.Integer(int(text, 0)) if whole else sympy.Rational(text)
-
-
-_ALGEBRA: Mapping[str, Any] = {
-    "number": _number,
-    "pi": sympy.pi,
-    **{name: getattr(sympy, name) for name in (*formulas.ELEMENTARY, "sign")},
-    "abs": sympy.Abs,
-    "heaviside": lambda x: sympy.Heaviside(x),
-    "min": sympy.Min,
-    "max": sympy.Max,
-    "dot": dot,
-}
-
-_UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
 
 
 class _Formulas:
@@ -57,16 +36,11 @@ class _Formulas:
         try:
             self.sizes[name] = growth.VARIES
             self.sizes[name] = growth.size(formula, self.sizes)
-            found = sympy.sympify(formulas.evaluate(formula, _ALGEBRA, self.known.__getitem__))
-            if found.has(*_UNDEFINED):
-                raise FormulaError("divides by zero")
-            if found.has(sympy.I):
-                raise FormulaError("has no real value")
+            return algebra.expression(formula, self.known)
         except (FormulaError, ArithmeticError, ValueError, TypeError) as fault:
             message = f"'{formula.shown}' {fault}"
             self.problems.append(self.scene.problem(key, message, formula))
             return sympy.S.Zero
-        return found
 
     def definitions(self) -> tuple[list[tuple[Symbol, Expr]], Terms]:
         """Constants become known; then definitions in their order, and what bodies add."""

@@ -13,13 +13,13 @@ from sympy.core.function import AppliedUndef
 from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.model import given
+from eomc.model.algebra import UNDEFINED
+from eomc.model.rewrite import JumpError, rewritten
 from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
 from eomc.scene.scene import Run
 
 if TYPE_CHECKING:
     from eomc.model.system import System
-
-_UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
 
 
 class Maker:
@@ -38,7 +38,7 @@ class Maker:
     def _name_of(self, one: Any, role: str) -> str:
         if not isinstance(one, (Symbol, AppliedUndef)):
             raise given.fault(role, f"{one!r} is not a symbol")
-        text = one.func.__name__ if isinstance(one, AppliedUndef) else str(one)
+        text = given.name_of(one)
         used = names.plain(text) if names.fault(text) else text
         if used in self.taken:
             raise EomcError(f"System.make: {role} '{text}': the name '{used}' is taken already")
@@ -48,7 +48,14 @@ class Maker:
         return used
 
     def _expression(self, value: Any, role: str) -> Expr:
+        if isinstance(value, str):
+            known = {s.name: s for s in self.known}
+            value = given.from_text(value, role, known)
         expr = given.expression(value, role)
+        expr = expr.replace(
+            lambda e: isinstance(e, sympy.Derivative),
+            lambda e: e if isinstance(e.expr, AppliedUndef) else e.doit(),
+        )
         expr = expr.replace(
             lambda e: isinstance(e, sympy.Derivative), lambda e: self.map.get(e, e)
         ).xreplace(self.map)
@@ -64,11 +71,12 @@ class Maker:
                 "dynamicsymbols._t where coordinates are dynamicsymbols",
             )
         if strange:
-            raise EomcError(
-                f"System.make: {role}: {', '.join(strange)} not declared: "
-                "name it among coordinates, parameters, inputs or definitions"
-            )
-        if expr.has(*_UNDEFINED, sympy.I):
+            raise given.undeclared(role, strange, (s.name for s in self.known))
+        try:
+            expr = rewritten(expr, self.fixed)
+        except JumpError as jump:
+            raise given.fault(role, str(jump)) from None
+        if expr.has(*UNDEFINED, sympy.I):
             raise EomcError(f"System.make: {role}: {expr} is not a real, finite expression")
         given.check_functions(expr, role)
         return expr
@@ -82,9 +90,9 @@ class Maker:
         """The system, of the class `of`."""
         starts = given.symbols(coordinates, "coordinates", 0.0)
         parameters = given.mapping(parameters, "parameters", "{m: 2.0}")
-        forces = given.mapping(forces, "forces", "{x: F}")
+        forces = given.by_name(forces, "forces", "{x: F}")
         definitions = given.mapping(definitions, "definitions", "{y: l*cos(theta)}")
-        units = given.mapping(units, "units", '{m: "kg"}')
+        units = given.by_name(units, "units", '{m: "kg"}')
         for text in (title, *units.values()):
             if not isinstance(text, str):
                 raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
@@ -93,7 +101,9 @@ class Maker:
         made = []
         for one, start in starts.items():
             name = self._name_of(one, "coordinate")
-            c = Coordinate(name, units.get(one, ""), *given.start(start, f"start of {name}"))
+            c = Coordinate(
+                name, units.get(given.name_of(one), ""), *given.start(start, f"start of {name}")
+            )
             self.map[one] = c.q
             if isinstance(one, AppliedUndef):
                 time = one.args[0]
@@ -101,11 +111,15 @@ class Maker:
                 self.map[time] = t
             else:
                 self.map[Symbol(f"{one}_dot", **one.assumptions0)] = c.qd
+                if one == symbol(one.name):
+                    self.map[Symbol(one.name)], self.map[Symbol(f"{one}_dot")] = c.q, c.qd
             made.append(c)
         declared = []
         for p, v in parameters.items():
             value = given.number(v, f"parameter {p}")
-            declared.append(Parameter(self._declare(p, "parameter"), value, units.get(p, "")))
+            unit = units.get(given.name_of(p), "")
+            declared.append(Parameter(self._declare(p, "parameter"), value, unit))
+        self.fixed = {p.symbol for p in declared}
         pending = given.symbols(inputs, "inputs", 0)
         given_inputs = [(i, self._declare(i, "input")) for i in pending]
         self.known = {c.q for c in made} | {c.qd for c in made} | {t}
@@ -116,23 +130,27 @@ class Maker:
             defined = symbol(self._declare(one, "definition"))
             self.known.add(defined)
             ordered.append((defined, expr))
-        unknown = [str(f) for f in forces if f not in starts]
-        if unknown:
+        if unknown := [f for f in forces if f not in map(given.name_of, starts)]:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
         expression = self._expression
         given_energies = {"kinetic": kinetic, "potential": potential, "dissipation": dissipation}
         energies = {role: expression(energy, role) for role, energy in given_energies.items()}
-        fixed = {p.symbol for p in declared}
         for role, energy in energies.items():
-            given.check_smooth(energy, role, dict(ordered), fixed)
+            given.check_smooth(energy, role, dict(ordered), self.fixed)
         made_of: dict[str, Any] = {
             "name": self.name,
             "coordinates": tuple(made),
             **energies,
-            "forces": tuple(expression(forces.get(c, 0), f"force on {c}") for c in starts),
+            "forces": tuple(
+                expression(forces.get(given.name_of(c), 0), f"force on {c}") for c in starts
+            ),
             "parameters": tuple(declared),
             "inputs": tuple(
-                Input(used, units.get(one, ""), expression(pending[one], f"signal of {one}"))
+                Input(
+                    used,
+                    units.get(given.name_of(one), ""),
+                    expression(pending[one], f"signal of {one}"),
+                )
                 for one, used in given_inputs
             ),
             "definitions": tuple(ordered),
@@ -167,4 +185,6 @@ class Maker:
     def _declare(self, one: Any, role: str) -> str:
         used = self._name_of(one, role)
         self.map[one] = symbol(used)
+        if one == symbol(given.name_of(one)):  # as a name gives it: whatever the assumptions
+            self.map[Symbol(one.name)] = symbol(used)
         return used

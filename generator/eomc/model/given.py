@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
+from sympy.core.function import AppliedUndef
 
 from eomc.base.errors import EomcError
 from eomc.integrators.tableaux import METHODS
-from eomc.model.symbols import dot
+from eomc.model import algebra, growth
+from eomc.model.symbols import dot, symbol
+from eomc.scene import formulas
+from eomc.scene.formulas import FormulaError
 from eomc.scene.scene import Run
 from eomc.scene.schema import REALS
 
@@ -22,10 +26,9 @@ _FUNCTIONS = (
 )
 _KNOWN = (sympy.Add, sympy.Mul, sympy.Pow, Symbol, sympy.Number, sympy.NumberSymbol, *_FUNCTIONS)
 _INSTEAD = {
-    "sec": "1/cos(x)", "csc": "1/sin(x)", "cot": "1/tan(x)", "sech": "1/cosh(x)",
-    "csch": "1/sinh(x)", "coth": "1/tanh(x)", "asinh": "log(x + sqrt(x**2 + 1))",
+    "asinh": "log(x + sqrt(x**2 + 1))",
     "acosh": "log(x + sqrt(x**2 - 1))", "atanh": "log((1 + x)/(1 - x))/2", "acot": "atan(1/x)",
-    "Piecewise": "Heaviside(x), Min or Max", "ITE": "Heaviside(x), Min or Max", "erf": "tanh(x)",
+    "ITE": "Heaviside(x), Min or Max", "erf": "tanh(x)",
     "floor": "a smooth function", "ceiling": "a smooth function", "Mod": "a smooth function",
     "Integral": "its value, by .doit()", "Sum": "its terms, by .doit()",
     "Product": "its factors, by .doit()", "sinc": "sin(x)/x",
@@ -37,13 +40,36 @@ def fault(role: str, message: str) -> EomcError:
     return EomcError(f"System.make: {role}: {message}")
 
 
+def from_text(text: str, role: str, known: Mapping[str, Symbol]) -> Expr:
+    """A formula as scenes have it. Raises EomcError."""
+    try:
+        formula = formulas.parse(text)
+        if strange := [n.id for n in formula.names() if n.id not in known]:
+            raise undeclared(role, strange, known)
+        growth.size(formula, {})
+        return algebra.expression(formula, known)
+    except FormulaError as wrong:
+        raise fault(role, f"'{text if len(text) <= 80 else text[:79] + '…'}' {wrong}") from None
+
+
+def undeclared(role: str, strange: Sequence[str], known: Iterable[str]) -> EomcError:
+    """The error where an expression has names that nobody declared."""
+    known = [*known]
+    meant = formulas.suggest(strange[0], known)
+    if strange[0] in known:
+        meant = f"; the '{strange[0]}' declared there is another symbol: take the same one"
+    return fault(
+        role,
+        f"{', '.join(strange)} not declared: name it among coordinates, parameters, inputs or "
+        f"definitions{meant}",
+    )
+
+
 def expression(given: Any, role: str) -> Expr:
     """A SymPy expression, or a number as one. Raises EomcError for anything else."""
-    if isinstance(given, str):
-        raise fault(role, f"give a SymPy expression, not the text {given!r}")
     try:
         expr = sympy.sympify(given)
-    except (sympy.SympifyError, TypeError, AttributeError):
+    except (sympy.SympifyError, TypeError, AttributeError, ValueError, RecursionError):
         expr = None
     if isinstance(expr, (sympy.MatrixBase, sympy.MatrixExpr)):
         rows, columns = expr.shape
@@ -63,6 +89,8 @@ def check_functions(expr: Expr, role: str) -> None:
             instead = f": write {_INSTEAD[name]}" if name in _INSTEAD else ""
             known = ", ".join(f.__name__ for f in _FUNCTIONS)
             raise fault(role, f"{name} can't be used{instead}; functions are {known}")
+        if isinstance(part, sympy.Heaviside) and part.args[1] != sympy.S.Half:
+            raise fault(role, f"{part}: Heaviside(x) is 1/2 at 0, without another value")
         more = [arg for arg in part.args if arg not in seen]
         seen.update(more)
         queue += more
@@ -91,12 +119,12 @@ def check_smooth(expr: Expr, role: str, definitions: Mapping[Symbol, Expr], fixe
 
 
 def number(given: Any, role: str) -> float:
-    """A finite number. Raises EomcError."""
+    """A finite number, or a formula of numbers. Raises EomcError."""
+    if isinstance(given, str):
+        given = from_text(given, role, {})
     try:
-        if isinstance(given, str):
-            raise TypeError
         value = float(given)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, IndexError):  # as SymPy has it
         raise fault(role, f"must be a number, here {given!r}") from None
     if not math.isfinite(value):
         raise fault(role, f"must be a finite number, here {value}")
@@ -119,20 +147,35 @@ def mapping(given: Any, role: str, example: str) -> Mapping[Any, Any]:
     return {symbol_of(key, role): value for key, value in given.items()}
 
 
+def by_name(given: Any, role: str, example: str) -> dict[str, Any]:
+    """A mapping from symbols, by their names. Raises EomcError."""
+    return {name_of(one): value for one, value in mapping(given, role, example).items()}
+
+
+def name_of(one: Any) -> str:
+    """What a symbol, or a function of time, is called."""
+    return str(one.func.__name__ if isinstance(one, AppliedUndef) else one)
+
+
+def or_none(given: Any) -> Any:
+    """What was given, nothing where it was None."""
+    return {} if given is None else given
+
+
 def symbols(given: Any, role: str, default: Any) -> dict[Any, Any]:
     """Symbols to what belongs to them; a list of symbols alone gives each the default."""
     if isinstance(given, Mapping):
         return dict(mapping(given, role, ""))
-    if isinstance(given, (str, sympy.Basic)) or not isinstance(given, Iterable):
+    if not isinstance(given, (list, tuple, set, frozenset)):
         raise fault(role, f"give a list or dict of symbols, here {given!r}")
     return {symbol_of(one, role): default for one in given}
 
 
 def symbol_of(given: Any, role: str) -> Any:
-    """A symbol or a function of time, as dynamicsymbols makes them."""
-    if isinstance(given, str):
-        raise fault(role, f"give a symbol, sympy.Symbol({given!r}), not the text {given!r}")
-    return given
+    """A symbol, a function of time as dynamicsymbols makes them, or a name as a symbol."""
+    if not isinstance(given, (str, Symbol, AppliedUndef)):
+        raise fault(role, f"{given!r} is not a symbol")
+    return symbol(given) if isinstance(given, str) else given
 
 
 def run(h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any) -> Run:
@@ -140,8 +183,9 @@ def run(h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: A
     for name, value in (("h", h), ("duration", duration)):
         if number(value, name) <= 0:
             raise fault(name, f"must be greater than zero, here {value!r}")
-    methods = (methods,) if isinstance(methods, str) else tuple(methods)
-    if not methods or not all(method in METHODS for method in methods):
+    methods = (methods,) if isinstance(methods, str) else methods
+    methods = tuple(methods) if isinstance(methods, (tuple, list)) else (methods,)
+    if not methods or not all(isinstance(m, str) and m in METHODS for m in methods):
         raise fault("methods", f"known are {', '.join(METHODS)}, here {methods!r}")
     if real not in REALS:
         raise fault("real", f"known are {', '.join(REALS)}, here {real!r}")

@@ -121,8 +121,9 @@ class System:
     ) -> System:
         r"""A system from SymPy expressions.
 
-        coordinates: symbols or dynamicsymbols, or a mapping to their start (or (start, rate)).
-        With plain symbols the velocity of `theta` is the symbol `theta_dot`; with dynamicsymbols
+        coordinates: symbols, names or dynamicsymbols, or a mapping to their start (or (start,
+        rate)). Names stand for symbols, and formulas as scenes have them for expressions. With
+        plain symbols the velocity of `theta` is the symbol `theta_dot`; with dynamicsymbols
         it is `theta.diff()`. parameters, inputs (to their default signal) and definitions are
         mappings from symbols, outputs from names; `theta_ddot`, or the second derivative of a
         dynamicsymbol, is an acceleration there. Names that C can't bear (`\theta`, `lambda`) are
@@ -136,8 +137,9 @@ class System:
         """
         run = given.run(h, duration, methods, real, batch, linearize)
         system = from_sympy.Maker(name).make(
-            cls, coordinates, kinetic, potential, parameters or {}, dissipation, forces or {},
-            inputs, definitions or {}, outputs or {}, units or {}, title, run,
+            cls, coordinates, kinetic, potential, given.or_none(parameters), dissipation,
+            given.or_none(forces), inputs, given.or_none(definitions), given.or_none(outputs),
+            given.or_none(units), title, run,
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)

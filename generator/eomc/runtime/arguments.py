@@ -16,7 +16,7 @@ import numpy as np
 from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
-from .package import Defaults, reduced
+from .package import Defaults, meant, reduced
 
 Array = NDArray[Any]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -70,8 +70,8 @@ class Params:
         return values
 
     def __repr__(self) -> str:
-        inside = ", ".join(f"{n}={v:g}" for n, v in zip(self._names, self._array, strict=True))
-        return f"Params({inside})"
+        both = zip(self._names, self._array, strict=True)
+        return in_a_line("Params(", [f"{n}={v:g}" for n, v in both], ")")
 
 
 class Arguments:
@@ -104,6 +104,7 @@ class Arguments:
             "_names": self.parameters,
             "_defaults": tuple(parameters.values()),
             "_dtype": dtype,
+            "__module__": __package__,  # where pickle finds the class
         }
         self.Params: Any = type("Params", (Params,), {**names, "__slots__": ()})
 
@@ -226,10 +227,40 @@ class Arguments:
             return None
         if not self.nu:
             raise ValueError("u: this scene has no inputs")
+        if type(u) is not ndarray and isinstance(u, Mapping):
+            u = self._by_name(u)
         array = self._array(u.reshape(1) if type(u) is ndarray and not u.ndim else u, "u", self.nu)
         if array.ndim != 1:
             raise ValueError(f"u: shape {array.shape}, expected ({self.nu},): one value an input")
         return array
+
+    def _by_name(self, u: Mapping[str, Any]) -> Array:
+        """Inputs by name as arrays have them, (..., nu).
+
+        All are to be given: held inputs and signals, which go on through a step, can't be mixed.
+        """
+        for name in u:
+            if name not in self.inputs:
+                raise ValueError(not_one_of("u", name, self.inputs))
+        if missing := [name for name in self.inputs if name not in u]:
+            raise ValueError(
+                f"u: no value for {', '.join(missing)}: give all inputs, or None for the signals "
+                "of the scene"
+            )
+        columns = [self._numbers(u[name], f"u: {name}") for name in self.inputs]
+        shapes = [np.shape(u[name]) for name in self.inputs]
+        most = max(map(len, shapes))
+        lined = [  # (batch,) beside (batch, steps) is one number a row
+            c.reshape(shape + (1,) * (most - len(shape) if shape else 0))
+            for c, shape in zip(columns, shapes, strict=True)
+        ]
+        try:
+            return np.stack(np.broadcast_arrays(*lined), axis=-1)
+        except ValueError:
+            raise ValueError(
+                "u: "
+                + ", ".join(f"{n} has shape {s}" for n, s in zip(self.inputs, shapes, strict=True))
+            ) from None
 
     def _out(self, out: Any, shape: tuple[int, ...], name: str = "out") -> Array:
         if out is None:
@@ -317,5 +348,16 @@ def machine_memory() -> float:
 
 
 def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
-    """What is wrong with a name, and what there is."""
-    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}"
+    """What is wrong with a name, what there is, and what may be meant."""
+    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}{meant(name, known)}"
+
+
+def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:
+    """start, the parts and end; as many of the parts as a line has room for."""
+    whole = start + ", ".join(parts) + end
+    if len(whole) <= width:
+        return whole
+    used, room = 0, width - len(f"{start}..., {len(parts)} more{end}")
+    while used < len(parts) and (room := room - len(parts[used]) - 2) >= 0:
+        used += 1
+    return f"{start}{', '.join([*parts[:used], f'... {len(parts) - used} more'])}{end}"

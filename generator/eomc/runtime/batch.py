@@ -14,24 +14,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from . import saved
 from .arguments import Array, Params, as_count, as_number, as_step_size, machine_memory, unmasked
 from .batch_work import WORTH, Work
-from .model import LARGE, RARELY, Model
+from .columns import Columns, File
+from .model import LARGE, RARELY, SOME, Model
 from .package import reduced
-from .trajectory import STATUS, Interrupted
+from .trajectory import STATUS, Interrupted, Run
 
 _NAMES = np.array([*STATUS, "interrupted"])
+_KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as the fields go
 
 
 @dataclass(eq=False, repr=False)
-class BatchRun:
-    """Trajectories: t (n,), q and qd (batch, n, nq), status and steps (batch,).
+class BatchRun(Columns):
+    """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
 
     status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the
     rows behind the last good one of an instance that could not go on are nan. steps: how many each
-    has made. Equal where all of these are, bit by bit; a pickled one keeps all of them.
+    has made. By name, run["theta_dot"], (batch, n). Equal where scene, settings and rows are, bit
+    by bit; a pickled one keeps all of them.
     """
 
+    _axes = ("instance", "t")
+    _model: Model
     t0: float
     q: Array
     qd: Array
@@ -40,6 +46,9 @@ class BatchRun:
     _codes: Array
     every: int
     _wanted: int
+    _params: Array  # (batch or 1, np)
+    _held: Array | None  # at the rows, (batch or 1, n or 1, nu)
+    method: str
 
     @cached_property
     def t(self) -> Array:
@@ -51,6 +60,74 @@ class BatchRun:
     def status(self) -> Array:
         """How each ended; made when it is asked for, since so many words take time."""
         return np.asarray(_NAMES[self._codes])
+
+    @property
+    def energy(self) -> Array:
+        """K + P, (batch, n), J. What is conserved may be `jacobi` instead."""
+        return self._values("energy", ())
+
+    @property
+    def jacobi(self) -> Array:
+        """qd.dK/dqd - K + P, (batch, n), J: the energy, where K is purely quadratic."""
+        return self._values("jacobi", ())
+
+    @property
+    def u(self) -> Array:
+        """The inputs at each row, (batch, n, nu): the signals there, or what was held from there.
+
+        The last row has what was held over the last step.
+        """
+        if self._held is None:
+            return self._values("signal", (self._model.nu,))
+        found = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
+        found[np.isnan(self.q[..., 0])] = np.nan
+        return found
+
+    @cached_property
+    def outputs(self) -> dict[str, Array]:
+        """The scene's outputs by their names, (batch, n) each, nan where rows are.
+
+        nan also where one needs accelerations and D is singular.
+        """
+        names = self._model.outputs
+        if not names:
+            return {}
+        if self._held is None:
+            found = self._values("outputs", (len(names),))
+        else:  # one state at a time, as each has its own inputs
+            found = np.full((*self.q.shape[:2], len(names)), np.nan, self._model.dtype)
+            u, alike = self.u, len(self._params) == 1
+            for k, j in np.argwhere(np.isfinite(self.q).all(axis=-1)).tolist():
+                params = self._params[0 if alike else k]
+                row = self.q[k, j], self.qd[k, j], float(self.t[j]), u[k, j], params
+                found[k, j] = self._model.output(*row)
+        return dict(zip(names, np.ascontiguousarray(np.moveaxis(found, 2, 0)), strict=True))
+
+    def _values(self, name: str, shape: tuple[int, ...]) -> Array:
+        """A function at all rows, (batch, n, ...), nan where these are."""
+        model = self._model
+        function = model.output if name == "outputs" else getattr(model, name)
+        found = np.full((*self.q.shape[:2], *shape), np.nan, model.dtype)
+        good: Any = np.isfinite(self.q).all(axis=-1) & np.isfinite(self.qd).all(axis=-1)
+        one_time = name != "signal" and name not in model._timed
+        times = [slice(None)] if one_time else [slice(j, j + 1) for j in range(len(self.t))]
+        alike = len(self._params) == 1
+        for k in [slice(None)] if alike else [slice(k, k + 1) for k in range(len(self))]:
+            params = self._params[0 if alike else k.start]
+            for j in times:
+                here = good[k, j]
+                q, qd, t = self.q[k, j][here], self.qd[k, j][here], float(self.t[j][0])
+                found[k, j][here] = function(q, qd, t=t, params=params)
+        return found
+
+    def _kept(self) -> dict[str, Any]:
+        """What a saved run keeps of it besides its columns; None: nothing."""
+        return dict(zip(_KEPT, self._all()[1:], strict=True))
+
+    @classmethod
+    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> BatchRun:
+        values: Any = map(kept.get, _KEPT)
+        return cls(model, *values)
 
     @property
     def message(self) -> str:
@@ -70,16 +147,25 @@ class BatchRun:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, BatchRun):
             return NotImplemented
-        both = zip(self._all(), other._all(), strict=True)
-        return all(np.array_equal(a, b, equal_nan=True) for a, b in both)
+        alike = self._settings() == other._settings()
+        both = zip(self._arrays(), other._arrays(), strict=True)
+        return alike and all(np.array_equal(a, b, equal_nan=True) for a, b in both)
 
     __hash__ = None  # type: ignore[assignment]  # rows may be changed
+
+    def _settings(self) -> tuple[Any, ...]:
+        model = self._model
+        return (model.name, model.digest, self.t0, self.h, self.every, self._wanted, self.method)
+
+    def _arrays(self) -> tuple[Array, ...]:
+        held = np.empty(0) if self._held is None else self._held
+        return self.q, self.qd, self.steps, self._codes, self._params, held
 
     def __len__(self) -> int:
         return len(self._codes)
 
     def __repr__(self) -> str:
-        return f"<BatchRun: {self.message}>"
+        return f"<BatchRun of {self._model.name}: {self.message}>"
 
 
 class BatchModel(Model):
@@ -94,6 +180,11 @@ class BatchModel(Model):
         # power of two (few fill no register); they only cut work up
         self._paces: dict[Any, float] = {}
 
+    def load_run(self, file: File) -> Any:
+        """A run or batch that `save` has written to an .npz file; see `Model.load_run`."""
+        kind, kept = saved.read(self, file)
+        return (Run if kind == "Run" else BatchRun)._of_kept(self, kept)
+
     def simulate_batch(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
@@ -105,7 +196,8 @@ class BatchModel(Model):
 
         q0, qd0: (batch, nq), or (nq,) for all alike. params: a dict of numbers or (batch,)
         arrays, Params, or an array (batch, np). u: None, the scene's signals; (nu,) or
-        (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step.
+        (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step; a
+        dict of all inputs by name, numbers, (batch,), (batch, steps) or (1, steps).
         threads: as many as there are processors where None. An instance that can't go on has its
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
         """
@@ -140,7 +232,17 @@ class BatchModel(Model):
                 q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
             if not whole:
                 work.status[(work.status == 0) & short] = len(_NAMES) - 1
-        run = BatchRun(t0, q_rows, qd_rows, h, work.done, work.status, every, steps)
+        if held is not None and held.shape[1] > 1:  # a copy, as the caller's table may change
+            held = held[:, np.minimum(np.arange(rows) * every, steps - 1)]
+        method = self._method(method)
+        if steps >= SOME and (method, h) not in self._warned:
+            first = q_rows[0, 0], qd_rows[0, 0]
+            u0 = None if held is None else held[0, 0]
+            self._look(*first, h, t0, u0, table[0], method, "the first instance: ")
+        run = BatchRun(
+            self, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
+            held, method,
+        )  # fmt: skip
         if not whole:
             raise Interrupted(run)
         return run
@@ -283,6 +385,8 @@ class BatchModel(Model):
             raise ValueError("u: this scene has no inputs")
         if callable(u):
             raise ValueError("u: a Python function can't be called for many at once: give a table")
+        if type(u) is not np.ndarray and isinstance(u, Mapping):
+            u = self._by_name(u)
         if type(u) is np.ndarray and u.dtype is self.dtype and u.flags.carray:
             array = u
         else:

@@ -54,6 +54,11 @@ class Estimate:
         """Whether nothing speaks against the figures."""
         return not self.verdict
 
+    @property
+    def warning(self) -> str:
+        """What is to be said of a run that is not resolved, or ""."""
+        return f"this motion is not resolved: {self.verdict}" if self.verdict else ""
+
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("estimate.Estimate", *self.__dict__.values())
 
@@ -273,6 +278,15 @@ def _verdict(
             f"2^{order}: h is too long yet, forces jump, or rounding decides"
         )
     return words
+
+
+def beyond_end(h: float, duration: float) -> str | None:
+    """A sentence where one step is longer than the whole run is to be."""
+    if not 0 < duration < h * (1 - 1e-12):
+        return None
+    return (
+        f"h = {h:g} s is longer than the duration, {duration:g} s: the run is one step of {h:g} s"
+    )
 
 
 # --- stability ------------------------------------------------------------------------------------

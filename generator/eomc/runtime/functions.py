@@ -127,8 +127,13 @@ class Functions(Arguments):
         out: Any = None,
     ) -> Any:  # fmt: skip
         """qd.dK/dqd - K + P, J: K + P where K is quadratic in qd, else what takes its place."""
-        name = "jacobi" if hasattr(self._lib, "jacobi") else "energy"
+        name = "jacobi" if self.has_jacobi else "energy"
         return self._evaluate(name, (), q, qd, t, None, params, out)
+
+    @property
+    def has_jacobi(self) -> bool:
+        """Whether Jacobi's integral is another than the energy: K is not purely quadratic in qd."""
+        return hasattr(self._lib, "jacobi")
 
     def power(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,

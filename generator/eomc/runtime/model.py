@@ -7,28 +7,57 @@ NumPy and cffi only. Angles in rad, everything in SI units.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from math import ceil, isfinite
 from time import perf_counter
 from typing import Any
 
-from numpy import array, empty
+import numpy as np
+from numpy import empty
 from numpy.typing import ArrayLike
 
+from . import saved
 from .arguments import Array, Parameters, as_count, as_number, as_step_size, machine_memory
-from .estimate import advice
+from .columns import File
+from .equilibrium import equilibrium
+from .estimate import advice, beyond_end
 from .functions import Functions
 from .package import reduced
 from .slices import longer
 from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
 
-Inputs = ArrayLike | Callable[[float, Array, Array], ArrayLike] | None
+Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
-_MANY = 1000  # steps from which a look at the stability limit is worth its time
+_MANY = 1000  # steps from which a run is not taken in one call
+SOME = 20  # steps from which a look at the stability limit is worth its time, once a method and h
 LARGE = 2**24  # positions from which a look at the memory is worth its time
 _CHUNK = 16_384  # steps times coordinates before the first look, some ms
 RARELY = 2**48  # steps from row to row, more than any run makes
 _MOST = 2**60  # steps, so that C can return four times as many
+
+
+class Law:
+    """A function u(t, q, qd) that a run calls before each step; keeps what it gave at the rows."""
+
+    def __init__(self, law: Callable[..., Any], inputs: Callable[[Any], Any], every: int) -> None:
+        self.law, self.inputs, self.every = law, inputs, every
+        self.calls, self.kept = 0, list[Array]()
+        self.last: Any = None
+
+    def __call__(self, t: float, q: Array, qd: Array) -> Array:
+        """What the function gives at a step's start."""
+        self.last = self.inputs(self.law(t, q.copy(), qd.copy()))
+        if self.last is None:
+            raise ValueError("u: the function returned None, not the inputs")
+        if self.calls % self.every == 0:
+            self.kept.append(self.last.copy())
+        self.calls += 1
+        return self.last  # type: ignore[no-any-return]
+
+    def rows(self, count: int, width: int) -> Array:
+        """What was applied from each row of the run on, (count, width)."""
+        last = np.full(width, np.nan) if self.last is None else self.last
+        return np.array([*self.kept, last][:count], last.dtype)
 
 
 class Model(Functions):
@@ -59,16 +88,29 @@ class Model(Functions):
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("_model._again", self.digest)
 
-    def _again(self, digest: str) -> Model:
-        """Itself, found by a value that was pickled; a warning where the scene was another then."""
+    def _again(self, digest: str, what: str = "this was pickled") -> Model:
+        """Itself, found by a value that was kept; a warning where the scene was another then."""
         if digest != self.digest:
             warnings.warn(
-                f"{self.name}: this was pickled from another version of the scene; what is "
+                f"{self.name}: {what} from another version of the scene; what is "
                 "computed from it now is of the present version",
                 RuntimeWarning,
                 stacklevel=2,
             )
         return self
+
+    def load_run(self, file: File) -> Run:
+        """A run, or a batch, that `save` has written to an .npz file; its columns are the same.
+
+        Raises ValueError where the file is none of this scene's, OSError where it can't be read;
+        warns where it is of another version of the scene.
+        """
+        kind, kept = saved.read(self, file)
+        if kind != "Run":
+            raise ValueError(
+                f"{file}: is a run of many at once, which a scene has by [run] batch = true"
+            )
+        return Run._of_kept(self, kept)
 
     def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
         """A method's step and loop in C, steps at once, stages; what is kept and counted."""
@@ -83,7 +125,7 @@ class Model(Functions):
         params: Parameters = None, method: str | None = None,
         out: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """(q, qd) one step of size h later; u is held over the step.
+        """(q, qd) one step of size h later; u, (nu,) or a dict, is held over the step.
 
         u None: the scene's signals, followed through the step. Raises MotionError where the step
         can't be made; `out` is untouched then.
@@ -133,6 +175,8 @@ class Model(Functions):
                 raise ValueError(f"steps: {count:.3g} are more than a run can count, {_MOST:.3g}")
             return count
         time = self.duration if duration is None else as_number(duration, "duration")
+        if words := beyond_end(h, time):
+            warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=3)
         if time < 0:
             raise ValueError(f"duration: {duration} is not a time in s")
         if time / h > _MOST:
@@ -155,8 +199,9 @@ class Model(Functions):
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration.
         every: a row is kept of every so many steps, and the first and last state always.
         method: one of `methods`, the first of them where None.
-        u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; or
-        a function u(t, q, qd) called before each step, which is some hundred times slower.
+        u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; a
+        dict of all inputs by name, numbers or (steps,); or a function u(t, q, qd) called before
+        each step, which is some hundred times slower.
         out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
         estimate: whether to find the run's own error, `run.error`, by doing it again in shorter
         steps, which takes some nine times as long.
@@ -182,7 +227,7 @@ class Model(Functions):
         ):  # fmt: skip
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
-            if 0 <= steps <= short:
+            if 0 <= steps <= short and (steps < SOME or (method, h) in self._warned):
                 address, real, null = self._c
                 rows = empty((2, 1 - -steps // every, self.nq), self.dtype)
                 if run(
@@ -195,13 +240,11 @@ class Model(Functions):
         t0 = as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
-        if steps >= _MANY and (method, h) not in self._warned:
-            self._warned.add((method, h))
-            first = self._table(u, steps)[1]
+        if steps >= SOME and (method, h) not in self._warned:
+            first = self._table(u, steps, every)[1]
             if first is not None and first.ndim == 2:
                 first = first[0]
-            if words := advice(self, q, qd, h, t0, first, p, method):
-                warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=2)
+            self._look(q, qd, h, t0, first, p, method)
         result = self._trajectory(
             q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress
         )
@@ -210,8 +253,17 @@ class Model(Functions):
                 raise Interrupted(result)
             warnings.warn(f"{self.name}: {result.message}", RuntimeWarning, stacklevel=2)
         if estimate:
-            result.estimate()
+            result._judged(None, 3)
         return result
+
+    def _look(
+        self, q: Array, qd: Array, h: float, t: float, u: Array | None, p: Array, method: str,
+        whose: str = "",
+    ) -> None:  # fmt: skip
+        """Warn, once a method and step size, where h is beyond the stability limit at a state."""
+        self._warned.add((method, h))
+        if words := advice(self, q, qd, h, t, u, p, method):
+            warnings.warn(f"{self.name}: {whose}{words}", RuntimeWarning, stacklevel=3)
 
     def advice(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
@@ -225,6 +277,25 @@ class Model(Functions):
         given, method = self._parameters(params), self._method(method)
         h = self.h if h is None else as_step_size(h, self.dtype)
         return advice(self, q, qd, h, as_number(t0, "t0"), u, given, method)
+
+    def equilibrium(
+        self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, u: Any = None,
+        free: Collection[str] | None = None, *, t: float = 0.0, params: Parameters = None,
+    ) -> tuple[Array, Array | None]:  # fmt: skip
+        """(q, u) where no force is left, so that q̈ = 0: by Newton's method from the guess q, u.
+
+        q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates and
+        inputs that are found, all coordinates where None; the others stay. u None: the scene's
+        signals. u comes back as (nu,), None where the scene has no inputs.
+        Raises MotionError, status "no convergence", where none is found.
+        """
+        if isinstance(free, str):
+            free = (free,)
+        moving = qd if np.ndim(qd) else np.full(self.nq, as_number(qd, "qd"))
+        at, moving = self._one(self._start[0] if q is None else q, moving)
+        found = self.coordinates if free is None else tuple(free)
+        held = self._inputs(u)
+        return equilibrium(self, at, moving, held, found, as_number(t, "t"), params)
 
     def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
         """A start, (nq,), and what C reads it from."""
@@ -243,7 +314,7 @@ class Model(Functions):
         """A run from checked arguments, whatever its status; C reads from_q, from_qd and at_p."""
         _, run, _, stages, work_type, counted = self._loops[method]
         nq, (address, real, null) = self.nq, self._c
-        law, held, stride = (None, None, 0) if u is None else self._table(u, steps)
+        law, held, stride = (None, None, 0) if u is None else self._table(u, steps, every)
         rows = 1 - -steps // every
         both: Any = out
         try:
@@ -264,7 +335,6 @@ class Model(Functions):
         done, chunk = 0, 1 if law else _CHUNK // (nq**3 if counted else nq) or 1
         # what goes from one call to the next, and what is counted; a single call may do without
         single = steps <= chunk and counted is None
-        applied: list[Array] = []  # by a law, at the rows
         work = null if single else self._ffi.new(work_type)
         try:
             while True:
@@ -272,12 +342,8 @@ class Model(Functions):
                     if done:  # else the start is not among the rows yet
                         row = -(-done // every)
                         q, qd = q_rows[row], qd_rows[row]
-                    held = self._inputs(law(t0 + done * h, q.copy(), qd.copy()))
-                    if held is None:
-                        raise ValueError("u: the function returned None, not the inputs")
+                    held = law(t0 + done * h, q, qd)
                     at_u = address(real, held)
-                    if done % every == 0:
-                        applied.append(held)
                 count = steps - done
                 if count > chunk:
                     count, begun = chunk, perf_counter()
@@ -301,15 +367,16 @@ class Model(Functions):
             kept = 1 - -done // every
             both = q_rows[:kept], qd_rows[:kept]
         evaluations = counted(work) if counted else stages * done
-        return Run(
-            self, t0, both, h, done, said, p, every, u if law else held, method,
-            evaluations, array(applied) if law else None,
-        )  # fmt: skip
+        given = law.law if law else None if held is None else held.copy()
+        made = Run(self, t0, both, h, done, said, p, every, given, method, evaluations)
+        if law:
+            made._applied = law.rows(len(made), self.nu)
+        return made
 
     def _bytes(self, rows: int) -> int:
         return rows * 2 * self.nq * self.dtype.itemsize
 
-    def _table(self, u: Any, steps: int) -> tuple[Callable[..., Any] | None, Array | None, int]:
+    def _table(self, u: Any, steps: int, every: int) -> tuple[Law | None, Array | None, int]:
         """(function, held values, values from one step to the next)."""
         if u is None:
             return None, None, 0
@@ -324,7 +391,9 @@ class Model(Functions):
                     RuntimeWarning,
                     stacklevel=4,
                 )
-            return u, None, 0
+            return Law(u, self._inputs, every), None, 0
+        if isinstance(u, Mapping):
+            u = self._by_name(u)
         array = self._numbers(u, "u")
         if self.nu == 1 and array.ndim < 2 and array.size:
             array = array.reshape((-1, 1) if array.size > 1 else 1)

@@ -1,13 +1,14 @@
 """A built package as a value: it can be pickled with all it makes, and refuses assignments.
 
 Functions are called with parameters; a
-parameter that is assigned to the module would change nothing there, or replace a function.
+parameter that is assigned to the module would change nothing there, or replace a function. Whoever
+means to, as a test may, writes to its dictionary: `vars(module)["simulate"] = ...`.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from types import ModuleType
 from typing import Any, NoReturn
@@ -31,6 +32,16 @@ def made(path: str, arguments: tuple[Any, ...]) -> Any:
     return functools.reduce(getattr, path.split("."), package)(*arguments)
 
 
+def meant(name: str, known: Iterable[str]) -> str:
+    """`"; did you mean 'm_c'?"` where a known name is close, else the empty string."""
+    import difflib  # of use here alone
+
+    known = [*known]
+    near = [k for k in known if k.lower() == str(name).lower()]
+    near = near or difflib.get_close_matches(str(name), known, n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
 class Package(ModuleType):
     """The class of a built package."""
 
@@ -51,10 +62,24 @@ class Package(ModuleType):
         if name in ("h", "duration"):
             return f"is given to a call, {call}({name}={value!r}), or eomc run --{name} {value!r}"
         if name in model.inputs:
-            return f"an input is given to a call: {call}(u=...)"
-        if name in model.coordinates or name == "start":
+            return f'an input is given to a call: {call}(u={{"{name}": {value!r}}})'
+        rates = [f"{c}_dot" for c in model.coordinates]
+        if name in (*model.coordinates, *rates, "start"):
             return f"a start is given to a call: {call}(q0=..., qd0=...), or eomc run --start"
-        return "belongs to the module and stays as it is" if name in self.__all__ else ""
+        if name in self.__all__:
+            return "belongs to the module and stays as it is"
+        near = meant(name, (*model.parameters, *model.inputs, *model.coordinates, *rates))
+        if not near or isinstance(value, ModuleType):  # one of its own files, imported
+            return ""
+        return f"is no name of the scene{near}; values are given to a call: {call}(params={{...}})"
+
+    def __repr__(self) -> str:
+        model = self.__dict__.get("_model")
+        if model is None:  # not imported yet
+            return super().__repr__()
+        counts = {"coordinate": model.nq, "input": model.nu, "parameter": len(model.parameters)}
+        said = ", ".join(f"{n} {what}{'s' * (n != 1)}" for what, n in counts.items())
+        return f"<compiled scene {model.name}: {said}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("_self")

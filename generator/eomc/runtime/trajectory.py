@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .arguments import Array
+from .columns import Columns
 from .estimate import Estimate, estimate
 from .package import reduced
 
@@ -25,7 +27,7 @@ SAID = {
     "no convergence": "the iteration for the step does not converge: take a smaller h",
     "interrupted": "interrupted",
 }
-_LEFT_OUT = "u was a function, which a pickled run doesn't keep: simulate again"
+_LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
 
 
 class MotionError(ArithmeticError):
@@ -68,8 +70,8 @@ class _Half:
 
 
 @dataclass(eq=False, repr=False)
-class Run:
-    """A trajectory: t (n,), q (n, nq), qd (n, nq), status.
+class Run(Columns):
+    """A trajectory: t (n,), q (n, nq), qd (n, nq), u (n, nu), status; by name run["theta_dot"].
 
     status: "ok", "singular", "not finite", "no convergence" or "interrupted"; a run that is not ok
     ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
@@ -92,9 +94,9 @@ class Run:
     _u: Any
     method: str
     evaluations: int
-    _applied: Array | None = None  # inputs at the rows, where a function gave them
     error: Estimate | None = field(default=None, init=False)
     _energy: Array | None = field(default=None, init=False)
+    _applied: Array | None = field(default=None, init=False)  # where u is a function
 
     q, qd = _Half(0), _Half(1)
 
@@ -104,33 +106,38 @@ class Run:
         return self.t0 + self.h * np.minimum(self.every * np.arange(len(self.q)), self.steps)
 
     @property
+    def u(self) -> Array:
+        """The inputs at each row, (n, nu): the signals there, or what was held from there on.
+
+        The last row has what was held over the last step.
+        """
+        if self._applied is not None:
+            return self._applied
+        shape = (len(self), self._model.nu)
+        if self._u is None:
+            signal: Any = self._model.signal
+            return np.asarray(signal(self.q, self.qd, self.t, self._params))
+        if self._u.ndim == 1:
+            return np.broadcast_to(self._u, shape).copy()
+        if not len(self._u):  # no step, and so nothing held
+            return np.full(shape, np.nan, self._u.dtype)
+        rows: Array = self._u[np.minimum(np.arange(len(self)) * self.every, self.steps - 1)]
+        return rows
+
+    @property
     def energy(self) -> Array:
-        """K + P along the run, (n,), J."""
+        """K + P along the run, (n,), J. What is conserved may be `jacobi` instead."""
         if self._energy is None:
             self._energy = self._values("energy")
         return self._energy
 
     @property
     def jacobi(self) -> Array:
-        """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic."""
-        return self._values("jacobi")
+        """qd.dK/dqd - K + P along the run, (n,), J: the energy, where K is purely quadratic.
 
-    @property
-    def u(self) -> Array:
-        """The inputs at the rows, (n, nu): of the step that begins there, at the end the last ones.
-
-        The scene's signals are followed within steps; this is what they are at the rows.
+        Else, as in a frame that is turned, this is what is conserved where there is no power.
         """
-        model, n = self._model, len(self.q)
-        given = self._u if self._applied is None else self._applied
-        if given is None:
-            each = zip(self.q, self.qd, self.t.tolist(), strict=True)
-            rows = [model.signal(q, qd, t, self._params) for q, qd, t in each if model.nu]
-            return np.reshape(rows, (n, model.nu)).astype(model.dtype)
-        if given.ndim == 1:
-            return np.tile(given, (n, 1))
-        step = 1 if given is self._applied else self.every
-        return given[np.minimum(step * np.arange(n), max(0, len(given) - 1))]
+        return self._values("jacobi")
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
@@ -160,14 +167,21 @@ class Run:
         """The run's own error, by doing it again in shorter steps; kept in `error`.
 
         Where u is a function, it is called again, as often as in the run for each finer one.
-        Raises ValueError where the run was pickled and lost that function.
+        Warns where the motion is not resolved. Raises ValueError where the run was pickled and lost
+        that function.
         """
+        return self._judged(progress, 3)
+
+    def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
+        """`estimate`, its warning given to whoever called so many levels above."""
         if isinstance(self._u, str):
             raise ValueError(f"estimate: {self._u}")
         try:
             self.error = estimate(self, progress)
         except KeyboardInterrupt:
             raise Interrupted(self) from None
+        if words := self.error.warning:
+            warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
         return self.error
 
     def _again(
@@ -189,6 +203,26 @@ class Run:
             self._params, model._pointer(self._params), self.method, float(self.t[0]), None,
             progress,
         )  # fmt: skip
+
+    def _kept(self) -> dict[str, Any]:
+        """What a saved run keeps of it besides its columns; None: nothing."""
+        held = None if callable(self._u) or isinstance(self._u, str) else self._u
+        return {
+            "q": self.q, "qd": self.qd, "t0": self.t0, "h": self.h, "steps": self.steps,
+            "status": self.status, "params": self._params, "every": self.every, "held": held,
+            "method": self.method, "evaluations": self.evaluations, "applied": self._applied,
+        }  # fmt: skip
+
+    @classmethod
+    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> Run:
+        applied = kept.get("applied")
+        u = kept.get("held") if applied is None else _LEFT_OUT
+        run = cls(
+            model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
+            kept["params"], kept["every"], u, kept["method"], kept["evaluations"],
+        )  # fmt: skip
+        run._applied = applied
+        return run
 
     def _state(self) -> dict[str, Any]:
         """All but what is made when it is asked for."""
@@ -247,7 +281,8 @@ class Run:
         return len(self.q)
 
     def __repr__(self) -> str:
-        return f"<Run of {self._model.name}: {self.message}>"
+        how = "" if self.status == "ok" else f"{self.status} after "
+        return f"<Run of {self._model.name}: {how}{self.steps} steps of {self.h:g} s>"
 
 
 def held_law(law: Callable[..., Any], parts: int) -> Callable[..., Any]:

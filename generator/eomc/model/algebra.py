@@ -1,0 +1,44 @@
+"""The algebra in which formula text becomes a SymPy expression."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy
+from sympy import Expr
+
+from eomc.model.symbols import dot
+from eomc.scene import formulas
+from eomc.scene.formulas import Formula, FormulaError
+
+
+def _number(text: str) -> Expr:
+    whole = text[:2].lower() in ("0x", "0o", "0b")
+    return sympy.Integer(int(text, 0)) if whole else sympy.Rational(text)
+
+
+ALGEBRA: Mapping[str, Any] = {
+    "number": _number,
+    "pi": sympy.pi,
+    **{name: getattr(sympy, name) for name in (*formulas.ELEMENTARY, "sign")},
+    "abs": sympy.Abs,
+    "heaviside": lambda x: sympy.Heaviside(x),
+    "min": sympy.Min,
+    "max": sympy.Max,
+    "dot": dot,
+}
+UNDEFINED = (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo)
+
+
+def expression(formula: Formula, known: Mapping[str, Expr]) -> Expr:
+    """The formula's expression. Raises FormulaError where that is no real, finite one."""
+    try:
+        found = sympy.sympify(formulas.evaluate(formula, ALGEBRA, known.__getitem__))
+    except (ArithmeticError, ValueError, TypeError) as fault:
+        raise FormulaError(str(fault)) from None
+    if found.has(*UNDEFINED):
+        raise FormulaError("divides by zero")
+    if found.has(sympy.I):
+        raise FormulaError("has no real value")
+    return found

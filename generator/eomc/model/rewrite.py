@@ -1,0 +1,73 @@
+"""SymPy functions that the formula language has not, in those that it has, where that is exact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import sympy
+from sympy import Expr, Symbol
+from sympy.core.relational import GreaterThan, LessThan, StrictGreaterThan, StrictLessThan
+
+_AS: Mapping[Any, Callable[[Expr], Expr]] = {
+    sympy.UnevaluatedExpr: lambda x: x,
+    sympy.sec: lambda x: 1 / sympy.cos(x),
+    sympy.csc: lambda x: 1 / sympy.sin(x),
+    sympy.cot: lambda x: sympy.cos(x) / sympy.sin(x),
+    sympy.sech: lambda x: 1 / sympy.cosh(x),
+    sympy.csch: lambda x: 1 / sympy.sinh(x),
+    sympy.coth: lambda x: 1 / sympy.tanh(x),
+    sympy.asec: lambda x: sympy.acos(1 / x),
+    sympy.acsc: lambda x: sympy.asin(1 / x),
+}
+_ORDERS = (GreaterThan, LessThan, StrictGreaterThan, StrictLessThan)
+
+
+class JumpError(ValueError):
+    """A Piecewise whose pieces do not meet, or can't be seen to."""
+
+
+def rewritten(expr: Expr, fixed: Collection[Symbol]) -> Expr:
+    """The same function in the words of the formula language. fixed: symbols that do not vary.
+
+    Raises JumpError.
+    """
+    expr = expr.replace(lambda e: type(e) in _AS, lambda e: _AS[type(e)](*e.args))
+    return expr.replace(
+        lambda e: isinstance(e, sympy.Piecewise), lambda e: _continuous(e, frozenset(fixed))
+    )
+
+
+def _continuous(given: sympy.Piecewise, fixed: frozenset[Symbol]) -> Expr:
+    """A Piecewise whose pieces meet, as a sum of products with Max.
+
+    From the last piece on: where d > 0 a piece takes the place of another, and where their
+    difference is q d, q finite, the sum grows by q Max(d, 0), at d = 0 and beyond.
+    """
+    *pieces, (made, last) = given.args
+    if last != sympy.true:
+        raise JumpError(f"{given} has no last piece: give one for all else, (0, True)")
+    for k in reversed(range(len(pieces))):
+        piece, condition = pieces[k]
+        if not isinstance(condition, _ORDERS):
+            raise JumpError(f"{condition} in a Piecewise can't be used: write x > a or x < a")
+        d = condition.gts - condition.lts
+        other = _there(condition, given.args[k + 1 :])
+        q = sympy.cancel((piece - other) / d) if other is not None else sympy.zoo
+        if q.has(sympy.zoo, sympy.nan) or not sympy.fraction(q)[1].free_symbols <= fixed:
+            raise JumpError(
+                f"{given} jumps where {d} = 0, or can't be seen not to: write Heaviside({d}), "
+                "which is 1/2 there, or Max, Min or a smooth tanh"
+            )
+        made += q * sympy.Max(d, 0)
+    return made
+
+
+def _there(condition: Any, later: Any) -> Expr | None:
+    """Which of the later pieces holds where a condition does; None where that is not clear."""
+    for piece, other in later:
+        if sympy.And(condition, sympy.Not(other)).simplify() == sympy.false:
+            return piece
+        if sympy.And(condition, other).simplify() != sympy.false:
+            return None
+    return None

@@ -1,0 +1,148 @@
+"""What a run holds, by name: as an item, an attribute, a dict, a file, a table of pandas or xarray.
+
+The names are t, the scene's coordinates, their rates (`theta_dot`), its inputs and outputs, energy,
+and jacobi where that is not the energy.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable, Iterable
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from .arguments import Array, not_one_of
+
+if TYPE_CHECKING:
+    from .model import Model
+
+File = str | os.PathLike[str]
+
+
+class Columns:
+    """The columns of a run, (n,), or of a batch, (batch, n); t is (n,) in both."""
+
+    _model: Model
+    outputs: Any  # by name
+    __len__: Callable[[], int]
+    _axes: ClassVar[tuple[str, ...]] = ("t",)
+    __iter__ = None  # `for name in run` would ask for run[0]
+
+    def _columns(self) -> dict[str, Callable[[], Array]]:
+        """What makes each column, by name, in the order of `to_dict`."""
+        found: dict[str, Callable[[], Array]] = {"t": partial(getattr, self, "t"), **self._named()}
+        names = ("energy", "jacobi") if self._model.has_jacobi else ("energy",)
+        for name in names:
+            found.setdefault(name, partial(getattr, self, name))  # a coordinate may be called so
+        return found
+
+    def _named(self) -> dict[str, Callable[[], Array]]:
+        """Those that the scene names: coordinates, rates, inputs, outputs."""
+        model = self._model
+        rates = [f"{name}_dot" for name in model.coordinates]
+        halves = (("q", model.coordinates), ("qd", rates), ("u", model.inputs))
+        found: dict[str, Callable[[], Array]] = {
+            name: partial(self._column, half, k)
+            for half, names in halves
+            for k, name in enumerate(names)
+        }
+        return found | {name: partial(self._output, name) for name in model.outputs}
+
+    def _output(self, name: str) -> Array:
+        values: Array = self.outputs[name]
+        return values
+
+    def _column(self, half: str, k: int) -> Array:
+        column: Array = getattr(self, half)[..., k]
+        return column
+
+    def __getitem__(self, name: str) -> Array:
+        if not isinstance(name, str):
+            raise TypeError(f"run[{name!r}]: give a name, such as run['t']; rows are run.q[k]")
+        columns = self._columns()
+        if name not in columns:
+            raise KeyError(not_one_of("run", name, tuple(columns)))
+        return columns[name]()
+
+    def __getattr__(self, name: str) -> Any:
+        """A column that the scene names and no member hides."""
+        named = {} if name.startswith("_") else self._named()
+        if name not in named:
+            known = tuple(named)
+            raise AttributeError(not_one_of("run", name, known) if known else name)
+        return named[name]()
+
+    def __dir__(self) -> Iterable[str]:
+        return [*super().__dir__(), *self._named()]
+
+    def to_dict(self) -> dict[str, Array]:
+        """All columns by name, in this order; jacobi where it is not the energy."""
+        return {name: column() for name, column in self._columns().items()}
+
+    def save(self, file: File) -> None:
+        """Write the columns to NAME.csv, or all of the run to NAME.npz, which `load_run` reads.
+
+        An .npz keeps arrays only, nothing pickled: numpy.load(file)["q"] reads it without a module.
+        A u that is a function is not kept, but what it gave at the rows is. Raises ValueError for
+        other names, and for the .csv of a batch.
+        """
+        path = Path(file)
+        if path.suffix == ".csv" and self._axes == ("t",):
+            self._to_csv(path)
+        elif path.suffix == ".npz":
+            from .saved import write
+
+            write(self, path)
+        else:
+            names = ".npz or .csv" if self._axes == ("t",) else ".npz"
+            raise ValueError(f"save: {file}: give a name that ends in {names}")
+
+    def _to_csv(self, path: Path) -> None:
+        columns = self.to_dict()
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            for row in zip(*(c.astype(float).tolist() for c in columns.values()), strict=True):
+                writer.writerow(map(repr, row))
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame of the columns over t; of a batch over instance and t."""
+        pandas = _imported("pandas", "to_pandas")
+        columns = self.to_dict()
+        t = columns.pop("t")
+        if self._axes == ("t",):
+            index = pandas.Index(t, name="t")
+        else:
+            index = pandas.MultiIndex.from_product([range(len(self)), t], names=self._axes)
+        return pandas.DataFrame({n: c.ravel() for n, c in columns.items()}, index=index)
+
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset of the columns over t, of a batch over instance and t; with units."""
+        xarray = _imported("xarray", "to_xarray")
+        model, columns = self._model, self.to_dict()
+        units = dict(model.units)
+        units |= {f"{c}_dot": f"{units[c]}/s" for c in model.coordinates if units.get(c)}
+        t = ("t", columns.pop("t"), {"units": "s"})
+        variables = {
+            name: (self._axes, column, {"units": units[name]} if name in units else {})
+            for name, column in columns.items()
+        }
+        attributes = {name: getattr(self, name) for name in ("h", "method")}
+        attributes |= {"scene": model.name, "digest": model.digest}
+        return xarray.Dataset(variables, coords={"t": t}, attrs=attributes)
+
+
+def _imported(package: str, function: str) -> Any:
+    """A package that a module does not need otherwise."""
+    try:
+        return import_module(package)
+    except ModuleNotFoundError as fault:
+        if fault.name != package:
+            raise
+        raise ModuleNotFoundError(
+            f"{function}: {package} is not installed: pip install {package}, or take to_dict()",
+            name=package,
+        ) from None

@@ -1,0 +1,68 @@
+"""Runs as .npz files: arrays only, nothing pickled, and of which scene they are."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .arguments import Array
+
+if TYPE_CHECKING:
+    from .columns import Columns, File
+    from .model import Model
+
+_KIND = "eomc {} 1"  # and the version of what such a file holds
+
+
+def write(run: Columns, path: Path) -> None:
+    """All of a run or batch: its columns q, qd, u, energies and what makes it again."""
+    model = run._model
+    arrays: dict[str, Any] = {
+        "kind": _KIND.format(type(run).__name__), "scene": model.name, "digest": model.digest,
+        "coordinates": model.coordinates, "parameters": model.parameters, "inputs": model.inputs,
+        "t": run["t"], "energy": run.energy, "u": run.u,
+    }  # fmt: skip
+    if model.has_jacobi:
+        arrays["jacobi"] = run.jacobi
+    arrays |= {name: value for name, value in run._kept().items() if value is not None}
+    made: Any = {name: np.asarray(value) for name, value in arrays.items()}
+    with path.open("wb") as file:
+        np.savez(file, **made)
+
+
+def read(model: Model, file: File) -> tuple[str, dict[str, Any]]:
+    """The kind of a saved run, "Run" or "BatchRun", and what it kept.
+
+    Raises ValueError where the file is none, or of another scene; warns where it is of another
+    version of the scene.
+    """
+    found = _arrays(file)
+    kind = next((k for k in ("Run", "BatchRun") if str(found.get("kind")) == _KIND.format(k)), "")
+    if not kind:
+        raise ValueError(f"{file}: was not written by run.save in this version of eomc")
+    if found["scene"] != model.name:
+        raise ValueError(f"{file}: is a run of {found['scene']}, not of {model.name}")
+    for what in ("coordinates", "parameters", "inputs"):
+        saved, own = tuple(found[what].tolist()), getattr(model, what)
+        if saved != own:
+            raise ValueError(
+                f"{file}: is a run of another version of {model.name}, whose {what} were "
+                f"{', '.join(saved) or 'none'}; here they are {', '.join(own) or 'none'}"
+            )
+    if found["q"].dtype != model.dtype:
+        raise ValueError(f"{file}: has numbers of {found['q'].dtype}, {model.name} {model.dtype}")
+    model._again(str(found["digest"]), f"{file}: was saved")
+    return kind, {name: x.item() if x.ndim == 0 else x for name, x in found.items()}
+
+
+def _arrays(file: File) -> dict[str, Array]:
+    """What an .npz file holds; a ValueError where it is none, OSError where it can't be read."""
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error):
+        raise ValueError(f"{file}: is no whole .npz file of a run") from None

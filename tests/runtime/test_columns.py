@@ -1,0 +1,305 @@
+"""What a run holds, by name, in files and as tables of other libraries."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import batches
+import numpy as np
+import pytest
+from conftest import Modules
+from states import QD, Q
+
+
+@pytest.fixture(scope="session")
+def batch() -> ModuleType:
+    """Many cart-poles with an input that depends on the time."""
+    return batches.module("cartpole_driven")
+
+
+def law(t: float, q: Any, qd: Any) -> float:
+    return float(-10 * q[0] - qd[0] + t)
+
+
+INPUTS: dict[str, Any] = {
+    "signals": None,
+    "constant": 0.5,
+    "table": np.sin(np.arange(10.0)),
+    "function": law,
+}
+
+
+@pytest.fixture(params=INPUTS.values(), ids=list(INPUTS))
+def run(request: pytest.FixtureRequest, driven: ModuleType) -> Any:
+    """Ten steps, of which five rows are kept."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driven._model, "_warned", {"u"})  # a function is slow: said elsewhere
+        return driven.simulate(Q, QD, steps=10, every=3, u=request.param, t0=0.5)
+
+
+# --- by name --------------------------------------------------------------------------------------
+
+
+def test_columns_have_the_names_of_the_scene(driven: ModuleType, run: Any) -> None:
+    columns = run.to_dict()
+    assert list(columns) == ["t", "x", "theta", "x_dot", "theta_dot", "force", "energy"]
+    for k, name in enumerate(driven.coordinates):
+        assert np.array_equal(run[name], run.q[:, k])
+        assert np.array_equal(run[f"{name}_dot"], run.qd[:, k])
+    assert np.array_equal(run.theta, run.q[:, 1]) and np.array_equal(run.theta_dot, run.qd[:, 1])
+    assert np.array_equal(run["force"], run.u[:, 0]) and np.array_equal(run.force, run.u[:, 0])
+    for name, column in columns.items():
+        assert np.array_equal(column, run[name]) and column.shape == (5,), name
+    assert np.array_equal(run["t"], run.t) and np.array_equal(run["energy"], run.energy)
+    assert {"theta", "force", "q"} <= set(dir(run))
+
+
+def test_a_member_hides_a_coordinate_but_not_its_column(everything: ModuleType) -> None:
+    """The scene's q and u are coordinate and input; run.x is the state."""
+    run = everything.simulate(steps=3)
+    assert run.x.shape == (4, 6) and np.array_equal(run["x"], run.q[:, 0])
+    assert np.array_equal(run["q"], run.q[:, 2]) and np.array_equal(run["u"], run.u[:, 0])
+    assert list(run.to_dict())[-2:] == ["energy", "jacobi"]  # K is not purely quadratic
+    assert np.array_equal(run["jacobi"], run.jacobi)
+
+
+def test_unknown_names_are_said_with_what_is_meant(run: Any) -> None:
+    with pytest.raises(
+        KeyError, match=r"run: 'thetadot' .*force, energy; did you mean 'theta_dot'"
+    ):
+        run["thetadot"]
+    with pytest.raises(AttributeError, match=r"run: 'Theta' .*; did you mean 'theta'\?"):
+        _ = run.Theta
+    with pytest.raises(TypeError, match=r"run\[0\]: give a name"):
+        run[0]
+    with pytest.raises(TypeError, match="not iterable"):
+        list(run)
+    assert not hasattr(run, "__array__") and not hasattr(run, "_nothing")
+
+
+def test_inputs_are_those_that_were_applied(driven: ModuleType) -> None:
+    """A row has what was held from it on, the last what was held before it; signals as they are."""
+    table, calls = np.cos(np.arange(10.0)), iter(np.cos(np.arange(10.0)))
+    held = driven.simulate(steps=10, every=3, u=table)
+    assert held.u[:, 0].tolist() == table[[0, 3, 6, 9, 9]].tolist()
+    expected, table = held.u.copy(), np.multiply(table, 0, out=table)
+    assert np.array_equal(held.u, expected)  # whatever becomes of the caller's table
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driven._model, "_warned", {"u"})
+        called = driven.simulate(steps=10, every=3, u=lambda t, q, qd: next(calls))
+    assert np.array_equal(called.u, expected) and np.array_equal(called.q, held.q)
+    own = driven.simulate(steps=10, every=3, t0=0.5)
+    for k, t in enumerate(own.t):
+        assert own.u[k] == driven.signal(own.q[k], own.qd[k], t)
+    assert driven.simulate(steps=0, u=0.5).u.tolist() == [[0.5]]
+    assert np.isnan(driven.simulate(steps=0, u=np.empty((0, 1))).u).tolist() == [[True]]
+
+
+def test_a_scene_without_inputs_has_none(cartpole: ModuleType) -> None:
+    run = cartpole.simulate(steps=2)
+    assert run.u.shape == (3, 0)
+    assert list(run.to_dict()) == ["t", "x", "theta", "x_dot", "theta_dot", "energy"]
+
+
+@pytest.mark.parametrize("steps", [6, 7])
+def test_inputs_of_a_run_that_stopped(driven: ModuleType, steps: int) -> None:
+    """A law that drives the state out of the numbers: as many inputs as rows."""
+    given = [*np.arange(float(steps)), 1e308]
+    with pytest.warns(RuntimeWarning, match="stopped"), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driven._model, "_warned", {"u"})
+        run = driven.simulate(steps=20, every=3, u=lambda t, q, qd: given[round(t / 0.005)])
+    assert (run.status, run.steps) == ("not finite", steps)
+    assert run.u[:, 0].tolist() == {6: [0, 3, 1e308], 7: [0, 3, 6, 1e308]}[steps]
+
+
+# --- batches --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("masses", [3.0, [2.0, 3.0, 4.0]])
+@pytest.mark.parametrize("inputs", ["signals", "constant", "each", "tables"])
+def test_columns_of_a_batch_are_those_of_its_runs(
+    batch: ModuleType, masses: Any, inputs: str
+) -> None:
+    random = np.random.default_rng(2)
+    u = {
+        "signals": None, "constant": 0.5, "each": random.random((3, 1)),
+        "tables": random.random((3, 10, 1)),
+    }[inputs]  # fmt: skip
+    q0 = Q + 0.1 * random.random((3, 2))
+    how: dict[str, Any] = {"steps": 10, "every": 3, "t0": 0.5}
+    runs = batch.simulate_batch(q0, params={"m_c": masses}, u=u, **how)
+    names = ["t", "x", "theta", "x_dot", "theta_dot", "force", "energy"]
+    assert list(runs.to_dict()) == names
+    for k in range(3):
+        own = u[k] if inputs in ("each", "tables") else u  # type: ignore[index]
+        mass = np.broadcast_to(masses, 3)[k]
+        one = batch.simulate(q0[k], params={"m_c": mass}, u=own, **how)
+        for name in names:
+            mine = runs[name] if name == "t" else runs[name][k]
+            np.testing.assert_allclose(mine, one[name], rtol=1e-12, atol=1e-12, err_msg=name)
+    assert np.array_equal(runs.theta_dot, runs.qd[..., 1])
+    assert runs.energy.shape == runs.jacobi.shape == (3, 5) and runs.u.shape == (3, 5, 1)
+
+
+def test_a_batch_keeps_what_it_was_given(batch: ModuleType) -> None:
+    table, u = np.tile([2.0, 2.0, 2.0, 9.8], (2, 1)), np.ones((2, 4, 1))
+    runs = batch.simulate_batch(steps=4, params=table, u=u)
+    energy = runs.energy.copy()
+    table[:], u[:] = 1.0, 7.0
+    assert np.array_equal(runs.energy, energy) and np.all(runs.u == 1.0)
+
+
+def test_rows_behind_a_failure_have_no_columns(batch: ModuleType) -> None:
+    runs = batch.simulate_batch([[0, 0.1], [0, 0.1]], [[0, 0], [0, 1e155]], steps=5, h=1.0, u=0.5)
+    gone = np.isnan(runs.x)
+    assert not gone[0].any() and gone[1].any() and not gone[1, 0]
+    for name in ("theta_dot", "force", "energy"):
+        assert np.array_equal(np.isnan(runs[name]), gone), name
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def test_a_saved_run_comes_back(driven: ModuleType, run: Any, tmp_path: Path) -> None:
+    file = tmp_path / "run.npz"
+    run.save(file)
+    other = driven.load_run(file)
+    assert other == run and (repr(other), other.message) == (repr(run), run.message)
+    for name, column in run.to_dict().items():
+        assert np.array_equal(other[name], column), name
+    assert (other.evaluations, other.method, other.every) == (run.evaluations, run.method, 3)
+    if callable(run._u):
+        with pytest.raises(ValueError, match=r"u was a function.*simulate again"):
+            other.estimate()
+    else:
+        assert np.array_equal(other.estimate().q, run.estimate().q)
+    with np.load(file, allow_pickle=False) as plain:  # by whoever has no module
+        assert np.array_equal(plain["q"], run.q) and str(plain["scene"]) == "cartpole_driven"
+        assert all(plain[name].dtype != object for name in plain.files)
+
+
+def test_a_saved_batch_comes_back(batch: ModuleType, driven: ModuleType, tmp_path: Path) -> None:
+    file = tmp_path / "runs.npz"
+    for how in ({}, {"u": 0.5}, {"params": {"m_c": [1.0, 2.0, 3.0]}}):
+        runs = batch.simulate_batch(np.tile(Q, (3, 1)), steps=7, every=2, **how)
+        runs.save(file)
+        other = batch.load_run(file)
+        assert other == runs and np.array_equal(other.energy, runs.energy)
+        assert np.array_equal(other.status, runs.status) and np.array_equal(other.u, runs.u)
+    batch.simulate(steps=3).save(file)
+    assert len(batch.load_run(file)) == 4
+    with pytest.raises(ValueError, match=r"save: runs\.csv: give a name that ends in \.npz"):
+        runs.save("runs.csv")
+
+
+def test_a_csv_file_has_the_columns(run: Any, tmp_path: Path) -> None:
+    file = tmp_path / "run.csv"
+    run.save(str(file))
+    rows = np.genfromtxt(file, delimiter=",", names=True)
+    assert rows.dtype.names == tuple(run.to_dict())
+    for name, column in run.to_dict().items():
+        assert np.array_equal(rows[name], column), name
+
+
+def test_a_file_that_is_no_run_of_this_scene(
+    driven: ModuleType, cartpole: ModuleType, batch: ModuleType, modules: Modules, tmp_path: Path
+) -> None:
+    file = tmp_path / "run.npz"
+
+    def says(words: str) -> None:
+        with pytest.raises(ValueError, match=rf"run\.npz: {words}"):
+            driven.load_run(file)
+
+    with pytest.raises(FileNotFoundError):
+        driven.load_run(file)
+    file.write_text("t,x\n0,1\n", encoding="utf-8")
+    says("is no whole .npz file")
+    np.savez(file, q=np.zeros((2, 2)))
+    says("was not written by run.save")
+    np.savez(file, kind=np.array({}, dtype=object))
+    says("is no whole .npz file")
+    cartpole.simulate(steps=2).save(file)
+    says("is a run of cartpole, not of cartpole_driven")
+    driven.simulate(steps=200).save(file)
+    file.write_bytes(file.read_bytes()[:3000])
+    says("is no whole .npz file")
+    driven.simulate(steps=2).save(file)
+    with np.load(file) as found:
+        kept: dict[str, Any] = dict(found)
+    np.savez(file, **kept | {"parameters": ["m_c", "m_p", "length", "g"]})
+    says(
+        "is a run of another version of .*, whose parameters were m_c, m_p, length, g; here .*l, g"
+    )
+    np.savez(file, **kept | {"q": kept["q"].astype("f4")})
+    says("has numbers of float32, cartpole_driven float64")
+    np.savez(file, **kept | {"kind": "eomc BatchRun 1"})
+    says("is a run of many at once")
+    np.savez(file, **kept | {"digest": "another"})
+    with pytest.warns(RuntimeWarning, match=r"run\.npz: was saved from another version"):
+        assert len(driven.load_run(file)) == 3
+
+
+# --- pandas and xarray ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("package", ["pandas", "xarray"])
+def test_without_the_package_what_to_do_is_said(
+    run: Any, package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(
+        ModuleNotFoundError, match=rf"to_{package}: {package} is not installed: pip"
+    ):
+        getattr(run, f"to_{package}")()
+
+
+def test_pandas(run: Any, batch: ModuleType) -> None:
+    pytest.importorskip("pandas")
+    table = run.to_pandas()
+    assert list(table.columns) == list(run.to_dict())[1:]
+    assert table.index.name == "t" and np.array_equal(table.index, run.t)
+    assert np.array_equal(table["theta_dot"], run["theta_dot"])
+    runs = batch.simulate_batch(np.tile(Q, (3, 1)), steps=4)
+    table = runs.to_pandas()
+    assert table.index.names == ["instance", "t"] and len(table) == 15
+    assert np.array_equal(table.loc[1, "theta"], runs["theta"][1])
+
+
+def test_xarray(run: Any, batch: ModuleType) -> None:
+    pytest.importorskip("xarray")
+    data = run.to_xarray()
+    assert list(data.data_vars) == list(run.to_dict())[1:]
+    assert np.array_equal(data["t"], run.t) and np.array_equal(data["theta"], run["theta"])
+    assert (
+        data["theta_dot"].attrs == {"units": "rad/s"} and data.attrs["scene"] == "cartpole_driven"
+    )
+    runs = batch.simulate_batch(np.tile(Q, (3, 1)), steps=4)
+    data = runs.to_xarray()
+    assert dict(data.sizes) == {"instance": 3, "t": 5}
+    assert np.array_equal(data["theta"].sel(instance=1), runs["theta"][1])
+
+
+# --- in a line ------------------------------------------------------------------------------------
+
+
+def test_each_is_shown_in_a_line(
+    batch: ModuleType, modules: Modules, everything: ModuleType, driven: ModuleType
+) -> None:
+    top = modules("heavy_top")
+    with pytest.warns(RuntimeWarning):
+        stopped = top.simulate(top.start[0] * 0, steps=5)
+    assert repr(stopped) == "<Run of heavy_top: singular after 0 steps of 0.002 s>"
+    runs = batch.simulate_batch(np.tile(Q, (3, 1)), steps=4, h=0.01)
+    said = "<BatchRun of many_cartpole_driven: 3 instances, 12 of 12 steps of 0.01 s: 3 ok>"
+    assert repr(runs) == said
+    assert repr(driven) == "<compiled scene cartpole_driven: 2 coordinates, 1 input, 4 parameters>"
+    long = repr(everything.Params(gamma=-1.25e-7))
+    assert len(long) <= 80 and long.startswith("Params(m=1.5, g=9.81, ") and "more)" in long
+    shown = long.count("=")
+    assert f"... {len(everything.parameters) - shown} more)" in long
+    assert repr(SimpleNamespace(p=driven.Params())) == (
+        "namespace(p=Params(m_c=2, m_p=2, l=2, g=9.8))"
+    )

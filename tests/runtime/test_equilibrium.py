@@ -1,0 +1,119 @@
+"""Where a motion rests: against formulas of textbooks, and where there is nothing to be found."""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+
+@pytest.mark.parametrize(("guess", "found"), [(0.4, 0.0), (1.5, 0.0), (2.5, math.pi)])
+def test_a_pole_upright_or_hanging(
+    cartpole: ModuleType, driven: ModuleType, guess: float, found: float
+) -> None:
+    """The cart, which no force holds, stays where it was; so does a force that is no unknown."""
+    q, u = cartpole.equilibrium([0.3, guess])
+    assert q == pytest.approx([0.3, found], abs=1e-14) and u is None
+    q, u = driven.equilibrium([0.3, guess], u={"force": 0.0})
+    assert q == pytest.approx([0.3, found], abs=1e-14) and u.tolist() == [0.0]
+    assert np.abs(driven.acceleration(q, [0, 0], u=u)).max() < 1e-13
+
+
+def test_an_input_is_found(driven: ModuleType) -> None:
+    q, u = driven.equilibrium([0.3, 0.4], u=[3.0], free=["theta", "force"])
+    assert u == pytest.approx([0.0], abs=1e-14) and q == pytest.approx([0.3, 0.0], abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("free", "kept"),
+    [
+        ({"u", "theta", "q"}, {"x": 0.3, "push": 0.5}),
+        ({"u", "push", "q"}, {"x": 0.3, "theta": 1.0}),
+    ],
+)
+def test_what_is_not_free_stays(
+    everything: ModuleType, free: set[str], kept: dict[str, float]
+) -> None:
+    params = {"gamma": 0.0, "N": 0.1}
+    q, u = everything.equilibrium(
+        [0.3, 1.0, 0.1], u={"u": 1.0, "push": 0.5}, free=free, params=params
+    )
+    found = dict(zip((*everything.coordinates, *everything.inputs), [*q, *u], strict=True))
+    assert {name: found[name] for name in kept} == kept
+    still = [0.0, 0.0, 0.0]
+    rest = everything.tau(q, still, u=u, params=params) - everything.bias(q, still, params=params)
+    assert np.abs(rest).max() < 1e-12 and q[2] == pytest.approx(-0.498, abs=1e-3)
+
+
+def test_signals_are_followed_where_no_input_is_free(driven: ModuleType) -> None:
+    """At t = 1 the signal pushes, and nothing holds the cart against it."""
+    _, u = driven.equilibrium([0.0, 0.1])
+    assert u.tolist() == [0.0]
+    with pytest.raises(driven.MotionError, match=r"where a force of 0\.00841 is left on x"):
+        driven.equilibrium([0.0, 0.1], t=1.0)
+    _, u = driven.equilibrium([0.0, 0.1], t=1.0, free=("theta", "force"))
+    assert u == pytest.approx([0.0], abs=1e-14)
+
+
+def test_a_steady_precession(modules: Modules) -> None:
+    """I1 phi'^2 cos(theta) - I3 (psi' + phi' cos(theta)) phi' + m g l = 0 (Goldstein, ch. 5)."""
+    top = modules("heavy_top")
+    phi_dot, psi_dot, p = 5.0, 15.0, top.defaults
+    rates = {"phi": phi_dot, "theta": 0.0, "psi": psi_dot}
+    qd = [rates[name] for name in top.coordinates]
+    c = (p["I3"] * psi_dot * phi_dot - p["m"] * p["g"] * p["l"]) / (
+        (p["I1"] - p["I3"]) * phi_dot**2
+    )
+    q, _ = top.equilibrium(top.start[0], qd, free="theta")
+    assert math.cos(q[top.coordinates.index("theta")]) == pytest.approx(c, rel=1e-13)
+    assert np.abs(top.acceleration(q, qd)).max() < 1e-12
+    upright, _ = top.equilibrium()  # where D is singular, and forces are not
+    assert np.sin(upright[top.coordinates.index("theta")]) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_chain_comes_to_rest_from_afar(modules: Modules) -> None:
+    chain = modules("chain")
+    q, _ = chain.equilibrium()
+    assert np.abs(chain.acceleration(q, 0 * q)).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"u": 5.0}, r"no equilibrium found from q = .*where a force of 5 is left on x; start"),
+        ({"free": []}, r"the search ends at q = \[0\.3 0\.5\], where a force of 9\.4 is left on"),
+        ({"free": "force"}, r"a force of 9\.4 is left on theta"),
+    ],
+)
+def test_where_there_is_none_that_is_said(driven: ModuleType, how: Any, words: str) -> None:
+    with pytest.raises(driven.MotionError, match=words) as fault:
+        driven.equilibrium([0.3, 0.5], **how)
+    assert fault.value.status == "no convergence"
+
+
+def test_a_force_that_only_fades_is_no_equilibrium(modules: Modules) -> None:
+    kepler = modules("kepler_orbit")
+    with pytest.raises(kepler.MotionError, match="no equilibrium found"):
+        kepler.equilibrium()
+    with pytest.raises(kepler.MotionError, match=r"from q = \[0\. 0\.\]"):
+        kepler.equilibrium([0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"free": ["Theta"]}, r"free: 'Theta' is not one of x, theta, force; did you mean 'theta'"),
+        ({"q": [1.0]}, r"q: shape \(1,\), expected \(2,\)"),
+        ({"q": [[1.0, 2.0]]}, r"with q of shape \(1, 2\)"),
+        ({"qd": "x"}, "qd: 'x' is not a number"),
+        ({"u": {"Force": 1}}, "u: 'Force' is not one of force"),
+        ({"params": {"M": 1}}, "params: 'M' is not one of"),
+    ],
+)
+def test_what_is_wrong_is_named(driven: ModuleType, how: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        driven.equilibrium(**{"q": [0.0, 0.1], "qd": [0.0, 0.0]} | how)

@@ -1,0 +1,94 @@
+"""Inputs by name, wherever u is taken."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import batches
+import numpy as np
+import pytest
+from states import QD, Q, same
+
+S, SD = [0.3, 0.4, 0.5], [0.2, -0.1, 0.3]
+
+
+@pytest.mark.parametrize("name", ["acceleration", "tau", "power", "step"])
+def test_functions_take_inputs_by_name(everything: ModuleType, name: str) -> None:
+    """In any order of the names."""
+    call = getattr(everything, name)
+    named = call(S, SD, t=0.3, u={"push": 2, "u": np.float64(0.7)})
+    assert np.array_equal(named, call(S, SD, t=0.3, u=[0.7, 2.0]))
+    assert not np.array_equal(named, call(S, SD, t=0.3, u=[2.0, 0.7]))
+
+
+def test_a_run_takes_inputs_by_name(everything: ModuleType, driven: ModuleType) -> None:
+    table = np.sin(np.arange(5.0))
+    how: dict[str, Any] = {"steps": 5, "h": 0.01}
+    both = {"u": 0.5, "push": table}
+    as_table = np.column_stack([np.full(5, 0.5), table])
+    assert same(everything.simulate(u=both, **how), everything.simulate(u=as_table, **how))
+    constant = everything.simulate(u={"push": 1, "u": 0.5}, **how)
+    assert same(constant, everything.simulate(u=[0.5, 1.0], **how))
+    law = everything.simulate(u=lambda t, q, qd: {"u": 0.5, "push": np.sin(round(100 * t))}, **how)
+    assert same(law, everything.simulate(u=as_table, **how))
+    assert everything.advice(h=1e3, u={"u": 0.5, "push": 1}) == everything.advice(
+        h=1e3, u=[0.5, 1.0]
+    )
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (3, 5), (1, 5)])
+def test_a_batch_takes_inputs_by_name(shape: tuple[int, ...]) -> None:
+    m = batches.module("cartpole_driven")
+    force = np.random.default_rng(1).random(shape)
+    q0 = np.tile(Q, (3, 1))
+    named = m.simulate_batch(q0, steps=5, u={"force": force})
+    assert named == m.simulate_batch(q0, steps=5, u=force[..., None])
+    if len(shape) < 2:
+        q, qd = q0.copy(), np.tile(QD, (3, 1))
+        q_too, qd_too = q.copy(), qd.copy()
+        m.step_batch(q, qd, u={"force": force})
+        m.step_batch(q_too, qd_too, u=np.atleast_1d(force)[..., None] if shape else [force])
+        assert np.array_equal(q, q_too) and np.array_equal(qd, qd_too)
+
+
+def test_numbers_of_instances_and_tables_go_together(everything: ModuleType) -> None:
+    given = {"u": np.arange(3.0), "push": np.arange(12.0).reshape(3, 4)}
+    made = everything._model._by_name(given)
+    assert made.shape == (3, 4, 2) and made.flags.c_contiguous
+    assert np.array_equal(made[..., 1], given["push"])
+    assert np.array_equal(made[..., 0], np.repeat(np.arange(3.0), 4).reshape(3, 4))
+
+
+@pytest.mark.parametrize(
+    ("u", "words"),
+    [
+        ({"push": 1, "Push": 1, "u": 0}, r"u: 'Push' is not one of u, push; did you mean 'push'\?"),
+        ({"pus": 1}, r"u: 'pus' is not one of u, push; did you mean 'push'\?"),
+        ({"u": 1.0}, r"u: no value for push: give all inputs, or None for the signals"),
+        ({}, r"u: no value for u, push"),
+        ({"u": 1, "push": "much"}, r"u: push: 'much' is not an array of numbers"),
+        ({"u": np.zeros(3), "push": np.zeros(2)}, r"u: u has shape \(3,\), push has shape \(2,\)"),
+        ({"u": 1, "push": np.nan}, r"u: .*nan.* is not finite"),
+    ],
+)
+def test_what_is_wrong_is_named(everything: ModuleType, u: Any, words: str) -> None:
+    for call in (
+        lambda: everything.acceleration(S, SD, u=u),
+        lambda: everything.simulate(steps=2, u=u),
+        lambda: everything.step(S, SD, u=u),
+    ):
+        with pytest.raises(ValueError, match=f"^{words}"):
+            call()
+
+
+def test_a_table_by_name_has_a_row_a_step(everything: ModuleType) -> None:
+    with pytest.raises(ValueError, match="u: 3 rows for 2 steps"):
+        everything.simulate(steps=2, u={"u": 1.0, "push": np.zeros(3)})
+
+
+def test_parameters_are_suggested(cartpole: ModuleType) -> None:
+    with pytest.raises(ValueError, match=r"params: 'M_c' is not one of .*; did you mean 'm_c'\?"):
+        cartpole.D(Q, params={"M_c": 1.0})
+    with pytest.raises(AttributeError, match=r"'mc' .*; did you mean 'm_c'\?"):
+        _ = cartpole.Params().mc
