@@ -5,6 +5,7 @@ Adaptive ones are made for a tolerance: (matrices, n) -> (tolerance -> Run), com
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import logging
 import math
@@ -74,7 +75,9 @@ def jitcode_dop853(matrices: Matrices, n: int) -> Adaptive:
     x = [jitcode.y(i) for i in range(2 * n)]
     rates = [*x[n:], *physics.acceleration(matrices, x, symengine.sin, symengine.cos)]
     ode = jitcode.jitcode(rates, verbose=False)
-    ode.compile_C(extra_compile_args=list(compiler.flags()))
+    # setuptools, which compiles it, takes the folder that it runs in for the project
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        ode.compile_C(extra_compile_args=list(compiler.flags()))
 
     def make(tolerance: float) -> Run:
         def run(x: Array, h: float, steps: int) -> Array:
