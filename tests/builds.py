@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
+import importlib
 import shutil
 import stat
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from cases import SCENES
+from instrument import in_a_fork
 
 import eomc
 
@@ -74,13 +74,17 @@ def script(file: Path, text: str) -> str:
 
 
 def gravity(root: Path) -> float:
-    """g(1 rad) of the module that lies there, as a new process imports it."""
-    done = subprocess.run(
-        [sys.executable, "-c", "import simple_pendulum as m; print(m.g([1.0])[0])"],
-        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return float(done.stdout)
+    """g(1 rad) of the module that lies there, as a process imports it that had none."""
+
+    def ask() -> float:
+        sys.path.insert(0, str(root))
+        for name in [m for m in sys.modules if m.split(".")[0] == "simple_pendulum"]:
+            del sys.modules[name]
+        return float(importlib.import_module("simple_pendulum").g([1.0])[0])
+
+    how, value = in_a_fork(ask, 20)
+    assert how == "done" and isinstance(value, float), value
+    return value
 
 
 def leftovers(root: Path) -> list[str]:
