@@ -40,6 +40,27 @@ ALIKE = {
 }
 
 
+FMA = "fma" in Path("/proc/cpuinfo").read_text(encoding="utf-8")  # of this processor
+
+# angles that are sums of coordinates and numbers, and one that is none
+ODD = """
+eomc = 1
+name = "odd"
+[coordinates]
+a = { start = 0.4 }
+b = { start = -0.7 }
+[parameters]
+phase = 0.3
+[energy]
+kinetic = "a_dot**2/2 + b_dot**2/2 + a_dot*b_dot*cos(a - b)/3"
+potential = "cos(2*a) + sin(b + 1/2) + cos(a + phase)/2 + sin(a*b)/4 + cos(a - b)/5"
+"""
+
+
+def odd_system() -> System:
+    return from_scene(parse(ODD, "odd.toml"))
+
+
 # of these the quick tier looks at
 FEW_ALIKE = (
     "mass_spring", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum",

@@ -319,8 +319,8 @@ def test_derivatives_are_compared_with_differences(
     modules: Modules, monkeypatch: pytest.MonkeyPatch, real: str, wrong: str
 ) -> None:
     monkeypatch.setattr(Comparison, "convergence_rows", lambda _: None)
-    text = SLOPES.replace("slopes", f"slopes_{real}") + f'real = "{real}"\n'
-    module = modules.of_text(text)
+    text = f'{SLOPES}real = "{real}"\n'
+    module = modules.unoptimised(text)
 
     class Bent:
         def __getattr__(self, name: str) -> Any:
