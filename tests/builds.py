@@ -14,6 +14,7 @@ from instrument import in_a_fork
 
 import eomc
 
+KEPT = SCENES.parent / "build" / "tests" / "kept"  # builds to be copied, from run to run
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
 CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
 
@@ -42,21 +43,19 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def pendulum(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
-    """A folder with the scene's module, to be copied, and the module's gravity."""
-    folder = tmp_path_factory.mktemp("pendulum")
-    (folder / "simple_pendulum.toml").write_text(TEXT, encoding="utf-8")
+def pendulum() -> tuple[Path, float]:
+    """The folder of the scene's module, to be copied, and the module's gravity."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EOMC_CFLAGS", "-O0")
         patch.delenv("CC", raising=False)
-        eomc.build(folder / "simple_pendulum.toml", folder / "build")
-    return folder / "build", gravity(folder / "build")
+        folder = eomc.build(SCENES / "simple_pendulum.toml", KEPT).folder
+    return folder, gravity(KEPT)
 
 
 @pytest.fixture
 def found(root: Path, pendulum: tuple[Path, float]) -> None:
     """A good build of the scene is there already."""
-    shutil.copytree(pendulum[0], root)
+    shutil.copytree(pendulum[0], root / "simple_pendulum")
 
 
 @pytest.fixture

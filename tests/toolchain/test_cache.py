@@ -376,7 +376,7 @@ def test_a_relative_root_survives_another_current_folder(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pendulum: tuple[Path, float]
 ) -> None:
     """Python caches a finder for each path; that of a relative one looked in the old folder."""
-    shutil.copytree(pendulum[0], tmp_path / "one" / "build")
+    shutil.copytree(pendulum[0], tmp_path / "one" / "build" / "simple_pendulum")
     for place in ("one", "other"):
         (tmp_path / place).mkdir(exist_ok=True)
         monkeypatch.chdir(tmp_path / place)

@@ -122,7 +122,7 @@ def test_the_tutorials_own_figures() -> None:
     q2, q2_dot, gravity = symbol("q2"), symbol("q2_dot"), symbol("g")
     del numbers[gravity]
     reference = derive(system)
-    for equations in (reference, reference.simplified()):
+    for equations in (reference, reference.simplified):
         D, C, g = (
             m.subs(numbers).applyfunc(sympy.simplify)
             for m in (equations.D, equations.C, equations.g)
@@ -134,7 +134,7 @@ def test_the_tutorials_own_figures() -> None:
 
 def test_simplified_means_the_same() -> None:
     reference = derive(scene_system("kapitza_pendulum"))
-    short = reference.simplified()
+    short = reference.simplified
     for name in ("D", "C", "g", "bias", "tau", "kinetic", "energy", "jacobi", "power"):
         for q, qd, at in states(reference, 2):
             np.testing.assert_allclose(

@@ -178,6 +178,7 @@ class Reference(Answer):
         """D by rows, bias and tau, which an acceleration needs together: (nq^2 + 2 nq, 1)."""
         return ImmutableMatrix([*self.D, *self.bias, *self.tau])
 
+    @cached_property
     def simplified(self) -> Reference:
         """The same in shorter forms, for people to read; what would take SymPy long stays."""
         names = ("D", "C", "g", "tau")
