@@ -41,7 +41,7 @@ class Shipped:
         ffi.set_source(self.extension, made.binding)
         ffi.emit_c_code(str(folder / "binding.c"))
         include = {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}
-        self._run("-fPIC", "-O1", *(f"-I{p}" for p in include), "-c", "binding.c")
+        self._run("-fPIC", "-O0", *(f"-I{p}" for p in include), "-c", "binding.c")
 
     def compile(self, flags: Sequence[str], source: str | None = None) -> str | None:
         """Compile and link, `source` in place of the shipped text; the compiler's words if not."""
