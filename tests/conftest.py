@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 import signal
 import warnings
@@ -24,6 +25,8 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 pytest_plugins = ["builds"]
+
+gc.set_threshold(20_000, 20, 100)  # SymPy makes many values and few cycles
 
 ROOT = Path(__file__).parent.parent
 # kept from one run of the tests to the next
