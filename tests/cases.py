@@ -6,6 +6,7 @@ import json
 import re
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,13 @@ def fast_kit(made: Sources) -> dict[str, str]:
     flat = {f: text for f, text in made.files.items() if "/" not in f}
     fast = {f.removeprefix("fast/"): text for f, text in made.files.items() if "/" in f}
     return flat | fast
+
+
+def fast_files(module: ModuleType) -> dict[str, str]:
+    """As `fast_kit`, of a module's folder."""
+    folder = Path(str(module.__file__)).parent
+    found = (*folder.glob("*.[ch]"), *(folder / "fast").glob("*.[ch]"))
+    return {file.name: file.read_text(encoding="utf-8") for file in found}
 
 
 @cache

@@ -7,17 +7,17 @@ import subprocess
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
-from cases import fast_kit, scene_system
+from cases import fast_files, fast_kit, scene_system
 from compilers import STRICT, compiled, run
-from conftest import EVERYTHING, MODULES, ROOT, needs, tiers
+from conftest import EVERYTHING, MODULES, ROOT, Modules, needs, tiers
 
 import eomc
 from eomc.emit import c_names
 from eomc.emit.fast.files import PLACEHOLDERS
-from eomc.emit.render import Sources
 from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
@@ -40,15 +40,21 @@ def made(name: str) -> System:
     return scene_system(name)
 
 
+def module(name: str) -> ModuleType:
+    modules = Modules()
+    return modules.of_text(EVERYTHING) if name == "everything" else modules(name)
+
+
 @cache
-def generated(name: str) -> Sources:
-    return eomc.sources(made(name))
+def generated(name: str) -> dict[str, str]:
+    """The C of a scene, the fast form in the place of the plain one."""
+    return fast_files(module(name))
 
 
 @pytest.fixture
 def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A folder with the generated files of a scene, the fast form in the place of the plain one."""
-    for file, text in fast_kit(generated(request.param)).items():
+    """A folder with the generated files of a scene."""
+    for file, text in generated(request.param).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     return tmp_path
 
@@ -69,9 +75,8 @@ def table(text: str) -> tuple[list[str], np.ndarray]:
     return head.split(","), np.array([[float(x) for x in row.split(",")] for row in rows])
 
 
-def rows_of(name: str, root: Path = MODULES) -> np.ndarray:
+def rows_of(name: str, module: ModuleType) -> np.ndarray:
     """What the Python module has for the rows that main.c prints."""
-    module = eomc.load(made(name), root)
     s = made(name).run
     steps = max(1, int(np.ceil(s.duration / s.h * (1 - 1e-12))))
     found = module.simulate(steps=steps, every=max(1, steps // 200))
@@ -132,7 +137,7 @@ int main() {{
 
 def step_of(name: str) -> str:
     """The arguments of rk4_step, in one line."""
-    header = " ".join(fast_kit(generated(name))[f"{name}.h"].split())
+    header = " ".join(generated(name)[f"{name}.h"].split())
     match = re.search(rf"{name}_rk4_step\(([^)]*)\);", header)
     assert match
     return match[1]
@@ -151,7 +156,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Printed:
     @cache
     def of(name: str, command: str) -> str:
         folder = tmp_path_factory.mktemp(name)
-        for file, text in fast_kit(generated(name)).items():
+        for file, text in generated(name).items():
             (folder / file).write_text(text, encoding="utf-8")
         compiler, *flags = command.split()
         files = ("-I.", "main.c", f"{name}.c", "-lm")
@@ -174,10 +179,10 @@ def test_the_example_prints_what_the_module_computes(
     columns, found = table(printed(name, "cc -O2"))
     names = [c.name for c in made(name).coordinates]
     assert columns == ["t", *names, *(f"{n}_dot" for n in names), "energy"]
-    usual = rows_of(name)
+    usual = rows_of(name, module(name))
     np.testing.assert_allclose(found, usual, rtol=0, atol=1e-9 * np.max(np.abs(usual)))
     monkeypatch.setenv("EOMC_CFLAGS", "-O2")
-    assert np.array_equal(found, rows_of(name, MODULES.parent / "embedded"))
+    assert np.array_equal(found, rows_of(name, eomc.load(made(name), MODULES.parent / "embedded")))
 
 
 @pytest.mark.parametrize(
@@ -325,7 +330,7 @@ def test_what_is_not_wanted_is_not_there(kit: Path, name: str) -> None:
 @driven
 def test_two_scenes_in_one_program(kit: Path) -> None:
     """Prefixes keep them apart, in one translation unit too."""
-    for file, text in fast_kit(generated("kapitza_pendulum")).items():
+    for file, text in generated("kapitza_pendulum").items():
         if file.startswith("kapitza"):
             (kit / file).write_text(text, encoding="utf-8")
     (kit / "both.c").write_text(
@@ -353,7 +358,7 @@ def test_nothing_is_printed_that_could_have_lost_digits(kit: Path, name: str) ->
 
 def test_a_misuse_is_told_by_the_compiler(tmp_path: Path) -> None:
     """-ffast-math breaks the reduction of angles: it is refused, not silently wrong."""
-    for file, text in fast_kit(generated("cartpole")).items():
+    for file, text in generated("cartpole").items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     done = run("cc", "-std=c99", "-O2", "-ffast-math", "-c", "cartpole.c", cwd=tmp_path)
     assert done.returncode != 0

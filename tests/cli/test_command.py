@@ -137,7 +137,7 @@ def test_a_run_that_cannot_go_on_is_status_1(there: Path) -> None:
 def test_show(here: Path) -> None:
     text = eomc("show", "kapitza_pendulum.toml").output
     assert "mass matrix" in text and "Jacobi integral" in text
-    assert r"\begin{align*}" in eomc("show", "cartpole.toml", "--latex").output
+    assert r"\begin{align*}" in eomc("show", "kapitza_pendulum.toml", "--latex").output
     space: dict[str, object] = {}
     exec(eomc("show", "cartpole.toml", "--python").output, space)  # it is Python
     assert str(space["D"]).count("m_p") >= 3

@@ -34,7 +34,7 @@ from eomc.verify.symbolic import Reference
 from eomc.verify.symbolic import derive as plainly
 
 FEW = settings(
-    derandomize=True, deadline=None, max_examples=3, database=None,
+    derandomize=True, deadline=None, max_examples=2, database=None,
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 MANY = settings(FEW, max_examples=48)

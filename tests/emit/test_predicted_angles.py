@@ -9,7 +9,7 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
-from cases import FMA, ODD, SCENES, fast_kit, odd_system
+from cases import FMA, ODD, SCENES, fast_files, odd_system
 from conftest import MODULES, Modules, needs, tiers
 from sympy import Rational, S
 
@@ -165,9 +165,11 @@ def test_sums_are_compensated(method: str, power: int, tmp_path: Path) -> None:
     ("h", "name"),
     tiers([(0.005, "cartpole"), (0.016, "cartpole"), (0.004, "double_pendulum")], 0.016),
 )
-def test_a_run_cut_in_c_is_the_same_to_the_last_bit(name: str, h: float, tmp_path: Path) -> None:
+def test_a_run_cut_in_c_is_the_same_to_the_last_bit(
+    name: str, h: float, tmp_path: Path, modules: Modules
+) -> None:
     """With the memory handed on; without it, sums begin anew. Near what was predicted, and not."""
-    for file, text in fast_kit(eomc.sources(eomc.read(SCENES / f"{name}.toml"))).items():
+    for file, text in fast_files(modules(name)).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     main = r"""
         #include "NAME.h"
@@ -224,12 +226,12 @@ static void METHOD_by_hand(void)
 """
 
 
-def test_a_memory_of_another_state_is_not_believed(tmp_path: Path) -> None:
+def test_a_memory_of_another_state_is_not_believed(tmp_path: Path, modules: Modules) -> None:
     """A state changed by hand between two calls moves on as it would with no memory at all."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     text = text.replace("[run]\n", f"[run]\nmethod = {list(METHODS_OF_MEMORY)}\n")
     made = system.from_scene(scene.parse(text, "cartpole.toml"))
-    for file, written in fast_kit(eomc.sources(made)).items():
+    for file, written in fast_files(modules.unoptimised(made)).items():
         (tmp_path / file).write_text(written, encoding="utf-8")
     functions = "".join(BY_HAND.replace("METHOD", m) for m in METHODS_OF_MEMORY)
     calls = " ".join(f"{m}_by_hand();" for m in METHODS_OF_MEMORY)

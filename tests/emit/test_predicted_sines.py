@@ -10,10 +10,9 @@ from pathlib import Path
 import mpmath
 import numpy as np
 import pytest
-from cases import FMA, fast_kit, odd_system, scene_system
-from conftest import needs, tiers
+from cases import FMA, fast_files, odd_system, scene_system
+from conftest import Modules, needs, tiers
 
-import eomc
 from eomc.derive import lagrange
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
@@ -27,7 +26,7 @@ def fast(name: str) -> tuple[Accelerations, dict[str, str]]:
     """Of the cart-pole or of the odd scene."""
     own = odd_system() if name == "odd" else scene_system(name)
     made = program.build(lagrange.derive(own))
-    return Accelerations(Target(made, DOUBLE)), fast_kit(eomc.sources(own))
+    return Accelerations(Target(made, DOUBLE)), fast_files(Modules().unoptimised(own))
 
 
 def made_with(
