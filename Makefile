@@ -5,6 +5,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# a half of the tests each, in their order: neighbours share what they derive and compile
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 DEMO := scenes/cartpole.toml scenes/cartpole_driven.toml scenes/cartpole_tutorial.toml
 # what a test run writes, it writes under build/
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
@@ -27,13 +29,13 @@ demo: .venv/demo
 	@echo "the command:         $(BIN)/eomc --help"
 
 test: .venv/dev
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-all: .venv/robots
-	$(BIN)/python -m pytest -n 2
+	$(PYTEST)
 
 test-slow: .venv/robots
-	$(BIN)/python -m pytest -n 2 -m slow
+	$(PYTEST) -m slow
 
 lint: .venv/dev
 	$(BIN)/ruff check .

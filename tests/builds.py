@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import os
+import importlib
 import shutil
 import stat
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from cases import SCENES
+from instrument import in_a_fork
 
 import eomc
 
+KEPT = SCENES.parent / "build" / "tests" / "kept"  # builds to be copied, from run to run
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
 CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
 
@@ -42,21 +43,19 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def pendulum(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
-    """A folder with the scene's module, to be copied, and the module's gravity."""
-    folder = tmp_path_factory.mktemp("pendulum")
-    (folder / "simple_pendulum.toml").write_text(TEXT, encoding="utf-8")
+def pendulum() -> tuple[Path, float]:
+    """The folder of the scene's module, to be copied, and the module's gravity."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("EOMC_CFLAGS", "-O0")
         patch.delenv("CC", raising=False)
-        eomc.build(folder / "simple_pendulum.toml", folder / "build")
-    return folder / "build", gravity(folder / "build")
+        folder = eomc.build(SCENES / "simple_pendulum.toml", KEPT).folder
+    return folder, gravity(KEPT)
 
 
 @pytest.fixture
 def found(root: Path, pendulum: tuple[Path, float]) -> None:
     """A good build of the scene is there already."""
-    shutil.copytree(pendulum[0], root)
+    shutil.copytree(pendulum[0], root / "simple_pendulum")
 
 
 @pytest.fixture
@@ -74,13 +73,17 @@ def script(file: Path, text: str) -> str:
 
 
 def gravity(root: Path) -> float:
-    """g(1 rad) of the module that lies there, as a new process imports it."""
-    done = subprocess.run(
-        [sys.executable, "-c", "import simple_pendulum as m; print(m.g([1.0])[0])"],
-        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return float(done.stdout)
+    """g(1 rad) of the module that lies there, as a process imports it that had none."""
+
+    def ask() -> float:
+        sys.path.insert(0, str(root))
+        for name in [m for m in sys.modules if m.split(".")[0] == "simple_pendulum"]:
+            del sys.modules[name]
+        return float(importlib.import_module("simple_pendulum").g([1.0])[0])
+
+    how, value = in_a_fork(ask, 20)
+    assert how == "done" and isinstance(value, float), value
+    return value
 
 
 def leftovers(root: Path) -> list[str]:

@@ -6,6 +6,7 @@ import json
 import re
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,27 @@ ALIKE = {
 }
 
 
+FMA = "fma" in Path("/proc/cpuinfo").read_text(encoding="utf-8")  # of this processor
+
+# angles that are sums of coordinates and numbers, and one that is none
+ODD = """
+eomc = 1
+name = "odd"
+[coordinates]
+a = { start = 0.4 }
+b = { start = -0.7 }
+[parameters]
+phase = 0.3
+[energy]
+kinetic = "a_dot**2/2 + b_dot**2/2 + a_dot*b_dot*cos(a - b)/3"
+potential = "cos(2*a) + sin(b + 1/2) + cos(a + phase)/2 + sin(a*b)/4 + cos(a - b)/5"
+"""
+
+
+def odd_system() -> System:
+    return from_scene(parse(ODD, "odd.toml"))
+
+
 # of these the quick tier looks at
 FEW_ALIKE = (
     "mass_spring", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum",
@@ -52,6 +74,13 @@ def fast_kit(made: Sources) -> dict[str, str]:
     flat = {f: text for f, text in made.files.items() if "/" not in f}
     fast = {f.removeprefix("fast/"): text for f, text in made.files.items() if "/" in f}
     return flat | fast
+
+
+def fast_files(module: ModuleType) -> dict[str, str]:
+    """As `fast_kit`, of a module's folder."""
+    folder = Path(str(module.__file__)).parent
+    found = (*folder.glob("*.[ch]"), *(folder / "fast").glob("*.[ch]"))
+    return {file.name: file.read_text(encoding="utf-8") for file in found}
 
 
 @cache

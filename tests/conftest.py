@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 import signal
 import warnings
@@ -25,8 +26,12 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 pytest_plugins = ["builds"]
 
+gc.set_threshold(20_000, 20, 100)  # SymPy makes many values and few cycles
+
 ROOT = Path(__file__).parent.parent
-MODULES = ROOT / "build" / "tests" / "modules"  # kept from one run of the tests to the next
+# kept from one run of the tests to the next
+MODULES = ROOT / "build" / "tests" / "modules"
+UNOPTIMISED = ROOT / "build" / "tests" / "unoptimised"
 
 # Every function of the formula language, an explicit time, friction, a part of K without
 # velocities, an input that hangs on the state, and names that C and Python would like to keep.
@@ -83,19 +88,23 @@ duration = 2.0
 
 @cache
 def _loaded(name: str) -> ModuleType:
-    return _optimised(SCENES / f"{name}.toml")
+    return _compiled(SCENES / f"{name}.toml", MODULES, None)
 
 
 @cache
-def _from_text(text: str) -> ModuleType:
-    return _optimised(from_scene(parse(text, "test.toml")))
+def _made(made: System, optimised: bool) -> ModuleType:
+    """In a folder of its own: tests may give two scenes one name."""
+    root, flags = (MODULES, None) if optimised else (UNOPTIMISED, "-O0")
+    return _compiled(made, root / made.digest[:16], flags)
 
 
-def _optimised(made: Path | System) -> ModuleType:
-    """As it is usually built, whatever flags a test has set for modules of its own."""
+def _compiled(made: Path | System, root: Path, flags: str | None) -> ModuleType:
+    """With these flags, or as it is usually, whatever a test has set for modules of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("EOMC_CFLAGS", raising=False)
-        return eomc.load(made, MODULES)
+        if flags is not None:
+            patch.setenv("EOMC_CFLAGS", flags)
+        return eomc.load(made, root)
 
 
 class Modules:
@@ -107,7 +116,12 @@ class Modules:
 
     def of_text(self, text: str) -> ModuleType:
         """The module of a scene given as text."""
-        return _from_text(text)
+        return _made(from_scene(parse(text, "test.toml")), True)
+
+    def unoptimised(self, made: str | System) -> ModuleType:
+        """The module of a text or a system, where speed is no matter: compiled in half the time."""
+        system = from_scene(parse(made, "test.toml")) if isinstance(made, str) else made
+        return _made(system, False)
 
 
 @pytest.fixture(scope="session")

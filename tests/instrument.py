@@ -41,7 +41,7 @@ class Shipped:
         ffi.set_source(self.extension, made.binding)
         ffi.emit_c_code(str(folder / "binding.c"))
         include = {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}
-        self._run("-fPIC", "-O1", *(f"-I{p}" for p in include), "-c", "binding.c")
+        self._run("-fPIC", "-O0", *(f"-I{p}" for p in include), "-c", "binding.c")
 
     def compile(self, flags: Sequence[str], source: str | None = None) -> str | None:
         """Compile and link, `source` in place of the shipped text; the compiler's words if not."""
@@ -157,10 +157,11 @@ def missed(scene_text: str, folder: Path) -> tuple[str, list[tuple[int, str]]]:
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     if ran.returncode:
         raise AssertionError(ran.stdout + ran.stderr)
-    return ran.stdout, list(_unexecuted(folder))
+    return ran.stdout, list(unexecuted(folder))
 
 
-def _unexecuted(folder: Path) -> Iterator[tuple[int, str]]:
+def unexecuted(folder: Path) -> Iterator[tuple[int, str]]:
+    """The lines that gcov counts as not executed, from scene.gcda: their numbers and texts."""
     told = subprocess.run(
         ["gcov", "--json-format", "--stdout", "scene.gcda"],
         cwd=folder, check=True, capture_output=True,

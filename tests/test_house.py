@@ -38,13 +38,25 @@ def modules() -> dict[str, Path]:
     }
 
 
-def imports(name: str, types: bool = True) -> Iterator[str]:
+@cache
+def tree(name: str) -> ast.Module:
+    return ast.parse(modules()[name].read_text(encoding="utf-8"))
+
+
+def for_types(node: ast.stmt) -> bool:
+    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+
+
+@cache
+def imports(name: str, types: bool = True) -> frozenset[str]:
     """The modules of eomc that a module imports anywhere in its text; types: for types too."""
+    body = [node for node in tree(name).body if types or not for_types(node)]
+    return frozenset(_imports(name, ast.Module(body, [])))
+
+
+def _imports(name: str, text: ast.Module) -> Iterator[str]:
     known = modules()
-    tree = ast.parse(known[name].read_text(encoding="utf-8"))
-    if not types:
-        tree.body = [n for n in tree.body if not ast.unparse(n).startswith("if TYPE_CHECKING:")]
-    for node in ast.walk(tree):
+    for node in ast.walk(text):
         if isinstance(node, ast.Import):
             wanted = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -78,7 +90,7 @@ def test_imports_go_down(name: str) -> None:
 
 
 def test_no_circle() -> None:
-    tops = {n: set(imports(n, types=False)) - {n} for n in modules()}
+    tops = {n: imports(n, types=False) - {n} for n in modules()}
     assert len(list(TopologicalSorter(tops).static_order())) >= len(tops)
 
 
@@ -98,7 +110,7 @@ def test_the_oracles_share_nothing_with_the_compiled_way() -> None:
 def test_what_lies_beside_a_built_module_needs_no_eomc() -> None:
     for name in modules():
         if room(name) == "runtime":
-            assert not list(imports(name)), name
+            assert not imports(name), name
 
 
 MODULE, FUNCTION = 450, 80  # lines
@@ -108,6 +120,6 @@ MODULE, FUNCTION = 450, 80  # lines
 def test_rooms_are_small(name: str) -> None:
     text = modules()[name].read_text(encoding="utf-8")
     assert text.count("\n") <= MODULE
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(tree(name)):
         if isinstance(node, ast.FunctionDef) and node.end_lineno is not None:
             assert node.end_lineno - node.lineno < FUNCTION, node.name

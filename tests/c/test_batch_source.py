@@ -44,7 +44,7 @@ def test_only_scenes_that_ask_have_it() -> None:
     shutil.which("gcc") is None or platform.system() != "Linux" or platform.machine() != "x86_64",
     reason="asks gcc about AVX2",
 )
-@pytest.mark.parametrize(("real", "scalar"), [("float", "ss"), ("double", "sd")])
+@pytest.mark.parametrize(("real", "scalar"), tiers([("float", "ss"), ("double", "sd")], "double"))
 def test_a_step_of_a_tile_is_vectors_alone(real: str, scalar: str, tmp_path: Path) -> None:
     """Nothing is wider than asked for, nothing is called, and sums are of whole registers."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
@@ -69,7 +69,7 @@ def test_a_step_of_a_tile_is_vectors_alone(real: str, scalar: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", tiers(("cartpole", "kepler_orbit", "furuta_pendulum"), "cartpole"))
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("real", tiers(["double", "float"], "float"))
 def test_strict_compilers_have_no_complaint(name: str, real: str, tmp_path: Path) -> None:
     """With angles that are turned and without, steppers by stages and by rates."""
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")

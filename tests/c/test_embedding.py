@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import re
 import subprocess
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
-from cases import fast_kit, scene_system
+from cases import fast_files, fast_kit, scene_system
 from compilers import STRICT, compiled, run
-from conftest import EVERYTHING, MODULES, ROOT, needs, tiers
+from conftest import EVERYTHING, MODULES, ROOT, Modules, needs, tiers
 
 import eomc
 from eomc.emit import c_names
 from eomc.emit.fast.files import PLACEHOLDERS
-from eomc.emit.render import Sources
 from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
@@ -39,15 +40,21 @@ def made(name: str) -> System:
     return scene_system(name)
 
 
+def module(name: str) -> ModuleType:
+    modules = Modules()
+    return modules.of_text(EVERYTHING) if name == "everything" else modules(name)
+
+
 @cache
-def generated(name: str) -> Sources:
-    return eomc.sources(made(name))
+def generated(name: str) -> dict[str, str]:
+    """The C of a scene, the fast form in the place of the plain one."""
+    return fast_files(module(name))
 
 
 @pytest.fixture
 def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A folder with the generated files of a scene, the fast form in the place of the plain one."""
-    for file, text in fast_kit(generated(request.param)).items():
+    """A folder with the generated files of a scene."""
+    for file, text in generated(request.param).items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     return tmp_path
 
@@ -58,6 +65,7 @@ def kits_of(*quick: str) -> pytest.MarkDecorator:
 
 
 kits, few_kits = kits_of("cartpole", "everything"), kits_of("cartpole")
+STRICTLY = {("cartpole", "-O2"), ("everything", "-O0")}  # in the quick tier
 driven = pytest.mark.parametrize("kit", ["cartpole_driven"], indirect=True)
 
 
@@ -67,9 +75,8 @@ def table(text: str) -> tuple[list[str], np.ndarray]:
     return head.split(","), np.array([[float(x) for x in row.split(",")] for row in rows])
 
 
-def rows_of(name: str, root: Path = MODULES) -> np.ndarray:
+def rows_of(name: str, module: ModuleType) -> np.ndarray:
     """What the Python module has for the rows that main.c prints."""
-    module = eomc.load(made(name), root)
     s = made(name).run
     steps = max(1, int(np.ceil(s.duration / s.h * (1 - 1e-12))))
     found = module.simulate(steps=steps, every=max(1, steps // 200))
@@ -79,9 +86,16 @@ def rows_of(name: str, root: Path = MODULES) -> np.ndarray:
 # --- compilers -----------------------------------------------------------------------------------
 
 
-@kits
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-@pytest.mark.parametrize("level", [pytest.param("-O0", marks=pytest.mark.slow), "-O2"])
+@pytest.mark.parametrize(
+    ("kit", "name", "level"),
+    [
+        pytest.param(n, n, level, marks=() if (n, level) in STRICTLY else pytest.mark.slow)
+        for n in NAMES
+        for level in ("-O0", "-O2")
+    ],
+    indirect=["kit"],
+)
 def test_strict_compilers_have_nothing_to_say(
     kit: Path, name: str, compiler: str, level: str
 ) -> None:
@@ -116,14 +130,14 @@ int main() {{
 """,
         encoding="utf-8",
     )
-    compiled(needs("gcc"), "-std=c99", "-O2", "-c", f"{name}.c", cwd=kit)
+    compiled(needs("gcc"), "-std=c99", "-O0", "-c", f"{name}.c", cwd=kit)
     compiled(needs("g++"), "-Wall", "-Wextra", "-Werror", "use.cpp", f"{name}.o", "-lm", cwd=kit)
     assert run("./a.out", cwd=kit).returncode == 0
 
 
 def step_of(name: str) -> str:
     """The arguments of rk4_step, in one line."""
-    header = " ".join(fast_kit(generated(name))[f"{name}.h"].split())
+    header = " ".join(generated(name)[f"{name}.h"].split())
     match = re.search(rf"{name}_rk4_step\(([^)]*)\);", header)
     assert match
     return match[1]
@@ -132,44 +146,57 @@ def step_of(name: str) -> str:
 # --- what it computes --------------------------------------------------------------------------
 
 
-@few_kits
+Printed = Callable[[str, str], str]
+
+
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory: pytest.TempPathFactory) -> Printed:
+    """What the example of a scene prints, compiled by a command; each once."""
+
+    @cache
+    def of(name: str, command: str) -> str:
+        folder = tmp_path_factory.mktemp(name)
+        for file, text in generated(name).items():
+            (folder / file).write_text(text, encoding="utf-8")
+        compiler, *flags = command.split()
+        files = ("-I.", "main.c", f"{name}.c", "-lm")
+        compiled(needs(compiler), "-std=c99", *flags, *files, cwd=folder)
+        done = run("./a.out", cwd=folder)
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout
+
+    return of
+
+
+@pytest.mark.parametrize("name", tiers(NAMES, "cartpole"))
 def test_the_example_prints_what_the_module_computes(
-    kit: Path, name: str, monkeypatch: pytest.MonkeyPatch
+    name: str, printed: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the last bit under the same flags; to 1e-9 against the module as it is usually built.
 
     Without FMA, gnu99, with which a module is compiled, and c99 give the same arithmetic.
     """
-    compiled("cc", "-std=c99", "-O2", "-I.", "main.c", f"{name}.c", "-lm", cwd=kit)
-    done = run("./a.out", cwd=kit)
-    assert (done.returncode, done.stderr) == (0, "")
-    columns, printed = table(done.stdout)
+    columns, found = table(printed(name, "cc -O2"))
     names = [c.name for c in made(name).coordinates]
     assert columns == ["t", *names, *(f"{n}_dot" for n in names), "energy"]
-    usual = rows_of(name)
-    np.testing.assert_allclose(printed, usual, rtol=0, atol=1e-9 * np.max(np.abs(usual)))
+    usual = rows_of(name, module(name))
+    np.testing.assert_allclose(found, usual, rtol=0, atol=1e-9 * np.max(np.abs(usual)))
     monkeypatch.setenv("EOMC_CFLAGS", "-O2")
-    assert np.array_equal(printed, rows_of(name, kit / "modules"))
+    assert np.array_equal(found, rows_of(name, eomc.load(made(name), MODULES.parent / "embedded")))
 
 
-@pytest.mark.parametrize("kit", ["cartpole"], indirect=True)
 @pytest.mark.parametrize(
-    "compiler",
-    tiers(["gcc -O0", "gcc -O3", "clang -O2", "gcc -O2 -std=gnu99"], "gcc -O3", "clang -O2"),
+    "command", tiers(["gcc -O0", "gcc -O3", "clang -O2", "gcc -O2 -std=gnu99"], "clang -O2")
 )
-def test_compilers_agree_to_the_last_bit(kit: Path, compiler: str) -> None:
+def test_compilers_agree_to_the_last_bit(command: str, printed: Printed) -> None:
     """On a processor's baseline, where nothing is contracted."""
-    command = compiler.split()
-    compiled("cc", "-std=c99", "-O2", "-I.", "main.c", "cartpole.c", "-lm", "-o", "one", cwd=kit)
-    files = ["-I.", "main.c", "cartpole.c", "-lm", "-o", "two"]
-    compiled(needs(command[0]), "-std=c99", *command[1:], *files, cwd=kit)
-    assert run("./one", cwd=kit).stdout == run("./two", cwd=kit).stdout
+    assert printed("cartpole", command) == printed("cartpole", "cc -O2")
 
 
 @few_kits
 def test_the_self_test_passes_and_finds_a_wrong_number(kit: Path, name: str) -> None:
     def outcome() -> tuple[int, str]:
-        compiled("cc", "-std=c99", "-O1", "-I.", "selftest.c", f"{name}.c", "-lm", cwd=kit)
+        compiled("cc", "-std=c99", "-O0", "-I.", "selftest.c", f"{name}.c", "-lm", cwd=kit)
         done = run("./a.out", cwd=kit)
         return done.returncode, done.stdout
 
@@ -303,7 +330,7 @@ def test_what_is_not_wanted_is_not_there(kit: Path, name: str) -> None:
 @driven
 def test_two_scenes_in_one_program(kit: Path) -> None:
     """Prefixes keep them apart, in one translation unit too."""
-    for file, text in fast_kit(generated("kapitza_pendulum")).items():
+    for file, text in generated("kapitza_pendulum").items():
         if file.startswith("kapitza"):
             (kit / file).write_text(text, encoding="utf-8")
     (kit / "both.c").write_text(
@@ -331,7 +358,7 @@ def test_nothing_is_printed_that_could_have_lost_digits(kit: Path, name: str) ->
 
 def test_a_misuse_is_told_by_the_compiler(tmp_path: Path) -> None:
     """-ffast-math breaks the reduction of angles: it is refused, not silently wrong."""
-    for file, text in fast_kit(generated("cartpole")).items():
+    for file, text in generated("cartpole").items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     done = run("cc", "-std=c99", "-O2", "-ffast-math", "-c", "cartpole.c", cwd=tmp_path)
     assert done.returncode != 0

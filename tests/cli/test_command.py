@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
+from builds import KEPT
 from click.testing import CliRunner, Result
 
 from eomc import pipeline
@@ -30,21 +31,15 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quickly_compiled: None
     return tmp_path
 
 
-@pytest.fixture(scope="session")
-def build(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder `build` with the cart-pole."""
-    folder = tmp_path_factory.mktemp("command") / "build"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("EOMC_CFLAGS", "-O0")
-        patch.delenv("CC", raising=False)
-        pipeline.build(SCENES / "cartpole.toml", folder)
-    return folder
-
-
 @pytest.fixture
-def there(here: Path, build: Path) -> Path:
+def there(here: Path) -> Path:
     """As `here`, the cart-pole built."""
-    shutil.copytree(build, here / "build")
+    return built(here, "cartpole")
+
+
+def built(here: Path, name: str) -> Path:
+    """`here`, with the module of a scene."""
+    shutil.copytree(pipeline.build(SCENES / f"{name}.toml", KEPT).folder, here / "build" / name)
     return here
 
 
@@ -120,7 +115,8 @@ def test_parameters_and_start_on_the_command_line(there: Path) -> None:
 def test_bad_input_is_status_2_and_says_what_to_do(
     there: Path, words: list[str], said: str
 ) -> None:
-    shutil.copy(SCENES / "cartpole_bodies.toml", there)
+    if "cartpole_bodies.toml" in words:
+        shutil.copy(SCENES / "cartpole_bodies.toml", built(there, "cartpole_bodies"))
     done = eomc(*words)
     assert done.exit_code == 2, done.output
     assert said in done.output
@@ -141,7 +137,7 @@ def test_a_run_that_cannot_go_on_is_status_1(there: Path) -> None:
 def test_show(here: Path) -> None:
     text = eomc("show", "kapitza_pendulum.toml").output
     assert "mass matrix" in text and "Jacobi integral" in text
-    assert r"\begin{align*}" in eomc("show", "cartpole.toml", "--latex").output
+    assert r"\begin{align*}" in eomc("show", "kapitza_pendulum.toml", "--latex").output
     space: dict[str, object] = {}
     exec(eomc("show", "cartpole.toml", "--python").output, space)  # it is Python
     assert str(space["D"]).count("m_p") >= 3

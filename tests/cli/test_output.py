@@ -17,6 +17,13 @@ from eomc.cli.main import main
 
 
 @pytest.fixture
+def there(here: Path, pendulum: tuple[Path, float]) -> Path:
+    """As `here`, the module built."""
+    shutil.copytree(pendulum[0], here / "build" / "simple_pendulum")
+    return here
+
+
+@pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty directory with a scene, in which the command is run."""
     shutil.copy(SCENES / "simple_pendulum.toml", tmp_path / "p.toml")
@@ -48,12 +55,12 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
         (["check", "p.toml", "--seed", "-5"], "-5 is not in the range x>=0"),
     ],
 )
-def test_numbers_that_make_no_run(here: Path, words: list[str], said: str) -> None:
+def test_numbers_that_make_no_run(there: Path, words: list[str], said: str) -> None:
     done = eomc(*words)
     assert (done.exit_code, said in done.output) == (2, True), done.output
 
 
-def test_a_step_longer_than_the_run_is_said(here: Path) -> None:
+def test_a_step_longer_than_the_run_is_said(there: Path) -> None:
     done = eomc("run", "p.toml", "--h", "0.3", "--duration", "0.1")
     assert done.exit_code == 0
     assert "  h = 0.3 s is longer than the duration, 0.1 s: the run is one step of" in done.output
@@ -61,10 +68,10 @@ def test_a_step_longer_than_the_run_is_said(here: Path) -> None:
     assert said["beyond_duration"].startswith("h = 0.3 s") and said["beyond_stability"] is None
 
 
-def test_fewer_rows_than_one_in_all_steps(here: Path) -> None:
+def test_fewer_rows_than_one_in_all_steps(there: Path) -> None:
     done = eomc("run", "p.toml", "--every", "9" * 20, "--duration", "0.1", "--out", "run.csv")
     assert done.exit_code == 0, done.output
-    assert len((here / "run.csv").read_text().splitlines()) == 3  # names, start and end
+    assert len((there / "run.csv").read_text().splitlines()) == 3  # names, start and end
 
 
 @pytest.mark.parametrize("number", ["0x" + "f" * 6000, "9" * 6000, "9" * 400, "-0b" + "1" * 1100])

@@ -20,6 +20,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from conftest import tiers
 from markupsafe import Markup
 from payloads import (
     PAYLOADS,
@@ -271,7 +272,7 @@ def test_robot_files_with_hostile_names(kind: str, here: Path) -> None:
     assert imported >= len(PLAIN) + 8
 
 
-@pytest.mark.parametrize("kind", [URDF, MJCF], ids=["urdf", "mjcf"])
+@pytest.mark.parametrize("kind", tiers([URDF, MJCF], MJCF), ids=["urdf", "mjcf"])
 @pytest.mark.parametrize(
     "name", ["docstring", "comment", "lines", "spliced", "spliced by a trigraph"]
 )

@@ -27,13 +27,14 @@ from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.program.ir import Call
 from eomc.program.program import Program
+from eomc.program.routes import Material
 from eomc.scene.read import parse
 from eomc.verify import check
 from eomc.verify.symbolic import Reference
 from eomc.verify.symbolic import derive as plainly
 
 FEW = settings(
-    derandomize=True, deadline=None, max_examples=6, database=None,
+    derandomize=True, deadline=None, max_examples=2, database=None,
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 MANY = settings(FEW, max_examples=48)
@@ -316,7 +317,8 @@ def arrow(n: int) -> System:
 
 def test_zeros_of_the_mass_matrix_are_not_computed() -> None:
     """D of the arrow is eliminated from its tips without fill: so much more for each body."""
-    flops = [compiled(arrow(n))["acceleration"].cost.flops for n in (3, 6, 9)]
+    found = (program.accelerations(Material(derive(arrow(n))))[0] for n in (3, 5, 7))
+    flops = [acceleration.cost.flops for acceleration in found]
     assert flops[2] - flops[1] == flops[1] - flops[0]
     ldl = derive(arrow(3)).ldl
     assert isinstance(ldl, Solution)

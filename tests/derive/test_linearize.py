@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from cases import SCENES, variant
-from conftest import MODULES, tiers
+from conftest import MODULES, Modules, tiers
 
 import eomc
 
@@ -118,14 +117,11 @@ def test_jumping_forces_are_refused() -> None:
 @pytest.mark.parametrize(
     "name", tiers(("cartpole", "cartpole_driven", "heavy_top", "chain"), "cartpole_driven")
 )
-@pytest.mark.usefixtures("quickly_compiled")
-def test_derivatives_by_parameters(name: str, tmp_path: Path) -> None:
+def test_derivatives_by_parameters(name: str, modules: Modules) -> None:
     """Against central differences, whose own error is that of h^2 and of rounding over h."""
     text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
     head, _, tail = text.partition("[run]\n")
-    path = tmp_path / f"{name}.toml"
-    path.write_text(f'{head}[run]\nlinearize = "parameters"\n{tail}', encoding="utf-8")
-    m = eomc.load(path, tmp_path)
+    m = modules.unoptimised(f'{head}[run]\nlinearize = "parameters"\n{tail}')
     random = np.random.default_rng(3)
     q, qd = random.uniform(0.3, 1.0, (2, len(m.coordinates)))
     u = random.standard_normal(len(m.inputs)) if m.inputs else None
@@ -137,6 +133,5 @@ def test_derivatives_by_parameters(name: str, tmp_path: Path) -> None:
         size = max(1.0, np.abs(E).max())
         np.testing.assert_allclose(E[:, k], (up - down) / (2 * by), rtol=1e-6, atol=1e-7 * size)
     assert np.abs(E).max() > 0
-    plain = eomc.load(SCENES / f"{name}.toml", tmp_path / "plain")
     with pytest.raises(ValueError, match='linearize = "parameters"'):
-        plain.sensitivity(q, qd, u)
+        modules(name).sensitivity(q, qd, u)

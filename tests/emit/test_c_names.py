@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-from conftest import tiers
+from conftest import Modules, tiers
 
-import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify.check import check
@@ -56,9 +53,8 @@ IMPLICIT = 'method = "gauss4"\nlinearize = "parameters"'
 @pytest.mark.parametrize(
     "text", tiers([UNUSED, COORDINATES], COORDINATES), ids=["unused", "coordinates"]
 )
-@pytest.mark.usefixtures("quickly_compiled")
-def test_names_that_temporaries_have_too(text: str, run: str, tmp_path: Path) -> None:
+def test_names_that_temporaries_have_too(text: str, run: str, modules: Modules) -> None:
     """A parameter that a function does not read once had its name taken, and its value too."""
     made = from_scene(parse(f"{text}[run]\nduration = 2\nh = 0.01\n{run}\n"))
-    report = check(made, eomc.load(made, tmp_path), states=4)
+    report = check(made, modules.unoptimised(made), states=4)
     assert report.passed, report.table()

@@ -11,6 +11,7 @@ from typing import Any
 import jinja2.meta
 import pytest
 from cases import SCENES
+from conftest import tiers
 
 import eomc
 from eomc.base import resources
@@ -81,7 +82,10 @@ def test_no_c_syntax_in_python(module: str) -> None:
     assert not [t for t in texts if re.search(r"->|\bconst\b|;$|\{$", t)]
 
 
-@pytest.mark.parametrize("name", ["cartpole", "cartpole_driven", "chain", "suspension"])
+@pytest.mark.parametrize(
+    "name",
+    tiers(["cartpole", "cartpole_driven", "chain", "suspension"], "cartpole", "cartpole_driven"),
+)
 def test_public_functions_are_those_of_the_header(name: str) -> None:
     """Each is declared there once, with these arguments."""
     made = program.build(lagrange.derive(eomc.read(SCENES / f"{name}.toml")))

@@ -13,9 +13,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from builds import KEPT
 from cases import SCENES, fast_kit, scene_system
 from compilers import STRICT, compiled
-from conftest import EVERYTHING, needs, tiers
+from conftest import EVERYTHING, Modules, needs, tiers
 from sympy import S
 
 import eomc
@@ -259,24 +260,30 @@ def test_compile_time_grows_with_the_size_and_no_faster(tmp_path: Path) -> None:
 # --- what they compute ---------------------------------------------------------------------------
 
 
+@pytest.fixture
+def root(request: pytest.FixtureRequest) -> Path:
+    """Where the modules of a test are kept from run to run, as long as this file stays as it is."""
+    return KEPT / "outline" / re.sub(r"\W+", "_", request.node.name)
+
+
 def module(made: Program, root: Path) -> ModuleType:
     """A program compiled under `root`."""
-    name = made.system.name
-    key = cache.key(made.system.digest, str(root))
+    name, mine = made.system.name, Path(__file__).read_text(encoding="utf-8")
+    key = cache.key(made.system.digest, f"{root} {mine}")
     return cache.load(cache.build(name, key, lambda extension: render(made, extension), root))
 
 
 @pytest.mark.slow
 def test_a_system_in_pieces_moves_as_it_does_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every function, single runs and batches; the operations are contracted in other places."""
     run = 'batch = true\nmethod = ["rk4", "dp8"]'
     plain = derived(everything(run))
-    whole = module(plain, tmp_path / "whole")
+    whole = module(plain, root / "whole")
     monkeypatch.setattr(outline, "LARGE", 20)
     monkeypatch.setattr(outline, "PIECE", 25)
-    cut = module(plain, tmp_path / "cut")
+    cut = module(plain, root / "cut")
     random_state = np.random.default_rng(3)
     q0, qd0 = (x + 0.1 * random_state.standard_normal((75, 3)) for x in whole.start)
     for name in ("D", "g"):
@@ -301,10 +308,10 @@ def test_a_system_in_pieces_moves_as_it_does_whole(
 
 
 def test_a_bad_instance_leaves_the_others_alone_in_pieces_too(
-    in_small_pieces: None, tmp_path: Path
+    in_small_pieces: None, root: Path
 ) -> None:
     made = eomc.read(SCENES / "kepler_orbit.toml")
-    m = module(derived(replace(made, run=replace(made.run, batch=True))), tmp_path)
+    m = module(derived(replace(made, run=replace(made.run, batch=True))), root)
     q0, qd0 = np.tile(m.start[0], (70, 1)), np.tile(m.start[1], (70, 1))
     good = m.simulate_batch(q0, qd0, steps=STEPS)
     q0[41] = 0.0  # at the centre, where the force is infinite
@@ -315,13 +322,13 @@ def test_a_bad_instance_leaves_the_others_alone_in_pieces_too(
 
 
 def test_signals_and_held_inputs_reach_a_batch_in_pieces(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, root: Path
 ) -> None:
     monkeypatch.setattr(outline, "LARGE", 8)
     monkeypatch.setattr(outline, "PIECE", 8)
     made = scene_system("cartpole_driven")
-    m = module(derived(replace(made, run=replace(made.run, batch=True))), tmp_path)
-    source = tmp_path / made.name / "fast" / f"{made.name}.c"
+    m = module(derived(replace(made, run=replace(made.run, batch=True))), root)
+    source = root / made.name / "fast" / f"{made.name}.c"
     assert "_rates_2_wide(" in source.read_text(encoding="utf-8")
     q0, qd0 = (np.tile(x, (9, 1)) for x in m.start)
     q0[:, 1] += np.linspace(-1, 1, 9)
@@ -363,18 +370,18 @@ def by_columns(made: Program) -> Program:
 )
 @pytest.mark.parametrize("small", tiers([False, True], True))
 def test_matrices_by_columns_are_the_matrices(
-    name: str, small: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, small: bool, tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain = derived(eomc.read(SCENES / f"{name}.toml"))
-    whole = module(plain, tmp_path / "whole")
+    whole = module(plain, root / "whole")
     if small:
         monkeypatch.setattr(outline, "LARGE", 5)
         monkeypatch.setattr(outline, "PIECE", 8)
     made = render(by_columns(plain), "_x")
     source = written(made, tmp_path)
     assert f"By {len(plain.system.q)} columns, each: " in made.files[f"{name}.h"]
-    compiled(needs("gcc"), *STRICT, "-O2", "-I.", "-c", source, "selftest.c", cwd=tmp_path)
-    columns = module(by_columns(plain), tmp_path / "columns")
+    compiled(needs("gcc"), *STRICT, "-O1", "-I.", "-c", source, "selftest.c", cwd=tmp_path)
+    columns = module(by_columns(plain), root / "columns")
     states = np.random.default_rng(4).standard_normal((2, 9, len(plain.system.q)))
     for found, expected in (
         (columns.D(states[0]), whole.D(states[0])),
@@ -390,7 +397,7 @@ def test_matrices_by_columns_are_the_matrices(
 # --- names ---------------------------------------------------------------------------------------
 
 
-def test_parameters_may_be_called_like_directions(tmp_path: Path) -> None:
+def test_parameters_may_be_called_like_directions(root: Path) -> None:
     """The entries of a direction, for D and the Jacobian, have names that no scene can have."""
     text = """
         eomc = 1
@@ -409,20 +416,20 @@ def test_parameters_may_be_called_like_directions(tmp_path: Path) -> None:
     found = []
     for name in ("x_along", "m"):
         made = system.from_scene(scene.parse(text.replace("NAME", name), "clash.toml"))
-        built = module(derived(made), tmp_path / name)
+        built = module(derived(made), root / name)
         found.append((built.D(q), built.acceleration(q, qd), *built.linearize(q, qd)[:2]))
     np.testing.assert_array_equal(found[0][0], np.diag([2.0, 1.09]))
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_parameters_may_be_called_like_values(tmp_path: Path) -> None:
+def test_parameters_may_be_called_like_values(root: Path, modules: Modules) -> None:
     """w1 is a name of ours inside a function that does not read the parameter."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     awkward = re.sub(r"(?m)^g( +=)", r"w1\1", text).replace("m_p*g*y_p", "m_p*w1*y_p")
     assert awkward.count("w1") == 2
-    found = module(derived(system.from_scene(scene.parse(awkward, "awkward.toml"))), tmp_path)
-    plain = eomc.load(SCENES / "cartpole.toml", tmp_path)
+    found = module(derived(system.from_scene(scene.parse(awkward, "awkward.toml"))), root)
+    plain = modules.unoptimised(scene_system("cartpole"))
     state = ([0.1, 0.4], [0.2, -0.3])
     assert np.array_equal(found.acceleration(*state), plain.acceleration(*state))
     assert np.array_equal(found.C(*state), plain.C(*state))

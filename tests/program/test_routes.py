@@ -60,7 +60,9 @@ def test_a_comment_says_how_d_is_solved(name: str) -> None:
 def test_no_other_file_compares_their_names() -> None:
     package = Path(__file__).parents[2] / "generator" / "eomc"
     files = [f for f in package.rglob("*.py") if f.name != "routes.py"]
-    trees = {f: ast.parse(f.read_text(encoding="utf-8")) for f in files}
+    texts = {f: f.read_text(encoding="utf-8") for f in files}
+    named = {f: text for f, text in texts.items() if any(f'"{route}"' in text for route in ROUTES)}
+    trees = {f: ast.parse(text) for f, text in named.items()}
     compared = [
         (f.name, node.lineno)
         for f, tree in trees.items()
@@ -69,5 +71,5 @@ def test_no_other_file_compares_their_names() -> None:
         for part in ast.walk(node)
         if isinstance(part, ast.Constant) and part.value in ROUTES
     ]
-    assert files
+    assert len(files) > 100
     assert not compared

@@ -17,6 +17,7 @@ from eomc.scene.read import read
 pytest.importorskip("matplotlib")
 
 SCENES = Path(__file__).parents[2] / "scenes"
+SLOW = pytest.mark.slow  # pictures in PNG and SVG are drawn by other quick tests
 
 
 def cartpole():
@@ -43,7 +44,11 @@ def spring(n=1):
 
 @pytest.mark.parametrize(
     ("run", "suffix"),
-    [(cartpole, ".png"), (cartpole, ".svg"), (spring, ".png"), (spring, ".svg"), (spring, ".pdf")],
+    [
+        pytest.param(run, suffix, marks=() if (run, suffix) == (spring, ".pdf") else SLOW)
+        for run in (cartpole, spring)
+        for suffix in plot.SUFFIXES
+    ],
 )
 def test_files_are_written(tmp_path, run, suffix):
     file = tmp_path / f"picture{suffix}"
@@ -164,7 +169,10 @@ def test_without_matplotlib_one_sentence_says_what_to_do(tmp_path, monkeypatch):
         plot.draw(*spring(), tmp_path / "a.png")
 
 
-def test_unknown_suffixes_and_folders_are_reported(tmp_path):
+def test_unknown_suffixes_and_folders_are_reported(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(plot, "figure", lambda *_: Figure())
     with pytest.raises(EomcError, match=r"\.png, \.svg, \.pdf"):
         plot.draw(*spring(), tmp_path / "a.jpg")
     with pytest.raises(EomcError, match="can't be written"):

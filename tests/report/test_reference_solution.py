@@ -79,8 +79,13 @@ def test_more_cases_have_25_digits(name: str) -> None:
     agrees(name)
 
 
-def test_an_oscillator_is_cos_all_along(tmp_path: Path) -> None:
-    made = reference_solution.of(oscillator(), rows=8, root=tmp_path)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> reference_solution.Reference:
+    """That of the oscillator."""
+    return reference_solution.of(oscillator(), rows=8, root=tmp_path_factory.mktemp("oscillator"))
+
+
+def test_an_oscillator_is_cos_all_along(made: reference_solution.Reference) -> None:
     with mpmath.workdps(40):
         for k, (q, qd) in enumerate(zip(made.q[:, 0], made.qd[:, 0], strict=True)):
             t = mpmath.mpf(2) * k / 8
@@ -91,8 +96,7 @@ def test_an_oscillator_is_cos_all_along(tmp_path: Path) -> None:
     np.testing.assert_array_equal(made.t, np.arange(9) / 4)
 
 
-def test_differences_are_right_below_double_precision(tmp_path: Path) -> None:
-    made = reference_solution.of(oscillator(), rows=4, root=tmp_path)
+def test_differences_are_right_below_double_precision(made: reference_solution.Reference) -> None:
     nearest = made.q.astype(float)
     off = made.off(nearest, made.qd.astype(float))[:, 0]
     expected = [float(Fraction(float(x)) - Fraction(str(s))) for x, s in zip(

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import sys
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from batches import STEPS, module, starts
-from conftest import tiers
-
-import eomc
+from conftest import Modules, tiers
 
 NAMES = ["cartpole", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum"]
 
@@ -146,16 +143,14 @@ def test_starts_of_any_layout_are_read_and_left_alone() -> None:
         assert np.array_equal(runs.q, wanted.q) and np.array_equal(runs.qd, wanted.qd)
 
 
-@pytest.mark.usefixtures("quickly_compiled")
-def test_long_rows_start_where_they_should(tmp_path: Path) -> None:
+def test_long_rows_start_where_they_should(modules: Modules) -> None:
     """Nine masses in a row, on springs."""
     names = [f"x{k}" for k in range(9)]
     springs = " + ".join(f"({a} - {b})**2" for a, b in pairwise(["1", *names, "2"]))
     lines = ["eomc = 1", 'name = "row"', "[coordinates]", *(f"{x} = {{}}" for x in names)]
     lines += ["[energy]", f'kinetic = "{" + ".join(f"{x}_dot**2" for x in names)}"']
     lines += [f'potential = "{springs}"', "[run]", "batch = true"]
-    (tmp_path / "row.toml").write_text("\n".join(lines), encoding="utf-8")
-    m = eomc.load(tmp_path / "row.toml", tmp_path)
+    m = modules.unoptimised("\n".join(lines))
     q0, qd0 = starts(m, 20)
     for given in (q0, q0.astype(np.float32)):
         runs = m.simulate_batch(given, qd0, h=0.01, steps=3)
@@ -234,15 +229,12 @@ def test_single_precision() -> None:
 
 
 @pytest.mark.parametrize("inputs", [True, False])
-@pytest.mark.usefixtures("quickly_compiled")
-def test_a_scene_without_parameters(tmp_path: Path, inputs: bool) -> None:
-    file = tmp_path / "bare.toml"
+def test_a_scene_without_parameters(modules: Modules, inputs: bool) -> None:
     given = "[inputs]\nf = { signal = 0.5 }\n[forces]\nx = 'f'\n" if inputs else ""
-    file.write_text(
+    bare = modules.unoptimised(
         "eomc = 1\nname = 'bare'\n[coordinates]\nx = { start = 1.0 }\n"
         f"{given}[energy]\nkinetic = 'x_dot**2/2'\npotential = 'x**2/2'\n[run]\nbatch = true\n"
     )
-    bare = eomc.load(file, tmp_path)
     runs = bare.simulate_batch([[1.0], [2.0]], [[0.0], [0.0]], h=0.01, steps=100, every=100)
     alone = bare.simulate([2.0], [0.0], h=0.01, steps=100, every=100)
     np.testing.assert_allclose(runs.q[1, -1], alone.q[-1], rtol=1e-14)

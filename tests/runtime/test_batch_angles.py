@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from batches import STEPS, module, starts
-from conftest import tiers
-
-import eomc
+from conftest import Modules, tiers
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
@@ -67,15 +63,13 @@ def test_turns_by_accelerations_are_as_good_as_computed_sines(h: float, real: st
 
 
 @pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
-def test_turns_by_velocities_are_as_good_as_computed_sines(real: str, tmp_path: Path) -> None:
+def test_turns_by_velocities_are_as_good_as_computed_sines(real: str, modules: Modules) -> None:
     """A heavy rotor turns evenly, by up to 2.4 rad a step, and pushes a mass by its sine."""
-    (tmp_path / "rotor.toml").write_text(
+    m = modules.of_text(
         "eomc = 1\nname = 'rotor'\n[coordinates]\nx = {}\ntheta = {}\n[energy]\n"
         "kinetic = 'x_dot**2/2 + 100*theta_dot**2'\npotential = 'x*sin(theta)'\n"
-        f"[run]\nbatch = true\nreal = '{real}'\n",
-        encoding="utf-8",
+        f"[run]\nbatch = true\nreal = '{real}'\n"
     )
-    m = eomc.load(tmp_path / "rotor.toml", tmp_path)
     q0, qd0 = (x.astype(m.dtype) for x in starts(m, 400))
     qd0[:, 1] = np.linspace(0, 2.4, 400)
     runs = m.simulate_batch(q0, qd0, h=1.0, steps=1)

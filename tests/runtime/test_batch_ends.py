@@ -5,13 +5,11 @@ from __future__ import annotations
 import _thread
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from batches import STEPS, module, starts
-
-import eomc
+from conftest import Modules
 
 
 def test_a_bad_instance_leaves_the_others_alone() -> None:
@@ -52,16 +50,13 @@ def test_a_singular_instance_is_reported_though_its_numbers_are_finite(m_c: floa
 
 
 @pytest.mark.parametrize("method", ["rk4", "dp8"])
-@pytest.mark.usefixtures("quickly_compiled")
-def test_positions_and_velocities_overflow_each_alone(method: str, tmp_path: Path) -> None:
+def test_positions_and_velocities_overflow_each_alone(method: str, modules: Modules) -> None:
     """Under a force, near the largest double; what the other makes of it is finite."""
-    (tmp_path / "push.toml").write_text(
+    m = modules.unoptimised(
         "eomc = 1\nname = 'push'\n[coordinates]\nx = {}\n[parameters]\nf = 1e299\n[energy]\n"
         "kinetic = 'x_dot**2/2'\npotential = '-f*x'\n"
-        f"[run]\nh = 0.01\nbatch = true\nmethod = '{method}'\n",
-        encoding="utf-8",
+        f"[run]\nh = 0.01\nbatch = true\nmethod = '{method}'\n"
     )
-    m = eomc.load(tmp_path / "push.toml", tmp_path)
     largest = np.finfo(float).max
     q0, qd0 = np.zeros((9, 1)), np.zeros((9, 1))
     qd0[2] = largest

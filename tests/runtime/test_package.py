@@ -12,13 +12,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from builds import CHANGED, TEXT
 from cases import SCENES
 from conftest import MODULES, Modules
 
 import eomc
 from eomc.model.system import System, symbol, t
-
-PENDULUM = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
 
 
 def test_says_what_it_is(cartpole: ModuleType, driven: ModuleType) -> None:
@@ -79,17 +78,16 @@ def test_modules_side_by_side(cartpole: ModuleType, driven: ModuleType, modules:
     assert driven.Params is not cartpole.Params
 
 
-def test_a_changed_scene_is_a_new_module_in_the_same_process(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("quickly_compiled", "found")
+def test_a_changed_scene_is_a_new_module_in_the_same_process(scene: Path, root: Path) -> None:
     """And the old one, still held, still works."""
-    file = tmp_path / "simple_pendulum.toml"
-    file.write_text(PENDULUM, encoding="utf-8")
-    old = eomc.load(file, tmp_path / "build")
-    file.write_text(PENDULUM.replace('"m*g*y"', '"2*m*g*y"'), encoding="utf-8")
-    new = eomc.load(file, tmp_path / "build")
+    old = eomc.load(scene, root)
+    scene.write_text(CHANGED, encoding="utf-8")
+    new = eomc.load(scene, root)
     assert new.g([1.0]) == 2 * old.g([1.0])
     assert new.simulate(steps=10).q[-1] != old.simulate(steps=10).q[-1]
-    file.write_text(PENDULUM, encoding="utf-8")
-    assert eomc.load(file, tmp_path / "build").g([1.0]) == old.g([1.0])
+    scene.write_text(TEXT, encoding="utf-8")
+    assert eomc.load(scene, root).g([1.0]) == old.g([1.0])
 
 
 def test_the_folder_is_a_package_that_needs_numpy_and_cffi_alone(tmp_path: Path) -> None:

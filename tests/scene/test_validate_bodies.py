@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import pytest
+from conftest import tiers
 
 from eomc.base.errors import SceneError
 from eomc.scene import formulas
@@ -306,8 +307,9 @@ friction_width = "w"
             scene.parse(text, parameters=values)
 
 
-def test_thousands_of_bodies_are_read():
+@pytest.mark.parametrize("number", tiers([1000, 4000], 1000))
+def test_thousands_of_bodies_are_read(number):
     text = (SCENES / "chain.toml").read_text(encoding="utf-8")
-    made = scene.parse(text.replace("value = 5", "value = 4000"))  # and 4000 coordinates
-    assert len(made.assembly.bodies) == 4000
-    assert math.isclose(made.start()[0][-1], 400.0)
+    made = scene.parse(text.replace("value = 5", f"value = {number}"))  # and as many coordinates
+    assert len(made.assembly.bodies) == number
+    assert math.isclose(made.start()[0][-1], number / 10)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import signal
 import stat
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import pytest
 from builds import gravity, leftovers, script
+from instrument import in_a_fork
 
 import eomc
 from eomc.toolchain import cache
@@ -76,11 +76,13 @@ def test_only_a_file_is_locked(
     assert not (tmp_path / "nowhere").exists() and not (root / "simple_pendulum").exists()
 
 
-def test_a_lock_is_not_emptied(scene: Path, root: Path) -> None:
+def test_a_lock_is_not_emptied(scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root.mkdir()
     lock = root / ".simple_pendulum.lock"
     lock.write_text("a hard link to something", encoding="utf-8")
-    eomc.build(scene, root)
+    monkeypatch.setenv("CC", "false")  # called while the lock is held
+    with pytest.raises(eomc.EomcError, match="the C compiler failed"):
+        eomc.build(scene, root)
     assert lock.read_text(encoding="utf-8") == "a hard link to something"
 
 
@@ -116,8 +118,9 @@ def test_a_package_of_somebody_else_is_not_replaced(scene: Path, root: Path) -> 
 def test_every_bit_of_a_build_is_looked_at(scene: Path, root: Path, found: None) -> None:
     """A damaged extension of the right size would end the process that loads it."""
     folder = root / "simple_pendulum"
-    files = [f for f in sorted(folder.iterdir()) if f.is_file() and f.name != "build.json"]
+    files = [f for f in sorted(folder.rglob("*.*")) if f.suffix not in (".json", ".pyc")]
     assert {".so", ".py", ".c", ".h"} <= {f.suffix for f in files}
+    assert {folder / "simple_pendulum.h", folder / "fast" / "simple_pendulum.h"} <= set(files)
     for file in files:
         good = file.read_bytes()
         for at in (0, len(good) // 2, len(good) - 1):
@@ -125,6 +128,10 @@ def test_every_bit_of_a_build_is_looked_at(scene: Path, root: Path, found: None)
             bad[at] ^= 4
             file.write_bytes(bytes(bad))
             assert not cache.found(folder, _key(folder)), file
+        file.write_bytes(b"")
+        assert not cache.found(folder, _key(folder)), file
+        file.unlink()
+        assert not cache.found(folder, _key(folder)), file
         file.write_bytes(good)
     assert cache.found(folder, _key(folder))
     assert not eomc.build(scene, root).fresh
@@ -205,23 +212,23 @@ def test_what_is_no_compiler(
         eomc.build(scene, root)
 
 
-def test_flags_that_are_no_text(scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flags_that_are_no_text(
+    scene: Path, root: Path, found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The build with others takes the place of that without, once."""
     monkeypatch.setenv("EOMC_CFLAGS", "-O0 -DX=\udcff")
     assert eomc.build(scene, root).fresh
     assert not eomc.build(scene, root).fresh
+    assert len(list((root / "simple_pendulum").glob("_simple_pendulum_*"))) == 1
 
 
 def test_a_full_device(scene: Path, root: Path, built: float) -> None:
     """As `ulimit -f`: the old module stays."""
-    code = (
-        "import resource, signal, sys, eomc\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
-        "try: eomc.build(*sys.argv[1:])\n"
-        "except eomc.EomcError as fault: print(fault)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-B", "-c", code, str(scene), str(root)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert "can't be written (File too large)" in done.stdout
+
+    def build() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
+        eomc.build(scene, root)
+
+    how, words = in_a_fork(build, 20)
+    assert how == "raised" and "can't be written (File too large)" in str(words)
     assert leftovers(root) == [] and gravity(root) == built

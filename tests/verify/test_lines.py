@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 from cases import SCENES
+from compilers import compiled, run
 from conftest import needs, tiers
-from instrument import missed
+from instrument import missed, unexecuted
 
-QUICK = ("cartpole", "cartpole_driven")
+FIRST = ("mass_spring", "cartpole", "cartpole_driven")
 
 # other lines under [run], and scenes to have them
 VARIANTS = {
@@ -83,14 +84,14 @@ def after_solve(name: str, source: str) -> set[int]:
     return found
 
 
-@pytest.mark.parametrize("name", tiers(QUICK, "cartpole_driven"))
+@pytest.mark.parametrize("name", tiers(FIRST, "mass_spring"))
 def test_every_line_is_executed(name: str, tmp_path: Path) -> None:
     assert unexplained(name, text_of(name), tmp_path) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [p.stem for p in sorted(SCENES.glob("*.toml")) if p.stem not in QUICK]
+    "name", [p.stem for p in sorted(SCENES.glob("*.toml")) if p.stem not in FIRST]
 )
 def test_every_line_of_every_scene_is_executed(name: str, tmp_path: Path) -> None:
     assert unexplained(name, text_of(name), tmp_path) == []
@@ -108,14 +109,33 @@ def test_every_refusal_of_gauss16_is_provoked(tmp_path: Path) -> None:
     assert unexplained("gentle", GENTLE, tmp_path) == []
 
 
+PROGRAM = """int main(int count, char **words)
+{
+    if (count > 1)
+        return words[1][0];
+    return 0;
+}
+"""
+
+
+def test_gcov_tells_which_lines_were_not_executed(tmp_path: Path) -> None:
+    needs("gcov")
+    (tmp_path / "scene.c").write_text(PROGRAM, encoding="utf-8")
+    compiled("gcc", "-O0", "--coverage", "-c", "scene.c", "-o", "scene.o", cwd=tmp_path)
+    compiled("gcc", "--coverage", "scene.o", "-o", "scene", cwd=tmp_path)
+    assert run("./scene", cwd=tmp_path).returncode == 0
+    assert list(unexecuted(tmp_path)) == [(4, "return words[1][0];")]
+
+
+@pytest.mark.slow
 def test_lines_that_are_not_executed_are_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the rows about refusals, these are left out."""
+    """Without the rows about refusals, these are left out; those about properties say nothing."""
     import instrument
 
     needs("gcov")
-    without = "check.compiled_rows = lambda made: None\nreport = check.check"
+    without = "check.compiled_rows = check.property_rows = lambda made: None\nreport = check.check"
     monkeypatch.setattr(
         instrument, "CHECK", instrument.CHECK.replace("report = check.check", without)
     )

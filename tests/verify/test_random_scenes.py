@@ -5,17 +5,17 @@ Many more of both: python tests/random_scenes.py --count 2000 [--negate].
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import scene_author
-from conftest import tiers
+from conftest import Modules, tiers
 from random_scenes import JUDGES, outcome
 from scene_author import scene_text
 
-import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify.check import check
@@ -198,19 +198,22 @@ REGRESSIONS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
-def checked(text: str, root: Path) -> Report:
-    made = from_scene(parse(text, "test.toml"))
-    return check(made, eomc.load(made, root))
+def checked(text: str, modules: Modules) -> Report:
+    return check(from_scene(parse(text, "test.toml")), modules.unoptimised(text))
+
+
+@cache
+def right(text: str, modules: Modules) -> Report:
+    """As it is, for several tests."""
+    return checked(text, modules)
 
 
 @pytest.mark.parametrize("what", tiers(REGRESSIONS, "friction of a body", "friction alone"))
-def test_right_modules_pass(tmp_path: Path, what: str) -> None:
-    report = checked(REGRESSIONS[what], tmp_path)
+def test_right_modules_pass(modules: Modules, what: str) -> None:
+    report = right(REGRESSIONS[what], modules)
     assert report.passed, report.table()
     about = [row for row in report.rows if any(word in row.name for word in JUDGES)]
     assert all(row.judged for row in about), report.table()
@@ -248,10 +251,10 @@ linearize = true
 """
 
 
-def test_derivatives_are_compared_where_small_terms_count(tmp_path: Path) -> None:
+def test_derivatives_are_compared_where_small_terms_count(modules: Modules) -> None:
     """A term of order x**4 beside 1, in a motion that stays within 1e-2 for what is drawn."""
     made = from_scene(parse(FAR, "test.toml"))
-    comparison = Comparison(made, eomc.load(made, tmp_path), np.random.default_rng(0), None)
+    comparison = Comparison(made, modules.unoptimised(FAR), np.random.default_rng(0), None)
     near = max(abs(float(e.state.q[0])) for e in comparison.expected)
     (far,) = comparison.sampler.farther()
     assert abs(float(far.state.q[0])) > 2 * near
@@ -296,44 +299,35 @@ inertia = 0.1
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [WOUND, WOUND_ARM])
-def test_an_angle_that_is_wound_up_may_throw_another_coordinate(tmp_path: Path, text: str) -> None:
-    report = checked(text, tmp_path)
+def test_an_angle_that_is_wound_up_may_throw_another_coordinate(
+    modules: Modules, text: str
+) -> None:
+    report = checked(text, modules)
     assert report.passed, report.table()
 
 
 @pytest.mark.parametrize("potential", ["x**2", "max(-x, 0)**2"])
 def test_rounding_is_not_judged_where_steps_leap_over_a_bend(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, potential: str
+    modules: Modules, monkeypatch: pytest.MonkeyPatch, potential: str
 ) -> None:
     monkeypatch.setattr(Runs, "rounded", lambda *_: 99.0)
     text = WELL.replace("-depth*exp(-x**2)", potential).replace(', "gauss8", "gauss16"', "")
-    (row,) = (r for r in checked(text, tmp_path).rows if r.name == "rk4 rounding")
+    (row,) = (r for r in checked(text, modules).rows if r.name == "rk4 rounding")
     bends = "max" in potential
     assert row.passed == bends and row.judged != bends
     assert (row.unit == "not judged: steps leap over max") == bends
 
 
-def test_advice_near_stiff_friction_is_judged_by_eigenvalues(tmp_path: Path) -> None:
-    (row,) = (r for r in checked(DRAG, tmp_path).rows if r.name == "h of rk4")
+def test_advice_near_stiff_friction_is_judged_by_eigenvalues(modules: Modules) -> None:
+    (row,) = (r for r in right(DRAG, modules).rows if r.name == "h of rk4")
     assert row.passed and row.limit == 2 and 1 <= row.error < 1.1
     assert "eigenvalues" in row.unit
 
 
-def test_a_method_of_order_1_balances_power_at_order_1(tmp_path: Path) -> None:
+def test_a_method_of_order_1_balances_power_at_order_1(modules: Modules) -> None:
     text = ORDER_1.replace('["euler", "dp8"]', '"euler"')
-    (row,) = (r for r in checked(text, tmp_path).rows if r.name == "power balance")
+    (row,) = (r for r in checked(text, modules).rows if r.name == "power balance")
     assert row.error == pytest.approx(1, abs=0.1) and row.limit == 0.5
-
-
-def assert_right(seed: int, root: Path) -> None:
-    found = outcome(seed, False, root)
-    assert found.outcome == "passed", (found, scene_text(seed))
-
-
-def assert_caught(seed: int, root: Path) -> None:
-    """Unless what was negated changes no value, or is refused at once."""
-    found = outcome(seed, True, root)
-    assert found.outcome in ("caught", "unchanged", "refused"), (found, scene_text(seed))
 
 
 def test_scenes_are_the_same_for_the_same_number() -> None:
@@ -345,23 +339,15 @@ def test_scenes_are_the_same_for_the_same_number() -> None:
         assert any(word in text for text in texts), word
 
 
-@pytest.mark.parametrize("seed", tiers(range(3), 1))
+@pytest.mark.parametrize("seed", tiers(range(43), 2))
 def test_random_scenes_pass(tmp_path: Path, seed: int) -> None:
-    assert_right(seed, tmp_path)
+    found = outcome(seed, False, tmp_path)
+    assert found.outcome == "passed", (found, scene_text(seed))
 
 
-@pytest.mark.parametrize("seed", tiers(range(2), 0))
+@pytest.mark.parametrize("seed", tiers(range(23), 14))  # 14: an acceleration, seen in half a second
 def test_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> None:
-    assert_caught(seed, tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3, 43))
-def test_more_random_scenes_pass(tmp_path: Path, seed: int) -> None:
-    assert_right(seed, tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3, 23))
-def test_more_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> None:
-    assert_caught(seed, tmp_path)
+    """Unless what was negated changes no value, or is refused at once."""
+    found = outcome(seed, True, tmp_path)
+    assert found.outcome in ("caught", "unchanged", "refused"), (found, scene_text(seed))
+    assert found.outcome == "caught" or seed != 14

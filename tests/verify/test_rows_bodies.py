@@ -14,7 +14,7 @@ from conftest import tiers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from test_check import StandIn
+from stand_in import StandIn
 from trees import SHAPES, trees
 
 from eomc.model import multibody as building

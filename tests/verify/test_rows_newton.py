@@ -12,7 +12,7 @@ from instrument import Shipped, in_a_fork
 from mutants import variant
 
 from eomc.integrators.tableaux import METHODS
-from eomc.verify import one_step, rows_newton
+from eomc.verify import one_step, rows_newton, symbolic
 from eomc.verify.comparison import Comparison
 
 MADE = variant("pendulum_dp8_gauss8")
@@ -34,6 +34,7 @@ WRONG = {
 @pytest.fixture(scope="module")
 def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
     """The C of the double pendulum."""
+    symbolic.of(MADE).acceleration(*np.zeros((2, len(MADE.q))))  # made once, for all forks
     return Shipped(MADE, tmp_path_factory.mktemp("newton"))
 
 

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from cases import scene_system
 from instrument import Shipped, in_a_fork
 from mutants import variant
+from stand_in import StandIn
 
+from eomc.verify import symbolic
 from eomc.verify.comparison import Comparison
 from eomc.verify.rows_runs import Runs
 
@@ -20,6 +25,7 @@ STAGE = "x[k] = at[k][j];"
 @pytest.fixture(scope="module")
 def shipped(tmp_path_factory: pytest.TempPathFactory) -> Shipped:
     """The C of the double pendulum with rk4 and gauss16."""
+    symbolic.of(MADE).acceleration(*np.zeros((2, len(MADE.q))))  # made once, for all forks
     return Shipped(MADE, tmp_path_factory.mktemp("runs"))
 
 
@@ -37,6 +43,15 @@ def found(shipped: Shipped, source: str, row: Callable[[Comparison], object]) ->
     return value
 
 
+def test_a_step_that_is_refused_without_need_fails() -> None:
+    """Of a method whose sweeps come to their end on the reference."""
+    system = scene_system("mass_spring")
+    module: Any = StandIn(symbolic.derive(system))
+    module.simulate = lambda **how: SimpleNamespace(status="no convergence")
+    comparison = Comparison(system, module, np.random.default_rng(0), 4)
+    assert comparison.step_by("gauss16") == math.inf
+
+
 @pytest.mark.slow
 def test_steps_of_every_method_are_compared_at_angles_far_out(shipped: Shipped) -> None:
     """There stages of gauss16 are computed one by one, which stands last in its sweep."""
@@ -46,6 +61,7 @@ def test_steps_of_every_method_are_compared_at_angles_far_out(shipped: Shipped) 
     assert found(shipped, wrong, lambda check: Runs(check).far()) > Runs.limit
 
 
+@pytest.mark.slow
 def test_a_stepper_that_refuses_what_it_could_do_fails(shipped: Shipped) -> None:
     right, wrong = "double most = 0, change = 0, size;", "double most = 0, change = 1, size;"
     assert shipped.source.count(right) == 1

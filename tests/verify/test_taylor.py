@@ -105,8 +105,9 @@ def test_every_function_of_the_formula_language() -> None:
     assert_alike(everything())
 
 
-def test_a_chain_of_three_links() -> None:
-    assert_alike(chain(3), rows=2)
+@pytest.mark.parametrize("links", tiers([2, 3], 2))
+def test_chains(links: int) -> None:
+    assert_alike(chain(links), rows=2)
 
 
 def test_all_parts_of_a_general_kinetic_energy() -> None:
@@ -148,9 +149,24 @@ def expressions(draw: st.DrawFn, leaves: tuple[Any, ...], depth: int = 3) -> Any
     return draw(st.sampled_from(FUNCTIONS))(draw(inner))
 
 
-@settings(max_examples=8, deadline=None, derandomize=True)
+FEW = settings(max_examples=2, deadline=None, derandomize=True)
+MANY = settings(FEW, max_examples=20)
+
+
+@FEW
 @drawn(st.data())
 def test_random_systems(data: st.DataObject) -> None:
+    look_at_a_random_system(data)
+
+
+@pytest.mark.slow
+@MANY
+@drawn(st.data())
+def test_many_random_systems(data: st.DataObject) -> None:
+    look_at_a_random_system(data)
+
+
+def look_at_a_random_system(data: st.DataObject) -> None:
     """Points at random formulas of two coordinates, the time and each other."""
     y, (a, b) = symbol("y"), (symbol("a"), symbol("b"))
     first = data.draw(expressions((x, y, t, sympy.Rational(1, 3))))
@@ -413,7 +429,8 @@ def test_runs_are_those_of_the_plain_reference() -> None:
 
 def test_the_size_decides() -> None:
     assert isinstance(symbolic.of(scene_system("heavy_top")), Reference)
-    assert isinstance(symbolic.of(chain(3)), Reference)
+    assert isinstance(symbolic.of(chain(2)), Reference)
+    assert symbolic.is_small(chain(3))
     assert isinstance(symbolic.of(chain(8)), Jets)
 
 

@@ -72,21 +72,28 @@ def build(derived: Derivation) -> Program:
         )
         for name in next(iter(found.values())).outputs
     }
-    ways = {r.name: r.accelerations(material) for r in ROUTES.values()}
-    candidates = {r: _solving(way, system) for r, way in ways.items() if isinstance(way, Solution)}
-    best = functions["acceleration"] = cheapest("acceleration", system, candidates)
-    taken = candidates[best.route]
+    best, taken, passed_over = accelerations(material)
+    functions["acceleration"] = best
     for made in _derivatives(system, taken):
         functions[made.name] = replace(made, route=best.route)
     functions |= {made.name: made for made in _outputs(system)}
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     notes = next(f.notes for f in found.values())
-    passed_over = {route: why for route, why in ways.items() if isinstance(why, str)}
     whole = Program(system, functions, notes, taken.order, passed_over)
     if unsuited := _unsuited(whole):
         raise SceneError(unsuited)
     return whole
+
+
+def accelerations(material: Material) -> tuple[Function, Candidate, dict[str, str]]:
+    """By their cheapest route; what that is made of; routes that were not tried, and why."""
+    ways = {r.name: r.accelerations(material) for r in ROUTES.values()}
+    system = material.derived.system
+    candidates = {r: _solving(way, system) for r, way in ways.items() if isinstance(way, Solution)}
+    best = cheapest("acceleration", system, candidates)
+    passed_over = {route: why for route, why in ways.items() if isinstance(why, str)}
+    return best, candidates[best.route], passed_over
 
 
 def _solving(solution: Solution, system: System) -> Candidate:

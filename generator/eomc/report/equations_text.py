@@ -53,7 +53,7 @@ def equations(system: System, form: str = "text") -> str:
             )
         return _assignments(made)
     plain = symbolic.derive(system)
-    found = plain.simplified()
+    found = plain.simplified
     values = {name: _readable(getattr(found, name)) for name in (*_MATRICES, *_SCALARS)}
     if sympy.expand(plain.jacobi - plain.energy) == 0:
         del values["jacobi"]

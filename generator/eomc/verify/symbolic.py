@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ WRITTEN_OUT = 10_000  # some seconds of SymPy at five links
 SIMPLIFIED_WORK = 200_000  # squares of operations, added up: a few seconds of SymPy
 
 
+@lru_cache(maxsize=16)
 def derive(system: System) -> Reference:
     """D qdd + C qd + g = tau from d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, plainly.
 
@@ -41,6 +42,7 @@ def derive(system: System) -> Reference:
     - jacobi = p.qd - K + P, which is K + P where K is purely quadratic, and changes at the rate
       power = tau.qd - dL/dt, L = K - P at fixed q and qd.
 
+    The last few are kept, with their functions: a report asks for the same in three places.
     Raises EomcError where K is not quadratic in the velocities, or where a definition can't be
     differentiated.
     """
@@ -178,6 +180,7 @@ class Reference(Answer):
         """D by rows, bias and tau, which an acceleration needs together: (nq^2 + 2 nq, 1)."""
         return ImmutableMatrix([*self.D, *self.bias, *self.tau])
 
+    @cached_property
     def simplified(self) -> Reference:
         """The same in shorter forms, for people to read; what would take SymPy long stays."""
         names = ("D", "C", "g", "tau")
@@ -209,12 +212,10 @@ class Reference(Answer):
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> tuple[Vector, Vector]:
         """D and tau - bias, of one evaluation."""
-        n, one = q.shape[-1], q.ndim == 1
-        states = [(q, qd, float(t), u, values)] if one else self._states(q, qd, t, u, values)
-        found = np.array([self._one("motion", *state) for state in states])
-        D, bias, tau = np.split(found, [n * n, n * n + n], axis=1)
-        D, force = D.reshape(-1, n, n), tau - bias
-        return (D[0], force[0]) if one else (D, force)
+        n = q.shape[-1]
+        found = self._value("motion", q, qd, t, u, values)
+        D, bias, tau = found[..., : n * n], found[..., n * n : -n], found[..., -n:]
+        return D.reshape(*q.shape, n), tau - bias
 
     def _states(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values

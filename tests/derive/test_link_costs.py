@@ -1,0 +1,232 @@
+"""What accelerations by link multipliers cost, and which systems they are not for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy
+from cases import scene_system
+from conftest import Modules, tiers
+from links import (
+    A_DOT,
+    B_DOT,
+    CHAIN,
+    PARAMETERS,
+    L,
+    R,
+    a,
+    b,
+    by_multipliers,
+    c,
+    cheapest,
+    cos,
+    hung,
+    independent,
+    links,
+    m,
+    made_of,
+    moving,
+    sin,
+    states,
+    x,
+    y,
+)
+
+from eomc.derive import ldl, link_multipliers
+from eomc.model.system import System, dot
+from eomc.program.interpret import evaluate
+from eomc.program.ir import Call
+
+EPS = 2.0**-52
+
+# --- what it costs -------------------------------------------------------------------------------
+
+
+BATCH = "\n[run]\nbatch = true\n"
+
+
+@pytest.mark.parametrize(
+    "n, equal, unequal", tiers([(5, 82, 104), (10, 177, 224), (20, 367, 464)], 10)
+)
+def test_flops_of_a_chain(n: int, equal: int, unequal: int) -> None:
+    """19 a link, and five more where masses and lengths differ; up to 24 where none is to wait."""
+    chain = [k - 1 for k in range(n)]
+    assert by_multipliers(made_of(links(chain) + BATCH)).cost.flops <= equal
+    assert by_multipliers(made_of(links(chain, equal=False) + BATCH)).cost.flops <= unequal
+    prompt = by_multipliers(made_of(links(chain))).cost
+    assert prompt.flops <= 24 * n
+    assert prompt.divisions <= n // 2
+
+
+def test_a_chain_is_eliminated_from_both_ends() -> None:
+    """So that only half of its divisions wait for one another."""
+    order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]) + BATCH)).order
+    assert [order.index(k) for k in range(4)] == sorted(order.index(k) for k in range(4))
+    assert [order.index(k) for k in (8, 7, 6, 5)] == sorted(order.index(k) for k in (5, 6, 7, 8))
+    assert order[-1] == 4
+
+
+@pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
+def test_the_order_names_the_last_coordinate_of_each_angle(relative: bool) -> None:
+    """That of the link itself, whatever it is measured from."""
+    order = link_multipliers.solution(made_of(links(CHAIN, relative=relative))).order
+    assert sorted(order) == [0, 1, 2, 3, 4]
+
+
+def test_every_other_link_goes_first_where_one_trajectory_is_all() -> None:
+    """Their pivots depend on parameters alone; the others then from both ends."""
+    order = link_multipliers.solution(made_of(links([k - 1 for k in range(9)]))).order
+    assert set(order[:5]) == {0, 2, 4, 6, 8}
+    assert set(order[5:7]) == {1, 7}
+
+
+def test_divisions_do_not_wait_for_one_another() -> None:
+    """No reciprocal of what a place decides is made of another."""
+    function = by_multipliers(made_of(links([k - 1 for k in range(12)])))
+    values = {a.name: a.value for a in function.body}
+
+    def divisions_in_a_row(name: str) -> int:
+        value = values.get(name)
+        if value is None:
+            return 0
+        before = max(map(divisions_in_a_row, value.names), default=0)
+        return before + (isinstance(value, Call) and value.function == "reciprocal")
+
+    made = [n for n, v in values.items() if isinstance(v, Call) and v.function == "reciprocal"]
+    assert len(made) >= 5
+    assert max(map(divisions_in_a_row, made)) == 1
+
+
+@pytest.mark.parametrize(
+    "size, n, longest", tiers([(1e-150, 12, 2), (1e-34, 40, 8), (1e34, 40, 8)], 1e-150)
+)
+def test_masses_of_any_size(
+    size: float, n: int, longest: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Products of pivots stay in the range of a double; only ratios of masses count."""
+    monkeypatch.setattr(ldl, "LONGEST", longest)
+    made = made_of(links([k - 1 for k in range(n)], equal=False))
+    ours, state = by_multipliers(made), states(made)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
+    scaled = {**state, **{f"m{k}": size * state[f"m{k}"] for k in range(n)}}
+    (expected, _), (found, regular) = evaluate(ours, state), evaluate(ours, scaled)
+    assert regular
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("n", tiers([9, 20], 9))
+def test_products_of_pivots_lose_nothing(n: int) -> None:
+    """In 40 digits; 20 links leave five products on one side of the last pivot, four on the other,
+    more than there may be in one."""
+    chain = links([k - 1 for k in range(n)], equal=False)
+    made = made_of(chain)
+    prompt, plain = by_multipliers(made), by_multipliers(made_of(chain + BATCH))
+    assert prompt != plain
+    for state in states(made, 2):
+        (found, _), (expected, _) = (evaluate(f, state, exact=True) for f in (prompt, plain))
+        size = np.max(np.abs(expected))
+        np.testing.assert_allclose(found, expected, rtol=4 * EPS, atol=4 * EPS * size)
+
+
+def test_a_float_has_no_room_for_products_of_pivots() -> None:
+    chain = links([k - 1 for k in range(9)])
+    plain, many = (by_multipliers(made_of(f"{chain}\n[run]\n{run}\n")) for run in (
+        'real = "float"', "batch = true",
+    ))  # fmt: skip
+    assert plain == many
+
+
+@pytest.mark.parametrize("n", tiers((3, 5, 10), 5))
+def test_it_is_taken_where_it_is_the_cheapest(n: int) -> None:
+    made = made_of(links([k - 1 for k in range(n)]))
+    assert cheapest(made)[0].route == "multipliers"
+
+
+# --- where it is not ------------------------------------------------------------------------------
+
+FIRST = (L * sin(a), L * cos(a))
+UNSUITED = {
+    "otherwise than on a sum": moving([(x * sin(a), -x * cos(a))], [x, a]),
+    "irrational": moving([(*FIRST, L * sin(a + sympy.sqrt(2) * b))], [a, b], m * B_DOT**2),
+    "velocities in K, more than": scene_system("chain"),
+    "depend on coordinates": moving([FIRST], [a, b], (2 + cos(a)) * B_DOT**2),
+    "no sum of masses": moving([FIRST], [a, b], m * (B_DOT - A_DOT / 3) ** 2),
+    "one direction": moving([FIRST[:1], (L * sin(a) + R * sin(b), L * cos(b))], [a, b]),
+    "no links": moving([(x,), (y,)], [x, y]),
+    "velocities in K, 3 increments": moving([FIRST, (R * sin(a), b)], [a, b]),
+    "follow": moving([(sin(a) + cos(a), cos(a) - sin(a)), (sin(b), cos(b))], [a, b]),
+    "on 3 angles, of 2 coordinates": moving([FIRST, (L * sin(b), cos(a - b))], [a, b]),
+    "steady": moving([(*FIRST, sin(2 * a)), (x,)], [a, x]),
+}
+
+
+@pytest.mark.parametrize("why", UNSUITED)
+def test_what_is_of_another_kind_is_passed_over_with_the_reason(why: str) -> None:
+    with pytest.raises(link_multipliers.UnsuitedError, match=why):
+        link_multipliers.solution(UNSUITED[why])
+    best, passed_over = cheapest(UNSUITED[why])
+    assert "multipliers" not in dict(best.routes)
+    assert why in passed_over["multipliers"]
+
+
+def test_a_negative_mass_is_reported() -> None:
+    """Where it is a number nothing is left of it to look at in a tape; D is indefinite."""
+    made = System.make(
+        "negative",
+        [a, b],
+        sum(dot(e) ** 2 for e in FIRST) - 2 * sum(dot(e) ** 2 for e in hung(FIRST, R, b)),
+        0,
+        parameters=PARAMETERS,
+    )
+    with pytest.raises(link_multipliers.UnsuitedError, match="no sum of masses"):
+        link_multipliers.solution(made)
+    acceleration, _ = cheapest(made)
+    for state in states(made):
+        assert not evaluate(acceleration, state)[1]
+
+
+def test_angles_that_do_not_determine_the_coordinates() -> None:
+    points = [(L * sin(e), L * cos(e)) for e in (a, b, a - b)]
+    with pytest.raises(link_multipliers.UnsuitedError, match="do not determine"):
+        link_multipliers.solution(moving(points, [a, b, c]))
+
+
+@pytest.mark.parametrize("gone", ["m", "l", "m1", "l1", "m0", "l0"])
+def test_a_mass_or_link_of_nothing_is_singular(gone: str) -> None:
+    """Even where all that is left of it cancels."""
+    ours = by_multipliers(made_of(links([-1, 0, 1], equal=len(gone) == 1)))
+    state = states(made_of(links([-1, 0, 1], equal=len(gone) == 1)))[0]
+    assert evaluate(ours, state)[1]
+    try:
+        _, regular = evaluate(ours, {**state, gone: 0.0})
+    except ArithmeticError:  # in C it is not finite
+        return
+    assert not regular
+
+
+@pytest.mark.slow
+def test_singular_and_regular_in_c(modules: Modules) -> None:
+    made = modules.of_text(links([-1, 0, 1, 2], more='potential = "0"'))
+    q, qd = np.array([0.1, 0.4, -0.3, 0.8]), np.array([1.0, -0.5, 0.7, 0.2])
+    state = {f"q{k}": v for k, v in enumerate(q)} | {f"q{k}_dot": v for k, v in enumerate(qd)}
+    text = made_of(links([-1, 0, 1, 2], more='potential = "0"'))
+    right, _ = independent(
+        text, {**{p.name: p.value for p in text.parameters}, **state, "u": 0, "t": 0}
+    )
+    np.testing.assert_allclose(made.acceleration(q, qd, t=0.0, u=[0.0]), right, rtol=1e-13)
+    for gone in "ml":
+        with pytest.raises(ArithmeticError):
+            made.acceleration(q, qd, t=0.0, u=[0.0], params={gone: 0.0})
+
+
+@pytest.mark.slow
+def test_a_scene_with_a_massless_link_keeps_the_way_by_d() -> None:
+    """D is regular with m0 = 0 where the links are not in line; 1/m0 is nothing to go by."""
+    text = links([-1, 0, 1, 2], equal=False)
+    assert cheapest(made_of(text))[0].route == "multipliers"
+    made = made_of(text.replace("m0 = 1.0", "m0 = 0.0"))
+    best, _ = cheapest(made)
+    assert "multipliers" in dict(best.routes)
+    assert best.route != "multipliers"
+    values = {**states(made)[0], "m0": 0.0}
+    right, _ = independent(made, values)
+    np.testing.assert_allclose(evaluate(best, values)[0], right, rtol=1e-12)

@@ -1,0 +1,242 @@
+"""Sines of rotated and of predicted angles, compiled with and without FMA, against forty digits."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterable, Sequence
+from functools import cache
+from pathlib import Path
+
+import mpmath
+import numpy as np
+import pytest
+from cases import FMA, fast_files, odd_system, scene_system
+from conftest import Modules, needs, tiers
+
+from eomc.derive import lagrange
+from eomc.emit.c_expression import DOUBLE
+from eomc.emit.c_names import Target
+from eomc.emit.fast.lanes import Accelerations
+from eomc.program import program
+from eomc.program.trig import Angle
+
+
+@cache
+def fast(name: str) -> tuple[Accelerations, dict[str, str]]:
+    """Of the cart-pole or of the odd scene."""
+    own = odd_system() if name == "odd" else scene_system(name)
+    made = program.build(lagrange.derive(own))
+    return Accelerations(Target(made, DOUBLE)), fast_files(Modules().unoptimised(own))
+
+
+def made_with(
+    main: str, name: str, rows: Iterable[Sequence[float]], flags: Sequence[str], folder: Path
+) -> list[list[float]]:
+    """What a main() behind the fast C of a scene tells of rows of numbers."""
+    for file, text in fast(name)[1].items():
+        (folder / file).write_text(text, encoding="utf-8")
+    source = (folder / f"{name}.c").read_text(encoding="utf-8")
+    main = "#include <stdio.h>\n" + main.replace("eomc_", f"{name}_")
+    main = main.replace("EOMC_", f"{name.upper()}_")
+    (folder / "near.c").write_text(f"{source}\n{main}", encoding="utf-8")
+    command = [needs("gcc"), *flags, "near.c", "-o", "near", "-lm"]
+    subprocess.run(command, cwd=folder, check=True)
+    lines = "\n".join(" ".join(repr(float(x)) for x in row) for row in rows)
+    done = subprocess.run(
+        ["./near"], cwd=folder, input=lines, capture_output=True, text=True, check=True
+    )
+    return [[float(x) for x in line.split()] for line in done.stdout.splitlines()]
+
+
+# FMA in one of them
+BUILDS = {"narrow": ("-std=c99", "-O2"), "native": ("-std=gnu99", "-O3", "-march=native")}
+UNIT = 2.0**-53
+
+
+def worst_of(found: Iterable[tuple[float, float, mpmath.mpf]]) -> float:
+    """The largest error of sines and cosines at exact angles, in units of rounding of 1."""
+    with mpmath.workdps(40):
+        return max(
+            float(max(abs(s - mpmath.sin(x)), abs(c - mpmath.cos(x)))) / UNIT for s, c, x in found
+        )
+
+
+@pytest.mark.parametrize("build", tiers(BUILDS, "narrow"))
+def test_a_turned_sine_is_a_sine(build: str, tmp_path: Path) -> None:
+    """Of a step without predictions: from its middle back and on, then by the accelerations.
+
+    Up to the bounds 2^-3 and 2^-6 of what is rotated; beyond them the step has failed.
+    """
+    main = r"""
+    int main(void)
+    {
+        double x, d, on, further;
+
+        while (scanf("%lf %lf %lf %lf", &x, &d, &on, &further) == 4) {
+            const double q[2] = { 0.0, x }, qd[2] = { 0.0, d };
+            eomc_rk4_stages w;
+            int failed;
+
+            w.failed = 0;
+            eomc_rk4_begin(&w, q, qd, 2.0); /* its half step turns by qd */
+            failed = w.failed;
+            printf("%.17g %.17g %.17g %.17g %.17g %.17g ", w.begin.s[0], w.begin.c[0], w.mid.s[0],
+                w.mid.c[0], w.end.s[0], w.end.c[0]);
+            w.failed = 0;
+            w.a[0][1] = on;
+            w.a[1][1] = further/2;
+            eomc_rk4_rotate(&w, 2.0);
+            printf("%.17g %.17g %.17g %.17g %d %d\n", w.mid.s[0], w.mid.c[0], w.end.s[0],
+                w.end.c[0], failed != 0, w.failed != 0);
+        }
+        return 0;
+    }
+    """
+    random = np.random.default_rng(8)
+
+    def spread(widest: int) -> np.ndarray:
+        d = random.choice([-1, 1], 600) * 2.0 ** -random.uniform(widest, 40, 600)
+        d[::3] = random.uniform(-1, 1, 200) * 2.0**-widest
+        d[:4] = 0.0, 2.0**-widest, -(2.0**-widest), 2.0**-40
+        return d
+
+    x, d, on, further = random.uniform(-10, 10, 600), spread(3), spread(6), spread(6)
+    rows = [tuple(map(float, row)) for row in zip(x, d, on, further, strict=True)]
+    large, more, nan = 2.0**-3 * (1 + 2.0**-52), 2.0**-6 * (1 + 2.0**-52), float("nan")
+    beyond = [(d, 0.0, 0.0) for d in (large, -large, 1.0, nan)]
+    beyond += [(0.0, d, 0.0) for d in (more, -more, nan)]
+    beyond += [(0.0, 0.0, d) for d in (more, -more, 1e300, nan)]
+    rows += [(0.5, *row) for row in beyond]
+    found = made_with(main, "cartpole", rows, BUILDS[build], tmp_path)
+    assert [row[-2:] for row in found] == (
+        [[0, 0]] * 600 + [[1, 0]] * 4 + [[0, 1]] * (len(beyond) - 4)
+    )
+    known: dict[str, list[tuple[float, float, mpmath.mpf]]] = {}
+    with mpmath.workdps(40):
+        for (x0, back, near, far), row in zip(rows[:600], found, strict=False):
+            mid, d = mpmath.mpf(x0 + back), mpmath.mpf(back)
+            places = {"begin": mid - d, "mid": mid, "end": mid + d, "on": mid + near}
+            for k, (place, at) in enumerate((places | {"further": mid + d + far}).items()):
+                known.setdefault(place, []).append((row[2 * k], row[2 * k + 1], at))
+    worst = {place: worst_of(rows) for place, rows in known.items()}
+    assert 0.5 < worst["mid"] < 1.4  # 1.6 units of the last place, of numbers up to 1
+    assert all(0.5 < worst[place] < 1.4 + 1 for place in ("begin", "end", "on"))
+    assert 0.5 < worst["further"] < 1.4 + 2
+
+
+@pytest.mark.parametrize("build", tiers(BUILDS, "native"))
+@pytest.mark.parametrize("name", tiers(["cartpole", "odd"], "odd"))
+def test_sines_near_predictions_are_sines(name: str, build: str, tmp_path: Path) -> None:
+    """In units of rounding of 1, of one angle and of three in one register, up to their bounds."""
+    main = r"""
+    int main(void)
+    {
+        enum { N = ANGLES };
+        double q[2], v[2], a[2], mid, end, d[N];
+
+        while (scanf("%lf %lf %lf %lf %lf %lf %lf %lf %lf", &q[0], &q[1], &v[0], &v[1], &a[0],
+            &a[1], &mid, &end, &d[0]) == 9) {
+            eomc_predicted f;
+
+            for (int k = 1; k < N; k++)
+                d[k] = -0.5*d[k - 1];
+            eomc_predict(&f, q, v, a, mid, end);
+            for (int from = 0; from < 2*N; from += N) {
+                eomc_sines to;
+                const double far = eomc_near(&f, from, d, &to);
+
+                for (int k = 0; k < N; k++)
+                    printf("%.17g %.17g %.17g %.17g ", f.x[from + k], d[k], to.s[k], to.c[k]);
+                printf("%.17g ", far);
+            }
+            printf("\n");
+        }
+        return 0;
+    }
+    """
+    accelerations, _ = fast(name)
+    names, angles = accelerations.target.names, accelerations.angles
+    assert len(angles) == (1 if name == "cartpole" else 3)
+    random, count = np.random.default_rng(9), 600
+    q = np.where(random.random((count, 2)) < 0.5, 1, 1e4) * random.uniform(-10, 10, (count, 2))
+    q[:40] = np.pi / 2 * np.arange(-40, 40).reshape(40, 2)
+    v, a = random.normal(size=(2, count, 2))
+    mid, end = random.uniform(0, 0.1, (2, count))
+    mid[:40] = 0.0
+    d = random.choice([-1, 1], count) * 2.0 ** -random.uniform(12, 40, count)
+    d[:3] = 2.0**-12, -(2.0**-12), 0.0
+    rows = [*zip(*q.T, *v.T, *a.T, mid, end, d, strict=True)]
+    nan = float("nan")
+    odd_rows = [(0.1, 0.1, nan, nan, 0, 0, 0.1, 0.1, 0.0), (0.1, 0.1, 0, 0, 0, 0, 0.1, 0.1, nan)]
+    main = main.replace("ANGLES", str(len(angles)))
+    found = np.array(made_with(main, name, [*rows, *odd_rows], BUILDS[build], tmp_path))
+    assert np.isnan(found[count:, [2, 3]]).all()  # what is no number stays none
+    assert np.isnan(found[-1, [4 * len(angles), -1]]).all()
+    found = found[:count].reshape(count, 2, 4 * len(angles) + 1)
+    near, far = found[:, :, :-1].reshape(count, 2, len(angles), 4), found[:, :, -1]
+    distances = near[..., 1]
+    np.testing.assert_array_equal(distances[:, 0, 0], d)
+    np.testing.assert_allclose(far, (distances**2 / 2).sum(axis=2), rtol=1e-8)
+    for k, angle in enumerate(angles):
+
+        def along(vector: np.ndarray, angle: Angle = angle) -> np.ndarray:
+            return sum(float(w) * vector[:, names.index(n)] for w, n in angle.terms)
+
+        for part, t in enumerate((mid, end)):
+            x = along(q) + float(angle.offset) + along(v) * t + along(a) * t**2 / 2
+            size = np.abs(q).max(axis=1) + 3
+            assert (np.abs(near[:, part, k, 0] - x) <= 8 * UNIT * size).all()
+    with mpmath.workdps(40):
+        known = [
+            (s, c, mpmath.mpf(x) + mpmath.mpf(by)) for x, by, s, c in near.reshape(-1, 4).tolist()
+        ]
+    fma = build == "native" and FMA
+    assert 0.5 < worst_of(known) < (2 if fma else 2.4)
+
+
+@pytest.mark.parametrize("build", tiers(BUILDS, "native"))
+def test_steps_end_where_predictions_do(build: str, tmp_path: Path) -> None:
+    """Four distances, whose squares may be 2^-24 together; an angle of 2^20 takes all of that.
+
+    What was not done leaves the state as it was, what was done has the sines of its end.
+    """
+    main = r"""
+    int main(void)
+    {
+        double x, shift, h, steps;
+
+        while (scanf("%lf %lf %lf %lf", &x, &shift, &h, &steps) == 4) {
+            const double predicted[2] = { 0.0, x + shift };
+            eomc_rk4_state m = { 0 };
+            eomc_constants c;
+            long done;
+            int same;
+
+            eomc_compute_constants(&c, &eomc_defaults);
+            m.q[1] = x;
+            m.qd[0] = 0.1, m.qd[1] = 0.2;
+            eomc_sines_at(&m.s, m.q);
+            eomc_accelerations(m.a, m.q, m.qd, &m.s, &c);
+            eomc_predict(&m.next, predicted, m.qd, m.a, h/2, h);
+            done = eomc_rk4_predicted(&m, h, 0, 0, (long)steps, 0, 0, 0, &c);
+            same = m.q[0] == 0 && (m.q[1] == x || x != x) && m.qd[0] == 0.1 && m.qd[1] == 0.2;
+            printf("%ld %d %.17g %.17g %.17g\n", done, same, m.q[1], m.s.s[0], m.s.c[0]);
+        }
+        return 0;
+    }
+    """
+    h, limit = 2.0**-30, 2.0**20
+    close = [(x, s) for x in (0.3, -9.0) for s in (0.0, 2.0**-13.01, -(2.0**-13.01))]
+    close += [(limit - 1, 0.0), (-limit + 1, 0.0), (limit / 2, 2.0**-13.3)]
+    far = [(0.3, 2.0**-12.99), (0.3, -(2.0**-12.99)), (0.3, 2.0**-12), (0.3, 1.0)]
+    far += [(limit + 1, 0.0), (-limit - 1, 0.0), (limit / 2, 2.0**-13.1)]
+    far += [(float(x), 0.0) for x in ("nan", "inf", "-inf")] + [(0.3, float("nan"))]
+    rows = [(x, shift, h, 1) for x, shift in (*close, *far)]
+    rows += [(x, 0.0, 0.005, 40) for x in np.linspace(-3, 3, 50)]
+    found = made_with(main, "cartpole", rows, BUILDS[build], tmp_path)
+    assert [row[:2] for row in found[: len(close)]] == [[1, 0]] * len(close)
+    assert [row[:2] for row in found[len(close) : len(close) + len(far)]] == [[0, 1]] * len(far)
+    on = found[len(close) + len(far) :]
+    assert [row[0] for row in on] == [40] * 50
+    with mpmath.workdps(40):
+        assert worst_of((s, c, mpmath.mpf(x)) for *_, x, s, c in on) < 8  # q, too, is rounded

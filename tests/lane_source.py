@@ -1,0 +1,183 @@
+"""The C of csrc/lanes over lanes of every width, and functions that call it for arrays."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from conftest import ROOT
+from sincos_bench import bench
+
+VECTORS = {"_16": 16, "_32": 32, "_64": 64}  # bytes by what names end in
+LANES = ("", *VECTORS)
+MOST = 16  # numbers in the widest of them
+
+ONE = """
+typedef EOMC_REAL eomc_LANE_loose;
+enum { EOMC_LANE_COUNT = 1 };
+
+void exceeds(long n, const EOMC_REAL *x, const EOMC_REAL *most, int *told)
+{
+    for (long i = 0; i < n; i++)
+        told[i] = eomc_exceeds(x[i], *most);
+}
+"""
+ROTATING = """
+void rotate_LANE(long n, const EOMC_REAL *d, EOMC_REAL *s, EOMC_REAL *c)
+{
+    for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
+        eomc_LANE x = *(eomc_LANE_loose *)(s + i), y = *(eomc_LANE_loose *)(c + i);
+
+        eomc_rotate_LANE(*(const eomc_LANE_loose *)(d + i), &x, &y);
+        *(eomc_LANE_loose *)(s + i) = x;
+        *(eomc_LANE_loose *)(c + i) = y;
+    }
+}
+
+void rotate_both_LANE(long n, const EOMC_REAL *d, const EOMC_REAL *s0, const EOMC_REAL *c0,
+    EOMC_REAL *s_back, EOMC_REAL *c_back, EOMC_REAL *s_on, EOMC_REAL *c_on)
+{
+    for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
+        eomc_LANE s[2], c[2];
+
+        eomc_rotate_both_LANE(*(const eomc_LANE_loose *)(d + i),
+            *(const eomc_LANE_loose *)(s0 + i), *(const eomc_LANE_loose *)(c0 + i),
+            &s[0], &c[0], &s[1], &c[1]);
+        *(eomc_LANE_loose *)(s_back + i) = s[0];
+        *(eomc_LANE_loose *)(c_back + i) = c[0];
+        *(eomc_LANE_loose *)(s_on + i) = s[1];
+        *(eomc_LANE_loose *)(c_on + i) = c[1];
+    }
+}
+"""
+SEVERAL = """
+static void tell_LANE(int *told, const eomc_LANE_mask *failed)
+{
+    for (int i = 0; i < EOMC_LANE_COUNT; i++)
+        told[i] = (*failed)[i] < 0;
+}
+
+void small_LANE(long n, const EOMC_REAL *x, EOMC_REAL *s, EOMC_REAL *c)
+{
+    for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
+        const eomc_LANE angle = *(const eomc_LANE_loose *)(x + i);
+        eomc_LANE sine, cosine;
+
+        eomc_sincos_small_LANE(&angle, &sine, &cosine);
+        *(eomc_LANE_loose *)(s + i) = sine;
+        *(eomc_LANE_loose *)(c + i) = cosine;
+    }
+}
+
+/* told: what has failed before, and then that and what fails now */
+void sincos_LANE(long n, const EOMC_REAL *x, EOMC_REAL *s, EOMC_REAL *c, int *told)
+{
+    for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
+        eomc_LANE_mask failed;
+        eomc_LANE sine, cosine;
+
+        for (int k = 0; k < EOMC_LANE_COUNT; k++)
+            failed[k] = -told[i + k];
+        eomc_sincos_LANE(*(const eomc_LANE_loose *)(x + i), &sine, &cosine, &failed);
+        *(eomc_LANE_loose *)(s + i) = sine;
+        *(eomc_LANE_loose *)(c + i) = cosine;
+        tell_LANE(told + i, &failed);
+    }
+}
+
+void exceeds_LANE(long n, const EOMC_REAL *x, const EOMC_REAL *most, int *told)
+{
+    for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
+        eomc_LANE_mask failed = eomc_exceeds_LANE(*(const eomc_LANE_loose *)(x + i), *most);
+
+        tell_LANE(told + i, &failed);
+    }
+}
+
+void not_positive_LANE(long n, const EOMC_REAL *x, int *told)
+{
+    for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
+        eomc_LANE_mask failed = eomc_not_positive_LANE(*(const eomc_LANE_loose *)(x + i));
+
+        tell_LANE(told + i, &failed);
+    }
+}
+
+void not_finite_LANE(long n, const EOMC_REAL *x, int *told)
+{
+    for (long i = 0; i < n; i += EOMC_LANE_COUNT) {
+        eomc_LANE_mask failed = eomc_not_finite_LANE(*(const eomc_LANE_loose *)(x + i));
+
+        tell_LANE(told + i, &failed);
+    }
+}
+
+int count_LANE(void)
+{
+    return EOMC_LANE_COUNT;
+}
+
+int any_LANE(const EOMC_INTEGER *bits)
+{
+    eomc_LANE_mask failed;
+
+    for (int i = 0; i < EOMC_LANE_COUNT; i++)
+        failed[i] = bits[i];
+    return eomc_any_LANE(&failed);
+}
+
+void same_LANE(const EOMC_REAL *x, EOMC_REAL *to)
+{
+    *(eomc_LANE_loose *)to = eomc_same_LANE(*x);
+}
+"""
+FOUR = """
+void put(const EOMC_REAL *x, EOMC_REAL *to)
+{
+    eomc_put(to, x[0], x[1], x[2], x[3]);
+}
+
+void interleave(const EOMC_REAL *x, const EOMC_REAL *y, EOMC_REAL *to)
+{
+    eomc_two both[4];
+
+    eomc_interleave(both, x, y);
+    for (int i = 0; i < 8; i++)
+        to[i] = both[i/2][i % 2];
+}
+"""
+
+
+def over(of: Any, text: str, name: str = "", width: int = 0) -> str:
+    """A text of csrc/lanes over a lane of so many bytes, or over one number."""
+    real, double = ("float", False) if of.suffix else ("double", True)
+    for old, new in (
+        ("EOMC_BITS_OF_SIZE", "0x7fffffffffffffff" if double else "0x7fffffff"),
+        ("EOMC_INTEGER", "long long" if double else "int"),
+        ("EOMC_LANE_ALIGNED", str(min(width, 16))),
+        ("EOMC_LANE_BYTES", str(width)),
+        ("EOMC_LANE_COUNT", f"EOMC_COUNT{name}"),
+        ("fabs_REAL", f"fabs{of.suffix}"),
+        ("EOMC_REAL", real),
+        ("eomc_LANE", f"eomc{name}" if name else real),
+        ("_LANE", name),
+    ):
+        text = text.replace(old, new)
+    assert not re.search("LANE|REAL|EOMC_(INTEGER|BITS)", text)
+    return text
+
+
+def source(of: Any) -> str:
+    """All of it, and functions that call it for arrays."""
+    size = np.dtype(of.dtype).itemsize
+
+    def file(name: str) -> str:
+        return (ROOT / "csrc" / "lanes" / f"{name}.h").read_text(encoding="utf-8")
+
+    sincos, rotate = file(f"sincos{of.suffix}"), file(f"rotate{of.suffix}")
+    texts = [over(of, file("scalar") + rotate + ONE + ROTATING)]
+    several = file("vector") + sincos + rotate + ROTATING + SEVERAL
+    texts += [over(of, several, name, width) for name, width in VECTORS.items()]
+    texts += [over(of, file("vector"), f"_{n}", k * size) for n, k in (("two", 2), ("four", 4))]
+    return "\n".join([bench.HARNESS, *texts, over(of, file("four") + FOUR)])
