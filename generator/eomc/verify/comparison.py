@@ -392,7 +392,7 @@ class Comparison:
         n, nu = len(self.system.q), len(self.system.inputs)
         known: list[float | None] = []
         for e in (*self.few(self.effort.few), *self.sampler.farther()):
-            s, size = e.state, e.size["acceleration"]
+            s, size = e.state, e.size["acceleration"] + NUDGE * scale[1] ** 2 / scale[0]
             found = self._slopes(name, s)
             if found is None:
                 return math.inf  # not even dq/dt = qd
