@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import sympy
 from cases import cases, fast_kit, scene_text, variant
-from conftest import MODULES
+from conftest import MODULES, Modules
 
 import eomc
 from eomc.integrators import tableaux
@@ -208,12 +208,10 @@ def test_no_convergence_is_told_and_the_last_state_kept() -> None:
     assert np.isfinite([q, qd]).all() and evaluations < 20 * 4 * 200
 
 
-def test_runs_are_the_same_however_they_are_cut() -> None:
+def test_runs_are_the_same_however_they_are_cut(modules: Modules) -> None:
     """To the last bit, also where C is called for one step at a time."""
     text = Path("scenes/cartpole_driven.toml").read_text(encoding="utf-8")
-    path = Path("build/tests/gauss_cut.toml")
-    path.write_text(text.replace("[run]\n", f"[run]\nmethod = {ALL}\n"), encoding="utf-8")
-    m = eomc.load(path, MODULES)
+    m = modules.unoptimised(text.replace("[run]\n", f"[run]\nmethod = {ALL}\n"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for method in GAUSS:

@@ -18,6 +18,7 @@ import eomc
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import GAUSS16
 from eomc.verify.check import check
+from eomc.verify.comparison import Comparison
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
@@ -92,7 +93,18 @@ def test_five_sweeps_are_stable_where_they_suffice() -> None:
     assert radius(0, -1.9) < 1 + 1e-6 < radius(0, -2.0)
 
 
-@pytest.mark.parametrize("name", tiers(("cartpole_driven", "kapitza_pendulum"), "cartpole_driven"))
+def test_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With an input and its signal; beside rk4."""
+    monkeypatch.setattr(Comparison, "advice_row", lambda *_: None)
+    path = variant("cartpole_driven", "g16_check_cartpole_driven", method='["rk4", "gauss16"]')
+    made = Comparison(eomc.read(path), eomc.load(path, MODULES), np.random.default_rng(0), 4)
+    made.convergence_rows()
+    assert [row for row in made.rows if not row.passed] == []
+    assert {"order of gauss16", "gauss16 beside rk4"} <= {row.name for row in made.rows}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cartpole_driven", "kapitza_pendulum"])
 def test_order_by_check(name: str) -> None:
     """Inputs, signals, explicit time."""
     path = variant(name, f"g16_check_{name}", method='["rk4", "gauss16"]')

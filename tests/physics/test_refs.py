@@ -177,6 +177,7 @@ def test_mass_on_a_spring_makes_the_error_of_rk4(modules: Modules, h: float) -> 
     assert np.max(np.abs(run.q[:, 0] - np.cos(t))) == pytest.approx(theory, rel=0.02)
 
 
+@pytest.mark.slow
 def test_mass_on_a_spring_for_a_million_periods(modules: Modules) -> None:
     """63 million steps; the error is theory's, the end known to 30 digits."""
     name = "harmonic_1e6_periods"

@@ -80,9 +80,14 @@ def test_more_cases_have_25_digits(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> reference_solution.Reference:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("oscillator")
+
+
+@pytest.fixture(scope="module")
+def made(folder: Path) -> reference_solution.Reference:
     """That of the oscillator."""
-    return reference_solution.of(oscillator(), rows=8, root=tmp_path_factory.mktemp("oscillator"))
+    return reference_solution.of(oscillator(), rows=8, root=folder)
 
 
 def test_an_oscillator_is_cos_all_along(made: reference_solution.Reference) -> None:
@@ -106,16 +111,15 @@ def test_differences_are_right_below_double_precision(made: reference_solution.R
 
 
 def test_it_is_kept_until_start_or_parameters_change(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: reference_solution.Reference, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     system = oscillator()
-    first = reference_solution.of(system, rows=4, root=tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(reference_solution, "_computed", lambda *a: pytest.fail("computed again"))
-        again = reference_solution.of(system, rows=4, root=tmp_path)
-    np.testing.assert_array_equal(first.q, again.q)
-    np.testing.assert_array_equal(first.digits, again.digits)
-    other = reference_solution.of(system.at({"k": 4.0}), rows=4, root=tmp_path)
+        again = reference_solution.of(system, rows=8, root=folder)
+    np.testing.assert_array_equal(made.q, again.q)
+    np.testing.assert_array_equal(made.digits, again.digits)
+    other = reference_solution.of(system.at({"k": 4.0}), rows=8, root=folder)
     assert float(other.q[-1, 0]) == pytest.approx(np.cos(4.0), abs=1e-14)
 
 
