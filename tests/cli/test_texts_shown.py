@@ -173,7 +173,7 @@ def test_the_commands_print_no_text_raw(here: Path) -> None:
     out = said("run", file, "--out", "x.csv", "--plot", "x.svg", "--build", "b\x1b[31m")
     assert out.startswith(every)
     assert json.loads(said("run", file, "--json"))["scene"] == "fields"
-    assert Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,energy"  # names only
+    assert Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,u,energy"  # names only
     ElementTree.parse("x.svg")
     for form in ([], ["--cost"], ["--python"], ["--latex"]):
         said("show", file, *form)
