@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import mpmath
@@ -22,6 +22,7 @@ _DOUBLES: Mapping[str, Callable[..., Any]] = {
 }
 
 
+@cache
 def _many_digits() -> Mapping[str, Callable[..., Any]]:
     """The same in 40 digits."""
     mp = mpmath.mp.clone()

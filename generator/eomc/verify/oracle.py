@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -115,13 +116,19 @@ class Answer(ABC):
         times, qs, qds = zip(*rows, strict=True)
         return np.array(times), np.array(qs), np.array(qds)
 
+    @cached_property
+    def _defaults(self) -> Values:
+        return tuple(p.value for p in self.system.parameters)
+
     def _values(self, params: Mapping[str, Any] | None) -> Values:
         """Parameters in the system's order."""
+        if not params:
+            return self._defaults
         values = {p.name: p.value for p in self.system.parameters}
-        for name in params or {}:
+        for name in params:
             if name not in values:
                 raise EomcError(f"'{name}' is not a parameter{suggest(name, values)}")
-        return tuple((values | dict(params or {})).values())
+        return tuple((values | dict(params)).values())
 
     def _acceleration(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values

@@ -242,9 +242,9 @@ class Reference(Answer):
         except (ArithmeticError, ValueError):
             return np.full(shape, math.nan)[()]
         made = np.array(found)
-        if np.iscomplexobj(made):  # Python's power of a negative number
+        if made.dtype.kind == "c":  # Python's power of a negative number
             return np.full(shape, math.nan)[()]
-        return made.astype(float).reshape(shape)[()]
+        return made.astype(float, copy=False).reshape(shape)[()]
 
     def _function(self, name: str) -> Callable[..., Any]:
         if name not in self._functions:
