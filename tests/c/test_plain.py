@@ -25,7 +25,6 @@ from eomc.model.system import System
 from eomc.program import outline
 from eomc.scene import read as scene
 from eomc.verify import rows_plain
-from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import Row
 
@@ -200,8 +199,8 @@ def test_a_wrong_weight_is_found_by_check(tmp_path: Path) -> None:
         patch.setattr(resources, "text", wrong)
         plain = eomc.load(named, tmp_path, form="plain")
     render.environment.cache_clear()
-    report = check(made("cartpole"), both("cartpole")[0], plain=plain, states=4)
-    failed = {row.name for row in report.rows if not row.passed}
+    rows = compared("cartpole", both("cartpole")[0], plain, states=4)
+    failed = {row.name for row in rows if not row.passed}
     assert failed == {"plain C: one step", "plain C: run", "plain C beside fast: rk4"}
 
 

@@ -65,7 +65,8 @@ def assert_accurate(library: ctypes.CDLL, x: np.ndarray, of: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("precision", "sine", "cosine"), [("DOUBLE", "57.9", "63.9"), ("SINGLE", "27.9", "33.0")]
+    ("precision", "sine", "cosine"),
+    tiers([("DOUBLE", "57.9", "63.9"), ("SINGLE", "27.9", "33.0")], "SINGLE"),
 )
 def test_header_has_the_derived_constants(precision: str, sine: str, cosine: str) -> None:
     of = getattr(bench, precision)

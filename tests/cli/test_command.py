@@ -139,8 +139,8 @@ def test_show(here: Path) -> None:
     assert "mass matrix" in text and "Jacobi integral" in text
     assert r"\begin{align*}" in eomc("show", "kapitza_pendulum.toml", "--latex").output
     space: dict[str, object] = {}
-    exec(eomc("show", "cartpole.toml", "--python").output, space)  # it is Python
-    assert str(space["D"]).count("m_p") >= 3
+    exec(eomc("show", "kapitza_pendulum.toml", "--python").output, space)  # it is Python
+    assert str(space["D"]) == "Matrix([[l**2*m]])"
     assert "1 division, 1 sincos" in eomc("show", "cartpole.toml", "--cost").output
 
 

@@ -204,6 +204,7 @@ def test_chaos_is_reported(tmp_path: Path) -> None:
     assert 1e-9 < smallest < 1e-2  # 1.7e11 times rounding
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_a_stepper_that_a_scene_can_not_use_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

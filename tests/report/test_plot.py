@@ -17,7 +17,6 @@ from eomc.scene.read import read
 pytest.importorskip("matplotlib")
 
 SCENES = Path(__file__).parents[2] / "scenes"
-SLOW = pytest.mark.slow
 
 
 def cartpole():
@@ -42,13 +41,10 @@ def spring(n=1):
     return made, t, q, np.gradient(q, t, axis=0), np.exp(-t)
 
 
+@pytest.mark.slow  # the quick ones: SVG below, PNG by `eomc run --plot`
 @pytest.mark.parametrize(
     ("run", "suffix"),
-    [
-        pytest.param(run, suffix, marks=() if (run, suffix) == (spring, ".png") else SLOW)
-        for run in (cartpole, spring)
-        for suffix in plot.SUFFIXES
-    ],
+    [(run, suffix) for run in (cartpole, spring) for suffix in plot.SUFFIXES],
 )
 def test_files_are_written(tmp_path, run, suffix):
     file = tmp_path / f"picture{suffix}"

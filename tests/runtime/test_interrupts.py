@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from conftest import tiers
 from states import QD, Q, same
 
 
@@ -71,7 +72,7 @@ def ctrl_c_after(seconds: float) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("every", [1, 7, 100_003])
-@pytest.mark.parametrize("after", [0.13, 0.17])
+@pytest.mark.parametrize("after", tiers([0.13, 0.17], 0.13))
 def test_ctrl_c_gives_the_run_so_far(cartpole: ModuleType, every: int, after: float) -> None:
     """What was done until then is right: it equals a run of that many steps."""
     with pytest.raises(KeyboardInterrupt) as caught, ctrl_c_after(after):
