@@ -64,8 +64,7 @@ def odd_system() -> System:
 
 # of these the quick tier looks at
 FEW_ALIKE = (
-    "mass_spring", "cartpole_driven", "furuta_pendulum", "kapitza_pendulum", "foucault_pendulum",
-    "heavy_top",
+    "mass_spring", "cartpole_driven", "kapitza_pendulum", "foucault_pendulum", "heavy_top",
 )  # fmt: skip
 
 

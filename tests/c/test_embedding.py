@@ -6,6 +6,7 @@ import re
 import subprocess
 from collections.abc import Callable
 from functools import cache
+from itertools import product
 from pathlib import Path
 from types import ModuleType
 
@@ -65,7 +66,10 @@ def kits_of(*quick: str) -> pytest.MarkDecorator:
 
 
 kits, few_kits = kits_of("cartpole", "everything"), kits_of("cartpole")
-STRICTLY = {("cartpole", "-O2"), ("everything", "-O0")}  # in the quick tier
+# in the quick tier
+STRICTLY = {
+    ("cartpole", "gcc", "-O2"), ("everything", "gcc", "-O0"), ("everything", "clang", "-O0"),
+}  # fmt: skip
 driven = pytest.mark.parametrize("kit", ["cartpole_driven"], indirect=True)
 
 
@@ -86,13 +90,12 @@ def rows_of(name: str, module: ModuleType) -> np.ndarray:
 # --- compilers -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize(
-    ("kit", "name", "level"),
+    ("kit", "name", "compiler", "level"),
     [
-        pytest.param(n, n, level, marks=() if (n, level) in STRICTLY else pytest.mark.slow)
+        pytest.param(n, n, *how, marks=() if (n, *how) in STRICTLY else pytest.mark.slow)
         for n in NAMES
-        for level in ("-O0", "-O2")
+        for how in product(("gcc", "clang"), ("-O0", "-O2"))
     ],
     indirect=["kit"],
 )
@@ -309,7 +312,7 @@ def test_coordinates_may_be_called_like_our_own_macros(name: str, tmp_path: Path
     assert float(told.stdout) == pytest.approx(q[-1][0], rel=1e-12)
 
 
-@kits
+@kits_of("everything")
 def test_what_is_not_wanted_is_not_there(kit: Path, name: str) -> None:
     """No input, no signal and no u; no force, no tau; no time, no t; nothing of a batch."""
     names = {symbol for _, symbol in symbols(kit, name, "-O0")}

@@ -4,6 +4,7 @@ After a change that is meant: `python tests/scene/test_bad_scenes.py` writes the
 each one as its user would before keeping it.
 """
 
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,19 +17,22 @@ BAD = Path(__file__).parent / "bad"
 SCENES = sorted(BAD.glob("*.toml"))
 
 
-def problems(file: Path) -> tuple[Problem, ...]:
+@cache
+def said(file: Path) -> tuple[tuple[Problem, ...], str]:
+    """The problems of a scene, and the message that its user sees."""
     try:
-        return from_scene(read(file)).warnings
+        warnings = from_scene(read(file)).warnings
     except SceneError as fault:
-        return fault.problems
+        return fault.problems, str(fault)
+    return warnings, "\n".join(map(str, warnings))
+
+
+def problems(file: Path) -> tuple[Problem, ...]:
+    return said(file)[0]
 
 
 def message(file: Path) -> str:
-    try:
-        text = "\n".join(map(str, from_scene(read(file)).warnings))
-    except SceneError as fault:
-        text = str(fault)
-    return text.replace(str(file), file.name) + "\n"
+    return said(file)[1].replace(str(file), file.name) + "\n"
 
 
 def test_there_are_many_and_none_is_orphaned():
