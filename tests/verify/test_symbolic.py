@@ -218,3 +218,13 @@ def test_derivation_is_quick() -> None:
     start = time.perf_counter()
     derive(system).acceleration([0.0, 1.0], [0.0, 0.0])
     assert time.perf_counter() - start < 1
+
+
+def test_terms_multiplied_out() -> None:
+    q, qd = symbol("q"), symbol("q_dot")
+    s = System.make("shallow", {q: 1e-3}, qd**2 / 2 - qd * sin(q), 2e4 * (1 - cos(q)) - q / 7)
+    answer = derive(s)
+    at = {"q": np.array([1e-3]), "qd": np.array([0.5]), "t": 0.0, "u": None, "params": None}
+    terms = 2e4 * (1 + math.cos(1e-3)) + 1e-3 / 7 + 0.125 + 0.5 * math.sin(1e-3)
+    assert answer.terms(at) == pytest.approx(terms, rel=1e-14)
+    assert abs(answer.evaluate("potential", at["q"])) < 1e-6 * terms

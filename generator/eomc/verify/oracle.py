@@ -22,7 +22,7 @@ Vector = NDArray[np.float64]
 Values = tuple[Any, ...]  # of the parameters, in the system's order: floats, or one a row
 
 MATRICES = ("D", "C")
-SCALARS = ("kinetic", "potential", "energy", "jacobi", "power")
+SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "magnitude")
 
 
 class Answer(ABC):
@@ -33,6 +33,13 @@ class Answer(ABC):
     """
 
     system: System
+
+    def terms(self, s: Mapping[str, Any]) -> float:
+        """The sizes of the terms of K and P multiplied out, added up, at the arguments `s`.
+
+        0 where they are not written out.
+        """
+        return 0.0
 
     @abstractmethod
     def _value(

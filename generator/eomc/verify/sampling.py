@@ -226,7 +226,8 @@ class Sampler:
         force = reach["bias"] + reach["g"] + reach["tau"] + rate * inertia @ qd
         # a force that is zero along one coordinate may be the sum of what others have whole
         force = np.maximum(force, diagonal * np.max(force / diagonal))
-        energy = reach["kinetic_energy"] + reach["potential_energy"]
+        terms = self.reference.terms(vars(s))
+        energy = np.maximum(reach["kinetic_energy"] + reach["potential_energy"], terms)
         size = {
             "D": inertia,
             "C": reach["C"] + rate * inertia,
@@ -242,7 +243,8 @@ class Sampler:
         """K + P and its size."""
         names = ("kinetic", "potential")
         K, P = (self.reach(partial(self.reference.evaluate, name), s)[1] for name in names)
-        return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), K + P
+        size = np.maximum(K + P, self.reference.terms(vars(s)))
+        return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), size
 
     def reach(self, of: Callable[..., Any], s: State) -> tuple[Vector, Vector]:
         """f and |f| + sum_i |x_i df/dx_i|; of: f of states as rows.

@@ -8,7 +8,7 @@ solved with NumPy and stepped in a Python loop. Slow, short, and meant to be bel
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -200,6 +200,15 @@ class Reference(Answer):
             kinetic=K, potential=P, energy=K + P, jacobi=jacobi, power=power,
         )  # fmt: skip
 
+    @cached_property
+    def magnitude(self) -> Expr:
+        """The sizes of the terms of K and P, added up."""
+        return _magnitude(self.kinetic) + _magnitude(self.potential)
+
+    def terms(self, s: Mapping[str, Any]) -> float:
+        """As `Answer.terms`."""
+        return float(self.evaluate("magnitude", **s))
+
     def _value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Any:
@@ -255,6 +264,15 @@ class Reference(Answer):
                 symbols, entries, modules=[_JUMPS, "math"], cse=True
             )
         return self._functions[name]
+
+
+def _magnitude(e: Expr) -> Expr:
+    """The sum of the sizes of the terms that `e` has, multiplied out as far as + and * go."""
+    if e.is_Add or e.is_Mul:
+        return e.func(*map(_magnitude, e.args))
+    if e.is_Pow and e.exp.is_Integer and e.exp > 0:
+        return _magnitude(e.base) ** e.exp
+    return sympy.Abs(e, evaluate=False)
 
 
 def _sign(x: float) -> float:
