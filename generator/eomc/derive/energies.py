@@ -32,14 +32,21 @@ def directions(system: System) -> dict[Symbol, Symbol]:
     return {x: symbol(f"{x.name}{ALONG}") for x in (*system.q, *system.qd, *system.u)}
 
 
-def on_tape(system: System, kinetic: Expr, potential: Expr) -> Energies:
+def leaves(system: System, *more: Symbol) -> dict[Symbol, Stage]:
+    """t, parameters, inputs, coordinates, velocities, and what else changes as these do."""
+    found: dict[Symbol, Stage] = {t: Stage.TIME}
+    found |= {p.symbol: Stage.PARAMETER for p in system.parameters}
+    found |= dict.fromkeys(system.u, Stage.TIME)
+    found |= dict.fromkeys(system.q, Stage.POSITION)
+    return found | dict.fromkeys((*system.qd, *more), Stage.VELOCITY)
+
+
+def on_tape(
+    system: System, kinetic: Expr, potential: Expr, accelerations: bool = False
+) -> Energies:
     """K and P, with the system's dissipation, forces and signals, and what they are made of."""
-    leaves: dict[Symbol, Stage] = {t: Stage.TIME}
-    leaves |= {p.symbol: Stage.PARAMETER for p in system.parameters}
-    leaves |= dict.fromkeys(system.u, Stage.TIME)
-    leaves |= dict.fromkeys(system.q, Stage.POSITION)
-    leaves |= dict.fromkeys((*system.qd, *directions(system).values()), Stage.VELOCITY)
-    tape = Tape(leaves)
+    more = system.qdd if accelerations else directions(system).values()
+    tape = Tape(leaves(system, *more))
     rates: dict[Symbol, Expr] = {**dict(zip(system.q, system.qd, strict=True)), t: S.One}
     known: dict[Symbol, Expr] = {}
     points: dict[Symbol, Expr] = {}

@@ -180,6 +180,20 @@ def _sums(tape: Tape, one: Sequence[Expr], other: Sequence[Expr]) -> Vector:
     return tuple(tape.total(pair) for pair in zip(one, other, strict=True))
 
 
+def inertial_forces(
+    system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
+) -> list[Expr]:
+    """D qdd + bias of K and P on a tape, by Lagrange's operator. accelerations: by velocity."""
+    tape, q, qd, w = e.tape, system.q, system.qd, list(e.points)
+    stop = frozenset(w)
+    rates: dict[Symbol, Expr] = {**dict(zip(q, qd, strict=True)), t: S.One, **accelerations}
+    momenta = tape.gradient([(e.kinetic, S.One)], [*qd, *w], stop)
+    moving = tape.forward(momenta, rates)
+    seeds = [(e.kinetic, S.NegativeOne), (e.potential, S.One)]
+    seeds += zip(e.points.values(), moving[len(q) :], strict=True)
+    return [tape.total(x) for x in zip(moving, tape.gradient(seeds, q, stop), strict=False)]
+
+
 def _lagrange(system: System, e: Energies) -> Motion:
     tape, q, qd = e.tape, system.q, system.qd
     w = list(e.points)

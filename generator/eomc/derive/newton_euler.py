@@ -18,12 +18,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
-import sympy
 from sympy import Expr, S
 
-from eomc.base.spatial import ENTRIES, transposed
+from eomc.base.spatial import ENTRIES
+from eomc.derive.links import Links
 from eomc.derive.tape import Tape
-from eomc.derive.vectors import AXES, ZERO, Vector, Vectors
+from eomc.derive.vectors import AXES, ZERO, Vector
 from eomc.model.exact import Matrix
 from eomc.model.multibody import Link, Tree
 
@@ -43,6 +43,11 @@ class Inertia:
         """I_ij"""
         return self.inertia.get((min(i, j), max(i, j)), S.Zero)
 
+    @property
+    def tensor(self) -> list[list[Expr]]:
+        """I by rows."""
+        return [[self.entry(i, j) for j in range(3)] for i in range(3)]
+
     def is_zero(self) -> bool:
         """Whether there is none at all."""
         return self.mass == 0 and self.moment == ZERO and not any(self.inertia.values())
@@ -56,65 +61,20 @@ class _Forces:
     moment: list[Vector]
 
 
-class Recursion(Vectors):
-    """A tree on a tape: sines, grouped inertias and the sweeps."""
+class Recursion(Links):
+    """A tree on a tape: grouped inertias and the sweeps."""
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
-        super().__init__(tape)
-        self.links = tree.links
-        self.n = len(tree.links)
+        super().__init__(tape, tree.links)
         self.gravity = self.vector(tree.gravity)
         self.still = self.vector(tree.still)
-        self.cosine = [self.define(sympy.cos(x.q)) if x.turns else S.One for x in self.links]
-        self.sine = [self.define(sympy.sin(x.q)) if x.turns else S.Zero for x in self.links]
-        self.rotation: list[Matrix] = [
-            tuple(self.vector(row) for row in x.rotation)  # type: ignore[misc]
-            for x in self.links
-        ]
-        self.arm = [self._arm(k) for k in range(self.n)]
         self.armature = [self.define(x.armature) for x in self.links]
         self.inertia = self._grouped()
 
-    # --- frames ----------------------------------------------------------------------------------
-
-    def turn(self, k: int, v: Vector, back: bool = False) -> Vector:
-        """A vector of link k's frame in the joint's frame; `back`: the other way."""
-        if not self.links[k].turns:
-            return v
-        c, s = self.cosine[k], self.sine[k]
-        i, j = AXES[self.links[k].axis]
-        out = list(v)
-        up, down = self.times(s, v[i]), self.times(s, v[j])
-        out[i] = self.add(self.times(c, v[i]), down if back else self.minus(down))
-        out[j] = self.add(self.minus(up) if back else up, self.times(c, v[j]))
-        return (out[0], out[1], out[2])
-
-    def inwards(self, k: int, v: Vector) -> Vector:
-        """A vector of link k's frame in its parent's frame."""
-        return self.apply(self.rotation[k], self.turn(k, v))
-
-    def outwards(self, k: int, v: Vector) -> Vector:
-        """A vector of the parent's frame in link k's frame."""
-        return self.turn(k, self.apply(transposed(self.rotation[k]), v), back=True)
-
-    def _arm(self, k: int) -> Vector:
-        """From the parent's origin to link k's, in the parent's frame."""
-        link = self.links[k]
-        offset = self.vector(link.offset)
-        if link.turns:
-            return offset
-        slide = tuple(self.times(row[link.axis], link.q) for row in self.rotation[k])
-        return self.plus(offset, slide)
-
-    def on_axis(self, k: int, x: Expr) -> Vector:
-        """A vector along link k's axis."""
-        v = list(ZERO)
-        v[self.links[k].axis] = x
-        return (v[0], v[1], v[2])
-
     # --- inertial parameters ---------------------------------------------------------------------
 
-    def _own(self, link: Link) -> Inertia:
+    def own(self, link: Link) -> Inertia:
+        """What moves with a link, as it is."""
         inertia = dict(zip(ENTRIES, map(self.define, link.inertia), strict=True))
         return Inertia(self.define(link.mass), self.vector(link.moment), inertia)
 
@@ -135,7 +95,7 @@ class Recursion(Vectors):
         as if it were the parent's; so does all inertia of a sliding link. Gautier & Khalil, IEEE
         Trans. Robotics and Automation 6(3), 1990.
         """
-        own = [self._own(link) for link in self.links]
+        own = [self.own(link) for link in self.links]
         for k in reversed(range(self.n)):
             link, mine = self.links[k], own[k]
             i, j = AXES[link.axis]
@@ -166,8 +126,7 @@ class Recursion(Vectors):
         """The same in a frame that R takes vectors to."""
         if all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
             return x
-        full = [[x.entry(i, j) for j in range(3)] for i in range(3)]
-        half = [self.apply(R, row) for row in full]  # (R I)^T, I symmetric
+        half = [self.apply(R, row) for row in x.tensor]  # (R I)^T, I symmetric
         columns = list(zip(*half, strict=True))
         pairs = combinations_with_replacement(range(3), 2)
         inertia = {(i, j): self.dot(R[j], columns[i]) for i, j in pairs}
@@ -224,18 +183,6 @@ class Recursion(Vectors):
         return self.times(s, e), self.times(c, e)
 
     # --- outwards: velocities, accelerations, forces ---------------------------------------------
-
-    def rates(self) -> list[Expr]:
-        """The joints' rates, by link."""
-        return [link.qd for link in self.links]
-
-    def angular_velocities(self, rates: Sequence[Expr]) -> list[Vector]:
-        """omega of each link in its frame."""
-        out: list[Vector] = []
-        for k, link in enumerate(self.links):
-            w = self.outwards(k, out[link.parent]) if link.parent >= 0 else ZERO
-            out.append(self.plus(w, self.on_axis(k, rates[k])) if link.turns else w)
-        return out
 
     def forces(
         self, rates: Sequence[Expr], wishes: Sequence[Expr], gravity: bool = True
@@ -379,19 +326,10 @@ class Recursion(Vectors):
         """K of the tree."""
         rates = self.rates()
         spin = self.angular_velocities(rates)
-        velocities: list[Vector] = []
         terms: list[Expr] = []
-        for k, link in enumerate(self.links):
-            v = ZERO
-            if (p := link.parent) >= 0:
-                v = self.plus(velocities[p], self.cross(spin[p], self.arm[k]))
-            v = self.outwards(k, v)
-            if not link.turns:
-                v = self.plus(v, self.on_axis(k, rates[k]))
-            velocities.append(v)
+        for k, v in enumerate(self.velocities(rates, spin)):
             x, w = self.inertia[k], spin[k]
-            whole = [[x.entry(i, j) for j in range(3)] for i in range(3)]
-            momentum = self.apply(whole, w)
+            momentum = self.apply(x.tensor, w)
             terms += [
                 self.times(self.define(x.mass / 2), self.dot(v, v)),
                 self.dot(v, self.cross(w, x.moment)),

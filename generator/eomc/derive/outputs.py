@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from sympy import Expr, S, Symbol
 
 from eomc.base.errors import EomcError, SceneError
+from eomc.derive.energies import leaves
 from eomc.derive.ldl import Rows, Vector
-from eomc.derive.tape import RoughError, Stage, Tape
+from eomc.derive.tape import RoughError, Tape
 from eomc.model.multibody import needed
 from eomc.model.symbols import dot
 from eomc.model.system import System, t
@@ -39,12 +40,7 @@ def outputs(system: System, sloped: bool) -> Outputs:
 
 
 def _outputs(system: System, sloped: bool) -> Outputs:
-    leaves: dict[Symbol, Stage] = {t: Stage.TIME}
-    leaves |= {p.symbol: Stage.PARAMETER for p in system.parameters}
-    leaves |= dict.fromkeys(system.u, Stage.TIME)
-    leaves |= dict.fromkeys(system.q, Stage.POSITION)
-    leaves |= dict.fromkeys((*system.qd, *system.qdd), Stage.VELOCITY)
-    tape = Tape(leaves)
+    tape = Tape(leaves(system, *system.qdd))
     state = (*system.q, *system.qd)
     rates = {**dict(zip(state, (*system.qd, *system.qdd), strict=True)), t: S.One}
     known: dict[Symbol, Expr] = {}

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from sympy import Symbol
+
+from eomc.derive.frames import wrenches
 from eomc.emit import c_expression, c_function
 from eomc.emit.c_expression import Body, Real
 from eomc.emit.c_safe_names import may_be_enumerator_of_others
@@ -19,14 +22,15 @@ from eomc.program.program import TIME, Program
 _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
-    "moving constants along column slopes outputs count failures point E".split()
+    "moving constants along column slopes outputs count failures point E poses velocities "
+    "accelerations jacobians forces wrenches momentum".split()
 )
 
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
 # that is called so has another name in C
 OWN = frozenset(
-    "AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE NOINLINE NOT_FINITE NO_CONVERGENCE NQ NU "
-    "NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
+    "AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE NF NOINLINE NOT_FINITE NO_CONVERGENCE NQ "
+    "NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
 )
 
 Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C
@@ -64,12 +68,13 @@ class Target:
 
     @cached_property
     def enum(self) -> dict[str, str]:
-        """The enumerator of every coordinate and input, and of each output, as OUT_name."""
+        """Enumerators of coordinates and inputs; of outputs as OUT_name, of frames FRAME_name."""
         taken = {f"{self.PREFIX}_{w}" for w in OWN}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         outputs = [f"OUT_{o.name}" for o in self.system.outputs]
-        wishes = [f"{self.PREFIX}_{name}" for name in (*indexed, *outputs)]
-        return dict(zip((*indexed, *outputs), _unique(wishes, taken), strict=True))
+        names = [*indexed, *outputs, *(f"FRAME_{f.name}" for f in self.system.asked)]
+        wishes = [f"{self.PREFIX}_{name}" for name in names]
+        return dict(zip(names, _unique(wishes, taken), strict=True))
 
     @property
     def input_names(self) -> list[str]:
@@ -80,6 +85,11 @@ class Target:
     def names(self) -> list[str]:
         """The coordinates in the order of q."""
         return [c.name for c in self.system.coordinates]
+
+    @cached_property
+    def wrenches(self) -> list[Symbol]:
+        """The entries of forces and moments at the frames."""
+        return wrenches(self.system)
 
     @property
     def needs_p(self) -> bool:
@@ -130,7 +140,7 @@ class Target:
         """How names from outside are written: p->m_c for parameters, theta_ where theta is ours."""
         s = self.system
         out = {x.name: c_function.member("p", x.name) for x in s.parameters}
-        mine = [x.name for x in (*s.q, *s.qd, *(s.qdd if s.outputs else ()), *s.u)]
+        mine = [x.name for x in (*s.q, *s.qd, *(s.qdd if s.reads_qdd else ()), *s.u)]
         return out | {n: local(n) for n in mine}
 
     def body(
@@ -149,8 +159,9 @@ class Target:
         NQ = f"{self.PREFIX}_NQ"
         read = [(c.q.name, state("q", c.name)) for c in s.coordinates]
         read += [(c.qd.name, state("qd", c.name)) for c in s.coordinates]
-        if s.outputs:
+        if s.reads_qdd:
             read += [(c.qdd.name, state("qdd", c.name)) for c in s.coordinates]
+        read += [(w.name, f"wrenches[{k}]") for k, w in enumerate(self.wrenches)]
         read += [(name, inputs("u", name)) for name in self.input_names]
         read += [(c.q.name + ALONG, state("along", c.name)) for c in s.coordinates]
         read += [(c.qd.name + ALONG, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
@@ -171,7 +182,8 @@ class Target:
         return {
             "q": frozenset(x.name for x in s.q),
             "qd": frozenset(x.name for x in s.qd),
-            "qdd": frozenset(x.name for x in s.qdd) if s.outputs else frozenset(),
+            "qdd": frozenset(x.name for x in s.qdd) if s.reads_qdd else frozenset(),
+            "wrenches": frozenset(x.name for x in self.wrenches),
             "t": frozenset({TIME}),
             "u": frozenset(self.input_names),
             "p": frozenset(p.name for p in s.parameters),

@@ -15,12 +15,13 @@ class Kind:
     """What is known of a function before it is looked at: results, arguments, meaning."""
 
     out: str
-    shape: str  # "", "n", "n*n", "n*p", "m", "y" or "y*x"
+    shape: str  # one that `extent` knows; "" of a number
     qd: bool
     u: bool
     doc: str
     symmetric: bool = False
     qdd: bool = False  # whether it may read accelerations
+    given: str = ""  # what it takes besides: "qdd" or "wrenches"
 
 
 KINDS: Mapping[str, Kind] = {
@@ -60,8 +61,78 @@ KINDS: Mapping[str, Kind] = {
         "[dy/dq, dy/dqd, dy/du, dy/dqdd] of the outputs y, by rows, each at the others held.",
         qdd=True,
     ),
+    "frame_poses": Kind("poses", "f*pose", False, False, "Where each frame is: {pose}."),
+    "frame_velocities": Kind(
+        "velocities", "f*twist", True, False, "Of each frame: {twist}, along the world's axes."
+    ),
+    "frame_accelerations": Kind(
+        "accelerations",
+        "f*twist",
+        True,
+        False,
+        "d(velocities)/dt at the accelerations qdd; at qdd = 0 that is dJ/dt qd of the Jacobians.",
+        given="qdd",
+    ),
+    "frame_jacobians": Kind(
+        "jacobians", "f*twist*n", False, False, "J of each frame: velocities = J qd, by rows."
+    ),
+    "frame_forces": Kind(
+        "forces",
+        "n",
+        False,
+        False,
+        "The sum of J^T w: what forces and moments w do that act on the frames, ordered as "
+        "velocities.",
+        given="wrenches",
+    ),
+    "inverse_dynamics": Kind(
+        "tau",
+        "n",
+        True,
+        False,
+        "tau = D qdd + C qd + g: the generalized forces of a motion, without forming D.",
+        given="qdd",
+    ),
+    "momentum": Kind(
+        "momentum", "momentum", True, False, "Of all bodies that move, rotors aside: {momentum}."
+    ),
     "signal": Kind("u", "m", True, False, "u: the scene's own signals for the inputs."),
 }
+
+
+_PLANE = {
+    "pose": "x, y, angle",
+    "twist": "the velocity of its origin (2) and the angular one",
+    "momentum": "mass, its centre (2), momentum (2), that about the centre",
+}
+_SPACE = {
+    "pose": "position (3), rotation matrix by rows (9)",
+    "twist": "the velocity of its origin (3) and the angular one (3)",
+    "momentum": "mass, its centre (3), momentum (3), that about the centre (3)",
+}
+
+
+def doc(target: Target, name: str) -> str:
+    """What a function gives, in the words of the plane or of space."""
+    return KINDS[name].doc.format(**(_PLANE if target.system.plane else _SPACE))
+
+
+def extent(target: Target, shape: str) -> str:
+    """How many numbers that is, in C."""
+    s, NQ, NU, NY, NF = (target.system, *(f"{target.PREFIX}_{n}" for n in ("NQ", "NU", "NY", "NF")))
+    pose, twist, momentum = (3, 3, 6) if s.plane else (12, 6, 10)
+    return {
+        "n*n": f"{NQ}*{NQ}",
+        "n*p": f"{NQ}*{len(s.parameters)}",
+        "n": NQ,
+        "m": NU,
+        "y": NY,
+        "y*x": f"{NY}*(3*{NQ} + {NU})" if s.inputs else f"{NY}*(3*{NQ})",
+        "f*pose": f"{NF}*{pose}",
+        "f*twist": f"{NF}*{twist}",
+        "f*twist*n": f"{NF}*{twist}*{NQ}",
+        "momentum": str(momentum),
+    }.get(shape, "")
 
 
 def source(target: Target, name: str) -> Function | None:

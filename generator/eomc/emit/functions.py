@@ -15,7 +15,7 @@ from eomc.emit import heading
 from eomc.emit.c_expression import REALS, Block, Body, Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, sentence, unclashed
-from eomc.emit.evaluations import KINDS, source
+from eomc.emit.evaluations import KINDS, doc, source
 from eomc.emit.plain.views import Computed, Indexed, Parameter
 from eomc.emit.public import Public
 from eomc.model.symbols import Coordinate, Input, Output
@@ -24,7 +24,7 @@ from eomc.program.ir import Function
 from eomc.program.program import Program
 
 STATE = ("q", "qd")
-READ = (*STATE, "qdd", "t", "u", "p")
+READ = (*STATE, "qdd", "wrenches", "t", "u", "p")
 FEW = 16  # statements that are read at a glance, without comments between them
 
 
@@ -112,7 +112,7 @@ class Functions:
     def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:
         """The arguments that a static function needs, arrays as pointers."""
         needed = [n for n in names if function.uses & self.brought[n]]
-        arrays = (*STATE, "qdd", "along")
+        arrays = (*STATE, "qdd", "wrenches", "along")
         return tuple(c.given(self.real, n) if n in arrays else self.argument(n) for n in needed)
 
     # the scene's signals
@@ -224,12 +224,13 @@ class Functions:
         assert function is not None
         told = sentence(function)
         by_columns = name not in target.program
-        takes_u = kind.u and bool(target.system.inputs)
-        doc = [kind.doc, *(["u: the inputs; NULL for the scene's signals."] if takes_u else [])]
+        said = [doc(target, name)]
+        if kind.u and target.system.inputs:
+            said.append("u: the inputs; NULL for the scene's signals.")
         if by_columns:
             told = f"By {len(target.names)} columns, each: {told[0].lower()}{told[1:]}"
         reads = self.read(function) | {kind.out}
-        public = replace(self.public.evaluation(name), reads=reads, doc=(*doc, told))
+        public = replace(self.public.evaluation(name), reads=reads, doc=(*said, told))
         if by_columns:
             return self._by_columns(public, function, name)
         if name == "energy" and (summed := self._summed(public)):

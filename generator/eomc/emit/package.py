@@ -20,6 +20,11 @@ FUNCTIONS = (
     "output potential_energy power rhs sensitivity signal simulate simulate_batch step step_batch "
     "tau"
 ).split()
+ASKED = {  # what only scenes have that ask for it in [run]
+    "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
+    "inverse_dynamics": ("inverse_dynamics",),
+    "momentum": ("momentum",),
+}
 
 
 def main(target: Target) -> Main:
@@ -54,8 +59,12 @@ def _bound(target: Target) -> tuple[Bound, ...]:
     at, found = _rows(target), []
     for function in Public(target).evaluations():
         name = function.name.removeprefix(f"{target.prefix}_")
-        kind, out = KINDS[name], function.arguments[0].extent
-        call = function.call(**at | ({kind.out: f"out + {out}*k"} if kind.out else {}))
+        kind = KINDS[name]
+        extents = {a.name: a.extent for a in function.arguments}
+        rows = {kind.out: f"out + {extents[kind.out]}*k"} if kind.out else {}
+        if kind.given:
+            rows[kind.given] = f"u + {extents[kind.given]}*k"
+        call = function.call(**at, **rows)
         solve = Public(target).acceleration.call(**at) if takes_qdd(target, name) else ""
         found.append(Bound(name, call if kind.out else f"out[k] = {call}", solve))
     return tuple(found)
@@ -130,6 +139,8 @@ def face(target: Target, extension: str) -> Face:
     s, written = target.system, target.as_written
     units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
     units |= {i.name: i.unit for i in s.inputs} | {o.name: o.unit for o in s.outputs}
+    functions = [n for n in FUNCTIONS if s.run.batch or not n.endswith("_batch")]
+    functions += [n for key, names in ASKED.items() if getattr(s.run, key) for n in names]
     return Face(
         title=FreeText(s.title),
         stamp=tuple(stamp(target)),
@@ -147,6 +158,8 @@ def face(target: Target, extension: str) -> Face:
         parameter_values={written(p.name): p.value for p in s.parameters},
         input_units=FreeText({written(i.name): i.unit for i in s.inputs}),
         output_units=FreeText({o.name: o.unit for o in s.outputs}),
+        frames=tuple(f.name for f in s.asked),
+        plane=bool(s.plane and (s.asked or s.run.momentum)),
         units=FreeText({written(name): unit for name, unit in units.items() if unit}),
         start=([c.start for c in s.coordinates], [c.rate for c in s.coordinates]),
         h=s.run.h,
@@ -154,5 +167,6 @@ def face(target: Target, extension: str) -> Face:
         timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,
         methods=tuple(METHODS[name] for name in s.run.methods),
-        functions=tuple(n for n in FUNCTIONS if s.run.batch or not n.endswith("_batch")),
+        functions=tuple(sorted(functions)),
+        asked=tuple(x for x in ASKED.items() if not getattr(s.run, x[0])),
     )

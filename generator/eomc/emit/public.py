@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from eomc.emit.c_function import CArgument, CFunction, filled, given
 from eomc.emit.c_names import Target
-from eomc.emit.evaluations import KINDS, source, takes_qdd, takes_t
+from eomc.emit.evaluations import KINDS, extent, source, takes_qdd, takes_t
 
 STATE = ("q", "qd")
 
@@ -24,6 +24,7 @@ class Public:
             "q": given(real, "q", f"{target.PREFIX}_NQ"),
             "qd": given(real, "qd", f"{target.PREFIX}_NQ"),
             "qdd": given(real, "qdd", f"{target.PREFIX}_NQ"),
+            "wrenches": given(real, "wrenches", extent(target, "f*twist")),
             "t": CArgument(real, "t") if target.driven else None,
             "h": CArgument(real, "h"),
             "u": given(real, "u") if target.system.inputs else None,
@@ -38,22 +39,18 @@ class Public:
     def evaluation(self, name: str) -> CFunction:
         """One of them."""
         kind, target, real = KINDS[name], self.target, self.target.real.name
-        NQ, signal = f"{target.PREFIX}_NQ", name == "signal"
-        NU, NY = f"{target.PREFIX}_NU", f"{target.PREFIX}_NY"
-        state = f"3*{NQ} + {NU}" if target.system.inputs else f"3*{NQ}"
-        extents = {"n*n": f"{NQ}*{NQ}", "n*p": f"{NQ}*{len(target.system.parameters)}", "n": NQ}
-        extents |= {"m": NU, "y": NY, "y*x": f"{NY}*({state})"}
-        extent = extents.get(kind.shape, "")
+        signal = name == "signal"
         t = (CArgument(real, "t"),) if takes_t(target, name) else ()
         moving = STATE if kind.qd else STATE[:1]
         return CFunction(
             f"{target.prefix}_{name}",
             "void" if kind.out else real,
             (
-                *([filled(real, kind.out, extent)] if kind.out else []),
+                *([filled(real, kind.out, extent(target, kind.shape))] if kind.out else []),
                 *(t if signal else ()),
                 *(self.usual(*moving) if not signal or target.signal_state else ()),
                 *(self.usual("qdd") if takes_qdd(target, name) else ()),
+                *(self.usual(kind.given) if kind.given else ()),
                 *(() if signal else t),
                 *self.usual(*(["u"] if kind.u else []), "p"),
             ),

@@ -122,7 +122,10 @@ class Named:
 
 @dataclass(frozen=True)
 class Face:
-    """python/face.py.jinja. start: coordinates and velocities; functions: public, of the model."""
+    """python/face.py.jinja. start: coordinates and velocities; functions: public, of the model.
+
+    asked: which others there would be by which key of [run].
+    """
 
     TEMPLATE: ClassVar[str] = "python/face.py"
     title: FreeText
@@ -139,6 +142,8 @@ class Face:
     parameter_values: Mapping[str, float]
     input_units: FreeText
     output_units: FreeText
+    frames: tuple[str, ...]
+    plane: bool
     units: FreeText
     start: tuple[list[float], list[float]]
     h: float
@@ -147,6 +152,7 @@ class Face:
     batch: bool
     methods: tuple[Method, ...]
     functions: tuple[str, ...]
+    asked: tuple[tuple[str, tuple[str, ...]], ...]
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,8 @@ def from_scene(scene: Scene) -> System:
         ),
         applied=tuple(more.applied),
         tree=more.tree(kinetic, potential),
+        frames=tuple(more.frames),
+        plane=bool(scene.assembly and scene.assembly.plane),
         parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
         inputs=inputs,
         definitions=tuple(definitions),

@@ -86,7 +86,8 @@ def count(scene: Scene) -> Mobility:
         )
     d = 3 if assembly.plane else 6
     placed = [body for body in assembly.bodies if not body.joint]
-    joints = Counter(body.joint or FORMULAS for body in assembly.bodies)
+    bodies = [body for body in assembly.bodies if not body.point]
+    joints = Counter(body.joint or FORMULAS for body in bodies)
     M = sum(n * _freedoms(kind, d) for kind, n in joints.items())  # a tree: N - 1 - j = 0
     kinematics = Kinematics(scene, assembly)
     names = kinematics.coordinates
@@ -104,7 +105,7 @@ def count(scene: Scene) -> Mobility:
         *_singular_start(kinematics, generic),
         *(f"{problem.key}: {problem.message}" for problem in meeting(scene)),
     ]
-    return Mobility(scene.name, d, len(assembly.bodies), joints, M, len(names), rank, (*remarks,))
+    return Mobility(scene.name, d, len(bodies), joints, M, len(names), rank, (*remarks,))
 
 
 def meeting(scene: Scene) -> list[Problem]:
@@ -164,7 +165,7 @@ def _freedoms(kind: str, d: int) -> int:
 
 
 def _fixed(assembly: Assembly) -> Iterator[str]:
-    rigid = [body.name for body in assembly.bodies if body.joint == "fixed"]
+    rigid = [body.name for body in assembly.bodies if body.joint == "fixed" and not body.point]
     if rigid:
         yield f"fixed (f = 0), moving as one with what they are fixed to: {listed(rigid)}"
 

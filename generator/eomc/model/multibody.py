@@ -63,6 +63,24 @@ class Tree:
     beside_potential: Expr = S.Zero
 
 
+@dataclass(frozen=True)
+class Frame:
+    """The frame of a body or a point: at `offset`, rotated by `rotation`, in that of its link.
+
+    link -1: in the world, where a body placed by formulas has them in the coordinates, and its
+    mass and inertia (as those of a link) about its centre, where its frame is. angle: in the plane,
+    over definitions.
+    """
+
+    name: str
+    link: int
+    offset: Vector
+    rotation: Matrix
+    angle: Expr
+    mass: Expr = S.Zero
+    inertia: tuple[Expr, ...] = (S.Zero,) * 6
+
+
 @dataclass
 class Terms:
     """What bodies, springs and dampers add to a system.
@@ -80,6 +98,7 @@ class Terms:
     forces: dict[str, Expr] = field(default_factory=dict)
     applied: list[tuple[Expr, Expr]] = field(default_factory=list)  # forces at positions
     links: list[Link] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
     still: Vector = ZERO
     gravity: Vector = ZERO
 
@@ -117,7 +136,7 @@ class Builder:
         self.taken = set(taken)
         self.terms = Terms()
         self.places: dict[str, _Place] = {WORLD: _Place(-1, ZERO, ONE, ZERO, ONE)}
-        self.masses: dict[str, Expr] = {}
+        self.loads: dict[str, tuple[Expr, tuple[Expr, ...]]] = {}  # of bodies placed by formulas
         self.terms.gravity = self._vector("gravity", assembly.gravity)
 
     # --- the tree --------------------------------------------------------------------------------
@@ -240,12 +259,19 @@ class Builder:
         for body in self.assembly.bodies:
             if not body.joint:
                 self._put(body)
+        for body in sorted(self.assembly.bodies, key=lambda body: body.point):
+            self.terms.frames.append(self._frame(body.name, self.places[body.name]))
         for k, spring in enumerate(self.assembly.springs):
             self._spring(f"spring.{k + 1}", spring)
         for k, damper in enumerate(self.assembly.dampers):
             self._damper(f"damper.{k + 1}", damper)
         for k, force in enumerate(self.assembly.forces):
             self._apply(f"force.{k + 1}", force)
+
+    def _frame(self, name: str, place: _Place) -> Frame:
+        if name in self.loads:
+            return Frame(name, -1, place.at, place.R, place.angle, *self.loads[name])
+        return Frame(name, place.link, place.offset, place.rotation, place.angle)
 
     def _apply(self, key: str, force: Force) -> None:
         """A force at a point of a body, a torque on it; virtual work is F.dp + tau.(dR R^T)."""
@@ -281,6 +307,7 @@ class Builder:
             R = self._entries(body.name, R, later=True)
         place = _Place(-1, ZERO, ONE, position, R, angle)
         self.places[body.name] = place
+        self.loads[body.name] = mass, tuple(inertia)
         terms.kinetic += Add(*self._kinetic(mass, inertia, position, place))
         terms.potential += self._weight(mass, position)
 

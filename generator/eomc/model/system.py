@@ -15,7 +15,7 @@ from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
-from eomc.model.multibody import Tree
+from eomc.model.multibody import Frame, Tree
 from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
 from eomc.scene.scene import Run, Scene
 
@@ -31,7 +31,8 @@ class System:
     `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
     `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate; to it come the forces
     F that are `applied` at positions y, pairs (y, F), each with F dy/dq. `tree`: the bodies
-    that are held by joints, whose energies are part of K and P. `digest` names what the system was
+    that are held by joints, whose energies are part of K and P. `frames`: of bodies and points, in
+    space or in the `plane`. `digest` names what the system was
     made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
     was read from, where it was.
     """
@@ -48,6 +49,8 @@ class System:
     outputs: tuple[Output, ...] = ()
     applied: tuple[tuple[Expr, Expr], ...] = ()
     tree: Tree | None = None
+    frames: tuple[Frame, ...] = ()
+    plane: bool = False
     run: Run = field(default_factory=Run)
     title: str = ""
     note: str = ""
@@ -85,10 +88,21 @@ class System:
         return replace(self, parameters=changed)
 
     @property
+    def asked(self) -> tuple[Frame, ...]:
+        """The frames whose poses, velocities and Jacobians are wanted."""
+        wanted = self.run.frames
+        return tuple(f for f in self.frames if wanted is True or (wanted and f.name in wanted))
+
+    @property
+    def reads_qdd(self) -> bool:
+        """Whether functions may read accelerations."""
+        return bool(self.outputs or self.asked or self.run.inverse_dynamics)
+
+    @property
     def names(self) -> frozenset[str]:
-        """Those of coordinates, velocities, inputs, parameters, and of accelerations where outputs
-        may read them: no value may take one."""
-        given = (*self.q, *self.qd, *self.u, *(self.qdd if self.outputs else ()))
+        """Those of coordinates, velocities, inputs, parameters, and of accelerations where
+        functions may read them: no value may take one."""
+        given = (*self.q, *self.qd, *self.u, *(self.qdd if self.reads_qdd else ()))
         return frozenset([*(x.name for x in given), *(p.name for p in self.parameters)])
 
     @property

@@ -6,9 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from eomc.base.errors import Problem, SceneError
+from eomc.derive.frames import motions
+from eomc.derive.inverse_dynamics import inverse_dynamics
 from eomc.derive.lagrange import Derivation
 from eomc.derive.ldl import Solution
 from eomc.derive.linearize import linearization, sensitivity
+from eomc.derive.momentum import momentum
 from eomc.derive.outputs import outputs
 from eomc.derive.tape import Stage
 from eomc.integrators.tableaux import METHODS
@@ -76,7 +79,7 @@ def build(derived: Derivation) -> Program:
     functions["acceleration"] = best
     for made in _derivatives(system, taken):
         functions[made.name] = replace(made, route=best.route)
-    functions |= {made.name: made for made in _outputs(system)}
+    functions |= {made.name: made for made in (*_outputs(system), *_asked(system))}
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     notes = next(f.notes for f in found.values())
@@ -126,6 +129,26 @@ def _outputs(system: System) -> Iterator[Function]:
     yield lower("outputs", made.tape, made.values, (), labels, system.names)
     if rows := [x for row in made.slopes for x in row]:
         yield lower("output_slopes", made.tape, rows, (), (), system.names)
+
+
+def _asked(system: System) -> Iterator[Function]:
+    """What [run] asks for besides: of frames, inverse dynamics, momenta."""
+    frames = [f.name for f in system.asked]
+    if frames:
+        found = motions(system)
+        entries = ("x", "y", "angle") if system.plane else ("x", "y", "z")
+        where = [f"{name}_{entry}" for name in frames for entry in entries]
+        for name in ("poses", "velocities", "accelerations", "jacobians", "forces"):
+            labels = where if name == "poses" and system.plane else ()
+            values = getattr(found, name)
+            yield lower(f"frame_{name}", found.tape, values, (), labels, system.names)
+    if system.run.inverse_dynamics:
+        tape, forces = inverse_dynamics(system)
+        labels = [f"tau_{c.name}" for c in system.coordinates]
+        yield lower("inverse_dynamics", tape, forces, (), labels, system.names)
+    if system.run.momentum:
+        tape, values = momentum(system)
+        yield lower("momentum", tape, values, (), (), system.names)
 
 
 def _unsuited(program: Program) -> list[Problem]:

@@ -82,6 +82,7 @@ class Arguments:
         coordinates: Mapping[str, str], parameters: Mapping[str, float],
         inputs: Mapping[str, str], outputs: Sequence[str], units: Mapping[str, str],
         start: tuple[Sequence[float], Sequence[float]], timed: Sequence[str], digest: str,
+        frames: Sequence[str] = (), plane: bool = False,
     ) -> None:  # fmt: skip
         # thirty attributes at most with those of Model: with more CPython 3.11 looks up each slowly
         self._ffi, self._lib = extension.ffi, extension.lib
@@ -92,6 +93,7 @@ class Arguments:
         self.dtype = np.dtype(dtype)
         self.coordinates, self.inputs = tuple(coordinates), tuple(inputs)
         self.parameters, self.outputs = tuple(parameters), tuple(outputs)
+        self._frames = tuple(frames), plane
         self.defaults = Defaults(parameters)
         self.units = dict(units)
         self.nq, self.nu = len(self.coordinates), len(self.inputs)

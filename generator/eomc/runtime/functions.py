@@ -16,7 +16,9 @@ from .arguments import Arguments, Array, Parameters, as_number, unmasked
 from .slices import slices
 from .trajectory import SAID, STATUS, MotionError, state_text
 
-_OF_POSITION = ("D", "g", "potential_energy")
+_OF_POSITION = (
+    "D", "g", "potential_energy", "frame_poses", "frame_jacobians", "frame_forces"
+)  # fmt: skip
 _ROWS = 20_000  # rows times coordinates squared in one call, some ms at most
 
 
@@ -25,8 +27,9 @@ class Functions(Arguments):
 
     def _evaluate(
         self, name: str, shape: tuple[int, ...], q: ArrayLike, qd: ArrayLike | None, t: float,
-        u: Any, params: Any, out: Any,
+        u: Any, params: Any, out: Any, each: Array | None = None,
     ) -> Any:  # fmt: skip
+        """The function of that name. each: what it takes in place of u, a row for each state."""
         address, real, null = self._c
         at: Any
         moving: Array | None
@@ -45,9 +48,13 @@ class Functions(Arguments):
                 raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
             for k, now in enumerate(np.asarray(t)):
                 row_qd = None if moving is None else moving[k]
-                result[k] = self._evaluate(name, shape, at[k], row_qd, now, u, params, None)
+                own = None if each is None else each[k]
+                result[k] = self._evaluate(name, shape, at[k], row_qd, now, u, params, None, own)
             return result
         time, (inputs, p) = as_number(t, "t"), self._given(u, params)
+        width = 0
+        if each is not None:
+            inputs, width = address(real, each), each.shape[-1]
         function = getattr(self._lib, name, None)
         if function is None:  # no forces, no power
             result[...] = 0
@@ -56,7 +63,8 @@ class Functions(Arguments):
             for k, many in slices(rows[0], _ROWS // self.nq**2 + 1):
                 here = self.nq * k
                 moving_here = from_qd + here if moving is not None else null
-                function(many, to + size * k, from_q + here, moving_here, time, inputs, p)
+                held = inputs + width * k if width else inputs
+                function(many, to + size * k, from_q + here, moving_here, time, held, p)
         else:
             function(
                 rows[0] if rows else 1, address(real, result), from_q, from_qd, time, inputs, p

@@ -21,7 +21,7 @@ from .arguments import Array, Parameters, as_count, as_number, as_step_size, mac
 from .columns import File
 from .equilibrium import equilibrium
 from .estimate import advice, beyond_end
-from .functions import Functions
+from .frames import Frames
 from .package import reduced
 from .slices import longer
 from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
@@ -60,7 +60,7 @@ class Law:
         return np.array([*self.kept, last][:count], last.dtype)
 
 
-class Model(Functions):
+class Model(Frames):
     """The functions of one compiled scene; the package hands them on under their own names."""
 
     def __init__(

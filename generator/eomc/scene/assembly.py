@@ -38,7 +38,7 @@ class Body:
     the off-diagonal entries are those of the tensor, -sum m x y.
     armature (kg or kg m^2), damping (N s/m or N m s/rad), friction (N or N m; Coulomb's, smoothed
     as friction*tanh(rate/friction_width)) and actuator (a force along the coordinate, of all
-    names): empty, or one a coordinate.
+    names): empty, or one a coordinate. A `point` is a body without mass on a fixed joint.
     """
 
     name: str
@@ -58,6 +58,7 @@ class Body:
     friction_width: Formula | None = None
     actuator: tuple[Formula, ...] = ()
     note: str = ""
+    point: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -103,6 +103,7 @@ class _Check(Checker):
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
         outputs = self._outputs()
+        self._asked()
         self._unused()
         if any(p.severity == "error" for p in self.problems):
             raise SceneError(self.problems)
@@ -358,6 +359,21 @@ class _Check(Checker):
             if formula:
                 out.append(Output(name, entry.unit, formula, entry.note))
         return out
+
+    def _asked(self) -> None:
+        """What [run] asks for of bodies."""
+        run, doc = self.doc.run, self.doc
+        for key in ("frames", "momentum"):
+            if getattr(run, key) and not doc.body:
+                why = f"'{key}' is of bodies, and there is no [[body]]: remove it, or name what is "
+                self.say(("run", key), f"{why}asked for in [outputs]")
+                return
+        known = [entry.name for table in (doc.body, doc.point) for entry in table.values()]
+        for name in run.frames if isinstance(run.frames, tuple) else ():
+            if name not in known:
+                remedy = suggest(name, known) or f": known are {', '.join(known[:9])}"
+                message = f"'{name}' is no body or point{remedy}"
+                self.say(("run", "frames"), message, text=name)
 
     def _unused(self) -> None:
         if any(p.severity == "error" for p in self.problems):

@@ -1,8 +1,8 @@
 """Repetition: `repeat = "i = 1..n"` and `theta[i]` written out, on the plain tree of a scene.
 
 Entries that repeat become entries of their own, and `name[index]` becomes the name with the number
-behind it. The arrays of tables [[body]], [[spring]] and [[damper]] become tables: of the bodies'
-names, and of numbers from 1.
+behind it. The arrays of tables [[body]], [[spring]], ... become tables: of the names of bodies and
+points, else of numbers from 1.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ _TABLES = ("constants", "parameters", "coordinates", "inputs", "definitions", "f
 _PLAIN = ("definitions", "forces")  # whose entries are formulas, not tables
 _WORDS = ("unit", "note", "title", "repeat")  # keys whose texts are for people
 # no formulas
+_NAMED = ("body", "point")  # arrays whose entries have names
 _NAMES = ("name", "parent", "joint", "coordinates", "coordinate", "bodies", "body", "frame")
 _ARRAYS_MEANT = {
     "bodies": "body", "Body": "body", "link": "body", "links": "body", "springs": "spring",
@@ -116,7 +117,7 @@ class _Expansion:
             inner = isinstance(entries, dict) and all(isinstance(e, dict) for e in entries.values())
             named = (
                 f' and name = "{next(iter(entries))}"'
-                if inner and entries and array == "body"
+                if inner and entries and array in _NAMED
                 else ""
             )
             message = f"each {array} has a table of its own: write [[{array}]]{named}"
@@ -126,7 +127,7 @@ class _Expansion:
         places = self.check.places
         for k, entry in enumerate(entries, start=1):
             written = (array, f"#{k}")
-            name = entry.get("name") if array == "body" else None
+            name = entry.get("name") if array in _NAMED else None
             shown = (array, name if isinstance(name, str) and name else str(len(out) + 1))
             places.repeat(written, [shown])
             if "repeat" in entry:
@@ -135,7 +136,7 @@ class _Expansion:
                 made = [self._once(shown, entry)]
             labels = []
             for each in made:
-                label = each.get("name") if array == "body" else None
+                label = each.get("name") if array in _NAMED else None
                 if not isinstance(label, str) or not label or label in out:
                     label = str(len(out) + 1)
                 out[label] = each

@@ -60,7 +60,9 @@ class Run:
 
     methods: the steppers wanted, the one that runs use first. real: the C type that everything
     is computed in. batch: whether many trajectories at once are wanted. linearize: whether the
-    derivatives of the accelerations are, "parameters" for those by parameters too.
+    derivatives of the accelerations are, "parameters" for those by parameters too. frames: of
+    which bodies and points poses, velocities, accelerations and Jacobians are, True for all.
+    inverse_dynamics, momentum: whether these are.
     """
 
     h: float = 0.001
@@ -69,6 +71,9 @@ class Run:
     real: str = "double"
     batch: bool = False
     linearize: bool | str = False
+    frames: bool | tuple[str, ...] = False
+    inverse_dynamics: bool = False
+    momentum: bool = False
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,16 @@ def _linearized(value: object) -> bool | str:
     raise ValueError(f'must be true, false or "parameters", here {spelling.toml(value)}')
 
 
+def _asked(value: object) -> bool | tuple[str, ...]:
+    """Whether all frames are wanted, or which."""
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, list) and all(isinstance(name, str) for name in value):
+        return tuple(dict.fromkeys(value))
+    example = 'true, or a list of bodies and points such as ["tip"]'
+    raise ValueError(f"must be {example}, here {spelling.toml(value)}")
+
+
 class _Run(_Table):
     h: _Positive = 0.001
     duration: _Positive = 10.0
@@ -90,6 +100,9 @@ class _Run(_Table):
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
     linearize: Annotated[bool | str, pydantic.PlainValidator(_linearized)] = False
+    frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(_asked)] = False
+    inverse_dynamics: pydantic.StrictBool = False
+    momentum: pydantic.StrictBool = False
 
 
 def _spelled_out(key: str, value: object) -> object:
@@ -133,6 +146,16 @@ class BodyTable(_Table):
     friction: _Each | None = None
     friction_width: _Value | None = None
     actuator: _Each | None = None
+
+
+class PointTable(_Table):
+    """A [[point]] as it is written."""
+
+    name: pydantic.StrictStr
+    body: pydantic.StrictStr
+    place: _Vector | None = None
+    rotation: _Rotation | None = None
+    note: _Note = ""
 
 
 class _Between(_Table):
@@ -186,6 +209,7 @@ class Document(_Table):
     forces: dict[str, _Value] = {}
     outputs: dict[str, _Formula] = {}
     body: dict[str, BodyTable] = {}
+    point: dict[str, PointTable] = {}
     spring: dict[str, SpringTable] = {}
     damper: dict[str, DamperTable] = {}
     force: dict[str, ForceTable] = {}
@@ -211,6 +235,7 @@ _MODELS: Mapping[str, type[_Table]] = {
     "outputs": OutputTable,
     "energy": _Energy,
     "body": BodyTable,
+    "point": PointTable,
     "spring": SpringTable,
     "damper": DamperTable,
     "force": ForceTable,
@@ -237,6 +262,11 @@ _ALIASES_OF = {
         "J": "inertia", "moment": "inertia", "c": "damping", "b": "damping", "d": "damping",
         "mu": "friction", "coulomb": "friction", "width": "friction_width", "motor": "actuator",
         "torque": "actuator", "force": "actuator", "input": "actuator", "id": "name",
+    },
+    "point": {
+        "parent": "body", "link": "body", "at": "place", "offset": "place", "position": "place",
+        "xyz": "place", "point": "place", "origin": "place", "rpy": "rotation",
+        "angle": "rotation", "orientation": "rotation", "id": "name",
     },
     "spring": {
         "k": "stiffness", "c": "stiffness", "constant": "stiffness", "rest": "length",
@@ -346,6 +376,8 @@ _MISSING: Mapping[tuple[str, ...], str] = {
     ("energy",): 'add [energy] with kinetic = "..." and potential = "..."',
     ("energy", "kinetic"): 'add kinetic = "..."',
     ("body", "name"): 'give the body a name: name = "..."',
+    ("point", "name"): 'give the point a name: name = "..."',
+    ("point", "body"): 'name the body that it is fixed to: body = "..."',
     ("spring", "stiffness"): 'add stiffness = "..."',
     ("damper", "damping"): 'add damping = "..."',
     ("force", "body"): 'name the body that it acts on, body = "..."; a force along a coordinate '
@@ -362,8 +394,8 @@ def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
     elif path in _HARMLESS:
         table[last] = _HARMLESS[path]
     elif len(path) == 3 and path[0] in _ALIASES_OF and last in ("name", "stiffness", "damping"):
-        table[last] = f"body_{path[1]}" if last == "name" else 1.0
-    elif len(path) == 3 and (path[0], last) == ("force", "body"):
+        table[last] = f"{path[0]}_{path[1]}" if last == "name" else 1.0
+    elif len(path) == 3 and last == "body" and path[0] in ("force", "point"):
         table[last] = next((b["name"] for b in tree.get("body", {}).values() if "name" in b), "")
     elif len(path) == 2 and path[0] in ("definitions", "forces"):
         table[last] = "0"

@@ -15,7 +15,7 @@ from eomc.scene import formulas
 from eomc.scene.assembly import WORLD, Assembly, Body, Vector
 from eomc.scene.formulas import Formula, nearest, suggest
 from eomc.scene.joints import JOINTS, MEANT, Z
-from eomc.scene.schema import BodyTable, Document
+from eomc.scene.schema import BodyTable, Document, PointTable
 from eomc.scene.scope import Checker, Path, ring_text, rings
 from eomc.scene.validate_springs import Springs
 from eomc.scene.validate_values import ORIGIN, ZERO
@@ -29,14 +29,11 @@ _OF_JOINTS = (
 
 
 def centers(doc: Document) -> set[str]:
-    """The names that bodies on joints give to the position of their centres of mass."""
+    """The names that bodies on joints give to the position of their centres of mass, and points."""
     letters = "xy" if doc.gravity and len(doc.gravity) == 2 else "xyz"
-    return {
-        f"{body.name}_{letter}"
-        for body in doc.body.values()
-        if body.position is None
-        for letter in letters
-    }
+    named = [body.name for body in doc.body.values() if body.position is None]
+    named += [point.name for point in doc.point.values()]
+    return {f"{name}_{letter}" for name in named for letter in letters}
 
 
 def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assembly | None:
@@ -45,7 +42,7 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
     known: the values of constants and parameters. Faults are reported to `check`; with faults the
     assembly is not to be used.
     """
-    if not (doc.body or doc.spring or doc.damper or doc.force):
+    if not (doc.body or doc.point or doc.spring or doc.damper or doc.force):
         if doc.gravity is not None:
             check.say(
                 ("gravity",),
@@ -65,10 +62,11 @@ class _Bodies(Springs):
     def assembly(self) -> Assembly:
         gravity = self._gravity()
         self._names()
-        labels = self.names.values()
-        for label in labels:
-            entry, path = self.doc.body[label], ("body", label)
-            if entry.position is None:
+        for name, path in self.names.items():
+            entry = self._entry(name)
+            if isinstance(entry, PointTable):
+                self._point(path, entry)
+            elif entry.position is None:
                 self._jointed(path, entry)
             else:
                 self._placed(path, entry)
@@ -111,8 +109,10 @@ class _Bodies(Springs):
         return self._vector(("gravity",), given)
 
     def _names(self) -> None:
-        for label, entry in self.doc.body.items():
-            path, name = ("body", label, "name"), entry.name
+        entries = [(("body", label), entry.name) for label, entry in self.doc.body.items()]
+        entries += [(("point", label), entry.name) for label, entry in self.doc.point.items()]
+        for place, name in entries:
+            path = (*place, "name")
             if why := names.fault(name):
                 self.check.say(path, why)
             elif name == WORLD:
@@ -121,15 +121,15 @@ class _Bodies(Springs):
                 )
                 continue
             elif name in self.names:
-                self.check.say(path, f"'{name}' is the name of a body above: rename one of the two")
+                what = f"{self.names[name][0]} above"
+                self.check.say(path, f"'{name}' is the name of a {what}: rename one of the two")
                 continue
-            self.names[name] = label
+            self.names[name] = place
         for name in sorted(self.check.centers & {*self.check.tables}):
             body = name[:-2]
             self.check.say(
                 (self.check.tables[name], name),
-                f"'{name}' is where the centre of mass of body '{body}' is: use that, or choose "
-                "another name",
+                f"'{name}' is where {self._what(body)} is: use that, or choose another name",
             )
 
     # --- bodies -----------------------------------------------------------------------------------
@@ -163,11 +163,40 @@ class _Bodies(Springs):
             note=entry.note,
         )
 
+    def _entry(self, name: str) -> BodyTable | PointTable:
+        array, label = self.names[name]
+        entries: Mapping[str, BodyTable | PointTable] = getattr(self.doc, array)
+        return entries[label]
+
+    def _what(self, name: str) -> str:
+        point = self.names.get(name, ("body",))[0] == "point"
+        return f"point '{name}'" if point else f"the centre of mass of body '{name}'"
+
+    def _point(self, path: Path, entry: PointTable) -> None:
+        """A frame on a body, which is one without mass on a fixed joint."""
+        place = self._vector((*path, "place"), entry.place)
+        rotation = self._rotation((*path, "rotation"), entry.rotation, self._formula)
+        parent = self._parent((*path, "body"), entry.name, entry.body)
+        self.heavy[entry.name] = False
+        if parent is not None:
+            self.bodies[entry.name] = Body(
+                name=entry.name,
+                mass=ZERO,
+                inertia=(ZERO,) * 6,
+                center=ORIGIN,
+                rotation=rotation,
+                parent=parent,
+                joint="fixed",
+                offset=place,
+                note=entry.note,
+                point=True,
+            )
+
     def _jointed(self, path: Path, entry: BodyTable) -> None:
         """A body held by a joint."""
         check = self.check
         joint = self._joint(path, entry)
-        parent = self._parent((*path, "parent"), entry)
+        parent = self._parent((*path, "parent"), entry.name, entry.parent)
         mass, inertia = self._mass(path, entry)
         center = self._vector((*path, "center"), entry.center)
         offset = self._vector((*path, "offset"), entry.offset)
@@ -240,18 +269,18 @@ class _Bodies(Springs):
             return ""
         return joint
 
-    def _parent(self, path: Path, entry: BodyTable) -> str | None:
-        parent = WORLD if entry.parent is None else entry.parent
-        if parent == WORLD:
-            return parent
+    def _parent(self, path: Path, name: str, parent: str | None) -> str | None:
+        """The body that carries `name`; None where it can't be one."""
+        if parent is None or parent == WORLD:
+            return WORLD
         if parent not in self.names:
             remedy = suggest(parent, [WORLD, *self.names]) or ": declare it as a [[body]]"
             self.check.say(path, f"there is no body '{parent}'{remedy}", text=parent)
-        elif parent == entry.name:
+        elif parent == name:
             self.check.say(
                 path, f"'{parent}' is its own parent: name another body, or world", text=parent
             )
-        elif self.doc.body[self.names[parent]].position is not None:
+        elif getattr(self._entry(parent), "position", None) is not None:
             self.check.say(
                 path,
                 f"'{parent}' is placed by formulas, and can't be a parent: give it a joint, "
@@ -366,8 +395,9 @@ class _Bodies(Springs):
         """Parents before children, else as written; rings of parents are reported."""
         graph = {name: [b.parent] if b.joint else [] for name, b in self.bodies.items()}
         for ring in islice(rings(graph), MOST):
+            place = self.names[ring[0]]
             self.check.say(
-                ("body", self.names[ring[0]], "parent"),
+                (*place, "body" if place[0] == "point" else "parent"),
                 f"the parents form a loop: {ring_text(ring)}; let one of them be held by the "
                 "world, and close the loop with stiff springs",
                 text=ring[1],
@@ -407,7 +437,7 @@ class _Bodies(Springs):
                 continue
             reported.add(body.name)
             self.check.say(
-                ("body", self.names[body.name]),
+                self.names[body.name],
                 f"nothing that {' and '.join(body.coordinates)} would move has mass or inertia: "
                 f"give '{body.name}' a mass, or its joint an armature",
             )

@@ -27,7 +27,7 @@ class Values:
         self.check = check
         self.doc = doc
         self.known = known
-        self.names: dict[str, str] = {}  # of each body, and the label of its entry
+        self.names: dict[str, Path] = {}  # of each body and point, and where it stands
         # entries of a vector; None where gravity doesn't say whether the scene is plane
         self.wide: int | None = 2
         self.values: dict[float | str, tuple[Formula, float]] = {}  # sound formulas, by text

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from eomc.model.system import System
-from eomc.verify import rows_newton, rows_outputs, rows_plain, rows_sines
+from eomc.verify import rows_frames, rows_newton, rows_outputs, rows_plain, rows_sines
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT, Report
 from eomc.verify.rows_batch import Batches
@@ -46,6 +46,10 @@ def check(
         scene = system.scene
         if scene is not None and scene.assembly is not None:
             Bodies(made, scene).report()
+            if hasattr(module, "frames"):
+                rows_frames.report(made, plain, scene)
+        if system.run.inverse_dynamics and hasattr(module, "frames"):
+            rows_frames.inverse_dynamics(made, plain)
         if system.outputs and hasattr(module, "output"):
             rows_outputs.report(made, plain)
         if plain is not None:

@@ -114,12 +114,13 @@ class Frame:
 
 @dataclass
 class Line:
-    """A scene's bodies along q + s qd, t + s for |s| <= width, all numbers (n,)."""
+    """A scene's bodies along q + s qd + s^2/2 bend, t + s for |s| <= width, all numbers (n,)."""
 
     scene: Scene
     state: State
     width: float
     stretch: float = 1.0  # of the velocities
+    bend: Vector | float = 0.0  # accelerations
     frames: dict[str, Frame] = field(default_factory=dict)
     known: dict[str, Any] = field(default_factory=dict)
 
@@ -131,9 +132,10 @@ class Line:
         self.middle = n // 2
         self.algebra = {**_ALGEBRA, "dot": lambda x: self.rate @ (x + zero)}
         known = self.known = {"t": s.t + self.nodes}
-        for c, q, qd in zip(self.scene.coordinates, s.q, s.qd, strict=True):
-            qd = qd * self.stretch
-            known |= {c.name: q + qd * self.nodes, f"{c.name}_dot": qd + zero}
+        motion = np.broadcast_arrays(s.q, s.qd * self.stretch, self.bend)
+        for c, q, qd, qdd in zip(self.scene.coordinates, *motion, strict=True):
+            rate = qd + qdd * self.nodes
+            known |= {c.name: q + (qd + rate) / 2 * self.nodes, f"{c.name}_dot": rate + zero}
         for constant in self.scene.constants:
             known[constant.name] = self.of(constant.formula)
         known |= {p.name: (s.params or {}).get(p.name, p.value) for p in self.scene.parameters}

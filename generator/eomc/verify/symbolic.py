@@ -261,7 +261,7 @@ class Reference(Answer):
             symbols = (*system.q, *system.qd, t, *system.u, *(p.symbol for p in system.parameters))
             entries = [expr] if name in SCALARS else expr.flat()
             self._functions[name] = sympy.lambdify(
-                symbols, entries, modules=[_JUMPS, "math"], cse=True
+                symbols, entries, modules=[_NAMED, "math"], cse=True
             )
         return self._functions[name]
 
@@ -272,7 +272,7 @@ def _magnitude(e: Expr) -> Expr:
         return e.func(*map(_magnitude, e.args))
     if e.is_Pow and e.exp.is_Integer and e.exp > 0:
         return _magnitude(e.base) ** e.exp
-    return sympy.Abs(e, evaluate=False)
+    return _SIZE(e)
 
 
 def _sign(x: float) -> float:
@@ -287,8 +287,10 @@ def _dirac_delta(x: float, order: int = 0) -> float:
     return math.inf if x == 0 else 0.0
 
 
+_SIZE = sympy.Function("size")  # not Abs, of which SymPy makes parts of complex numbers
+
 # what `math` has no name for
-_JUMPS = {"sign": _sign, "Heaviside": _heaviside, "DiracDelta": _dirac_delta}
+_NAMED = {"sign": _sign, "Heaviside": _heaviside, "DiracDelta": _dirac_delta, "size": abs}
 
 
 def _shorter(e: Expr) -> Expr:

@@ -77,6 +77,7 @@ def header(
         coordinates=indexed(plain, s.coordinates),
         inputs=indexed(plain, s.inputs),
         outputs=indexed(plain, s.outputs, "OUT_"),
+        frames=tuple(target.enum[f"FRAME_{f.name}"] for f in s.asked),
         parameters=parameters(plain),
         implicit=any(m.implicit for m in methods),
         timed=target.driven,

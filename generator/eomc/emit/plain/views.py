@@ -93,6 +93,7 @@ class Header(Named):
     coordinates: tuple[Indexed, ...]
     inputs: tuple[Indexed, ...]
     outputs: tuple[Indexed, ...]
+    frames: tuple[str, ...]
     parameters: tuple[Parameter, ...]
     implicit: bool
     timed: bool

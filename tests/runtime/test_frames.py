@@ -1,0 +1,234 @@
+"""Poses, Jacobians, inverse dynamics and momenta of a compiled module."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+import eomc
+
+SPACE = """eomc = 1
+name = "crane3"
+gravity = [0, 0, "-9.81"]
+[coordinates]
+x = { unit = "m", start = 0.1 }
+phi = { unit = "rad", start = 0.5, rate = 0.3 }
+psi = { unit = "rad", start = 0.2, rate = 1 }
+[definitions]
+w = "x*cos(phi)"
+[[body]]
+name = "cart"
+joint = "prismatic"
+axis = [1, 0, 0]
+coordinates = "x"
+mass = 2.0
+center = [0.1, 0.2, 0]
+rotation = [["z", 0.3], ["x", 0.7]]
+[[body]]
+name = "arm"
+parent = "cart"
+joint = "universal"
+coordinates = ["phi", "psi"]
+mass = 1.0
+center = [0, 0, -0.5]
+inertia = [0.1, 0.2, 0.15, 0.01, 0.02, -0.01]
+armature = [0.1, 0.2]
+[[point]]
+name = "tip"
+body = "arm"
+place = [0.1, 0.2, -1]
+rotation = [["y", 0.4]]
+[[point]]
+name = "base"
+body = "world"
+place = [0.3, 0, 0.1]
+[[body]]
+name = "bob"
+position = ["w + 0.1*t", "sin(phi)", "-cos(psi)"]
+rotation = [["z", "phi+t"], ["x", "psi"]]
+mass = 0.7
+inertia = [0.1, 0.2, 0.15, 0.01, 0.02, -0.01]
+[run]
+frames = true
+inverse_dynamics = true
+momentum = true
+"""
+PLANE = """eomc = 1
+name = "twolink"
+gravity = [0, "-g"]
+[coordinates]
+a = { unit = "rad", start = 0.5 }
+b = { unit = "rad", start = 0.3 }
+[parameters]
+l = 0.7
+m = 1.2
+g = 9.81
+[[body]]
+name = "upper"
+joint = "revolute"
+coordinates = "a"
+mass = "m"
+center = ["l/2", 0]
+inertia = "m*l**2/12"
+[[body]]
+name = "lower"
+parent = "upper"
+joint = "revolute"
+coordinates = "b"
+offset = ["l", 0]
+mass = "m"
+center = ["l/2", 0]
+inertia = "m*l**2/12"
+damping = 0.1
+[[point]]
+name = "tip"
+body = "lower"
+place = ["l", 0]
+rotation = "pi/2"
+[run]
+frames = ["tip"]
+inverse_dynamics = true
+momentum = true
+"""
+Q, QD, QDD = np.array([0.4, -1.1]), np.array([0.7, 0.3]), np.array([-0.2, 1.9])
+
+
+@pytest.fixture(scope="module")
+def plane(modules: Modules) -> ModuleType:
+    return modules.of_text(PLANE)
+
+
+@pytest.fixture(scope="module")
+def space(modules: Modules) -> ModuleType:
+    return modules.of_text(SPACE)
+
+
+def tip(q: np.ndarray, length: float = 0.7) -> np.ndarray:
+    a, c = q[0], q[0] + q[1]
+    return length * np.array([np.cos(a) + np.cos(c), np.sin(a) + np.sin(c)])
+
+
+def test_two_links_as_on_paper(plane: ModuleType) -> None:
+    m, length, c = plane, 0.7, Q[0] + Q[1]
+    position, angle = m.pose(Q, "tip")
+    assert position == pytest.approx(tip(Q), rel=1e-14)
+    assert angle == pytest.approx(c + np.pi / 2, rel=1e-14)
+    sa, ca, sc, cc = np.sin(Q[0]), np.cos(Q[0]), np.sin(c), np.cos(c)
+    J = length * np.array([[-sa - sc, -sc], [ca + cc, cc], [1 / length, 1 / length]])
+    assert m.jacobian(Q, "tip") == pytest.approx(J, rel=1e-14)
+    assert m.frame_velocity(Q, QD, "tip") == pytest.approx(J @ QD, rel=1e-13)
+    drift = m.frame_acceleration(Q, QD, frame="tip")
+    both = QD[0] + QD[1]
+    centripetal = -length * (QD[0] ** 2 * np.array([ca, sa]) + both**2 * np.array([cc, sc]))
+    assert drift == pytest.approx([*centripetal, 0.0], rel=1e-13)
+    assert m.frame_acceleration(Q, QD, QDD, "tip") == pytest.approx(J @ QDD + drift, rel=1e-13)
+    long = m.pose(Q, "tip", params={"l": 1.4}).position
+    assert long == pytest.approx(tip(Q, 1.4), rel=1e-14)
+
+
+def test_forces_of_a_motion(plane: ModuleType) -> None:
+    m, wrench = plane, [3.0, -1.0, 0.2]
+    tau = m.D(Q) @ QDD + m.bias(Q, QD)
+    assert m.inverse_dynamics(Q, QD, QDD) == pytest.approx(tau, rel=1e-13)
+    J = m.jacobian(Q, "tip")
+    assert m.frame_forces(Q, {"tip": wrench}) == pytest.approx(J.T @ wrench, rel=1e-13)
+    found = m.inverse_dynamics(Q, QD, QDD, {"tip": wrench})
+    assert found == pytest.approx(tau - J.T @ wrench, rel=1e-13)
+    # what moves it like that is what it moves like
+    alone = m.acceleration(Q, QD)
+    assert m.inverse_dynamics(Q, QD, alone) == pytest.approx(m.tau(Q, QD), abs=1e-12)
+
+
+def test_momenta_as_on_paper(plane: ModuleType) -> None:
+    found = plane.momentum(Q, QD)
+    c, half = Q[0] + Q[1], 0.35
+    one = half * np.array([np.cos(Q[0]), np.sin(Q[0])])
+    two = tip(Q) - half * np.array([np.cos(c), np.sin(c)])
+    assert found.mass == pytest.approx(2.4)
+    assert found.center == pytest.approx((one + two) / 2, rel=1e-14)
+    h = 1e-6
+    ends = [plane.momentum(Q + s * h * QD, QD).center for s in (1, -1)]
+    assert found.linear / found.mass == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-8)
+    v1 = QD[0] * np.array([-one[1], one[0]])
+    v2 = 2 * found.linear / found.mass - v1
+    spin = 1.2 * 0.7**2 / 12 * (2 * QD[0] + QD[1])
+    about = sum(1.2 * (r[0] * v[1] - r[1] * v[0]) for r, v in ((one - two, v1), (two - one, v2)))
+    assert found.angular == pytest.approx(spin + about / 2, rel=1e-13)
+
+
+def test_many_states_are_rows(space: ModuleType) -> None:
+    m, random = space, np.random.default_rng(0)
+    assert m.frames == ("cart", "arm", "bob", "tip", "base")
+    q, qd, qdd = random.normal(size=(3, 7, 3))
+    t = np.linspace(0, 1, 7)
+    w = random.normal(size=(7, 5, 6))
+    for k in range(7):
+        one, at = (q[k], qd[k]), {"t": t[k]}
+        for name in ("position", "rotation"):
+            assert np.array_equal(
+                getattr(m.pose(q, t=t), name)[k], getattr(m.pose(q[k], **at), name)
+            )
+        assert np.array_equal(m.jacobian(q, t=t)[k], m.jacobian(q[k], **at))
+        assert np.array_equal(m.jacobian(q, "tip", t=t)[k], m.jacobian(q[k], **at)[3])
+        assert np.array_equal(m.frame_velocity(q, qd, t=t)[k], m.frame_velocity(*one, **at))
+        found = m.frame_acceleration(q, qd, qdd, t=t)[k]
+        assert np.array_equal(found, m.frame_acceleration(*one, qdd[k], **at))
+        found = m.inverse_dynamics(q, qd, qdd, w, t=t)[k]
+        assert np.array_equal(found, m.inverse_dynamics(*one, qdd[k], w[k], **at))
+        assert np.array_equal(m.momentum(q, qd, t=t).angular[k], m.momentum(*one, **at).angular)
+    same = m.inverse_dynamics(q, qd, qdd[0], {"tip": w[0, 0]}, t=0.5)
+    each = m.inverse_dynamics(q[3], qd[3], qdd[0], {"tip": w[0, 0]}, t=0.5)
+    assert np.array_equal(same[3], each)
+
+
+def test_many_more_rows_than_one_call_takes(space: ModuleType) -> None:
+    q = np.random.default_rng(1).normal(size=(5000, 3))
+    found = space.inverse_dynamics(q, q, q)
+    assert np.array_equal(found[4321], space.inverse_dynamics(*[q[4321]] * 3))
+
+
+def test_what_does_not_move(space: ModuleType) -> None:
+    pose = space.pose([1.0, 2.0, 3.0], "base")
+    assert pose.position.tolist() == [0.3, 0, 0.1]
+    assert pose.rotation.tolist() == np.eye(3).tolist()
+    assert not space.jacobian([1.0, 2.0, 3.0], "base").any()
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda m: m.pose(Q, "tipp"), "frame: 'tipp' is not one of tip; did you mean 'tip'?"),
+        (lambda m: m.pose(Q, "upper"), "frame: 'upper' is not one of tip"),
+        (lambda m: m.frame_forces(Q, {"tpi": [1, 2, 3]}), "wrenches: 'tpi' is not one of tip"),
+        (lambda m: m.frame_forces(Q, {"tip": [1, 2]}), r"wrenches: tip: shape \(2,\), expected"),
+        (lambda m: m.inverse_dynamics(Q, QD, [1.0]), r"qdd: shape \(1,\), expected \(2,\)"),
+        (lambda m: m.inverse_dynamics(Q, QD, [np.nan, 0]), "qdd: not all numbers are finite"),
+        (lambda m: m.inverse_dynamics(Q, [1.0], QDD), "qd: shape"),
+    ],
+)
+def test_wrong_arguments(plane: ModuleType, call, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        call(plane)
+
+
+def test_what_was_not_asked_for_is_told(modules: Modules) -> None:
+    module = modules.of_text(PLANE.partition("[run]")[0])
+    with pytest.raises(AttributeError, match=r"pose: the scene asks for it with \[run\] frames"):
+        _ = module.pose
+    with pytest.raises(AttributeError, match=r"\[run\] inverse_dynamics = true"):
+        _ = module.inverse_dynamics
+
+
+def test_nothing_of_it_in_scenes_that_do_not_ask() -> None:
+    from eomc.model.from_scene import from_scene
+    from eomc.scene.read import parse
+
+    bare = eomc.sources(from_scene(parse(PLANE.partition("[run]")[0], "bare.toml")))
+    some = eomc.sources(from_scene(parse(PLANE, "some.toml")))
+    words = ("frame_", "_NF", "momentum", "inverse_dynamics")
+    for name in ("twolink.h", "twolink.c"):
+        assert not any(word in bare.files[name] for word in words)
+        assert all(word in some.files[name] for word in words)
