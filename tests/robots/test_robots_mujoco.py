@@ -115,14 +115,15 @@ class Pair:
 
 
 def from_urdf(
-    name: str, folder: Path, free: bool = False, locked: Mapping[str, float] | None = None
-) -> Pair:
+    name: str, folder: Path, free: bool = False, locked: Mapping[str, float] | None = None,
+    fuse: bool = True,
+) -> Pair:  # fmt: skip
     file = stripped(robot_data(name), folder)
     robot = edit.lock(urdf.read(file), locked or {})
     if free:
         robot = edit.based(robot, free=True)
     spec = mujoco.MjSpec.from_file(str(file))
-    spec.compiler.fusestatic = True
+    spec.compiler.fusestatic = fuse
     for joint, value in (locked or {}).items():
         assert value == 0.0
         spec.delete(spec.joint(joint))

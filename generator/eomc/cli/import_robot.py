@@ -79,8 +79,10 @@ def command(
         )
     files.write_new(path, text)
     called = "" if path.stem == robot.name else f"; its module is called {robot.name}"
+    points = sum(body.point for body in robot.bodies)
+    marks = f"points {points}, " if points else ""
     say(
-        f"wrote {shown(path)}: bodies {len(robot.bodies)}, coordinates {len(robot.motions)}, "
+        f"wrote {shown(path)}: bodies {len(robot.bodies) - points}, {marks}coordinates {len(robot.motions)}, "
         f"inputs {len(robot.drives)}{called}"
     )
     if robot.left_out:

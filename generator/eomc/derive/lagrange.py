@@ -31,7 +31,7 @@ from eomc.derive.equations import Equations, Motion, equations, no_inertia
 from eomc.derive.ldl import Rows, Solution, Vector, Way, solve, work
 from eomc.derive.newton_euler import Recursion
 from eomc.derive.tape import RoughError, Stage, Tape
-from eomc.model.multibody import Tree
+from eomc.model.multibody import Tree, needed
 from eomc.model.system import System, t
 
 LAGRANGE_DEFINITIONS = 12  # of a tree's world coordinates: beyond, recursion always needs less
@@ -65,9 +65,10 @@ def derive(system: System) -> Derivation:
     Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
     """
     lagrange = newton_euler = articulated = composite = None
-    ldl: Way = f"{len(system.definitions)} world coordinates to differentiate"
+    places = len(needed(system.definitions, (system.kinetic, system.potential)))
+    ldl: Way = f"{places} world coordinates to differentiate"
     try:
-        if system.tree is None or len(system.definitions) <= LAGRANGE_DEFINITIONS:
+        if system.tree is None or places <= LAGRANGE_DEFINITIONS:
             lagrange, ldl, multipliers = _by_lagrange(system)
         if system.tree is not None:
             newton_euler, articulated, composite = _by_newton_euler(system, system.tree)

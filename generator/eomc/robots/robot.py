@@ -42,7 +42,8 @@ class RobotBody:
     parent: a body above, or "world". joint: a key of joints.JOINTS, with a motion for each of
     its coordinates and its unit `axes` in the joint's frame. offset (m) and rotation: the joint's
     frame in the parent's, v_parent = offset + rotation v_joint. mass: kg. center: m, in the
-    body's frame. inertia: kg m^2, of the centre of mass, along the body's axes.
+    body's frame. inertia: kg m^2, of the centre of mass, along the body's axes. point: whether it
+    only marks a place on its parent.
     """
 
     name: str
@@ -56,6 +57,7 @@ class RobotBody:
     center: Vector = ORIGIN
     inertia: Inertia = NO_INERTIA
     note: str = ""
+    point: bool = False
 
 
 @dataclass(frozen=True)

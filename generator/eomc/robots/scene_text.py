@@ -20,13 +20,13 @@ _NAME = 32  # characters of a name, so that what is made of it ("_torque", "_dot
 
 
 def finished(robot: Robot) -> Robot:
-    """The robot fit for a scene: its names such as C can bear, bare frames left out and listed.
+    """The robot fit for a scene: its names such as C can bear, bare frames marked as points.
 
     Raises EomcError where nothing moves, where a joint moves nothing that has mass, and for a
     tensor that is not positive semi-definite; one that breaks the triangle inequality is noted.
     """
     bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
-    robot = _without_frames(replace(robot, bodies=bodies))
+    robot = _with_points(replace(robot, bodies=bodies))
     if not robot.motions:
         raise EomcError(
             f"{robot.name}: nothing moves in this robot, no joint has a coordinate; with "
@@ -60,22 +60,17 @@ def _rough(angle: float) -> bool:
     return SNAP < abs(angle - round(angle * 2 / math.pi) * math.pi / 2) < 1e-4
 
 
-def _without_frames(robot: Robot) -> Robot:
-    """Without fixed bodies that have no mass and carry nothing: they only mark places."""
-    kept = list(robot.bodies)
-    gone: list[str] = []
+def _with_points(robot: Robot) -> Robot:
+    """Fixed bodies that have no mass and carry no other, which only mark places, as points."""
+    found: list[RobotBody] = []
     carried: set[str] = set()
     for body in reversed(robot.bodies):  # children come before parents
         bare = not body.mass and not any(body.inertia)
-        if body.joint == "fixed" and bare and body.name not in carried:
-            kept.remove(body)
-            gone.append(body.name)
-        else:
+        point = body.joint == "fixed" and bare and body.name not in carried
+        found.append(replace(body, point=point))
+        if not point:
             carried.add(body.parent)
-    if not gone:
-        return robot
-    words = f"frames without mass that carry nothing: {texts.listed(gone[::-1], 1000)}"
-    return replace(robot, bodies=tuple(kept), left_out=(*robot.left_out, words))
+    return replace(robot, bodies=tuple(found[::-1]))
 
 
 def _named(robot: Robot) -> Robot:
@@ -172,7 +167,8 @@ def scene_text(robot: Robot) -> str:
     ]
     if robot.drives:
         parts.append(_table("[inputs]", {d.name: _input(d, units) for d in robot.drives}))
-    parts += [_table("[[body]]", _entry(body, robot)) for body in robot.bodies]
+    bodies = sorted(robot.bodies, key=lambda body: body.point)
+    parts += [_table(f"[[{'point' if b.point else 'body'}]]", _entry(b, robot)) for b in bodies]
     for motion in robot.motions:
         if motion.stiffness:
             spring = {"coordinate": toml(motion.name), "stiffness": number(motion.stiffness)}
@@ -229,15 +225,18 @@ def _input(drive: Drive, units: Mapping[str, str]) -> str:
 
 
 def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
-    """The keys of a [[body]] that differ from their defaults."""
+    """The keys of a [[body]] or [[point]] that differ from their defaults."""
     entry = {"name": toml(body.name)}
-    if body.parent != WORLD:
-        entry["parent"] = toml(body.parent)
-    entry["joint"] = toml(body.joint)
+    if body.point:
+        entry["body"] = toml(body.parent)
+    else:
+        if body.parent != WORLD:
+            entry["parent"] = toml(body.parent)
+        entry["joint"] = toml(body.joint)
     if body.motions:
         entry["coordinates"] = _each([toml(m.name) for m in body.motions])
     if any(body.offset):
-        entry["offset"] = vector(body.offset)
+        entry["place" if body.point else "offset"] = vector(body.offset)
     if turns := turns_of(body.rotation):
         shown = (f'["{axis}", {angle(by)}]' for axis, by in turns)
         entry["rotation"] = f"[{', '.join(shown)}]"
