@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import sympy
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +22,8 @@ angles = st.floats(-7, 7)
 rotations = st.builds(lambda v, a: spatial.about(v, math.cos(a), math.sin(a)), axes, angles)
 # a rigid body: masses at places
 masses = st.lists(st.tuples(st.floats(0.1, 5), vectors), min_size=1, max_size=6)
+# linear in nearly all that is drawn: a wrong entry shows at once
+few = settings(max_examples=20, deadline=None)
 CLOSE = {"rtol": 1e-12, "atol": 1e-11}
 
 
@@ -43,6 +45,7 @@ def six(tensor: np.ndarray) -> spatial.Inertia[float]:
     return spatial.six(tensor[i][j] for i, j in spatial.ENTRIES)
 
 
+@few
 @given(vectors, vectors, number)
 def test_vectors(a: Vector[float], b: Vector[float], factor: float) -> None:
     assert np.allclose(spatial.plus(a, b), np.add(a, b), **CLOSE)
@@ -51,6 +54,7 @@ def test_vectors(a: Vector[float], b: Vector[float], factor: float) -> None:
     assert np.allclose(spatial.cross(a, b), np.cross(a, b), **CLOSE)
 
 
+@few
 @given(axes, angles)
 def test_rotation_about_any_axis(axis: Vector[float], angle: float) -> None:
     found = spatial.about(axis, math.cos(angle), math.sin(angle))
@@ -58,12 +62,14 @@ def test_rotation_about_any_axis(axis: Vector[float], angle: float) -> None:
 
 
 @pytest.mark.parametrize("k", range(3))
+@few
 @given(angle=angles)
 def test_rotation_about_a_coordinate_axis(k: int, angle: float) -> None:
     found = spatial.about_axis(k, math.cos(angle), math.sin(angle))
     assert np.allclose(found, Rotation.from_euler("xyz"[k], angle).as_matrix(), **CLOSE)
 
 
+@few
 @given(rotations, rotations, vectors)
 def test_products(A: spatial.Matrix[float], B: spatial.Matrix[float], v: Vector[float]) -> None:
     one, other = Rotation.from_matrix(A), Rotation.from_matrix(B)
@@ -72,6 +78,7 @@ def test_products(A: spatial.Matrix[float], B: spatial.Matrix[float], v: Vector[
     assert np.allclose(spatial.transposed(A), one.inv().as_matrix(), **CLOSE)
 
 
+@few
 @given(masses, rotations)
 def test_a_rotated_body_has_the_rotated_inertia(
     points: list[tuple[float, Vector[float]]], R: spatial.Matrix[float]
@@ -81,6 +88,7 @@ def test_a_rotated_body_has_the_rotated_inertia(
     assert np.allclose(spatial.tensor(found), inertia_about_origin(rotated), rtol=1e-11, atol=1e-9)
 
 
+@few
 @given(masses, vectors)
 def test_a_moved_body_has_the_moved_inertia(
     points: list[tuple[float, Vector[float]]], center: Vector[float]
@@ -93,6 +101,7 @@ def test_a_moved_body_has_the_moved_inertia(
     assert np.allclose(spatial.tensor(found), inertia_about_origin(moved), rtol=1e-11, atol=1e-9)
 
 
+@few
 @given(st.floats(0.1, 5), vectors)
 def test_a_point_mass(mass: float, place: Vector[float]) -> None:
     found = spatial.tensor(spatial.point_inertia(mass, place))

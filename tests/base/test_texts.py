@@ -272,7 +272,10 @@ def test_each_payload_builds_imports_and_runs(
     assert title == given and units == dict.fromkeys(("x", "m", "g", "u"), given)
 
 
-@pytest.mark.parametrize("given", tiers(PAYLOADS.values(), *FEW), ids=PAYLOADS)
+@pytest.mark.parametrize(
+    "given", tiers(PAYLOADS.values(), *(PAYLOADS[k] for k in ("docstring", "spliced", "NUL"))),
+    ids=PAYLOADS,
+)  # fmt: skip
 def test_systems_made_in_python(given: str) -> None:
     x, m = sympy.Symbol(given), sympy.Symbol(given + "m")
     v = sympy.Symbol(f"{given}_dot")

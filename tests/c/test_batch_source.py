@@ -40,6 +40,7 @@ def test_only_scenes_that_ask_have_it() -> None:
     assert "batch" not in plain.files["fast/cartpole.c"] and "batch.py" not in plain.files
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     shutil.which("gcc") is None or platform.system() != "Linux" or platform.machine() != "x86_64",
     reason="asks gcc about AVX2",

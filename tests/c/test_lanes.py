@@ -57,7 +57,7 @@ def judge(of: Any, folder: Path) -> ctypes.CDLL:
     return bench.reference(folder, of)
 
 
-@pytest.fixture(scope="module", params=tiers(BUILDS, "native", "narrow registers"))
+@pytest.fixture(scope="module", params=tiers(BUILDS, "native"))
 def library(request: pytest.FixtureRequest, of: Any, folder: Path) -> ctypes.CDLL:
     found = built(folder, of, request.param)
     if found is None:

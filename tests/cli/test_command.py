@@ -144,6 +144,7 @@ def test_show(here: Path) -> None:
     assert "1 division, 1 sincos" in eomc("show", "cartpole.toml", "--cost").output
 
 
+@pytest.mark.slow
 def test_fractions_stay_exact_in_python(here: Path) -> None:
     """What would be divided by Python itself: a number of a sum, an exponent."""
     text = (here / "cartpole.toml").read_text(encoding="utf-8")

@@ -179,6 +179,7 @@ def assert_agree(made: System) -> None:
             )
 
 
+@pytest.mark.slow
 @FEW
 @given(systems())
 def test_a_random_system_is_derived_as_by_the_textbook(made: System) -> None:
@@ -255,6 +256,7 @@ def chain(links: int) -> str:
     return "\n".join(lines)
 
 
+@pytest.mark.slow
 def test_ten_links_are_derived_in_two_seconds_at_1800_flops() -> None:
     made = from_scene(parse(chain(10), "chain_10.toml"))
 
@@ -318,7 +320,7 @@ def arrow(n: int) -> System:
 
 def test_zeros_of_the_mass_matrix_are_not_computed() -> None:
     """D of the arrow is eliminated from its tips without fill: so much more for each body."""
-    found = (program.accelerations(Material(derive(arrow(n))))[0] for n in (3, 5, 7))
+    found = (program.accelerations(Material(derive(arrow(n))))[0] for n in (3, 4, 5))
     flops = [acceleration.cost.flops for acceleration in found]
     assert flops[2] - flops[1] == flops[1] - flops[0]
     ldl = derive(arrow(3)).ldl

@@ -123,7 +123,7 @@ def test_springs_dampers_forces_inputs_and_a_driven_pivot(equal: bool, relative:
     assert_right(made_of(links([-1, 0, 1], equal, relative, pivot="b*sin(3*t)", more=more)))
 
 
-@pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
+@pytest.mark.parametrize("relative", tiers([False, True], False), ids=["absolute", "relative"])
 def test_positions_may_be_written_out(relative: bool) -> None:
     costs = {
         by_multipliers(made_of(links(CHAIN, relative=relative, written=written))).cost
@@ -207,6 +207,7 @@ def test_other_systems_of_the_kind(kind: str) -> None:
     assert_right(KINDS[kind])
 
 
+@pytest.mark.slow
 def test_bodies_that_are_points_in_relative_angles() -> None:
     """Their world coordinates depend on sums of angles."""
     made = made_of(trees.chain(4, points=True))

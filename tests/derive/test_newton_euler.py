@@ -242,6 +242,7 @@ def test_lagrange_over_world_coordinates_says_the_same(monkeypatch: pytest.Monke
         assert_every_route_agrees(made, Jets(made))
 
 
+@pytest.mark.slow
 def test_a_planar_joint_in_a_plane_scene() -> None:
     names = ["x", "y", "turn"]
     body = {"name": "b", "joint": "planar", "coordinates": names, "mass": "m",
@@ -252,10 +253,10 @@ def test_a_planar_joint_in_a_plane_scene() -> None:
     assert_every_route_agrees(made, Jets(made))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
-    [trees.chain(2), pytest.param(trees.arm(2, numbers=True, straight=True),
-                                  marks=pytest.mark.slow)],
+    [trees.chain(2), trees.arm(2, numbers=True, straight=True)],
     ids=["chain", "arm"],
 )  # fmt: skip
 def test_the_reference_written_out_says_the_same(text: str) -> None:
@@ -384,10 +385,12 @@ def test_a_link_more_costs_the_same_wherever_it_hangs() -> None:
     assert fifty / 50 == pytest.approx(twenty / 20, rel=0.06)
 
 
+@pytest.mark.slow
 def test_an_arm_of_seven_joints_costs_at_most_1650() -> None:
     assert flops(trees.arm()) <= 1650
 
 
+@pytest.mark.slow
 def test_numbers_fold_away() -> None:
     """Nothing is left to be prepared, and what is zero costs nothing."""
     numbers, parameters = (acceleration_of(trees.arm(3, numbers=x)) for x in (True, False))
@@ -397,6 +400,7 @@ def test_numbers_fold_away() -> None:
     assert flops(straight) < 0.7 * numbers.cost.flops
 
 
+@pytest.mark.slow
 def test_grouping_inertias_saves_work_and_changes_no_motion(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import cffi
 import pytest
-from conftest import needs, tiers
+from conftest import needs
 
 import eomc
 from eomc.base import names
@@ -210,7 +210,8 @@ def test_names_of_our_own_do_not_collide(role: str, run: str, tmp_path: Path) ->
 SOME = "NAN INFINITY HUGE_VAL EOF errno NULL M_PI FP_NAN CHAR_BIT LONG_MAX EIO stdin linux".split()
 
 
-@pytest.mark.parametrize("role", tiers(ROLES, "coordinates"))
+@pytest.mark.slow
+@pytest.mark.parametrize("role", ROLES)
 def test_macros_as_names_compile(role: str, tmp_path: Path) -> None:
     given = [n for n in SOME if not names.fault(n)]
     assert len(given) >= 11

@@ -238,7 +238,7 @@ def test_a_memory_of_another_state_is_not_believed(tmp_path: Path, modules: Modu
     main = f'#include "cartpole.h"\n#include <stdio.h>\n{functions}\nint main(void) {{ {calls} }}\n'
     (tmp_path / "hand.c").write_text(main, encoding="utf-8")
     subprocess.run(
-        ["cc", "-std=c99", "-O1", "hand.c", "cartpole.c", "-o", "hand", "-lm"],
+        ["cc", "-std=c99", "-O0", "hand.c", "cartpole.c", "-o", "hand", "-lm"],
         cwd=tmp_path, check=True,
     )  # fmt: skip
     done = subprocess.run(["./hand"], cwd=tmp_path, capture_output=True, text=True, check=True)

@@ -165,6 +165,7 @@ def test_stiff_in_few_evaluations() -> None:
     assert evaluations < 800
 
 
+@pytest.mark.slow
 def test_stiff_spring_pendulum() -> None:
     """k = 1e6 with damping over 10 s, against thirty trusted digits: 1e-9 in under 4,000.
 

@@ -150,6 +150,7 @@ def test_what_it_can_not_do_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         reference_solution.of(oscillator(), rows=4, root=tmp_path)
 
 
+@pytest.mark.slow
 def test_a_jump_costs_digits(tmp_path: Path) -> None:
     """sign(x_dot) is not smooth where the block turns: both ways must not claim 25 digits."""
     x, v = sympy.symbols("x x_dot")

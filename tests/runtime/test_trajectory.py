@@ -169,7 +169,7 @@ def test_a_long_run_is_the_same_in_pieces(cartpole: ModuleType) -> None:
 
 def test_looking_up_leaves_no_trace(driven: ModuleType) -> None:
     """However the loop is cut, with a table and with rows that do not fit the cuts."""
-    steps = 100_003
+    steps = 40_003
     table = np.cos(np.arange(steps))
     seen: list[tuple[int, int]] = []
     run = driven.simulate(

@@ -174,9 +174,9 @@ BREAKAGES: dict[str, tuple[Breakage, set[str]]] = {
 
 OF_RUNS = {"order of rk4", "power balance"}  # of several step sizes, which take most of the time
 
-# of the last stage, a template, the binding; what tests/verify/test_check.py breaks in a stand-in
-# is for the slow tier
-QUICK = ("printing", "a sign in the stepper", "what Python asks for")
+# the binding, a template; what tests/verify/test_check.py breaks in a stand-in, what
+# tests/physics/test_steppers.py breaks in a tableau, and what golden files show, is slow
+QUICK = ("what Python asks for",)
 
 
 @pytest.mark.parametrize("scene", tiers((SCENE, "kapitza_pendulum"), SCENE))

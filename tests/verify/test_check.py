@@ -117,7 +117,7 @@ def right() -> Report:
             "kapitza_pendulum",
             "foucault_pendulum",
         ),
-        "cartpole_driven",
+        "mass_spring",
     ),
 )
 def test_what_is_right_passes(name: str) -> None:
@@ -205,6 +205,7 @@ def test_a_module_that_raises_fails_with_its_words(monkeypatch: pytest.MonkeyPat
     assert "KeyError: 'k'" in report.table()
 
 
+@pytest.mark.slow
 def test_friction_that_jumps_is_not_blamed_for_its_order() -> None:
     """Spans between two jumps show it; before, the row was of any span."""
     x, v = symbol("x"), symbol("x_dot")
@@ -321,7 +322,10 @@ linearize = "parameters"
 
 @pytest.mark.parametrize(
     "real, wrong",
-    [*(("double", what) for what in ("", "A", "B", "sensitivity")), ("float", ""), ("float", "A")],
+    [
+        *(("double", what) for what in ("", "A", "B", "sensitivity")),
+        *(pytest.param("float", what, marks=pytest.mark.slow) for what in ("", "A")),
+    ],
 )
 def test_derivatives_are_compared_with_differences(
     modules: Modules, monkeypatch: pytest.MonkeyPatch, real: str, wrong: str

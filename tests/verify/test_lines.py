@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 from cases import SCENES
 from compilers import compiled, run
-from conftest import needs, tiers
+from conftest import needs
 from instrument import missed, unexecuted
-
-FIRST = ("mass_spring", "cartpole", "cartpole_driven")
 
 # other lines under [run], and scenes to have them
 VARIANTS = {
@@ -84,15 +82,8 @@ def after_solve(name: str, source: str) -> set[int]:
     return found
 
 
-@pytest.mark.parametrize("name", tiers(FIRST, "mass_spring"))
-def test_every_line_is_executed(name: str, tmp_path: Path) -> None:
-    assert unexplained(name, text_of(name), tmp_path) == []
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [p.stem for p in sorted(SCENES.glob("*.toml")) if p.stem not in FIRST]
-)
+@pytest.mark.parametrize("name", [p.stem for p in sorted(SCENES.glob("*.toml"))])
 def test_every_line_of_every_scene_is_executed(name: str, tmp_path: Path) -> None:
     assert unexplained(name, text_of(name), tmp_path) == []
 

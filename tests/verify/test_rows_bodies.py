@@ -163,7 +163,9 @@ WRONG = {
 RIGHT = building.Builder._kinetic
 
 
-@pytest.mark.parametrize("what", WRONG)
+@pytest.mark.parametrize(
+    "what", tiers(WRONG, "the sign of gravity", "the sense of a rotation", "products of inertia")
+)
 def test_a_fault_in_what_is_made_of_bodies_is_noticed(
     what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,6 +55,7 @@ def test_an_entry_that_is_one_cosine_is_judged_by_itself(
     assert found > 1e6 * LIMIT if wrong and bend is shifted else (found > LIMIT) == wrong
 
 
+@pytest.mark.slow
 def test_where_no_entry_is_a_sine_alone_nothing_is_judged(modules: Modules) -> None:
     made = Comparison(scene_system("chain"), modules("chain"), np.random.default_rng(0), 4)
     found = vanishing(made)
