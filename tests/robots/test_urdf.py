@@ -107,7 +107,7 @@ def test_frames_without_mass_are_points(read: Reader) -> None:
     robot = scene_text.finished(read(ARM))
     (tool,) = [body for body in robot.bodies if body.point]
     text = scene_text.scene_text(read(ARM))
-    assert f'[[point]]\nname  = "{tool.name}"\nbody  = "{tool.parent}"' in text
+    assert text.endswith(f'[[point]]\nname = "{tool.name}"\nbody = "{tool.parent}"\n')
     frames = {f.name: f for f in from_scene(parse(text, "arm.toml")).frames}
     assert frames[tool.name].link == frames[tool.parent].link
 
@@ -304,7 +304,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_import_writes_a_scene_that_reads_without_a_warning(here: Path) -> None:
     done = CliRunner().invoke(main, ["import", "crane.urdf"])
     assert done.exit_code == 0, done.output
-    assert "wrote crane.toml: bodies 3, coordinates 2, inputs 2" in done.output
+    assert "wrote crane.toml: bodies 3, points 1, coordinates 2, inputs 2" in done.output
     assert "extend mimics shoulder" in done.output and "eomc dof crane.toml" in done.output
     found = scene.read("crane.toml")
     assert not found.warnings

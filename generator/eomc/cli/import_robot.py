@@ -82,8 +82,8 @@ def command(
     points = sum(body.point for body in robot.bodies)
     marks = f"points {points}, " if points else ""
     say(
-        f"wrote {shown(path)}: bodies {len(robot.bodies) - points}, {marks}coordinates {len(robot.motions)}, "
-        f"inputs {len(robot.drives)}{called}"
+        f"wrote {shown(path)}: bodies {len(robot.bodies) - points}, {marks}"
+        f"coordinates {len(robot.motions)}, inputs {len(robot.drives)}{called}"
     )
     if robot.left_out:
         say("not modelled, or to be looked at:")

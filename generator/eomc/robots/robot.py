@@ -16,6 +16,9 @@ from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
 
+BARE = "no <inertial>"  # the note of a link that has none, and no shape
+
+
 @dataclass(frozen=True)
 class Motion:
     """A coordinate of a joint, in `unit` "rad" or "m".

@@ -11,7 +11,7 @@ from eomc.base import names, texts
 from eomc.base.errors import EomcError
 from eomc.base.texts import line, toml
 from eomc.robots.inertias import indefinite, unbalanced
-from eomc.robots.robot import Drive, Motion, Robot, RobotBody, joined, without_dust
+from eomc.robots.robot import BARE, Drive, Motion, Robot, RobotBody, joined, without_dust
 from eomc.robots.rotations import SNAP, Vector, turns_of
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
@@ -67,7 +67,8 @@ def _with_points(robot: Robot) -> Robot:
     for body in reversed(robot.bodies):  # children come before parents
         bare = not body.mass and not any(body.inertia)
         point = body.joint == "fixed" and bare and body.name not in carried
-        found.append(replace(body, point=point))
+        note = "" if point and body.note == BARE else body.note
+        found.append(replace(body, point=point, note=note))
         if not point:
             carried.add(body.parent)
     return replace(robot, bodies=tuple(found[::-1]))

@@ -17,7 +17,7 @@ from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.base.spatial import transposed
 from eomc.robots import xml
 from eomc.robots.inertias import NO_INERTIA, rotated_inertia
-from eomc.robots.robot import Drive, Motion, Robot, RobotBody, free_motions
+from eomc.robots.robot import BARE, Drive, Motion, Robot, RobotBody, free_motions
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, times, toward, unit
 from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
@@ -142,7 +142,7 @@ class _Reader:
         inertial = link.first("inertial")
         if inertial is None:
             shapes = _shapes(link)
-            note = f"a {shapes[0]} only, no <inertial>" if shapes else "no <inertial>"
+            note = f"a {shapes[0]} only, {BARE}" if shapes else BARE
             return RobotBody(name, note=note)
         self._parts(inertial, ("origin", "mass", "inertia"), key)
         mass, tensor = inertial.first("mass"), inertial.first("inertia")
