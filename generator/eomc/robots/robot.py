@@ -15,7 +15,6 @@ from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_axis_an
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
-
 BARE = "no <inertial>"  # the note of a link that has none, and no shape
 
 
