@@ -19,6 +19,7 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
+from eomc.verify.sampling import NUDGE
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
@@ -242,8 +243,14 @@ class Runs:
                 errors.append(self.far_steps(at, gain))
             for method in self.check.methods if not wound else ():
                 if method != "rk4":
-                    errors.append(self.check.one_step_of(method, far, self.h) or 0.0)
+                    solved = self.solved(far) if METHODS[method].newton else far
+                    errors.append(self.check.one_step_of(method, solved, self.h) or 0.0)
         return float(np.max(errors, initial=0))
+
+    def solved(self, e: Expected) -> Expected:
+        """With what a rounding of q makes of velocities, to which stages are solved for."""
+        rounded = np.abs(e.state.q) / self.h**2
+        return replace(e, size={**e.size, "acceleration": e.size["acceleration"] + rounded})
 
     def far_steps(self, s: State, acceleration: Vector) -> float:
         """Some steps from there; acceleration: the size of what is rounded in one."""
@@ -262,18 +269,16 @@ class Runs:
 
     def inputs(self) -> float:
         """A row of inputs each step beside the reference, and cut as one."""
-        errors = []
+        errors, spread = [], np.array([self.sampler.spread, self.sampler.speed])
         for s in self.states:
             signals = np.abs(self.sampler.reference.evaluate("signals", s.q, s.qd, s.t))
             scale = np.where(signals > 0, signals, 1)
             u = self.random.normal(size=(FEW, self.model.nu)) * scale
             at = replace(s, u=u)
-            x, p = (s.q, s.qd), s.params
-            for n in range(FEW):
-                x = self.sampler.reference.step(*x, h=self.h, t=s.t + n * self.h, u=u[n], params=p)
+            x, growth, p = *self.driven(s, u, spread), s.params
             run = drive(self.model, self.check.methods[0], at, self.h, FEW)
             size = np.abs(np.array([s.q, s.qd])) + np.abs(np.array(x))
-            size = FEW * (size + np.array([self.sampler.spread, self.sampler.speed]))
+            size = FEW * (size + growth * spread)
             if np.all(np.isfinite(x)):
                 errors.append(self.check.units(run.rows[:, -1], np.array(x), size))
                 again = self.check.module.simulate(
@@ -282,6 +287,17 @@ class Runs:
                 same = np.array_equal([again.q, again.qd], run.rows)
                 errors.append(0.0 if same else np.inf)
         return float(np.max(errors, initial=0))
+
+    def driven(self, s: State, u: Vector, spread: Vector) -> tuple[Vector, float]:
+        """The reference's end with a row of inputs each step, and how a difference has grown."""
+        x = np.array([s.q, s.qd])[:, None] + [[0.0], [NUDGE]] * spread[:, None]  # (2, 2, nq)
+        with np.errstate(all="ignore"):
+            for n, row in enumerate(u):
+                t, held = s.t + n * self.h, np.array([row, row])
+                step = self.sampler.reference.step
+                x = np.array(step(x[0], x[1], self.h, t, held, s.params))
+            growth = float(np.max(np.abs(x[:, 1] - x[:, 0]) / spread)) / NUDGE
+        return x[:, 0], max(growth, 1.0)
 
     def cut(self, method: str) -> float:
         """How many runs in several calls, or with fewer rows kept, are not the whole to the bit."""
