@@ -14,12 +14,12 @@ Robots*, ch. 9 (the matrix U, the grouping of inertial parameters).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import sympy
-from sympy import Expr, S
+from sympy import Expr, S, Symbol
 
 from eomc.base.spatial import ENTRIES, transposed
 from eomc.derive.tape import Tape
@@ -65,8 +65,19 @@ class Recursion(Vectors):
         self.n = len(tree.links)
         self.gravity = self.vector(tree.gravity)
         self.still = self.vector(tree.still)
-        self.cosine = [self.define(sympy.cos(x.q)) if x.turns else S.One for x in self.links]
-        self.sine = [self.define(sympy.sin(x.q)) if x.turns else S.Zero for x in self.links]
+        # of each joint how far it has moved, how fast, how its rate changes where all qdd = 0, and
+        # its slopes over the coordinates
+        rates = dict(tree.rates)
+        self.moved = [self.define(x.q) for x in self.links]
+        self.speed = tape.forward(self.moved, rates)
+        self.drift = tape.forward(self.speed, rates)
+        self.slopes = [
+            {q: tape.forward([moved], {q: S.One})[0] for q in rates if q in x.q.free_symbols}
+            for x, moved in zip(self.links, self.moved, strict=True)
+        ]
+        both = [*zip(self.links, self.moved, strict=True)]
+        self.cosine = [self.define(sympy.cos(s)) if x.turns else S.One for x, s in both]
+        self.sine = [self.define(sympy.sin(s)) if x.turns else S.Zero for x, s in both]
         self.rotation: list[Matrix] = [
             tuple(self.vector(row) for row in x.rotation)  # type: ignore[misc]
             for x in self.links
@@ -74,6 +85,29 @@ class Recursion(Vectors):
         self.arm = [self._arm(k) for k in range(self.n)]
         self.armature = [self.define(x.armature) for x in self.links]
         self.inertia = self._grouped()
+
+    # --- joints and coordinates ------------------------------------------------------------------
+
+    @property
+    def plain(self) -> bool:
+        """Whether each joint has a coordinate of its own."""
+        by = {link.q for link in self.links if link.q.is_Symbol}
+        return len(by) == self.n
+
+    def projected(self, by_link: Iterable[Expr]) -> dict[Symbol, Expr]:
+        """Forces along joints as forces along coordinates: sum_k ds_k/dq f_k."""
+        terms: dict[Symbol, list[Expr]] = {}
+        for slopes, force in zip(self.slopes, by_link, strict=True):
+            for q, slope in slopes.items():
+                terms.setdefault(q, []).append(self.times(slope, force))
+        return {q: self.add(*those) for q, those in terms.items()}
+
+    def by_link(self, direction: Mapping[Symbol, Expr]) -> list[Expr]:
+        """A direction along the coordinates as one along the joints: sum_q ds_k/dq v_q."""
+        return [
+            self.add(*(self.times(slope, direction[q]) for q, slope in slopes.items()))
+            for slopes in self.slopes
+        ]
 
     # --- frames ----------------------------------------------------------------------------------
 
@@ -103,7 +137,7 @@ class Recursion(Vectors):
         offset = self.vector(link.offset)
         if link.turns:
             return offset
-        slide = tuple(self.times(row[link.axis], link.q) for row in self.rotation[k])
+        slide = tuple(self.times(row[link.axis], self.moved[k]) for row in self.rotation[k])
         return self.plus(offset, slide)
 
     def on_axis(self, k: int, x: Expr) -> Vector:
@@ -227,7 +261,7 @@ class Recursion(Vectors):
 
     def rates(self) -> list[Expr]:
         """The joints' rates, by link."""
-        return [link.qd for link in self.links]
+        return self.speed
 
     def angular_velocities(self, rates: Sequence[Expr]) -> list[Vector]:
         """omega of each link in its frame."""
@@ -323,7 +357,7 @@ class Recursion(Vectors):
 
     def bias(self) -> list[Expr]:
         """C qd + g, by link."""
-        return self.joint_forces(self.forces(self.rates(), [S.Zero] * self.n))
+        return self._with_rotors(self.forces(self.rates(), self.drift), self.drift)
 
     def gravity_forces(self) -> list[Expr]:
         """g, by link."""
@@ -333,11 +367,12 @@ class Recursion(Vectors):
     def mass_times(self, direction: Sequence[Expr]) -> list[Expr]:
         """D v for a direction v, by link, without D."""
         forces = self.forces([S.Zero] * self.n, direction, gravity=False)
-        found = self.joint_forces(forces)
-        return [
-            self.add(x, self.times(a, v))
-            for x, a, v in zip(found, self.armature, direction, strict=True)
-        ]
+        return self._with_rotors(forces, direction)
+
+    def _with_rotors(self, forces: _Forces, wishes: Sequence[Expr]) -> list[Expr]:
+        """The forces along the joints, with those that armatures need."""
+        found = zip(self.joint_forces(forces), self.armature, wishes, strict=True)
+        return [self.add(x, self.times(a, v)) for x, a, v in found]
 
     # --- D by composite bodies -------------------------------------------------------------------
 

@@ -59,7 +59,7 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
 class _Bodies(Springs):
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
         super().__init__(check, doc, known)
-        self.moved_by: dict[str, str] = {}  # each coordinate and the body whose joint it moves
+        self.moved_by: dict[str, str] = {}  # each coordinate: the first body that it moves
         self.bodies: dict[str, Body] = {}
 
     def assembly(self) -> Assembly:
@@ -72,6 +72,7 @@ class _Bodies(Springs):
                 self._jointed(path, entry)
             else:
                 self._placed(path, entry)
+        self._shared()
         ordered = self._ordered()
         self._inertia_of_joints(ordered)
         springs = [self._spring(("spring", k), e) for k, e in self.doc.spring.items()]
@@ -262,7 +263,7 @@ class _Bodies(Springs):
             return parent
         return None
 
-    def _coordinates(self, path: Path, joint: str, entry: BodyTable) -> tuple[str, ...] | None:
+    def _coordinates(self, path: Path, joint: str, entry: BodyTable) -> tuple[Formula, ...] | None:
         check, given, wanted = self.check, entry.coordinates or (), len(JOINTS[joint].motions)
         if path in check.mended:
             return None
@@ -276,27 +277,57 @@ class _Bodies(Springs):
             remedy = remedy if wanted else ": remove it"
             check.say(path, f"a {joint} joint has {count}{order}, here {here}{remedy}")
             return None
-        sound = True
-        for name in given:
-            if name not in self.doc.coordinates:
-                sound = False
-                table = check.tables.get(name)
-                if table:
-                    why = f"'{name}' stands in [{table}]: a joint moves by what is in [coordinates]"
-                else:
-                    near = suggest(name, self.doc.coordinates) or ": add it to [coordinates]"
-                    why = f"'{name}' is not a coordinate{near}"
-                check.say(path, why, text=name)
-            elif name in self.moved_by:
-                sound = False
-                check.say(
-                    path,
-                    f"'{name}' moves the joint of '{self.moved_by[name]}' already: each joint has "
-                    "coordinates of its own",
-                    text=name,
-                )
+        made = [self._coordinate(path, text) for text in given]
+        sound = tuple(formula for formula in made if formula)
+        for name in self._moved(sound):
             self.moved_by.setdefault(name, entry.name)
-        return given if sound else None
+        return sound if len(sound) == len(made) else None
+
+    def _coordinate(self, path: Path, text: str) -> Formula | None:
+        """A coordinate, or a formula of coordinates; None where it has a fault."""
+        check, coordinates = self.check, self.doc.coordinates
+        if text.isidentifier() and text not in coordinates:
+            table = check.tables.get(text)
+            near = suggest(text, coordinates) or ": add it to [coordinates]"
+            why = f"'{text}' is not a coordinate{near}"
+            if table:
+                why = f"'{text}' stands in [{table}]: a joint moves by what is in [coordinates]"
+            check.say(path, why, text=text)
+            return None
+        rule = "a joint moves by coordinates, or formulas of coordinates, parameters and constants"
+        formula = check.formula(path, text, {*self.known, *coordinates}, rule)
+        if formula is None:
+            return None
+        fault = ""
+        if any(formula.calls("dot")):
+            fault = f"dot(...) can't be used here: {rule}"
+        elif not any(node.id in coordinates for node in formula.names()):
+            fault = f"'{formula.shown}' has no coordinate in it: what does not move is 'fixed'"
+        if fault:
+            check.say(path, fault, text=formula.text)
+            return None
+        check.smooth(path, formula)
+        return formula
+
+    def _moved(self, formulas_: Iterable[Formula]) -> dict[str, None]:
+        """The coordinates in formulas."""
+        found = (node.id for formula in formulas_ for node in formula.names())
+        return dict.fromkeys(name for name in found if name in self.doc.coordinates)
+
+    def _shared(self) -> None:
+        """Joints that move by one coordinate while another moves none: a slip."""
+        taken = {*self.moved_by, *self.check.used}
+        idle = [c for c in self.doc.coordinates if not {c, f"{c}_dot"} & taken]
+        for body in self.bodies.values() if idle else ():
+            for text in (formula.text for formula in body.coordinates):
+                first = self.moved_by.get(text, body.name)
+                if first != body.name:
+                    self.check.say(
+                        ("body", self.names[body.name], "coordinates"),
+                        f"'{text}' moves the joint of '{first}' already, and '{idle[0]}' moves "
+                        f"none; did you mean '{idle[0]}'?",
+                        text=text,
+                    )
 
     def _axes(
         self, path: Path, joint: str, entry: BodyTable
@@ -397,17 +428,17 @@ class _Bodies(Springs):
             if body.parent in carries:
                 carries[body.parent] |= carries[body.name]
         reported: set[str] = set()
+        heavy = [b for b in ordered if carries[b.name] or b.armature]
+        resisted = self._moved(formula for body in heavy for formula in body.coordinates)
         for body in ordered:
-            if (
-                carries[body.name]
-                or body.parent in reported
-                or not body.coordinates
-                or body.armature
-            ):
+            moved = self._moved(body.coordinates)
+            if body.parent in reported or not moved or moved.keys() & resisted:
                 continue
             reported.add(body.name)
+            resisted |= moved  # once
+            by = " and ".join(formula.text for formula in body.coordinates)
             self.check.say(
                 ("body", self.names[body.name]),
-                f"nothing that {' and '.join(body.coordinates)} would move has mass or inertia: "
+                f"nothing that {by} would move has mass or inertia: "
                 f"give '{body.name}' a mass, or its joint an armature",
             )
