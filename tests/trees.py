@@ -22,7 +22,8 @@ def text(
     start: float = 0.3,
 ) -> str:
     """A scene; `more`: the other tables, each with its heading."""
-    names = [q for body in bodies for q in _listed(body.get("coordinates", []))]
+    moved_by = [q for body in bodies for q in _listed(body.get("coordinates", []))]
+    names = dict.fromkeys(q for q in moved_by if q.isidentifier())  # the others are formulas
     tables = [
         ("[coordinates]", {q: {"start": round(start + 0.1 * k, 6)} for k, q in enumerate(names)}),
         ("[parameters]", parameters),
@@ -115,6 +116,8 @@ SHAPES = [(-1,), *((-1, p) for p in (-1, 0)), *((-1, p, r) for p in (-1, 0) for 
 PLANE = ("revolute", "prismatic")
 SPACE = ("revolute", "prismatic", "revolute", "prismatic", "cylindrical", "universal")
 
+GEARS = ("qb00", "-qb00", "-2*qb00 + 0.3", "alpha*qb00 - l", "sin(qb00)/2")  # of the first joint
+
 _AXES = ([1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1], [1, 2, -2], [0.36, 0.48, -0.8])
 
 
@@ -126,6 +129,11 @@ def trees(draw: Any, shape: Sequence[int], plane: bool) -> str:
     for k, (parent, kind) in enumerate(zip(shape, kinds, strict=True)):
         bodies.append(_body(draw, f"b{k}", parent, kind, k not in shape, plane))
     coordinates = [q for body in bodies for q in body["coordinates"]]
+    if draw(st.booleans()):  # something geared to the joints
+        parent = draw(st.sampled_from(["world", *(body["name"] for body in bodies)]))
+        geared = _body(draw, "geared", -1, draw(st.sampled_from(PLANE)), True, plane)
+        geared |= {"parent": parent, "coordinates": draw(st.sampled_from(GEARS))}
+        bodies.append(geared)
     if draw(st.booleans()):  # something screwed on
         bodies.append(
             {"name": "load", "parent": draw(st.sampled_from(["world", "b0"])), "joint": "fixed",

@@ -71,14 +71,14 @@ def gymnasium_model(name: str) -> Path:
     return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / name
 
 
-def stripped(urdf_file: Path, folder: Path) -> Path:
-    """The file without meshes and other things that MuJoCo would open or tie together.
+def stripped(urdf_file: Path, folder: Path, coupled: bool = False) -> Path:
+    """The file without meshes and, unless `coupled`, <mimic>, which MuJoCo would tie together.
 
     Tensors that no body can have, which both sides refuse, become balls of the same trace.
     """
     tree = ElementTree.parse(urdf_file)
     root = tree.getroot()
-    for parent, tags in (("link", ("visual", "collision")), ("joint", ("mimic",))):
+    for parent, tags in (("link", ("visual", "collision")), ("joint", ("mimic",) * (not coupled))):
         for element in root.findall(parent):
             for tag in tags:
                 for part in element.findall(tag):
@@ -138,11 +138,17 @@ def from_mjcf(name: str) -> Pair:
     return pair(read.read(file), mujoco.MjModel.from_xml_path(str(file)))
 
 
-def pair(robot: Robot, model: Any) -> Pair:
-    """Both without what we do not model, or model otherwise."""
+def without_the_rest(model: Any) -> Any:
+    """MuJoCo's model without contacts, limits and drag of the air."""
     off = mujoco.mjtDisableBit
     model.opt.disableflags |= off.mjDSBL_CONSTRAINT | off.mjDSBL_CLAMPCTRL
     model.opt.density = model.opt.viscosity = 0.0
+    return model
+
+
+def pair(robot: Robot, model: Any) -> Pair:
+    """Both without what we do not model, or model otherwise."""
+    without_the_rest(model)
     bodies = tuple(
         replace(b, motions=tuple(replace(m, friction=0.0) for m in b.motions)) for b in robot.bodies
     )
@@ -358,6 +364,33 @@ def test_a_humanoid_with_a_free_base_as_compiled_c(modules: Modules) -> None:
 def test_a_humanoid_with_a_fixed_base(name: str, tmp_path: Path) -> None:
     both = from_urdf(name, tmp_path)
     compare(both, in_python(both.text()))
+
+
+@pytest.mark.parametrize(
+    "name", ["panda_description/urdf/panda.urdf", "urdf/baxter.urdf", "urdf/pr2.urdf"]
+)
+def test_joints_that_mimic_others(name: str, tmp_path: Path) -> None:
+    """D = G^T M G and bias = G^T bias', where MuJoCo's joints, all free, move by G q + c."""
+    (tmp_path / "coupled").mkdir()
+    robot = urdf.read(stripped(robot_data(name), tmp_path / "coupled", coupled=True))
+    spec = mujoco.MjSpec.from_file(str(stripped(robot_data(name), tmp_path)))
+    spec.compiler.fusestatic = True
+    model = without_the_rest(spec.compile())
+    index = {m.name: k for k, m in enumerate(robot.motions)}
+    G, c = np.zeros((model.nv, len(index))), np.zeros(model.nv)
+    for motion in (m for body in robot.bodies for m in body.motions):
+        row = model.joint(motion.name).dofadr[0]
+        mimics = motion.mimics
+        G[row, index[mimics.coordinate if mimics else motion.name]] = mimics.gear if mimics else 1.0
+        c[row] = mimics.shift if mimics else 0.0
+    assert np.sum(np.count_nonzero(G, axis=0) > 1), "nothing mimics"
+    ask, random = in_python(scene_text.scene_text(robot)), np.random.default_rng(3)
+    nothing = np.zeros(len(robot.drives))
+    for _ in range(STATES):
+        q, qd = random.uniform(-2, 2, (2, len(index)))
+        right = theirs(model, G @ q + c, G @ qd, np.zeros(0), np.zeros(model.nv))
+        near(ask("D", q, qd, nothing), G.T @ right.D @ G, "D")
+        near(ask("bias", q, qd, nothing), G.T @ right.bias, "bias")
 
 
 def test_a_wrong_sign_would_be_seen() -> None:

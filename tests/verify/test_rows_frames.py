@@ -71,3 +71,17 @@ def test_wrong_ones_fail(comparison: Comparison, name: str) -> None:
     # forces are held against the Jacobians
     also = {"forces at frames"} if name == "jacobian" else set()
     assert failed == ({ROWS[name], *also} if name else set()), comparison.rows
+
+
+def test_joints_that_move_together(modules: Modules) -> None:
+    """By formulas of coordinates: rates and accelerations have slopes and drift."""
+    text = SPACE.replace(
+        'coordinates = ["phi", "psi"]', 'coordinates = ["phi*psi", "sin(psi) - x"]'
+    )
+    module = modules.of_text(text.replace("crane3", "crane4"))
+    made = from_scene(parse(text.replace("crane3", "crane4"), "test.toml"))
+    comparison = Comparison(made, module, np.random.default_rng(0), 6)
+    rows_frames.report(comparison, None, made.scene)
+    rows_frames.inverse_dynamics(comparison, None)
+    assert len(comparison.rows) == len(ROWS)
+    assert all(row.passed for row in comparison.rows), comparison.rows

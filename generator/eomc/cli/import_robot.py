@@ -40,7 +40,7 @@ def command(
     """Write the scene of a robot file, URDF or MJCF, and say what it leaves out.
 
     \b
-    eomc import panda.urdf --lock panda_finger_joint1=0.04 --lock panda_finger_joint2=0.04
+    eomc import panda.urdf --lock panda_finger_joint1=0.04
     eomc import humanoid.urdf --root torso --tip left_hand
     """
     from dataclasses import replace

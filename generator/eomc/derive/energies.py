@@ -8,8 +8,7 @@ from sympy import Expr, S, Symbol
 
 from eomc.base.errors import EomcError
 from eomc.derive.tape import Stage, Tape
-from eomc.model.multibody import needed
-from eomc.model.symbols import ALONG
+from eomc.model.symbols import ALONG, needed
 from eomc.model.system import System, dot, symbol, t
 
 

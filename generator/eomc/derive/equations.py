@@ -13,7 +13,7 @@ from eomc.base.errors import SceneError
 from eomc.derive.energies import Energies, directions
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import Tape
-from eomc.model.system import System, t
+from eomc.model.system import System, symbol, t
 
 WRITTEN_OUT = 2500  # names on the tape, about, from which C is computed column by column
 
@@ -107,7 +107,7 @@ def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool)
 def no_inertia(system: System, name: str) -> NoReturn:
     """Raise SceneError for a coordinate that nothing resists."""
     links = system.tree.links if system.tree else ()
-    body = next((link.name for link in links if link.q.name == name), "")
+    body = next((link.name for link in links if symbol(name) in link.q.free_symbols), "")
     if body:
         key = f"body.{body}"
         message = (

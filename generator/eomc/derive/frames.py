@@ -21,9 +21,9 @@ from eomc.derive.energies import leaves
 from eomc.derive.links import Links
 from eomc.derive.tape import Stage, Tape
 from eomc.derive.vectors import AXES, ZERO, Vector
-from eomc.model.multibody import Frame, needed
-from eomc.model.symbols import symbol
+from eomc.model.symbols import needed, symbol
 from eomc.model.system import System, t
+from eomc.model.tree import Frame, Tree
 
 Twist = tuple[Vector, Vector]  # of a frame's origin and about it: velocity and omega, force, moment
 
@@ -97,13 +97,16 @@ class Sweep(Links):
     """Links and frames along the world's axes. d, width: entries of a place and of a twist."""
 
     def __init__(self, tape: Tape, system: System, frames: Sequence[Frame]) -> None:
-        super().__init__(tape, system.tree.links if system.tree else ())
+        super().__init__(tape, system.tree or Tree((), (), ZERO, ZERO))
         self.system, self.plane, self.frames = system, system.plane, frames
         self.d, self.width = (2, 3) if system.plane else (3, 6)
         self.along: Mapping[Symbol, Expr] = {
             **dict(zip((*system.q, *system.qd), (*system.qd, *system.qdd), strict=True)),
             t: S.One,
         }
+        self.joint_accelerations = self.by_link(
+            dict(zip(system.q, system.qdd, strict=True))
+        )  # without drift
         self.columns: list[Sequence[Vector]] = []  # of R_k, link k's frame in the world
         self.origin: list[Vector] = []
         self.step: list[Vector] = []  # from the parent's origin
@@ -135,19 +138,19 @@ class Sweep(Links):
 
     def _move(self, k: int, p: int) -> None:
         link, axis, r = self.links[k], self.axis(k), self.step[k]
-        qd, qdd = self.along[link.q], self.along[link.qd]
-        own = self.scaled(axis, qd)
+        own = self.scaled(axis, self.speed[k])
+        faster = self.scaled(axis, self.add(self.joint_accelerations[k], self.drift[k]))
         v = a = omega = alpha = ZERO
         if p >= 0:
             omega, alpha = self.spin[p], self.turning[p]
             v, a = self.carried((self.velocity[p], omega), (self.acceleration[p], alpha), r)
         swept = self.cross(omega, own)
         if link.turns:
-            alpha = self.plus(alpha, self.scaled(axis, qdd), swept)
+            alpha = self.plus(alpha, faster, swept)
             omega = self.plus(omega, own)
         else:
             v = self.plus(v, own)
-            a = self.plus(a, self.scaled(axis, qdd), self.scaled(swept, S(2)))
+            a = self.plus(a, faster, self.scaled(swept, S(2)))
         self.spin.append(omega)
         self.turning.append(alpha)
         self.velocity.append(v)
@@ -220,16 +223,18 @@ class Sweep(Links):
         omega, alpha = self.spin[k], self.turning[k]
         moving, accelerating = (self.velocity[k], omega), (self.acceleration[k], alpha)
         v, a = self.carried(moving, accelerating, arm)
-        jacobian = [(ZERO, ZERO)] * len(self.system.q)
-        index = {q: n for n, q in enumerate(self.system.q)}
+        by: dict[Symbol, Twist] = dict.fromkeys(self.system.q, (ZERO, ZERO))
         away = arm
         while k >= 0:
             link, axis = self.links[k], self.axis(k)
-            jacobian[index[link.q]] = (self.cross(axis, away), axis) if link.turns else (axis, ZERO)
+            twist = (self.cross(axis, away), axis) if link.turns else (axis, ZERO)
+            for q, slope in self.slopes[k].items():
+                linear, angular = (self.scaled(x, slope) for x in twist)
+                by[q] = (self.plus(by[q][0], linear), self.plus(by[q][1], angular))
             k, away = link.parent, self.plus(away, self.step[k])
         rows = list(zip(*columns, strict=True))
         angle = self.value(f.angle) if self.plane else S.Zero
-        return Held(f.link, arm, at, rows, angle, (v, omega), (a, alpha), jacobian)
+        return Held(f.link, arm, at, rows, angle, (v, omega), (a, alpha), [*by.values()])
 
     def _placed(self, f: Frame) -> Held:
         """A body placed by formulas, or what does not move."""
@@ -266,10 +271,13 @@ class Sweep(Links):
             else:
                 for q, (v, omega) in zip(self.system.q, frame.jacobian, strict=True):
                     found[q] += [self.dot(v, f), self.dot(omega, m)]
+        along = [S.Zero] * self.n
         for k in reversed(range(self.n)):
             link = self.links[k]
-            found[link.q].append(self.dot(self.axis(k), (moment if link.turns else force)[k]))
+            along[k] = self.dot(self.axis(k), (moment if link.turns else force)[k])
             if (p := link.parent) >= 0:
                 force[p] = self.plus(force[p], force[k])
                 moment[p] = self.plus(moment[p], moment[k], self.cross(self.step[k], force[k]))
+        for q, projected in self.projected(along).items():
+            found[q].append(projected)
         return [self.add(*terms) for terms in found.values()]

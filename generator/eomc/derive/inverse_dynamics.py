@@ -25,11 +25,12 @@ def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
     accelerations = dict(zip(system.qd, system.qdd, strict=True))
     found = [[x] for x in inertial_forces(system, e, accelerations)]
     if tree:
-        recursion = Recursion(e.tape, tree)
-        qdd = [accelerations[link.qd] for link in tree.links]
-        forces = recursion.joint_forces(recursion.forces(recursion.rates(), qdd))
-        at = {q: k for k, q in enumerate(system.q)}
-        for k, link in enumerate(tree.links):
-            rotor = recursion.times(recursion.armature[k], qdd[k])
-            found[at[link.q]] += [forces[k], rotor]
+        r = Recursion(e.tape, tree)
+        along = r.by_link(dict(zip(system.q, system.qdd, strict=True)))
+        faster = [r.add(*pair) for pair in zip(along, r.drift, strict=True)]
+        forces = r.joint_forces(r.forces(r.rates(), faster))
+        rotors = map(r.times, r.armature, faster)
+        whole = r.projected(r.add(*pair) for pair in zip(forces, rotors, strict=True))
+        for terms, q in zip(found, system.q, strict=True):
+            terms.append(whole.get(q, S.Zero))
     return e.tape, [e.tape.total(x for x in terms if x is not S.Zero) for terms in found]

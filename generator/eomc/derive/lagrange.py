@@ -31,8 +31,9 @@ from eomc.derive.equations import Equations, Motion, equations, no_inertia
 from eomc.derive.ldl import Rows, Solution, Vector, Way, solve, work
 from eomc.derive.newton_euler import Recursion
 from eomc.derive.tape import RoughError, Stage, Tape
-from eomc.model.multibody import Tree, needed
+from eomc.model.symbols import needed
 from eomc.model.system import System, t
+from eomc.model.tree import Tree
 
 LAGRANGE_DEFINITIONS = 12  # of a tree's world coordinates: beyond, recursion always needs less
 MOST_ROWS = 16  # coordinates from which D is computed column by column, where nothing needs it
@@ -105,10 +106,10 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, Way, Way]:
     tape, q = e.tape, system.q
     rest = _lagrange(system, e)
     recursion = Recursion(tape, tree)
-    at = {link.q: k for k, link in enumerate(tree.links)}
 
     def placed(by_link: Sequence[Expr]) -> list[Expr]:
-        return [by_link[at[x]] if x in at else S.Zero for x in q]
+        found = recursion.projected(by_link)
+        return [found.get(x, S.Zero) for x in q]
 
     bias = placed(recursion.bias())
     motion = replace(
@@ -117,17 +118,17 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, Way, Way]:
         g=_sums(tape, rest.g, placed(recursion.gravity_forces())),
         balance=_sums(tape, rest.balance, [-x for x in bias]),
     )
-    articulated = _by_articulated_bodies(system, recursion, at, rest)
+    articulated = _by_articulated_bodies(system, recursion, rest)
     operations = recursion.elimination()
-    long = articulated is not None and operations > _length(articulated)
+    long = isinstance(articulated, Solution) and operations > _length(articulated)
     if long and len(q) > MOST_ROWS:
-        D = _column(system, recursion, at)
+        along = recursion.by_link(directions(system))
+        D: Rows = (tuple(placed(recursion.mass_times(along))),)
     else:
-        rows = recursion.mass_matrix()
-        D = tuple(
-            _sums(tape, rest.D[i], placed(rows[at[x]]) if x in at else [S.Zero] * len(q))
-            for i, x in enumerate(q)
-        )
+        columns = zip(*map(placed, recursion.mass_matrix()), strict=True)
+        whole = [*map(placed, columns)]  # by column; of symmetric entries one is kept
+        rows = [[whole[min(i, j)][max(i, j)] for j in range(len(q))] for i in range(len(q))]
+        D = tuple(_sums(tape, *pair) for pair in zip(rest.D, rows, strict=True))
         _refuse_massless(system, D)
     composite: Way = f"{operations} flops for elimination alone"
     if not long:
@@ -137,13 +138,14 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, Way, Way]:
     return equations(system, e, replace(motion, D=D)), articulated, composite
 
 
-def _by_articulated_bodies(
-    system: System, recursion: Recursion, at: Mapping[Symbol, int], rest: Motion
-) -> Solution | None:
-    """The accelerations where all inertia is the tree's."""
+def _by_articulated_bodies(system: System, recursion: Recursion, rest: Motion) -> Way:
+    """The accelerations where all inertia is the tree's, and joints have their own coordinates."""
     q, links = system.q, recursion.links
-    if len(at) < len(q) or any(x != 0 for column in rest.D for x in column):
+    if not recursion.plain:
+        return "joints that move together"
+    if len(links) < len(q) or any(x != 0 for column in rest.D for x in column):
         return None
+    at = {link.q: k for k, link in enumerate(links)}
     try:
         found, pivots = accelerations(recursion, [rest.balance[q.index(link.q)] for link in links])
     except MasslessError as fault:
@@ -162,13 +164,6 @@ def _by_multipliers(system: System) -> Way:
 def _length(solution: Solution) -> int:
     """The names that a solution depends on, about its operations."""
     return len(solution.tape.live(solution.acceleration))
-
-
-def _column(system: System, recursion: Recursion, at: Mapping[Symbol, int]) -> Rows:
-    """D e for a direction e."""
-    entries = directions(system)
-    found = recursion.mass_times([entries[link.q] for link in recursion.links])
-    return (tuple(found[at[x]] for x in system.q),)
 
 
 def _refuse_massless(system: System, D: Rows) -> None:

@@ -2,32 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import sympy
-from sympy import Expr, S
+from sympy import Expr, S, Symbol
 
 from eomc.base.spatial import transposed
 from eomc.derive.tape import Tape
 from eomc.derive.vectors import AXES, ZERO, Vector, Vectors
 from eomc.model.exact import Matrix
-from eomc.model.multibody import Link
+from eomc.model.tree import Tree
 
 
 class Links(Vectors):
     """Links on a tape, parents first."""
 
-    def __init__(self, tape: Tape, links: Sequence[Link]) -> None:
+    def __init__(self, tape: Tape, tree: Tree) -> None:
         super().__init__(tape)
-        self.links = links
-        self.n = len(links)
-        self.cosine = [self.define(sympy.cos(x.q)) if x.turns else S.One for x in links]
-        self.sine = [self.define(sympy.sin(x.q)) if x.turns else S.Zero for x in links]
+        self.links = tree.links
+        self.n = len(tree.links)
+        # of each joint how far it has moved, how fast, how its rate changes where all qdd = 0, and
+        # its slopes over the coordinates
+        rates = dict(tree.rates)
+        self.moved = [self.define(x.q) for x in self.links]
+        self.speed = tape.forward(self.moved, rates)
+        self.drift = tape.forward(self.speed, rates)
+        self.slopes = [
+            {q: tape.forward([moved], {q: S.One})[0] for q in rates if q in x.q.free_symbols}
+            for x, moved in zip(self.links, self.moved, strict=True)
+        ]
+        both = [*zip(self.links, self.moved, strict=True)]
+        self.cosine = [self.define(sympy.cos(s)) if x.turns else S.One for x, s in both]
+        self.sine = [self.define(sympy.sin(s)) if x.turns else S.Zero for x, s in both]
         self.rotation: list[Matrix] = [
             tuple(self.vector(row) for row in x.rotation)  # type: ignore[misc]
-            for x in links
+            for x in self.links
         ]
         self.arm = [self._arm(k) for k in range(self.n)]
+
+    # --- joints and coordinates ------------------------------------------------------------------
+
+    @property
+    def plain(self) -> bool:
+        """Whether each joint has a coordinate of its own."""
+        by = {link.q for link in self.links if link.q.is_Symbol}
+        return len(by) == self.n
+
+    def projected(self, by_link: Iterable[Expr]) -> dict[Symbol, Expr]:
+        """Forces along joints as forces along coordinates: sum_k ds_k/dq f_k."""
+        terms: dict[Symbol, list[Expr]] = {}
+        for slopes, force in zip(self.slopes, by_link, strict=True):
+            for q, slope in slopes.items():
+                terms.setdefault(q, []).append(self.times(slope, force))
+        return {q: self.add(*those) for q, those in terms.items()}
+
+    def by_link(self, direction: Mapping[Symbol, Expr]) -> list[Expr]:
+        """A direction along the coordinates as one along the joints: sum_q ds_k/dq v_q."""
+        return [
+            self.add(*(self.times(slope, direction[q]) for q, slope in slopes.items()))
+            for slopes in self.slopes
+        ]
+
+    # --- frames ----------------------------------------------------------------------------------
 
     def turn(self, k: int, v: Vector, back: bool = False) -> Vector:
         """A vector of link k's frame in the joint's frame; `back`: the other way."""
@@ -55,7 +91,7 @@ class Links(Vectors):
         offset = self.vector(link.offset)
         if link.turns:
             return offset
-        slide = tuple(self.times(row[link.axis], link.q) for row in self.rotation[k])
+        slide = tuple(self.times(row[link.axis], self.moved[k]) for row in self.rotation[k])
         return self.plus(offset, slide)
 
     def on_axis(self, k: int, x: Expr) -> Vector:
@@ -66,7 +102,7 @@ class Links(Vectors):
 
     def rates(self) -> list[Expr]:
         """The joints' rates, by link."""
-        return [link.qd for link in self.links]
+        return self.speed
 
     def angular_velocities(self, rates: Sequence[Expr]) -> list[Vector]:
         """omega of each link in its frame."""

@@ -25,7 +25,7 @@ from eomc.derive.links import Links
 from eomc.derive.tape import Tape
 from eomc.derive.vectors import AXES, ZERO, Vector
 from eomc.model.exact import Matrix
-from eomc.model.multibody import Link, Tree
+from eomc.model.tree import Link, Tree
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Recursion(Links):
     """A tree on a tape: grouped inertias and the sweeps."""
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
-        super().__init__(tape, tree.links)
+        super().__init__(tape, tree)
         self.gravity = self.vector(tree.gravity)
         self.still = self.vector(tree.still)
         self.armature = [self.define(x.armature) for x in self.links]
@@ -270,7 +270,7 @@ class Recursion(Links):
 
     def bias(self) -> list[Expr]:
         """C qd + g, by link."""
-        return self.joint_forces(self.forces(self.rates(), [S.Zero] * self.n))
+        return self._with_rotors(self.forces(self.rates(), self.drift), self.drift)
 
     def gravity_forces(self) -> list[Expr]:
         """g, by link."""
@@ -280,11 +280,12 @@ class Recursion(Links):
     def mass_times(self, direction: Sequence[Expr]) -> list[Expr]:
         """D v for a direction v, by link, without D."""
         forces = self.forces([S.Zero] * self.n, direction, gravity=False)
-        found = self.joint_forces(forces)
-        return [
-            self.add(x, self.times(a, v))
-            for x, a, v in zip(found, self.armature, direction, strict=True)
-        ]
+        return self._with_rotors(forces, direction)
+
+    def _with_rotors(self, forces: _Forces, wishes: Sequence[Expr]) -> list[Expr]:
+        """The forces along the joints, with those that armatures need."""
+        found = zip(self.joint_forces(forces), self.armature, wishes, strict=True)
+        return [self.add(x, self.times(a, v)) for x, a, v in found]
 
     # --- D by composite bodies -------------------------------------------------------------------
 

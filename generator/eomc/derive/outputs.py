@@ -10,8 +10,7 @@ from eomc.base.errors import EomcError, SceneError
 from eomc.derive.energies import leaves
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import RoughError, Tape
-from eomc.model.multibody import needed
-from eomc.model.symbols import dot
+from eomc.model.symbols import dot, needed
 from eomc.model.system import System, t
 
 

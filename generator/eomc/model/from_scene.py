@@ -48,7 +48,8 @@ class _Formulas:
         for constant in scene.constants:
             known[constant.name] = self.value(f"constants.{constant.name}", constant.formula)
         declared = [*known, *(name for name, _ in scene.definitions)]
-        builder = Builder(scene.assembly, self.value, declared) if scene.assembly else None
+        rates = {symbol(c.name): symbol(f"{c.name}_dot") for c in scene.coordinates}
+        builder = Builder(scene.assembly, self.value, rates, declared) if scene.assembly else None
         made = []
         if builder:
             builder.build_tree()

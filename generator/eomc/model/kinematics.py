@@ -18,8 +18,8 @@ from eomc.scene.scene import Scene
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # where a body's frame is in the world: offset (3,), rotation (3, 3)
-# coordinate, "t" or "r", axis and a point on it, in the world
-Motion = tuple[int, str, Array, Array]
+# how fast over each coordinate, "t" or "r", axis and a point on it, in the world
+Motion = tuple[dict[int, float], str, Array, Array]
 
 STEP = 1e-5  # of central differences: their error is about 1e-10
 NOTHING = 1e-7  # a column shorter than this, relative to the longest, is one of zeros
@@ -55,6 +55,7 @@ class Kinematics:
 
     def __init__(self, scene: Scene, assembly: Assembly) -> None:
         self.coordinates = [c.name for c in scene.coordinates]
+        self.index = {name: k for k, name in enumerate(self.coordinates)}
         self.values = {p.name: p.value for p in (*scene.parameters, *scene.constants)}
         self.definitions = dict(scene.definitions)
         self.start = np.array(scene.start()[0])
@@ -64,7 +65,6 @@ class Kinematics:
         self.frames = {body.name: self.joint_frame(body) for body in self.tree}
         self.centers = {body.name: self.vector(body.center, self.values) for body in self.tree}
         self.roots = {body.name: self._roots(body) for body in assembly.bodies}
-        self.armature = np.diag(np.sqrt(self._armature(assembly)))
 
     def states(self) -> Iterator[Null]:
         """At random states: coordinates not too far from the start, where formulas have values."""
@@ -90,7 +90,8 @@ class Kinematics:
         *Rigid Body Dynamics Algorithms*, ch. 7), which takes as long as the tree is. A pivot that
         may be rounding is not judged: then the answer is False.
         """
-        if self.placed or len({c for b in self.tree for c in b.coordinates}) < len(q):
+        by = [formula.text for body in self.tree for formula in body.coordinates]
+        if self.placed or sorted(by) != sorted(self.coordinates):
             return False
         frames = self._frames(q)
         inertia: dict[str, Array] = {}  # of what is beyond a joint, in the world's directions
@@ -117,15 +118,15 @@ class Kinematics:
 
     def poses(self, q: Array) -> dict[str, Pose] | None:
         """Of each body's frame, of a placed one its centre's; None where a formula has no value."""
-        held = {name: pose for name, (pose, _) in self._frames(q).items()}
         try:
+            held = {name: pose for name, (pose, _) in self._frames(q).items()}
             return held | (self._placed_at(q, 0.0) if self.placed else {})
         except (ArithmeticError, ValueError, TypeError):
             return None
 
     def _frames(self, q: Array) -> dict[str, tuple[Pose, list[Motion]]]:
         """Of each body its frame, and its joint's motions, in the world."""
-        index = {name: k for k, name in enumerate(self.coordinates)}
+        known = self._known(q)
         out: dict[str, tuple[Pose, list[Motion]]] = {WORLD: ((np.zeros(3), np.eye(3)), [])}
         for body in self.tree:
             at, R = out[body.parent][0]
@@ -133,20 +134,37 @@ class Kinematics:
             at, R = at + R @ offset, R @ rotation
             motions = []
             kinds = JOINTS[body.joint].motions
-            for kind, axis, name in zip(kinds, self.axes(body), body.coordinates, strict=True):
-                k = index[name]
-                motions.append((k, kind, R @ axis, at))
+            for kind, axis, by in zip(kinds, self.axes(body), body.coordinates, strict=True):
+                motions.append((self._slopes(by, known), kind, R @ axis, at))
+                moved = self._number(by, known)
                 if kind == "t":
-                    at = at + R @ axis * q[k]
+                    at = at + R @ axis * moved
                 else:
-                    R = R @ _about(axis, q[k])
+                    R = R @ _about(axis, moved)
             out[body.name] = (at, R), motions
         return out
+
+    def _known(self, q: Array) -> dict[str, float]:
+        """Values of parameters, constants and coordinates."""
+        return {**self.values, **dict(zip(self.coordinates, map(float, q), strict=True))}
+
+    def _slopes(self, by: Formula, known: dict[str, float]) -> dict[int, float]:
+        """What a joint moves by, over the coordinates; of a formula by central differences."""
+        if by.text in self.index:
+            return {self.index[by.text]: 1.0}
+        slopes = {}
+        for name in {node.id for node in by.names()} & self.index.keys():
+            after, before = (
+                self._number(by, {**known, name: known[name] + step}) for step in (STEP, -STEP)
+            )
+            slopes[self.index[name]] = (after - before) / (2 * STEP)
+        return slopes
 
     def jacobian(self, q: Array, t: float) -> Jacobian | None:
         """At a state; None where a formula has no value there."""
         try:
             found = [*self._tree_rates(q), *self._placed_rates(q, t)]
+            rotors = [*self._armatures(q)]
         except (ArithmeticError, ValueError, TypeError):
             return None
         moves, weighs = [], []
@@ -154,7 +172,7 @@ class Kinematics:
             mass, inertia = self.roots[body.name]
             moves += [v, omega]
             weighs += [mass * v, inertia @ R.T @ omega]
-        return Jacobian(np.vstack(moves), np.vstack([*weighs, self.armature]))
+        return Jacobian(np.vstack(moves), np.vstack([*weighs, *rotors]))
 
     def _tree_rates(self, q: Array) -> Iterator[tuple[Body, Array, Array, Array]]:
         """Each body's rotation, and velocities of its centre and of turning over q: (3, nq)."""
@@ -165,12 +183,13 @@ class Kinematics:
             above[body.name] = [*above[body.parent], *own]
             center = at + R @ self.centers[body.name]
             v, omega = np.zeros((3, len(q))), np.zeros((3, len(q)))
-            for k, kind, axis, point in above[body.name]:
-                if kind == "t":
-                    v[:, k] += axis
-                else:
-                    v[:, k] += np.cross(axis, center - point)
-                    omega[:, k] += axis
+            for slopes, kind, axis, point in above[body.name]:
+                for k, slope in slopes.items():
+                    if kind == "t":
+                        v[:, k] += slope * axis
+                    else:
+                        v[:, k] += slope * np.cross(axis, center - point)
+                        omega[:, k] += slope * axis
             yield body, R, v, omega
 
     def _placed_rates(self, q: Array, t: float) -> Iterator[tuple[Body, Array, Array, Array]]:
@@ -195,7 +214,7 @@ class Kinematics:
 
     def _placed_at(self, q: Array, t: float) -> dict[str, Pose]:
         """Centre of mass and rotation of each body that is placed by formulas."""
-        known = {**self.values, **dict(zip(self.coordinates, map(float, q), strict=True)), "t": t}
+        known = {**self._known(q), "t": t}
         for name, ((at, R), _) in self._frames(q).items():
             if name != WORLD:
                 center = at + R @ self.centers[name]
@@ -225,12 +244,14 @@ class Kinematics:
         root = np.sqrt(np.maximum(moments, 0))[:, None] * axes.T
         return math.sqrt(max(self._number(body.mass, self.values), 0)), root
 
-    def _armature(self, assembly: Assembly) -> list[float]:
-        by_name = dict.fromkeys(self.coordinates, 0.0)
-        for body in assembly.bodies:
-            for name, armature in zip(body.coordinates, body.armature, strict=False):
-                by_name[name] += max(self._number(armature, self.values), 0)
-        return list(by_name.values())
+    def _armatures(self, q: Array) -> Iterator[Array]:
+        """A row (nq,) for each armature: its root times how fast its joint moves."""
+        frames = self._frames(q)
+        for body in self.tree:
+            for armature, (slopes, *_) in zip(body.armature, frames[body.name][1], strict=False):
+                row = np.zeros(len(q))
+                row[[*slopes]] = [*slopes.values()]
+                yield math.sqrt(max(self._number(armature, self.values), 0)) * row
 
     def vector(self, formulas_: Iterable[Formula], known: dict[str, float]) -> Array:
         """The values of formulas, where the names have those in `known`."""

@@ -98,7 +98,7 @@ def count(scene: Scene) -> Mobility:
     rank = len(names) - len(generic.moves)
     remarks = [
         *_fixed(assembly),
-        *_shared(assembly),
+        *_shared(assembly, {*names}),
         *_formulas_fix(placed, d, names, rank, M),
         *_moves_nothing(generic, names, bool(scene.kinetic.names())),
         *_in_a_row(assembly, kinematics),
@@ -170,17 +170,21 @@ def _fixed(assembly: Assembly) -> Iterator[str]:
         yield f"fixed (f = 0), moving as one with what they are fixed to: {listed(rigid)}"
 
 
-def _shared(assembly: Assembly) -> Iterator[str]:
-    holders: dict[str, list[str]] = {}
+def _shared(assembly: Assembly, names: set[str]) -> Iterator[str]:
+    seen: set[str] = set()
+    motions, together = 0, []
     for body in assembly.bodies:
-        for name in body.coordinates:
-            holders.setdefault(name, []).append(body.name)
-    for name, bodies in holders.items():
-        if len(bodies) > 1:
-            yield (
-                f"'{name}' moves {len(bodies)} joints, those of {listed(bodies)}: M counts each, "
-                f"they are {len(bodies) - 1} fewer"
-            )
+        by = {formula.text for formula in body.coordinates}
+        if seen & by or not by <= names:
+            together.append(body.name)
+        seen |= by
+        motions += len(body.coordinates)
+    if motions > len(names):
+        fewer = motions - len(names)
+        yield (
+            f"{listed(together)}: moved by coordinates of other joints; M counts every joint, the "
+            f"coordinates are {fewer} fewer"
+        )
 
 
 def _formulas_fix(
@@ -227,8 +231,10 @@ def _in_a_row(assembly: Assembly, kinematics: Kinematics) -> Iterator[str]:
         turns = body.joint == "revolute"
         if not parallel or (turns and float(np.linalg.norm(np.cross(offset, first))) > 1e-9):
             continue
+        pair = above.coordinates[0].text, body.coordinates[0].text
+        if len({*pair} & {*kinematics.coordinates}) < 2:
+            continue  # they move together
         how = "turn about the same line" if turns else "slide along the same direction"
-        pair = above.coordinates[0], body.coordinates[0]
         yield (
             f"'{pair[0]}' and '{pair[1]}' {how}, one behind the other: only what lies between the "
             f"two joints distinguishes them, {above.name} needs inertia of its own"

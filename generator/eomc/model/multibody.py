@@ -18,67 +18,12 @@ from eomc.base.spatial import apply, plus, product, scaled, transposed
 from eomc.model import exact
 from eomc.model.exact import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
 from eomc.model.symbols import dot, symbol
+from eomc.model.tree import Frame, Link, Tree
 from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 
 Value = Callable[[str, Formula], Expr]  # the expression of a formula that stands at a key
-
-
-@dataclass(frozen=True)
-class Link:
-    """An elementary joint and the mass that moves with it, in the frame that the joint moves.
-
-    The frame stands at `offset` in the parent's frame, rotated by `rotation` (it takes vectors of
-    the joint's frame to the parent's), and then turns about (`turns`) or slides along its own
-    `axis` (0, 1, 2) by `q`. mass, moment (mass times centre of mass) and inertia (Ixx, Iyy, Izz,
-    Ixy, Ixz, Iyz) are about the frame's origin.
-    """
-
-    name: str
-    parent: int  # -1: the world
-    turns: bool
-    axis: int
-    q: Symbol
-    qd: Symbol
-    offset: Vector
-    rotation: Matrix
-    mass: Expr = S.Zero
-    moment: Vector = ZERO
-    inertia: tuple[Expr, ...] = (S.Zero,) * 6
-    armature: Expr = S.Zero
-
-
-@dataclass(frozen=True)
-class Tree:
-    """Links, parents first. beside_*: the energies that the tree does not account for.
-
-    still: the moment of the mass that does not move at all, which has potential energy.
-    """
-
-    links: tuple[Link, ...]
-    gravity: Vector
-    still: Vector
-    beside_kinetic: Expr = S.Zero
-    beside_potential: Expr = S.Zero
-
-
-@dataclass(frozen=True)
-class Frame:
-    """The frame of a body or a point: at `offset`, rotated by `rotation`, in that of its link.
-
-    link -1: in the world, where a body placed by formulas has them in the coordinates, and its
-    mass and inertia (as those of a link) about its centre, where its frame is. angle: in the plane,
-    over definitions.
-    """
-
-    name: str
-    link: int
-    offset: Vector
-    rotation: Matrix
-    angle: Expr
-    mass: Expr = S.Zero
-    inertia: tuple[Expr, ...] = (S.Zero,) * 6
 
 
 @dataclass
@@ -99,6 +44,7 @@ class Terms:
     applied: list[tuple[Expr, Expr]] = field(default_factory=list)  # forces at positions
     links: list[Link] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
+    rates: dict[Symbol, Symbol] = field(default_factory=dict)  # of the coordinates of joints
     still: Vector = ZERO
     gravity: Vector = ZERO
 
@@ -108,6 +54,7 @@ class Terms:
             return None
         return Tree(
             tuple(self.links),
+            tuple(self.rates.items()),
             self.gravity,
             self.still,
             kinetic + self.kinetic,
@@ -130,11 +77,19 @@ class _Place:
 class Builder:
     """Puts bodies together, in the order in which a scene needs the pieces."""
 
-    def __init__(self, assembly: Assembly, value: Value, taken: Sequence[str]) -> None:
+    def __init__(
+        self,
+        assembly: Assembly,
+        value: Value,
+        coordinates: Mapping[Symbol, Symbol],
+        taken: Sequence[str],
+    ) -> None:
         self.assembly = assembly
         self.value = value
+        self.coordinates = coordinates  # with their velocities
         self.taken = set(taken)
         self.terms = Terms()
+        self.moved: dict[str, list[Expr]] = {}  # of each body the motions of its joint
         self.places: dict[str, _Place] = {WORLD: _Place(-1, ZERO, ONE, ZERO, ONE)}
         self.loads: dict[str, tuple[Expr, tuple[Expr, ...]]] = {}  # of bodies placed by formulas
         self.terms.gravity = self._vector("gravity", assembly.gravity)
@@ -146,8 +101,6 @@ class Builder:
         for body in self.assembly.bodies:
             if body.joint:
                 self._join(body)
-        for link in self.terms.links:
-            self.terms.tree_kinetic.append(link.armature * link.qd**2 / 2)
 
     def _join(self, body: Body) -> None:
         key = f"body.{body.name}"
@@ -168,29 +121,37 @@ class Builder:
             angle,
         )
         armature = [self.value(f"{key}.armature", a) for a in body.armature]
-        for k, (motion, axis, name) in enumerate(_motions(body)):
-            place = self._move(
-                body.name, place, motion, axis, name, armature[k] if armature else S.Zero
-            )
+        kind, by = JOINTS[body.joint], [self._coordinate(key, c) for c in body.coordinates]
+        for k, along in enumerate(zip(kind.motions, kind.along(body.axes), by, strict=True)):
+            place = self._move(body.name, place, *along, armature[k] if armature else S.Zero)
         if not self.assembly.plane and body.joint != "fixed":
             R = self._entries(body.name, place.R)
             place = replace(place, R=R)
         self.places[body.name] = place
         self._load(body, place)
 
+    def _coordinate(self, key: str, formula: Formula) -> Expr:
+        """What a joint moves by, in coordinates, whose velocities are noted."""
+        moved = self.value(f"{key}.coordinates", formula)
+        by = sorted(self.coordinates.keys() & moved.free_symbols, key=str)
+        self.terms.rates |= {q: self.coordinates[q] for q in by}
+        return moved
+
     def _move(
-        self, name: str, place: _Place, motion: str, axis: Sequence[float], coordinate: str,
+        self, name: str, place: _Place, motion: str, axis: Sequence[float], moved: Expr,
         armature: Expr,
     ) -> _Place:  # fmt: skip
         """The place behind one more elementary joint, which becomes a link."""
         terms = self.terms
-        q, qd = symbol(coordinate), symbol(f"{coordinate}_dot")
+        q = self._named(f"{name}_q", moved)
+        self.moved.setdefault(name, []).append(q)
+        terms.tree_kinetic.append(armature * self.terms.rates.get(q, _rate(q)) ** 2 / 2)
         k, aligned = exact.aligned_with(axis)
         direction = tuple(S(x) for x in exact.unit(axis))
         rotation = exact.clean(product(place.rotation, aligned))
         terms.links.append(
             Link(
-                name, place.link, motion == "r", k, q, qd, place.offset, rotation, armature=armature
+                name, place.link, motion == "r", k, moved, place.offset, rotation, armature=armature
             )
         )
         back = transposed(aligned)
@@ -239,8 +200,8 @@ class Builder:
             key, width = f"body.{body.name}", S.One
             if body.friction_width:
                 width = self.value(f"{key}.friction_width", body.friction_width)
-            for k, name in enumerate(body.coordinates):
-                rate = symbol(f"{name}_dot")
+            for k, q in enumerate(self.moved.get(body.name, ())):
+                rate = terms.rates.get(q, _rate(q))
                 if body.damping:
                     terms.dissipation += self.value(f"{key}.damping", body.damping[k]) * rate**2 / 2
                 force = S.Zero
@@ -249,8 +210,10 @@ class Builder:
                     force -= friction * sympy.tanh(rate / width)
                 if body.actuator:
                     force += self.value(f"{key}.actuator", body.actuator[k])
-                if force != 0:
-                    terms.forces[name] = terms.forces.get(name, S.Zero) + force
+                if force != 0 and q in terms.rates:
+                    terms.forces[q.name] = terms.forces.get(q.name, S.Zero) + force
+                elif force != 0:
+                    terms.applied.append((q, force))
 
     # --- bodies placed by formulas, springs and dampers ------------------------------------------
 
@@ -412,27 +375,6 @@ def _rate(e: Expr) -> Expr:
     return dot(e) if e.free_symbols else S.Zero
 
 
-def _motions(body: Body) -> list[tuple[str, Sequence[float], str]]:
-    """The elementary joints of a body: (motion, axis, coordinate), the outermost last."""
-    joint = JOINTS[body.joint]
-    return list(zip(joint.motions, joint.along(body.axes), body.coordinates, strict=True))
-
-
 def rotation_about(axis: int, angle: Expr) -> Matrix:
     """The rotation about a coordinate axis: takes vectors of the rotated frame to the old one."""
     return spatial.about_axis(axis, sympy.cos(angle), sympy.sin(angle))
-
-
-def needed(
-    definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
-) -> list[tuple[Symbol, Expr]]:
-    """The definitions that `ends` depend on, in their order."""
-    known: Mapping[Symbol, Expr] = dict(definitions)
-    found: set[Symbol] = set()
-    queue = [s for end in ends for s in end.free_symbols]
-    while queue:
-        name = queue.pop()
-        if name in known and name not in found:
-            found.add(name)
-            queue.extend(known[name].free_symbols)
-    return [(name, e) for name, e in definitions if name in found]

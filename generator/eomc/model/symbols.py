@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -93,3 +94,18 @@ class Input(_Named):
     unit: str = ""
     signal: Expr = sympy.S.Zero
     note: str = ""
+
+
+def needed(
+    definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
+) -> list[tuple[Symbol, Expr]]:
+    """The definitions that `ends` depend on, in their order."""
+    known: Mapping[Symbol, Expr] = dict(definitions)
+    found: set[Symbol] = set()
+    queue = [s for end in ends for s in end.free_symbols]
+    while queue:
+        name = queue.pop()
+        if name in known and name not in found:
+            found.add(name)
+            queue.extend(known[name].free_symbols)
+    return [(name, e) for name, e in definitions if name in found]

@@ -15,8 +15,8 @@ from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
-from eomc.model.multibody import Frame, Tree
 from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
+from eomc.model.tree import Frame, Tree
 from eomc.scene.scene import Run, Scene
 
 LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision, in C

@@ -9,7 +9,16 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus
 from eomc.robots.inertias import indefinite, nearest, principal, shown, unbalanced
-from eomc.robots.robot import Robot, RobotBody, free_motions, joined, moved, without_dust
+from eomc.robots.robot import (
+    Robot,
+    RobotBody,
+    fixed,
+    free_motions,
+    joined,
+    moved,
+    settled,
+    without_dust,
+)
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_pitch_roll
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
@@ -34,15 +43,24 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
                 f"--lock {name}: the {body.joint} joint of '{body.name}' moves by {those} "
                 "together: only a joint with one coordinate can be frozen"
             )
+        mimics = body.motions[0].mimics
+        if mimics and mimics.coordinate not in values:
+            raise EomcError(
+                f"--lock {name}: it moves as '{mimics.coordinate}' does: lock that, and both are "
+                "frozen"
+            )
     bodies = []
     for body in robot.bodies:
-        if body.motions and body.motions[0].name in values:
-            motion = body.motions[0]
+        motion = body.motions[0] if body.motions else None
+        if motion and motion.name in values:
             value = values[motion.name]
             note = joined(body.note, f"joint {motion.name} locked at {value!r} {motion.unit}")
-            body = replace(_fixed(body, *moved(body, (value,))), note=note)
+            body = replace(fixed(body, *moved(body, (value,))), note=note)
+        elif motion and motion.mimics and motion.mimics.coordinate in values:
+            start = motion.mimics.at(values[motion.mimics.coordinate])
+            body = replace(body, motions=(replace(motion, start=start),))
         bodies.append(body)
-    return _without_loose_drives(replace(robot, bodies=tuple(bodies)))
+    return settled(replace(robot, bodies=tuple(bodies)))
 
 
 def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
@@ -79,10 +97,10 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
     bodies = [body for body in robot.bodies if body.name in kept]
     for k, body in enumerate(bodies):
         if body.name == root and body.parent != WORLD:
-            bodies[k] = replace(_fixed(body, *_stands(by_name, body)), parent=WORLD)
+            bodies[k] = replace(fixed(body, *_stands(by_name, body)), parent=WORLD)
     gone = tuple(name for name in by_name if name not in kept)
     left_out = ((f"cut off: {texts.listed(gone)}",) if gone else ()) + robot.left_out
-    return _without_loose_drives(replace(robot, bodies=tuple(bodies), left_out=left_out))
+    return settled(replace(robot, bodies=tuple(bodies), left_out=left_out))
 
 
 def mended(robot: Robot) -> Robot:
@@ -119,20 +137,16 @@ def based(robot: Robot, free: bool) -> Robot:
             motions = free_motions("base")
         at = (*root.offset, *yaw_pitch_roll(root.rotation))
         motions = tuple(replace(m, start=s) for m, s in zip(motions, at, strict=True))
-        new = replace(_fixed(root, ORIGIN, IDENTITY), joint="free", motions=motions)
+        new = replace(fixed(root, ORIGIN, IDENTITY), joint="free", motions=motions)
     elif not free and root.motions:
-        new = _fixed(root, *_at_start(root))
+        new = fixed(root, *_at_start(root))
     if free and new.joint != "free":
         raise EomcError(
             f"--base free: '{root.name}' stands on the world by a {root.joint} joint, "
             "which the file gives it: --base free is for a root without one"
         )
     bodies = tuple(new if body is root else body for body in robot.bodies)
-    return _without_loose_drives(replace(robot, bodies=bodies))
-
-
-def _fixed(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
-    return replace(body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation)
+    return settled(replace(robot, bodies=bodies))
 
 
 def _at_start(body: RobotBody) -> tuple[Vector, Matrix]:
@@ -147,8 +161,3 @@ def _stands(by_name: Mapping[str, RobotBody], body: RobotBody) -> tuple[Vector, 
         o, r = _at_start(body)
         offset, rotation = plus(o, apply(r, offset)), times(r, rotation)
     return offset, rotation
-
-
-def _without_loose_drives(robot: Robot) -> Robot:
-    there = {m.name for m in robot.motions}
-    return replace(robot, drives=tuple(d for d in robot.drives if d.coordinate in there))

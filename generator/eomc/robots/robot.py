@@ -7,7 +7,7 @@ asks, scene_text.py makes it fit for a scene and writes that.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from eomc.base.spatial import apply, plus, scaled
 from eomc.robots.inertias import NO_INERTIA, Inertia
@@ -19,8 +19,21 @@ BARE = "no <inertial>"  # the note of a link that has none, and no shape
 
 
 @dataclass(frozen=True)
+class Mimic:
+    """A joint moves by gear times a coordinate, plus shift (rad or m)."""
+
+    coordinate: str
+    gear: float = 1.0
+    shift: float = 0.0
+
+    def at(self, value: float) -> float:
+        """Where the joint is while the coordinate has this value."""
+        return self.gear * value + self.shift
+
+
+@dataclass(frozen=True)
 class Motion:
-    """A coordinate of a joint, in `unit` "rad" or "m".
+    """A coordinate of a joint, in `unit` "rad" or "m"; where it `mimics` another, it is none.
 
     damping: N m s/rad or N s/m; friction: N m or N; armature: kg m^2 or kg; stiffness (N m/rad or
     N/m) and rest: of the joint's own spring. note: its limits.
@@ -35,6 +48,7 @@ class Motion:
     armature: float = 0.0
     stiffness: float = 0.0
     rest: float = 0.0
+    mimics: Mimic | None = None
 
 
 @dataclass(frozen=True)
@@ -86,7 +100,7 @@ class Robot:
     @property
     def motions(self) -> tuple[Motion, ...]:
         """The coordinates, in the order of the bodies."""
-        return tuple(m for body in self.bodies for m in body.motions)
+        return tuple(m for body in self.bodies for m in body.motions if not m.mimics)
 
 
 def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
@@ -99,6 +113,27 @@ def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
         else:
             rotation = times(rotation, from_axis_angle(axis, value))
     return offset, rotation
+
+
+def fixed(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
+    """The body on a fixed joint there."""
+    return replace(body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation)
+
+
+def settled(robot: Robot) -> Robot:
+    """The robot with joints fixed at their start that mimic what does not move; no loose drives."""
+    there = {m.name for m in robot.motions}
+    bodies = []
+    for body in robot.bodies:
+        motion = body.motions[0] if body.motions else None
+        mimics = motion.mimics if motion else None
+        if motion and mimics and (not mimics.gear or mimics.coordinate not in there):
+            note = f"joint {motion.name} stands at {motion.start:g} {motion.unit}"
+            body = fixed(body, *moved(body, (motion.start,)))
+            body = replace(body, note=joined(body.note, note))
+        bodies.append(body)
+    drives = tuple(d for d in robot.drives if d.coordinate in there)
+    return replace(robot, bodies=tuple(bodies), drives=drives)
 
 
 def free_motions(of: str = "") -> tuple[Motion, ...]:

@@ -11,7 +11,16 @@ from eomc.base import names, texts
 from eomc.base.errors import EomcError
 from eomc.base.texts import line, toml
 from eomc.robots.inertias import indefinite, unbalanced
-from eomc.robots.robot import BARE, Drive, Motion, Robot, RobotBody, joined, without_dust
+from eomc.robots.robot import (
+    BARE,
+    Drive,
+    Mimic,
+    Motion,
+    Robot,
+    RobotBody,
+    joined,
+    without_dust,
+)
 from eomc.robots.rotations import SNAP, Vector, turns_of
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
@@ -105,8 +114,9 @@ def _named(robot: Robot) -> Robot:
         bodies[body.name] = name
         motions = tuple(
             replace(m, name=new, note=_renamed(m.name, new, m.note))
+            if (new := coordinates.get(m.name, ""))
+            else replace(m, mimics=_of(m, coordinates))
             for m in body.motions
-            if (new := coordinates[m.name])
         )
         note = _renamed(body.name, name, body.note)
         out.append(replace(body, name=name, parent=bodies[body.parent], motions=motions, note=note))
@@ -116,14 +126,21 @@ def _named(robot: Robot) -> Robot:
     return replace(robot, name=name, bodies=tuple(out), drives=drives)
 
 
+def _of(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
+    """What a joint mimics, by its name in the scene."""
+    found = motion.mimics
+    return found and replace(found, coordinate=coordinates[found.coordinate])
+
+
 def _renamed(old: str, new: str, note: str) -> str:
     return note if old == new else joined(f"'{old}' in the file", note)
 
 
 def _without_inertia(robot: Robot) -> list[str]:
     """In words, each joint that moves nothing with mass or inertia."""
-    faults: list[str] = []
-    locks: list[str] = []
+    faults: dict[str, str] = {}  # by coordinate
+    locks: dict[str, str] = {}
+    resisted: set[str] = set()
     carries: dict[str, list[RobotBody]] = {}
     for body in reversed(robot.bodies):  # children come before parents
         mine = [body, *carries.get(body.name, ())]
@@ -132,16 +149,22 @@ def _without_inertia(robot: Robot) -> list[str]:
         for kind, motion in zip(kinds, body.motions, strict=True):
             has = any(b.mass or (kind == "r" and any(b.inertia)) for b in mine)
             if has or motion.armature:
+                resisted.add(motion.mimics.coordinate if motion.mimics else motion.name)
+            if has or motion.armature or motion.mimics:
                 continue
             those = texts.listed([b.name + (f" ({b.note})" if b.note else "") for b in mine], 4)
             lacks = "mass" if kind == "t" else "inertia"
-            faults.append(f"joint {motion.name} moves nothing that has {lacks}, only {those}")
+            faults[motion.name] = (
+                f"joint {motion.name} moves nothing that has {lacks}, only {those}"
+            )
             if len(body.motions) == 1:
-                locks.append(f"--lock {motion.name}=0")
-    if not faults:
+                locks[motion.name] = f"--lock {motion.name}=0"
+    names = [name for name in reversed(faults) if name not in resisted]
+    if not names:
         return []
-    freeze = f", or freeze what moves nothing: {' '.join(locks[::-1])}" if locks else ""
-    return [*faults[::-1], f"add mass and inertia to the file{freeze}"]
+    freeze = " ".join(locks[name] for name in names if name in locks)
+    freeze = f", or freeze what moves nothing: {freeze}" if freeze else ""
+    return [*(faults[name] for name in names), f"add mass and inertia to the file{freeze}"]
 
 
 # --- the text -------------------------------------------------------------------------------------
@@ -235,7 +258,7 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
             entry["parent"] = toml(body.parent)
         entry["joint"] = toml(body.joint)
     if body.motions:
-        entry["coordinates"] = _each([toml(m.name) for m in body.motions])
+        entry["coordinates"] = _each([toml(_moved_by(m)) for m in body.motions])
     if any(body.offset):
         entry["place" if body.point else "offset"] = vector(body.offset)
     if turns := turns_of(body.rotation):
@@ -260,6 +283,17 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
     if body.note:
         entry["note"] = toml(body.note)
     return entry
+
+
+def _moved_by(m: Motion) -> str:
+    """The coordinate of a joint, or the formula of the one that it mimics."""
+    if not m.mimics:
+        return m.name
+    gear, shift = number(m.mimics.gear), _length(m.mimics.shift, m.unit).strip('"')
+    factor = {"1": "", "-1": "-"}.get(gear, f"{gear}*")
+    return f"{factor}{m.mimics.coordinate}" + (f" + {shift}" if shift != "0" else "").replace(
+        "+ -", "- "
+    )
 
 
 def _force(coordinate: str, drives: Sequence[Drive]) -> str:

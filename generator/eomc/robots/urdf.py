@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,12 +17,22 @@ from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.base.spatial import transposed
 from eomc.robots import xml
 from eomc.robots.inertias import NO_INERTIA, rotated_inertia
-from eomc.robots.robot import BARE, Drive, Motion, Robot, RobotBody, free_motions
+from eomc.robots.robot import (
+    BARE,
+    Drive,
+    Mimic,
+    Motion,
+    Robot,
+    RobotBody,
+    free_motions,
+    joined,
+    settled,
+)
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, times, toward, unit
 from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
-from eomc.scene.scope import rings
+from eomc.scene.scope import ring_text, rings
 
 GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
 
@@ -91,19 +101,22 @@ class _Reader:
         if not links and not self.faults:
             self.say("", "the robot has no <link>: a URDF has one for each body")
         bodies = {name: self._link(name, element) for name, element in links.items()}
-        joints = [self._joint(name, e, bodies) for name, e in self._named("joint").items()]
-        tree = self._tree(bodies, [j for j in joints if j])
+        elements = self._named("joint")
+        read = [self._joint(name, e, bodies) for name, e in elements.items()]
+        joints = self._coupled([j for j in read if j], elements)
+        tree = self._tree(bodies, joints)
         if self.faults:
             raise SceneError(self.faults)
         name = self.root.get("name") or self.path.stem
-        return Robot(
+        robot = Robot(
             name=name,
             title=f"{name}, from {self.path.name}",
             gravity=GRAVITY,
             bodies=tuple(tree),
-            drives=tuple(j.drive for j in joints if j and j.drive),
+            drives=tuple(j.drive for j in joints if j.drive),
             left_out=tuple(self._besides()),
         )
+        return settled(robot)
 
     def say(self, key: str, message: str) -> None:
         """Note a fault of a link or joint."""
@@ -228,9 +241,56 @@ class _Reader:
             if lower or upper:
                 note = f"{lower:g} to {upper:g}"
                 start = min(max(0.0, lower), upper) if lower <= upper else 0.0
-        if (mimic := joint.first("mimic")) is not None:
-            note = "; ".join(filter(None, (note, f"mimics {mimic.get('joint', '?')} in the file")))
         return (Motion(name, of, start, note, damping, friction),)
+
+    def _coupled(self, joints: list[_Joint], elements: Mapping[str, Tag]) -> list[_Joint]:
+        """The joints, those with <mimic> moved by the coordinate that it leads to."""
+        found: dict[str, Mimic] = {}
+        for joint in joints:
+            given = elements[joint.name].first("mimic")
+            if given is not None and joint.kind != "fixed":
+                found[joint.name] = self._mimic(joint, given, elements)
+        for ring in rings({name: [mimic.coordinate] for name, mimic in found.items()}):
+            self.say(f"joint {ring[0]}", f"joints mimic one another in a ring: {ring_text(ring)}")
+            for name in ring:
+                found.pop(name, None)
+        by_name = {joint.name: joint for joint in joints}
+        out = []
+        for joint in joints:
+            if joint.name in found:
+                mimic = found[joint.name]
+                while further := found.get(mimic.coordinate):
+                    gear, shift = mimic.gear * further.gear, mimic.at(further.shift)
+                    mimic = Mimic(further.coordinate, gear, shift)
+                joint = self._following(joint, mimic, by_name.get(mimic.coordinate))
+            out.append(joint)
+        return out
+
+    def _mimic(self, joint: _Joint, given: Tag, elements: Mapping[str, Tag]) -> Mimic:
+        key, of = f"joint {joint.name}", given.get("joint").strip()
+        if not of:
+            self.say(key, 'its <mimic> names no joint: add joint="..."')
+        elif of not in elements:
+            near = suggest(of, elements) or ": remove the <mimic>, or add that joint"
+            self.say(key, f"it mimics joint '{of}', which is not in the file{near}")
+        numbers = {"multiplier": 1.0, "offset": 0.0}
+        for name in numbers:
+            if name in given.attributes:
+                numbers[name] = self._number(given, name, key)
+        return Mimic(of, *numbers.values())
+
+    def _following(self, joint: _Joint, mimic: Mimic, of: _Joint | None) -> _Joint:
+        """The joint as it moves by what it mimics, without a drive of its own."""
+        for each in (joint, of):
+            if each and len(each.motions) > 1:
+                count = f"a {each.kind} joint, which has {len(each.motions)} coordinates"
+                why = f"it mimics '{mimic.coordinate}'; '{each.name}' is {count}: only joints "
+                self.say(f"joint {joint.name}", why + "with one can mimic: remove the <mimic>")
+                return joint
+        leads = of.motions[0].start if of and of.motions else 0.0
+        (motion,) = joint.motions
+        motion = replace(motion, start=mimic.at(leads), mimics=mimic)
+        return replace(joint, motions=(motion,), drive=None)
 
     # --- the tree
 
@@ -285,6 +345,7 @@ class _Reader:
             axes=(joint.axis,) if len(joint.motions) == 1 else (),
             offset=joint.offset,
             rotation=joint.rotation,
+            note=joined(body.note, *(f"joint {_told(m)}" for m in joint.motions if m.mimics)),
         )
         if joint.kind != "planar" or joint.axis == (0.0, 0.0, 1.0):
             return [held]
@@ -313,13 +374,6 @@ class _Reader:
             out.append(
                 "links with a shape but without <inertial>, taken as massless: " + ", ".join(bare)
             )
-        for joint in joints:
-            if (mimic := joint.first("mimic")) is not None:
-                gear, shift = mimic.get("multiplier", "1"), mimic.get("offset", "0")
-                out.append(
-                    f"joint {joint.get('name')} mimics {mimic.get('joint')} (times {gear}, plus "
-                    f"{shift}): it moves by itself here, --lock freezes it"
-                )
         limited = [j for j in joints if j.first("limit") is not None and j.get("type") != "fixed"]
         if limited:
             out.append(f"limits of {len(limited)} joints: their values are in the notes")
@@ -379,6 +433,12 @@ class _Reader:
 def _macro(written: str) -> str:
     """The remedy where a number is one of xacro's, or ""."""
     return "; " + xml.RUN_XACRO if "${" in written or "$(" in written else ""
+
+
+def _told(motion: Motion) -> str:
+    """A joint that mimics another in words, with its limits."""
+    assert motion.mimics
+    return joined(f"{motion.name} mimics {motion.mimics.coordinate}", motion.note)
 
 
 def _shapes(link: Tag) -> list[str]:

@@ -28,8 +28,9 @@ class Body:
     """A rigid body, held by a joint in a tree or placed by formulas.
 
     parent: a body's name or "world". joint: a key of joints.JOINTS, with `coordinates` in its
-    order and unit `axes` in the joint's frame, which stands at `offset` (m) in the parent's frame,
-    rotated by `rotation`. The body's frame is the joint's frame, moved by the coordinates. A body
+    order, each one of the scene or a formula of these, and unit `axes` in the joint's frame, which
+    stands at `offset` (m) in the parent's frame, rotated by `rotation`. The body's frame is the
+    joint's frame, moved by the coordinates. A body
     placed by formulas has joint "", no parent, the `position` (m) of its centre of mass in the
     world and the `rotation` of its frame there; these depend on coordinates, t and definitions too.
 
@@ -48,7 +49,7 @@ class Body:
     rotation: tuple[Turn, ...]
     parent: str = WORLD
     joint: str = ""
-    coordinates: tuple[str, ...] = ()
+    coordinates: tuple[Formula, ...] = ()
     axes: tuple[tuple[float, float, float], ...] = ()
     offset: Vector | None = None
     position: Vector | None = None

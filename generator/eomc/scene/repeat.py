@@ -25,7 +25,7 @@ _PLAIN = ("definitions", "forces")  # whose entries are formulas, not tables
 _WORDS = ("unit", "note", "title", "repeat")  # keys whose texts are for people
 # no formulas
 _NAMED = ("body", "point")  # arrays whose entries have names
-_NAMES = ("name", "parent", "joint", "coordinates", "coordinate", "bodies", "body", "frame")
+_NAMES = ("name", "parent", "joint", "coordinate", "bodies", "body", "frame")
 _ARRAYS_MEANT = {
     "bodies": "body", "Body": "body", "link": "body", "links": "body", "springs": "spring",
     "Spring": "spring", "dampers": "damper", "Damper": "damper",

@@ -10,7 +10,7 @@ multibody.py.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
@@ -190,7 +190,7 @@ class Line:
             # a joint with one axis slides along it and turns about it
             axis = np.array(given[min(k, len(given) - 1)], float) if own is None else own
             axis = axis / np.linalg.norm(axis)
-            by = self.known[body.coordinates[k]]
+            by = self.of(body.coordinates[k]) + 0 * self.nodes
             frame = frame.slid(by, axis) if motion == "t" else frame.turned(by, axis)
         self.frames[body.name] = frame
         centre = frame.point(self.vector(body.center))
@@ -247,9 +247,14 @@ class Line:
         for m, x in self.points(body):
             velocity = self.rate @ frame.point(x)
             energy = energy + m / 2 * np.sum(velocity**2, axis=1)
-        for armature, name in zip(body.armature, body.coordinates, strict=False):
-            energy = energy + self.of(armature) / 2 * self.known[f"{name}_dot"] ** 2
+        for armature, rate in zip(body.armature, self.rates(body), strict=False):
+            energy = energy + self.of(armature) / 2 * rate**2
         return energy
+
+    def rates(self, body: Body) -> Iterator[Vector]:
+        """Those of the motions of a body's joint."""
+        for formula in body.coordinates:
+            yield self.rate @ (self.of(formula) + 0 * self.nodes)
 
     def weight(self, body: Body) -> Vector:
         """-m g.c"""
@@ -286,8 +291,7 @@ class Line:
             power = power + self.of(formula) * self.known[f"{name}_dot"]
         for body in self.assembly.bodies:
             width = self.of(body.friction_width) if body.friction_width else 1.0
-            for k, name in enumerate(body.coordinates):
-                rate = self.known[f"{name}_dot"]
+            for k, rate in enumerate(self.rates(body)):
                 if body.friction:
                     power = power - self.of(body.friction[k]) * np.tanh(rate / width) * rate
                 if body.actuator:
@@ -336,8 +340,8 @@ class Line:
         """R of the scene, of joints and of dampers."""
         R: Vector = self.of(self.scene.dissipation) + 0 * self.nodes
         for body in self.assembly.bodies:
-            for damping, name in zip(body.damping, body.coordinates, strict=False):
-                R = R + self.of(damping) / 2 * self.known[f"{name}_dot"] ** 2
+            for damping, rate in zip(body.damping, self.rates(body), strict=False):
+                R = R + self.of(damping) / 2 * rate**2
         for damper in self.assembly.dampers:
             R = R + self.of(damper.damping) / 2 * (self.rate @ self.length(damper)) ** 2
         return R

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from sympy import Symbol
 
 from eomc.verify.oracle import Answer, Vector
 
@@ -136,7 +137,10 @@ class Sampler:
         self.rejected = 0
         start = self.start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
         # how far things go: from the start, from what happens next, else 1 of the unit
-        slides = {link.q for link in system.tree.links if not link.turns} if system.tree else set()
+        slides, turns = set[Symbol](), set[Symbol]()
+        for link in system.tree.links if system.tree else ():
+            (turns if link.turns else slides).update(link.q.free_symbols)
+        slides -= turns
         self.angles = np.array([c.unit == "rad" and c.q not in slides for c in system.coordinates])
         turned = start.q + self.angles  # as what rests where it starts moves from elsewhere
         far, fast = np.max([self._ahead(q, effort) for q in (start.q, turned)], axis=0)

@@ -97,6 +97,7 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
         start=ref,
         rest=value("springref") if own["stiffness"] else 0.0,
         note=note,
+        mimics=None,
         **own,
     )
     if turns:

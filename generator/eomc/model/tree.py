@@ -1,0 +1,66 @@
+"""A tree of elementary joints, and the frames on it: what the recursions run along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sympy import Expr, S, Symbol
+
+from eomc.model.exact import ZERO, Matrix, Vector
+
+
+@dataclass(frozen=True)
+class Link:
+    """An elementary joint and the mass that moves with it, in the frame that the joint moves.
+
+    The frame stands at `offset` in the parent's frame, rotated by `rotation` (it takes vectors of
+    the joint's frame to the parent's), and then turns about (`turns`) or slides along its own
+    `axis` (0, 1, 2) by `q`, a coordinate or an expression in coordinates. mass, moment (mass times
+    centre of mass) and inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) are about the frame's origin.
+    """
+
+    name: str
+    parent: int  # -1: the world
+    turns: bool
+    axis: int
+    q: Expr
+    offset: Vector
+    rotation: Matrix
+    mass: Expr = S.Zero
+    moment: Vector = ZERO
+    inertia: tuple[Expr, ...] = (S.Zero,) * 6
+    armature: Expr = S.Zero
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Links, parents first. beside_*: the energies that the tree does not account for.
+
+    still: the moment of the mass that does not move at all, which has potential energy. rates:
+    the coordinates that joints move by, and their velocities.
+    """
+
+    links: tuple[Link, ...]
+    rates: tuple[tuple[Symbol, Symbol], ...]
+    gravity: Vector
+    still: Vector
+    beside_kinetic: Expr = S.Zero
+    beside_potential: Expr = S.Zero
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame of a body or a point: at `offset`, rotated by `rotation`, in that of its link.
+
+    link -1: in the world, where a body placed by formulas has them in the coordinates, and its
+    mass and inertia (as those of a link) about its centre, where its frame is. angle: in the plane,
+    over definitions.
+    """
+
+    name: str
+    link: int
+    offset: Vector
+    rotation: Matrix
+    angle: Expr
+    mass: Expr = S.Zero
+    inertia: tuple[Expr, ...] = (S.Zero,) * 6
