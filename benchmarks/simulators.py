@@ -100,6 +100,9 @@ def pinocchio_python() -> Run:
 PINOCCHIO = """
 #include <pinocchio/multibody.hpp>
 #include <pinocchio/algorithm/aba.hpp>
+#include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
 using namespace pinocchio;
 typedef Eigen::VectorXd Vector;
 typedef Eigen::Ref<const Vector> Ref;
@@ -147,13 +150,60 @@ extern "C" void run(void *made, const double *damping, double *x, double h, long
     }
 }
 """
+# one function of bodies at n states, rows of x; what it is for the last joint, or the forces
+FUNCTIONS = """
+extern "C" void functions(void *made, int which, long n, const double *q, const double *v,
+    const double *a, double *out)
+{
+    const Model &model = *static_cast<Model *>(made);
+    const int nv = model.nv;
+    const JointIndex last = model.njoints - 1;
+    Data data(model);
+    Vector at(nv), moving(nv), faster(nv);
+
+    for (long k = 0; k < n; ++k, q += nv, v += nv, a += nv) {
+        at = Eigen::Map<const Vector>(q, nv);
+        if (which == 0) {
+            moving = Eigen::Map<const Vector>(v, nv), faster = Eigen::Map<const Vector>(a, nv);
+            Eigen::Map<Vector>(out + k*nv, nv) =
+                rnea(model, data, Ref(at), Ref(moving), Ref(faster));
+        } else if (which == 1) {
+            forwardKinematics(model, data, Ref(at));
+            Eigen::Map<Eigen::Vector3d>(out + 3*k) = data.oMi[last].translation();
+        } else {
+            computeJointJacobians(model, data, Ref(at));
+            Eigen::Map<Vector>(out + k*nv, nv) = data.J.row(2);
+        }
+    }
+}
+"""
 DEFINED = """-DNDEBUG -DPINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION -DBOOST_MPL_LIMIT_LIST_SIZE=30
 -DBOOST_MPL_LIMIT_VECTOR_SIZE=30 -DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS
 -DBOOST_FUSION_INVOKE_MAX_ARITY=12""".split()  # what its CMake files ask for
 
 
 def pinocchio_loop(root: Path) -> Run:
-    """The same loop in C++, on the library of the wheel; in the quicker of aba's two conventions.
+    """The same loop in C++; in the quicker of aba's two conventions."""
+    loaded, made = pinocchio_library(root)
+    model = panda_model()
+    damping = np.array(model.damping)
+
+    def loop(world: int) -> Run:
+        def run(x: Array, h: float, steps: int) -> Array:
+            y = np.array(x, float)
+            loaded.run(made, damping.ctypes.data, y.ctypes.data, h, steps, world)
+            return y
+
+        return run
+
+    at = np.zeros(2 * model.nv)
+    return min(
+        map(loop, (0, 1)), key=lambda run: min(timed(run, at, 1e-3, 200)[0] for _ in "five!")
+    )
+
+
+def pinocchio_library(root: Path) -> tuple[ctypes.CDLL, int]:
+    """Loops in C++ on the library of the wheel, and the Panda there.
 
     -march=native would lay Eigen's types out otherwise than the library did."""
     model = panda_model()
@@ -162,7 +212,7 @@ def pinocchio_loop(root: Path) -> Run:
     base = next(p for p in Path(pinocchio.__file__).parents if (p / "include").is_dir())
     folder = Path(tempfile.mkdtemp(dir=root))
     file, library = folder / "loop.cpp", folder / "loop.so"
-    file.write_text(PINOCCHIO, encoding="utf-8")
+    file.write_text(PINOCCHIO + FUNCTIONS, encoding="utf-8")
     paths = [f"-I{base}/include", f"-I{base}/include/eigen3", f"-L{base}/lib"]
     paths += [f"-Wl,-rpath,{base}/lib", "-lpinocchio_default"]
     flags = ["-std=c++17", "-O2", *DEFINED, "-fPIC", "-shared"]
@@ -182,18 +232,10 @@ def pinocchio_loop(root: Path) -> Run:
         each(lambda i: model.inertias[i].lever),
         each(lambda i: model.inertias[i].inertia),
     ]
-    made = loaded.make(model.nv, *(part.ctypes.data for part in parts))
-    damping = np.array(model.damping)
-
-    def loop(world: int) -> Run:
-        def run(x: Array, h: float, steps: int) -> Array:
-            y = np.array(x, float)
-            loaded.run(made, damping.ctypes.data, y.ctypes.data, h, steps, world)
-            return y
-
-        return run
-
-    at = np.zeros(2 * model.nv)
-    return min(
-        map(loop, (0, 1)), key=lambda run: min(timed(run, at, 1e-3, 200)[0] for _ in "five!")
-    )
+    loaded.functions.argtypes = [
+        ctypes.c_void_p,
+        ctypes.c_int,
+        ctypes.c_long,
+        *[ctypes.c_void_p] * 4,
+    ]
+    return loaded, loaded.make(model.nv, *(part.ctypes.data for part in parts))

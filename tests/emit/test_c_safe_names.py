@@ -221,3 +221,20 @@ def test_macros_as_names_compile(role: str, tmp_path: Path) -> None:
         compiled(tmp_path, "scene")
     if role != "definitions":
         assert f"{given[4]} is {given[4]}_" in files["fast/scene.h"]
+
+
+def test_accelerations_are_renamed_with_their_coordinates() -> None:
+    """`small` may be a macro: C calls it small_, and its acceleration as well."""
+    text = """eomc = 1
+name = "one"
+[coordinates]
+small = {}
+[energy]
+kinetic = "small_dot**2"
+[outputs]
+a = "small_ddot*small"
+[run]
+inverse_dynamics = true
+"""
+    source = eomc.sources(system.from_scene(scene.parse(text, "one.toml"))).files["one.c"]
+    assert "small__ddot" in source and not re.search(r"\bsmall_ddot\b", source)

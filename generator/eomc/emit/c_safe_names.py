@@ -85,8 +85,8 @@ def borne(program: Program) -> tuple[Program, Mapping[str, str]]:
 
 
 def _derived(other: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """The names, with those of velocities and of directions along both."""
+    """The names, with those of rates and of directions along them."""
     for name, used in other.items():
-        for behind in ("", "_dot"):
+        for behind in ("", "_dot", "_ddot"):
             yield name + behind, used + behind
             yield name + behind + ALONG, used + behind + ALONG
