@@ -60,6 +60,9 @@ KINDS: Mapping[str, Kind] = {
         "[dy/dq, dy/dqd, dy/du, dy/dqdd] of the outputs y, by rows, each at the others held.",
         qdd=True,
     ),
+    "applied": Kind(
+        "applied", "m", True, True, "The inputs as they act: u, or the signals, within limits."
+    ),
     "signal": Kind("u", "m", True, False, "u: the scene's own signals for the inputs."),
 }
 

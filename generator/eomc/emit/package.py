@@ -16,9 +16,9 @@ from eomc.integrators.tableaux import METHODS
 TIMED = ("energy", "jacobi", "outputs")  # what runs ask for at each of their rows
 ROWS = 200  # of main.c, about
 FUNCTIONS = (
-    "C D acceleration advice bias energy equilibrium g jacobi kinetic_energy linearize load_run "
-    "output potential_energy power rhs sensitivity signal simulate simulate_batch step step_batch "
-    "tau"
+    "C D acceleration advice applied bias energy equilibrium g jacobi kinetic_energy linearize "
+    "load_run output potential_energy power rhs sensitivity signal simulate simulate_batch step "
+    "step_batch tau"
 ).split()
 
 

@@ -10,7 +10,7 @@ from eomc.derive.lagrange import Derivation
 from eomc.derive.ldl import Solution
 from eomc.derive.linearize import linearization, sensitivity
 from eomc.derive.outputs import outputs
-from eomc.derive.tape import Stage
+from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG
 from eomc.model.system import System, t
@@ -76,7 +76,7 @@ def build(derived: Derivation) -> Program:
     functions["acceleration"] = best
     for made in _derivatives(system, taken):
         functions[made.name] = replace(made, route=best.route)
-    functions |= {made.name: made for made in _outputs(system)}
+    functions |= {made.name: made for made in (*_outputs(system), *_applied(system))}
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     notes = next(f.notes for f in found.values())
@@ -126,6 +126,17 @@ def _outputs(system: System) -> Iterator[Function]:
     yield lower("outputs", made.tape, made.values, (), labels, system.names)
     if rows := [x for row in made.slopes for x in row]:
         yield lower("output_slopes", made.tape, rows, (), (), system.names)
+
+
+def _applied(system: System) -> Iterator[Function]:
+    """The inputs within their limits, where there are limits."""
+    if all(i.limited == i.symbol for i in system.inputs):
+        return
+    leaves = {p.symbol: Stage.PARAMETER for p in system.parameters}
+    tape = Tape(leaves | dict.fromkeys(system.u, Stage.TIME))
+    within = [tape.define(i.limited) for i in system.inputs]
+    labels = [f"{i.name}_limited" for i in system.inputs]
+    yield lower("applied", tape, within, (), labels, system.names)
 
 
 def _unsuited(program: Program) -> list[Problem]:

@@ -73,10 +73,33 @@ class BatchRun(Columns):
 
     @property
     def u(self) -> Array:
-        """The inputs at each row, (batch, n, nu): the signals there, or what was held from there.
+        """The inputs as they acted at each row, (batch, n, nu), so within their limits.
 
-        The last row has what was held over the last step.
+        They are the signals there, or what was held from there on; in the last row what was held
+        over the last step.
         """
+        return self._within(self._given)
+
+    @property
+    def saturated(self) -> Array:
+        """Whether each input was beyond its limits at each row, (batch, n, nu); not where nan."""
+        given = self._given
+        return np.asarray(np.abs(given - self._within(given)) > 0)
+
+    def _within(self, u: Array) -> Array:
+        """Inputs (batch, n, nu) within the limits of their instances."""
+        if not self._model.has_limits:
+            return u
+        ends = (
+            [self._model._within(u, self._params[0])]
+            if len(self._params) == 1
+            else [self._model._within(u[k], p) for k, p in enumerate(self._params)]
+        )
+        return np.reshape(ends, u.shape)
+
+    @property
+    def _given(self) -> Array:
+        """The inputs at each row, (batch, n, nu), whatever their limits."""
         if self._held is None:
             return self._values("signal", (self._model.nu,))
         found = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()

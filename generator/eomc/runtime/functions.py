@@ -146,6 +146,30 @@ class Functions(Arguments):
         """The scene's own inputs at a state and time, (nu,)."""
         return self._evaluate("signal", (self.nu,), q, qd, t, None, params, None)
 
+    @property
+    def has_limits(self) -> bool:
+        """Whether an input has limits."""
+        return hasattr(self._lib, "applied")
+
+    def applied(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
+    ) -> Array:
+        """The inputs as they act at a state, (nu,): u, or the scene's signals, within limits."""
+        held = self._inputs(u)
+        given = self.signal(q, qd, t, params) if held is None else held
+        return self._within(np.broadcast_to(given, (*np.shape(q)[:-1], self.nu)), params)
+
+    def _within(self, u: Array, params: Any) -> Array:
+        """Inputs (..., nu) within their limits: what becomes of the largest and least numbers."""
+        if not self.has_limits:
+            return u
+        far = np.full(self.nu, np.finfo(self.dtype).max, self.dtype)
+        ends = (
+            self._evaluate("applied", (self.nu,), *self._start, 0.0, x, params, None)
+            for x in (-far, far)
+        )
+        return np.asarray(np.clip(u, *ends))
+
     def output(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,

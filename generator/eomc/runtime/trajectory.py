@@ -107,10 +107,22 @@ class Run(Columns):
 
     @property
     def u(self) -> Array:
-        """The inputs at each row, (n, nu): the signals there, or what was held from there on.
+        """The inputs as they acted at each row, (n, nu), so within their limits.
 
-        The last row has what was held over the last step.
+        They are the signals there, or what was held from there on; in the last row what was held
+        over the last step.
         """
+        return self._model._within(self._given, self._params)
+
+    @property
+    def saturated(self) -> Array:
+        """Whether each input was beyond its limits at each row, (n, nu)."""
+        given = self._given
+        return np.asarray(np.abs(given - self._model._within(given, self._params)) > 0)
+
+    @property
+    def _given(self) -> Array:
+        """The inputs at each row, (n, nu), whatever their limits."""
         if self._applied is not None:
             return self._applied
         shape = (len(self), self._model.nu)

@@ -36,12 +36,16 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Input:
-    """A quantity given from outside at every step; `signal` is what it is by default."""
+    """A quantity given from outside at every step; `signal` is what it is by default.
+
+    limits: the least and largest value that acts, None where there is none.
+    """
 
     name: str
     unit: str
     signal: Formula
     note: str
+    limits: tuple[Formula | None, ...] = (None, None)
 
 
 @dataclass(frozen=True)

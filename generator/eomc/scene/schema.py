@@ -43,9 +43,13 @@ class QuantityTable(_Table):
     note: _Note = ""
 
 
+_Limits = Annotated[tuple[float | str | None, ...], pydantic.PlainValidator(spelling.limits)]
+
+
 class _Input(_Table):
     unit: _Line = ""
     signal: _Value = 0.0
+    limits: _Limits = (None, None)
     note: _Note = ""
 
 
@@ -225,6 +229,7 @@ _ALIASES = {
     "q0": "start", "v0": "rate", "qd0": "rate", "speed": "rate", "t_final": "duration",
     "tf": "duration", "T_end": "duration", "tmax": "duration", "stepsize": "h", "step_size": "h",
     "integrator": "method", "solver": "method", "dofs": "coordinates",
+    "range": "limits", "bounds": "limits", "limit": "limits", "saturation": "limits",
     "T": "kinetic", "K": "kinetic",
     "V": "potential", "U": "potential", "P": "potential", "R": "dissipation",
 }  # fmt: skip

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from eomc.model.system import System
-from eomc.verify import rows_newton, rows_outputs, rows_plain, rows_sines
+from eomc.verify import rows_limits, rows_newton, rows_outputs, rows_plain, rows_sines
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT, Report
 from eomc.verify.rows_batch import Batches
@@ -48,6 +48,8 @@ def check(
             Bodies(made, scene).report()
         if system.outputs and hasattr(module, "output"):
             rows_outputs.report(made, plain)
+        if hasattr(module, "applied"):
+            rows_limits.report(made, plain)
         if plain is not None:
             rows_plain.rows(made, plain)
     else:
