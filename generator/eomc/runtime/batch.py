@@ -15,7 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import saved
-from .arguments import Array, Params, as_count, as_number, as_step_size, machine_memory, unmasked
+from .arguments import (
+    Array,
+    Params,
+    as_count,
+    as_number,
+    as_period,
+    as_step_size,
+    machine_memory,
+    unmasked,
+)
 from .batch_work import WORTH, Work
 from .columns import Columns, File
 from .model import LARGE, RARELY, SOME, Model
@@ -212,7 +221,7 @@ class BatchModel(Model):
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
         params: Any = None, u: ArrayLike | None = None, threads: int | None = None,
-        method: str | None = None, *, t0: float = 0.0,
+        method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> BatchRun:  # fmt: skip
         """Trajectories of many instances by fixed steps; see `simulate` for what is not here.
@@ -230,7 +239,10 @@ class BatchModel(Model):
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
-        starts, table, held, count = self._instances(q0, qd0, params, u, steps)
+        hold = as_period(control_period, h)
+        starts, table, held, count = self._instances(q0, qd0, params, u, -(-steps // hold))
+        if held is not None and hold > 1 and held.shape[1] > 1:
+            held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])
         rows = 1 + steps // every + (steps % every > 0)
         try:
             if count * rows * self.nq > LARGE and self._bytes(count * rows) > machine_memory():
