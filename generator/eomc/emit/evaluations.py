@@ -15,7 +15,7 @@ class Kind:
     """What is known of a function before it is looked at: results, arguments, meaning."""
 
     out: str
-    shape: str  # "", "n", "n*n", "n*p", "m", "y" or "y*x"
+    shape: str  # "", "n", "n*n", "n*p", "m", "m*x", "y" or "y*x"
     qd: bool
     u: bool
     doc: str
@@ -62,6 +62,9 @@ KINDS: Mapping[str, Kind] = {
     ),
     "applied": Kind(
         "applied", "m", True, True, "The inputs as they act: u, or the signals, within limits."
+    ),
+    "signal_slopes": Kind(
+        "slopes", "m*x", True, False, "[du/dq, du/dqd] of the scene's signals u, by rows."
     ),
     "signal": Kind("u", "m", True, False, "u: the scene's own signals for the inputs."),
 }

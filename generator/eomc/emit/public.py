@@ -42,7 +42,7 @@ class Public:
         NU, NY = f"{target.PREFIX}_NU", f"{target.PREFIX}_NY"
         state = f"3*{NQ} + {NU}" if target.system.inputs else f"3*{NQ}"
         extents = {"n*n": f"{NQ}*{NQ}", "n*p": f"{NQ}*{len(target.system.parameters)}", "n": NQ}
-        extents |= {"m": NU, "y": NY, "y*x": f"{NY}*({state})"}
+        extents |= {"m": NU, "m*x": f"{NU}*2*{NQ}", "y": NY, "y*x": f"{NY}*({state})"}
         extent = extents.get(kind.shape, "")
         t = (CArgument(real, "t"),) if takes_t(target, name) else ()
         moving = STATE if kind.qd else STATE[:1]

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from eomc.base.errors import Problem, SceneError
+from eomc.derive import outputs
 from eomc.derive.lagrange import Derivation
 from eomc.derive.ldl import Solution
 from eomc.derive.linearize import linearization, sensitivity
-from eomc.derive.outputs import outputs
 from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG
@@ -76,7 +76,8 @@ def build(derived: Derivation) -> Program:
     functions["acceleration"] = best
     for made in _derivatives(system, taken):
         functions[made.name] = replace(made, route=best.route)
-    functions |= {made.name: made for made in (*_outputs(system), *_applied(system))}
+    more = (*_outputs(system), *_applied(system), *_signal_slopes(system, functions))
+    functions |= {made.name: made for made in more}
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     notes = next(f.notes for f in found.values())
@@ -121,11 +122,24 @@ def _outputs(system: System) -> Iterator[Function]:
     """The outputs, and their derivatives where those of the accelerations are asked for."""
     if not system.outputs:
         return
-    made = outputs(system, sloped=bool(system.run.linearize))
+    made = outputs.outputs(system, sloped=bool(system.run.linearize))
     labels = [o.name for o in system.outputs]
     yield lower("outputs", made.tape, made.values, (), labels, system.names)
     if rows := [x for row in made.slopes for x in row]:
         yield lower("output_slopes", made.tape, rows, (), (), system.names)
+
+
+def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterator[Function]:
+    """[du/dq, du/dqd] of signals that answer the state, where these don't jump."""
+    state = {x.name for x in (*system.q, *system.qd)}
+    if not system.run.linearize or not ("signal" in functions and functions["signal"].uses & state):
+        return
+    try:
+        made = outputs.signal_slopes(system)
+    except SceneError:  # there is no derivative
+        return
+    rows = [x for row in made.slopes for x in row[: len(state)]]
+    yield lower("signal_slopes", made.tape, rows, (), (), system.names)
 
 
 def _applied(system: System) -> Iterator[Function]:

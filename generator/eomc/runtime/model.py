@@ -228,7 +228,7 @@ class Model(Functions):
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
         hold = as_period(control_period, h)
-        if u is None and hold > 1 and self.nu:
+        if u is None and control_period is not None and self.nu:
             u = Sampled(self, params)
         if steps >= SOME and (method, h) not in self._warned:
             first = self._table(u, steps, every, hold)[1]
