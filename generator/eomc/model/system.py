@@ -119,6 +119,7 @@ class System:
         real: str = "double",
         batch: bool = False,
         linearize: bool | str = False,
+        discretize: bool = False,
         limits: Mapping[Any, Sequence[Any]] | None = None,
     ) -> System:
         r"""A system from SymPy expressions.
@@ -138,7 +139,7 @@ class System:
         ...             -m*g*l*sympy.cos(theta), parameters={m: 1, l: 1, g: 9.81}).qd
         (theta_dot,)
         """
-        run = given.run(h, duration, methods, real, batch, linearize)
+        run = given.run(h, duration, methods, real, batch, linearize, discretize)
         system = from_sympy.Maker(name).make(
             cls, coordinates, kinetic, potential, given.or_none(parameters), dissipation,
             given.or_none(forces), inputs, given.or_none(definitions), given.or_none(outputs),

@@ -108,7 +108,7 @@ def _solving(solution: Solution, system: System) -> Candidate:
 def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
     """The derivatives of the accelerations that [run] or a method needs, by the route taken."""
     run, names = system.run, system.names
-    if run.linearize or any(METHODS[name].newton for name in run.methods):
+    if run.sloped or any(METHODS[name].newton for name in run.methods):
         rows = linearization(system, taken.tape, taken.outputs)
         by_rows = len(rows) == len(system.q) and len(rows[0]) > len(rows)
         name = "linearization" if by_rows else "linearization_column"
@@ -122,7 +122,7 @@ def _outputs(system: System) -> Iterator[Function]:
     """The outputs, and their derivatives where those of the accelerations are asked for."""
     if not system.outputs:
         return
-    made = outputs.outputs(system, sloped=bool(system.run.linearize))
+    made = outputs.outputs(system, sloped=system.run.sloped)
     labels = [o.name for o in system.outputs]
     yield lower("outputs", made.tape, made.values, (), labels, system.names)
     if rows := [x for row in made.slopes for x in row]:
@@ -132,12 +132,18 @@ def _outputs(system: System) -> Iterator[Function]:
 def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterator[Function]:
     """[du/dq, du/dqd] of signals that answer the state, where these don't jump."""
     state = {x.name for x in (*system.q, *system.qd)}
-    if not system.run.linearize or not ("signal" in functions and functions["signal"].uses & state):
+    if not system.run.sloped or not ("signal" in functions and functions["signal"].uses & state):
         return
     try:
         made = outputs.signal_slopes(system)
     except SceneError:  # there is no derivative
-        return
+        if not system.run.discretize:
+            return
+        message = (
+            "a signal jumps (sign or heaviside of a coordinate or velocity), so steps under it "
+            "have no derivatives: make it smooth, say tanh(x/width), or do without discretize"
+        )
+        raise SceneError([system.problem("run.discretize", message)]) from None
     rows = [x for row in made.slopes for x in row[: len(state)]]
     yield lower("signal_slopes", made.tape, rows, (), (), system.names)
 
@@ -160,7 +166,7 @@ def _unsuited(program: Program) -> list[Problem]:
     if implicit and s.run.batch:
         message = f"'{implicit[0]}' is for one trajectory: leave out batch = true, or that method"
         out.append(s.problem("run.batch", message))
-    for name in (name for name in implicit if METHODS[name].newton):
+    for name in (name for name in implicit if METHODS[name].newton or s.run.discretize):
         size = METHODS[name].stages * len(s.q)
         if size > MOST_IMPLICIT:
             message = (

@@ -64,7 +64,8 @@ class Run:
 
     methods: the steppers wanted, the one that runs use first. real: the C type that everything
     is computed in. batch: whether many trajectories at once are wanted. linearize: whether the
-    derivatives of the accelerations are, "parameters" for those by parameters too.
+    derivatives of the accelerations are, "parameters" for those by parameters too. discretize:
+    whether those of steps are.
     """
 
     h: float = 0.001
@@ -73,6 +74,12 @@ class Run:
     real: str = "double"
     batch: bool = False
     linearize: bool | str = False
+    discretize: bool = False
+
+    @property
+    def sloped(self) -> bool:
+        """Whether derivatives of the accelerations are wanted; those of steps are made of them."""
+        return bool(self.linearize) or self.discretize
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,7 @@ class _Run(_Table):
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
     linearize: Annotated[bool | str, pydantic.PlainValidator(_linearized)] = False
+    discretize: pydantic.StrictBool = False
 
 
 def _spelled_out(key: str, value: object) -> object:

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 
 from eomc.model.system import System
-from eomc.verify import rows_limits, rows_newton, rows_outputs, rows_plain, rows_signals, rows_sines
+from eomc.verify import (
+    rows_discretize,
+    rows_limits,
+    rows_newton,
+    rows_outputs,
+    rows_plain,
+    rows_signals,
+    rows_sines,
+)
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT, Report
 from eomc.verify.rows_batch import Batches
@@ -51,6 +59,7 @@ def check(
         if hasattr(module, "applied"):
             rows_limits.report(made, plain)
             rows_signals.report(made, plain)
+            rows_discretize.report(made, plain)
         if plain is not None:
             rows_plain.rows(made, plain)
     else:
