@@ -36,10 +36,10 @@ NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
 # by name: the scene, and what it has under [run] besides
 WISHES = {
     "steppers": ("cartpole", STEPPERS + 'linearize = "parameters"\n'),
-    "driven": ("cartpole_driven", STEPPERS + "linearize = true\n"),
+    "driven": ("cartpole_driven", STEPPERS + "linearize = true\ndiscretize = true\n"),
     "verlet": ("kepler_orbit", 'method = ["rk4", "euler", "verlet"]\nbatch = true\n'),
     "many": ("cartpole_driven", 'batch = true\nmethod = ["rk4", "dp8"]\n'),
-    "single": ("suspension", 'real = "float"\nlinearize = true\nmethod = ["rk4", "gauss4"]\n'),
+    "single": ("suspension", 'real = "float"\ndiscretize = true\nmethod = ["rk4", "gauss4"]\n'),
     "slopes": ("cartpole", "linearize = true\n"),
     "everything": ("", 'method = ["rk4", "dp8", "euler"]\n'),
 }
@@ -356,7 +356,7 @@ def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.M
         (tmp_path / file).write_text(small.files[file], encoding="utf-8")
     text = small.files[f"{title}.c"]
     assert f"{title}_acceleration_2(" in text
-    assert (f"{title}_slopes_2(" in text) == bool(made(name).run.linearize)
+    assert (f"{title}_slopes_2(" in text) == made(name).run.sloped
     assert f"{title}_kinetic_energy_2(" in text
     run(needs("gcc"), *STRICT, "-O1", "-I.", "-c", f"{title}.c", cwd=tmp_path)
     run("cc", "-std=c99", "-I.", "selftest.c", f"{title}.c", "-lm", cwd=tmp_path)

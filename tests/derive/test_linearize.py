@@ -11,6 +11,10 @@ from cases import SCENES, variant
 from conftest import MODULES, Modules, tiers
 
 import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+from eomc.verify import rows_signals
+from eomc.verify.comparison import Comparison
 
 
 def linearization(m: ModuleType, q: Any, qd: Any, t: float = 0.0, u: Any = None) -> list[Any]:
@@ -135,3 +139,107 @@ def test_derivatives_by_parameters(name: str, modules: Modules) -> None:
     assert np.abs(E).max() > 0
     with pytest.raises(ValueError, match='linearize = "parameters"'):
         modules(name).sensitivity(q, qd, u)
+
+
+LOOP = """eomc = 1
+name = "looped"
+[coordinates]
+x = { unit = "m" }
+theta = { unit = "rad", start = 0.3 }
+[parameters]
+k = 4.0
+[inputs]
+force = { unit = "N", signal = "k*theta + 3*lean*theta_dot - x_dot**2", limits = [-9, 9] }
+push = { unit = "N m", signal = "sin(t)" }
+[definitions]
+lean = "sin(theta + x)"
+[energy]
+kinetic = "x_dot**2 + x_dot*theta_dot*cos(theta) + theta_dot**2"
+potential = "9.81*cos(theta)"
+[forces]
+x = "force"
+theta = "push*cos(x)"
+[outputs]
+f = "force*theta_dot + x_ddot"
+[run]
+linearize = true
+"""
+STATES = np.random.default_rng(5).uniform(-1, 1, (2, 6, 2))
+
+
+@pytest.mark.parametrize("how", [{}, {"outputs": True}, {"closed": True, "outputs": True}])
+@pytest.mark.parametrize("t", [0.4, np.linspace(0, 1, 6)])
+def test_many_states_are_each_of_them(modules: Modules, how: dict[str, bool], t: Any) -> None:
+    m = modules.of_text(LOOP)
+    q, qd = STATES
+    many = m.linearize(q, qd, t=t, params={"k": 2.0}, **how)
+    assert [x.shape for x in many[:2]] == [(6, 4, 4), (6, 4, 2)]
+    for k in range(6):
+        now = np.broadcast_to(t, 6)[k]
+        one = m.linearize(q[k], qd[k], t=float(now), params={"k": 2.0}, **how)
+        assert all(np.array_equal(a[k], b) for a, b in zip(many, one, strict=True))
+    assert [len(x) for x in m.linearize(q[:0], qd[:0])] == [0, 0]
+    with pytest.raises(ValueError, match=r"t: shape \(3,\), expected one number or \(6,\)"):
+        m.linearize(q, qd, t=np.zeros(3))
+
+
+def test_the_state_that_has_none_is_named(modules: Modules) -> None:
+    polar = 'eomc = 1\nname = "polar"\n[coordinates]\nr = { start = 1 }\nphi = {}\n[energy]\n'
+    m = modules.unoptimised(
+        polar + 'kinetic = "(r_dot**2 + r**2*phi_dot**2)/2"\n[run]\nlinearize = true\n'
+    )
+    q, qd = np.array([[1.0, 0], [2, 1], [0, 3], [1, 2]]), np.zeros((4, 2))
+    with pytest.raises(m.MotionError, match=r"at q = \[0. 3.\].*positive definite"):
+        m.linearize(q, qd)
+
+
+def test_the_closed_loop_is_that_of_the_motion(modules: Modules) -> None:
+    """Accelerations and outputs under the signals by differences: good to 1e-10 or so."""
+    m = modules.of_text(LOOP)
+    for q, qd in np.moveaxis(STATES, 1, 0):
+        A, B, C, D = m.linearize(q, qd, t=0.4, closed=True, outputs=True)
+        held = m.linearize(q, qd, t=0.4, outputs=True)
+        assert np.array_equal(B, held[1]) and np.array_equal(D, held[3])
+        assert not np.array_equal(A, held[0])
+        x = np.hstack([q, qd])
+        for k, by in enumerate(1e-3 * np.eye(4)):
+            for found, f in ((A[2:, k], m.acceleration), (C[:, k], m.output)):
+
+                def at(j: int, f: Any = f, by: Any = by, x: Any = x) -> Any:
+                    return f(*np.split(x + j * by, 2), t=0.4)
+
+                stencil = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+                near = sum(w * (at(j) - at(-j)) for j, w in stencil) / 1e-3
+                assert found == pytest.approx(near, rel=1e-9, abs=1e-9)
+
+
+def test_a_loop_that_is_none_is_refused(modules: Modules, driven: ModuleType) -> None:
+    m, jumps = modules.of_text(LOOP), LOOP.replace('x_dot**2",', 'sign(x_dot)",')
+    assert "sign" in jumps
+    for module, words in ((m, "give no u"), (modules.unoptimised(jumps), "has no loop to close")):
+        with pytest.raises(ValueError, match=words):
+            module.linearize([0, 0], [0, 0], [1, 2] if module is m else None, closed=True)
+    modules.unoptimised(jumps).linearize([0, 0], [0, 0])
+
+
+def test_outputs_without_derivatives_are_told(modules: Modules) -> None:
+    """A method that needs those of accelerations has them, which is all that was asked for."""
+    text = LOOP.replace("linearize = true", 'method = "gauss4"')
+    with pytest.raises(ValueError, match="without derivatives of its outputs"):
+        modules.unoptimised(text).linearize([0, 0], [0, 0], outputs=True)
+
+
+def test_a_wrong_loop_fails_the_check(modules: Modules) -> None:
+    class Wrong:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(m, name)
+
+        def linearize(self, *state: Any, closed: bool = False, **how: Any) -> Any:
+            A, B = m.linearize(*state, closed=closed, **how)
+            return A + 1e-8 * closed * np.abs(A).max(), B
+
+    m, made = modules.of_text(LOOP), from_scene(parse(LOOP, "test.toml"))
+    for module, passed in ((m, True), (Wrong(), False)):
+        of = Comparison(made, module, np.random.default_rng(0), 4)
+        rows_signals.report(of, None)
+        assert [(row.name, row.passed) for row in of.rows] == [("closed loop", passed)], of.rows

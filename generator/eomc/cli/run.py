@@ -182,6 +182,7 @@ def _summary(
             "end": float(energy[-1]),
             "largest_change": float(np.max(np.abs(energy - energy[0]))),
         },
+        "saturated": _saturated(module, done),
         "jacobi_change": None
         if np.array_equal(energy, jacobi)
         else float(np.max(np.abs(jacobi - jacobi[0]))),
@@ -192,6 +193,12 @@ def _summary(
         "steps_per_second": done.steps / seconds if seconds else None,
         "files": [str(path) for path in files.values() if path],
     }
+
+
+def _saturated(module: Any, done: Run) -> dict[str, float]:
+    """At what part of the rows each input was beyond its limits, where any was."""
+    parts = zip(module.inputs, map(float, done.saturated.mean(axis=0)), strict=True)
+    return {name: part for name, part in parts if part}
 
 
 def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
@@ -208,6 +215,8 @@ def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
     also = "" if jacobi is None else f"; Jacobi's integral by {jacobi:.2g} J"
     end = summary["energy"]["end"]
     say(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J{also}")
+    for name, part in summary["saturated"].items():
+        say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
     for words in (summary["beyond_stability"], summary["beyond_duration"]):
         if words:
             say(f"  {words}")

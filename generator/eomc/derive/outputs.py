@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sympy import Expr, S, Symbol
 
@@ -10,7 +10,7 @@ from eomc.base.errors import EomcError, SceneError
 from eomc.derive.energies import leaves
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import RoughError, Tape
-from eomc.model.symbols import dot, needed
+from eomc.model.symbols import Output, dot, needed
 from eomc.model.system import System, t
 
 
@@ -36,6 +36,12 @@ def outputs(system: System, sloped: bool) -> Outputs:
             "linearize): make it smooth, say tanh(x/width)"
         )
         raise SceneError([system.problem("outputs", message)]) from None
+
+
+def signal_slopes(system: System) -> Outputs:
+    """The signals as outputs, with their slopes along q, qd and qdd. Raises as `outputs` does."""
+    signals = tuple(Output(i.name, i.signal) for i in system.inputs)
+    return outputs(replace(system, outputs=signals, inputs=()), sloped=True)
 
 
 def _outputs(system: System, sloped: bool) -> Outputs:

@@ -96,6 +96,12 @@ KINDS: Mapping[str, Kind] = {
     "momentum": Kind(
         "momentum", "momentum", True, False, "Of all bodies that move, rotors aside: {momentum}."
     ),
+    "applied": Kind(
+        "applied", "m", True, True, "The inputs as they act: u, or the signals, within limits."
+    ),
+    "signal_slopes": Kind(
+        "slopes", "m*x", True, False, "[du/dq, du/dqd] of the scene's signals u, by rows."
+    ),
     "signal": Kind("u", "m", True, False, "u: the scene's own signals for the inputs."),
 }
 
@@ -126,6 +132,7 @@ def extent(target: Target, shape: str) -> str:
         "n*p": f"{NQ}*{len(s.parameters)}",
         "n": NQ,
         "m": NU,
+        "m*x": f"{NU}*2*{NQ}",
         "y": NY,
         "y*x": f"{NY}*(3*{NQ} + {NU})" if s.inputs else f"{NY}*(3*{NQ})",
         "f*pose": f"{NF}*{pose}",

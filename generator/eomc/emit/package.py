@@ -13,12 +13,13 @@ from eomc.emit.public import Public
 from eomc.emit.views import Binding, Bound, BoundMethod, Declarations, Face, Main, Named
 from eomc.integrators.tableaux import METHODS
 
+_OF_STEPS = ("Phi", "Gamma")
 TIMED = ("energy", "jacobi", "outputs")  # what runs ask for at each of their rows
 ROWS = 200  # of main.c, about
 FUNCTIONS = (
-    "C D acceleration advice bias energy equilibrium g jacobi kinetic_energy linearize load_run "
-    "output potential_energy power rhs sensitivity signal simulate simulate_batch step step_batch "
-    "tau"
+    "C D acceleration advice applied bias discretize energy equilibrium g jacobi kinetic_energy "
+    "linearize load_run output potential_energy power rhs sensitivity signal simulate "
+    "simulate_batch step step_batch tau"
 ).split()
 ASKED = {  # what only scenes have that ask for it in [run]
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
@@ -82,7 +83,7 @@ def _rows(target: Target) -> dict[str, str]:
 
 
 def _methods(target: Target) -> tuple[BoundMethod, ...]:
-    """The calls of step, run and batch."""
+    """The calls of step, run, batch and derivative."""
     public, p, NQ = Public(target), _parameters(target), f"{target.PREFIX}_NQ"
     memory = f"work ? &{member('work', 'memory')} : NULL"
     return tuple(
@@ -96,9 +97,17 @@ def _methods(target: Target) -> tuple[BoundMethod, ...]:
                 status="&found",
             ),
             public.batch(name).call(p=p),
+            _derivative(target, name) if target.system.run.discretize else "",
         )
         for name in target.system.run.methods
     )  # fmt: skip
+
+
+def _derivative(target: Target, method: str) -> str:
+    """The call of a step's derivatives."""
+    function = Public(target).derivative(method)
+    out = {a.name: f"{a.name} + {a.extent}*k" for a in function.arguments if a.name in _OF_STEPS}
+    return function.call(**_rows(target), **out)
 
 
 def binding(target: Target) -> Binding:

@@ -77,6 +77,14 @@ class Public:
         """One step in place."""
         return self._status(f"{method}_step", *self._moved, *self.usual("t", "h", "u", "p"))
 
+    def derivative(self, method: str) -> CFunction:
+        """Phi and Gamma of one step, with a status."""
+        target, NQ = self.target, f"{self.target.PREFIX}_NQ"
+        out = [filled(target.real.name, "Phi", f"4*{NQ}*{NQ}")]
+        if target.system.inputs:
+            out.append(filled(target.real.name, "Gamma", f"2*{NQ}*{target.PREFIX}_NU"))
+        return self._status(f"{method}_derivative", *out, *self.usual(*STATE, "t", "h", "u", "p"))
+
     def run(self, method: str) -> CFunction:
         """Many steps in place."""
         P = self.target.prefix

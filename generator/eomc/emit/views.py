@@ -74,13 +74,14 @@ class Bound:
 
 @dataclass(frozen=True)
 class BoundMethod:
-    """A method in the binding, and the calls of its three functions."""
+    """A method in the binding, and the calls of its functions; derivative: if there is one."""
 
     name: str
     implicit: bool
     step: str
     run: str
     batch: str
+    derivative: str
 
 
 @dataclass(frozen=True)

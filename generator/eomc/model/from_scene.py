@@ -8,7 +8,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model import algebra, growth
+from eomc.model import algebra, growth, limits
 from eomc.model.multibody import Builder, Terms
 from eomc.model.symbols import Coordinate, Input, Output, Parameter, symbol, t
 from eomc.model.system import System
@@ -64,6 +64,13 @@ class _Formulas:
             made += builder.terms.later
         return made, builder.terms if builder else Terms()
 
+    def inputs(self) -> Iterator[Input]:
+        """The inputs with their signals and limits."""
+        for i in self.scene.inputs:
+            signal = self.value(f"inputs.{i.name}.signal", i.signal)
+            ends = (f and self.value(f"inputs.{i.name}.limits", f) for f in i.limits)
+            yield Input(i.name, i.unit, signal, i.note, tuple(ends))
+
     def outputs(self, kinetic: Expr, potential: Expr) -> Iterator[Output]:
         """The outputs, which may use accelerations and energies."""
         accelerations = (f"{c.name}_ddot" for c in self.scene.coordinates)
@@ -89,10 +96,6 @@ def from_scene(scene: Scene) -> System:
     zero = sympy.S.Zero
     kinetic_energy = sympy.Add(kinetic, more.kinetic, *more.tree_kinetic)
     potential_energy = sympy.Add(potential, more.potential, *more.tree_potential)
-    inputs = tuple(
-        Input(i.name, i.unit, value(f"inputs.{i.name}.signal", i.signal), i.note)
-        for i in scene.inputs
-    )
     system = System(
         name=scene.name,
         coordinates=tuple(
@@ -110,7 +113,7 @@ def from_scene(scene: Scene) -> System:
         frames=tuple(more.frames),
         plane=bool(scene.assembly and scene.assembly.plane),
         parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
-        inputs=inputs,
+        inputs=tuple(made.inputs()),
         definitions=tuple(definitions),
         outputs=tuple(made.outputs(kinetic_energy, potential_energy)),
         run=scene.run,
@@ -124,7 +127,7 @@ def from_scene(scene: Scene) -> System:
     )
     if faults := made.problems or system.beyond_float():
         raise SceneError(faults)
-    return system
+    return limits.within(system)
 
 
 def _at_the_start(scene: Scene) -> list[Problem]:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from eomc.model.system import System
 
 
+Ends = tuple[Expr | None, ...]  # the least and the largest value of an input
+
+
 class Maker:
     """Takes a user's symbols, of whatever assumptions and spelling, for ours."""
 
@@ -85,7 +88,7 @@ class Maker:
         self, of: type[System], coordinates: Any, kinetic: Any, potential: Any,
         parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
         definitions: Mapping[Any, Any], outputs: Mapping[str, Any], units: Mapping[Any, str],
-        title: str, run: Run,
+        title: str, run: Run, limits: Mapping[Any, Any],
     ) -> System:  # fmt: skip
         """The system, of the class `of`."""
         starts = given.symbols(coordinates, "coordinates", 0.0)
@@ -121,7 +124,8 @@ class Maker:
             declared.append(Parameter(self._declare(p, "parameter"), value, unit))
         self.fixed = {p.symbol for p in declared}
         pending = given.symbols(inputs, "inputs", 0)
-        given_inputs = [(i, self._declare(i, "input")) for i in pending]
+        given_inputs = {i: self._declare(i, "input") for i in pending}
+        ends = self._limits(limits, pending, declared)
         self.known = {c.q for c in made} | {c.qd for c in made} | {t}
         self.known |= {symbol(n) for n in self.taken}
         ordered = []
@@ -145,14 +149,7 @@ class Maker:
                 expression(forces.get(given.name_of(c), 0), f"force on {c}") for c in starts
             ),
             "parameters": tuple(declared),
-            "inputs": tuple(
-                Input(
-                    used,
-                    units.get(given.name_of(one), ""),
-                    expression(pending[one], f"signal of {one}"),
-                )
-                for one, used in given_inputs
-            ),
+            "inputs": tuple(self._inputs(pending, given_inputs, units, ends)),
             "definitions": tuple(ordered),
             "outputs": tuple(self._outputs(outputs, starts, made, units)),
             "run": run,
@@ -160,6 +157,38 @@ class Maker:
         }
         digest = hashlib.sha256(sympy.srepr(sorted(made_of.items())).encode()).hexdigest()
         return of(**made_of, digest=digest, renamed=tuple(self.renamed))
+
+    def _inputs(
+        self, signals: Mapping[Any, Any], used: Mapping[Any, str], units: Mapping[Any, str],
+        limits: Mapping[str, Ends],
+    ) -> Iterator[Input]:  # fmt: skip
+        """The inputs by the names that are used."""
+        for one, signal in signals.items():
+            name, value = given.name_of(one), self._expression(signal, f"signal of {one}")
+            ends = limits.get(name, (None, None))
+            yield Input(used[one], units.get(name, ""), value, limits=ends)
+
+    def _limits(
+        self, limits: Any, inputs: Iterable[Any], parameters: Iterable[Parameter]
+    ) -> dict[str, Ends]:
+        """The limits of inputs by their names, over parameters."""
+        values = {p.symbol: p.value for p in parameters}
+        self.known = {*values}
+        known, found = {given.name_of(i) for i in inputs}, dict[str, Ends]()
+        for name, pair in given.by_name(limits, "limits", "{F: (-1, 1)}").items():
+            role = f"limits of {name}"
+            if name not in known:
+                raise given.fault(role, f"inputs are {', '.join(sorted(known)) or 'none'}")
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                raise given.fault(role, f"give the least and the largest value, here {pair!r}")
+            ends = zip(pair, (-sympy.oo, sympy.oo), strict=True)
+            least, most = (
+                None if x is None or x == end else self._expression(x, role) for x, end in ends
+            )
+            if least is not None and most is not None and (most - least).xreplace(values) <= 0:
+                raise given.fault(role, f"{least}, the least value, is not below {most}")
+            found[name] = (least, most)
+        return found
 
     def _outputs(
         self, outputs: Any, starts: Iterable[Any], made: Sequence[Coordinate],

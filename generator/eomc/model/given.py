@@ -178,7 +178,9 @@ def symbol_of(given: Any, role: str) -> Any:
     return symbol(given) if isinstance(given, str) else given
 
 
-def run(h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any) -> Run:
+def run(
+    h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any, discretize: Any
+) -> Run:
     """How the system is run. Raises EomcError where that is not possible."""
     for name, value in (("h", h), ("duration", duration)):
         if number(value, name) <= 0:
@@ -189,8 +191,9 @@ def run(h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: A
         raise fault("methods", f"known are {', '.join(METHODS)}, here {methods!r}")
     if real not in REALS:
         raise fault("real", f"known are {', '.join(REALS)}, here {real!r}")
-    if not isinstance(batch, bool):
-        raise fault("batch", f"must be True or False, here {batch!r}")
+    for name, value in (("batch", batch), ("discretize", discretize)):
+        if not isinstance(value, bool):
+            raise fault(name, f"must be True or False, here {value!r}")
     if not isinstance(linearize, bool) and linearize != "parameters":
         raise fault("linearize", f'must be True, False or "parameters", here {linearize!r}')
-    return Run(float(h), float(duration), methods, real, batch, linearize)
+    return Run(float(h), float(duration), methods, real, batch, linearize, discretize)

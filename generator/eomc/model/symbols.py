@@ -89,11 +89,22 @@ class Output(_Named):
 
 @dataclass(frozen=True)
 class Input(_Named):
-    """A quantity given from outside at every step; `signal` is its value by default."""
+    """A quantity given from outside at every step; `signal` is its value by default.
+
+    limits: the least and largest value that acts, None where there is none.
+    """
 
     unit: str = ""
     signal: Expr = sympy.S.Zero
     note: str = ""
+    limits: tuple[Expr | None, ...] = (None, None)
+
+    @property
+    def limited(self) -> Expr:
+        """What acts: the input within its limits."""
+        least, most = self.limits
+        within = self.symbol if least is None else sympy.Max(self.symbol, least)
+        return within if most is None else sympy.Min(within, most)
 
 
 def needed(

@@ -15,6 +15,7 @@ from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
+from eomc.model.limits import within
 from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
 from eomc.model.tree import Frame, Tree
 from eomc.scene.scene import Run, Scene
@@ -132,6 +133,8 @@ class System:
         real: str = "double",
         batch: bool = False,
         linearize: bool | str = False,
+        discretize: bool = False,
+        limits: Mapping[Any, Sequence[Any]] | None = None,
     ) -> System:
         r"""A system from SymPy expressions.
 
@@ -140,7 +143,8 @@ class System:
         plain symbols the velocity of `theta` is the symbol `theta_dot`; with dynamicsymbols
         it is `theta.diff()`. parameters, inputs (to their default signal) and definitions are
         mappings from symbols, outputs from names; `theta_ddot`, or the second derivative of a
-        dynamicsymbol, is an acceleration there. Names that C can't bear (`\theta`, `lambda`) are
+        dynamicsymbol, is an acceleration there. limits: mapping from inputs to pairs, the least and
+        largest value that acts, None for no such. Names that C can't bear (`\theta`, `lambda`) are
         replaced, and `renamed` says how. Raises EomcError where something is undeclared.
 
         >>> from sympy.physics.mechanics import dynamicsymbols
@@ -149,15 +153,15 @@ class System:
         ...             -m*g*l*sympy.cos(theta), parameters={m: 1, l: 1, g: 9.81}).qd
         (theta_dot,)
         """
-        run = given.run(h, duration, methods, real, batch, linearize)
+        run = given.run(h, duration, methods, real, batch, linearize, discretize)
         system = from_sympy.Maker(name).make(
             cls, coordinates, kinetic, potential, given.or_none(parameters), dissipation,
             given.or_none(forces), inputs, given.or_none(definitions), given.or_none(outputs),
-            given.or_none(units), title, run,
+            given.or_none(units), title, run, given.or_none(limits),
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
-        return system
+        return within(system)
 
     def beyond_float(self) -> list[Problem]:
         """Faults of numbers that a system in single precision can't have."""
@@ -175,6 +179,12 @@ class System:
             ("energy.dissipation", self.dissipation),
             *((f"forces.{c.name}", e) for c, e in zip(self.coordinates, self.forces, strict=True)),
             *((f"inputs.{i.name}.signal", i.signal) for i in self.inputs),
+            *(
+                (f"inputs.{i.name}.limits", e)
+                for i in self.inputs
+                for e in i.limits
+                if e is not None
+            ),
             *(("force", e) for pair in self.applied for e in pair),
             *((f"outputs.{o.name}", o.formula) for o in self.outputs),
         ]

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from eomc.base.errors import Problem, SceneError
+from eomc.derive import outputs
 from eomc.derive.frames import motions
 from eomc.derive.inverse_dynamics import inverse_dynamics
 from eomc.derive.lagrange import Derivation
 from eomc.derive.ldl import Solution
 from eomc.derive.linearize import linearization, sensitivity
 from eomc.derive.momentum import momentum
-from eomc.derive.outputs import outputs
-from eomc.derive.tape import Stage
+from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG
 from eomc.model.system import System, t
@@ -79,7 +79,8 @@ def build(derived: Derivation) -> Program:
     functions["acceleration"] = best
     for made in _derivatives(system, taken):
         functions[made.name] = replace(made, route=best.route)
-    functions |= {made.name: made for made in (*_outputs(system), *_asked(system))}
+    more = (*_outputs(system), *_applied(system), *_signal_slopes(system, functions))
+    functions |= {made.name: made for made in (*more, *_asked(system))}
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
     notes = next(f.notes for f in found.values())
@@ -110,7 +111,7 @@ def _solving(solution: Solution, system: System) -> Candidate:
 def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
     """The derivatives of the accelerations that [run] or a method needs, by the route taken."""
     run, names = system.run, system.names
-    if run.linearize or any(METHODS[name].newton for name in run.methods):
+    if run.sloped or any(METHODS[name].newton for name in run.methods):
         rows = linearization(system, taken.tape, taken.outputs)
         by_rows = len(rows) == len(system.q) and len(rows[0]) > len(rows)
         name = "linearization" if by_rows else "linearization_column"
@@ -124,7 +125,7 @@ def _outputs(system: System) -> Iterator[Function]:
     """The outputs, and their derivatives where those of the accelerations are asked for."""
     if not system.outputs:
         return
-    made = outputs(system, sloped=bool(system.run.linearize))
+    made = outputs.outputs(system, sloped=system.run.sloped)
     labels = [o.name for o in system.outputs]
     yield lower("outputs", made.tape, made.values, (), labels, system.names)
     if rows := [x for row in made.slopes for x in row]:
@@ -151,6 +152,36 @@ def _asked(system: System) -> Iterator[Function]:
         yield lower("momentum", tape, values, (), (), system.names)
 
 
+def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterator[Function]:
+    """[du/dq, du/dqd] of signals that answer the state, where these don't jump."""
+    state = {x.name for x in (*system.q, *system.qd)}
+    if not system.run.sloped or not ("signal" in functions and functions["signal"].uses & state):
+        return
+    try:
+        made = outputs.signal_slopes(system)
+    except SceneError:  # there is no derivative
+        if not system.run.discretize:
+            return
+        message = (
+            "a signal jumps (sign or heaviside of a coordinate or velocity), so steps under it "
+            "have no derivatives: make it smooth, say tanh(x/width), or do without discretize"
+        )
+        raise SceneError([system.problem("run.discretize", message)]) from None
+    rows = [x for row in made.slopes for x in row[: len(state)]]
+    yield lower("signal_slopes", made.tape, rows, (), (), system.names)
+
+
+def _applied(system: System) -> Iterator[Function]:
+    """The inputs within their limits, where there are limits."""
+    if all(i.limited == i.symbol for i in system.inputs):
+        return
+    leaves = {p.symbol: Stage.PARAMETER for p in system.parameters}
+    tape = Tape(leaves | dict.fromkeys(system.u, Stage.TIME))
+    within = [tape.define(i.limited) for i in system.inputs]
+    labels = [f"{i.name}_limited" for i in system.inputs]
+    yield lower("applied", tape, within, (), labels, system.names)
+
+
 def _unsuited(program: Program) -> list[Problem]:
     """What [run] asks for and this system can't have."""
     s, out = program.system, []
@@ -158,7 +189,7 @@ def _unsuited(program: Program) -> list[Problem]:
     if implicit and s.run.batch:
         message = f"'{implicit[0]}' is for one trajectory: leave out batch = true, or that method"
         out.append(s.problem("run.batch", message))
-    for name in (name for name in implicit if METHODS[name].newton):
+    for name in (name for name in implicit if METHODS[name].newton or s.run.discretize):
         size = METHODS[name].stages * len(s.q)
         if size > MOST_IMPLICIT:
             message = (

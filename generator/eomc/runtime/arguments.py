@@ -326,6 +326,20 @@ def as_step_size(h: Any, dtype: np.dtype[Any]) -> float:
     return size
 
 
+def as_period(period: Any, h: float) -> int:
+    """The steps in a control period, 1 where it is None, or a ValueError."""
+    if period is None:
+        return 1
+    count = as_number(period, "control_period") / h
+    whole = max(round(count), 1) if isfinite(count) else 1
+    if abs(count - whole) > 1e-6 * whole:
+        raise ValueError(
+            f"control_period: {period:g} s is {count:.6g} steps of h = {h:g} s: give a whole "
+            f"number of steps, such as {whole * h:.6g}, or another h"
+        )
+    return whole
+
+
 def aligned(array: Array) -> Array:
     """The array, copied where its numbers lie at addresses that C can't read them from."""
     return array if array.flags.aligned else array.copy()

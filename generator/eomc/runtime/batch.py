@@ -15,7 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import saved
-from .arguments import Array, Params, as_count, as_number, as_step_size, machine_memory, unmasked
+from .arguments import (
+    Array,
+    Params,
+    as_count,
+    as_number,
+    as_period,
+    as_step_size,
+    machine_memory,
+    unmasked,
+)
 from .batch_work import WORTH, Work
 from .columns import Columns, File
 from .model import LARGE, RARELY, SOME, Model
@@ -73,10 +82,33 @@ class BatchRun(Columns):
 
     @property
     def u(self) -> Array:
-        """The inputs at each row, (batch, n, nu): the signals there, or what was held from there.
+        """The inputs as they acted at each row, (batch, n, nu), so within their limits.
 
-        The last row has what was held over the last step.
+        They are the signals there, or what was held from there on; in the last row what was held
+        over the last step.
         """
+        return self._within(self._given)
+
+    @property
+    def saturated(self) -> Array:
+        """Whether each input was beyond its limits at each row, (batch, n, nu); not where nan."""
+        given = self._given
+        return np.asarray(np.abs(given - self._within(given)) > 0)
+
+    def _within(self, u: Array) -> Array:
+        """Inputs (batch, n, nu) within the limits of their instances."""
+        if not self._model.has_limits:
+            return u
+        ends = (
+            [self._model._within(u, self._params[0])]
+            if len(self._params) == 1
+            else [self._model._within(u[k], p) for k, p in enumerate(self._params)]
+        )
+        return np.reshape(ends, u.shape)
+
+    @property
+    def _given(self) -> Array:
+        """The inputs at each row, (batch, n, nu), whatever their limits."""
         if self._held is None:
             return self._values("signal", (self._model.nu,))
         found = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
@@ -189,7 +221,7 @@ class BatchModel(Model):
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
         params: Any = None, u: ArrayLike | None = None, threads: int | None = None,
-        method: str | None = None, *, t0: float = 0.0,
+        method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> BatchRun:  # fmt: skip
         """Trajectories of many instances by fixed steps; see `simulate` for what is not here.
@@ -207,7 +239,10 @@ class BatchModel(Model):
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
-        starts, table, held, count = self._instances(q0, qd0, params, u, steps)
+        hold = as_period(control_period, h)
+        starts, table, held, count = self._instances(q0, qd0, params, u, -(-steps // hold))
+        if held is not None and hold > 1 and held.shape[1] > 1:
+            held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])
         rows = 1 + steps // every + (steps % every > 0)
         try:
             if count * rows * self.nq > LARGE and self._bytes(count * rows) > machine_memory():

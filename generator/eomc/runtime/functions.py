@@ -22,6 +22,16 @@ _OF_POSITION = (
 _ROWS = 20_000  # rows times coordinates squared in one call, some ms at most
 
 
+def row_times(t: Any, rows: tuple[int, ...]) -> Array | None:
+    """A time for each row, None where there is one for all."""
+    if not (rows and np.ndim(t)):
+        return None
+    unmasked(t, "t")
+    if np.shape(t) != rows:
+        raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
+    return np.asarray(t)
+
+
 class Functions(Arguments):
     """The functions of a state that a compiled scene has."""
 
@@ -42,11 +52,8 @@ class Functions(Arguments):
             from_q, from_qd, at, moving = self._read(q, qd)
         rows = at.shape[:-1]
         result = self._out(out, rows + shape)
-        if rows and np.ndim(t):  # a time for each row
-            unmasked(t, "t")
-            if np.shape(t) != rows:
-                raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
-            for k, now in enumerate(np.asarray(t)):
+        if (times := row_times(t, rows)) is not None:
+            for k, now in enumerate(times):
                 row_qd = None if moving is None else moving[k]
                 own = None if each is None else each[k]
                 result[k] = self._evaluate(name, shape, at[k], row_qd, now, u, params, None, own)
@@ -154,6 +161,30 @@ class Functions(Arguments):
         """The scene's own inputs at a state and time, (nu,)."""
         return self._evaluate("signal", (self.nu,), q, qd, t, None, params, None)
 
+    @property
+    def has_limits(self) -> bool:
+        """Whether an input has limits."""
+        return hasattr(self._lib, "applied")
+
+    def applied(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
+    ) -> Array:
+        """The inputs as they act at a state, (nu,): u, or the scene's signals, within limits."""
+        held = self._inputs(u)
+        given = self.signal(q, qd, t, params) if held is None else held
+        return self._within(np.broadcast_to(given, (*np.shape(q)[:-1], self.nu)), params)
+
+    def _within(self, u: Array, params: Any) -> Array:
+        """Inputs (..., nu) within their limits: what becomes of the largest and least numbers."""
+        if not self.has_limits:
+            return u
+        far = np.full(self.nu, np.finfo(self.dtype).max, self.dtype)
+        ends = (
+            self._evaluate("applied", (self.nu,), *self._start, 0.0, x, params, None)
+            for x in (-far, far)
+        )
+        return np.asarray(np.clip(u, *ends))
+
     def output(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,
@@ -208,15 +239,17 @@ class Functions(Arguments):
 
     def linearize(
         self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0,
-        params: Parameters = None, *, outputs: bool = False,
+        params: Parameters = None, *, outputs: bool = False, closed: bool = False,
     ) -> tuple[Array, ...]:  # fmt: skip
         """d[q; qd]/dt = A dx + B du near a state, x = [q; qd]: A (2 nq, 2 nq), B (2 nq, nu).
 
-        With outputs=True also C (ny, 2 nq) and D (ny, nu) of the outputs, dy = C dx + D du.
+        With outputs=True also C (ny, 2 nq) and D (ny, nu) of the outputs, dy = C dx + D du. Many
+        states, (n, nq), give each of them a leading n.
 
         Upper rows of A: [0, 1]; lower ones [dqdd/dq, dqdd/dqd], in rad or m per s^2 and per rad,
         m or their rates; of B: 0, then dqdd/du. Exact derivatives, to rounding. u None: held at
-        the scene's signals, where these depend on the state as well.
+        the scene's signals, where these depend on the state as well; with closed=True they are
+        followed: A is that of the closed loop, B of what is added to the signals.
         Raises MotionError as `acceleration` does, ValueError where the module lacks them.
         """
         if not self.has_slopes:
@@ -224,30 +257,63 @@ class Functions(Arguments):
                 f"linearize: {self.name} was built without it: a scene asks with [run] "
                 "linearize = true"
             )
-        at, moving = self._one(q, qd)
-        n, m = self.nq, self.nu
-        A_q, A_qd, B_u = (empty((n, w), self.dtype) for w in (n, n, m))
-        status = self._ffi.new("int *")
-        self._lib.linearization(
-            1, self._pointer(A_q), self._pointer(A_qd), self._pointer(B_u if m else None),
-            self._pointer(at), self._pointer(moving), as_number(t, "t"),
-            *self._given(u, params), status,
-        )  # fmt: skip
-        if status[0]:
-            said = STATUS[status[0]]
-            what = SAID[said] if said == "singular" else "a derivative is not finite there"
-            raise MotionError(f"at {state_text(at, moving)}: {what}", said)
-        A, B = np.zeros((2 * n, 2 * n), self.dtype), np.zeros((2 * n, m), self.dtype)
-        A[:n, n:] = np.eye(n)
-        A[n:, :n], A[n:, n:], B[n:] = A_q, A_qd, B_u
-        if not outputs:
-            return A, B
-        if not self.outputs:
+        if outputs and not self.outputs:
             raise ValueError(f"linearize: {self.name} has no outputs: name them in [outputs]")
-        shape = (len(self.outputs), 3 * n + m)
-        slopes = self._evaluate("output_slopes", shape, at, moving, t, u, params, None)
-        by_state, by_u, by_qdd = np.split(slopes, [2 * n, 2 * n + m], axis=1)
-        return A, B, by_state + by_qdd @ A[n:], by_u + by_qdd @ B[n:]
+        if outputs and not hasattr(self._lib, "output_slopes"):
+            raise ValueError(
+                f"linearize: {self.name} was built without derivatives of its outputs: a scene "
+                "asks with [run] linearize = true"
+            )
+        at, moving = self._state(q, qd)
+        A, B = self._slopes(at, moving, u, t, params)
+        both = [(A, B)]
+        if outputs:
+            n, m = self.nq, self.nu
+            shape = (len(self.outputs), 3 * n + m)
+            slopes = self._evaluate("output_slopes", shape, at, moving, t, u, params, None)
+            by_state, by_u, by_qdd = np.split(slopes, [2 * n, 2 * n + m], axis=-1)
+            both.append((by_state + by_qdd @ A[..., n:, :], by_u + by_qdd @ B[..., n:, :]))
+        if closed:
+            K = self._feedback(at, moving, u, t, params)
+            both = [(by_state + by_u @ K, by_u) for by_state, by_u in both]
+        return tuple(x for pair in both for x in pair)
+
+    def _slopes(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> tuple[Array, Array]:
+        """A and B of states (nq,) or (n, nq). Raises MotionError."""
+        n, m, rows = self.nq, self.nu, q.shape[:-1]
+        A, B = np.zeros((*rows, 2 * n, 2 * n), self.dtype), np.zeros((*rows, 2 * n, m), self.dtype)
+        A_q, A_qd, B_u = (empty((*rows, n, w), self.dtype) for w in (n, n, m))
+        out = [(self._pointer(x), n * w) for x, w in ((A_q, n), (A_qd, n), (B_u, m))]
+        status, (inputs, p), count = self._ffi.new("int *"), self._given(u, params), q.size // n
+        from_q, from_qd, times = self._pointer(q), self._pointer(qd), row_times(t, rows)
+        one = slices(count, _ROWS // n**3 + 1) if times is None else ((k, 1) for k in range(count))
+        for first, many in one:
+            now = as_number(t if times is None else times[first], "t")
+            done = self._lib.linearization(
+                many, *(to + first * size for to, size in out), from_q + n * first,
+                from_qd + n * first, now, inputs, p, status,
+            )  # fmt: skip
+            if status[0]:
+                said = STATUS[status[0]]
+                what = SAID[said] if said == "singular" else "a derivative is not finite there"
+                where = state_text(*(x.reshape(-1, n)[first + done] for x in (q, qd)))
+                raise MotionError(f"at {where}: {what}", said)
+        A[..., :n, n:] = np.eye(n)
+        A[..., n:, :n], A[..., n:, n:], B[..., n:, :] = A_q, A_qd, B_u
+        return A, B
+
+    def _feedback(self, q: Array, qd: Array, u: Any, t: float, params: Any) -> Array:
+        """du/dx of the scene's signals, (nu, 2 nq), with a leading n for many states."""
+        if u is not None:
+            raise ValueError("closed: is for the scene's signals: give no u, which would be held")
+        if not hasattr(self._lib, "signal_slopes"):
+            raise ValueError(
+                f"closed: {self.name} has no loop to close: no signal is a smooth function of the "
+                "state"
+            )
+        shape = (self.nu, 2 * self.nq)
+        K: Array = self._evaluate("signal_slopes", shape, q, qd, t, None, params, None)
+        return K
 
     def sensitivity(
         self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Parameters = None

@@ -17,11 +17,21 @@ from numpy import empty
 from numpy.typing import ArrayLike
 
 from . import saved
-from .arguments import Array, Parameters, as_count, as_number, as_step_size, machine_memory
+from .arguments import (
+    Array,
+    Parameters,
+    as_count,
+    as_number,
+    as_period,
+    as_step_size,
+    machine_memory,
+)
 from .columns import File
+from .discretize import discretize
 from .equilibrium import equilibrium
 from .estimate import advice, beyond_end
 from .frames import Frames
+from .laws import Law, Sampled
 from .package import reduced
 from .slices import longer
 from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
@@ -34,30 +44,6 @@ LARGE = 2**24  # positions from which a look at the memory is worth its time
 _CHUNK = 16_384  # steps times coordinates before the first look, some ms
 RARELY = 2**48  # steps from row to row, more than any run makes
 _MOST = 2**60  # steps, so that C can return four times as many
-
-
-class Law:
-    """A function u(t, q, qd) that a run calls before each step; keeps what it gave at the rows."""
-
-    def __init__(self, law: Callable[..., Any], inputs: Callable[[Any], Any], every: int) -> None:
-        self.law, self.inputs, self.every = law, inputs, every
-        self.calls, self.kept = 0, list[Array]()
-        self.last: Any = None
-
-    def __call__(self, t: float, q: Array, qd: Array) -> Array:
-        """What the function gives at a step's start."""
-        self.last = self.inputs(self.law(t, q.copy(), qd.copy()))
-        if self.last is None:
-            raise ValueError("u: the function returned None, not the inputs")
-        if self.calls % self.every == 0:
-            self.kept.append(self.last.copy())
-        self.calls += 1
-        return self.last  # type: ignore[no-any-return]
-
-    def rows(self, count: int, width: int) -> Array:
-        """What was applied from each row of the run on, (count, width)."""
-        last = np.full(width, np.nan) if self.last is None else self.last
-        return np.array([*self.kept, last][:count], last.dtype)
 
 
 class Model(Frames):
@@ -151,6 +137,24 @@ class Model(Frames):
             )
         return ends
 
+    def discretize(
+        self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
+        params: Parameters = None, method: str | None = None, *,
+        control_period: float | None = None,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """(Phi, Gamma): dx' = Phi dx + Gamma du of `step`, x = [q; qd], x' one step later.
+
+        Phi (2 nq, 2 nq), Gamma (2 nq, nu), with a leading n for many states (n, nq); the step's
+        own derivatives, exact to rounding. u None: Phi follows the scene's signals, as steps do,
+        and Gamma is along what is added to them. control_period: over so many steps, in s, u held
+        or the signals read at their start. Raises MotionError as `step` does, ValueError where the
+        module lacks them.
+        """
+        at, moving = self._state(q, qd)
+        h = self.h if h is None else as_step_size(h, self.dtype)
+        hold = None if control_period is None else as_period(control_period, h)
+        return discretize(self, self._method(method), at, moving, h, hold, t, u, params)
+
     def _method(self, method: str | None) -> str:
         """The name of a method that the module has."""
         if method is None:
@@ -191,7 +195,7 @@ class Model(Frames):
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
         u: Inputs = None, params: Parameters = None, method: str | None = None, *, t0: float = 0.0,
-        out: tuple[Array, Array] | None = None,
+        control_period: float | None = None, out: tuple[Array, Array] | None = None,
         progress: Callable[[int, int], None] | None = None, estimate: bool = False,
     ) -> Run:  # fmt: skip
         """A trajectory by fixed steps of size h, the loop in C and the GIL released.
@@ -202,6 +206,8 @@ class Model(Frames):
         u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; a
         dict of all inputs by name, numbers or (steps,); or a function u(t, q, qd) called before
         each step, which is some hundred times slower.
+        control_period: in s, a whole number of steps: the function is called, a row taken, or the
+        signals are read, once in it, and held until the next.
         out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
         estimate: whether to find the run's own error, `run.error`, by doing it again in shorter
         steps, which takes some nine times as long.
@@ -223,7 +229,7 @@ class Model(Frames):
         if (
             type(steps) is int and type(every) is int and type(t0) is float and isfinite(t0)
             and u is None and duration is None and out is None and progress is None
-            and 0 < every <= RARELY and not estimate
+            and control_period is None and 0 < every <= RARELY and not estimate
         ):  # fmt: skip
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
@@ -240,13 +246,16 @@ class Model(Frames):
         t0 = as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
+        hold = as_period(control_period, h)
+        if u is None and control_period is not None and self.nu:
+            u = Sampled(self, params)
         if steps >= SOME and (method, h) not in self._warned:
-            first = self._table(u, steps, every)[1]
+            first = self._table(u, steps, every, hold)[1]
             if first is not None and first.ndim == 2:
                 first = first[0]
             self._look(q, qd, h, t0, first, p, method)
         result = self._trajectory(
-            q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress
+            q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress, hold
         )
         if result.status != "ok":
             if result.status == "interrupted":
@@ -309,12 +318,12 @@ class Model(Frames):
     def _trajectory(
         self, q: Array, qd: Array, from_q: Any, from_qd: Any, h: float, steps: int, every: int,
         u: Any, p: Array, at_p: Any, method: str, t0: float, out: tuple[Array, Array] | None,
-        progress: Callable[[int, int], None] | None,
+        progress: Callable[[int, int], None] | None, hold: int = 1,
     ) -> Run:  # fmt: skip
         """A run from checked arguments, whatever its status; C reads from_q, from_qd and at_p."""
         _, run, _, stages, work_type, counted = self._loops[method]
         nq, (address, real, null) = self.nq, self._c
-        law, held, stride = (None, None, 0) if u is None else self._table(u, steps, every)
+        law, held, stride = (None, None, 0) if u is None else self._table(u, steps, every, hold)
         rows = 1 - -steps // every
         both: Any = out
         try:
@@ -332,7 +341,7 @@ class Model(Frames):
         to_q, to_qd = address(real, q_rows), address(real, qd_rows)
         at_u = null if held is None else address(real, held)
         # a step of an implicit method may solve for all its stages
-        done, chunk = 0, 1 if law else _CHUNK // (nq**3 if counted else nq) or 1
+        done, chunk = 0, hold if law else _CHUNK // (nq**3 if counted else nq) or 1
         # what goes from one call to the next, and what is counted; a single call may do without
         single = steps <= chunk and counted is None
         work = null if single else self._ffi.new(work_type)
@@ -370,20 +379,23 @@ class Model(Frames):
         given = law.law if law else None if held is None else held.copy()
         made = Run(self, t0, both, h, done, said, p, every, given, method, evaluations)
         if law:
+            made._hold = hold
             made._applied = law.rows(len(made), self.nu)
         return made
 
     def _bytes(self, rows: int) -> int:
         return rows * 2 * self.nq * self.dtype.itemsize
 
-    def _table(self, u: Any, steps: int, every: int) -> tuple[Law | None, Array | None, int]:
+    def _table(
+        self, u: Any, steps: int, every: int, hold: int
+    ) -> tuple[Law | None, Array | None, int]:
         """(function, held values, values from one step to the next)."""
         if u is None:
             return None, None, 0
         if not self.nu:
             raise ValueError("u: this scene has no inputs")
         if callable(u):
-            if "u" not in self._warned:
+            if "u" not in self._warned and hold == 1:
                 self._warned.add("u")
                 warnings.warn(
                     f"{self.name}: u is a Python function, called before each step: some hundred "
@@ -391,7 +403,7 @@ class Model(Frames):
                     RuntimeWarning,
                     stacklevel=4,
                 )
-            return Law(u, self._inputs, every), None, 0
+            return Law(u, self._inputs, every, hold), None, 0
         if isinstance(u, Mapping):
             u = self._by_name(u)
         array = self._numbers(u, "u")
@@ -400,6 +412,7 @@ class Model(Frames):
         array = self._array(array, "u", self.nu)
         if array.ndim == 1:
             return None, array, 0
-        if len(array) != steps:
-            raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a step")
-        return None, array, self.nu
+        if len(array) != -(-steps // hold):
+            what = "step" if hold == 1 else f"control period of {hold} steps"
+            raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a {what}")
+        return None, array if hold == 1 else np.repeat(array, hold, axis=0)[:steps], self.nu

@@ -96,7 +96,8 @@ class Run(Columns):
     evaluations: int
     error: Estimate | None = field(default=None, init=False)
     _energy: Array | None = field(default=None, init=False)
-    _applied: Array | None = field(default=None, init=False)  # where u is a function
+    _applied: Array | None = field(default=None, init=False)  # where u is a function,
+    _hold: int = field(default=1, init=False)  # which is called every so many steps
 
     q, qd = _Half(0), _Half(1)
 
@@ -107,10 +108,22 @@ class Run(Columns):
 
     @property
     def u(self) -> Array:
-        """The inputs at each row, (n, nu): the signals there, or what was held from there on.
+        """The inputs as they acted at each row, (n, nu), so within their limits.
 
-        The last row has what was held over the last step.
+        They are the signals there, or what was held from there on; in the last row what was held
+        over the last step.
         """
+        return self._model._within(self._given, self._params)
+
+    @property
+    def saturated(self) -> Array:
+        """Whether each input was beyond its limits at each row, (n, nu)."""
+        given = self._given
+        return np.asarray(np.abs(given - self._model._within(given, self._params)) > 0)
+
+    @property
+    def _given(self) -> Array:
+        """The inputs at each row, (n, nu), whatever their limits."""
         if self._applied is not None:
             return self._applied
         shape = (len(self), self._model.nu)
@@ -193,15 +206,13 @@ class Run(Columns):
         if nudge is not None:
             x = (x + nudge).astype(model.dtype)
         u = self._u
-        if callable(u):
-            u = held_law(u, parts)
-        elif u is not None and np.ndim(u) == 2:
-            u = np.repeat(u[: self.steps], parts, axis=0)
+        if u is not None and not callable(u) and np.ndim(u) == 2:
+            u = u[: self.steps]  # each row held over `parts` steps
         return model._trajectory(
             x[: model.nq], x[model.nq :], model._pointer(x[: model.nq]),
             model._pointer(x[model.nq :]), self.h / parts, self.steps * parts, every, u,
             self._params, model._pointer(self._params), self.method, float(self.t[0]), None,
-            progress,
+            progress, self._hold * parts,
         )  # fmt: skip
 
     def _kept(self) -> dict[str, Any]:
@@ -283,20 +294,6 @@ class Run(Columns):
     def __repr__(self) -> str:
         how = "" if self.status == "ok" else f"{self.status} after "
         return f"<Run of {self._model.name}: {how}{self.steps} steps of {self.h:g} s>"
-
-
-def held_law(law: Callable[..., Any], parts: int) -> Callable[..., Any]:
-    """A law u(t, q, qd) that is called before every `parts`-th step, and held between."""
-    done, u = 0, None
-
-    def held(t: float, q: Array, qd: Array) -> Any:
-        nonlocal done, u
-        if done % parts == 0:
-            u = law(t, q, qd)
-        done += 1
-        return u
-
-    return held
 
 
 def state_text(q: Array, qd: Array) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -98,7 +98,7 @@ class _Check(Checker):
         parameters = self._quantities("parameters", known)
         coordinates = self._coordinates(known)
         self._definitions()
-        inputs = self._inputs()
+        inputs = self._inputs(known)
         energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
@@ -294,15 +294,28 @@ class _Check(Checker):
             lost.update(ring)
         return lost
 
-    def _inputs(self) -> list[Input]:
+    def _inputs(self, known: Mapping[str, float]) -> list[Input]:
         allowed = [name for name, kinds in self.kinds.items() if INPUT not in kinds]
         rule = "a signal can't depend on inputs"
         out = []
         for name, entry in self.doc.inputs.items():
             signal = self.formula(("inputs", name, "signal"), entry.signal, allowed, rule)
+            limits = self._limits(("inputs", name, "limits"), entry.limits, known)
             if signal:
-                out.append(Input(name, entry.unit, signal, entry.note))
+                out.append(Input(name, entry.unit, signal, entry.note, limits))
         return out
+
+    def _limits(
+        self, path: tuple[str, ...], given: Sequence[float | str | None], known: Mapping[str, float]
+    ) -> tuple[Formula | None, ...]:
+        """An input's limits, in their order at the values of the parameters."""
+        rule = "limits are made of numbers, constants and parameters"
+        found = [None if x is None else self.formula(path, x, known, rule) for x in given]
+        values = [self.number(path, f, known) for f in found if f]
+        if len(values) == 2 and values[0] >= values[1]:
+            why = f"the least value, {values[0]:g}, is not below the largest, {values[1]:g}"
+            self.say(path, why)
+        return tuple(found)
 
     def _energy(self, key: str) -> Formula:
         path = ("energy", key)

@@ -36,12 +36,16 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Input:
-    """A quantity given from outside at every step; `signal` is what it is by default."""
+    """A quantity given from outside at every step; `signal` is what it is by default.
+
+    limits: the least and largest value that acts, None where there is none.
+    """
 
     name: str
     unit: str
     signal: Formula
     note: str
+    limits: tuple[Formula | None, ...] = (None, None)
 
 
 @dataclass(frozen=True)
@@ -60,9 +64,9 @@ class Run:
 
     methods: the steppers wanted, the one that runs use first. real: the C type that everything
     is computed in. batch: whether many trajectories at once are wanted. linearize: whether the
-    derivatives of the accelerations are, "parameters" for those by parameters too. frames: of
-    which bodies and points poses, velocities, accelerations and Jacobians are, True for all.
-    inverse_dynamics, momentum: whether these are.
+    derivatives of the accelerations are, "parameters" for those by parameters too. discretize:
+    whether those of steps are. frames: of which bodies and points poses, velocities, accelerations
+    and Jacobians are, True for all. inverse_dynamics, momentum: whether these are.
     """
 
     h: float = 0.001
@@ -71,9 +75,15 @@ class Run:
     real: str = "double"
     batch: bool = False
     linearize: bool | str = False
+    discretize: bool = False
     frames: bool | tuple[str, ...] = False
     inverse_dynamics: bool = False
     momentum: bool = False
+
+    @property
+    def sloped(self) -> bool:
+        """Whether derivatives of the accelerations are wanted; those of steps are made of them."""
+        return bool(self.linearize) or self.discretize
 
 
 @dataclass(frozen=True)

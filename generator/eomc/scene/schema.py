@@ -43,9 +43,13 @@ class QuantityTable(_Table):
     note: _Note = ""
 
 
+_Limits = Annotated[tuple[float | str | None, ...], pydantic.PlainValidator(spelling.limits)]
+
+
 class _Input(_Table):
     unit: _Line = ""
     signal: _Value = 0.0
+    limits: _Limits = (None, None)
     note: _Note = ""
 
 
@@ -100,6 +104,7 @@ class _Run(_Table):
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
     linearize: Annotated[bool | str, pydantic.PlainValidator(_linearized)] = False
+    discretize: pydantic.StrictBool = False
     frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(_asked)] = False
     inverse_dynamics: pydantic.StrictBool = False
     momentum: pydantic.StrictBool = False
@@ -250,6 +255,7 @@ _ALIASES = {
     "q0": "start", "v0": "rate", "qd0": "rate", "speed": "rate", "t_final": "duration",
     "tf": "duration", "T_end": "duration", "tmax": "duration", "stepsize": "h", "step_size": "h",
     "integrator": "method", "solver": "method", "dofs": "coordinates",
+    "range": "limits", "bounds": "limits", "limit": "limits", "saturation": "limits",
     "T": "kinetic", "K": "kinetic",
     "V": "potential", "U": "potential", "P": "potential", "R": "dissipation",
 }  # fmt: skip

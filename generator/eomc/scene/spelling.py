@@ -77,6 +77,17 @@ def _is_number(value: object) -> bool:
     return abs(value) < 1e100
 
 
+def limits(value: object) -> tuple[float | str | None, ...]:
+    """The least and the largest value; None for an infinite one."""
+    if not (isinstance(value, list) and len(value) == 2):
+        raise ValueError(
+            "must be the least and the largest value, such as [-1, 1] or [0, inf], "
+            f"here {toml(value)}"
+        )
+    unbounded = (("-inf", -math.inf), ("inf", "+inf", math.inf))
+    return tuple(None if x in none else entry(x) for x, none in zip(value, unbounded, strict=True))
+
+
 def names(value: object) -> tuple[str, ...]:
     """A name, or a list of names."""
     given = value if isinstance(value, list) else [value]

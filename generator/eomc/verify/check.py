@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 
 from eomc.model.system import System
-from eomc.verify import rows_frames, rows_newton, rows_outputs, rows_plain, rows_sines
+from eomc.verify import (
+    rows_discretize,
+    rows_frames,
+    rows_limits,
+    rows_newton,
+    rows_outputs,
+    rows_plain,
+    rows_signals,
+    rows_sines,
+)
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT, Report
 from eomc.verify.rows_batch import Batches
@@ -52,6 +61,10 @@ def check(
             rows_frames.inverse_dynamics(made, plain)
         if system.outputs and hasattr(module, "output"):
             rows_outputs.report(made, plain)
+        if hasattr(module, "applied"):
+            rows_limits.report(made, plain)
+            rows_signals.report(made, plain)
+            rows_discretize.report(made, plain)
         if plain is not None:
             rows_plain.rows(made, plain)
     else:

@@ -381,7 +381,7 @@ class Comparison:
         run = self.system.run
         if name == "sensitivity":
             return run.linearize == "parameters" and bool(self.system.parameters)
-        return bool(run.linearize) or any(METHODS[method].newton for method in self.methods)
+        return run.sloped or any(METHODS[method].newton for method in self.methods)
 
     def slopes(self, name: str) -> float | Finding:
         """linearize or sensitivity against differences of the reference's accelerations.

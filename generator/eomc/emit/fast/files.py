@@ -15,6 +15,7 @@ from eomc.emit import c_function as c
 from eomc.emit import heading
 from eomc.emit.c_expression import C_NAMES, DOUBLE
 from eomc.emit.c_names import Target
+from eomc.emit.derivatives import derivatives
 from eomc.emit.fast import runs, views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, Lane
@@ -246,3 +247,4 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
         yield show(runs.loop(made, m))
         if batch:
             yield show(runs.batch(made, m))
+    yield from map(show, derivatives(made.functions))

@@ -13,6 +13,7 @@ from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
 from eomc.emit.coefficients import matrix, numbers, rounded
+from eomc.emit.derivatives import derivatives
 from eomc.emit.evaluations import source
 from eomc.emit.functions import Functions, handshake, indexed, of, parameters
 from eomc.emit.plain.views import (
@@ -46,6 +47,7 @@ def files(program: Program, show: Show, real: Real | None = None) -> dict[str, s
     views += [
         view for m, run in zip(methods, loops, strict=True) for view in (stepper(plain, m), run)
     ]
+    views += derivatives(plain)
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
     texts = (
@@ -87,6 +89,7 @@ def header(
             Declared(
                 m.name, _titled(m), m.implicit, room, plain.public.step(m.name),
                 plain.public.run(m.name), plain.public.batch(m.name) if s.run.batch else None,
+                plain.public.derivative(m.name) if s.run.discretize else None,
             )
             for m, room in zip(methods, rooms, strict=True)
         ),

@@ -65,7 +65,7 @@ class Computed:
 
 @dataclass(frozen=True)
 class Declared:
-    """A method of integration in the header: step, run and, where the scene wants it, batch.
+    """A method of integration in the header: step, run and what else the scene wants of it.
 
     kept: the numbers that its memory has room for.
     """
@@ -77,6 +77,7 @@ class Declared:
     step: CFunction
     run: CFunction
     batch: CFunction | None
+    derivative: CFunction | None
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,43 @@ class Slopes(Named):
     unread: tuple[str, ...]
     signal_call: str
     slopes_call: str
+
+
+@dataclass(frozen=True)
+class Derivative(Named):
+    """c/derivative.c.jinja: of a step by a tableau. rates, eliminate: what methods share.
+
+    width: of a row along q, qd and u. feedback: the call of the signals' derivatives, if there are.
+    start, stage: calls of accelerations. settled, loose: corrections of stages, of a velocity;
+    other: how far apart ends are of stages that are not the step's.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/derivative.c"
+    inputs: bool
+    width: str
+    rates: CFunction | None
+    linearization: str
+    feedback: str
+    eliminate: bool
+    function: CFunction
+    implicit: bool
+    stages: int
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    step: str
+    start: str
+    stage: str
+    rates_call: str
+    fabs: str
+    fmax: str
+    tiny: str
+    settled: str
+    loose: str
+    other: str
+    most: int
 
 
 @dataclass(frozen=True)
@@ -222,4 +260,4 @@ class Loop(Named):
     run_one: str
 
 
-View = Header | Source | Slopes | RungeKutta4 | Explicit | Implicit | Gauss | Loop
+View = Header | Source | Slopes | Derivative | RungeKutta4 | Explicit | Implicit | Gauss | Loop

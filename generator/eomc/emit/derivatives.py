@@ -1,0 +1,63 @@
+"""The derivatives of a step along q, qd and u, in both forms of C."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from eomc.emit import c_function as c
+from eomc.emit.c_function import CFunction
+from eomc.emit.coefficients import matrix, numbers, rounded
+from eomc.emit.functions import Functions
+from eomc.emit.plain.views import Derivative
+from eomc.integrators.tableaux import METHODS
+
+TURNS = 50  # of Newton's method for the stages
+
+
+def derivatives(plain: Functions) -> Iterator[Derivative]:
+    """Those of each method, where the scene asks for them; what they share is in the first."""
+    target, real = plain.target, plain.target.real
+    run = target.system.run
+    if not run.discretize:
+        return
+    inputs, end = bool(target.system.inputs), real.function_suffix
+    state = plain.usual("q", "qd", *plain.state[2:], "u", "p")
+    rates = CFunction(
+        f"{plain.prefix}_stage_slopes", plain.status, (c.filled(plain.real, "J"), *state),
+        qualifier="static",
+    )  # fmt: skip
+    feedback = ""
+    if "signal_slopes" in target.program:
+        feedback = plain.public.evaluation("signal_slopes").call(slopes="K")
+    accelerate = plain.acceleration.function.call
+    methods = [METHODS[name] for name in run.methods]
+    first_implicit = next((m for m in methods if m.implicit), None)
+    for m in methods:
+        yield Derivative(
+            **plain.names,
+            inputs=inputs,
+            width=f"2*{plain.NQ} + {plain.NU}" if inputs else f"2*{plain.NQ}",
+            rates=rates if m is methods[0] else None,
+            linearization=plain.public.linearization.call(),
+            feedback=feedback,
+            eliminate=m is first_implicit,
+            function=plain.public.derivative(m.name),
+            implicit=m.implicit,
+            stages=m.stages,
+            c=numbers(m.c, real),
+            A=matrix(m.a, real),
+            AA=matrix(m.a_squared, real),
+            b=numbers(rounded(m.b, real), real),
+            bA=numbers(m.b_a, real),
+            step=plain.public.step(m.name).call(q="at", qd="moving"),
+            start=accelerate(qdd="a"),
+            stage=accelerate(qdd="f" if m.implicit else "a + NQ*i", q="r", qd="v", t="t + c[i]*h"),
+            rates_call=rates.call(q="r", qd="v", t="t + c[i]*h"),
+            fabs=f"fabs{end}",
+            fmax=f"fmax{end}",
+            tiny=target.literal(1e-30),
+            settled=target.literal(16 * real.epsilon),
+            loose=target.literal(real.epsilon**0.5),
+            other=target.literal(real.epsilon**0.25),
+            most=TURNS,
+        )

@@ -1,0 +1,36 @@
+"""Limits of inputs: formulas see what acts, min(max(u, least), most), in place of the input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from sympy import Symbol
+
+from eomc.model.symbols import symbol
+
+if TYPE_CHECKING:
+    from eomc.model.system import System
+
+
+def within(system: System) -> System:
+    """The system with a definition for each limited input, `force_limited`, used in its place."""
+    names = {s.name for s, _ in system.definitions} | system.names | {system.name}
+    made: dict[Symbol, Symbol] = {}
+    for i in system.inputs:
+        if any(x is not None for x in i.limits):
+            name = f"{i.name}_limited"
+            while name in names:
+                name += "_too"
+            names.add(name)
+            made[i.symbol] = symbol(name)
+    if not made:
+        return system
+    limited = [(made[i.symbol], i.limited) for i in system.inputs if i.symbol in made]
+    return replace(
+        system,
+        definitions=(*limited, *((s, e.xreplace(made)) for s, e in system.definitions)),
+        forces=tuple(e.xreplace(made) for e in system.forces),
+        applied=tuple((y, force.xreplace(made)) for y, force in system.applied),
+        outputs=tuple(replace(o, formula=o.formula.xreplace(made)) for o in system.outputs),
+    )

@@ -1,0 +1,49 @@
+"""Inputs that are functions of the time and the state, called from a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .arguments import Array
+from .functions import Functions
+
+
+class Law:
+    """A function u(t, q, qd) that a run calls every so many steps; keeps what rows have of it."""
+
+    def __init__(
+        self, law: Callable[..., Any], inputs: Callable[[Any], Any], every: int, hold: int
+    ) -> None:
+        self.law, self.inputs, self.every, self.hold = law, inputs, every, hold
+        self.calls, self.kept = 0, list[Array]()
+        self.last: Any = None
+
+    def __call__(self, t: float, q: Array, qd: Array) -> Array:
+        """What the function gives at the start of so many steps."""
+        self.last = self.inputs(self.law(t, q.copy(), qd.copy()))
+        if self.last is None:
+            raise ValueError("u: the function returned None, not the inputs")
+        self.calls += 1
+        rows = -(-self.calls * self.hold // self.every)  # that begin before the next call
+        self.kept += [self.last.copy()] * (rows - len(self.kept))
+        return self.last  # type: ignore[no-any-return]
+
+    def rows(self, count: int, width: int) -> Array:
+        """What was applied from each row of the run on, (count, width)."""
+        last = np.full(width, np.nan) if self.last is None else self.last
+        return np.array([*self.kept, last][:count], last.dtype)
+
+
+class Sampled:
+    """The scene's signals as a law, which is held over a control period."""
+
+    def __init__(self, model: Functions, params: Any) -> None:
+        self.model, self.params = model, params
+
+    def __call__(self, t: float, q: Array, qd: Array) -> Array:
+        """The signals at a state."""
+        found: Array = self.model.signal(q, qd, t, self.params)
+        return found

@@ -1,0 +1,87 @@
+"""Rows of `check` about derivatives of steps: beside differences of steps by the tableau.
+
+The steps are those of `one_step`, on the reference's accelerations.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.integrators.tableaux import METHODS
+from eomc.verify import one_step
+from eomc.verify.derivatives import STENCIL, WIDTHS, apart
+from eomc.verify.finding import Finding, largest
+from eomc.verify.oracle import Vector
+from eomc.verify.report import LIMIT
+from eomc.verify.sampling import State
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+
+SLOPE_LIMIT = 1e-6  # of the largest derivative
+SMALL = 1e-4  # what inputs do to a coordinate in a step may be so little, and less is not seen
+SHORTER = (1.0, 0.1, 0.01)  # of the scene's h, until the stages of an implicit method are found
+
+
+def report(of: Comparison, plain: Any) -> None:
+    """Add the rows of a scene that asks for them. plain: the module of the plain form, or None."""
+    if not of.system.run.discretize:
+        return
+    limit = max(SLOPE_LIMIT, LIMIT * of.eps)
+    for module, form in ((of.module, ""), (plain, "plain C: ")):
+        for method in of.methods if module is not None else ():
+            measure = partial(_worst, of, module, method)
+            of.row(f"{form}discretize by {method}", limit, "of the largest derivative", measure)
+
+
+def _worst(of: Comparison, module: Any, method: str) -> float | Finding:
+    errors = (_error(of, module, method, e.state) for e in of.few(4))
+    return largest(errors, "no state has finite differences")
+
+
+def _error(of: Comparison, module: Any, method: str, s: State) -> float | None:
+    """The best of some widths for each entry; None where there are no finite differences."""
+    n, nu = len(s.q), len(of.system.inputs)
+    scales = np.concatenate([of.sampler.spread, of.sampler.speed, np.ones(nu)])
+    if s.u is not None:
+        scales[2 * n :] = np.maximum(1.0, np.abs(s.u))
+    for h in (part * of.system.run.h for part in SHORTER):
+        with np.errstate(all="ignore"):
+            exact = [_differences(of, method, s, h, width * scales) for width in WIDTHS]
+        if not any(np.isfinite(J).all() for J in exact):
+            continue
+        held = {"h": h, "t": s.t, "u": s.u, "params": s.params, "method": method}
+        found = [np.asarray(x, float) for x in module.discretize(s.q, s.qd, **held)]
+        parts, size = (slice(0, 2 * n), slice(2 * n, None)), SMALL * scales[: 2 * n]
+        off = [
+            np.hstack(
+                [apart(x, J[:, i], scales[i], size) for x, i in zip(found, parts, strict=True)]
+            )
+            for J in exact
+        ]
+        return float(np.nan_to_num(np.max(np.fmin.reduce(off)), nan=math.inf))
+    return None
+
+
+def _differences(of: Comparison, method: str, s: State, h: float, by: Vector) -> Vector:
+    """d[q; qd]'/d[q, qd, u] of a step, (2 nq, 2 nq + nu); u: added to signals, where not given."""
+    n, nu = len(s.q), len(of.system.inputs)
+    moved = np.concatenate([k * np.diag(by) for m, _ in STENCIL for k in (m, -m)])
+    x = moved + np.concatenate([s.q, s.qd, np.zeros(nu)])
+
+    def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
+        u, now = None, np.full(len(q), t)
+        if nu:
+            own = of.reference.evaluate("signals", q, qd, now, None, s.params)
+            u = x[:, 2 * n :] + (own if s.u is None else s.u)
+        return of.reference.acceleration(q, qd, now, u, s.params)
+
+    ends = one_step.step(METHODS[method], acceleration, x[:, :n], x[:, n : 2 * n], s.t, h)
+    rows = np.moveaxis(ends, 0, 1).reshape(len(STENCIL), 2, len(by), 2 * n)
+    forward, back = np.moveaxis(rows, 1, 0)
+    weights = np.array([w for _, w in STENCIL])
+    return np.asarray((np.tensordot(weights, forward - back, 1) / by[:, None]).T)

@@ -1,0 +1,77 @@
+"""Rows of `check` about limits of inputs: what is beyond them acts as they do, to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.model.symbols import symbol
+from eomc.model.system import System
+from eomc.verify.oracle import Vector
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import State
+
+STATES = 4
+FAR = 3.0  # times what lies between limits
+
+
+def report(of: Comparison, plain: Any) -> None:
+    """Add the rows of a scene with limits. plain: the module of the plain form, or None."""
+    if all(x is None for i in of.system.inputs for x in i.limits):
+        return
+    for module, form in ((of.module, ""), (plain, "plain C: ")):
+        if module is not None:
+            of.row(f"{form}limits of inputs", 0, "that differ", partial(_differ, of, module))
+
+
+def _differ(of: Comparison, module: Any) -> float:
+    """How many of applied inputs, accelerations and steps are not those at the limits."""
+    found = 0
+    for e in of.few(STATES):
+        s = e.state
+        least, most = limits(of.system, s.params or of.sampler.defaults)
+        for beyond in _beyond(least, most):
+            both = [list(_answers(module, s, u)) for u in (beyond, np.clip(beyond, least, most))]
+            found += sum(not np.array_equal(a, b) for a, b in zip(*both, strict=True))
+    return float(found)
+
+
+def limits(system: System, params: Mapping[str, float]) -> tuple[Vector, Vector]:
+    """The least and largest values of the inputs, by their formulas; infinite where none."""
+    values = {symbol(name): value for name, value in params.items()}
+    ends = [
+        [
+            far if x is None else float(x.xreplace(values))
+            for x, far in zip(i.limits, (-np.inf, np.inf), strict=True)
+        ]
+        for i in system.inputs
+    ]
+    least, most = np.array(ends).T
+    return least, most
+
+
+def _beyond(least: Vector, most: Vector) -> Iterator[Vector]:
+    """Inputs below, above and between their limits, in turns."""
+    width = np.where(np.isfinite(most - least), most - least, 1.0)
+    low = np.where(np.isfinite(least), least, np.where(np.isfinite(most), most, 0) - 2 * width)
+    high = np.where(np.isfinite(most), most, low + 2 * width)
+    for turn in range(3):
+        where = (np.arange(len(low)) + turn) % 3
+        yield np.choose(where, [low - FAR * width, high + FAR * width, (low + high) / 2])
+
+
+def _answers(module: Any, s: State, u: Vector) -> Iterator[Vector]:
+    held = {"t": s.t, "u": u, "params": s.params}
+    yield module.applied(s.q, s.qd, **held)
+    yield module.acceleration(s.q, s.qd, **held)
+    for method in module.methods:
+        yield np.array(module.step(s.q, s.qd, method=method, **held))
+    if hasattr(module, "step_batch"):
+        q, qd = np.array([s.q], module.dtype), np.array([s.qd], module.dtype)
+        yield module.step_batch(q, qd, **held)
+        yield np.array([q, qd])

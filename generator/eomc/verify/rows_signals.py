@@ -1,0 +1,62 @@
+"""A row of `check` about closed loops: A of signals that answer the state, in eighty digits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sympy
+
+from eomc.model.symbols import Output
+from eomc.model.system import System
+from eomc.verify.report import LIMIT
+from eomc.verify.rows_outputs import SLOPE_LIMIT, Formulas
+from eomc.verify.sampling import Expected
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+
+
+def report(of: Comparison, plain: Any) -> None:
+    """Add the rows of a scene with a smooth feedback. plain: the module of the plain form."""
+    if not of.system.run.linearize or not _is_feedback(of.system):
+        return
+    signals = tuple(Output(i.name, i.signal) for i in of.system.inputs)
+    formulas = Formulas(replace(of.system, outputs=signals, inputs=()))
+    for module, form in ((of.module, ""), (plain, "plain C: ")):
+        if module is not None:
+            limit, unit = max(SLOPE_LIMIT, LIMIT * of.eps), "of the largest derivative"
+            of.row(f"{form}closed loop", limit, unit, partial(_loop, of, module, formulas))
+
+
+def _is_feedback(system: System) -> bool:
+    """Whether a signal answers the state, and none jumps."""
+    known: dict[sympy.Symbol, sympy.Expr] = {}
+    for name, e in system.definitions:
+        known[name] = e.xreplace(known)
+    signals = sympy.Tuple(*(i.signal.xreplace(known) for i in system.inputs))
+    moves = signals.free_symbols & {*system.q, *system.qd}
+    return bool(moves) and not signals.has(sympy.sign, sympy.Heaviside)
+
+
+def _loop(of: Comparison, module: Any, formulas: Formulas) -> float:
+    """A of the closed loop beside A + B du/dx, by the module's own A and B."""
+
+    def error(e: Expected) -> float:
+        s = replace(e.state, u=None)
+        held = {"t": s.t, "params": s.params}
+        n = 2 * len(s.q)
+        A, B, closed = (
+            np.asarray(x, float)
+            for x in (
+                *module.linearize(s.q, s.qd, **held),
+                module.linearize(s.q, s.qd, closed=True, **held)[0],
+            )
+        )
+        K = formulas.slopes(s, np.zeros(len(s.q)))[:, :n]
+        size = np.max(abs(A) + abs(B) @ abs(K), axis=1, keepdims=True)
+        return float(np.max(abs(closed - A - B @ K) / (size + 1e-300)))
+
+    return float(np.max([error(e) for e in of.few(2)]))

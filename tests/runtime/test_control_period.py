@@ -1,0 +1,135 @@
+"""A control period: what is held over so many steps is what a row of each step holds."""
+
+from __future__ import annotations
+
+import warnings
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+SCENE = """eomc = 1
+name = "balanced"
+[coordinates]
+x = { unit = "m" }
+theta = { unit = "rad", start = 0.1 }
+[parameters]
+k = 60.0
+[inputs]
+force = { unit = "N", signal = "k*theta + 12*theta_dot", limits = [-9, 9] }
+wind = { unit = "N m", signal = "sin(3*t)/10" }
+[energy]
+kinetic = "x_dot**2 + x_dot*theta_dot*cos(theta) + theta_dot**2"
+potential = "9.81*cos(theta)"
+[forces]
+x = "force"
+theta = "wind"
+[run]
+batch = true
+method = ["rk4", "dp8"]
+h = 0.005
+"""
+PLAIN = SCENE.replace("batch = true\n", "").replace('"dp8"', '"gauss4"')
+
+
+@pytest.fixture(scope="module")
+def balanced(modules: Modules) -> ModuleType:
+    return modules.of_text(SCENE)
+
+
+def law(t: float, q: Any, qd: Any) -> list[float]:
+    return [60 * q[1] + 12 * qd[1] + q[0], np.sin(3 * t) / 10]
+
+
+@pytest.mark.parametrize(("steps", "every"), [(40, 1), (41, 3), (43, 7), (2, 5)])
+@pytest.mark.parametrize("text", [SCENE, PLAIN])
+def test_a_function_is_called_once_a_period(
+    modules: Modules, text: str, steps: int, every: int
+) -> None:
+    module = modules.of_text(text)
+    for method in module.methods:
+        how: dict[str, Any] = {"steps": steps, "method": method}
+        calls: list[float] = []
+
+        def counted(t: float, q: Any, qd: Any, calls: list[float] = calls) -> list[float]:
+            calls.append(t)
+            return law(t, q, qd)
+
+        run = module.simulate(u=counted, control_period=0.02, every=every, **how)
+        assert calls == pytest.approx(np.arange(-(-steps // 4)) * 0.02)
+        # by hand: a row of each step, found four steps at a time
+        table = np.empty((steps, 2))
+        for k in range(0, steps, 4):
+            table[k:] = law(k * 0.005, *(x[-1] for x in _upto(module, table[:k], method)))
+        whole = module.simulate(u=table, every=every, **how)
+        assert np.array_equal(run.x, whole.x), method
+        assert np.array_equal(run.u, whole.u) and np.array_equal(run.saturated, whole.saturated)
+        rows = module.simulate(u=table[::4], control_period=0.02, every=every, **how)
+        assert rows == whole and np.array_equal(rows.u, whole.u)
+
+
+def _upto(module: ModuleType, table: Any, method: str) -> tuple[Any, Any]:
+    run = module.simulate(u=table if len(table) else None, steps=len(table), method=method)
+    return run.q, run.qd
+
+
+def test_signals_are_read_once_a_period(balanced: ModuleType) -> None:
+    params = {"k": 55.0}
+    run = balanced.simulate(control_period=0.02, steps=40, params=params)
+    same = balanced.simulate(
+        u=lambda t, q, qd: balanced.signal(q, qd, t, params), control_period=0.02, steps=40,
+        params=params,
+    )  # fmt: skip
+    assert np.array_equal(run.x, same.x) and np.array_equal(run.u, same.u)
+    assert not np.array_equal(run.x, balanced.simulate(steps=40, params=params).x)
+    assert balanced.simulate(u=[1, 0], control_period=0.1, steps=40) == balanced.simulate(
+        u=[1, 0], steps=40
+    )
+
+
+def test_batches_take_a_row_a_period(balanced: ModuleType) -> None:
+    table = np.random.default_rng(2).normal(size=(3, 11, 2))
+    runs = balanced.simulate_batch(u=table, steps=41, every=3, control_period=0.02)
+    for k in range(3):
+        run = balanced.simulate(u=table[k], steps=41, every=3, control_period=0.02)
+        assert runs.q[k] == pytest.approx(run.q, rel=1e-11, abs=1e-12)
+        assert np.array_equal(runs.u[k], run.u)
+    for u in (None, [1.0, 0.0], table[:, 0], {"force": table[:, :, 0], "wind": 0.5}):
+        balanced.simulate_batch(u=u, steps=41, control_period=0.02)
+
+
+def test_the_error_is_that_of_the_run_with_its_period(balanced: ModuleType) -> None:
+    """The finer runs ask as often: what is left is the stepper's error, of order 4."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = balanced.simulate(u=law, control_period=0.02, duration=1.0, estimate=True)
+    exact = balanced.simulate(u=law, control_period=0.02, duration=1.0, h=0.02 / 64)
+    off = np.abs(run.q[-1] - exact.q[-1])
+    assert np.all(off < 3 * run.error.q[-1]) and np.all(run.error.q[-1] < 30 * off + 1e-13)
+    assert run.error.observed == pytest.approx(4, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("period", "words"),
+    [
+        (0.012, r"0.012 s is 2.4 steps of h = 0.005 s: give a whole number of steps, such as 0.01"),
+        (0.001, "0.2 steps.*such as 0.005"),
+        (0, "0 steps"),
+        (-0.02, "such as 0.005"),
+        ("soon", "control_period: 'soon' is not a number"),
+        (np.inf, "not a finite number"),
+    ],
+)
+def test_periods_are_whole_numbers_of_steps(balanced: ModuleType, period: Any, words: str) -> None:
+    for call in (balanced.simulate, balanced.simulate_batch):
+        with pytest.raises(ValueError, match=words):
+            call(steps=8, control_period=period)
+
+
+def test_a_row_too_few_is_told(balanced: ModuleType) -> None:
+    with pytest.raises(ValueError, match="9 rows for 40 steps: give one row a control period of 4"):
+        balanced.simulate(u=np.zeros((9, 2)), steps=40, control_period=0.02)
+    with pytest.raises(ValueError, match=r"expected \(2,\), \(batch, 2\) or \(batch, 10, 2\)"):
+        balanced.simulate_batch(u=np.zeros((3, 9, 2)), steps=40, control_period=0.02)

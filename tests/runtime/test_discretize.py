@@ -1,0 +1,275 @@
+"""The derivatives of a step against differences of forty digits, and of steps one by one."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+import sympy
+from conftest import Modules, tiers
+
+import eomc
+from eomc.base.errors import EomcError
+from eomc.integrators.tableaux import METHODS
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.scene.read import parse
+from eomc.verify import rows_discretize, symbolic
+from eomc.verify.comparison import Comparison
+
+HEAD = """eomc = 1
+name = "NAME"
+[coordinates]
+x = { unit = "m" }
+theta = { unit = "rad", start = 0.3 }
+[parameters]
+k = 4.0
+[inputs]
+"""
+LOOP = (
+    HEAD.replace("NAME", "stepped")
+    + """force = { unit = "N", signal = "k*theta + 3*lean*theta_dot - x_dot**2", limits = [-9, 9] }
+push = { unit = "N m", signal = "sin(30*t)" }
+[definitions]
+lean = "sin(theta + x)"
+[energy]
+kinetic = "x_dot**2 + x_dot*theta_dot*cos(theta) + theta_dot**2"
+potential = "9.81*cos(theta) + k*x**2"
+dissipation = "theta_dot**2/5"
+[forces]
+x = "force"
+theta = "push*cos(x)"
+[run]
+h = 0.02
+"""
+)
+EXPLICIT = LOOP + 'discretize = true\nmethod = ["rk4", "dp8", "euler"]\nbatch = true\n'
+IMPLICIT = LOOP + 'discretize = true\nmethod = ["gauss4", "gauss6", "gauss8", "gauss16"]\n'
+NYSTROM = (
+    HEAD.replace("NAME", "nystrom")
+    + """force = { unit = "N", signal = "k*theta - x**3" }
+[energy]
+kinetic = "x_dot**2 + x_dot*theta_dot/2 + theta_dot**2"
+potential = "9.81*cos(theta - x)"
+[forces]
+x = "force*cos(x + t)"
+[run]
+h = 0.02
+discretize = true
+method = ["verlet", "euler"]
+"""
+)
+CASES = [
+    *((EXPLICIT, m) for m in ("rk4", "dp8", "euler")),
+    *((IMPLICIT, m) for m in ("gauss4", "gauss6", "gauss8", "gauss16")),
+    (NYSTROM, "verlet"),
+]
+Q, QD = np.array([0.2, 0.4]), np.array([-0.3, 0.7])
+INPUTS = {"signals": None, "held": [0.6, -0.4], "beyond": [40.0, 0.3]}
+
+
+class Exact:
+    """Steps of a scene in many digits, by the equations that the reference writes out."""
+
+    def __init__(self, system: System) -> None:
+        r, self.n, self.m = symbolic.derive(system), len(system.q), len(system.u)
+        parameters = [p.symbol for p in system.parameters]
+        self.values = [mpmath.mpf(p.value) for p in system.parameters]
+        symbols = [*system.q, *system.qd, sympy.Symbol("t", real=True), *system.u, *parameters]
+        modules = [{"Min": min, "Max": max}, "mpmath"]
+        self.motion, self.signals = (
+            sympy.lambdify(symbols, list(found), modules=modules) for found in (r.motion, r.signals)
+        )
+
+    def acceleration(self, q: Any, qd: Any, t: Any, u: Any, more: Any) -> Any:
+        """u: held, or None for the signals; more: added to either."""
+        n = self.n
+        if u is None:
+            u = self.signals(*q, *qd, t, *[0] * self.m, *self.values)
+        found = self.motion(
+            *q, *qd, t, *(a + b for a, b in zip(u, more, strict=True)), *self.values
+        )
+        D, bias, tau = found[: n * n], found[n * n : -n], found[-n:]
+        matrix = mpmath.matrix([D[n * i : n * i + n] for i in range(n)])
+        force = mpmath.matrix([a - b for a, b in zip(tau, bias, strict=True)])
+        return np.array(mpmath.lu_solve(matrix, force))
+
+    def step(self, method: str, z: Any, h: Any, t: Any, u: Any) -> Any:
+        """The state a step after z = [q, qd, u added]; stages by sweeps until nothing moves."""
+        m, n = METHODS[method], self.n
+        q, qd, more = z[:n], z[n : 2 * n], z[2 * n :]
+        number = lambda f: mpmath.mpf(f.numerator) / f.denominator  # noqa: E731
+        square = [[[number(x) for x in row] for row in rows] for rows in (m.a, m.a_squared)]
+        a = np.array([[mpmath.mpf(0)] * n] * m.stages)
+        for _ in range(60 if m.implicit else 1):
+            before = a.copy()
+            for i in range(m.stages):
+                v, r = (sum((x * a[j] for j, x in enumerate(rows[i])), 0 * q) for rows in square)
+                c = number(m.c[i])
+                a[i] = self.acceleration(q + c * h * qd + h**2 * r, qd + h * v, t + c * h, u, more)
+            if m.implicit and max(abs(x) for x in (a - before).ravel()) < mpmath.mpf(10) ** -52:
+                break
+        else:
+            assert not m.implicit, "the stages are not found"
+        r, v = (sum(number(x) * a[j] for j, x in enumerate(row)) for row in (m.b_a, m.b))
+        return np.concatenate([q + h * qd + h**2 * r, qd + h * v])
+
+    def derivative(self, method: str, z: Any, h: float, t: float, u: Any) -> Any:
+        """d step/dz by central differences: 55 digits, 18 of them the width's."""
+        with mpmath.workdps(55):
+            z, by = np.array([mpmath.mpf(float(x)) for x in z]), mpmath.mpf(10) ** -18
+            h, t = mpmath.mpf(h), mpmath.mpf(t)
+            columns = []
+            for k in range(len(z)):
+                ends = []
+                for sign in (1, -1):
+                    moved = z.copy()
+                    moved[k] += sign * by
+                    ends.append(self.step(method, moved, h, t, u))
+                columns.append([float(x) for x in (ends[0] - ends[1]) / (2 * by)])
+        return np.array(columns).T
+
+
+@cache
+def exact(text: str) -> Exact:
+    return Exact(from_scene(parse(text, "test.toml")))
+
+
+def derivative(text: str, method: str, h: float, t: float, u: Any) -> Any:
+    """(Phi, Gamma) to all digits of a double."""
+    found = exact(text)
+    given = None if u is None else [mpmath.mpf(x) for x in u[: found.m]]
+    J = found.derivative(method, [*Q, *QD, *[0] * found.m], h, t, given)
+    return J[:, :4], J[:, 4:]
+
+
+@pytest.mark.parametrize("given", INPUTS)
+@pytest.mark.parametrize(("text", "method"), CASES, ids=[m for _, m in CASES])
+def test_against_differences_of_forty_digits(
+    modules: Modules, text: str, method: str, given: str
+) -> None:
+    """All digits, but for the last two of the largest entry."""
+    m, u = modules.of_text(text), INPUTS[given]
+    held = None if u is None else u[: len(m.inputs)]
+    Phi, Gamma = m.discretize(Q, QD, 0.03, 0.4, held, method=method)
+    right, right_u = derivative(text, method, 0.03, 0.4, u)
+    assert np.max(np.abs(Phi - right)) < 4e-15 * np.max(np.abs(right))
+    assert np.max(np.abs(Gamma - right_u)) < 4e-15 * max(np.max(np.abs(right_u)), 0.01)
+    assert np.any(right_u) or given == "beyond"
+
+
+@pytest.mark.parametrize("text", tiers([EXPLICIT, IMPLICIT], EXPLICIT), ids=lambda t: t[-20:-1])
+def test_plain_c_has_the_same(modules: Modules, text: str, tmp_path: Any) -> None:
+    fast = modules.of_text(text)
+    plain = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form="plain")
+    for method in fast.methods:
+        for u in (None, [0.6, -0.4]):
+            both = [m.discretize(Q, QD, 0.03, 0.4, u, method=method) for m in (fast, plain)]
+            for a, b in zip(*both, strict=True):
+                assert a == pytest.approx(b, rel=1e-13, abs=1e-14)
+
+
+@pytest.mark.parametrize("t", [0.3, np.linspace(0, 1, 3)])
+@pytest.mark.parametrize("period", [None, 0.06])
+def test_many_states_are_each_of_them(modules: Modules, t: Any, period: float | None) -> None:
+    m, how = modules.of_text(EXPLICIT), {"params": {"k": 3.0}, "control_period": period}
+    q, qd = np.array([Q, 2 * Q, -Q]), np.array([QD, -QD, QD])
+    Phi, Gamma = m.discretize(q, qd, t=t, **how)
+    assert Phi.shape == (3, 4, 4) and Gamma.shape == (3, 4, 2)
+    for k in range(3):
+        one = m.discretize(q[k], qd[k], t=float(np.broadcast_to(t, 3)[k]), **how)
+        assert np.array_equal(Phi[k], one[0]) and np.array_equal(Gamma[k], one[1])
+
+
+@pytest.mark.parametrize("given", ["signals", "held"])
+@pytest.mark.parametrize("method", ["rk4", "euler"])
+def test_a_control_period_is_its_steps(modules: Modules, method: str, given: str) -> None:
+    """Against differences of runs with that period, good to 1e-10 or so."""
+    m, u = modules.of_text(EXPLICIT), INPUTS[given]
+    x, how = np.hstack([Q, QD]), {"h": 0.02, "control_period": 0.1, "method": method}
+    Phi, Gamma = m.discretize(Q, QD, u=u, **how)
+
+    def end(x: Any, u: Any) -> Any:
+        run = m.simulate(*np.split(x, 2), steps=5, u=u, **how)
+        return run.x[-1]
+
+    stencil, width = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280)), 4e-3
+    for k, by in enumerate(width * np.eye(4)):
+        near = sum(w * (end(x + j * by, u) - end(x - j * by, u)) for j, w in stencil) / width
+        assert Phi[:, k] == pytest.approx(near, abs=1e-9)
+    start = m.signal(Q, QD) if u is None else np.array(u)
+    for k, by in enumerate(width * np.eye(2)):
+        ends = ((w, end(x, start + j * by) - end(x, start - j * by)) for j, w in stencil)
+        assert Gamma[:, k] == pytest.approx(sum(w * d for w, d in ends) / width, abs=1e-9)
+
+
+def test_what_it_refuses(modules: Modules, cartpole: ModuleType) -> None:
+    m = modules.of_text(EXPLICIT)
+    with pytest.raises(ValueError, match=r"cartpole was built without it.*discretize = true"):
+        cartpole.discretize([0, 0], [0, 0])
+    with pytest.raises(ValueError, match="'gauss4' is not in this module"):
+        m.discretize(Q, QD, method="gauss4")
+    with pytest.raises(ValueError, match="give a whole number of steps"):
+        m.discretize(Q, QD, h=0.02, control_period=0.05)
+    with pytest.raises(m.MotionError, match="not finite there") as caught:
+        m.discretize([Q, Q], [QD, 1e160 * QD], u=[0, 0])
+    assert caught.value.status == "not finite" and "e+159" in str(caught.value)
+    stiff = 'eomc = 1\nname = "stiff"\n[coordinates]\nx = { start = 1 }\n[energy]\n' + (
+        'kinetic = "x_dot**2/2"\npotential = "1e4*x**4"\n[run]\ndiscretize = true\n'
+    )
+    gauss: Any = modules.unoptimised(stiff + 'method = "gauss4"\n')
+    with pytest.raises(gauss.MotionError, match="does not converge") as caught:
+        gauss.discretize([1.0], [0.0], h=5.0)
+    assert caught.value.status == "no convergence"
+
+
+def test_a_scene_that_does_not_ask_has_nothing_of_it() -> None:
+    for text in (LOOP, LOOP + "linearize = true\n"):
+        for name, file in eomc.sources(from_scene(parse(text, "test.toml"))).files.items():
+            if name.endswith((".c", ".h")):
+                for trace in ("derivative(", "Phi", "_eliminate(", "stage_slopes"):
+                    assert trace not in file, name
+    explicit = eomc.sources(from_scene(parse(EXPLICIT, "test.toml"))).files["stepped.c"]
+    assert "rk4_derivative(" in explicit and "_eliminate(" not in explicit
+
+
+@pytest.mark.parametrize(
+    ("run", "signal", "words"),
+    [
+        ("discretize = true", "sign(theta)", "a signal jumps.*do without discretize"),
+        ("discretize = 1", "theta", "run.discretize: must be true or false"),
+    ],
+)
+def test_what_can_not_be_built(run: str, signal: str, words: str) -> None:
+    text = LOOP.replace("k*theta + 3*lean*theta_dot - x_dot**2", signal) + run
+    with pytest.raises(EomcError, match=words):
+        eomc.sources(from_scene(parse(text, "test.toml")))
+
+
+def test_a_system_made_in_python_asks_too(modules: Modules) -> None:
+    made = eomc.System.make(
+        "slider", ["x"], "x_dot**2/2", "x**4", inputs={"F": 0}, forces={"x": "F"}, discretize=True
+    )
+    Phi, Gamma = modules.unoptimised(made).discretize([0.0], [1.0], 0.1, u=[0.0])
+    assert Phi.shape == (2, 2) and Gamma == pytest.approx(np.array([[0.005], [0.1]]), rel=1e-3)
+
+
+def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
+    class Wrong:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(m, name)
+
+        def discretize(self, *state: Any, **how: Any) -> Any:
+            Phi, Gamma = m.discretize(*state, **how)
+            return Phi, Gamma * (1 + 1e-5)
+
+    m, made = modules.of_text(EXPLICIT), from_scene(parse(EXPLICIT, "test.toml"))
+    for module, passed in ((m, True), (Wrong(), False)):
+        of = Comparison(made, module, np.random.default_rng(0), 4)
+        rows_discretize.report(of, None)
+        assert [row.passed for row in of.rows] == [passed] * 3, of.rows
+    assert [row.name for row in of.rows] == [f"discretize by {x}" for x in m.methods]

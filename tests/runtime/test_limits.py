@@ -1,0 +1,197 @@
+"""Limits of inputs: what acts is within them, wherever inputs are used, and runs tell."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from conftest import Modules, tiers
+
+import eomc
+from eomc.base.errors import EomcError
+from eomc.cli.main import main
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.scene.read import parse
+from eomc.verify import rows_limits
+from eomc.verify.comparison import Comparison
+
+SCENE = """eomc = 1
+name = "limited"
+[coordinates]
+x = { unit = "m" }
+theta = { unit = "rad", start = 0.3 }
+[parameters]
+most = 2.0
+[inputs]
+force = { unit = "N", signal = "20*theta + 3*theta_dot", limits = ["-most", "most*3/2"] }
+push = { unit = "N", signal = "sin(9*t)", limits = [0, inf] }
+free = { unit = "N m", signal = "cos(t)" }
+[definitions]
+both = "force + push"
+[energy]
+kinetic = "x_dot**2 + x_dot*theta_dot*cos(theta) + theta_dot**2"
+potential = "9.81*cos(theta)"
+[forces]
+x = "both"
+theta = "free"
+[outputs]
+pull = "force*x_dot"
+[run]
+linearize = true
+h = 0.01
+duration = 2.0
+"""
+BATCH = SCENE + 'batch = true\nmethod = ["rk4", "dp8", "euler"]\n'
+IMPLICIT = SCENE + 'method = ["gauss4", "gauss8", "gauss16"]\n'
+LEAST, MOST = np.array([-2.0, 0.0, -np.inf]), np.array([3.0, np.inf, np.inf])
+TABLE = np.random.default_rng(3).uniform(-9, 9, (200, 3))
+
+
+@pytest.fixture(scope="module")
+def limited(modules: Modules) -> ModuleType:
+    return modules.of_text(BATCH)
+
+
+@pytest.mark.parametrize("form", ["fast", "plain"])
+@pytest.mark.parametrize("text", tiers([BATCH, IMPLICIT], BATCH), ids=lambda t: t[-30:-1])
+def test_what_is_beyond_acts_as_the_limit(text: str, form: str, tmp_path: Path) -> None:
+    """To the last bit, in every method, held or a row a step."""
+    module = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form=form)
+    q, qd = module.start
+    assert not np.array_equal(np.clip(TABLE, LEAST, MOST), TABLE)
+    for method in module.methods:
+        for u in (TABLE, TABLE[1]):
+            run = module.simulate(u=u, method=method)
+            same = module.simulate(u=np.clip(u, LEAST, MOST), method=method)
+            assert run.status == "ok" and np.array_equal(run.x, same.x)
+            assert np.array_equal(run.u, same.u) and not same.saturated.any()
+            assert np.array_equal(run.outputs["pull"], same.outputs["pull"])
+    for name in ("acceleration", "tau", "power", "output", "applied"):
+        call = getattr(module, name)
+        assert np.array_equal(call(q, qd, u=[-7, -1, 9]), call(q, qd, u=[-2, 0, 9]))
+
+
+def test_signals_are_limited_at_every_stage(modules: Modules, limited: ModuleType) -> None:
+    by_hand = SCENE.replace("[energy]", 'a = "min(max(force, -most), 3*most/2)"\n[energy]')
+    by_hand = by_hand.replace(', limits = ["-most", "most*3/2"]', "").replace(
+        "force + push", "push"
+    )
+    by_hand = by_hand.replace(", limits = [0, inf]", "").replace('"push"', '"max(push, 0)"')
+    other = modules.of_text(by_hand.replace('x = "both"', 'x = "a + both"'))
+    run, same = limited.simulate(), other.simulate()
+    assert run.x == pytest.approx(same.x, rel=1e-11, abs=1e-11)
+    signals = np.array([20 * run.theta + 3 * run.theta_dot, np.sin(9 * run.t), np.cos(run.t)]).T
+    assert run.u == pytest.approx(np.clip(signals, LEAST, MOST), abs=1e-12)
+    beyond = (signals < LEAST) | (signals > MOST)
+    assert np.array_equal(run.saturated, beyond) and beyond.any(axis=0).tolist() == [
+        True,
+        True,
+        False,
+    ]
+    assert np.array_equal(run["force"], run.u[:, 0])
+
+
+@pytest.mark.parametrize("u", [None, TABLE[:20][None], TABLE[0], TABLE[:60].reshape(3, 20, 3)])
+def test_a_batch_has_the_limits_of_each(limited: ModuleType, u: Any) -> None:
+    most = np.array([0.1, 2.0, 50.0])
+    runs = limited.simulate_batch(
+        np.tile(limited.start[0], (3, 1)), steps=20, params={"most": most}, u=u
+    )
+    for k in range(3):
+        held = u if u is None or u.ndim == 1 else u[k % len(u)]
+        run = limited.simulate(steps=20, params={"most": most[k]}, u=held)
+        assert runs.q[k] == pytest.approx(run.q, rel=1e-12, abs=1e-12)
+        assert runs.u[k] == pytest.approx(run.u, rel=1e-12, abs=1e-12)
+        assert np.array_equal(runs.saturated[k], run.saturated)
+    assert runs.saturated.shape == runs.u.shape and runs.saturated.any()
+    assert not runs.saturated.all()
+
+
+@pytest.mark.filterwarnings("ignore:.*Python function")
+def test_runs_keep_what_was_asked_for(limited: ModuleType, tmp_path: Path) -> None:
+    run = limited.simulate(u=lambda t, q, qd: [30 * q[1], -1, 0], steps=40, every=7)
+    assert run.saturated[:, 1].all() and run.u[:, 0].max() == 3.0
+    run.save(tmp_path / "run.npz")
+    for again in (limited.load_run(tmp_path / "run.npz"), pickle.loads(pickle.dumps(run))):
+        assert np.array_equal(again.u, run.u) and np.array_equal(again.saturated, run.saturated)
+
+
+def test_derivatives_are_zero_beyond(limited: ModuleType) -> None:
+    q, qd = limited.start
+    within = limited.linearize(q, qd, [1, 1, 0])[1]
+    beyond = limited.linearize(q, qd, [4, -1, 0])[1]
+    assert np.all(within[2:] != 0) and np.all(beyond[:, :2] == 0)
+    assert np.array_equal(beyond[:, 2], within[:, 2])
+
+
+def test_the_command_tells(tmp_path: Path) -> None:
+    (tmp_path / "limited.toml").write_text(SCENE, encoding="utf-8")
+    said = (
+        CliRunner()
+        .invoke(main, ["run", str(tmp_path / "limited.toml"), "--build", str(tmp_path)])
+        .output
+    )
+    assert "push beyond its limits, and so at them, in 4" in said, said
+    assert "free beyond" not in said
+
+
+def test_a_scene_without_has_nothing_of_it(limited: ModuleType, driven: ModuleType) -> None:
+    assert limited._model.has_limits
+    assert not driven._model.has_limits and not driven.simulate(steps=3).saturated.any()
+    q, qd = driven.start
+    assert np.array_equal(driven.applied(q, qd, 0.3), driven.signal(q, qd, 0.3))
+    assert driven.applied(q, qd, u=[1e9]).tolist() == [1e9]
+    sources = eomc.sources(eomc.read("scenes/cartpole_driven.toml")).files
+    assert not any(
+        "applied(" in text or "fmin" in text for n, text in sources.items() if n[-1] in "ch"
+    )
+
+
+def test_systems_made_in_python() -> None:
+    made: dict[str, Any] = {
+        "parameters": {"m": 1.0}, "inputs": {"F": "sin(t)", "G": 0}, "forces": {"x": "F + G"},
+    }  # fmt: skip
+
+    def system(limits: Any) -> System:
+        return System.make("cart", ["x"], "m*x_dot**2/2", limits=limits, **made)
+
+    limited = system({"F": ("-m", 2), "G": (None, np.inf)})
+    assert str(limited.inputs[0].limited) == "Min(2, Max(F, -m))"
+    assert limited.inputs[1].limited == limited.inputs[1].symbol
+    assert str(limited.forces[0]) == "F_limited + G"
+    for limits, words in (
+        ({"H": (0, 1)}, "limits of H: inputs are F, G"),
+        ({"F": 1}, "give the least and the largest value, here 1"),
+        ({"F": (2, "m")}, "2, the least value, is not below m"),
+        ({"F": ("x", 1)}, "x not declared"),
+    ):
+        with pytest.raises(EomcError, match=words):
+            system(limits)
+
+
+class Wrong:
+    """The module with inputs of accelerations a little less limited."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._module, name)
+
+    def acceleration(self, *state: Any, u: Any, **how: Any) -> Any:
+        return self._module.acceleration(*state, u=u, **how) + 1e-15 * np.max(u)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_the_check_finds_what_does_not_hold_them(limited: ModuleType, wrong: bool) -> None:
+    module: Any = Wrong(limited) if wrong else limited
+    of = Comparison(from_scene(parse(BATCH, "test.toml")), module, np.random.default_rng(0), 4)
+    rows_limits.report(of, None)
+    (row,) = of.rows
+    assert row.name == "limits of inputs" and row.passed is not wrong, row
