@@ -1,0 +1,117 @@
+"""The scripts of docs/examples run as they are written, and do what they say."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import runpy
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+EXAMPLES = ROOT / "docs" / "examples"
+FOLDER = ROOT / "build" / "tests" / "examples"  # where their scene is built, once
+needs_gymnasium = pytest.mark.skipif(
+    importlib.util.find_spec("gymnasium") is None, reason="gymnasium is not installed"
+)
+needs_scipy = pytest.mark.skipif(
+    importlib.util.find_spec("scipy") is None, reason="SciPy is not installed"
+)
+
+
+@cache
+def said(name: str) -> str:
+    """What a script prints; it ends well and has nothing to complain of."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(EXAMPLES / name)], cwd=FOLDER, capture_output=True,
+        text=True,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    return done.stdout
+
+
+def numbers(text: str, pattern: str) -> list[float]:
+    """The groups of the pattern as numbers, one match after the other."""
+    found = re.findall(pattern, text)
+    assert found, text
+    return [float(x) for match in found for x in ([match] if isinstance(match, str) else match)]
+
+
+@needs_scipy
+def test_the_pole_is_balanced_within_the_limits() -> None:
+    text = said("lqr.py")
+    low, high = numbers(text, r"force between (\S+) and (\S+) N")
+    assert low == -10 and high <= 10
+    beyond, rows = numbers(text, r"at (\d+) of (\d+) rows")
+    assert 0 < beyond < rows == 1201
+    x, theta = numbers(text, r"x = (\S+) m, theta = (\S+) rad")
+    assert abs(x) < 1e-3 and abs(theta) < 1e-3
+    assert max(numbers(text.splitlines()[0], r"0\.\d+")) < 1
+    assert numbers(text, r"exact to (\S+)")[0] < 1e-9
+
+
+@needs_scipy
+def test_the_pole_is_swung_up() -> None:
+    text = said("swing_up.py")
+    assert numbers(text, r"upright from t = (\S+) s")[0] < 10
+    x, y = numbers(text, r"tip is at (\S+) m, (\S+) m")
+    assert abs(x) < 1e-3 and y == pytest.approx(1, abs=1e-3)
+    assert 0 < numbers(text, r"saturated (\d+)%")[0] < 50
+
+
+def test_a_heavier_pole_is_caught_less_far() -> None:
+    lines = np.reshape(numbers(said("sweep.py"), r"(\S+) kg: up to (\S+) rad"), (-1, 2))
+    assert lines[:, 0].tolist() == pytest.approx(np.linspace(0.1, 0.8, 8))
+    assert np.all(np.diff(lines[:, 1]) < 0) and 0.2 < lines[-1, 1] < lines[0, 1] < 1
+
+
+@needs_gymnasium
+def test_many_poles_are_kept_up() -> None:
+    text = said("vector_env.py")
+    assert text.startswith("observed: cart tip_x tip_y speed turn swing")
+    by_chance, by_feedback = numbers(text, r"forces: (\S+) falls[^:]*feedback: (\S+) falls")
+    assert by_chance > 3 and by_feedback < 0.1
+
+
+@needs_gymnasium
+def test_the_environment_is_what_gymnasium_expects(monkeypatch: pytest.MonkeyPatch) -> None:
+    from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    monkeypatch.chdir(FOLDER)
+    made = runpy.run_path(str(EXAMPLES / "vector_env.py"))
+    poles = made["CartPoles"](8)
+    env = RecordEpisodeStatistics(poles)
+    first, _ = env.reset(seed=3)
+    assert poles.observation_space.contains(first)
+    assert np.array_equal(env.reset(seed=3)[0], first)
+    push = np.full((8, 1), 10.0)
+    assert poles.action_space.contains(push)
+    for _ in range(60):
+        seen, rewards, over, late, info = env.step(push)
+        assert poles.observation_space.contains(seen) and rewards.shape == over.shape == (8,)
+        if over.any():
+            break
+    assert over.any() and not late.any()
+    lean = np.arccos(info["final_obs"][:, 2])
+    assert np.array_equal(lean > 0.5, over) and np.all(np.arccos(seen[over, 2]) < 0.1)
+    assert info["episode"]["l"][over].min() > 5
+
+
+def test_the_documents_name_each() -> None:
+    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    for file in sorted(EXAMPLES.iterdir()):
+        assert f"](examples/{file.name})" in text, file.name
+
+
+def test_they_stand_on_their_own() -> None:
+    """Each says how to run it; the scene lies beside them."""
+    for file in sorted(EXAMPLES.glob("*.py")):
+        assert f"python docs/examples/{file.name}" in file.read_text(encoding="utf-8")
+    assert Path(EXAMPLES / "balance.toml").is_file()
