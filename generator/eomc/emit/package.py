@@ -13,7 +13,7 @@ from eomc.emit.public import Public
 from eomc.emit.views import Binding, Bound, BoundMethod, Declarations, Face, Main, Named
 from eomc.integrators.tableaux import METHODS
 
-TIMED = ("energy", "jacobi", "outputs")  # what runs ask for at each of their rows
+TIMED = ("energy", "jacobi", "tau", "power", "outputs")  # what runs ask for at each of their rows
 ROWS = 200  # of main.c, about
 FUNCTIONS = (
     "C D acceleration advice bias energy equilibrium g jacobi kinetic_energy linearize load_run "
