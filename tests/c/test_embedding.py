@@ -82,7 +82,8 @@ def rows_of(name: str, module: ModuleType) -> np.ndarray:
     s = made(name).run
     steps = max(1, int(np.ceil(s.duration / s.h * (1 - 1e-12))))
     found = module.simulate(steps=steps, every=max(1, steps // 200))
-    return np.column_stack([found.t, found.q, found.qd, found.energy])
+    outputs = found.outputs.values()
+    return np.column_stack([found.t, found.q, found.qd, *outputs, found.energy])
 
 
 # --- compilers -----------------------------------------------------------------------------------
@@ -179,7 +180,8 @@ def test_the_example_prints_what_the_module_computes(
     """
     columns, found = table(printed(name, "cc -O2"))
     names = [c.name for c in made(name).coordinates]
-    assert columns == ["t", *names, *(f"{n}_dot" for n in names), "energy"]
+    outputs = [o.name for o in made(name).outputs]
+    assert columns == ["t", *names, *(f"{n}_dot" for n in names), *outputs, "energy"]
     usual = rows_of(name, module(name))
     np.testing.assert_allclose(found, usual, rtol=0, atol=1e-9 * np.max(np.abs(usual)))
     monkeypatch.setenv("EOMC_CFLAGS", "-O2")

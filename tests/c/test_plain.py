@@ -218,7 +218,9 @@ def test_example_and_self_test_serve_both_forms(name: str, form: str, tmp_path: 
     steps = max(1, int(np.ceil(s.duration / s.h * (1 - 1e-12))))
     wanted = module.simulate(steps=steps, every=max(1, steps // 200))
     found = np.array([[float(x) for x in row.split(",")] for row in rows])
-    wanted = np.column_stack([wanted.t, wanted.q, wanted.qd, wanted.energy])
+    wanted = np.column_stack(
+        [wanted.t, wanted.q, wanted.qd, *wanted.outputs.values(), wanted.energy]
+    )
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * np.max(np.abs(wanted)))
 
 

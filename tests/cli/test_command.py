@@ -89,6 +89,17 @@ def test_what_does_nothing_imports_nothing_slow(there: Path) -> None:
     assert "is up to date" in done.stdout
 
 
+def test_where_the_energy_went_is_told(there: Path) -> None:
+    assert "J, changed by at most" in eomc("run", "cartpole.toml").output
+    built(there, "kapitza_pendulum")
+    told = eomc("run", "kapitza_pendulum.toml").output
+    assert "energy K + P 8.73323504 J, changed by at most 18 J; it is not conserved\n" in told
+    assert "Jacobi's integral 8.6428537 J: forces took 1.71 J; numerical error 8.4e-08 J\n" in told
+    assert "forces took 1.71 J; n" in eomc("run", "kapitza_pendulum.toml", "--every", "99").output
+    said = json.loads(eomc("run", "kapitza_pendulum.toml", "--json").output)["energy"]["balance"]
+    assert said["told"] and said["forces"] == pytest.approx(-1.71, abs=1e-3)
+
+
 def test_parameters_and_start_on_the_command_line(there: Path) -> None:
     words = ["--set", "m_c=1+2", "--start", "theta=pi/3", "--start", "x_dot=-l", "--json"]
     summary = json.loads(eomc("run", "cartpole.toml", "--duration", "0", *words).output)

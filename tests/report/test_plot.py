@@ -109,10 +109,16 @@ def test_jacobis_integral_is_drawn_beside_the_energy_where_it_is_another():
     jacobi = 7 + 1e-9 * np.sin(t)
     *_, axes, _ = plot.figure(made, t, q, qd, energy, jacobi=jacobi).axes
     lines = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
-    assert np.array_equal(lines["energy"], energy - energy[0])
-    assert np.array_equal(lines["Jacobi's integral"], jacobi - jacobi[0])
+    assert np.array_equal(lines["energy, not conserved"], energy - energy[0])
+    assert np.array_equal(lines["Jacobi's integral, conserved"], jacobi - jacobi[0])
     assert axes.get_ylabel() == "$E - E(0)$, $J - J(0)$ (J)" and axes.get_legend()
     assert r"Jacobi's integral: max $|J - J(0)|$ = $1\times10^{-9}$ J" in axes.get_title()
+    words = "forces took 2 J; numerical error 1e-09 J"
+    *_, axes, _ = plot.figure(made, t, q, qd, energy, jacobi=jacobi, words=words).axes
+    assert "Jacobi's integral: forces took 2 J\nnumerical error" in axes.get_title()
+    assert "Jacobi's integral" in {line.get_label() for line in axes.get_lines()}
+    *_, axes, _ = plot.figure(made, t, q, qd, energy, words=words).axes
+    assert axes.get_title().endswith("; forces took 2 J\nnumerical error 1e-09 J")
     still = plot.figure(made, t, q, qd, 0 * energy, jacobi=jacobi).axes[-2]
     assert still.get_ylim()[1] < 1e-8  # of the energy alone it would be 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 import time
@@ -21,6 +22,7 @@ from eomc.cli.pairs import pairs
 from eomc.cli.terminal import progress_bar, say, shown, status_line, warn
 
 if TYPE_CHECKING:
+    from eomc.runtime.balance import Balance
     from eomc.runtime.estimate import Estimate
     from eomc.runtime.trajectory import Run
 
@@ -81,17 +83,19 @@ def command(
             stopped = True
     if out:
         _write(out, done)
+    balance = done.balance() if own.has_power and seconds < 2 else None
     if plot:
         from eomc.report import plot as plots
 
         jacobi = done.jacobi if own.has_jacobi else None
         system, rows = pipeline.read(scene).at(values), (done.t, done.q, done.qd, done.energy)
-        plots.draw(system, *rows, plot, jacobi=jacobi, outputs=done.outputs)
-    summary = _summary(module, done, seconds, unstable, ends, plot=plot, out=out)
+        words = balance.words if balance else ""
+        plots.draw(system, *rows, plot, jacobi=jacobi, outputs=done.outputs, words=words)
+    summary = _summary(module, done, balance, seconds, unstable, ends, plot=plot, out=out)
     if as_json:
         say(json.dumps(summary, indent=1))
     elif not quiet:
-        _print_summary(module, done, summary)
+        _print_summary(module, done, balance, summary)
     if done.status != "ok":
         say(f"eomc: {done.message}", err=True)
     if stopped or done.status != "ok":
@@ -161,8 +165,8 @@ def _error(done: Run) -> dict[str, Any] | None:
 
 
 def _summary(
-    module: Any, done: Run, seconds: float, unstable: str | None, ends: str | None,
-    **files: Path | None,
+    module: Any, done: Run, balance: Balance | None, seconds: float, unstable: str | None,
+    ends: str | None, **files: Path | None,
 ) -> dict[str, Any]:  # fmt: skip
     import numpy as np
 
@@ -181,6 +185,7 @@ def _summary(
             "start": float(energy[0]),
             "end": float(energy[-1]),
             "largest_change": float(np.max(np.abs(energy - energy[0]))),
+            "balance": dataclasses.asdict(balance) if balance else None,
         },
         "saturated": _saturated(module, done),
         "jacobi_change": None
@@ -201,7 +206,9 @@ def _saturated(module: Any, done: Run) -> dict[str, float]:
     return {name: part for name, part in parts if part}
 
 
-def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
+def _print_summary(
+    module: Any, done: Run, balance: Balance | None, summary: Mapping[str, Any]
+) -> None:
     say(
         f"{shown(module.title)}: {done.steps} steps of {summary['method']}, h = {done.h:g} s, "
         f"to t = {done.t[-1]:g} s"
@@ -211,10 +218,7 @@ def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
         unit = texts.line(module.units.get(name, ""))
         rate = f"{unit}/s" if unit else ""
         say(f"  {name:{wide}} {q: .9g} {unit}   {name}_dot {qd: .9g} {rate}".rstrip())
-    change, jacobi = summary["energy"]["largest_change"], summary["jacobi_change"]
-    also = "" if jacobi is None else f"; Jacobi's integral by {jacobi:.2g} J"
-    end = summary["energy"]["end"]
-    say(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J{also}")
+    _print_energy(done, balance, summary)
     for name, part in summary["saturated"].items():
         say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
     for words in (summary["beyond_stability"], summary["beyond_duration"]):
@@ -226,6 +230,18 @@ def _print_summary(module: Any, done: Run, summary: Mapping[str, Any]) -> None:
     say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
     for file in summary["files"]:
         say(f"  wrote {shown(file)}")
+
+
+def _print_energy(done: Run, balance: Balance | None, summary: Mapping[str, Any]) -> None:
+    """What is conserved, or what was put in and lost of it; K + P apart where it is another."""
+    energy, jacobi = summary["energy"], summary["jacobi_change"]
+    end, change = energy["end"], energy["largest_change"]
+    if jacobi is not None:
+        say(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J; it is not conserved")
+        end, change = float(done.jacobi[-1]), jacobi
+    name = "energy K + P" if jacobi is None else "Jacobi's integral"
+    how = f": {balance.words}" if balance else f", changed by at most {change:.2g} J"
+    say(f"  {name} {end:.9g} J{how}")
 
 
 def _print_error(module: Any, error: Estimate) -> None:

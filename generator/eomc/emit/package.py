@@ -14,7 +14,7 @@ from eomc.emit.views import Binding, Bound, BoundMethod, Declarations, Face, Mai
 from eomc.integrators.tableaux import METHODS
 
 _OF_STEPS = ("Phi", "Gamma")
-TIMED = ("energy", "jacobi", "outputs")  # what runs ask for at each of their rows
+TIMED = ("energy", "jacobi", "tau", "power", "outputs")  # what runs ask for at each of their rows
 ROWS = 200  # of main.c, about
 FUNCTIONS = (
     "C D acceleration advice applied bias discretize energy equilibrium g jacobi kinetic_energy "
@@ -33,7 +33,9 @@ def main(target: Target) -> Main:
     s, public = target.system, Public(target)
     steps = max(1, math.ceil(s.run.duration / s.run.h * (1 - 1e-12)))
     names = [target.as_written(c.name) for c in s.coordinates]
-    method, energy = s.run.methods[0], public.evaluation("energy")
+    method, asked = s.run.methods[0], [o.name for o in s.outputs]
+    outputs = public.evaluation("outputs").call(u="NULL") if asked else ""
+    solved = asked and takes_qdd(target, "outputs")
     return Main(
         title=FreeText(s.title),
         stamp=tuple(stamp(target)),
@@ -45,13 +47,14 @@ def main(target: Target) -> Main:
         h=target.literal(s.run.h),
         steps=steps,
         every=max(1, steps // ROWS),
-        columns=("t", *names, *(f"{n}_dot" for n in names), "energy"),
+        columns=("t", *names, *(f"{n}_dot" for n in names), *asked, "energy"),
         run=public.run(method).call(
             t0="0", first="n", steps="next", u="NULL", u_stride="0", every="0", q_rows="NULL",
             qd_rows="NULL", memory="&memory", status="&status",
         ),
-        energy=energy.call(),
-        energy_at_end=energy.call(t=f"({target.real.name})steps*h"),
+        energy=public.evaluation("energy").call(),
+        outputs=outputs,
+        accelerations=public.acceleration.call(u="NULL") if solved else "",
     )  # fmt: skip
 
 

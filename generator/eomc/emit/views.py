@@ -12,7 +12,7 @@ from eomc.integrators.tableaux import Method
 
 @dataclass(frozen=True)
 class Main:
-    """c/main.c.jinja: the scene's own run. run, energy, energy_at_end: calls."""
+    """c/main.c.jinja: the scene's own run. run, energy, outputs: calls; accelerations: outputs'."""
 
     TEMPLATE: ClassVar[str] = "c/main.c"
     title: FreeText
@@ -28,7 +28,8 @@ class Main:
     columns: tuple[str, ...]
     run: str
     energy: str
-    energy_at_end: str
+    outputs: str
+    accelerations: str
 
 
 @dataclass(frozen=True)

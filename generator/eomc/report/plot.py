@@ -42,17 +42,18 @@ SAMPLES = 20_000  # of a run that are drawn, at most
 def draw(
     system: System, t: Array, q: Array, qd: Array, energy: Array, path: str | Path, *,
     jacobi: Array | None = None, title: str | None = None, outputs: Outputs = _NONE,
+    words: str = "",
 ) -> None:  # fmt: skip
     """Write the figure of a run to `path`; its suffix says how: .png, .svg or .pdf.
 
     t: (n,), s; q, qd: (n, nq); energy: (n,); jacobi: (n,), where it is not the energy; outputs:
-    (n,) by name. Raises EomcError without matplotlib, with another suffix, or where the file can't
-    be written.
+    (n,) by name; words: what was put in and lost. Raises EomcError without matplotlib, with another
+    suffix, or where the file can't be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise EomcError(f"{path}: a picture is written as {', '.join(SUFFIXES)}: end its name so")
-    made = figure(system, t, q, qd, energy, title, jacobi, outputs)
+    made = figure(system, t, q, qd, energy, title, jacobi, outputs, words)
     import matplotlib
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
@@ -65,7 +66,7 @@ def draw(
 
 def figure(
     system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None = None,
-    jacobi: Array | None = None, outputs: Outputs = _NONE,
+    jacobi: Array | None = None, outputs: Outputs = _NONE, words: str = "",
 ) -> Figure:  # fmt: skip
     """The figure of a run. t: (n,), s; q, qd: (n, nq); energy, jacobi, each of outputs: (n,)."""
     try:
@@ -74,7 +75,7 @@ def figure(
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
         name = title or system.title or system.name
-        return _figure(system, t, q, qd, energy, name, jacobi, outputs)
+        return _figure(system, t, q, qd, energy, name, jacobi, outputs, words)
 
 
 def _figure(
@@ -86,6 +87,7 @@ def _figure(
     title: str,
     jacobi: Array | None,
     outputs: Outputs,
+    words: str,
 ) -> Figure:
     from matplotlib.figure import Figure
 
@@ -114,7 +116,8 @@ def _figure(
         values = np.column_stack([np.asarray(outputs[o.name], float)[::every] for o in some])
         _against_time(axes, t, values, some, rate=False, kind="outputs")
     axes = made.add_subplot(grid[-1, :2], sharex=first)
-    _energy(axes, t, energy, jacobi, "J" if any(c.unit for c in system.coordinates) else "")
+    unit = "J" if any(c.unit for c in system.coordinates) else ""
+    _energy(axes, t, energy, jacobi, unit, words)
     axes.set_xlabel("$t$ (s)")
     if len(t) > 1 and t[-1] > t[0]:
         axes.set_xlim(t[0], t[-1])  # and of all that share it
@@ -206,28 +209,31 @@ def _against_time(
                     bbox_to_anchor=(1.0, 0.5), handlelength=1.0, borderaxespad=0.2)  # fmt: skip
 
 
-def _energy(axes: Axes, t: Array, energy: Array, jacobi: Array | None, unit: str) -> None:
+def _energy(
+    axes: Axes, t: Array, energy: Array, jacobi: Array | None, unit: str, words: str
+) -> None:
     """E, or E - E(0) where it is conserved so well that E would be a straight line.
 
-    Where Jacobi's integral J is another, both from where they start.
+    Where Jacobi's integral J is another, both from where they start. words: where it went.
     """
     change = energy - energy[:1]
     drift = float(np.max(np.abs(change), initial=0.0))
     conserved = jacobi is not None or drift <= 0.01 * float(np.max(np.abs(energy), initial=0.0))
-    axes.plot(t, change if conserved else energy, color=INK, label="energy")
-    label, more = "$E - E(0)$" if conserved else "$E$", ""
+    axes.plot(t, change if conserved else energy, color=INK, label="energy, not conserved")
+    label = "$E - E(0)$" if conserved else "$E$"
+    told, of = f", max $|E - E(0)|$ = {_quantity(drift, unit, 2)}", ""
     if jacobi is not None:
-        other = jacobi - jacobi[:1]
-        axes.plot(t, other, color=COLOURS[1], label="Jacobi's integral")
+        other, of = jacobi - jacobi[:1], "Jacobi's integral: "
+        axes.plot(t, other, color=COLOURS[1], label=of[:-2] + ("" if words else ", conserved"))
         axes.legend(fontsize=8, frameon=False, loc="upper left")
         label = "$E - E(0)$, $J - J(0)$"
-        largest = float(np.max(np.abs(other), initial=0.0))
-        more = f"; Jacobi's integral: max $|J - J(0)|$ = {_quantity(largest, unit, 2)}"
+        told += f"; {of}max $|J - J(0)|$ = {_quantity(float(np.abs(other).max()), unit, 2)}"
+    if words:
+        told = "; " + of + texts.figure(words).replace("; ", "\n")
     _plain(axes)
     axes.set_ylabel(_with_unit(label, unit))
     start = _quantity(float(energy[0]), unit) if len(energy) else "?"
-    title = f"Energy: $E(0)$ = {start}, max $|E - E(0)|$ = {_quantity(drift, unit, 2)}"
-    axes.set_title(title + more, fontsize=10, color=INK)
+    axes.set_title(f"Energy: $E(0)$ = {start}{told}", fontsize=10, color=INK)
     if drift == 0 and jacobi is None:
         axes.set_ylim(-1, 1)
 

@@ -150,6 +150,11 @@ class Functions(Arguments):
         """Whether Jacobi's integral is another than the energy: K is not purely quadratic in qd."""
         return hasattr(self._lib, "jacobi")
 
+    @property
+    def has_power(self) -> bool:
+        """Whether energy, or Jacobi's integral, is put in or lost: there are forces or the time."""
+        return hasattr(self._lib, "power")
+
     def power(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None, out: Any = None,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .arguments import Array
+from .balance import Balance, balance
 from .columns import Columns
 from .estimate import Estimate, estimate
 from .package import reduced
@@ -151,6 +152,13 @@ class Run(Columns):
         Else, as in a frame that is turned, this is what is conserved where there is no power.
         """
         return self._values("jacobi")
+
+    def balance(self) -> Balance | None:
+        """What inputs and forces put in and what was lost, J, and the error that this leaves.
+
+        None where inputs are held that the rows or the power's formula don't tell: take every=1.
+        """
+        return balance(self)
 
     @cached_property
     def outputs(self) -> dict[str, Array]:

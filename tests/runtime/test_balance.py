@@ -1,0 +1,142 @@
+"""Where a run's energy went: against exact integrals, and honest where rows are far apart."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from itertools import pairwise
+from types import ModuleType
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+from eomc.runtime.balance import _work as work
+
+SPRING = """
+eomc = 1
+name = "pushed"
+[coordinates]
+x = { unit = "m", start = 1.0 }
+[parameters]
+c = 0.4
+a = 0.0
+[inputs]
+u = { unit = "N" }
+[energy]
+kinetic     = "x_dot**2/2"
+potential   = "2*x**2"
+dissipation = "c*x_dot**2/2"
+[forces]
+x = "u + a*cos(t)"
+[run]
+h        = 0.02
+duration = 10.0
+"""
+EXACT = {"h": 0.0005, "duration": 10.0}
+
+
+@pytest.fixture
+def pushed(modules: Modules) -> ModuleType:
+    """A mass on a damped spring, with an input and a force that moves with time."""
+    return modules.unoptimised(SPRING)
+
+
+def test_a_damped_spring_loses_what_is_exact(pushed: ModuleType) -> None:
+    """x = e^(-d t) (cos w t + d/w sin w t), d = c/2: all that is lost is the fall of the energy."""
+    d, T = 0.2, 10.0
+    w = math.sqrt(4 - d**2)
+    x = math.exp(-d * T) * (math.cos(w * T) + d / w * math.sin(w * T))
+    v = -math.exp(-d * T) * 4 / w * math.sin(w * T)
+    lost = 2 - (v**2 / 2 + 2 * x**2)
+    balance = pushed.simulate().balance()
+    assert balance.told and balance.inputs == balance.forces == 0
+    assert abs(balance.lost - lost) < 1e-6
+    assert abs(pushed.simulate(**EXACT).balance().lost - lost) < 1e-12
+    assert balance.words.startswith(f"{lost:.3g} J were lost; numerical error 1")
+
+
+def test_inputs_and_forces_are_told_apart(pushed: ModuleType) -> None:
+    """A constant push does u (x(T) - x(0)); the signal's default does nothing."""
+    still = pushed.simulate(params={"a": 0.7}).balance()
+    run = pushed.simulate(params={"a": 0.7}, u=[3.0])
+    balance = run.balance()
+    rows = pushed.simulate(**EXACT, params={"a": 0.7})
+    assert still.inputs == 0
+    assert still.forces == pytest.approx(
+        np.trapezoid(0.7 * np.cos(rows.t) * rows.qd[:, 0], rows.t), rel=1e-5
+    )
+    assert balance.inputs == pytest.approx(3 * (run.q[-1, 0] - run.q[0, 0]), rel=1e-6)
+    change = run.energy[-1] - run.energy[0]
+    work = balance.inputs + balance.forces - balance.lost
+    assert abs(work - change) <= balance.left + 1e-14
+    assert "inputs took 1.38 J, forces put in 0.0673 J, 0.101 J were lost; " in balance.words
+
+
+@pytest.mark.parametrize("params", [{}, {"c": 2.0, "a": 5.0}])
+def test_what_is_left_is_the_error_of_the_method(
+    pushed: ModuleType, params: dict[str, float]
+) -> None:
+    """It falls by sixteen and more where h is halved, and is that of the energy along the run."""
+    left = [pushed.simulate(h=h, duration=8.0, params=params).balance() for h in (0.04, 0.02, 0.01)]
+    assert all(b.left > 10 * b.unsure for b in left)
+    for one, other in pairwise(left):
+        assert 14 < one.left / other.left < 40
+
+
+@pytest.mark.parametrize("rows", [20, 33, 60, 100, 200, 500, 3000])
+@pytest.mark.parametrize("sharp", [1.0, 10.0, 300.0])
+def test_an_integral_is_off_by_no_more_than_is_said(rows: int, sharp: float) -> None:
+    """Of cos t tanh(sharp sin t) over ten seconds: a friction that is or is not resolved."""
+
+    def exact(t: np.ndarray) -> np.ndarray:
+        return np.log(np.cosh(sharp * np.sin(t))) / sharp
+
+    t = np.minimum(np.arange(rows + 1) * 10 / (rows - 0.6), 10.0)  # the last step is a shorter one
+    sums, unsure = work(t, np.cos(t) * np.tanh(sharp * np.sin(t)))
+    assert np.max(np.abs(sums - exact(t))) <= unsure + 1e-15  # rounding
+    assert unsure < 1e-7 or sharp > 1 or rows < 200
+
+
+def test_of_few_steps_nothing_is_told(pushed: ModuleType) -> None:
+    balance = pushed.simulate(h=0.9, steps=12).balance()
+    assert not balance.told
+    assert balance.words == "steps are too long to tell what was put in and what was lost"
+
+
+def test_rows_that_were_not_kept_are_made_again(pushed: ModuleType) -> None:
+    assert pushed.simulate(every=50).balance() == pushed.simulate().balance()
+
+
+def test_a_conservative_run_has_its_error_only(cartpole: ModuleType) -> None:
+    run = cartpole.simulate()
+    balance = run.balance()
+    assert (balance.inputs, balance.forces, balance.lost) == (0, 0, 0)
+    assert balance.left == np.max(np.abs(run.energy - run.energy[0])) > 1e-9
+    assert balance.told and balance.words.startswith("nothing was put in or lost; numerical error")
+    assert not cartpole._model.has_power
+
+
+def test_where_jacobis_integral_is_conserved_its_balance_is_told(modules: Modules) -> None:
+    run = modules("kapitza_pendulum").simulate(duration=2.0)
+    balance = run.balance()
+    assert balance.forces == pytest.approx(run.jacobi[-1] - run.jacobi[0], abs=2 * balance.left)
+    assert balance.told and balance.left < 1e-7 and balance.lost == 0
+
+
+def test_inputs_that_change_from_step_to_step_have_none(pushed: ModuleType) -> None:
+    assert pushed.simulate(steps=20, u=np.ones((20, 1))).balance() is None
+    with pytest.warns(RuntimeWarning, match="a Python function"):
+        run = pushed.simulate(steps=20, u=lambda t, q, qd: [-qd[0]])
+    assert run.balance() is None
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2, 3, 9])
+def test_short_runs_have_one(pushed: ModuleType, steps: int) -> None:
+    balance = pushed.simulate(steps=steps, every=2).balance()
+    assert math.isfinite(balance.left) and math.isfinite(balance.unsure)
+
+
+def test_a_balance_travels(pushed: ModuleType) -> None:
+    balance = pushed.simulate(steps=30).balance()
+    assert pickle.loads(pickle.dumps(balance)) == balance
