@@ -210,6 +210,39 @@ def test_pieces_that_jump_are_refused(pieces: Any, said: str) -> None:
         System.make("a", [x], x_dot**2 / 2, inputs=[u], forces={x: sympy.Piecewise(*pieces)})
 
 
+a, b, k = sympy.Symbol("a", positive=True), sympy.Symbol("b", nonnegative=True), sympy.Symbol("k")
+BETWEEN = {
+    "dead band": ((k * (x + a), x < -a), (k * (x - a), x > a), (0, True)),
+    "from above": ((k * (x - a), x > a), (k * (x + a), x < -a), (0, True)),
+    "saturation": ((-k * a, x < -a), (k * x, x < a), (k * a, True)),
+    "apart": ((k * (x + b), x <= -b), (k * (x - a), x >= a), (0, True)),
+    "stretched": ((x + a, 2 * x < -2 * a), (x - b, 3 * x > 3 * b), (0, True)),
+    "shifted": ((0, x < k), (x - k, x < k + a), (a, True)),
+}
+
+
+@pytest.mark.parametrize("pieces", BETWEEN.values(), ids=list(BETWEEN))
+def test_pieces_between_thresholds_of_known_order(pieces: Any) -> None:
+    """-a < a is known where a is a positive symbol."""
+    given = sympy.Piecewise(*pieces)
+    made = System.make("a", [x], x_dot**2 / 2, given, parameters={a: 0.5, b: 0.25, k: 3}).potential
+    assert not made.has(sympy.Piecewise, sympy.Heaviside)
+    for at in (-3.0, -0.5, -0.4, 0.0, 0.1, 0.25, 0.5, 0.7, 1.0, 2.5, 3.1, 3.5, 8.0):
+        values = {"x": at, "a": 0.5, "b": 0.25, "k": 3.0}
+        right = float(given.subs({a: 0.5, b: 0.25, k: 3.0}).subs(x, at))
+        found = float(made.subs({s: values[s.name] for s in made.free_symbols}))
+        assert found == pytest.approx(right, rel=1e-14, abs=1e-14)
+
+
+def test_thresholds_of_unknown_order_are_refused_with_the_remedy() -> None:
+    free = sympy.Symbol("a", real=True)
+    dead = sympy.Piecewise((x + free, x < -free), (x - free, x > free), (0, True))
+    with pytest.raises(EomcError, match=r"; Symbol\('a', positive=True\) tells an order"):
+        System.make("a", [x], x_dot**2 / 2, dead, parameters={free: 1})
+    with pytest.raises(EomcError, match="parameter a: its symbol can't be negative, here -1"):
+        System.make("a", [x], x_dot**2 / 2, a * x, parameters={a: -1})
+
+
 def test_a_derivative_that_waits_is_done() -> None:
     q, t = dynamicsymbols("x"), dynamicsymbols._t
     made = System.make("a", [q], sympy.Derivative(q**2, t) ** 2)

@@ -37,6 +37,7 @@ class Maker:
         self.map: dict[Any, Expr] = {}
         self.taken: dict[str, Any] = {}
         self.renamed: list[tuple[str, str]] = []
+        self.fixed: dict[Symbol, bool] = {}  # parameters, and whether they are never negative
 
     def _name_of(self, one: Any, role: str) -> str:
         if not isinstance(one, (Symbol, AppliedUndef)):
@@ -84,6 +85,16 @@ class Maker:
         given.check_functions(expr, role)
         return expr
 
+    def _parameter(self, one: Any, given_value: Any, units: Mapping[str, str]) -> Parameter:
+        value = given.number(given_value, f"parameter {one}")
+        never_negative = getattr(one, "is_nonnegative", None) is True
+        if never_negative and value < 0:
+            raise given.fault(f"parameter {one}", f"its symbol can't be negative, here {value:g}")
+        unit = units.get(given.name_of(one), "")
+        declared = Parameter(self._declare(one, "parameter"), value, unit)
+        self.fixed[declared.symbol] = never_negative
+        return declared
+
     def make(
         self, of: type[System], coordinates: Any, kinetic: Any, potential: Any,
         parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
@@ -117,12 +128,7 @@ class Maker:
                 if one == symbol(one.name):
                     self.map[Symbol(one.name)], self.map[Symbol(f"{one}_dot")] = c.q, c.qd
             made.append(c)
-        declared = []
-        for p, v in parameters.items():
-            value = given.number(v, f"parameter {p}")
-            unit = units.get(given.name_of(p), "")
-            declared.append(Parameter(self._declare(p, "parameter"), value, unit))
-        self.fixed = {p.symbol for p in declared}
+        declared = [self._parameter(p, v, units) for p, v in parameters.items()]
         pending = given.symbols(inputs, "inputs", 0)
         given_inputs = {i: self._declare(i, "input") for i in pending}
         ends = self._limits(limits, pending, declared)
@@ -140,7 +146,7 @@ class Maker:
         given_energies = {"kinetic": kinetic, "potential": potential, "dissipation": dissipation}
         energies = {role: expression(energy, role) for role, energy in given_energies.items()}
         for role, energy in energies.items():
-            given.check_smooth(energy, role, dict(ordered), self.fixed)
+            given.check_smooth(energy, role, dict(ordered), self.fixed.keys())
         made_of: dict[str, Any] = {
             "name": self.name,
             "coordinates": tuple(made),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import sympy
@@ -27,18 +27,16 @@ class JumpError(ValueError):
     """A Piecewise whose pieces do not meet, or can't be seen to."""
 
 
-def rewritten(expr: Expr, fixed: Collection[Symbol]) -> Expr:
-    """The same function in the words of the formula language. fixed: symbols that do not vary.
+def rewritten(expr: Expr, fixed: Mapping[Symbol, bool]) -> Expr:
+    """The same function in the words of the formula language.
 
-    Raises JumpError.
+    fixed: symbols that do not vary, and whether each is known not to be negative. Raises JumpError.
     """
     expr = expr.replace(lambda e: type(e) in _AS, lambda e: _AS[type(e)](*e.args))
-    return expr.replace(
-        lambda e: isinstance(e, sympy.Piecewise), lambda e: _continuous(e, frozenset(fixed))
-    )
+    return expr.replace(lambda e: isinstance(e, sympy.Piecewise), lambda e: _continuous(e, fixed))
 
 
-def _continuous(given: sympy.Piecewise, fixed: frozenset[Symbol]) -> Expr:
+def _continuous(given: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Expr:
     """A Piecewise whose pieces meet, as a sum of products with Max.
 
     From the last piece on: where d > 0 a piece takes the place of another, and where their
@@ -52,22 +50,38 @@ def _continuous(given: sympy.Piecewise, fixed: frozenset[Symbol]) -> Expr:
         if not isinstance(condition, _ORDERS):
             raise JumpError(f"{condition} in a Piecewise can't be used: write x > a or x < a")
         d = condition.gts - condition.lts
-        other = _there(condition, given.args[k + 1 :])
+        other = _there(condition, given.args[k + 1 :], fixed)
         q = sympy.cancel((piece - other) / d) if other is not None else sympy.zoo
-        if q.has(sympy.zoo, sympy.nan) or not sympy.fraction(q)[1].free_symbols <= fixed:
+        if q.has(sympy.zoo, sympy.nan) or not sympy.fraction(q)[1].free_symbols <= fixed.keys():
+            unknown = [str(s) for s in fixed if s in condition.free_symbols and not fixed[s]]
+            order = f"; Symbol('{unknown[0]}', positive=True) tells an order" if unknown else ""
             raise JumpError(
                 f"{given} jumps where {d} = 0, or can't be seen not to: write Heaviside({d}), "
-                "which is 1/2 there, or Max, Min or a smooth tanh"
+                f"which is 1/2 there, or Max, Min or a smooth tanh{order}"
             )
         made += q * sympy.Max(d, 0)
     return made
 
 
-def _there(condition: Any, later: Any) -> Expr | None:
+def _there(condition: Any, later: Any, fixed: Mapping[Symbol, bool]) -> Expr | None:
     """Which of the later pieces holds where a condition does; None where that is not clear."""
     for piece, other in later:
-        if sympy.And(condition, sympy.Not(other)).simplify() == sympy.false:
+        if _never_both(condition, sympy.Not(other), fixed):
             return piece
-        if sympy.And(condition, other).simplify() != sympy.false:
+        if not _never_both(condition, other, fixed):
             return None
     return None
+
+
+def _never_both(one: Any, other: Any, fixed: Mapping[Symbol, bool]) -> bool:
+    """Whether two conditions exclude one another: for d > 0 and e > 0, d + s e <= 0 with s > 0."""
+    if isinstance(one, _ORDERS) and isinstance(other, _ORDERS):
+        (d, varying), (e, against) = (
+            (x.gts - x.lts).expand().as_independent(*x.free_symbols - fixed.keys(), as_Add=True)
+            for x in (one, other)
+        )
+        s = -sympy.cancel(varying / against) if against != 0 else sympy.S.Zero
+        known = {x: sympy.Dummy(x.name, nonnegative=True) for x in fixed if fixed[x]}
+        if s.is_positive and sympy.expand(d + s * e).xreplace(known).is_nonpositive:
+            return True
+    return bool(sympy.And(one, other).simplify() == sympy.false)
