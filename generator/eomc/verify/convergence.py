@@ -188,11 +188,22 @@ class Convergence:
             if not math.isnan(best := one.best(least)):
                 return best
             if abs(one.settled - before) <= ALIKE:  # and nan is not
-                return one.settled
+                if not self._bends(at, method, one.span):
+                    return one.settled
+                moved = True
             before, moved = one.settled, moved or not one.exact
         if not any(ladders.values()):
             raise RuntimeError(f"no run by {method} gets to its end")
         return math.nan if moved else math.inf
+
+    def _bends(self, at: Place, method: str, span: float) -> bool:
+        """Whether another method is of a low order over a span too: steps leap over a bend."""
+        for other in self.methods:
+            least = min(METHODS[other].order, SEEN) - ORDER_MARGIN
+            one = self._ladder(at, other, span) if other != method else None
+            if one and math.isnan(one.best(least)) and one.settled < least:
+                return True
+        return False
 
     def _ladder(self, at: Place, method: str, span: float) -> _Ladder | None:
         ends = [self.end(at.state, method, span, n) for n in COUNTS]

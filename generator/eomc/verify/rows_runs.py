@@ -117,7 +117,18 @@ class Runs:
         self.sampler, self.random = check.sampler, np.random.default_rng(7)
         self.states = [e.state for e in check.few(2)]
         self.few = FEWER if check.large else FEW
-        self.turning = [replace(s, qd=k * s.qd) for s in self.states for k in SPEEDS]
+        faster = [replace(s, qd=k * s.qd) for s in self.states for k in SPEEDS]
+        self.turning = [s for s in faster if self._moves(s)]
+
+    def _moves(self, s: State) -> bool:
+        """Whether accelerations are finite there: single precision overflows sooner."""
+        if self.check.dtype == np.float64:
+            return True
+        try:
+            self.check.ask("acceleration", s)
+        except ArithmeticError:
+            return False
+        return True
 
     def report(self) -> None:
         """Add them."""
@@ -327,7 +338,7 @@ class Runs:
         rows[:, : last + 1] = kept
         wrong = (not pieces.same(whole)) + (not sparse.same(replace(whole, rows=rows)))
         # a state that is another than was left has no memory
-        by = 1e-3 * float(self.sampler.spread[0])
+        by = max(1e-3 * float(self.sampler.spread[0]), 64 * self.check.eps)
         moved, anew = (
             drive(self.model, method, s, h, CUTS[3], cuts=CUTS, moved=by, anew=anew)
             for anew in (False, True)
