@@ -96,7 +96,7 @@ def test_batches_take_a_row_a_period(balanced: ModuleType) -> None:
         run = balanced.simulate(u=table[k], steps=41, every=3, control_period=0.02)
         assert runs.q[k] == pytest.approx(run.q, rel=1e-11, abs=1e-12)
         assert np.array_equal(runs.u[k], run.u)
-    for u in (None, [1.0, 0.0], table[:, 0], {"force": table[:, :, 0], "wind": 0.5}):
+    for u in ([1.0, 0.0], table[:, 0], {"force": table[:, :, 0], "wind": 0.5}):
         balanced.simulate_batch(u=u, steps=41, control_period=0.02)
 
 
@@ -126,6 +126,11 @@ def test_periods_are_whole_numbers_of_steps(balanced: ModuleType, period: Any, w
     for call in (balanced.simulate, balanced.simulate_batch):
         with pytest.raises(ValueError, match=words):
             call(steps=8, control_period=period)
+
+
+def test_a_batch_can_not_read_signals_once_a_period(balanced: ModuleType) -> None:
+    with pytest.raises(ValueError, match="a batch follows the signals: give u, a row a period"):
+        balanced.simulate_batch(steps=40, control_period=0.02)
 
 
 def test_a_row_too_few_is_told(balanced: ModuleType) -> None:

@@ -323,7 +323,7 @@ def test_linearize_is_the_slope_of_the_acceleration(modules: Modules) -> None:
     # differences over 2e-6 of values below 100: off by d^2 and by rounding, 1e-16*100/1e-6
     np.testing.assert_allclose(np.hstack([A, B]), np.transpose(slopes), rtol=1e-7, atol=1e-7)
     with pytest.raises(ValueError, match="expected"):
-        module.linearize(q[None], qd[None], u)
+        module.linearize(q[None, None], qd[None, None], u)
 
 
 @pytest.mark.parametrize(

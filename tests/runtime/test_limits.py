@@ -195,3 +195,10 @@ def test_the_check_finds_what_does_not_hold_them(limited: ModuleType, wrong: boo
     rows_limits.report(of, None)
     (row,) = of.rows
     assert row.name == "limits of inputs" and row.passed is not wrong, row
+
+
+def test_batches_bound_a_register_at_once() -> None:
+    """Not number by number, which took three to six times as long as the whole step."""
+    files = eomc.sources(from_scene(parse(BATCH, "test.toml"))).files
+    assert "limited_fmax_wide(" in files["fast/limited.c"]
+    assert "fmax(x[i]" not in files["fast/limited.c"]

@@ -240,6 +240,8 @@ class BatchModel(Model):
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
         hold = as_period(control_period, h)
+        if u is None and control_period is not None and self.nu:
+            raise ValueError("control_period: a batch follows the signals: give u, a row a period")
         starts, table, held, count = self._instances(q0, qd0, params, u, -(-steps // hold))
         if held is not None and hold > 1 and held.shape[1] > 1:
             held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])

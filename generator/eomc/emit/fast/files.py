@@ -192,6 +192,7 @@ def _library_text(lane: Lane, show: Show) -> str:
             inline=lane.qualifiers[INLINE],
             lane=lane.real.name,
             L=lane.end,
+            mask=lane.mask,
             count=f"{lane.target.PREFIX}_{lane.name.upper()}_COUNT",
             calls=tuple(_library(lane.accelerations, n) for n in lane.calls),
         )

@@ -54,6 +54,7 @@ class LibraryText:
     inline: str
     lane: str
     L: str
+    mask: str
     count: str
     calls: tuple[Library, ...]
 
