@@ -104,6 +104,42 @@ def test_the_environment_is_what_gymnasium_expects(monkeypatch: pytest.MonkeyPat
     assert info["episode"]["l"][over].min() > 5
 
 
+def test_the_path_of_the_tip_is_in_the_file() -> None:
+    text = said("tip_path.py")
+    table = np.genfromtxt(FOLDER / "path.csv", delimiter=",", names=True)
+    (x, y, fastest), (change,) = (
+        numbers(text, r"x = (\S+) m, y = (\S+) m; fastest (\S+)"),
+        numbers(text, r"changed by (\S+) J"),
+    )
+    assert len(table) == 251 and change < 1e-5
+    assert (table["x"][-1], table["y"][-1]) == pytest.approx((x, y), abs=1e-6)
+    assert table["speed"].max() == pytest.approx(fastest, abs=1e-3)
+    upper, lower = table["upper_angle"], table["upper_angle"] + table["lower_angle"]
+    assert table["x"] == pytest.approx(np.sin(upper) + np.sin(lower), abs=1e-12)
+    assert table["y"] == pytest.approx(-np.cos(upper) - np.cos(lower), abs=1e-12)
+
+
+@pytest.mark.slow
+def test_an_arm_is_held_and_pushed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mujoco", reason="robot files come with pip install 'eomc[robots]'")
+    from robots.test_robots_mujoco import robot_data
+
+    file = robot_data("/ur5_robot.urdf")
+    (tmp_path / file.name).write_bytes(file.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    script = EXAMPLES / "arm.py"
+    first, second = re.findall(
+        r"^    (eomc import .*)\n    (printf .*)$", script.read_text(), re.M
+    )[0]
+    eomc = f"{sys.executable} -m {first}"
+    for command in (eomc, second, f"{sys.executable} -W error {script} ur5.toml"):
+        done = subprocess.run(command, shell=True, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    assert numbers(done.stdout, r"then: (\S+) rad")[0] < 1e-10
+    assert numbers(done.stdout, r"f to (\S+) N m")[0] < 1e-12
+    assert "[ 0.   0.   0.1  0.   0.   0. ]" in done.stdout.replace("-0. ", " 0. ")
+
+
 def test_the_documents_name_each() -> None:
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     for file in sorted(EXAMPLES.iterdir()):

@@ -1,0 +1,61 @@
+"""Poses, velocities, Jacobians and inverse dynamics of robot files, as Pinocchio has them.
+
+Where Pinocchio is installed (pip install pin), which the tests' own environment does not do: there
+MuJoCo is the judge (test_frames_mujoco.py).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pinocchio = pytest.importorskip("pinocchio", reason="Pinocchio is not installed")
+from robots.test_frames_mujoco import FIXED, Ours, near  # noqa: E402
+from robots.test_robots_mujoco import from_urdf, robot_data, stripped  # noqa: E402
+
+from eomc.derive.inverse_dynamics import inverse_dynamics  # noqa: E402
+from eomc.robots.scene_text import finished  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_robots(name: str, tmp_path: Path) -> None:
+    both = from_urdf(f"/{name}.urdf", tmp_path, fuse=False)
+    ours, bodies = Ours(both.text()), finished(both.robot).bodies
+    order = sorted(range(len(bodies)), key=lambda k: bodies[k].point)
+    model = pinocchio.buildModelFromUrdf(str(stripped(robot_data(f"/{name}.urdf"), tmp_path)))
+    data, n = model.createData(), model.nv
+    random = np.random.default_rng(7)
+    q, qd, qdd = random.uniform(-1, 1, (3, n))
+    at, v, a, places = np.zeros(model.nq), np.zeros(n), np.zeros(n), []
+    for k, motion in enumerate(both.robot.motions):
+        joint = model.joints[model.getJointId(motion.name)]
+        places.append(joint.idx_v)
+        v[joint.idx_v], a[joint.idx_v] = qd[k], qdd[k]
+        turns = [math.cos(q[k]), math.sin(q[k])] if joint.nq == 2 else [q[k]]
+        at[joint.idx_q : joint.idx_q + joint.nq] = turns
+    found = ours.values(*inverse_dynamics(ours.system), q, qd, qdd)
+    near(found, pinocchio.rnea(model, data, at, v, a)[places], "inverse dynamics")
+
+    pinocchio.forwardKinematics(model, data, at, v, a)
+    pinocchio.computeJointJacobians(model, data, at)
+    pinocchio.updateFramePlacements(model, data)
+    poses, velocities = ours.frames("poses", q), ours.frames("velocities", q, qd)
+    accelerations = ours.frames("accelerations", q, qd, qdd)
+    jacobians = ours.frames("jacobians", q).reshape(len(order), 6, n)
+    world = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for row, k in enumerate(order):
+        body = both.robot.bodies[k].name
+        frame = model.getFrameId(body, pinocchio.FrameType.BODY)
+        pose = data.oMf[frame]
+        near(poses[row], np.hstack([pose.translation, pose.rotation.ravel()]), body, 1.0)
+        there = pinocchio.getFrameVelocity(model, data, frame, world).vector
+        near(velocities[row], there, body, 1.0)
+        there = pinocchio.getFrameClassicalAcceleration(model, data, frame, world).vector
+        near(accelerations[row], there, body, 1.0)
+        J = pinocchio.getFrameJacobian(model, data, frame, world)
+        near(jacobians[row], J[:, places], body, 1.0)
