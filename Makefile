@@ -49,6 +49,7 @@ golden: .venv/dev
 bench: build/bench/done
 	build/bench/bin/python benchmarks/loop.py
 	build/bench/bin/python benchmarks/peers.py
+	build/bench/bin/python benchmarks/bodies.py
 	build/bench/bin/python benchmarks/digits.py
 
 build/bench/done: pyproject.toml benchmarks/requirements.txt
