@@ -205,10 +205,15 @@ def test_a_wrong_weight_is_found_by_check(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", tiers(["cartpole", "everything"], "cartpole"))
-@pytest.mark.parametrize("form", tiers(["plain", "fast"], "plain"))
+@pytest.mark.parametrize("form", tiers(["plain", "fast", "mixed"], "plain", "mixed"))
 def test_example_and_self_test_serve_both_forms(name: str, form: str, tmp_path: Path) -> None:
+    """Mixed: the program sees the header of the one form, and is linked with the other's source."""
     title = kit(name, tmp_path)
     at = "." if form == "plain" else "fast"
+    if form == "mixed":
+        shown = (tmp_path / "main.c").read_text().replace(f"<{title}.h>", f'"{title}.h"')
+        assert f'"{title}.h"' in shown
+        (tmp_path / "main.c").write_text(shown)
     source = f"{at}/{title}.c"
     run("cc", "-std=c99", "-O0", f"-I{at}", "selftest.c", source, "-lm", cwd=tmp_path)
     assert re.fullmatch(rf"{title}: right in \d states\n", run("./a.out", cwd=tmp_path))

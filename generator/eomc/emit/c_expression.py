@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -17,6 +17,7 @@ from eomc.program.ir import Call, Function, Operand, Product, Sum, Value, rename
 from eomc.program.trig import pair_of
 
 MOST_INLINE = 5  # operations; longer expressions get a name of their own
+SEVERAL, FOUR = 3, 4  # angles from which on sines are taken side by side; so many at once
 
 # what C calls the functions of a program
 C_NAMES = {
@@ -234,12 +235,14 @@ def body(
     pivots: int = 0,
     in_order: bool = False,
     reserved: frozenset[str] = frozenset(),
+    together: bool = False,
 ) -> Body:
     """The statements of a function.
 
     where: how each name from outside is written (`m_c` -> `p->m_c`).
     stored: where values go that are no locals. pivots: how many the whole has, if this is a part.
-    in_order: terms of sums stay in their order. reserved: names that no value gets.
+    in_order: terms of sums stay in their order. reserved: names that no value gets. together: the
+    sines of several angles are computed side by side.
     """
     stored = stored or {}
     inline = _inlined(function)
@@ -267,10 +270,15 @@ def body(
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             angles.setdefault(a.value.args, {})[a.value.function] = a.name
     sincos = real.reach > 0 and bool(angles)
+    side_by_side = several(function) if together else {}
     lines: dict[Stage, list[str]] = {stage: [] for stage in _STAGE_COMMENTS}
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
-            if names := angles.pop(a.value.args, None):
+            group = side_by_side.get(a.value.args[0], ())
+            if group and a.value.args in angles:
+                taken = {angle: angles.pop((angle,)) for angle in group}
+                lines[a.stage] += _sincos_several(printer, taken, set_to)
+            elif names := angles.pop(a.value.args, None):
                 lines[a.stage] += _sincos(printer, a.value.args[0], names, stored)
             continue
         text, strength = printer.value(a.value)
@@ -332,6 +340,41 @@ def _sincos(
         if real.lane
         else f"{printer.prefix}_sincos{suffix}({argument}, {both});",
     ]
+
+
+def several(function: Function) -> Mapping[Operand, Sequence[Operand]]:
+    """Angles that come from outside, each with those of its stage, where they are SEVERAL."""
+    made = {a.name for a in (*function.early, *function.body)}
+    by_stage: dict[Stage, dict[Operand, None]] = {}
+    for a in function.body:
+        if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
+            (angle,) = a.value.args
+            if angle.name and angle.name not in made:
+                by_stage.setdefault(a.stage, {})[angle] = None
+    groups = [tuple(group) for group in by_stage.values() if len(group) >= SEVERAL]
+    return {angle: group for group in groups for angle in group}
+
+
+def _sincos_several(
+    printer: Printer,
+    angles: Mapping[Operand, Mapping[str, str]],
+    set_to: Callable[[str, str], str],
+) -> list[str]:
+    lane, lines, groups = f"{printer.prefix}_four", list[str](), list(angles.items())
+    for first in range(0, len(groups), FOUR):
+        some, j = groups[first : first + FOUR], first // FOUR + 1
+        x, s, c = (f"{what}{j}_" for what in ("angles", "sines", "cosines"))
+        arguments = ", ".join(printer.operand(angle) for angle, _ in some)
+        lines += [
+            f"{lane} {x} = {{ {arguments} }}, {s}, {c};",
+            f"{printer.prefix}_sincos_each_four(&{x}, &{s}, &{c});",
+            *(
+                set_to(name, f"{ {'sin': s, 'cos': c}[f] }[{k}]")
+                for k, (_, names) in enumerate(some)
+                for f, name in names.items()
+            ),
+        ]
+    return lines
 
 
 def _inlined(function: Function) -> frozenset[str]:

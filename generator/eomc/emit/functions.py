@@ -12,7 +12,7 @@ from functools import cached_property
 
 from eomc.emit import c_function as c
 from eomc.emit import heading
-from eomc.emit.c_expression import REALS, Block, Body, Real
+from eomc.emit.c_expression import REALS, Block, Body, Real, several
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, sentence, unclashed
 from eomc.emit.evaluations import KINDS, doc, source
@@ -53,6 +53,16 @@ class Functions:
     def names(self) -> dict[str, str]:
         """What nearly every view begins with."""
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
+
+    @property
+    def together(self) -> bool:
+        """Whether sines of several angles are computed side by side."""
+        return self.target.real.reach > 0
+
+    @property
+    def several(self) -> bool:
+        """Whether a function has several angles of which that holds."""
+        return self.together and any(map(several, self.target.program.functions.values()))
 
     @property
     def NQ(self) -> str:
@@ -156,7 +166,7 @@ class Functions:
 
     def straight(self, function: Function, out: str) -> tuple[tuple[Block, ...], Body]:
         """The statements of a function, its results in `out`, or returned where that is empty."""
-        body = self.target.body(function)
+        body = self.target.body(function, together=self.together)
         ends = tuple(c.assign(f"{out}[{k}]", x) for k, x in enumerate(body.results))
         last = Block("", ends if out else (c.result(body.results[0]),))
         return (*self.statements(function, body), last), body
@@ -184,7 +194,7 @@ class Functions:
             f, P = part.function, f"{self.prefix}_{what}_{k}"
             body = self.target.body(
                 f, {n: handed[n] for n in part.reads}, stored={n: handed[n] for n in part.keeps},
-                pivots=len(function.checks),
+                pivots=len(function.checks), together=self.together,
             )  # fmt: skip
             failures = c.unless(body.failures, self.singular)
             found = zip(part.outputs, body.results, strict=True)
@@ -302,7 +312,7 @@ class Functions:
             first = Block("", (c.local(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
             blocks = (first, *blocks[1:])
         else:
-            body = self.target.body(function)
+            body = self.target.body(function, together=self.together)
             array = c.listed(self.real, "a", self.NQ, body.results)
             failures = c.unless(body.failures, self.singular)
             *most, last = self.statements(function, body)

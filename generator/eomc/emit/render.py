@@ -98,11 +98,12 @@ def render(program: Program, extension: str) -> Sources:
     target = Target(program, REALS[run.real], written)
     binding = package.binding(target)
     name = program.system.name
+    made = fast.steppers(target)
     return Sources(
         name=name,
         files={
-            **steppers.files(program, show),
-            **{f"{FAST}/{file}": text for file, text in fast.files(target, show).items()},
+            **steppers.files(program, show, rooms=fast.rooms(made)),
+            **{f"{FAST}/{file}": text for file, text in fast.files(made, show).items()},
             "main.c": show(package.main(target)),
             "selftest.c": show(selftest.view(target)),
             "__init__.py": show(package.face(target, extension)),

@@ -90,9 +90,9 @@ class System:
 
     @property
     def asked(self) -> tuple[Frame, ...]:
-        """The frames whose poses, velocities and Jacobians are wanted."""
-        wanted = self.run.frames
-        return tuple(f for f in self.frames if wanted is True or (wanted and f.name in wanted))
+        """The frames whose poses, velocities and Jacobians are wanted, in the order of [run]."""
+        wanted, known = self.run.frames, {f.name: f for f in self.frames}
+        return self.frames if wanted is True else tuple(known[name] for name in wanted or ())
 
     @property
     def reads_qdd(self) -> bool:

@@ -62,6 +62,8 @@ def balance(run: Run) -> Balance | None:
     """The balance of a run; None where inputs change from step to step, which rows do not show."""
     if run._u is not None and np.ndim(run._u) != 1:
         return None
+    if not np.isfinite(run.jacobi).all():
+        return None
     if run.every > 1:
         run = run._again(1, 1, None, None)  # all its rows: few may look smooth and not be
     model, energy = run._model, run.jacobi.astype(float)

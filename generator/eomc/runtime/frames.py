@@ -106,7 +106,7 @@ class Frames(Functions):
         """tau = D qdd + C qd + g, (nq,), less what f_ext does: recursively, without D.
 
         f_ext: wrenches from outside, as in `frame_forces`. tau is all that acts along the
-        coordinates, N or N m: what drives have to give is that less `tau(q, qd, u=0)`, friction.
+        coordinates, N or N m: what drives have to give is that less `tau` at u = 0, friction.
         """
         self._built("inverse_dynamics")
         given = self._like(qdd, "qdd", (self.nq,), q)

@@ -369,6 +369,11 @@ class _Check(Checker):
         out = []
         for name, entry in self.doc.outputs.items():
             formula = self.formula(("outputs", name, "formula"), entry.formula)
+            if name in self.centers and formula and formula.text.strip() != name:
+                message = (
+                    f"'{name}' is a place of a body or point already: use that, or another name"
+                )
+                self.say(("outputs", name), message)
             if formula:
                 out.append(Output(name, entry.unit, formula, entry.note))
         return out

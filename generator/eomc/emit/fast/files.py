@@ -33,14 +33,22 @@ PLACEHOLDERS = ("BITS_OF_SIZE", "INTEGER", "LANE_ALIGNED", "LANE_BYTES", "LANE_C
 TWO = ("atan2", "pow", "min", "max")  # of two arguments
 
 
-def files(target: Target, show: Show) -> dict[str, str]:
+def steppers(target: Target) -> Steppers:
+    """The methods of a scene, on their accelerations."""
+    functions = Functions(target)
+    return Steppers(Accelerations(target), functions, plain.linearization(functions))
+
+
+def rooms(made: Steppers) -> list[int]:
+    """The numbers that each method's memory keeps."""
+    return [runs.kept(made, m) for m in made.methods]
+
+
+def files(made: Steppers, show: Show) -> dict[str, str]:
     """Header and source of the fast form by file name."""
-    functions, accelerations = Functions(target), Accelerations(target)
-    slopes = plain.linearization(functions)
-    made = Steppers(accelerations, functions, slopes)
+    functions, slopes, target = made.functions, made.slopes, made.accelerations.target
     stamp = f"0x{hashlib.sha256(f'fast {target.system.digest}'.encode()).hexdigest()[:8]}u"
-    rooms = [runs.kept(made, m) for m in made.methods]
-    header = show(plain.header(functions, slopes, stamp, rooms))
+    header = show(plain.header(functions, slopes, stamp, rooms(made), fast=True))
     source = show(
         views.Source(
             title=FreeText(target.system.title),
@@ -83,7 +91,9 @@ def _csrc(made: Steppers) -> Iterator[str]:
     rotates = bool(made.accelerations.angles) and RK4 in made.methods
     lanes = [("wide", f"{target.PREFIX}_WIDE_BYTES", True)] * _wide(made)
     if made.two_point:
-        lanes += [("two", str(2 * size), False), ("four", str(4 * size), True)]
+        lanes += [("two", str(2 * size), False)]
+    if made.two_point or made.functions.several:
+        lanes += [("four", str(4 * size), made.two_point)]
     if RK4 in made.methods and made.predicted:
         bytes_ahead = size * ahead_count(len(made.accelerations.angles))
         lanes += [("ahead", str(bytes_ahead), False)]
@@ -95,7 +105,8 @@ def _csrc(made: Steppers) -> Iterator[str]:
         texts += [("lanes/vector.h", name, width)]
         texts += [(f"lanes/sincos{end}.h", name, width)] * target.sincos
         texts += [(f"lanes/rotate{end}.h", name, width)] * (turns and rotates)
-        texts += [("lanes/four.h", name, width)] * (name == "four")
+        texts += [("lanes/four.h", name, width)] * (name == "four" and made.two_point)
+        texts += [("lanes/angles.h", name, width)] * (name == "four" and made.functions.several)
     for file, name, width in texts:
         text = resources.text("csrc", file).replace("#include <math.h>\n", "")
         integer, bits = ("long long", "0x7fffffffffffffff") if size == 8 else ("int", "0x7fffffff")
@@ -109,6 +120,7 @@ def _csrc(made: Steppers) -> Iterator[str]:
             ("EOMC_LANE_BYTES", width),
             ("EOMC_LANE_COUNT", f"{target.PREFIX}_{name.upper()}_COUNT"),
             ("fabs_REAL", f"fabs{end}"),
+            ("sincos_REAL", f"sincos{end}"),
             ("EOMC_REAL", target.real.name),
             *(
                 (("_LANE", f"_{name}"),)

@@ -37,8 +37,13 @@ Show = Callable[[View], str]  # a view by its template
 SWEEPS = {True: 50, False: 60}  # at most, with Newton's method and without
 
 
-def files(program: Program, show: Show, real: Real | None = None) -> dict[str, str]:
-    """Header and source of the plain form by file name; real: other numbers than the scene's."""
+def files(
+    program: Program, show: Show, real: Real | None = None, rooms: Sequence[int] = ()
+) -> dict[str, str]:
+    """Header and source of the plain form by file name; real: other numbers than the scene's.
+
+    rooms: those of `header`.
+    """
     plain = of(program, real)
     name = plain.prefix
     methods = [METHODS[m] for m in plain.target.system.run.methods]
@@ -51,7 +56,7 @@ def files(program: Program, show: Show, real: Real | None = None) -> dict[str, s
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
     texts = (
-        show(header(plain, slopes, handshake(plain))),
+        show(header(plain, slopes, handshake(plain), rooms or [0] * len(methods))),
         show(source_view(plain, show(slopes).rstrip("\n") if slopes else "", steppers)),
     )
     return {f"{name}.{end}": c.laid_out(text) for end, text in zip("hc", texts, strict=True)}
@@ -61,12 +66,15 @@ def header(
     plain: Functions,
     slopes: Slopes | None,
     stamp: str,
-    rooms: Sequence[int] | None = None,
+    rooms: Sequence[int],
+    fast: bool = False,
 ) -> Header:
-    """The header's view. rooms: of the fast form the numbers that each method's memory keeps."""
+    """The header's view. rooms: the numbers that each method's memory keeps in the fast form.
+
+    The plain form has the room too, so that a program built with the one header runs with both.
+    """
     target, s = plain.target, plain.target.system
     methods = [METHODS[name] for name in s.run.methods]
-    rooms, fast = rooms or [0] * len(methods), rooms is not None
     found = [*plain.evaluations, plain.acceleration]
     return Header(
         title=FreeText(s.title),
