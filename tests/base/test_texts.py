@@ -205,7 +205,7 @@ def test_templates_are_given_free_text_only_as_free_text() -> None:
         return ""
 
     steppers.files(marked, show)
-    files.files(target, show)
+    files.files(files.steppers(target), show)
     assert len(given) > 12
     for view in given:
         assert not [s for s in strings(view) if "MARKED" in s], type(view)
