@@ -95,8 +95,8 @@ def test_where_the_energy_went_is_told(there: Path) -> None:
     told = eomc("run", "kapitza_pendulum.toml").output
     assert "energy K + P 8.73323504 J, changed by at most 18 J; it is not conserved\n" in told
     assert "Jacobi's integral 8.6428537 J: forces took 1.71 J; numerical error 8.4e-08 J\n" in told
-    assert "forces took 1.71 J; n" in eomc("run", "kapitza_pendulum.toml", "--every", "99").output
-    said = json.loads(eomc("run", "kapitza_pendulum.toml", "--json").output)["energy"]["balance"]
+    words = ["--json", "--every", "99"]
+    said = json.loads(eomc("run", "kapitza_pendulum.toml", *words).output)["energy"]["balance"]
     assert said["told"] and said["forces"] == pytest.approx(-1.71, abs=1e-3)
 
 

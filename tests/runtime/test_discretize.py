@@ -147,8 +147,22 @@ def derivative(text: str, method: str, h: float, t: float, u: Any) -> Any:
     return J[:, :4], J[:, 4:]
 
 
-@pytest.mark.parametrize("given", INPUTS)
-@pytest.mark.parametrize(("text", "method"), CASES, ids=[m for _, m in CASES])
+def quick(method: str, given: str) -> bool:
+    """Whether that is no variant of what others show too."""
+    return method in ("rk4", "euler") or (method, given) == ("gauss4", "beyond")
+
+
+@pytest.mark.parametrize(
+    ("text", "method", "given"),
+    [
+        pytest.param(
+            text, method, given, id=f"{method}-{given}",
+            marks=() if quick(method, given) else pytest.mark.slow,
+        )
+        for text, method in CASES
+        for given in INPUTS
+    ],
+)  # fmt: skip
 def test_against_differences_of_forty_digits(
     modules: Modules, text: str, method: str, given: str
 ) -> None:

@@ -58,7 +58,7 @@ def limited(modules: Modules) -> ModuleType:
     return modules.of_text(BATCH)
 
 
-@pytest.mark.parametrize("form", ["fast", "plain"])
+@pytest.mark.parametrize("form", tiers(["fast", "plain"], "plain"))
 @pytest.mark.parametrize("text", tiers([BATCH, IMPLICIT], BATCH), ids=lambda t: t[-30:-1])
 def test_what_is_beyond_acts_as_the_limit(text: str, form: str, tmp_path: Path) -> None:
     """To the last bit, in every method, held or a row a step."""
