@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from robots.test_robots_mujoco import (
     Array,
+    elsewhere,  # noqa: F401 - a fixture, for all tests here
     from_urdf,
     mujoco,
     positions,

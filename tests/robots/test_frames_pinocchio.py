@@ -14,7 +14,12 @@ import pytest
 
 pinocchio = pytest.importorskip("pinocchio", reason="Pinocchio is not installed")
 from robots.test_frames_mujoco import FIXED, Ours, near  # noqa: E402
-from robots.test_robots_mujoco import from_urdf, robot_data, stripped  # noqa: E402
+from robots.test_robots_mujoco import (  # noqa: E402
+    elsewhere,  # noqa: F401 - a fixture, for all tests here
+    from_urdf,
+    robot_data,
+    stripped,
+)
 
 from eomc.derive.inverse_dynamics import inverse_dynamics  # noqa: E402
 from eomc.robots.scene_text import finished  # noqa: E402
