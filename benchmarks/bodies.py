@@ -4,7 +4,7 @@
 
 The scene is what `eomc import` writes, fingers locked. Beside one another: `inverse_dynamics` and
 `rnea`; `frame_poses` of the seven links and `forwardKinematics`; `frame_jacobians` of the last link
-and `computeJointJacobians`, which has a column for each joint too. Both run over the same hundred
+and `computeJointJacobians`, which has a column for each joint too. Both run over the same fifty
 states in a row in C and C++, in turns; the ratio of our time to theirs is taken within each round,
 and the largest difference of the results stands beside it. The bar is 0.15.
 """
@@ -30,7 +30,7 @@ from eomc.model.from_scene import from_scene
 from eomc.program import program
 from eomc.scene.read import parse
 
-STATES = 100  # whose results stay in the cache
+STATES = 50  # whose results stay in the cache
 BAR = 0.15
 LINKS = [f"panda_link{k}" for k in range(1, 8)]
 FRAMES = {"poses": LINKS, "jacobians": LINKS[-1:]}

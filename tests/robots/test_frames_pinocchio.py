@@ -27,7 +27,13 @@ from eomc.robots.scene_text import finished  # noqa: E402
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("name", FIXED)
+MORE = """
+    ur3_gripper ur5_gripper ur3_joint_limited_robot ur5_joint_limited_robot
+    ur10_joint_limited_robot romeo_laas_small tiago_dual talos_full_v2 icub_reduced centauro
+""".split()
+
+
+@pytest.mark.parametrize("name", [*FIXED, *MORE])
 def test_robots(name: str, tmp_path: Path) -> None:
     both = from_urdf(f"/{name}.urdf", tmp_path, fuse=False)
     ours, bodies = Ours(both.text()), finished(both.robot).bodies

@@ -9,6 +9,10 @@ import pytest
 from conftest import Modules
 
 import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+from eomc.verify.rows_outputs import Formulas
+from eomc.verify.sampling import State
 
 SPACE = """eomc = 1
 name = "crane3"
@@ -190,6 +194,25 @@ def test_many_more_rows_than_one_call_takes(space: ModuleType) -> None:
     assert np.array_equal(found[4321], space.inverse_dynamics(*[q[4321]] * 3))
 
 
+def test_accelerations_are_second_derivatives(modules: Modules) -> None:
+    """In eighty digits: of a point's place, and so of all rates in them, dJ/dt qd at qdd = 0."""
+    places = [f"tip_{x}" for x in "xyz"] + [f"arm_{x}" for x in "xyz"]
+    wanted = "\n".join(f'a_{name} = "dot(dot({name}))"' for name in places)
+    center = '\n[[point]]\nname = "middle"\nbody = "arm"\nplace = [0, 0, -0.5]\n'
+    text = SPACE.replace("crane3", "crane5").replace("[run]", f"{center}[outputs]\n{wanted}\n[run]")
+    module, formulas = modules.of_text(text), Formulas(from_scene(parse(text, "test.toml")))
+    random = np.random.default_rng(3)
+    for _ in range(3):
+        q, qd, qdd = random.uniform(-1, 1, (3, 3))
+        for accelerations in (qdd, 0 * qdd):
+            exact = formulas.at(State(q, qd, 0.4), accelerations)
+            found = [
+                module.frame_acceleration(q, qd, accelerations, name, t=0.4)[:3]
+                for name in ("tip", "middle")
+            ]
+            assert np.hstack(found) == pytest.approx(exact, abs=1e-14)
+
+
 def test_what_does_not_move(space: ModuleType) -> None:
     pose = space.pose([1.0, 2.0, 3.0], "base")
     assert pose.position.tolist() == [0.3, 0, 0.1]
@@ -225,9 +248,6 @@ def test_what_was_not_asked_for_is_told(modules: Modules) -> None:
 
 
 def test_nothing_of_it_in_scenes_that_do_not_ask() -> None:
-    from eomc.model.from_scene import from_scene
-    from eomc.scene.read import parse
-
     bare = eomc.sources(from_scene(parse(PLANE.partition("[run]")[0], "bare.toml")))
     some = eomc.sources(from_scene(parse(PLANE, "some.toml")))
     words = ("frame_", "_NF", "momentum", "inverse_dynamics")
