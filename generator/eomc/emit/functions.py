@@ -54,15 +54,18 @@ class Functions:
         """What nearly every view begins with."""
         return {"prefix": self.prefix, "PREFIX": self.PREFIX, "real": self.real}
 
-    @property
-    def together(self) -> bool:
-        """Whether sines of several angles are computed side by side."""
-        return self.target.real.reach > 0
+    def together(self, function: Function) -> bool:
+        """Whether sines of several angles are computed side by side.
+
+        Not those of D, by which selftest.c judges the sines that steps take.
+        """
+        return self.target.real.reach > 0 and function.name not in ("D", "D_column")
 
     @property
     def several(self) -> bool:
         """Whether a function has several angles of which that holds."""
-        return self.together and any(map(several, self.target.program.functions.values()))
+        functions = self.target.program.functions.values()
+        return any(self.together(f) and several(f) for f in functions)
 
     @property
     def NQ(self) -> str:
@@ -166,7 +169,7 @@ class Functions:
 
     def straight(self, function: Function, out: str) -> tuple[tuple[Block, ...], Body]:
         """The statements of a function, its results in `out`, or returned where that is empty."""
-        body = self.target.body(function, together=self.together)
+        body = self.target.body(function, together=self.together(function))
         ends = tuple(c.assign(f"{out}[{k}]", x) for k, x in enumerate(body.results))
         last = Block("", ends if out else (c.result(body.results[0]),))
         return (*self.statements(function, body), last), body
@@ -194,7 +197,7 @@ class Functions:
             f, P = part.function, f"{self.prefix}_{what}_{k}"
             body = self.target.body(
                 f, {n: handed[n] for n in part.reads}, stored={n: handed[n] for n in part.keeps},
-                pivots=len(function.checks), together=self.together,
+                pivots=len(function.checks), together=self.together(function),
             )  # fmt: skip
             failures = c.unless(body.failures, self.singular)
             found = zip(part.outputs, body.results, strict=True)
@@ -312,7 +315,7 @@ class Functions:
             first = Block("", (c.local(self.real, f"a[{self.NQ}]"), *blocks[0].lines))
             blocks = (first, *blocks[1:])
         else:
-            body = self.target.body(function, together=self.together)
+            body = self.target.body(function, together=self.together(function))
             array = c.listed(self.real, "a", self.NQ, body.results)
             failures = c.unless(body.failures, self.singular)
             *most, last = self.statements(function, body)
