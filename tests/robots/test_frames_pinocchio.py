@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 
 MORE = """
     ur3_gripper ur5_gripper ur3_joint_limited_robot ur5_joint_limited_robot
-    ur10_joint_limited_robot ur3 tiago_dual talos_full_v2 talos_full_v2_box centauro
+    ur10_joint_limited_robot tiago_dual talos_full_v2 talos_full_v2_box centauro
 """.split()
 
 
