@@ -436,7 +436,7 @@ def test_grouping_inertias_saves_work_and_changes_no_motion(
 ) -> None:
     made = made_of(trees.arm(3))
     grouped = every_route(made, accelerations)
-    monkeypatch.setattr(Recursion, "_grouped", lambda r: [r.own(link) for link in r.links])
+    monkeypatch.setattr(Recursion, "_grouped", lambda r: [r._own(link) for link in r.links])
     plain = every_route(made, accelerations)
     for route in ("composite", "articulated"):
         one, other = (found["acceleration", route] for found in (grouped, plain))

@@ -27,10 +27,7 @@ def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
     if tree:
         r = Recursion(e.tape, tree)
         along = r.by_link(dict(zip(system.q, system.qdd, strict=True)))
-        faster = [r.add(*pair) for pair in zip(along, r.drift, strict=True)]
-        forces = r.joint_forces(r.forces(r.rates(), faster))
-        rotors = map(r.times, r.armature, faster)
-        whole = r.projected(r.add(*pair) for pair in zip(forces, rotors, strict=True))
+        whole = r.projected(r.inverse_dynamics(along))
         for terms, q in zip(found, system.q, strict=True):
             terms.append(whole.get(q, S.Zero))
     return e.tape, [e.tape.total(x for x in terms if x is not S.Zero) for terms in found]

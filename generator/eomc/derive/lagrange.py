@@ -180,26 +180,36 @@ def inertial_forces(
     system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
 ) -> list[Expr]:
     """D qdd + bias of K and P on a tape, by Lagrange's operator. accelerations: by velocity."""
-    tape, q, qd, w = e.tape, system.q, system.qd, list(e.points)
-    stop = frozenset(w)
-    rates: dict[Symbol, Expr] = {**dict(zip(q, qd, strict=True)), t: S.One, **accelerations}
-    momenta = tape.gradient([(e.kinetic, S.One)], [*qd, *w], stop)
-    moving = tape.forward(momenta, rates)
-    seeds = [(e.kinetic, S.NegativeOne), (e.potential, S.One)]
-    seeds += zip(e.points.values(), moving[len(q) :], strict=True)
-    return [tape.total(x) for x in zip(moving, tape.gradient(seeds, q, stop), strict=False)]
+    tape, q = e.tape, system.q
+    moving = _momenta(system, e, accelerations)[1]
+    seeds = [*_lagrangian(e), *zip(e.points.values(), moving[len(q) :], strict=True)]
+    back = tape.gradient(seeds, q, frozenset(e.points))
+    return [tape.total(x) for x in zip(moving[: len(q)], back, strict=True)]
+
+
+def _momenta(
+    system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
+) -> tuple[list[Expr], list[Expr]]:
+    """dF/dqd and dF/dw, and their rates; velocities without an acceleration are steady."""
+    along = dict(zip(system.q, system.qd, strict=True))
+    rates: dict[Symbol, Expr] = {**along, t: S.One, **accelerations}
+    wanted = [*system.qd, *e.points]
+    momenta = e.tape.gradient([(e.kinetic, S.One)], wanted, frozenset(e.points))
+    return momenta, e.tape.forward(momenta, rates)
+
+
+def _lagrangian(e: Energies) -> list[tuple[Expr, Expr]]:
+    """Seeds of the gradient of -L."""
+    return [(e.kinetic, S.NegativeOne), (e.potential, S.One)]
 
 
 def _lagrange(system: System, e: Energies) -> Motion:
     tape, q, qd = e.tape, system.q, system.qd
     w = list(e.points)
     stop = frozenset(w)
-    rates: dict[Symbol, Expr] = {**dict(zip(q, qd, strict=True)), t: S.One}
 
-    # momenta dF/dqd and dF/dw, and their rates at qdd = 0
-    momenta = tape.gradient([(e.kinetic, S.One)], [*qd, *w], stop)
+    momenta, moving = _momenta(system, e, {})
     p, p_w = momenta[: len(q)], momenta[len(q) :]
-    moving = tape.forward(momenta, rates)
     p_dot, p_w_dot = moving[: len(q)], moving[len(q) :]
     against = [(e.dissipation, S.One), *((v, -force) for v, force in e.applied)]
     friction = tape.gradient(against, [*qd, *w], stop)
@@ -212,7 +222,7 @@ def _lagrange(system: System, e: Energies) -> Motion:
     def add(*terms: Expr) -> Expr:
         return tape.define(sympy.Add(*terms))
 
-    lagrangian = ((e.kinetic, S.NegativeOne), (e.potential, S.One))
+    lagrangian = _lagrangian(e)
     bias = [add(a, b) for a, b in zip(p_dot, projected(p_w_dot, *lagrangian), strict=True)]
     damping = [add(a, b) for a, b in zip(r, projected(r_w), strict=True)]
     tau = [add(force, -drag) for force, drag in zip(e.forces, damping, strict=True)]

@@ -73,7 +73,7 @@ class Recursion(Links):
 
     # --- inertial parameters ---------------------------------------------------------------------
 
-    def own(self, link: Link) -> Inertia:
+    def _own(self, link: Link) -> Inertia:
         """What moves with a link, as it is."""
         inertia = dict(zip(ENTRIES, map(self.define, link.inertia), strict=True))
         return Inertia(self.define(link.mass), self.vector(link.moment), inertia)
@@ -95,7 +95,7 @@ class Recursion(Links):
         as if it were the parent's; so does all inertia of a sliding link. Gautier & Khalil, IEEE
         Trans. Robotics and Automation 6(3), 1990.
         """
-        own = [self.own(link) for link in self.links]
+        own = [self._own(link) for link in self.links]
         for k in reversed(range(self.n)):
             link, mine = self.links[k], own[k]
             i, j = AXES[link.axis]
@@ -270,7 +270,11 @@ class Recursion(Links):
 
     def bias(self) -> list[Expr]:
         """C qd + g, by link."""
-        return self._with_rotors(self.forces(self.rates(), self.drift), self.drift)
+        return self._moving(self.drift)
+
+    def inverse_dynamics(self, wishes: Sequence[Expr]) -> list[Expr]:
+        """D qdd + C qd + g, by link. wishes: the accelerations along the joints, qdd, by link."""
+        return self._moving([self.add(*pair) for pair in zip(wishes, self.drift, strict=True)])
 
     def gravity_forces(self) -> list[Expr]:
         """g, by link."""
@@ -281,6 +285,9 @@ class Recursion(Links):
         """D v for a direction v, by link, without D."""
         forces = self.forces([S.Zero] * self.n, direction, gravity=False)
         return self._with_rotors(forces, direction)
+
+    def _moving(self, faster: Sequence[Expr]) -> list[Expr]:
+        return self._with_rotors(self.forces(self.rates(), faster), faster)
 
     def _with_rotors(self, forces: _Forces, wishes: Sequence[Expr]) -> list[Expr]:
         """The forces along the joints, with those that armatures need."""
