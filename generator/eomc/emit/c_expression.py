@@ -17,7 +17,8 @@ from eomc.program.ir import Call, Function, Operand, Product, Sum, Value, rename
 from eomc.program.trig import pair_of
 
 MOST_INLINE = 5  # operations; longer expressions get a name of their own
-SEVERAL, FOUR = 3, 4  # angles from which on sines are taken side by side; so many at once
+SEVERAL = 3  # angles from which on sines are taken side by side
+FOUR = 4  # numbers that are taken or stored at once
 
 # what C calls the functions of a program
 C_NAMES = {

@@ -5,12 +5,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from fractions import Fraction
+from typing import TypedDict
 
 from sympy import Rational
 
 from eomc.emit import c_expression, c_function
 from eomc.emit.c_expression import Real
-from eomc.integrators.tableaux import Row
+from eomc.integrators.tableaux import Method, Row
 
 
 def literal(x: Fraction, real: Real) -> str:
@@ -51,3 +52,24 @@ def matrix(rows: Sequence[Row], real: Real) -> tuple[str, ...]:
     """The rows of a square matrix, zeros where a triangle ends."""
     whole = [(*row, *[Fraction(0)] * (len(rows) - len(row))) for row in rows]
     return c_function.in_braces(numbers(row, real) for row in whole)
+
+
+class Tableau(TypedDict):
+    """Of a method for second-order equations: times, A and A A by row, b and b A."""
+
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+
+
+def tableau(m: Method, real: Real) -> Tableau:
+    """The coefficients of a method as they are written in C."""
+    return Tableau(
+        c=numbers(m.c, real),
+        A=matrix(m.a, real),
+        AA=matrix(m.a_squared, real),
+        b=numbers(rounded(m.b, real), real),
+        bA=numbers(m.b_a, real),
+    )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from eomc.emit import c_function as c
 from eomc.emit.c_function import CFunction
-from eomc.emit.coefficients import matrix, numbers, rounded
+from eomc.emit.coefficients import tableau
 from eomc.emit.functions import Functions
 from eomc.emit.plain.views import Derivative
 from eomc.integrators.tableaux import METHODS
@@ -44,11 +44,7 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
             function=plain.public.derivative(m.name),
             implicit=m.implicit,
             stages=m.stages,
-            c=numbers(m.c, real),
-            A=matrix(m.a, real),
-            AA=matrix(m.a_squared, real),
-            b=numbers(rounded(m.b, real), real),
-            bA=numbers(m.b_a, real),
+            **tableau(m, real),
             step=plain.public.step(m.name).call(q="at", qd="moving"),
             start=accelerate(qdd="a"),
             stage=accelerate(qdd="f" if m.implicit else "a + NQ*i", q="r", qd="v", t="t + c[i]*h"),

@@ -13,7 +13,7 @@ from functools import cached_property
 from sympy import Expr, S
 
 from eomc.emit import c_function as c
-from eomc.emit.c_expression import Block, Body, Printer, Real
+from eomc.emit.c_expression import FOUR, Block, Body, Printer, Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, sentence, unclashed
 from eomc.emit.fast.accelerations import Accelerations
@@ -23,9 +23,6 @@ from eomc.program.ir import Call, Function, Sum
 from eomc.program.trig import Angle
 
 INLINE, NOINLINE = "INLINE", "NOINLINE"
-
-
-FOUR = 4  # numbers that the two-point form stores together
 
 
 def four(n: int) -> int:

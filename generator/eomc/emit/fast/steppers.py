@@ -11,7 +11,7 @@ from math import isfinite, sqrt
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import CArgument, CFunction
-from eomc.emit.coefficients import literal, matrix, numbers, rounded
+from eomc.emit.coefficients import literal, matrix, numbers, rounded, tableau
 from eomc.emit.fast import views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, NOINLINE, Lane
@@ -266,11 +266,7 @@ class Steppers:
             order=m.order,
             notes=m.notes,
             stages=m.stages,
-            c=numbers(m.c, real),
-            A=matrix(m.a, real),
-            AA=matrix(m.a_squared, real),
-            b=numbers(rounded(m.b, real), real),
-            bA=numbers(m.b_a, real),
+            **tableau(m, real),
             extrapolation=matrix(m.ahead, real),
             width=slopes.width,
             factor=factor,

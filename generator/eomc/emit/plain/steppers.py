@@ -12,7 +12,7 @@ from eomc.emit import heading
 from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
-from eomc.emit.coefficients import matrix, numbers, rounded
+from eomc.emit.coefficients import tableau
 from eomc.emit.derivatives import derivatives
 from eomc.emit.evaluations import source
 from eomc.emit.functions import Functions, handshake, indexed, of, parameters
@@ -205,11 +205,7 @@ def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
         about=_about(m),
         step=plain.public.step(m.name),
         stages=m.stages,
-        c=numbers(m.c, plain.target.real),
-        A=matrix(m.a, plain.target.real),
-        AA=matrix(m.a_squared, plain.target.real),
-        b=numbers(rounded(m.b, plain.target.real), plain.target.real),
-        bA=numbers(m.b_a, plain.target.real),
+        **tableau(m, plain.target.real),
         stage=accelerate(qdd="a[i]", q="r", qd="v", t="t + c[i]*h"),
     )
 
@@ -266,11 +262,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
         newton=m.newton,
         sweeps=SWEEPS[m.newton],
         stages=m.stages,
-        c=numbers(m.c, plain.target.real),
-        A=matrix(m.a, plain.target.real),
-        AA=matrix(m.a_squared, plain.target.real),
-        b=numbers(rounded(m.b, plain.target.real), plain.target.real),
-        bA=numbers(m.b_a, plain.target.real),
+        **tableau(m, plain.target.real),
         eps=plain.target.literal(plain.target.real.epsilon),
         tenth=plain.target.literal(0.1),
         half=plain.target.literal(0.5),
