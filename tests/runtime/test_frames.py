@@ -247,6 +247,12 @@ def test_what_was_not_asked_for_is_told(modules: Modules) -> None:
         _ = module.inverse_dynamics
 
 
+def test_wrenches_without_frames_are_refused(modules: Modules) -> None:
+    module = modules.of_text(f"{PLANE.partition('[run]')[0]}[run]\ninverse_dynamics = true\n")
+    with pytest.raises(ValueError, match=r"f_ext acts at frames: .* \[run\] frames = true"):
+        module.inverse_dynamics(Q, QD, QDD, {"tip": [1.0, 2.0, 3.0]})
+
+
 def test_nothing_of_it_in_scenes_that_do_not_ask() -> None:
     bare = eomc.sources(from_scene(parse(PLANE.partition("[run]")[0], "bare.toml")))
     some = eomc.sources(from_scene(parse(PLANE, "some.toml")))

@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike
 from .arguments import Array, Parameters, not_one_of
 from .functions import Functions
 
-_ASKED = {"inverse_dynamics": "inverse_dynamics", "momentum": "momentum"}  # else frames
-
 
 class Pose(NamedTuple):
     """position: m, (3,); in the plane (2,). rotation: (3, 3), its columns the frame's axes; in the
@@ -94,7 +92,6 @@ class Frames(Functions):
 
         wrenches: by frame, (6,) or (n, 6) each, N and N m, in the plane 3; or all, (nf, 6).
         """
-        self._built("frame_forces")
         each = self._wrenches(wrenches, q)
         return self._call("frame_forces", (self.nq,), q, None, t, params, each)
 
@@ -108,7 +105,8 @@ class Frames(Functions):
         f_ext: wrenches from outside, as in `frame_forces`. tau is all that acts along the
         coordinates, N or N m: what drives have to give is that less `tau` at u = 0, friction.
         """
-        self._built("inverse_dynamics")
+        if f_ext is not None and not self.frames:
+            raise ValueError("f_ext acts at frames: a scene has them by [run] frames = true")
         given = self._like(qdd, "qdd", (self.nq,), q)
         found = self._call("inverse_dynamics", (self.nq,), q, qd, t, params, given)
         return found if f_ext is None else found - self.frame_forces(q, f_ext, t=t, params=params)
@@ -117,7 +115,6 @@ class Frames(Functions):
         self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None
     ) -> Momentum:
         """Mass, centre of mass and momenta of all bodies that move, rotors of drives aside."""
-        self._built("momentum")
         d, turns = (2, 1) if self._plane else (3, 3)
         x = self._call("momentum", (1 + 2 * d + turns,), q, qd, t, params)
         angular = x[..., -1] if self._plane else x[..., 7:]
@@ -133,13 +130,6 @@ class Frames(Functions):
     def _width(self) -> int:
         return 3 if self._plane else 6
 
-    def _built(self, name: str) -> None:
-        if not hasattr(self._lib, name):
-            key = _ASKED.get(name, "frames")
-            raise ValueError(
-                f"{name}: {self.name} was built without it: a scene asks with [run] {key} = true"
-            )
-
     def _call(
         self, name: str, shape: tuple[int, ...], q: ArrayLike, qd: ArrayLike | None, t: float,
         params: Parameters, each: Array | None = None,
@@ -152,12 +142,11 @@ class Frames(Functions):
         qd: ArrayLike | None, t: float, params: Parameters, each: Array | None = None,
     ) -> Array:  # fmt: skip
         """One frame's part of a function of all."""
-        self._built(name)
+        if not (frame is None or frame in self.frames):
+            raise ValueError(not_one_of("frame", frame, self.frames))
         found = self._call(name, (len(self.frames), *shape), q, qd, t, params, each)
         if frame is None:
             return found
-        if frame not in self.frames:
-            raise ValueError(not_one_of("frame", frame, self.frames))
         one: Array = found.take(self.frames.index(frame), axis=found.ndim - 1 - len(shape))
         return one
 

@@ -50,14 +50,15 @@ def check(
     if made.expected:
         value_rows(made)
         property_rows(made)
-        if hasattr(module, "_model"):  # what is compiled has several ways to one answer
+        compiled = hasattr(module, "_model")
+        if compiled:  # what is compiled has several ways to one answer
             compiled_rows(made)
         scene = system.scene
         if scene is not None and scene.assembly is not None:
             Bodies(made, scene).report()
-            if hasattr(module, "frames"):
+            if compiled:
                 rows_frames.report(made, plain, scene)
-        if system.run.inverse_dynamics and hasattr(module, "frames"):
+        if compiled and system.run.inverse_dynamics:
             rows_frames.inverse_dynamics(made, plain)
         if system.outputs and hasattr(module, "output"):
             rows_outputs.report(made, plain)
