@@ -219,6 +219,16 @@ def test_right_modules_pass(modules: Modules, what: str) -> None:
     assert all(row.judged for row in about), report.table()
 
 
+# what the author of scenes wrote when a row of a right module once said FAILED
+SEEDS = tuple(map(str, (400000, 500399, 500434, 500578, 500643, 500672)))
+
+
+@pytest.mark.parametrize("seed", tiers(SEEDS))
+def test_right_modules_of_these_numbers_pass(seed: str, tmp_path: Path) -> None:
+    found = outcome(int(seed), False, tmp_path)
+    assert found.outcome == "passed", found
+
+
 WOUND = """eomc = 1
 name = "wound"
 [coordinates]
