@@ -15,12 +15,12 @@ import argparse
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import robots
-import simulators
 import work
 from kernels import Array
 
@@ -59,10 +59,23 @@ def seconds(call: Callable[[], object]) -> float:
     return (time.perf_counter() - begun) / 10
 
 
+def in_c(
+    m: ModuleType, name: str, shape: tuple[int, ...], motion: tuple[Array, Array, Array]
+) -> tuple[Callable[[], None], Array]:
+    """A call of one function at all states, without what Python adds, and where results go."""
+    model, n = m._model, len(motion[0])
+    out = np.zeros((n, *shape))
+    q, qd, qdd, to = map(model._pointer, (*motion, out))
+    function, p = getattr(model._lib, name), model._at[2]
+    return lambda: function(n, to, q, qd, 0.0, qdd, p), out
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=41)
     rounds = parser.parse_args().rounds
+    import simulators  # with Pinocchio, which tricks.py can do without
+
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         loaded, made = simulators.pinocchio_library(root)
@@ -74,15 +87,7 @@ def main() -> None:
             places = [x.ctypes.data for x in (q, qd, qdd, out)]
             return lambda: loaded.functions(made, which, STATES, *places), out
 
-        def ours(
-            m: ModuleType, name: str, shape: tuple[int, ...]
-        ) -> tuple[Callable[[], None], Array]:
-            model, out = m._model, np.zeros((STATES, *shape))
-            at, moving, faster, to = map(model._pointer, (q, qd, qdd, out))
-            p = model._at[2]
-            function = getattr(model._lib, name)
-            return lambda: function(STATES, to, at, moving, 0.0, faster, p), out
-
+        ours = partial(in_c, motion=(q, qd, qdd))
         made_ours = {what: module(scene(frames), root, what) for what, frames in FRAMES.items()}
         pairs = {
             ("inverse_dynamics", "rnea"): (

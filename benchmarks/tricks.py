@@ -6,12 +6,14 @@ A trick is taken away by changing the generator in this process, so both modules
 tree. Ratios are without/with, medians of the ratios within the rounds, in processor time of the
 thread; below 1.1 a trick is worth nothing in that row. Both ends agree to 1e-9 of their size.
 `gauss16` is taken away as a user would: the quickest of the other methods takes its place, each at
-its longest step that ends within 1e-9, or 1e-12, of `gauss16` in steps of an eighth.
+its longest step that ends within 1e-9, or 1e-12, of `gauss16` in steps of an eighth. Sines side by
+side are of functions of the Panda's bodies (bodies.py), a thousand calls at fifty states.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 import tempfile
 import time
 import warnings
@@ -23,11 +25,13 @@ from types import ModuleType
 from typing import Any
 from unittest.mock import PropertyMock, patch
 
+import bodies
 import numpy as np
 import work
 
 import eomc
 from eomc.derive import link_multipliers
+from eomc.emit import c_expression
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.steppers import Steppers
 
@@ -47,6 +51,10 @@ def without_two_points() -> Any:
 def without_multipliers() -> Any:
     unsuited = link_multipliers.UnsuitedError("left out")
     return patch.object(link_multipliers, "solution", side_effect=unsuited)
+
+
+def without_side_by_side() -> Any:
+    return patch.object(c_expression, "SEVERAL", 1000)
 
 
 # trick, what takes it away, the cases that it could change, what else is asked for under [run]
@@ -115,6 +123,27 @@ def tricks(rounds: int) -> Iterator[str]:
                 yield f"| {trick} | {name} | {ratio(*jobs, rounds):.2f} |"
 
 
+def sines(rounds: int) -> Iterator[str]:
+    """Of functions of bodies: a thousand calls at fifty states."""
+    text, random = bodies.scene(bodies.LINKS), np.random.default_rng(0)
+    motion = tuple(random.uniform(-2, 2, (3, bodies.STATES, 7)))
+    with tempfile.TemporaryDirectory() as folder:
+        full = bodies.module(text, Path(folder), "full")
+        with without_side_by_side():
+            renamed = re.sub('^name += "panda"', 'name = "less"', text, count=1, flags=re.M)
+            less = bodies.module(renamed, Path(folder), "less")
+        if less is full:
+            raise SystemExit("sines side by side: one module in place of two")
+        for name, shape in (("frame_poses", (7, 12)), ("inverse_dynamics", (7,))):
+            calls = [bodies.in_c(m, name, shape, motion) for m in (less, full)]
+            jobs = [lambda call=call: [call() for _ in range(1000)] for call, _ in calls]
+            factor = ratio(*jobs, rounds)
+            (_, one), (_, other) = calls
+            if not np.max(np.abs(one - other)) < 1e-9 * np.max(np.abs(one)):
+                raise SystemExit(f"sines side by side, {name}: results apart")
+            yield f"| sines side by side | {name} of the Panda | {factor:.2f} |"
+
+
 def end(m: ModuleType, case: work.Case, method: str, steps: int) -> np.ndarray:
     """The state after SPAN seconds."""
     n = len(case.x0) // 2
@@ -157,7 +186,7 @@ def main() -> None:
     rounds = asked.parse_args().rounds
     warnings.simplefilter("ignore", RuntimeWarning)  # steps too long end runs early
     print("| trick | row | time without, over with |\n|---|---|---|")
-    for rows in (tricks(rounds), gauss16(rounds)):
+    for rows in (tricks(rounds), sines(rounds), gauss16(rounds)):
         for row in rows:
             print(row, flush=True)
 
