@@ -11,6 +11,8 @@ from conftest import Modules
 import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
+from eomc.verify import rows_sines
+from eomc.verify.comparison import Comparison
 from eomc.verify.rows_outputs import Formulas
 from eomc.verify.sampling import State
 
@@ -245,6 +247,15 @@ def test_what_was_not_asked_for_is_told(modules: Modules) -> None:
         _ = module.pose
     with pytest.raises(AttributeError, match=r"\[run\] inverse_dynamics = true"):
         _ = module.inverse_dynamics
+
+
+def test_a_rounding_of_a_sum_is_no_wrong_sine(space: ModuleType, monkeypatch) -> None:
+    """Of a body placed by formulas entries cancel; other coordinates tell that from a sine."""
+    made = from_scene(parse(SPACE, "crane3.toml"))
+    of = Comparison(made, space, np.random.default_rng(0), None)
+    assert rows_sines.vanishing(of) <= rows_sines.LIMIT
+    monkeypatch.setattr(rows_sines, "NUDGES", ())
+    assert rows_sines.vanishing(of) > rows_sines.LIMIT
 
 
 def test_wrenches_without_frames_are_refused(modules: Modules) -> None:
