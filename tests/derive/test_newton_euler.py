@@ -253,23 +253,6 @@ def test_a_planar_joint_in_a_plane_scene() -> None:
     assert_every_route_agrees(made, Jets(made))
 
 
-def geared(wheel: str, slide: str) -> str:
-    """A wheel and a slide that move by these formulas of an arm's coordinates."""
-    given = {"mass": "m", "center": [0.1, -0.2, "l/3"], "inertia": [0.05, "J", 0.04, 0.004, 0, 0]}
-    more = {"armature": 0.03, "damping": "c", "friction": "c", "friction_width": 0.5}
-    bodies = [
-        {"name": "arm", "joint": "revolute", "coordinates": "a", "axis": [1, 2, -2], **given},
-        {"name": "hand", "parent": "arm", "joint": "universal", "coordinates": ["b", "a - b"],
-         "offset": ["l", 0, 0], **given},
-        {"name": "wheel", "parent": "arm", "joint": "revolute", "coordinates": wheel,
-         "offset": [0, "l", 0], "axis": [0, 1, 0], **given, **more, "actuator": "u"},
-        {"name": "slide", "parent": "wheel", "joint": "prismatic", "coordinates": slide,
-         "axis": [3, 0, 4], **given, **more},
-    ]  # fmt: skip
-    inputs = ("[inputs]", {"u": {"signal": "sin(t)"}})
-    return trees.text(bodies, [0, 1, "-g"], trees.PARAMETERS, [inputs])
-
-
 @pytest.mark.parametrize(
     "wheel, slide",
     tiers(
@@ -278,7 +261,7 @@ def geared(wheel: str, slide: str) -> str:
     ),
 )
 def test_joints_that_move_together(wheel: str, slide: str) -> None:
-    made = made_of(geared(wheel, slide))
+    made = made_of(trees.geared(wheel, slide))
     assert [c.name for c in made.coordinates] == ["a", "b"]
     assert_every_route_agrees(made, Jets(made))
 
