@@ -211,6 +211,7 @@ def load(built: Built) -> ModuleType:
     )
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    importlib.invalidate_caches()  # a folder written anew within a tick of the clock looks the same
     sys.modules[alias] = module
     try:
         spec.loader.exec_module(module)
