@@ -80,6 +80,13 @@ VALID = {
                  "sinf_dot**2/2", "cos(sinf)*cosf", "real = 'float'"),
     "own": text("own", "own_D = { start = 1 }", "own_params = 1", "own_sincos = 'sin(own_D)*own_D'",
                 "own_D_dot**2/2", "cos(own_D)*own_sincos*own_params"),
+    # three angles of time and three of the state in one function, each three side by side
+    "three_and_three": text(
+        "three_and_three",
+        "x = { start = 0.3 }\ny = { start = 0.2 }\nz = { start = 0.1 }",
+        kinetic="m*(x_dot**2 + y_dot**2 + z_dot**2)/2",
+        potential="x*sin(t) + y*sin(2*t) + z*sin(3*t) - cos(x) - cos(y) - cos(z)",
+    ),
 }  # fmt: skip
 
 

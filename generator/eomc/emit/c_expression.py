@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -271,14 +271,14 @@ def body(
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             angles.setdefault(a.value.args, {})[a.value.function] = a.name
     sincos = real.reach > 0 and bool(angles)
-    side_by_side = several(function) if together else {}
+    side_by_side, numbers = several(function) if together else {}, count(1)
     lines: dict[Stage, list[str]] = {stage: [] for stage in _STAGE_COMMENTS}
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             group = side_by_side.get(a.value.args[0], ())
             if group and a.value.args in angles:
                 taken = {angle: angles.pop((angle,)) for angle in group}
-                lines[a.stage] += _sincos_several(printer, taken, set_to)
+                lines[a.stage] += _sincos_several(printer, taken, set_to, numbers)
             elif names := angles.pop(a.value.args, None):
                 lines[a.stage] += _sincos(printer, a.value.args[0], names, stored)
             continue
@@ -360,10 +360,12 @@ def _sincos_several(
     printer: Printer,
     angles: Mapping[Operand, Mapping[str, str]],
     set_to: Callable[[str, str], str],
+    numbers: Iterator[int],
 ) -> list[str]:
+    """Their statements; numbers: of what is still to be named in this function."""
     lane, lines, groups = f"{printer.prefix}_four", list[str](), list(angles.items())
     for first in range(0, len(groups), FOUR):
-        some, j = groups[first : first + FOUR], first // FOUR + 1
+        some, j = groups[first : first + FOUR], next(numbers)
         x, s, c = (f"{what}{j}_" for what in ("angles", "sines", "cosines"))
         arguments = ", ".join(printer.operand(angle) for angle, _ in some)
         lines += [

@@ -20,6 +20,7 @@ from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import Row
 from eomc.verify.sampling import (
+    FARTHEST,
     LARGE,
     NUDGE,
     SMALL,
@@ -33,7 +34,6 @@ from eomc.verify.sampling import (
 from eomc.verify.symbolic import of
 from eomc.verify.taylor import Jets
 
-FARTHEST = 100.0  # of the spread: how far long steps may lead
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
 LONGER = 16.0  # times the scene's h: a long step
 SHORTER = tuple(4.0**-k for k in range(7))  # parts of it, until stages are found by sweeps
@@ -237,11 +237,10 @@ class Comparison:
                     expected, size = self.sampler.reach(reference, s)
                 except np.linalg.LinAlgError:
                     continue
-            if h > self.system.run.h and not np.all(np.abs(expected - [s.q, s.qd]) < spread):
+            most = spread * (1 if h > self.system.run.h else FARTHEST)
+            if not np.all(np.abs(expected - [s.q, s.qd]) < most):
                 continue
             run = self.simulate(s, method=method, h=h, steps=1, t0=s.t)
-            if not np.all(np.isfinite(expected)):
-                continue
             if run.status == "ok":
                 size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain])
                 return self.units([run.q[-1], run.qd[-1]], expected, size)

@@ -19,7 +19,7 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import NUDGE
+from eomc.verify.sampling import FARTHEST, NUDGE
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
@@ -44,7 +44,6 @@ FEW, FEWER = 6, 3  # long steps, or steps with a row of u each; where the refere
 TURNS = 2.0**22  # radians: beyond what the inlined sine takes
 LATE = 2.0**24  # seconds: the same, of signals and driven supports
 FAR = ("D", "g", "bias", "tau", "kinetic_energy", "potential_energy", "acceleration")
-FARTHEST = 100.0  # of how far things go: steps that lead further are not compared
 # parts of h, of runs that differ by rounding alone; the second where the first are too long
 FINE = ((1024, 8192), (8192, 65536))
 EXACT = 4  # order from which on their steps are short enough

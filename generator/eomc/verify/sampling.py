@@ -21,6 +21,7 @@ from eomc.verify.oracle import Answer, Vector
 EPS = 2.0**-52
 CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
 NUDGE = 1e-6  # relative change of an input from which its influence is estimated
+FARTHEST = 100.0  # of the spread: steps that lead further are not compared
 MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 FARTHER = 8.0  # times as far from the start, where a term that is small near it counts
