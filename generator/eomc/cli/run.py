@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 @click.option("--h", "h", type=float, help="Step size in s, instead of the scene's.")
 @click.option("--duration", type=float, help="In s, instead of the scene's.")
 @click.option("--method", help="A stepper that the scene asks for; its first where not given.")
+@click.option("--tol", type=float, help="Tolerance of adaptive steps, instead of the scene's.")
 @click.option("--every", type=click.IntRange(1), default=1, help="Keep every so many steps.")
 @click.option(
     "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 @options.JSON
 def command(
     scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str], h: float | None,
-    duration: float | None, method: str | None, every: int, out: Path | None,
+    duration: float | None, method: str | None, tol: float | None, every: int, out: Path | None,
     plot: Path | None, quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Simulate a scene; print the end, the error and the speed.
@@ -60,11 +61,15 @@ def command(
     with status_line(f"building {scene.stem}", quiet or as_json):
         module = pipeline.load(scene, root, warn=warn)
     values, q0, qd0 = _overrides(scene, module, parameters, start)
-    options: dict[str, Any] = {"h": h, "duration": duration, "params": values, "method": method}
+    options: dict[str, Any] = {
+        "h": h, "duration": duration, "params": values, "method": method, "tol": tol,
+    }  # fmt: skip
+    own, unstable, ends = module._model, None, None
     try:
-        unstable = module.advice(q0, qd0, h, params=values, method=method)
-        own = module._model
-        ends = beyond_end(own.h if h is None else h, own.duration if duration is None else duration)
+        if tol is None and not (own.tolerance and h is None and method is None):
+            unstable = module.advice(q0, qd0, h, params=values, method=method)
+            span = own.duration if duration is None else duration
+            ends = beyond_end(own.h if h is None else h, span)
         with progress_bar("running", quiet or as_json) as progress:
             begun = time.perf_counter()
             with _reported_below():
@@ -177,6 +182,7 @@ def _summary(
         "message": done.message,
         "method": done.method,
         "h": done.h,
+        "tolerance": getattr(done, "tol", None),
         "steps": done.steps,
         "t": float(done.t[-1]),
         "q": dict(zip(module.coordinates, map(float, done.q[-1]), strict=True)),
@@ -210,7 +216,7 @@ def _print_summary(
     module: Any, done: Run, balance: Balance | None, summary: Mapping[str, Any]
 ) -> None:
     say(
-        f"{shown(module.title)}: {done.steps} steps of {summary['method']}, h = {done.h:g} s, "
+        f"{shown(module.title)}: {done.steps} steps of {summary['method']}, {done.told}, "
         f"to t = {done.t[-1]:g} s"
     )
     wide = max(map(len, module.coordinates))
@@ -225,7 +231,7 @@ def _print_summary(
         if words:
             say(f"  {words}")
     if done.error is not None:
-        _print_error(module, done.error)
+        _print_error(module, done.error, summary["tolerance"] is not None)
     speed = summary["steps_per_second"] or 0.0
     say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
     for file in summary["files"]:
@@ -244,15 +250,15 @@ def _print_energy(done: Run, balance: Balance | None, summary: Mapping[str, Any]
     say(f"  {name} {end:.9g} J{how}")
 
 
-def _print_error(module: Any, error: Estimate) -> None:
+def _print_error(module: Any, error: Estimate, adaptive: bool) -> None:
     import math
 
     q, qd = float(error.q[-1].max()), float(error.qd[-1].max())
     seen = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
-    say(
-        f"  error at the end about {q:.1g} in q, {qd:.1g} in qd "
-        f"(from the same run in shorter steps; order {error.order}, {seen})"
-    )
+    how = f"in shorter steps; order {error.order}, {seen}"
+    if adaptive:
+        how = "with a hundredth of the tolerance"
+    say(f"  error at the end about {q:.1g} in q, {qd:.1g} in qd (from the same run {how})")
     digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
     say(
         f"  right digits: {digits}; a difference at the start has become "

@@ -5,12 +5,22 @@ from __future__ import annotations
 import math
 
 from eomc.base.texts import FreeText
+from eomc.emit import adaptive
 from eomc.emit.c_function import cast, member
 from eomc.emit.c_names import Target
 from eomc.emit.evaluations import KINDS, takes_qdd, takes_t
 from eomc.emit.heading import stamp, words
 from eomc.emit.public import Public
-from eomc.emit.views import Binding, Bound, BoundMethod, Declarations, Face, Main, Named
+from eomc.emit.views import (
+    Binding,
+    Bound,
+    BoundAdaptive,
+    BoundMethod,
+    Declarations,
+    Face,
+    Main,
+    Named,
+)
 from eomc.integrators.tableaux import METHODS
 
 _OF_STEPS = ("Phi", "Gamma")
@@ -106,6 +116,18 @@ def _methods(target: Target) -> tuple[BoundMethod, ...]:
     )  # fmt: skip
 
 
+def _adaptive(target: Target) -> BoundAdaptive | None:
+    """The call of adaptive steps, where the scene asks for them."""
+    if target.system.run.tolerance is None:
+        return None
+    run = Public(target).adaptive(adaptive.METHOD.name)
+    call = run.call(
+        q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target), status="&found",
+        memory=f"&{member('work', 'memory')}",
+    )  # fmt: skip
+    return BoundAdaptive(f"{run.name}_memory", call)
+
+
 def _derivative(target: Target, method: str) -> str:
     """The call of a step's derivatives."""
     function = Public(target).derivative(method)
@@ -127,6 +149,7 @@ def binding(target: Target) -> Binding:
         linearization=linear.call(**at, **matrices) if _linearized(target) else "",
         batch=target.system.run.batch,
         methods=_methods(target),
+        adaptive=_adaptive(target),
         parameter_count=len(target.system.parameters),
     )
 
@@ -138,8 +161,9 @@ def _linearized(target: Target) -> bool:
 def declarations(bound: Binding) -> Declarations:
     """What cffi is told."""
     return Declarations(
-        bound.real, bound.evaluations, bound.linearization, bound.batch, bound.methods
-    )
+        bound.real, bound.evaluations, bound.linearization, bound.batch, bound.methods,
+        bound.adaptive,
+    )  # fmt: skip
 
 
 def _timed(target: Target, name: str) -> bool:
@@ -176,6 +200,7 @@ def face(target: Target, extension: str) -> Face:
         start=([c.start for c in s.coordinates], [c.rate for c in s.coordinates]),
         h=s.run.h,
         duration=s.run.duration,
+        tolerance=s.run.tolerance,
         timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,
         methods=tuple(METHODS[name] for name in s.run.methods),

@@ -9,6 +9,7 @@ from eomc.emit.c_names import Target
 from eomc.emit.evaluations import KINDS, extent, source, takes_qdd, takes_t
 
 STATE = ("q", "qd")
+LIMITS = ("t_end", "tol", "h_most")  # of adaptive steps
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,22 @@ class Public:
                 CArgument("long", "row_count"), *self.usual("p"),
                 *(strides[2:] if target.needs_p else []),
                 CArgument("long *", "done"), CArgument("int *", "status"),
+            ),
+        )  # fmt: skip
+
+    def adaptive(self, method: str) -> CFunction:
+        """Steps of the size that a tolerance asks for."""
+        P, real = self.target.prefix, self.target.real.name
+        name = f"{P}_{method}_adaptive"
+        return CFunction(
+            name,
+            "long",
+            (
+                *self._moved, filled(real, "t"), *(CArgument(real, n) for n in LIMITS),
+                *self.usual("u"), CArgument("long", "steps"), given(real, "times"),
+                CArgument("long", "count"), *(filled(real, f"{n}_rows") for n in ("t", *STATE)),
+                *self.usual("p"), CArgument(f"{name}_memory *", "memory"),
+                CArgument(f"{P}_status *", "status"),
             ),
         )  # fmt: skip
 

@@ -86,6 +86,14 @@ class BoundMethod:
 
 
 @dataclass(frozen=True)
+class BoundAdaptive:
+    """Adaptive steps in the binding: the type of their memory, and their call."""
+
+    memory: str
+    run: str
+
+
+@dataclass(frozen=True)
 class Binding:
     """python/binding.c.jinja. linearization: its call, if there is one."""
 
@@ -98,6 +106,7 @@ class Binding:
     linearization: str
     batch: bool
     methods: tuple[BoundMethod, ...]
+    adaptive: BoundAdaptive | None
     parameter_count: int
 
 
@@ -111,6 +120,7 @@ class Declarations:
     linearization: str
     batch: bool
     methods: tuple[BoundMethod, ...]
+    adaptive: BoundAdaptive | None
 
 
 @dataclass(frozen=True)
@@ -150,6 +160,7 @@ class Face:
     start: tuple[list[float], list[float]]
     h: float
     duration: float
+    tolerance: float | None
     timed: tuple[str, ...]
     batch: bool
     methods: tuple[Method, ...]

@@ -78,6 +78,16 @@ class Method:
         return tuple(tuple(_value(basis, 1 + x) for basis in _lagrange(self.c)) for x in self.c)
 
     @cached_property
+    def powers(self) -> tuple[Row, ...]:
+        """Accelerations at the nodes to those of their polynomial's powers of 2 c - 1."""
+        return tuple(zip(*_lagrange(tuple(2 * x - 1 for x in self.c)), strict=True))
+
+    def legendre(self, n: int) -> Row:
+        """To its part in Legendre's polynomial P_n(2 c - 1), n below the stages, at Gauss nodes."""
+        p = _legendre(n)
+        return tuple((2 * n + 1) * b * _value(p, x) for b, x in zip(self.b, self.c, strict=True))
+
+    @cached_property
     def a_ahead(self) -> tuple[Row, ...]:
         """A E: `a` for the accelerations of the step before."""
         return tuple(_times(row, self.ahead) for row in self.a)
@@ -167,6 +177,7 @@ DP8 = Method(
 # --- Gauss and Legendre ---------------------------------------------------------------------------
 
 _DIGITS = 45  # that the nodes are computed to, of which the last few may be off
+_NONE = Decimal(0)
 
 
 def _value(polynomial: Row, x: Fraction) -> Fraction:
@@ -197,18 +208,23 @@ def _lagrange(nodes: Row) -> tuple[Row, ...]:
     return tuple(out)
 
 
+def _legendre(s: int) -> Row:
+    """P_s(2 x - 1)."""
+    return tuple(Fraction((-1) ** (s + k) * comb(s, k) * comb(s + k, k)) for k in range(s + 1))
+
+
 def _legendre_roots(s: int) -> Row:
     """The s zeros of Legendre's polynomial P_s(2 x - 1), by Newton's iteration in decimals."""
-    p = [(-1) ** (s + k) * comb(s, k) * comb(s + k, k) for k in range(s + 1)]
+    p = [Decimal(x.numerator) for x in _legendre(s)]
     roots: list[Decimal] = []
     with localcontext() as context:
         context.prec = _DIGITS + 10
         for _ in range(s):
             x = Decimal("-0.01")  # left of all: Newton goes to the first that is not yet there
             for _ in range(100):
-                value = sum(c * x**k for k, c in enumerate(p))
-                slope = sum(k * c * x ** (k - 1) for k, c in enumerate(p) if k)
-                step = value / (slope - value * sum(1 / (x - root) for root in roots))
+                value = sum((c * x**k for k, c in enumerate(p)), _NONE)
+                slope = sum((k * c * x ** (k - 1) for k, c in enumerate(p) if k), _NONE)
+                step = value / (slope - value * sum((1 / (x - root) for root in roots), _NONE))
                 x -= step
                 if abs(step) < Decimal(10) ** -(_DIGITS + 5):
                     break

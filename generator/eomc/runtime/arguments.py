@@ -312,16 +312,16 @@ def as_number(value: Any, name: str) -> float:
     return number
 
 
-def as_step_size(h: Any, dtype: np.dtype[Any]) -> float:
+def as_step_size(h: Any, dtype: np.dtype[Any], name: str = "h") -> float:
     """A step size in the module's numbers, or a ValueError."""
     if type(h) is float and 1e-37 < h < 1e37:  # in single precision too
         return h
-    size = as_number(h, "h")
+    size = as_number(h, name)
     limits = np.finfo(dtype)
     if not limits.smallest_subnormal <= size <= limits.max:
         why = "" if size <= 0 else f" in {dtype}"
         raise ValueError(
-            f"h: {size:g} is not a step size{why}: give a number of seconds greater than 0"
+            f"{name}: {size:g} is not a step size{why}: give a number of seconds greater than 0"
         )
     return size
 

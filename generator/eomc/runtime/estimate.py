@@ -138,7 +138,7 @@ def _growth(run: Run, own: Array, eps: float, again: _Again) -> tuple[Array, Arr
     if len(run) < _ROWS:
         every = max(1, run.steps // _ROWS)
         base = again(1, every).x.astype(float)
-    scale = _scale(base)
+    scale = scales(base)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
 
     def moved(size: float) -> Array:
@@ -210,7 +210,7 @@ def _counts(run: Run, every: int, rows: int) -> Array:
     return np.minimum(np.arange(rows) * every, run.steps)
 
 
-def _scale(x: Array) -> Array:
+def scales(x: Array) -> Array:
     """The largest value of each column; those that only rounding moves count as a millionth of the
     largest position, or velocity, or of the state where all of these are 0."""
     largest = np.max(np.abs(x), axis=0)

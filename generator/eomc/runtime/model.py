@@ -16,7 +16,7 @@ import numpy as np
 from numpy import empty
 from numpy.typing import ArrayLike
 
-from . import saved
+from . import adaptive, saved
 from .arguments import (
     Array,
     Parameters,
@@ -51,11 +51,12 @@ class Model(Frames):
 
     def __init__(
         self, extension: Any, *, h: float, duration: float,
-        methods: Mapping[str, tuple[int, int, float, float]], **scene: Any,
+        methods: Mapping[str, tuple[int, int, float, float]], tolerance: float | None = None,
+        **scene: Any,
     ) -> None:  # fmt: skip
         """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
         super().__init__(extension, **scene)
-        self.h, self.duration = h, duration
+        self.h, self.duration, self.tolerance = h, duration, tolerance
         self.methods = tuple(methods)
         self._facts = dict(methods)
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
@@ -197,8 +198,9 @@ class Model(Frames):
         u: Inputs = None, params: Parameters = None, method: str | None = None, *, t0: float = 0.0,
         control_period: float | None = None, out: tuple[Array, Array] | None = None,
         progress: Callable[[int, int], None] | None = None, estimate: bool = False,
+        tol: float | None = None, times: ArrayLike | None = None, h_most: float | None = None,
     ) -> Run:  # fmt: skip
-        """A trajectory by fixed steps of size h, the loop in C and the GIL released.
+        """A trajectory by fixed steps of size h, or by steps that fit a tolerance; the loop in C.
 
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration.
         every: a row is kept of every so many steps, and the first and last state always.
@@ -211,9 +213,19 @@ class Model(Frames):
         out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
         estimate: whether to find the run's own error, `run.error`, by doing it again in shorter
         steps, which takes some nine times as long.
+        tol: of adaptive steps, each of which errs by about tol of how far it moves; built where
+        the scene says [run] tolerance, which is taken where h, steps and method are not given.
+        times: (n,) ascending, instead of duration: the rows, at no extra steps. h_most: the longest
+        adaptive step, in s, so that none leaps over a short pulse.
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
+        if tol is not None or (self.tolerance and h is None and steps is None and method is None):
+            fitted = adaptive.simulate(
+                self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, h=h,
+                steps=steps, method=method, every=every, control_period=control_period, out=out,
+            )  # fmt: skip
+            return self._finished(fitted, estimate)
         method = self.methods[0] if method is None else self._method(method)
         q, qd = self._start
         from_q, from_qd, at_p = self._at
@@ -257,13 +269,17 @@ class Model(Frames):
         result = self._trajectory(
             q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress, hold
         )
-        if result.status != "ok":
-            if result.status == "interrupted":
-                raise Interrupted(result)
-            warnings.warn(f"{self.name}: {result.message}", RuntimeWarning, stacklevel=2)
+        return self._finished(result, estimate)
+
+    def _finished(self, run: Run, estimate: bool) -> Run:
+        """A run as `simulate` returns it: with warnings to its caller, and its error if asked."""
+        if run.status == "interrupted":
+            raise Interrupted(run)
+        if words := run.message if run.status != "ok" else run._remark:
+            warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=3)
         if estimate:
-            result._judged(None, 3)
-        return result
+            run._judged(None, 4)
+        return run
 
     def _look(
         self, q: Array, qd: Array, h: float, t: float, u: Array | None, p: Array, method: str,

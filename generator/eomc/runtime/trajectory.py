@@ -296,6 +296,16 @@ class Run(Columns):
             f"{state_text(self.q[-1], self.qd[-1])}: {SAID[self.status]}"
         )
 
+    @property
+    def told(self) -> str:
+        """How its steps were chosen, in words."""
+        return f"h = {self.h:g} s"
+
+    @property
+    def _remark(self) -> str:
+        """What is to be said of a run that is whole, or ""."""
+        return ""
+
     def __len__(self) -> int:
         return len(self.q)
 

@@ -67,6 +67,7 @@ class Run:
     derivatives of the accelerations are, "parameters" for those by parameters too. discretize:
     whether those of steps are. frames: of which bodies and points poses, velocities, accelerations
     and Jacobians are, True for all. inverse_dynamics, momentum: whether these are.
+    tolerance: of adaptive steps, None where the scene asks for none.
     """
 
     h: float = 0.001
@@ -79,6 +80,7 @@ class Run:
     frames: bool | tuple[str, ...] = False
     inverse_dynamics: bool = False
     momentum: bool = False
+    tolerance: float | None = None
 
     @property
     def sloped(self) -> bool:

@@ -24,6 +24,9 @@ _Note = Annotated[pydantic.StrictStr, pydantic.AfterValidator(texts.checked_line
 _Positive = Annotated[float, pydantic.Field(strict=True, gt=0, allow_inf_nan=False)]
 
 
+_Tolerance = Annotated[float, pydantic.Field(strict=True, ge=1e-15, le=1e-2, allow_inf_nan=False)]
+
+
 class _Table(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
 
@@ -108,6 +111,7 @@ class _Run(_Table):
     frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(_asked)] = False
     inverse_dynamics: pydantic.StrictBool = False
     momentum: pydantic.StrictBool = False
+    tolerance: _Tolerance | None = None
 
 
 def _spelled_out(key: str, value: object) -> object:

@@ -14,6 +14,7 @@ import numpy as np
 
 from eomc.model.system import System
 from eomc.verify import (
+    rows_adaptive,
     rows_discretize,
     rows_frames,
     rows_limits,
@@ -66,6 +67,7 @@ def check(
             rows_limits.report(made, plain)
             rows_signals.report(made, plain)
             rows_discretize.report(made, plain)
+            rows_adaptive.report(made, plain)
         if plain is not None:
             rows_plain.rows(made, plain)
     else:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 
 from eomc.base import resources
 from eomc.base.texts import FreeText
+from eomc.emit import adaptive, heading
 from eomc.emit import c_function as c
-from eomc.emit import heading
 from eomc.emit.c_expression import C_NAMES, DOUBLE
 from eomc.emit.c_names import Target
 from eomc.emit.derivatives import derivatives
@@ -40,8 +40,9 @@ def steppers(target: Target) -> Steppers:
 
 
 def rooms(made: Steppers) -> list[int]:
-    """The numbers that each method's memory keeps."""
-    return [runs.kept(made, m) for m in made.methods]
+    """The numbers that each method's memory keeps, and behind that of adaptive steps."""
+    room = adaptive.kept(len(made.one.target.names), made.one.width)
+    return [*(runs.kept(made, m) for m in made.methods), room]
 
 
 def files(made: Steppers, show: Show) -> dict[str, str]:
@@ -80,7 +81,8 @@ def files(made: Steppers, show: Show) -> dict[str, str]:
 
 def _wide(made: Steppers) -> bool:
     """Whether the lane of a register is needed."""
-    return made.accelerations.target.system.run.batch or any(m.sweeps for m in made.methods)
+    run = made.accelerations.target.system.run
+    return run.batch or run.tolerance is not None or any(m.sweeps for m in made.methods)
 
 
 def _csrc(made: Steppers) -> Iterator[str]:
@@ -140,7 +142,7 @@ def _lanes(made: Steppers, show: Show) -> Iterator[str]:
         yield _library_text(Lane(made.accelerations, "two"), show)
     yield _lane(made, made.one, show)
     batch = made.accelerations.target.system.run.batch
-    if batch or any(m.sweeps for m in made.methods):
+    if _wide(made):
         yield _library_text(made.wide, show)
         yield _lane(made, made.wide, show)
     if batch:
@@ -164,6 +166,7 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
     parts = s.parts if not lane.name else None
     rates = lane.rates.text if parts is None else show(_two_points(made)).rstrip("\n")
     computed = lane.compute_constants.text if not lane.name and runs.constants_call(made) else ""
+    swept = target.system.run.tolerance is not None
     text = show(
         views.LaneText(
             prefix=target.prefix,
@@ -189,7 +192,7 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             accelerations=lane.all_in_one,
             two_point=parts is not None,
             takes_c=bool(s.constants),
-            alone=not lane.name or any(m is not RK4 for m in made.methods),
+            alone=not lane.name or swept or any(m is not RK4 for m in made.methods),
         )
     )
     return text
@@ -255,9 +258,25 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
         yield show(runs.state(made, m))
         if runs.predicts(made, m):
             yield show(made.prediction())
-        if m.implicit:
-            yield show(made.sweeps(m) if m.sweeps else made.gauss(m))
+        if m.sweeps:
+            yield show(made.stages(m)) + "\n" + show(made.sweeps(m)).rstrip("\n")
+        elif m.implicit:
+            yield show(made.gauss(m))
         yield show(runs.loop(made, m))
         if batch:
             yield show(runs.batch(made, m))
+    if made.accelerations.target.system.run.tolerance is not None:
+        if adaptive.METHOD not in made.methods:
+            yield show(made.stages(adaptive.METHOD))
+        yield show(adaptive.view(made.functions, _adaptive(made)))
     yield from map(show, derivatives(made.functions))
+
+
+def _adaptive(made: Steppers) -> adaptive.Form:
+    """The sweeps of adaptive steps, stages in a lane each."""
+    one, m = made.one, adaptive.METHOD
+    sweep = made.sweep(m).call(b="&b", w=f"&{one.prefix}_{m.name}_within")
+    return adaptive.Form(
+        made.stepping(one), sweep, made.accelerate(one, a="f"), one.extent,
+        bool(made.accelerations.constants), runs.constants_call(made),
+    )  # fmt: skip

@@ -259,7 +259,7 @@ class Steppers:
         read |= {a.name for a in signal.arguments} | {"u"} if signal else set()
         return views.Gauss(
             **self.extended(lane),
-            **self._literals,
+            **self.literals,
             nudge=target.literal(sqrt(real.epsilon)),
             title=m.title,
             source=m.source,
@@ -284,7 +284,8 @@ class Steppers:
         )
 
     @property
-    def _literals(self) -> dict[str, str]:
+    def literals(self) -> dict[str, str]:
+        """Numbers and functions of the library by the names that templates have for them."""
         real = self.one.real
         end = real.function_suffix
         return {
@@ -292,37 +293,59 @@ class Steppers:
             "eps": self.one.target.literal(real.epsilon),
         }  # fmt: skip
 
-    def sweeps(self, m: Method) -> views.Sweeps:
-        """A method of few sweeps, its stages in a lane each."""
+    def sweep(self, m: Method) -> CFunction:
+        """A sweep over the stages of a method, these in a lane each."""
+        P = f"{self.one.prefix}_{m.name}"
+        out = c.filled(f"{P}_stages", "b")
+        given = (c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"))
+        arguments = (out, *given, *self.stepping(self.one))
+        return CFunction(f"{P}_sweep", "int", arguments, qualifier="static")
+
+    def stages(self, m: Method) -> views.Stages:
+        """The accelerations at the stages of a method, and a sweep over them."""
         lane, wide, real = self.one, self.wide, self.one.real
-        P = f"{lane.prefix}_{m.name}"
-        state = c.filled(f"{P}_state", "m")
-        values = c.filled(f"{P}_stages", "a")
-        given = self.stepping(lane)
-        sweep = CFunction(
-            f"{P}_sweep", "int",
-            (c.filled(f"{P}_stages", "b"), c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"),
-             *given),
-            qualifier="static",
-        )  # fmt: skip
-        settle = CFunction(
-            f"{P}_settle", f"{lane.prefix}_status",
-            (values, CArgument("int", "fresh"), *given, state), qualifier="static",
-        )  # fmt: skip
+        fixed = m.name in lane.target.system.run.methods
 
         def by_stage(rows: Sequence[Row]) -> tuple[str, ...]:
             return c.in_braces(numbers(column, real) for column in zip(*rows, strict=True))
 
-        within, before = f"&{P}_within", f"&{P}_extrapolated"
+        before = (by_stage(m.a_ahead), by_stage(m.a_squared_ahead)) if fixed else None
+        return views.Stages(
+            **self.extended(lane),
+            inputs=bool(lane.target.system.inputs),
+            constants=bool(self.accelerations.constants),
+            members=self.accelerations.constants,
+            name=m.name,
+            stages=m.stages,
+            padded=f"{max(m.stages, 64 // (8 if real is DOUBLE else 4))}",
+            c=numbers(m.c, real),
+            within=(by_stage(m.a), by_stage(m.a_squared)),
+            extrapolated=before,
+            sweep=self.sweep(m),
+            together=self.accelerate(
+                wide, a="f", q="at", qd="moving", t="t + nodes", u="u ? given : NULL", c="&wide"
+            ),
+            alone=self.accelerate(lane, a="one", q="x", qd="v", t="t + c_[i + j]*h"),
+        )
+
+    def sweeps(self, m: Method) -> views.Sweeps:
+        """A method of few sweeps."""
+        lane, real = self.one, self.one.real
+        P = f"{lane.prefix}_{m.name}"
+        state = c.filled(f"{P}_state", "m")
+        values = c.filled(f"{P}_stages", "a")
+        settle = CFunction(
+            f"{P}_settle", f"{lane.prefix}_status",
+            (values, CArgument("int", "fresh"), *self.stepping(lane), state), qualifier="static",
+        )  # fmt: skip
+        sweep, within, before = self.sweep(m), f"&{P}_within", f"&{P}_extrapolated"
         return views.Sweeps(
             **self.extended(lane),
-            **self._literals,
+            **self.literals,
             # steps that five sweeps do not do are long, and err by more than this
             enough=lane.target.literal(max(1e-8, real.epsilon)),
             loose=f"{max(1e-6, 512 * real.epsilon):.0e}{real.suffix}",
             inputs=bool(lane.target.system.inputs),
-            constants=bool(self.accelerations.constants),
-            members=self.accelerations.constants,
             name=m.name,
             title=m.title,
             source=m.source,
@@ -330,19 +353,8 @@ class Steppers:
             stability=stability(m),
             stages=m.stages,
             sweeps=m.sweeps,
-            padded=f"{max(m.stages, 64 // (8 if real is DOUBLE else 4))}",
-            c=numbers(m.c, real),
-            A=by_stage(m.a),
-            AA=by_stage(m.a_squared),
-            A_extrapolated=by_stage(m.a_ahead),
-            AA_extrapolated=by_stage(m.a_squared_ahead),
             b=numbers(rounded(m.b, real), real),
             bA=numbers(m.b_a, real),
-            sweep=sweep,
-            together=self.accelerate(
-                wide, a="f", q="at", qd="moving", t="t + nodes", u="u ? given : NULL", c="&wide"
-            ),
-            alone=self.accelerate(lane, a="one", q="x", qd="v", t="t + c_[i + j]*h"),
             settle=settle,
             settle_call=settle.call(a="&a", fresh="!smooth"),
             sweep_settling=sweep.call(b="&b", a="a", w=within),

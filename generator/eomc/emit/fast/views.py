@@ -258,8 +258,31 @@ class Gauss(Named):
 
 
 @dataclass(frozen=True)
+class Stages(Named):
+    """c/fast/stages.c.jinja: tableau, functions, calls. padded: stages, to whole registers.
+
+    extrapolated: A and A A over the accelerations of the step before, where a method takes them.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/fast/stages.c"
+    extent: str
+    inputs: bool
+    constants: bool
+    members: tuple[str, ...]
+    name: str
+    stages: int
+    padded: str
+    c: tuple[str, ...]
+    within: tuple[tuple[str, ...], tuple[str, ...]]
+    extrapolated: tuple[tuple[str, ...], tuple[str, ...]] | None
+    sweep: CFunction
+    together: str
+    alone: str
+
+
+@dataclass(frozen=True)
 class Sweeps(Named):
-    """c/fast/sweeps.c.jinja: tableau, functions, calls. padded: stages, to whole registers."""
+    """c/fast/sweeps.c.jinja: tableau, functions, calls."""
 
     TEMPLATE: ClassVar[str] = "c/fast/sweeps.c"
     extent: str
@@ -269,8 +292,6 @@ class Sweeps(Named):
     enough: str
     loose: str
     inputs: bool
-    constants: bool
-    members: tuple[str, ...]
     name: str
     title: str
     source: str
@@ -278,17 +299,8 @@ class Sweeps(Named):
     stability: str
     stages: int
     sweeps: int
-    padded: str
-    c: tuple[str, ...]
-    A: tuple[str, ...]
-    AA: tuple[str, ...]
-    A_extrapolated: tuple[str, ...]
-    AA_extrapolated: tuple[str, ...]
     b: tuple[str, ...]
     bA: tuple[str, ...]
-    sweep: CFunction
-    together: str
-    alone: str
     settle: CFunction
     settle_call: str
     sweep_settling: str
@@ -364,5 +376,5 @@ class Batch(Named):
 
 View = (
     Source | LibraryText | LaneText | Blocks | TwoPoints | RungeKutta4 | Predictions
-    | Predicted | Explicit | Factors | Gauss | Sweeps | State | Loop | Batch
+    | Predicted | Explicit | Factors | Gauss | Stages | Sweeps | State | Loop | Batch
 )  # fmt: skip

@@ -7,8 +7,8 @@ from dataclasses import replace
 from math import isfinite, sqrt
 
 from eomc.base.texts import FreeText
+from eomc.emit import adaptive, heading
 from eomc.emit import c_function as c
-from eomc.emit import heading
 from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
@@ -17,6 +17,8 @@ from eomc.emit.derivatives import derivatives
 from eomc.emit.evaluations import source
 from eomc.emit.functions import Functions, handshake, indexed, of, parameters
 from eomc.emit.plain.views import (
+    Adaptive,
+    AdaptiveDeclared,
     Computed,
     Declared,
     Explicit,
@@ -24,6 +26,7 @@ from eomc.emit.plain.views import (
     Header,
     Implicit,
     Loop,
+    Nodes,
     RungeKutta4,
     Slopes,
     Source,
@@ -52,11 +55,11 @@ def files(
     views += [
         view for m, run in zip(methods, loops, strict=True) for view in (stepper(plain, m), run)
     ]
-    views += derivatives(plain)
+    views += [*derivatives(plain), *_adaptive(plain)]
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
     texts = (
-        show(header(plain, slopes, handshake(plain), rooms or [0] * len(methods))),
+        show(header(plain, slopes, handshake(plain), rooms or [0] * (len(methods) + 1))),
         show(source_view(plain, show(slopes).rstrip("\n") if slopes else "", steppers)),
     )
     return {f"{name}.{end}": c.laid_out(text) for end, text in zip("hc", texts, strict=True)}
@@ -69,7 +72,8 @@ def header(
     rooms: Sequence[int],
     fast: bool = False,
 ) -> Header:
-    """The header's view. rooms: the numbers that each method's memory keeps in the fast form.
+    """The header's view. rooms: the numbers that each method's memory keeps in the fast form, and
+    that of adaptive steps behind.
 
     The plain form has the room too, so that a program built with the one header runs with both.
     """
@@ -89,7 +93,7 @@ def header(
         outputs=indexed(plain, s.outputs, "OUT_"),
         frames=tuple(target.enum[f"FRAME_{f.name}"] for f in s.asked),
         parameters=parameters(plain),
-        implicit=any(m.implicit for m in methods),
+        implicit=any(m.implicit for m in methods) or s.run.tolerance is not None,
         timed=target.driven,
         functions=tuple(x.function for x in found),
         linearization=slopes.linearization if slopes else None,
@@ -99,8 +103,13 @@ def header(
                 plain.public.run(m.name), plain.public.batch(m.name) if s.run.batch else None,
                 plain.public.derivative(m.name) if s.run.discretize else None,
             )
-            for m, room in zip(methods, rooms, strict=True)
+            for m, room in zip(methods, rooms, strict=False)
         ),
+        adaptive=AdaptiveDeclared(
+            adaptive.TITLE, adaptive.memory(plain),
+            rooms[-1] or adaptive.kept(len(s.coordinates), len(s.coordinates)),
+            plain.public.adaptive(adaptive.METHOD.name),
+        ) if s.run.tolerance else None,
     )  # fmt: skip
 
 
@@ -120,6 +129,7 @@ def source_view(plain: Functions, slopes: str, steppers: Sequence[str]) -> Sourc
         solved=tuple(heading.solved(target)),
         slopes=slopes,
         steppers=tuple(steppers),
+        adaptive=s.run.tolerance is not None,
     )
 
 
@@ -279,6 +289,30 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
         matrix_mid=matrix_function.call(q="q_mid", qd="qd_mid", t="t + h/2"),
         solve_call=solve.call(evaluations="&evaluations"),
     )
+
+
+def _adaptive(plain: Functions) -> list[Nodes | Adaptive]:
+    """Adaptive steps, where the scene asks for them."""
+    if plain.target.system.run.tolerance is None:
+        return []
+    m, method = adaptive.METHOD, f"{plain.prefix}_{adaptive.METHOD.name}"
+    around = plain.usual(*plain.state, "h", "u", "p")
+    values = (c.filled(f"{method}_stages", "b"), c.given(f"{method}_stages", "a"))
+    sweep = CFunction(f"{method}_sweep", "int", (*values, *around), qualifier="static")
+    accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
+    nodes = Nodes(
+        **plain.names,
+        title=adaptive.TITLE,
+        name=m.name,
+        stages=m.stages,
+        c=coefficients["c"],
+        A=coefficients["A"],
+        AA=coefficients["AA"],
+        sweep=sweep,
+        stage=accelerate(qdd="f", q="r", qd="v", t="t + c[i]*h"),
+    )
+    form = adaptive.Form(around, sweep.call(b="&b"), accelerate(qdd="f"), plain.NQ)
+    return [nodes, adaptive.view(plain, form)]
 
 
 def loop(plain: Functions, m: Method) -> Loop:

@@ -81,6 +81,16 @@ class Declared:
 
 
 @dataclass(frozen=True)
+class AdaptiveDeclared:
+    """Adaptive steps in the header. memory: the type of what they keep, kept numbers of it."""
+
+    title: str
+    memory: str
+    kept: int
+    run: CFunction
+
+
+@dataclass(frozen=True)
 class Header(Named):
     """c/header.h.jinja. functions: those of mechanics. timed: whether steps take t."""
 
@@ -101,6 +111,7 @@ class Header(Named):
     functions: tuple[CFunction, ...]
     linearization: CFunction | None
     methods: tuple[Declared, ...]
+    adaptive: AdaptiveDeclared | None
 
 
 @dataclass(frozen=True)
@@ -119,6 +130,7 @@ class Source(Named):
     solved: tuple[str, ...]
     slopes: str
     steppers: tuple[str, ...]
+    adaptive: bool
 
 
 @dataclass(frozen=True)
@@ -249,6 +261,62 @@ class Gauss(Named):
 
 
 @dataclass(frozen=True)
+class Nodes(Named):
+    """c/plain/nodes.c.jinja: a sweep over the stages of a method, as adaptive steps take it."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/nodes.c"
+    title: str
+    name: str
+    stages: int
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    sweep: CFunction
+    stage: str
+
+
+@dataclass(frozen=True)
+class Adaptive(Named):
+    """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
+
+    method: what its C names begin with. powers, last, before: from accelerations at the stages to
+    their polynomial's powers and its parts in the last two of Legendre's. most: sweeps of a step.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/adaptive.c"
+    title: str
+    method: str
+    extent: str
+    stages: int
+    f: str
+    fabs: str
+    sqrt: str
+    eps: str
+    tiny: str
+    most: int
+    c: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    powers: tuple[str, ...]
+    last: tuple[str, ...]
+    before: tuple[str, ...]
+    timed: bool
+    constants: bool
+    unread_p: bool
+    compute_constants: str
+    settle: CFunction
+    sweep: str
+    step: CFunction
+    start: str
+    settled: str
+    within: CFunction
+    settled_within: str
+    run: CFunction
+    advance: str
+    look: str
+
+
+@dataclass(frozen=True)
 class Loop(Named):
     """c/plain/run.c.jinja: run and batch of one method, and the calls in them."""
 
@@ -260,4 +328,7 @@ class Loop(Named):
     run_one: str
 
 
-View = Header | Source | Slopes | Derivative | RungeKutta4 | Explicit | Implicit | Gauss | Loop
+View = (
+    Header | Source | Slopes | Derivative | RungeKutta4 | Explicit | Implicit | Gauss | Nodes
+    | Adaptive | Loop
+)  # fmt: skip

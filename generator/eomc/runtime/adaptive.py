@@ -1,0 +1,288 @@
+"""Runs by steps of a size that a tolerance asks for: what `[run] tolerance` adds in Python.
+
+The method of Gauss and Legendre with eight stages; how its steps are chosen is said in the C.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arguments import Array, as_number, as_step_size
+from .estimate import Estimate, scales
+from .package import reduced
+from .slices import longer
+from .trajectory import SAID, STATUS, Run, state_text
+
+if TYPE_CHECKING:
+    from .model import Model
+
+LOOSEST = 1e-2
+STAGES = 8
+_LEAST = {"float64": 1e-15, "float32": 5e-7}
+_TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
+_ROOM = 256  # steps of the first call
+_MOST = 2**20  # of one call
+_STIFF = 50  # steps that sweeps have held back, from which a run says so
+_FINER = 100.0  # the tolerance over that of the run by which an error is found
+
+
+@dataclass(eq=False, repr=False)
+class AdaptiveRun(Run):
+    """A run whose steps fit `tol`: rows after each step, or at the times that were asked for.
+
+    h is the mean step, `rejected` how many steps were tried in vain, `held_back` how many would
+    have been longer if the motion were not stiff; everything else as in a Run.
+    """
+
+    tol: float = field(kw_only=True)
+    rejected: int = field(kw_only=True)
+    held_back: int = field(kw_only=True)
+    _times: Array = field(kw_only=True)
+    _h_most: float = field(kw_only=True)
+
+    @property
+    def t(self) -> Array:
+        """The times of the rows, (n,), s."""
+        return self._times
+
+    @property
+    def message(self) -> str:
+        """What happened, in a sentence."""
+        done = f"{self.steps} steps, {self.told}"
+        if self.status == "ok":
+            return done
+        said = SAID[self.status].replace("take a smaller h", "take a looser tolerance")
+        where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
+        end = self.t[-1] if len(self) else self.t0
+        return f"stopped at t = {end:.9g} after {done}, {where}: {said}"
+
+    @property
+    def told(self) -> str:
+        """How its steps were chosen, in words."""
+        return f"{self.rejected} rejected, tolerance {self.tol:g}"
+
+    @property
+    def _remark(self) -> str:
+        if self.held_back < max(_STIFF, self.steps // 8):
+            return ""
+        return (
+            f"{self.held_back} of {self.steps} steps were held back by a stiff motion: fixed steps "
+            "of gauss8 may be quicker"
+        )
+
+    def __repr__(self) -> str:
+        how = "" if self.status == "ok" else f"{self.status} after "
+        return f"<Run of {self._model.name}: {how}{self.steps} steps, tolerance {self.tol:g}>"
+
+    def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
+        self.error = _error(self, progress)
+        if words := self.error.warning:
+            warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
+        return self.error
+
+    def _again(self, parts: int, every: int, nudge: Array | None, progress: Any) -> Run:
+        raise ValueError("an adaptive run has no steps of one size")
+
+    def _kept(self) -> dict[str, Any]:
+        own = {
+            "tol": self.tol, "rejected": self.rejected, "held_back": self.held_back,
+            "times": self.t, "h_most": self._h_most,
+        }  # fmt: skip
+        return super()._kept() | own
+
+    @classmethod
+    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> AdaptiveRun:
+        return cls(
+            model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
+            kept["params"], 1, kept.get("held"), kept["method"], kept["evaluations"],
+            tol=kept["tol"], rejected=kept["rejected"], held_back=kept["held_back"],
+            _times=kept["times"], _h_most=kept["h_most"],
+        )  # fmt: skip
+
+    def _state(self) -> dict[str, Any]:
+        return super()._state() | {"_times": self._times}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("adaptive.AdaptiveRun._of_state", self._state())
+
+    def _settings(self) -> tuple[Any, ...]:
+        return (*super()._settings(), self.tol, self._times.tolist())
+
+
+def simulate(
+    model: Model, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
+    params: Any, t0: float, progress: Callable[[int, int], None] | None, tol: float | None,
+    times: ArrayLike | None, h_most: float | None, **fixed: Any,
+) -> AdaptiveRun:  # fmt: skip
+    """`Model.simulate` with a tolerance; fixed: what belongs to fixed steps, and was given."""
+    if model.tolerance is None:
+        raise ValueError("tol: not built; a scene asks for it with [run] tolerance = 1e-9")
+    for name, value in fixed.items():
+        if value is not None and (name, value) != ("every", 1):
+            raise ValueError(f"{name}: belongs to fixed steps, tol to adaptive ones: give one")
+    if u is not None and (callable(u) or np.ndim(u) > 1):
+        raise ValueError(
+            "u: adaptive steps take the scene's signals, or one value an input, held over the "
+            "run; a function or a table is for fixed steps: give h="
+        )
+    start = model.start
+    q, qd = model._one(*(own if x is None else x for x, own in zip((q0, qd0), start, strict=True)))
+    t0, held = as_number(t0, "t0"), model._inputs(u)
+    p = np.array(model._parameters(params))
+    tol = as_tolerance(model.tolerance if tol is None else tol, model.dtype)
+    most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
+    if times is None:
+        span = model.duration if duration is None else as_number(duration, "duration")
+        if span < 0:
+            raise ValueError(f"duration: {span:g} is not a time in s")
+        found = run(model, q, qd, t0, t0 + span, tol, None, held, p, most, progress)
+    else:
+        if duration is not None:
+            raise ValueError("times: say where the run ends; give times or duration, not both")
+        rows = as_times(times, t0, model.dtype)
+        first = int(rows[0] == t0)
+        end = float(rows[-1])
+        found = run(model, q, qd, t0, end, tol, rows[first:], held, p, most, progress)
+        if first:
+            both = np.concatenate([np.array([[q], [qd]]), found._rows], axis=1)
+            found._rows, found._times = both, rows[: both.shape[1]]
+    return found
+
+
+def run(
+    model: Model, q: Array, qd: Array, t0: float, t_end: float, tol: float, times: Array | None,
+    u: Array | None, p: Array, h_most: float, progress: Callable[[int, int], None] | None,
+) -> AdaptiveRun:  # fmt: skip
+    """A run from checked arguments, whatever its status; times (n,) later than t0."""
+    address, real, null = model._c
+    nq, work = model.nq, model._ffi.new("adaptive_work *")
+    x, at = np.concatenate([q, qd]).astype(model.dtype), np.array([t0], model.dtype)
+    at_u = null if u is None else address(real, u)
+    given, done, room = null, 0, _ROOM
+    if times is not None:
+        asked = np.ascontiguousarray(times, model.dtype)
+        rows = np.empty((2, len(asked), nq), model.dtype)
+        given = address(real, asked)
+    pieces: list[tuple[Array, Array]] = []
+
+    def kept() -> None:
+        nonlocal done
+        if times is None:
+            pieces.append((stamps[: work.rows].copy(), both[:, : work.rows].copy()))
+        done += work.rows
+        work.rows = 0
+
+    said = "ok"
+    try:
+        while at[0] < t_end:
+            begun = perf_counter()
+            if times is None:
+                stamps, both = np.empty(room, model.dtype), np.empty((2, room, nq), model.dtype)
+                to_t, to_q, to_qd = (address(real, a) for a in (stamps, both[0], both[1]))
+            else:
+                left = rows[:, done:]
+                to_t, to_q, to_qd = null, address(real, left[0]), address(real, left[1])
+                given = address(real, asked[done:])
+            found = model._lib.adaptive(
+                address(real, x), address(real, at), t_end, tol, h_most, at_u, room, given,
+                0 if times is None else len(asked) - done, to_t, to_q, to_qd,
+                address(real, p), work,
+            )  # fmt: skip
+            kept()
+            said = STATUS[found]
+            if said != "ok":
+                break
+            if progress is not None:
+                progress(round(1000 * (float(at[0]) - t0) / (t_end - t0)), 1000)
+            room = min(longer(room, perf_counter() - begun), _MOST)
+    except KeyboardInterrupt:
+        kept()
+        said = "interrupted"
+    if times is None:
+        stamps = np.concatenate([[t0], *(t for t, _ in pieces)]).astype(model.dtype)
+        rows = np.concatenate([np.array([[q], [qd]]), *(r for _, r in pieces)], axis=1)
+    else:
+        stamps, rows = asked[:done], rows[:, :done]
+    mean = (float(at[0]) - t0) / work.steps if work.steps else t_end - t0
+    held = None if u is None else u.copy()
+    return AdaptiveRun(
+        model, t0, rows.astype(model.dtype), mean, work.steps, said, p, 1, held, "gauss16",
+        work.evaluations, tol=tol, rejected=work.rejected, held_back=work.held_back,
+        _times=stamps, _h_most=h_most,
+    )  # fmt: skip
+
+
+def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Estimate:
+    """The error of a run, beside one of a hundredth of its tolerance, and from a moved start."""
+    model, x = own._model, own.x.astype(float)
+    eps = float(np.finfo(model.dtype).eps) / 2
+    least = float(_LEAST[model.dtype.name])
+    scale = scales(x)
+    size = max(1e4 * eps, 100 * own.tol)
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
+
+    def again(tol: float, start: Array) -> Array:
+        nq, out = model.nq, np.full_like(x, np.nan)
+        out[0] = start
+        if len(own) > 1:
+            made = run(
+                model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[1:], own._u,
+                own._params, own._h_most, progress,
+            )  # fmt: skip
+            if made.status == "interrupted":
+                raise KeyboardInterrupt
+            out[1 : 1 + len(made)] = made.x
+        return out
+
+    finer = again(max(own.tol / _FINER, least), x[0])
+    moved = again(own.tol, x[0] + size * scale * signs)
+    error = np.maximum(np.abs(x - finer), eps * np.abs(x))
+    error[0] = 0.0
+    error[~np.isfinite(error)] = np.inf
+    with np.errstate(invalid="ignore", divide="ignore"):
+        grown = float(np.nanmax(np.abs(moved[-1] - x[-1]) / scale)) / size
+        digits = np.clip(-np.log10(error[-1] / scale), 0.0, -np.log10(eps)) + 0.0
+    names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
+    end, right = (dict(zip(names, map(float, x), strict=True)) for x in (error[-1], digits))
+    words = [f"the run stopped at t = {own.t[-1]:.6g} s"] if own.status != "ok" else []
+    if grown * eps > _TENTH:
+        words.append(f"chaotic: a difference at the start grows {grown:.1g} times or more")
+    if (error > _TENTH * scale).any():
+        row = int(np.argmax((error > _TENTH * scale).any(axis=1)))
+        words.append(
+            f"the error exceeds a tenth of the motion from t = {own.t[row]:.4g} s on: take a "
+            "tighter tolerance, or a shorter duration"
+        )
+    return Estimate(
+        error[:, : model.nq], error[:, model.nq :], end, right, 2 * STAGES, float("nan"), grown,
+        "; ".join(words),
+    )  # fmt: skip
+
+
+def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
+    """A tolerance that the numbers have digits for, or a ValueError."""
+    least = _LEAST[dtype.name]
+    number = as_number(tol, "tol")
+    if not least <= number <= LOOSEST:
+        raise ValueError(f"tol: {number:g}: give one between {least:.1g} and {LOOSEST:g}")
+    return number
+
+
+def as_times(times: ArrayLike, t0: float, dtype: np.dtype[Any]) -> Array:
+    """Times in ascending order, not before t0, or a ValueError."""
+    try:
+        found = np.ascontiguousarray(times, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"times: {times!r} is not an array of numbers") from None
+    if found.ndim != 1 or not len(found) or not np.isfinite(found).all():
+        raise ValueError("times: expected a row of finite numbers, in s")
+    if found[0] < t0 or (np.diff(found) <= 0).any():
+        raise ValueError(f"times: expected ascending times from t0 = {t0:g} s on")
+    return found

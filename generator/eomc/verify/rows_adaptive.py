@@ -1,0 +1,104 @@
+"""Rows of `check` about adaptive steps: their end, and rows within steps, beside the reference.
+
+The reference goes there by steps of the tableau on its own accelerations, half as long as those of
+a tighter tolerance. What each adaptive step may err by is the tolerance,
+times what a difference at the start grows to.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.integrators.tableaux import GAUSS16
+from eomc.verify import one_step
+from eomc.verify.comparison import GROWTH_LIMIT
+from eomc.verify.finding import Finding, largest
+from eomc.verify.oracle import Vector
+from eomc.verify.sampling import NUDGE, State
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+
+LIMIT, UNIT = 10.0, "tolerances a step, times growth"
+STEPS = (12, 6, 3)  # of a run that is compared, the first in which a difference grows little
+LEAST = {"float64": 1e-15, "float32": 5e-7}  # tolerance
+ROUNDING = 1e3  # in a tolerance's place, where that is smaller
+
+
+def report(of: Comparison, plain: Any) -> None:
+    """Add the rows of a scene that asks for them. plain: the module of the plain form, or None."""
+    if of.system.run.tolerance is None:
+        return
+    tight = 1e-13 if of.dtype == np.float64 else 1e-6
+    for module, form in ((of.module, ""), (plain, "plain C: ")):
+        for tol in (10 * tight**0.5, tight) if module is not None else ():
+            measure = partial(_worst, of, module, tol)
+            of.row(f"{form}adaptive steps, {tol:g}", LIMIT, UNIT, measure)
+
+
+def _worst(of: Comparison, module: Any, tol: float) -> float | Finding:
+    errors = (_error(of, module, max(tol, 8 * of.eps), e.state) for e in of.few(3))
+    return largest(errors, "a difference grows too much in a few steps")
+
+
+def _adaptive(module: Any, s: State, x: Vector, T: float, tol: float, **how: Any) -> Any:
+    n = len(s.q)
+    with warnings.catch_warnings():  # a run that stops is seen by its rows
+        warnings.simplefilter("ignore", RuntimeWarning)
+        span = how if "times" in how else {"duration": T}
+        return module.simulate(x[:n], x[n:], tol=tol, t0=s.t, u=s.u, params=s.params, **span)
+
+
+def _error(of: Comparison, module: Any, tol: float, s: State) -> float | None:
+    """At the end and at times within steps, from one state; None where nothing can be compared."""
+    x = np.concatenate([s.q, s.qd])
+    spread = np.concatenate([of.sampler.spread, of.sampler.speed])
+    first = _adaptive(module, s, x, of.system.run.duration, tol)
+    if len(first) < 2:
+        return None
+    for steps in STEPS:
+        T = float(first.t[min(steps, len(first) - 1)]) - s.t
+        run = _adaptive(module, s, x, T, tol)
+        near = _adaptive(module, s, x + NUDGE * spread, T, tol)
+        if run.status != "ok" or near.status != "ok":
+            continue
+        growth = float(np.max(np.abs(near.x[-1] - run.x[-1]) / spread)) / NUDGE
+        if not growth < GROWTH_LIMIT:
+            continue
+        times = s.t + T * np.array([0.31, 0.77, 1.0])
+        rows = _adaptive(module, s, x, T, tol, times=times)
+        finer = _adaptive(module, s, x, T, max(tol / 1000, LEAST[of.dtype.name]))
+        expected = _reference(of, s, x, times, finer.t)
+        if not np.isfinite(expected).all():
+            continue
+        found = np.vstack([rows.x, run.x[-1:]]).astype(float)
+        size = np.abs(expected).max(axis=0) + max(growth, 1.0) * spread
+        off = np.abs(found - np.vstack([expected, expected[-1:]])) / size
+        allowed = (tol + ROUNDING * of.eps) * (run.steps + 1)
+        return float(np.nan_to_num(off.max(), nan=math.inf) / allowed)
+    return None
+
+
+def _reference(of: Comparison, s: State, x: Vector, times: Vector, grid: Vector) -> Vector:
+    """The states at some times, (n, 2 nq), by two fixed steps from each time of a grid on."""
+    n, rows = len(s.q), []
+    held = None if s.u is None else s.u[None]
+
+    def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
+        return of.reference.acceleration(q, qd, np.full(len(q), t), held, s.params)
+
+    q, qd, t = x[None, :n], x[None, n:], s.t
+    with np.errstate(all="ignore"):
+        for end in np.union1d(grid[grid > s.t], times):
+            h = (end - t) / 2
+            for k in range(2):
+                q, qd = one_step.step(GAUSS16, acceleration, q, qd, t + k * h, h)
+            t = float(end)
+            if end in times:
+                rows.append(np.concatenate([q[0], qd[0]]))
+    return np.array(rows)

@@ -1,0 +1,186 @@
+"""Adaptive steps: their end, rows at times, what they refuse, and that both forms of C agree."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+import cases
+import numpy as np
+import pytest
+from conftest import tiers
+
+import eomc
+from eomc.base.errors import SceneError
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+from eomc.verify.check import check
+
+BUILDS = Path(__file__).parents[2] / "build" / "tests" / "adaptive"
+PERIOD = 2 * math.pi
+KEPLER = """eomc = 1
+name = "eccentric"
+[coordinates]
+x = { unit = "m", start = 0.1 }
+y = { unit = "m", rate = 4.358898943540674 }
+[parameters]
+mu = 1
+[inputs]
+push = { unit = "N" }
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "-mu/sqrt(x**2 + y**2)"
+[forces]
+x = "push"
+[run]
+tolerance = 1e-9
+"""
+
+
+@pytest.fixture(scope="module")
+def kepler() -> ModuleType:
+    """An orbit of eccentricity 0.9 about the origin, from its nearest point, period 2 pi."""
+    return eomc.load(from_scene(parse(KEPLER, "eccentric.toml")), BUILDS)
+
+
+def test_the_end_errs_by_about_the_tolerance(kepler: ModuleType) -> None:
+    errors = []
+    for tol in (1e-5, 1e-7, 1e-9, 1e-11):
+        run = kepler.simulate(tol=tol, duration=PERIOD)
+        assert run.status == "ok" and run.t[-1] == PERIOD and run.tol == tol
+        errors.append(math.hypot(run.q[-1, 0] - 0.1, run.q[-1, 1]))
+        assert errors[-1] < 10 * tol
+    assert errors[0] > 1e3 * errors[-1]
+
+
+def test_steps_are_short_where_the_motion_is_fast(kepler: ModuleType) -> None:
+    run = kepler.simulate(duration=PERIOD)
+    assert run.tol == 1e-9 and len(run) == run.steps + 1 < 40
+    steps, far = np.diff(run.t), np.hypot(*run.q.T)
+    assert steps[far[:-1] < 0.3].max() < steps[far[:-1] > 1.5].min() / 5
+    assert run.evaluations < 1500 and run.rejected < run.steps / 4
+
+
+def test_rows_at_times_are_those_of_runs_that_end_there(kepler: ModuleType) -> None:
+    times = np.array([0.0, 0.01, 0.5, 3.3, 3.4, 6.0])
+    run = kepler.simulate(tol=1e-12, times=times)
+    whole = kepler.simulate(tol=1e-12, duration=6.0)
+    assert run.t.tolist() == times.tolist() and run.q.shape == (6, 2)
+    assert run.steps == whole.steps and np.array_equal(run.q[-1], whole.q[-1])
+    assert run.q[0].tolist() == [0.1, 0.0]
+    for row, t in zip(run.q[1:], times[1:], strict=True):
+        ended = kepler.simulate(tol=1e-12, duration=t)
+        assert row == pytest.approx(ended.q[-1], abs=1e-11)
+
+
+def test_a_run_is_the_same_in_pieces(kepler: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = kepler.simulate(duration=50.0)
+    module = __import__(f"{kepler.__name__}.adaptive", fromlist=["adaptive"])
+    monkeypatch.setattr(module, "_ROOM", 1)
+    monkeypatch.setattr(module, "_MOST", 3)
+    again = kepler.simulate(duration=50.0)
+    assert again == run and np.array_equal(again.t, run.t) and again.steps == run.steps
+    assert pickle.loads(pickle.dumps(run)) == run
+
+
+def test_its_error_is_found(kepler: ModuleType) -> None:
+    run = kepler.simulate(tol=1e-6, duration=5 * PERIOD, estimate=True)
+    true = abs(run.q[-1] - [0.1, 0.0])
+    assert run.error.resolved and run.error.order == 16
+    assert np.all(run.error.q[-1] < 3 * true + 1e-12) and np.all(run.error.q[-1] > true / 3)
+    assert run.error.amplification > 10
+
+
+def test_held_inputs_act(kepler: ModuleType) -> None:
+    one, other = (kepler.simulate(duration=1.0, u=[u]) for u in (0.0, 0.1))
+    fixed = kepler.simulate(h=1e-4, duration=1.0, u=[0.1])
+    assert other.q[-1] == pytest.approx(fixed.q[-1], abs=1e-8)
+    assert abs(one.q[-1, 0] - other.q[-1, 0]) > 1e-3 and other.u[-1] == [0.1]
+
+
+def test_no_step_is_longer_than_asked(kepler: ModuleType) -> None:
+    run = kepler.simulate(duration=PERIOD, h_most=0.05)
+    assert np.diff(run.t).max() <= 0.05 * (1 + 1e-12) and run.steps > 120
+
+
+def test_a_motion_into_a_singularity_stops_and_says_where(kepler: ModuleType) -> None:
+    with pytest.warns(RuntimeWarning, match="stopped at t = 0.03"):
+        run = kepler.simulate(q0=[0.1, 0], qd0=[0, 0], duration=1.0)  # straight into the centre
+    assert run.status in ("not finite", "no convergence")
+    assert run.t[-1] == pytest.approx(math.pi * math.sqrt(0.1**3 / 8), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"tol": 1e-16}, "tol: 1e-16: give one between 1e-15 and 0.01"),
+        ({"tol": 1}, "tol: 1: give one between"),
+        ({"tol": "x"}, "tol: 'x' is not a number"),
+        ({"tol": 1e-6, "h": 0.1}, "h: belongs to fixed steps"),
+        ({"tol": 1e-6, "every": 2}, "every: belongs to fixed steps"),
+        ({"tol": 1e-6, "u": lambda t, q, qd: [0]}, "u: adaptive steps take"),
+        ({"tol": 1e-6, "u": np.zeros((3, 1))}, "u: adaptive steps take"),
+        ({"tol": 1e-6, "times": [1.0, 0.5]}, "times: expected ascending times from t0"),
+        ({"tol": 1e-6, "times": [-1.0]}, "times: expected ascending times from t0 = 0 s"),
+        ({"tol": 1e-6, "times": []}, "times: expected a row of finite numbers"),
+        ({"tol": 1e-6, "times": [1.0], "duration": 1.0}, "times: say where the run ends"),
+        ({"tol": 1e-6, "duration": -1.0}, "duration: -1 is not a time"),
+        ({"tol": 1e-6, "h_most": 0}, "h_most: 0 is not a step size"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(kepler: ModuleType, how: dict, words: str) -> None:
+    with pytest.raises(ValueError) as fault:
+        kepler.simulate(**how)
+    assert words in str(fault.value)
+
+
+@pytest.mark.slow
+def test_a_stiff_motion_says_so() -> None:
+    text = cases.scene_text("iftomm_A05_governor").replace("[run]", "[run]\ntolerance = 1e-9")
+    module = eomc.load(from_scene(parse(text, "stiff.toml")), BUILDS)
+    with pytest.warns(RuntimeWarning, match="steps were held back by a stiff motion: fixed steps"):
+        module.simulate()
+
+
+def test_without_tolerance_nothing_is_built(cartpole: ModuleType) -> None:
+    with pytest.raises(ValueError, match=r"tol: not built; a scene asks for it with \[run\] tol"):
+        cartpole.simulate(tol=1e-9)
+    assert not hasattr(cartpole._model._lib, "adaptive")
+
+
+@pytest.mark.parametrize("given", ["0", "1", "1e-16", '"1e-9"', "true"])
+def test_a_tolerance_is_a_small_number(given: str) -> None:
+    with pytest.raises(SceneError, match="tolerance"):
+        parse(KEPLER.replace("1e-9", given), "eccentric.toml")
+
+
+NAMES = ("double_pendulum_regular", "cartpole_drop_tutorialP", "pleiades", "gimbal_near_lock_1e-3")
+
+
+@pytest.mark.parametrize("name", tiers(NAMES, NAMES[0]))
+def test_hard_cases_end_as_they_should(name: str) -> None:
+    text = cases.scene_text(name).replace("[run]", "[run]\ntolerance = 1e-9")
+    module = eomc.load(from_scene(parse(text, f"{name}.toml")), BUILDS)
+    for tol in (1e-6, 1e-9):
+        assert cases.error_of(name, module.simulate(tol=tol).q[-1]) < 10 * tol
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["double_pendulum", "heavy_top", "furuta_pendulum", "chain"])
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_check_compares_both_forms_with_the_reference(scene: str, real: str) -> None:
+    tol = {"double": "1e-9", "float": "1e-5"}[real]
+    name = f"{scene}_{real}_fits"
+    path = cases.variant(
+        scene, name, tolerance=tol, **({"real": '"float"'} if real == "float" else {})
+    )
+    system = eomc.read(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        plain = eomc.load(system, BUILDS, form="plain")
+        report = check(system, eomc.load(system, BUILDS), plain=plain, states=4)
+    rows = [row for row in report.rows if "adaptive" in row.name]
+    assert len(rows) == 4 and all(row.passed for row in rows), rows
