@@ -101,9 +101,10 @@ def command(
         say(json.dumps(summary, indent=1))
     elif not quiet:
         _print_summary(module, done, balance, summary)
+    whole = done.status in ("ok", "accumulated")
     if done.status != "ok":
         say(f"eomc: {done.message}", err=True)
-    if stopped or done.status != "ok":
+    if stopped or not whole:
         sys.exit(130 if stopped else 1)
 
 
@@ -193,6 +194,8 @@ def _summary(
             "largest_change": float(np.max(np.abs(energy - energy[0]))),
             "balance": dataclasses.asdict(balance) if balance else None,
         },
+        "events": {name: e.t.tolist() for name, e in getattr(done, "events", {}).items()},
+        "stopped_by": getattr(done, "stopped", "") or None,
         "saturated": _saturated(module, done),
         "jacobi_change": None
         if np.array_equal(energy, jacobi)
@@ -225,6 +228,9 @@ def _print_summary(
         rate = f"{unit}/s" if unit else ""
         say(f"  {name:{wide}} {q: .9g} {unit}   {name}_dot {qd: .9g} {rate}".rstrip())
     _print_energy(done, balance, summary)
+    for name, times in summary["events"].items():
+        last = f", at t = {times[-1]:.9g} s{' at last' if len(times) > 1 else ''}" if times else ""
+        say(f"  event {name}: {len(times)} times{last}")
     for name, part in summary["saturated"].items():
         say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
     for words in (summary["beyond_stability"], summary["beyond_duration"]):

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from eomc.emit import c_function as c
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers, rounded
 from eomc.emit.functions import Functions
-from eomc.emit.plain.views import Adaptive
+from eomc.emit.plain.views import Adaptive, AdaptiveRun
 from eomc.integrators.tableaux import GAUSS16
 
 METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
+BUSY = 32  # events in one step, from which on it ends there
 
 
 def memory(functions: Functions) -> str:
@@ -22,9 +24,9 @@ def memory(functions: Functions) -> str:
     return f"{functions.prefix}_{METHOD.name}_adaptive_memory"
 
 
-def kept(coordinates: int, width: int) -> int:
+def kept(coordinates: int, width: int, events: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
-    return 6 * width + METHOD.stages * coordinates + 16
+    return 6 * width + METHOD.stages * coordinates + 16 + 2 * events
 
 
 @dataclass(frozen=True)
@@ -43,43 +45,78 @@ class Form:
     constants: bool = False
     compute_constants: str = ""
 
+
+@dataclass(frozen=True)
+class Stepping:
+    """The functions of adaptive steps over the sweeps of a form."""
+
+    functions: Functions
+    form: Form
+
+    @property
+    def method(self) -> str:
+        """What their C names begin with."""
+        return f"{self.functions.prefix}_{METHOD.name}"
+
     @property
     def rest(self) -> Sequence[CArgument]:
-        """Those arguments that are the same all along a run."""
-        return [a for a in self.around if a.name in "ucp"]
+        """The arguments that are the same all along a run."""
+        return [a for a in self.form.around if a.name in "ucp"]
+
+    @property
+    def held(self) -> CArgument:
+        """What a run hands on."""
+        return c.filled(memory(self.functions), "memory")
+
+    @property
+    def state(self) -> CArgument:
+        """The state of a run."""
+        return c.filled(f"{self.method}_adaptive_state", "x")
+
+    def number(self, name: str) -> CArgument:
+        """An argument that is a number."""
+        return CArgument(self.functions.real, name)
+
+    @cached_property
+    def settle(self) -> CFunction:
+        """The accelerations over a step."""
+        real = self.functions.real
+        out = c.filled(f"{self.method}_stages", "a")
+        told = (c.filled(real, "rough"), c.filled("int", "sweeps"))
+        given = (*self.form.around, self.number("tol"), self.number("most"))
+        return CFunction(f"{self.method}_settled", "int", (out, *given, *told), qualifier="static")
+
+    @cached_property
+    def step(self) -> CFunction:
+        """The next step."""
+        given = (self.number("t_end"), self.number("tol"), *self.rest)
+        arguments = (self.state, *given, self.held)
+        return CFunction(
+            f"{self.method}_adapted", self.functions.status, arguments, qualifier="static"
+        )
+
+    @cached_property
+    def within(self) -> CFunction:
+        """The state within the last step."""
+        out = tuple(c.filled(self.functions.real, name) for name in ("q_at", "qd_at"))
+        state = c.given(f"{self.method}_adaptive_state", "x")
+        given = (state, self.number("z"), self.number("tol"), *self.rest)
+        return CFunction(
+            f"{self.method}_inside", "void", (*out, *given, self.held), qualifier="static"
+        )
 
 
-def view(functions: Functions, form: Form) -> Adaptive:
-    """Adaptive steps over the sweeps of a form."""
-    target, m, real = functions.target, METHOD, functions.target.real
-    method, name = f"{functions.prefix}_{m.name}", functions.real
+def steps(made: Stepping) -> Adaptive:
+    """A step, and the state within it."""
+    functions, m, form = made.functions, METHOD, made.form
+    target, real = functions.target, functions.target.real
     end = real.function_suffix
-    state = f"{method}_adaptive_state"
-    run = functions.public.adaptive(m.name)
-    tol, held = CArgument(name, "tol"), c.filled(memory(functions), "memory")
-    settle = CFunction(
-        f"{method}_settled", "int",
-        (c.filled(f"{method}_stages", "a"), *form.around, tol, CArgument(name, "most"),
-         c.filled(name, "rough"), c.filled("int", "sweeps")),
-        qualifier="static",
-    )  # fmt: skip
-    step = CFunction(
-        f"{method}_adapted", functions.status,
-        (c.filled(state, "x"), CArgument(name, "t_end"), tol, *form.rest, held),
-        qualifier="static",
-    )  # fmt: skip
-    within = CFunction(
-        f"{method}_inside", "void",
-        (c.filled(name, "q_at"), c.filled(name, "qd_at"), c.given(state, "x"),
-         CArgument(name, "z"), tol, *form.rest, held),
-        qualifier="static",
-    )  # fmt: skip
     known = {"a": "&a", "rough": "&rough", "sweeps": "&sweeps"}
-    row = f"{functions.NQ}*rows"
     return Adaptive(
-        **functions.names,
+        PREFIX=functions.PREFIX,
+        real=functions.real,
         title=TITLE,
-        method=method,
+        method=made.method,
         extent=form.extent,
         stages=m.stages,
         f=real.suffix,
@@ -95,21 +132,41 @@ def view(functions: Functions, form: Form) -> Adaptive:
         last=numbers(m.legendre(m.stages - 1), real),
         before=numbers(m.legendre(m.stages - 2), real),
         timed=target.driven,
-        constants=form.constants,
-        unread_p=target.needs_p and not form.compute_constants and not _takes_p(form),
-        compute_constants=form.compute_constants,
-        settle=settle,
+        events=bool(target.system.events),
+        settle=made.settle,
         sweep=form.sweep,
-        step=step,
+        step=made.step,
         start=form.start,
-        settled=settle.call(most=f"{target.literal(2 * 0.8**-8)}*aim", **known),
-        within=within,
-        settled_within=settle.call(most=target.literal(1e30), **known),
-        run=run,
-        advance=step.call(x="&x"),
-        look=within.call(q_at=f"q_rows + {row}", qd_at=f"qd_rows + {row}", x="&x"),
+        settled=made.settle.call(most=f"{target.literal(2 * 0.8**-8)}*aim", **known),
+        within=made.within,
+        settled_within=made.settle.call(most=target.literal(1e30), **known),
     )
 
 
-def _takes_p(form: Form) -> bool:
-    return any(a.name == "p" for a in form.around)
+def run(made: Stepping, happen: str = "", restart: str = "") -> AdaptiveRun:
+    """The loop. happen, restart: the calls that find events, and go on behind them."""
+    functions, form = made.functions, made.form
+    target = functions.target
+    row = {name: f"{name} + {functions.NQ}*rows" for name in ("q_rows", "qd_rows")}
+    kept = CFunction(
+        f"{made.method}_kept", "void",
+        tuple(c.filled(functions.real, n) for n in ("q_row", "qd_row", "q", "qd")),
+    )  # fmt: skip
+    to = {"q_row": row["q_rows"], "qd_row": row["qd_rows"]}
+    takes_p = "p" in {a.name for a in made.rest} or bool(form.compute_constants or happen)
+    return AdaptiveRun(
+        **functions.names,
+        method=made.method,
+        constants=form.constants,
+        unread_p=target.needs_p and not takes_p,
+        compute_constants=form.compute_constants,
+        events=bool(happen),
+        busy=BUSY,
+        run=functions.public.adaptive(METHOD.name),
+        advance=made.step.call(x="&x"),
+        happen=happen,
+        restart=restart,
+        row=kept.call(q="x.q", qd="x.qd", **to),
+        row_before=kept.call(q="q_at", qd="qd_at", **to),
+        look=made.within.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
+    )

@@ -23,14 +23,15 @@ _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
     "moving constants along column slopes outputs applied count failures point E poses velocities "
-    "accelerations jacobians forces wrenches momentum".split()
+    "accelerations jacobians forces wrenches momentum events after".split()
 )
 
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
 # that is called so has another name in C
 OWN = frozenset(
-    "AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE NF NOINLINE NOT_FINITE NO_CONVERGENCE NQ "
-    "NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
+    "ACCUMULATED AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE NE NF NOINLINE NOT_FINITE "
+    "NO_CONVERGENCE NQ NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL WIDE_BYTES "
+    "WIDE_COUNT".split()
 )
 
 Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C
@@ -72,6 +73,7 @@ class Target:
         taken = {f"{self.PREFIX}_{w}" for w in OWN}
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         outputs = [f"OUT_{o.name}" for o in self.system.outputs]
+        outputs += [f"EVENT_{e.name}" for e in self.system.events]
         names = [*indexed, *outputs, *(f"FRAME_{f.name}" for f in self.system.asked)]
         wishes = [f"{self.PREFIX}_{name}" for name in names]
         return dict(zip(names, _unique(wishes, taken), strict=True))

@@ -61,6 +61,10 @@ KINDS: Mapping[str, Kind] = {
         "[dy/dq, dy/dqd, dy/du, dy/dqdd] of the outputs y, by rows, each at the others held.",
         qdd=True,
     ),
+    "events": Kind("events", "e", True, True, "Of each event what is zero where it happens."),
+    "jumps": Kind(
+        "after", "e*2*n", True, True, "[q; qd] behind each event, where it is one that jumps."
+    ),
     "frame_poses": Kind("poses", "f*pose", False, False, "Where each frame is: {pose}."),
     "frame_velocities": Kind(
         "velocities", "f*twist", True, False, "Of each frame: {twist}, along the world's axes."
@@ -125,7 +129,8 @@ def doc(target: Target, name: str) -> str:
 
 def extent(target: Target, shape: str) -> str:
     """How many numbers that is, in C."""
-    s, NQ, NU, NY, NF = (target.system, *(f"{target.PREFIX}_{n}" for n in ("NQ", "NU", "NY", "NF")))
+    s, NQ, NU = target.system, f"{target.PREFIX}_NQ", f"{target.PREFIX}_NU"
+    NY, NF, NE = (f"{target.PREFIX}_{n}" for n in ("NY", "NF", "NE"))
     pose, twist, momentum = (3, 3, 6) if s.plane else (12, 6, 10)
     return {
         "n*n": f"{NQ}*{NQ}",
@@ -135,6 +140,8 @@ def extent(target: Target, shape: str) -> str:
         "m*x": f"{NU}*2*{NQ}",
         "y": NY,
         "y*x": f"{NY}*(3*{NQ} + {NU})" if s.inputs else f"{NY}*(3*{NQ})",
+        "e": NE,
+        "e*2*n": f"{NE}*2*{NQ}",
         "f*pose": f"{NF}*{pose}",
         "f*twist": f"{NF}*{twist}",
         "f*twist*n": f"{NF}*{twist}*{NQ}",

@@ -18,7 +18,7 @@ from eomc.emit.c_names import Target, sentence, unclashed
 from eomc.emit.evaluations import KINDS, doc, source
 from eomc.emit.plain.views import Computed, Indexed, Parameter
 from eomc.emit.public import Public
-from eomc.model.symbols import Coordinate, Input, Output
+from eomc.model.symbols import Coordinate, Event, Input, Output
 from eomc.program import outline
 from eomc.program.ir import Function
 from eomc.program.program import Program
@@ -338,9 +338,9 @@ def of(program: Program, real: Real | None = None) -> Functions:
 
 
 def indexed(
-    plain: Functions, some: Sequence[Coordinate | Input | Output], prefix: str = ""
+    plain: Functions, some: Sequence[Coordinate | Event | Input | Output], prefix: str = ""
 ) -> tuple[Indexed, ...]:
-    """Coordinates, inputs or outputs with their enumerators."""
+    """Coordinates, inputs, outputs or events with their enumerators."""
     enum = plain.target.enum
     return tuple(Indexed(enum[prefix + x.name], heading.words(x.unit, x.note)) for x in some)
 

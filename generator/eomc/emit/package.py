@@ -123,9 +123,9 @@ def _adaptive(target: Target) -> BoundAdaptive | None:
     run = Public(target).adaptive(adaptive.METHOD.name)
     call = run.call(
         q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target), status="&found",
-        memory=f"&{member('work', 'memory')}",
+        memory=f"&{member('work', 'memory')}", events=f"&{member('work', 'events')}",
     )  # fmt: skip
-    return BoundAdaptive(f"{run.name}_memory", call)
+    return BoundAdaptive(f"{run.name}_memory", call, bool(target.system.events))
 
 
 def _derivative(target: Target, method: str) -> str:
@@ -201,6 +201,7 @@ def face(target: Target, extension: str) -> Face:
         h=s.run.h,
         duration=s.run.duration,
         tolerance=s.run.tolerance,
+        events=tuple(e.name for e in s.events),
         timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,
         methods=tuple(METHODS[name] for name in s.run.methods),

@@ -127,9 +127,18 @@ class Public:
                 *self._moved, filled(real, "t"), *(CArgument(real, n) for n in LIMITS),
                 *self.usual("u"), CArgument("long", "steps"), given(real, "times"),
                 CArgument("long", "count"), *(filled(real, f"{n}_rows") for n in ("t", *STATE)),
+                *(self.adaptive_events if self.target.system.events else ()),
                 *self.usual("p"), CArgument(f"{name}_memory *", "memory"),
                 CArgument(f"{P}_status *", "status"),
             ),
+        )  # fmt: skip
+
+    @property
+    def adaptive_events(self) -> tuple[CArgument, ...]:
+        """Where events that were found go."""
+        return (
+            CArgument("long", "room"), filled("long", "events"), filled("int", "which"),
+            filled(self.target.real.name, "event_rows"),
         )  # fmt: skip
 
     def _status(self, name: str, *arguments: CArgument) -> CFunction:

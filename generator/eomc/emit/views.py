@@ -87,10 +87,11 @@ class BoundMethod:
 
 @dataclass(frozen=True)
 class BoundAdaptive:
-    """Adaptive steps in the binding: the type of their memory, and their call."""
+    """Adaptive steps in the binding: the type of their memory, their call, whether events are."""
 
     memory: str
     run: str
+    events: bool
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,7 @@ class Face:
     h: float
     duration: float
     tolerance: float | None
+    events: tuple[str, ...]
     timed: tuple[str, ...]
     batch: bool
     methods: tuple[Method, ...]

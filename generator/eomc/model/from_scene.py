@@ -10,7 +10,7 @@ from sympy import Expr, Symbol
 from eomc.base.errors import Problem, SceneError
 from eomc.model import algebra, growth, limits
 from eomc.model.multibody import Builder, Terms
-from eomc.model.symbols import Coordinate, Input, Output, Parameter, symbol, t
+from eomc.model.symbols import Coordinate, Event, Input, Output, Parameter, symbol, t
 from eomc.model.system import System
 from eomc.scene.formulas import Formula, FormulaError
 from eomc.scene.scene import Scene
@@ -71,6 +71,13 @@ class _Formulas:
             ends = (f and self.value(f"inputs.{i.name}.limits", f) for f in i.limits)
             yield Input(i.name, i.unit, signal, i.note, tuple(ends))
 
+    def events(self) -> Iterator[Event]:
+        """The events, with what their jumps set."""
+        for k, e in enumerate(self.scene.events):
+            when = self.value(f"event.{k}.when", e.when)
+            jump = ((name, self.value(f"event.{k}.{name}", formula)) for name, formula in e.jump)
+            yield Event(e.name, when, e.direction, e.action, tuple(jump), note=e.note)
+
     def outputs(self, kinetic: Expr, potential: Expr) -> Iterator[Output]:
         """The outputs, which may use accelerations and energies."""
         accelerations = (f"{c.name}_ddot" for c in self.scene.coordinates)
@@ -115,6 +122,7 @@ def from_scene(scene: Scene) -> System:
         parameters=tuple(Parameter(p.name, p.value, p.unit, p.note) for p in scene.parameters),
         inputs=tuple(made.inputs()),
         definitions=tuple(definitions),
+        events=tuple(made.events()),
         outputs=tuple(made.outputs(kinetic_energy, potential_energy)),
         run=scene.run,
         title=scene.title,

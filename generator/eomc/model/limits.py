@@ -32,5 +32,13 @@ def within(system: System) -> System:
         definitions=(*limited, *((s, e.xreplace(made)) for s, e in system.definitions)),
         forces=tuple(e.xreplace(made) for e in system.forces),
         applied=tuple((y, force.xreplace(made)) for y, force in system.applied),
+        events=tuple(
+            replace(
+                e,
+                when=e.when.xreplace(made),
+                jump=tuple((name, to.xreplace(made)) for name, to in e.jump),
+            )
+            for e in system.events
+        ),
         outputs=tuple(replace(o, formula=o.formula.xreplace(made)) for o in system.outputs),
     )

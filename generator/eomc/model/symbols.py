@@ -107,6 +107,21 @@ class Input(_Named):
         return within if most is None else sympy.Min(within, most)
 
 
+@dataclass(frozen=True)
+class Event(_Named):
+    """Where `when` crosses zero, "rising", "falling" or "both"; action: "record", "stop", "jump".
+
+    jump: what coordinates and velocities are then, by their names.
+    """
+
+    when: Expr
+    direction: str = "both"
+    action: str = "record"
+    jump: tuple[tuple[str, Expr], ...] = ()
+    unit: str = ""
+    note: str = ""
+
+
 def needed(
     definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
 ) -> list[tuple[Symbol, Expr]]:

@@ -16,13 +16,13 @@ from sympy import Expr, Symbol
 from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
 from eomc.model.limits import within
-from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
+from eomc.model.symbols import Coordinate, Event, Input, Output, Parameter, dot, symbol, t
 from eomc.model.tree import Frame, Tree
 from eomc.scene.scene import Run, Scene
 
 LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision, in C
 
-__all__ = ["Coordinate", "Input", "Output", "Parameter", "System", "dot", "symbol", "t"]
+__all__ = ["Coordinate", "Event", "Input", "Output", "Parameter", "System", "dot", "symbol", "t"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class System:
     inputs: tuple[Input, ...] = ()
     definitions: tuple[tuple[Symbol, Expr], ...] = ()
     outputs: tuple[Output, ...] = ()
+    events: tuple[Event, ...] = ()
     applied: tuple[tuple[Expr, Expr], ...] = ()
     tree: Tree | None = None
     frames: tuple[Frame, ...] = ()
@@ -97,7 +98,7 @@ class System:
     @property
     def reads_qdd(self) -> bool:
         """Whether functions may read accelerations."""
-        return bool(self.outputs or self.asked or self.run.inverse_dynamics)
+        return bool(self.outputs or self.events or self.asked or self.run.inverse_dynamics)
 
     @property
     def names(self) -> frozenset[str]:
@@ -187,6 +188,7 @@ class System:
             ),
             *(("force", e) for pair in self.applied for e in pair),
             *((f"outputs.{o.name}", o.formula) for o in self.outputs),
+            *(("event", x) for e in self.events for x in (e.when, *(f for _, f in e.jump))),
         ]
         numbers += [(key, n) for key, e in expressions for n in e.atoms(sympy.Number)]
         for key, n in numbers:

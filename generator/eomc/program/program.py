@@ -15,7 +15,7 @@ from eomc.derive.linearize import linearization, sensitivity
 from eomc.derive.momentum import momentum
 from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
-from eomc.model.symbols import ALONG
+from eomc.model.symbols import ALONG, Output, symbol
 from eomc.model.system import System, t
 from eomc.program.admissible import Candidate, cheapest
 from eomc.program.interpret import evaluator, nearby
@@ -79,7 +79,12 @@ def build(derived: Derivation) -> Program:
     functions["acceleration"] = best
     for made in _derivatives(system, taken):
         functions[made.name] = replace(made, route=best.route)
-    more = (*_outputs(system), *_applied(system), *_signal_slopes(system, functions))
+    more = (
+        *_outputs(system),
+        *_events(system),
+        *_applied(system),
+        *_signal_slopes(system, functions),
+    )
     functions |= {made.name: made for made in (*more, *_asked(system))}
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
@@ -130,6 +135,22 @@ def _outputs(system: System) -> Iterator[Function]:
     yield lower("outputs", made.tape, made.values, (), labels, system.names)
     if rows := [x for row in made.slopes for x in row]:
         yield lower("output_slopes", made.tape, rows, (), (), system.names)
+
+
+def _events(system: System) -> Iterator[Function]:
+    """What crosses zero where events are, and the states behind their jumps."""
+    if not system.events:
+        return
+    state, values = [x.name for x in (*system.q, *system.qd)], []
+    for e in system.events:
+        to = dict(e.jump)
+        values += [to.get(name, symbol(name)) for name in state]
+    jumps = any(e.action == "jump" for e in system.events)
+    for name, formulas in (("events", [e.when for e in system.events]), ("jumps", values)):
+        if name == "events" or jumps:
+            named = tuple(Output(f"{name}_{k}", value) for k, value in enumerate(formulas))
+            made = outputs.outputs(replace(system, outputs=named), sloped=False)
+            yield lower(name, made.tape, made.values, (), (), system.names)
 
 
 def _asked(system: System) -> Iterator[Function]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -27,10 +28,23 @@ LOOSEST = 1e-2
 STAGES = 8
 _LEAST = {"float64": 1e-15, "float32": 5e-7}
 _TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
+_EVENTS = 1024  # of one call
 _ROOM = 256  # steps of the first call
 _MOST = 2**20  # of one call
 _STIFF = 50  # steps that sweeps have held back, from which a run says so
 _FINER = 100.0  # the tolerance over that of the run by which an error is found
+
+
+@dataclass(frozen=True)
+class Happened:
+    """Where an event happened: t (n,), s; q and qd (n, nq), before a jump."""
+
+    t: Array
+    q: Array
+    qd: Array
+
+    def __len__(self) -> int:
+        return len(self.t)
 
 
 @dataclass(eq=False, repr=False)
@@ -38,7 +52,10 @@ class AdaptiveRun(Run):
     """A run whose steps fit `tol`: rows after each step, or at the times that were asked for.
 
     h is the mean step, `rejected` how many steps were tried in vain, `held_back` how many would
-    have been longer if the motion were not stiff; everything else as in a Run.
+    have been longer if the motion were not stiff. events: by name where and when each happened, t,
+    q, qd; stopped: the one that ended the run, or "". A run whose jumps follow one another ever
+    sooner ends with the status "accumulated", and `limit`, the time that it can't pass, s.
+    Everything else as in a Run.
     """
 
     tol: float = field(kw_only=True)
@@ -46,6 +63,9 @@ class AdaptiveRun(Run):
     held_back: int = field(kw_only=True)
     _times: Array = field(kw_only=True)
     _h_most: float = field(kw_only=True)
+    _happened: tuple[Array, Array] = field(kw_only=True)  # which, rows of t, q, qd
+    stopped: str = field(default="", kw_only=True)
+    limit: float = field(default=float("nan"), kw_only=True)
 
     @property
     def t(self) -> Array:
@@ -58,10 +78,25 @@ class AdaptiveRun(Run):
         done = f"{self.steps} steps, {self.told}"
         if self.status == "ok":
             return done
+        if self.status == "accumulated":
+            return (
+                f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
+                f"run ends, after {done}"
+            )
         said = SAID[self.status].replace("take a smaller h", "take a looser tolerance")
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
         return f"stopped at t = {end:.9g} after {done}, {where}: {said}"
+
+    @cached_property
+    def events(self) -> dict[str, Happened]:
+        """Where and when each of the scene's events happened."""
+        which, rows = self._happened
+        nq, found = self._model.nq, {}
+        for k, name in enumerate(self._model.events):
+            own = rows[which == k]
+            found[name] = Happened(own[:, 0], own[:, 1 : 1 + nq], own[:, 1 + nq :])
+        return found
 
     @property
     def told(self) -> str:
@@ -93,7 +128,8 @@ class AdaptiveRun(Run):
     def _kept(self) -> dict[str, Any]:
         own = {
             "tol": self.tol, "rejected": self.rejected, "held_back": self.held_back,
-            "times": self.t, "h_most": self._h_most,
+            "times": self.t, "h_most": self._h_most, "which": self._happened[0],
+            "event_rows": self._happened[1], "stopped": self.stopped, "limit": self.limit,
         }  # fmt: skip
         return super()._kept() | own
 
@@ -104,10 +140,14 @@ class AdaptiveRun(Run):
             kept["params"], 1, kept.get("held"), kept["method"], kept["evaluations"],
             tol=kept["tol"], rejected=kept["rejected"], held_back=kept["held_back"],
             _times=kept["times"], _h_most=kept["h_most"],
+            _happened=(kept["which"], kept["event_rows"]), stopped=kept["stopped"],
+            limit=kept["limit"],
         )  # fmt: skip
 
     def _state(self) -> dict[str, Any]:
-        return super()._state() | {"_times": self._times}
+        found = super()._state() | {"_times": self._times}
+        found.pop("events", None)
+        return found
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("adaptive.AdaptiveRun._of_state", self._state())
@@ -171,6 +211,7 @@ def run(
         rows = np.empty((2, len(asked), nq), model.dtype)
         given = address(real, asked)
     pieces: list[tuple[Array, Array]] = []
+    found_events = _Found(model)
 
     def kept() -> None:
         nonlocal done
@@ -178,13 +219,15 @@ def run(
             pieces.append((stamps[: work.rows].copy(), both[:, : work.rows].copy()))
         done += work.rows
         work.rows = 0
+        found_events.keep(work)
 
     said = "ok"
     try:
         while at[0] < t_end:
             begun = perf_counter()
             if times is None:
-                stamps, both = np.empty(room, model.dtype), np.empty((2, room, nq), model.dtype)
+                most = 2 * room if model.events else room  # two rows beside a jump
+                stamps, both = np.empty(most, model.dtype), np.empty((2, most, nq), model.dtype)
                 to_t, to_q, to_qd = (address(real, a) for a in (stamps, both[0], both[1]))
             else:
                 left = rows[:, done:]
@@ -193,11 +236,11 @@ def run(
             found = model._lib.adaptive(
                 address(real, x), address(real, at), t_end, tol, h_most, at_u, room, given,
                 0 if times is None else len(asked) - done, to_t, to_q, to_qd,
-                address(real, p), work,
+                *found_events.room(), address(real, p), work,
             )  # fmt: skip
             kept()
-            said = STATUS[found]
-            if said != "ok":
+            said = "accumulated" if found == len(STATUS) else STATUS[found]
+            if said != "ok" or (model.events and work.stopped):
                 break
             if progress is not None:
                 progress(round(1000 * (float(at[0]) - t0) / (t_end - t0)), 1000)
@@ -215,8 +258,40 @@ def run(
     return AdaptiveRun(
         model, t0, rows.astype(model.dtype), mean, work.steps, said, p, 1, held, "gauss16",
         work.evaluations, tol=tol, rejected=work.rejected, held_back=work.held_back,
-        _times=stamps, _h_most=h_most,
+        _times=stamps, _h_most=h_most, _happened=found_events.all(),
+        stopped=model.events[work.stopped - 1] if model.events and work.stopped else "",
+        limit=work.limit if said == "accumulated" else float("nan"),
     )  # fmt: skip
+
+
+class _Found:
+    """Room for the events of a call, and all that were found."""
+
+    def __init__(self, model: Model) -> None:
+        self.model, self.pieces = model, list[tuple[Array, Array]]()
+        self.which = np.empty(_EVENTS if model.events else 0, np.intc)
+        self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)
+
+    def room(self) -> tuple[Any, ...]:
+        """What C is told of it, where the scene has events."""
+        if not self.model.events:
+            return ()
+        address, real, _ = self.model._c
+        which = self.model._ffi.from_buffer("int[]", self.which)
+        return len(self.which), which, address(real, self.rows)
+
+    def keep(self, work: Any) -> None:
+        """Copy what the last call has found."""
+        if self.model.events and work.events:
+            n, work.events = work.events, 0
+            self.pieces.append((self.which[:n].copy(), self.rows[:n].copy()))
+
+    def all(self) -> tuple[Array, Array]:
+        """Of each event which it is, and its row."""
+        if not self.pieces:
+            return self.which[:0], self.rows[:0]
+        which, rows = zip(*self.pieces, strict=True)
+        return np.concatenate(which), np.concatenate(rows)
 
 
 def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Estimate:
@@ -228,21 +303,27 @@ def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Est
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
 
+    # rows beside a jump may be on either side of it in another run
+    jumps = np.isin(own.t, own.t[1:][np.diff(own.t) == 0])
+    kept = np.flatnonzero(~jumps & (own.t > own.t[0]))
+    beside = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(x))))
+
     def again(tol: float, start: Array) -> Array:
         nq, out = model.nq, np.full_like(x, np.nan)
         out[0] = start
-        if len(own) > 1:
+        if len(kept):
             made = run(
-                model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[1:], own._u,
+                model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], own._u,
                 own._params, own._h_most, progress,
             )  # fmt: skip
             if made.status == "interrupted":
                 raise KeyboardInterrupt
-            out[1 : 1 + len(made)] = made.x
-        return out
+            out[kept[: len(made)]] = made.x
+        return out[beside]
 
     finer = again(max(own.tol / _FINER, least), x[0])
     moved = again(own.tol, x[0] + size * scale * signs)
+    x = x[beside]
     error = np.maximum(np.abs(x - finer), eps * np.abs(x))
     error[0] = 0.0
     error[~np.isfinite(error)] = np.inf

@@ -52,11 +52,12 @@ class Model(Frames):
     def __init__(
         self, extension: Any, *, h: float, duration: float,
         methods: Mapping[str, tuple[int, int, float, float]], tolerance: float | None = None,
-        **scene: Any,
+        events: tuple[str, ...] = (), **scene: Any,
     ) -> None:  # fmt: skip
         """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
         super().__init__(extension, **scene)
         self.h, self.duration, self.tolerance = h, duration, tolerance
+        self.events = events
         self.methods = tuple(methods)
         self._facts = dict(methods)
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}

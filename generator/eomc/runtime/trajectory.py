@@ -304,7 +304,11 @@ class Run(Columns):
     @property
     def _remark(self) -> str:
         """What is to be said of a run that is whole, or ""."""
-        return ""
+        model = self._model
+        if not model.events or "events" in model._warned:
+            return ""
+        model._warned.add("events")
+        return "fixed steps pass over the scene's events: give tol= instead of h, steps or method"
 
     def __len__(self) -> int:
         return len(self.q)

@@ -13,7 +13,15 @@ import pydantic
 
 from eomc.base import names, texts
 from eomc.base.errors import MOST, EomcError, SceneError
-from eomc.scene import formulas, messages, repeat, schema, toml_text, validate_bodies
+from eomc.scene import (
+    formulas,
+    messages,
+    repeat,
+    schema,
+    toml_text,
+    validate_bodies,
+    validate_events,
+)
 from eomc.scene.formulas import Formula, suggest
 from eomc.scene.scene import Coordinate, Input, Output, Quantity, Run, Scene
 from eomc.scene.scope import (
@@ -102,6 +110,7 @@ class _Check(Checker):
         energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
+        events = list(validate_events.events(self, doc))
         outputs = self._outputs()
         self._asked()
         self._unused()
@@ -121,11 +130,19 @@ class _Check(Checker):
             **energies,
             forces=forces,
             outputs=tuple(outputs),
-            run=Run(**doc.run.model_dump()),
+            events=tuple(events),
+            run=self._run(),
             assembly=assembly,
             places=self.places,
             warnings=tuple(self.problems),
         )
+
+    def _run(self) -> Run:
+        """How it is run; events are found by adaptive steps."""
+        asked = self.doc.run.model_dump()
+        if self.doc.event and asked["tolerance"] is None:
+            asked["tolerance"] = 1e-9
+        return Run(**asked)
 
     # document and names
 

@@ -59,6 +59,21 @@ class Output:
 
 
 @dataclass(frozen=True)
+class Event:
+    """Where a formula crosses zero: up, down or both ways.
+
+    action: "record", "stop" or "jump"; jump: what coordinates and velocities are after it.
+    """
+
+    name: str
+    when: Formula
+    direction: str
+    action: str
+    jump: tuple[tuple[str, Formula], ...]
+    note: str
+
+
+@dataclass(frozen=True)
 class Run:
     """How the scene is run unless the caller says otherwise: step size h and duration in s.
 
@@ -107,6 +122,7 @@ class Scene:
     dissipation: Formula
     forces: Mapping[str, Formula]
     outputs: tuple[Output, ...]
+    events: tuple[Event, ...]
     run: Run
     assembly: Assembly | None
     places: SourceMap = field(repr=False, compare=False)

@@ -11,9 +11,11 @@ import pydantic
 from eomc.base import texts
 from eomc.integrators.tableaux import METHODS
 from eomc.scene import messages, spelling
+from eomc.scene.aliases import ALIASES, ALIASES_OF
 from eomc.scene.formulas import nearest
 
 REALS = ("double", "float")
+DIRECTIONS, ACTIONS = ("both", "rising", "falling"), ("record", "stop", "jump")
 _NAMES = tuple(METHODS)
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
@@ -201,6 +203,18 @@ class ForceTable(_Table):
     note: _Note = ""
 
 
+class EventTable(_Table):
+    """An [[event]] as it is written; other keys are coordinates and velocities after a jump."""
+
+    model_config = pydantic.ConfigDict(extra="allow", frozen=True)
+
+    name: pydantic.StrictStr
+    when: _Value
+    direction: Literal[DIRECTIONS] = "both"  # type: ignore[valid-type]
+    action: Literal[ACTIONS] = "record"  # type: ignore[valid-type]
+    note: _Note = ""
+
+
 class Document(_Table):
     """A whole scene as it is written."""
 
@@ -222,6 +236,7 @@ class Document(_Table):
     spring: dict[str, SpringTable] = {}
     damper: dict[str, DamperTable] = {}
     force: dict[str, ForceTable] = {}
+    event: dict[str, EventTable] = {}
     run: _Run = _Run()
 
 
@@ -248,52 +263,9 @@ _MODELS: Mapping[str, type[_Table]] = {
     "spring": SpringTable,
     "damper": DamperTable,
     "force": ForceTable,
+    "event": EventTable,
     "run": _Run,
 }
-
-# what people write instead of our keys
-_ALIASES = {
-    "dt": "h", "step": "h", "time": "duration", "tend": "duration", "t_end": "duration",
-    "initial": "start", "init": "start", "velocity": "rate", "units": "unit", "val": "value",
-    "variables": "coordinates", "params": "parameters", "const": "constants", "x0": "start",
-    "q0": "start", "v0": "rate", "qd0": "rate", "speed": "rate", "t_final": "duration",
-    "tf": "duration", "T_end": "duration", "tmax": "duration", "stepsize": "h", "step_size": "h",
-    "integrator": "method", "solver": "method", "dofs": "coordinates",
-    "range": "limits", "bounds": "limits", "limit": "limits", "saturation": "limits",
-    "T": "kinetic", "K": "kinetic",
-    "V": "potential", "U": "potential", "P": "potential", "R": "dissipation",
-}  # fmt: skip
-_ALIASES_OF = {
-    "body": {
-        "origin": "offset", "xyz": "offset", "translation": "offset", "at": "offset",
-        "pos": "position", "rpy": "rotation", "angle": "rotation", "orientation": "rotation",
-        "com": "center", "cog": "center", "centre": "center", "type": "joint", "kind": "joint",
-        "coordinate": "coordinates", "q": "coordinates", "m": "mass", "I": "inertia",
-        "J": "inertia", "moment": "inertia", "c": "damping", "b": "damping", "d": "damping",
-        "mu": "friction", "coulomb": "friction", "width": "friction_width", "motor": "actuator",
-        "torque": "actuator", "force": "actuator", "input": "actuator", "id": "name",
-    },
-    "point": {
-        "parent": "body", "link": "body", "at": "place", "offset": "place", "position": "place",
-        "xyz": "place", "point": "place", "origin": "place", "rpy": "rotation",
-        "angle": "rotation", "orientation": "rotation", "id": "name",
-    },
-    "spring": {
-        "k": "stiffness", "c": "stiffness", "constant": "stiffness", "rest": "length",
-        "l": "length", "l0": "length", "rest_length": "length", "free_length": "length",
-        "torsional": "turning", "angular": "turning", "rotational": "turning",
-        "between": "bodies", "joint": "coordinate", "ends": "points", "anchors": "points",
-    },
-    "damper": {
-        "c": "damping", "b": "damping", "d": "damping", "coefficient": "damping",
-        "torsional": "turning", "angular": "turning", "rotational": "turning",
-        "between": "bodies", "joint": "coordinate", "ends": "points", "anchors": "points",
-    },
-    "force": {
-        "at": "point", "position": "point", "place": "point", "offset": "point", "link": "body",
-        "F": "force", "direction": "force", "moment": "torque", "M": "torque", "axes": "frame",
-    },
-}  # fmt: skip
 
 
 def table_at(tree: Any, path: tuple[str, ...]) -> dict[str, Any]:
@@ -329,8 +301,8 @@ def _keys(path: tuple[str, ...]) -> list[str]:
 def meant(path: tuple[str, ...]) -> str:
     """The key that the last of `path` may have been meant for, or the empty string."""
     known, last = _keys(path), path[-1]
-    alias = _ALIASES_OF.get(path[0], {}).get(last, "") if len(path) > 2 else ""
-    alias = alias or _ALIASES.get(last, "")
+    alias = ALIASES_OF.get(path[0], {}).get(last, "") if len(path) > 2 else ""
+    alias = alias or ALIASES.get(last, "")
     near = alias if alias in known else nearest(path[-1], known)
     # a table's entries are judged by what it is taken for: 'damping' is no 'spring'
     far = len(path) == 1 and near != alias and not nearest(path[-1], [near], 0.7)
@@ -342,7 +314,7 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
     kind, given, last = str(error["type"]), error.get("input"), path[-1]
     here = spelling.toml(given)
     if kind == "missing":
-        where = (path[0], last) if path[0] in _ALIASES_OF else path
+        where = (path[0], last) if path[0] in ALIASES_OF else path
         return "missing: " + _MISSING.get(where, f"add {last} = ...")
     if kind == "value_error":
         return str(error["ctx"]["error"])
@@ -358,6 +330,9 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
         return f"unknown method {here}: known are {', '.join(METHODS)}"
     if path == ("run", "real"):
         return f"unknown type {here}: known are {', '.join(REALS)}"
+    if path[0] == "event" and last in ("direction", "action"):
+        known = DIRECTIONS if last == "direction" else ACTIONS
+        return f"unknown {last} {here}: known are {', '.join(known)}"
     if kind == "greater_than":
         return f"must be greater than zero, here {here}"
     if kind == "finite_number":
@@ -390,9 +365,14 @@ _MISSING: Mapping[tuple[str, ...], str] = {
     ("point", "body"): 'name the body that it is fixed to: body = "..."',
     ("spring", "stiffness"): 'add stiffness = "..."',
     ("damper", "damping"): 'add damping = "..."',
+    ("event", "name"): 'give the event a name: name = "..."',
+    ("event", "when"): 'add when = "...", whose zeros are the event',
     ("force", "body"): 'name the body that it acts on, body = "..."; a force along a coordinate '
     'stands in [forces], x = "F - b*x_dot"',
 }
+
+
+_NEEDED = ("name", "stiffness", "damping", "when")  # of what stands in an array
 
 
 def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
@@ -403,7 +383,7 @@ def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
         table[last] = {key: value for g in given for key, value in g.items()}  # [[parameters]]
     elif path in _HARMLESS:
         table[last] = _HARMLESS[path]
-    elif len(path) == 3 and path[0] in _ALIASES_OF and last in ("name", "stiffness", "damping"):
+    elif len(path) == 3 and last in _NEEDED:
         table[last] = f"{path[0]}_{path[1]}" if last == "name" else 1.0
     elif len(path) == 3 and last == "body" and path[0] in ("force", "point"):
         table[last] = next((b["name"] for b in tree.get("body", {}).values() if "name" in b), "")

@@ -53,6 +53,7 @@ def check(
         property_rows(made)
         compiled = hasattr(module, "_model")
         if compiled:  # what is compiled has several ways to one answer
+            module._model._warned.add("events")  # which fixed steps are to pass over here
             compiled_rows(made)
         scene = system.scene
         if scene is not None and scene.assembly is not None:

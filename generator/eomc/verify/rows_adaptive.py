@@ -61,8 +61,11 @@ def _error(of: Comparison, module: Any, tol: float, s: State) -> float | None:
     first = _adaptive(module, s, x, of.system.run.duration, tol)
     if len(first) < 2:
         return None
+    ends = [first.events[e.name].t for e in of.system.events if e.action != "record"]
+    first_end = min((float(t[0]) for t in ends if len(t)), default=math.inf)
     for steps in STEPS:
-        T = float(first.t[min(steps, len(first) - 1)]) - s.t
+        T = min(float(first.t[min(steps, len(first) - 1)]), first_end) - s.t
+        T *= 1 if s.t + T < first_end else 0.9  # the reference knows of no events
         run = _adaptive(module, s, x, T, tol)
         near = _adaptive(module, s, x + NUDGE * spread, T, tol)
         if run.status != "ok" or near.status != "ok":

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 from eomc.base import resources
 from eomc.base.texts import FreeText
-from eomc.emit import adaptive, heading
+from eomc.emit import adaptive, events, heading
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import C_NAMES, DOUBLE
 from eomc.emit.c_names import Target
@@ -41,7 +41,8 @@ def steppers(target: Target) -> Steppers:
 
 def rooms(made: Steppers) -> list[int]:
     """The numbers that each method's memory keeps, and behind that of adaptive steps."""
-    room = adaptive.kept(len(made.one.target.names), made.one.width)
+    system = made.one.target.system
+    room = adaptive.kept(len(system.coordinates), made.one.width, len(system.events))
     return [*(runs.kept(made, m) for m in made.methods), room]
 
 
@@ -268,7 +269,7 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
     if made.accelerations.target.system.run.tolerance is not None:
         if adaptive.METHOD not in made.methods:
             yield show(made.stages(adaptive.METHOD))
-        yield show(adaptive.view(made.functions, _adaptive(made)))
+        yield from map(show, events.views(made.functions, _adaptive(made)))
     yield from map(show, derivatives(made.functions))
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from math import isfinite, sqrt
 
 from eomc.base.texts import FreeText
-from eomc.emit import adaptive, heading
+from eomc.emit import adaptive, events, heading
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
@@ -17,7 +17,6 @@ from eomc.emit.derivatives import derivatives
 from eomc.emit.evaluations import source
 from eomc.emit.functions import Functions, handshake, indexed, of, parameters
 from eomc.emit.plain.views import (
-    Adaptive,
     AdaptiveDeclared,
     Computed,
     Declared,
@@ -91,6 +90,7 @@ def header(
         coordinates=indexed(plain, s.coordinates),
         inputs=indexed(plain, s.inputs),
         outputs=indexed(plain, s.outputs, "OUT_"),
+        events=indexed(plain, s.events, "EVENT_"),
         frames=tuple(target.enum[f"FRAME_{f.name}"] for f in s.asked),
         parameters=parameters(plain),
         implicit=any(m.implicit for m in methods) or s.run.tolerance is not None,
@@ -107,9 +107,10 @@ def header(
         ),
         adaptive=AdaptiveDeclared(
             adaptive.TITLE, adaptive.memory(plain),
-            rooms[-1] or adaptive.kept(len(s.coordinates), len(s.coordinates)),
+            rooms[-1] or adaptive.kept(len(s.coordinates), len(s.coordinates), len(s.events)),
             plain.public.adaptive(adaptive.METHOD.name),
         ) if s.run.tolerance else None,
+        busy=adaptive.BUSY,
     )  # fmt: skip
 
 
@@ -291,7 +292,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     )
 
 
-def _adaptive(plain: Functions) -> list[Nodes | Adaptive]:
+def _adaptive(plain: Functions) -> list[View]:
     """Adaptive steps, where the scene asks for them."""
     if plain.target.system.run.tolerance is None:
         return []
@@ -312,7 +313,7 @@ def _adaptive(plain: Functions) -> list[Nodes | Adaptive]:
         stage=accelerate(qdd="f", q="r", qd="v", t="t + c[i]*h"),
     )
     form = adaptive.Form(around, sweep.call(b="&b"), accelerate(qdd="f"), plain.NQ)
-    return [nodes, adaptive.view(plain, form)]
+    return [nodes, *events.views(plain, form)]
 
 
 def loop(plain: Functions, m: Method) -> Loop:

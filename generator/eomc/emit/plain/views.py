@@ -104,6 +104,7 @@ class Header(Named):
     coordinates: tuple[Indexed, ...]
     inputs: tuple[Indexed, ...]
     outputs: tuple[Indexed, ...]
+    events: tuple[Indexed, ...]
     frames: tuple[str, ...]
     parameters: tuple[Parameter, ...]
     implicit: bool
@@ -112,6 +113,7 @@ class Header(Named):
     linearization: CFunction | None
     methods: tuple[Declared, ...]
     adaptive: AdaptiveDeclared | None
+    busy: int
 
 
 @dataclass(frozen=True)
@@ -276,7 +278,7 @@ class Nodes(Named):
 
 
 @dataclass(frozen=True)
-class Adaptive(Named):
+class Adaptive:
     """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
 
     method: what its C names begin with. powers, last, before: from accelerations at the stages to
@@ -284,6 +286,8 @@ class Adaptive(Named):
     """
 
     TEMPLATE: ClassVar[str] = "c/adaptive.c"
+    PREFIX: str
+    real: str
     title: str
     method: str
     extent: str
@@ -301,9 +305,7 @@ class Adaptive(Named):
     last: tuple[str, ...]
     before: tuple[str, ...]
     timed: bool
-    constants: bool
-    unread_p: bool
-    compute_constants: str
+    events: bool
     settle: CFunction
     sweep: str
     step: CFunction
@@ -311,8 +313,68 @@ class Adaptive(Named):
     settled: str
     within: CFunction
     settled_within: str
+
+
+@dataclass(frozen=True)
+class Events(Named):
+    """c/events.c.jinja: functions that find events in an adaptive step, and calls in them.
+
+    samples: the parts of a step at which events are looked at, nodes; slopes: of the polynomial
+    through values there. busy: the most events in one step; apart, near, close: parts of a step.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/events.c"
+    method: str
+    fabs: str
+    sqrt: str
+    eps: str
+    samples: int
+    nodes: tuple[str, ...]
+    slopes: tuple[str, ...]
+    directions: tuple[int, ...]
+    actions: tuple[int, ...]
+    jumps: bool
+    busy: int
+    apart: str
+    near: str
+    close: str
+    width: str
+    looked: CFunction
+    values: str
+    bracketed: CFunction
+    crossing: CFunction
+    look_value: str
+    bracket: str
+    bracket_dip: str
+    happened: CFunction
+    cross: str
+    look_before: str
+    look_behind: str
+    inside: str
+    values_there: str
+    restart: CFunction
+    values_before: str
+    jump: str
+    values_after: str
+
+
+@dataclass(frozen=True)
+class AdaptiveRun(Named):
+    """c/adaptive_run.c.jinja: the loop over adaptive steps, rows and events."""
+
+    TEMPLATE: ClassVar[str] = "c/adaptive_run.c"
+    method: str
+    constants: bool
+    unread_p: bool
+    compute_constants: str
+    events: bool
+    busy: int
     run: CFunction
     advance: str
+    happen: str
+    restart: str
+    row: str
+    row_before: str
     look: str
 
 
@@ -330,5 +392,5 @@ class Loop(Named):
 
 View = (
     Header | Source | Slopes | Derivative | RungeKutta4 | Explicit | Implicit | Gauss | Nodes
-    | Adaptive | Loop
+    | Adaptive | Events | AdaptiveRun | Loop
 )  # fmt: skip

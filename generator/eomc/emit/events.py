@@ -1,0 +1,125 @@
+"""Events in adaptive steps, in both forms of C: what crosses zero, where, and what it does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from math import cos, pi, prod
+
+from eomc.emit import c_function as c
+from eomc.emit.adaptive import BUSY, Form, Stepping, run, steps
+from eomc.emit.c_function import CArgument, CFunction
+from eomc.emit.coefficients import matrix, numbers
+from eomc.emit.functions import Functions
+from eomc.emit.plain.views import Adaptive, AdaptiveRun, Events
+from eomc.integrators.tableaux import Row
+
+SAMPLES = 9  # values in a step
+APART = 2e-4  # parts of a step between values that make a slope
+ACTIONS = ("record", "stop", "jump")
+DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
+
+
+def nodes() -> Row:
+    """Where the extrema of Chebyshev's polynomial are over a step, 0 and 1 among them."""
+    last = SAMPLES - 1
+    return tuple(Fraction((1 - cos(pi * j / last)) / 2).limit_denominator(10**12)
+                 for j in range(SAMPLES))  # fmt: skip
+
+
+def slopes(x: Row) -> Sequence[Row]:
+    """From values at the nodes x to the slopes there of the polynomial through them."""
+    weights = [1 / prod((a - b for b in x if b != a), start=Fraction(1)) for a in x]
+    rows = [
+        [w / v / (a - b) if a != b else Fraction(0) for b, w in zip(x, weights, strict=True)]
+        for a, v in zip(x, weights, strict=True)
+    ]
+    for i, row in enumerate(rows):
+        row[i] = -sum(row, Fraction(0))
+    return tuple(map(tuple, rows))
+
+
+def views(functions: Functions, form: Form) -> Iterator[Adaptive | Events | AdaptiveRun]:
+    """Adaptive steps, the events in them, and the loop over both."""
+    made = Stepping(functions, form)
+    yield steps(made)
+    if not functions.target.system.events:
+        yield run(made)
+        return
+    found = _events(made)
+    yield found
+    here = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
+    again = here | {"reached": "reached"}
+    yield run(made, found.happened.call(**here), found.restart.call(**again))
+
+
+def _events(made: Stepping) -> Events:
+    functions, method = made.functions, made.method
+    target, real, public = functions.target, functions.real, functions.public
+    end, system = target.real.function_suffix, target.system
+    jumps = "jumps" in target.program
+    asked = [public.evaluation(name) for name in ("events", "jumps")[: 1 + jumps]]
+    needed = {a.name for f in asked for a in f.arguments}
+    values, number, k = asked[0], made.number, CArgument("int", "k")
+    read = c.given(f"{method}_adaptive_state", "x")
+    # what the formulas take besides the state, and what steps do
+    own = [a for a in functions.usual("u", "p") if a.name in needed]
+    rest = [*made.rest, *(a for a in own if a.name not in {b.name for b in made.rest})]
+
+    def static(name: str, result: str, *arguments: CArgument) -> CFunction:
+        return CFunction(f"{method}_{name}", result, arguments, qualifier="static")
+
+    looked = static("looked", "void", c.filled(real, "g"), read, number("z"), *own)
+    ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
+    bracketed = static("bracketed", real, read, k, *ends, *own)
+    crossing = static(
+        "crossing", real, made.state, k, number("from"), c.given(real, "g"), *own
+    )  # fmt: skip
+    there = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
+    record = public.adaptive_events
+    happened = static(
+        "happened", "int", made.state, *there, number("tol"), *rest, *record, made.held
+    )
+    restart = static(
+        "restarted", functions.status, made.state, number("reached"), *there[1:],
+        *(own if jumps else ()), *([made.held] if jumps else []),
+    )  # fmt: skip
+    at = {"q": "q_at", "qd": "qd_at"}
+    within = {"t": f"{c.member('x', 'from')} + z*{c.member('x', 'size')}", **at}
+    reached = {"t": "reached", **at}
+    x = nodes()
+    return Events(
+        **functions.names,
+        method=method,
+        fabs=f"fabs{end}",
+        sqrt=f"sqrt{end}",
+        eps=target.literal(target.real.epsilon),
+        samples=SAMPLES,
+        nodes=numbers(x, target.real),
+        slopes=matrix(slopes(x), target.real),
+        directions=tuple(DIRECTIONS[e.direction] for e in system.events),
+        actions=tuple(ACTIONS.index(e.action) for e in system.events),
+        jumps=jumps,
+        busy=BUSY,
+        apart=target.literal(APART),
+        near=target.literal(0.01),
+        close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
+        width=f"(1 + 2*{functions.NQ})",
+        looked=looked,
+        values=values.call(events="g", **within),
+        bracketed=bracketed,
+        crossing=crossing,
+        look_value=looked.call(g="value"),
+        bracket=bracketed.call(high="node[j]", at_high="g[j]"),
+        bracket_dip=bracketed.call(high="z", at_high="value[k]"),
+        happened=happened,
+        cross=crossing.call(k="i", g="g[i]"),
+        look_before=looked.call(g="value", z=f"z - {target.literal(APART / 2)}"),
+        look_behind=looked.call(g="value", z=f"z + {target.literal(APART / 2)}"),
+        inside=made.within.call(),
+        values_there=values.call(events="value", **within),
+        restart=restart,
+        values_before=values.call(events="before", **reached),
+        jump=asked[-1].call(**reached) if jumps else "",
+        values_after=values.call(events="value", **reached),
+    )

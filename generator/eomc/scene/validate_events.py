@@ -1,0 +1,52 @@
+"""Events as they are written: names, formulas, what a jump changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from eomc.base import names
+from eomc.scene.formulas import Formula, suggest
+from eomc.scene.scene import Event
+from eomc.scene.schema import Document, EventTable
+from eomc.scene.scope import Checker
+
+
+def events(check: Checker, doc: Document) -> Iterator[Event]:
+    """The events of a document; faults are reported."""
+    seen: set[str] = set()
+    for k, entry in doc.event.items():
+        if why := names.fault(entry.name):
+            check.say(("event", k, "name"), why, text=entry.name)
+        elif entry.name in seen:
+            why = f"'{entry.name}' is an event already: rename one of the two"
+            check.say(("event", k, "name"), why, text=entry.name)
+        seen.add(entry.name)
+        when = check.formula(("event", k, "when"), entry.when)
+        jump = tuple(_jump(check, doc, k, entry))
+        if when and not any(when.names()):
+            check.say(("event", k, "when"), "never crosses zero: it has no names", text=when.text)
+        elif when:
+            yield Event(entry.name, when, entry.direction, entry.action, jump, entry.note)
+
+
+def _jump(
+    check: Checker, doc: Document, k: str, entry: EventTable
+) -> Iterator[tuple[str, Formula]]:
+    """What coordinates and velocities are after a jump."""
+    state = [name for c in doc.coordinates for name in (c, f"{c}_dot")]
+    given = entry.model_extra or {}
+    for name, value in given.items():
+        path = ("event", k, name)
+        if name not in state:
+            remedy = suggest(name, [*state, *EventTable.model_fields])
+            remedy = remedy or f": a jump sets {', '.join(state[:9])}"
+            check.say(path, f"'{name}' is no coordinate or velocity{remedy}")
+        elif isinstance(value, bool) or not isinstance(value, (int, float, str)):
+            check.say(path, "must be a number or a formula in quotes")
+        elif formula := check.formula(path, float(value) if isinstance(value, int) else value):
+            yield name, formula
+    if entry.action == "jump" and not given:
+        check.say(("event", k, "action"), f'a jump sets something: add {state[1]} = "..."')
+    elif given and entry.action != "jump":
+        first = next(iter(given))
+        check.say(("event", k, first), f"only a jump sets '{first}': add action = \"jump\"")

@@ -1,0 +1,253 @@
+"""Events in adaptive steps: where they happen, in which order, and what they do."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from pathlib import Path
+from types import ModuleType
+
+import mpmath
+import numpy as np
+import pytest
+
+import eomc
+from eomc.base.errors import SceneError
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+
+BUILDS = Path(__file__).parents[2] / "build" / "tests" / "events"
+G = 9.81
+BALL = """eomc = 1
+name = "bouncing"
+[coordinates]
+x = { unit = "m", rate = 1 }
+y = { unit = "m", start = 1 }
+[parameters]
+e = 0.8
+wall = 100
+far = 1e9
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "9.81*y"
+[[event]]
+name = "impact"
+when = "y"
+direction = "falling"
+action = "jump"
+y_dot = "-e*y_dot"
+[[event]]
+name = "top"
+when = "y_dot"
+direction = "falling"
+[[event]]
+name = "corner"
+when = "wall - x"
+action = "jump"
+x_dot = "-x_dot"
+[[event]]
+name = "away"
+when = "x - far"
+action = "stop"
+[run]
+duration = 3
+"""
+TWO = """eomc = 1
+name = "two_springs"
+[coordinates]
+x = { start = 1, rate = 0 }
+y = { start = 1, rate = 0 }
+[parameters]
+k = 2
+a = 1
+b = 1
+c = 0
+d = 0.1
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "(x**2 + k*y**2)/2"
+[[event]]
+name = "line"
+when = "a*x + b*y - c"
+[[event]]
+name = "curve"
+when = "x*y_dot - d"
+"""
+
+
+def built(text: str) -> ModuleType:
+    return eomc.load(from_scene(parse(text, "events.toml")), BUILDS)
+
+
+@pytest.fixture(scope="module")
+def ball() -> ModuleType:
+    """A ball that falls from 1 m, moves along at 1 m/s, and bounces from floor and wall."""
+    return built(BALL)
+
+
+@pytest.fixture(scope="module")
+def springs() -> ModuleType:
+    """Two oscillators of frequencies 1 and sqrt(k), with two events."""
+    return built(TWO)
+
+
+def impacts(e: float, count: int) -> np.ndarray:
+    """The times of the first impacts, by the formula."""
+    times = [math.sqrt(2 / G)]
+    for k in range(1, count):
+        times.append(times[-1] + 2 * math.sqrt(2 * G) * e**k / G)
+    return np.array(times)
+
+
+@pytest.mark.parametrize("e", [0.55, 0.8, 0.95])
+def test_a_ball_bounces_at_the_right_times_and_comes_to_rest(ball: ModuleType, e: float) -> None:
+    with pytest.warns(RuntimeWarning, match="jumps follow one another ever sooner"):
+        run = ball.simulate(tol=1e-12, duration=1e3, params={"e": e, "wall": 1e4})
+    found = run.events["impact"]
+    times = impacts(e, len(found))
+    assert len(found) >= 50 and np.max(np.abs(found.t - times) / times) < 1e-13
+    assert run.status == "accumulated" and f"t = {run.limit:.15g}" in run.message
+    assert run.limit == pytest.approx(times[0] * (1 + e) / (1 - e), rel=1e-10)
+    tops = run.events["top"]
+    assert tops.q[:20, 1] == pytest.approx(e ** (2.0 * np.arange(1, 21)), rel=1e-9)
+    assert np.array_equal(run.events["impact"].q[:, 0] > 0, np.ones(len(found), bool))
+    assert pickle.loads(pickle.dumps(run)).events["impact"].t.tolist() == found.t.tolist()
+
+
+def test_rows_stand_before_and_behind_a_jump(ball: ModuleType) -> None:
+    run = ball.simulate(duration=1.0)
+    at = int(np.flatnonzero(np.diff(run.t) == 0)[0])
+    assert run.qd[at, 1] < 0 < run.qd[at + 1, 1] == pytest.approx(-0.8 * run.qd[at, 1])
+    assert np.array_equal(run.q[at], run.q[at + 1]) and run.t[at] == run.events["impact"].t[0]
+
+
+def test_rows_at_times_follow_the_jumps(ball: ModuleType) -> None:
+    times = np.linspace(0, 2.5, 41)
+    run = ball.simulate(times=times, tol=1e-12)
+    hits = impacts(0.8, 9)
+    k = np.searchsorted(hits, times)
+    speed = math.sqrt(2 * G) * 0.8**k
+    since = times - np.where(k > 0, hits[k - 1], 0)
+    y = np.where(k > 0, speed * since, 1) - G * since**2 / 2
+    assert run.q[:, 1] == pytest.approx(y, abs=1e-12)
+    assert len(run.events["impact"]) == np.sum(hits < 2.5)
+
+
+def test_a_stop_ends_the_run_at_it(ball: ModuleType) -> None:
+    run = ball.simulate(params={"far": 0.7}, duration=5.0)
+    assert run.status == "ok" and run.stopped == "away"
+    assert run.t[-1] == pytest.approx(0.7, abs=1e-14) and run.q[-1, 0] == pytest.approx(0.7)
+    assert run.events["away"].t.tolist() == [run.t[-1]]
+    assert ball.simulate(params={"far": 7.0}, duration=1.0).stopped == ""
+
+
+def test_two_at_once_both_happen(ball: ModuleType) -> None:
+    corner = math.sqrt(2 / G)
+    run = ball.simulate(params={"wall": corner}, duration=0.6)
+    assert run.events["impact"].t == pytest.approx([corner], abs=1e-14)
+    assert run.events["corner"].t == pytest.approx([corner], abs=1e-14)
+    up = 0.8 * math.sqrt(2 * G) - G * (0.6 - corner)
+    assert run.qd[-1] == pytest.approx([-1, up])
+
+
+def test_what_is_at_zero_at_the_start_has_not_happened(ball: ModuleType) -> None:
+    up = ball.simulate(q0=[0, 0], qd0=[0, 2.0], duration=0.5)
+    assert up.events["impact"].t == pytest.approx([4 / G], abs=1e-14)
+    assert up.events["top"].t == pytest.approx([2 / G], abs=1e-14)
+    down = ball.simulate(q0=[0, 0], qd0=[0, -1.0], duration=0.5)  # it is below already
+    assert len(down.events["impact"]) == 0 and down.q[-1, 1] < 0
+
+
+def test_fixed_steps_say_that_they_pass_over_events() -> None:
+    module = built(BALL.replace("bouncing", "passing"))
+    with pytest.warns(RuntimeWarning, match="fixed steps pass over the scene's events"):
+        assert module.simulate(h=0.01, duration=1.0).q[-1, 1] < 0
+
+
+def test_crossings_close_together_in_one_long_step_are_seen() -> None:
+    text = """eomc = 1
+name = "straight"
+[coordinates]
+x = { rate = 1 }
+[parameters]
+w = 0.01
+[energy]
+kinetic = "x_dot**2/2"
+[[event]]
+name = "pair"
+when = "(x - 1)*(x - 1 - w)"
+[[event]]
+name = "three"
+when = "(x - 2)*(x - 2 - w)*(x - 3)"
+direction = "rising"
+"""
+    module = built(text)
+    for w in (0.3, 1e-2, 1e-4):
+        run = module.simulate(duration=4.0, params={"w": w})
+        assert run.events["pair"].t == pytest.approx([1, 1 + w], abs=1e-13)
+        assert run.events["three"].t == pytest.approx([2, 3], abs=1e-13)
+    assert run.steps < 20
+
+
+def roots(f, t_end: float) -> list[float]:
+    """All zeros in (0, t_end], by fine sampling and bisection in 30 digits."""
+    times = np.linspace(0, t_end, 4001)
+    values = [f(mpmath.mpf(t)) for t in times]
+    found = []
+    with mpmath.workdps(30):
+        for a, b, fa, fb in zip(times, times[1:], values, values[1:], strict=False):
+            if fa * fb < 0:
+                found.append(float(mpmath.findroot(f, (a, b), solver="anderson", tol=1e-40)))
+    return found
+
+
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 100))]
+)
+def test_random_events_are_those_of_the_exact_motion(springs: ModuleType, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    k, a, b, c, d = random.uniform([0.5, -1, -1, -1, -1], [9, 1, 1, 1, 1])
+    q0, qd0 = random.normal(size=(2, 2))
+    run = springs.simulate(
+        q0, qd0, tol=1e-13, duration=12.0, params=dict(zip("kabcd", (k, a, b, c, d), strict=True))
+    )
+
+    def motion(t):
+        w = mpmath.sqrt(mpmath.mpf(k))
+        x = q0[0] * mpmath.cos(t) + qd0[0] * mpmath.sin(t)
+        y = q0[1] * mpmath.cos(w * t) + qd0[1] / w * mpmath.sin(w * t)
+        return x, y, -q0[1] * w * mpmath.sin(w * t) + qd0[1] * mpmath.cos(w * t)
+
+    def line(t):
+        x, y, _ = motion(t)
+        return a * x + b * y - c
+
+    def curve(t):
+        x, _, rate = motion(t)
+        return x * rate - d
+
+    for name, f in (("line", line), ("curve", curve)):
+        expected, found = roots(f, 12.0), run.events[name].t
+        assert len(found) == len(expected), name
+        assert found == pytest.approx(expected, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('when = "y"', 'when = "z"', "'z' is not declared"),
+        ('when = "y"', 'when = "1"', "never crosses zero: it has no names"),
+        ('direction = "falling"', 'direction = "down"', "unknown direction"),
+        ('action = "stop"', 'action = "halt"', "unknown action"),
+        ('name = "top"', 'name = "impact"', "is an event already"),
+        ('y_dot = "-e*y_dot"', "", "a jump sets something"),
+        ('y_dot = "-e*y_dot"', 'z_dot = "1"', "'z_dot' is no coordinate or velocity"),
+        ('y_dot = "-e*y_dot"', "y_dot = true", "must be a number or a formula"),
+        ('name = "away"', 'name = "away"\nx = 0', "only a jump sets 'x'"),
+        ('name = "away"', 'nam = "away"', "nam"),
+    ],
+)
+def test_what_an_event_can_not_be_is_said(old: str, new: str, words: str) -> None:
+    with pytest.raises(SceneError) as fault:
+        parse(BALL.replace(old, new, 1), "events.toml")
+    assert words in str(fault.value)
