@@ -86,6 +86,37 @@ def test_a_run_is_the_same_in_pieces(kepler: ModuleType, monkeypatch: pytest.Mon
     assert pickle.loads(pickle.dumps(run)) == run
 
 
+def test_a_run_tells_the_state_at_any_time(kepler: ModuleType) -> None:
+    run = kepler.simulate(tol=1e-12, duration=PERIOD)
+    times = np.array([[0.0, 3.0, 0.05], [PERIOD, 1.7, 3.0]])
+    q, qd = run(times)
+    assert q.shape == qd.shape == (2, 3, 2)
+    for at in np.ndindex(2, 3):
+        ended = kepler.simulate(tol=1e-13, duration=times[at])
+        assert q[at] == pytest.approx(ended.q[-1], abs=2e-11)
+        assert qd[at] == pytest.approx(ended.qd[-1], abs=2e-10)
+    assert run(0.0)[0].tolist() == [0.1, 0.0] and run(3.0)[0].shape == (2,)
+    with pytest.raises(ValueError, match=r"t: the run goes from 0 s to 6.28"):
+        run(7.0)
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_fixed_steps_tell_it_to_their_order(driven: ModuleType, every: int) -> None:
+    times, errors = np.linspace(0.0, 1.0, 23), []
+    exact = driven.simulate(h=1e-4, duration=1.0, u=[0.3])(times)
+    for h in (0.02, 0.01):
+        run = driven.simulate(h=h, duration=1.0, every=every, u=[0.3])
+        errors.append(np.abs(np.array(run(times)) - exact).max())
+    assert 1e-12 < errors[1] < errors[0] / 10
+
+
+def test_a_saved_run_is_read_again(kepler: ModuleType, tmp_path: Path) -> None:
+    run = kepler.simulate(duration=2.0)
+    run.save(tmp_path / "run.npz")
+    again = kepler.load_run(tmp_path / "run.npz")
+    assert again == run and again.tol == run.tol and again(1.0)[0].tolist() == run(1.0)[0].tolist()
+
+
 def test_its_error_is_found(kepler: ModuleType) -> None:
     run = kepler.simulate(tol=1e-6, duration=5 * PERIOD, estimate=True)
     true = abs(run.q[-1] - [0.1, 0.0])
@@ -146,7 +177,7 @@ def test_a_stiff_motion_says_so() -> None:
 
 
 def test_without_tolerance_nothing_is_built(cartpole: ModuleType) -> None:
-    with pytest.raises(ValueError, match=r"tol: not built; a scene asks for it with \[run\] tol"):
+    with pytest.raises(ValueError, match=r"tol, times: not built; a scene asks for them"):
         cartpole.simulate(tol=1e-9)
     assert not hasattr(cartpole._model._lib, "adaptive")
 

@@ -338,5 +338,5 @@ def test_velocities_that_run_away_are_no_scale_of_positions(
     ends: list[float], scale: list[float]
 ) -> None:
     """Where positions are 1e40 times smaller their errors would look like nothing."""
-    found = estimate._scale(np.array([[0.0, 0.0, 0.0, 0.0], ends]))
+    found = estimate.scales(np.array([[0.0, 0.0, 0.0, 0.0], ends]))
     np.testing.assert_allclose(found, scale, rtol=1e-15)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array, as_number, as_step_size
+from .dense import within
 from .estimate import Estimate, scales
 from .package import reduced
 from .slices import longer
@@ -63,6 +64,8 @@ class AdaptiveRun(Run):
     held_back: int = field(kw_only=True)
     _times: Array = field(kw_only=True)
     _h_most: float = field(kw_only=True)
+    _begin: Array = field(kw_only=True)  # q and qd at t0, (2, nq)
+    _t_end: float = field(kw_only=True)
     _happened: tuple[Array, Array] = field(kw_only=True)  # which, rows of t, q, qd
     stopped: str = field(default="", kw_only=True)
     limit: float = field(default=float("nan"), kw_only=True)
@@ -87,6 +90,27 @@ class AdaptiveRun(Run):
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
         return f"stopped at t = {end:.9g} after {done}, {where}: {said}"
+
+    def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
+        """(q, qd) at any time within the run, t (...,): each (..., nq); at a jump before it.
+
+        By the same steps once more, and shorter ones within them: as exact as these. Raises
+        ValueError outside of the run.
+        """
+        times = within(self, t)
+        asked, place = np.unique(times, return_inverse=True)
+        q, qd = self._begin
+        rows = np.empty((2, len(asked), len(q)), self._model.dtype)
+        first = int(bool(len(asked)) and asked[0] <= self.t0)
+        rows[:, :first] = [[q], [qd]]
+        if len(asked) > first:
+            made = run(
+                self._model, q, qd, self.t0, self._t_end, self.tol, asked[first:], self._u,
+                self._params, self._h_most, None,
+            )  # fmt: skip
+            rows[:, first:] = made._rows
+        both = rows[:, place.ravel()].reshape(2, *times.shape, len(q))
+        return both[0], both[1]
 
     @cached_property
     def events(self) -> dict[str, Happened]:
@@ -128,7 +152,8 @@ class AdaptiveRun(Run):
     def _kept(self) -> dict[str, Any]:
         own = {
             "tol": self.tol, "rejected": self.rejected, "held_back": self.held_back,
-            "times": self.t, "h_most": self._h_most, "which": self._happened[0],
+            "times": self.t, "h_most": self._h_most, "begin": self._begin, "t_end": self._t_end,
+            "which": self._happened[0],
             "event_rows": self._happened[1], "stopped": self.stopped, "limit": self.limit,
         }  # fmt: skip
         return super()._kept() | own
@@ -139,7 +164,8 @@ class AdaptiveRun(Run):
             model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
             kept["params"], 1, kept.get("held"), kept["method"], kept["evaluations"],
             tol=kept["tol"], rejected=kept["rejected"], held_back=kept["held_back"],
-            _times=kept["times"], _h_most=kept["h_most"],
+            _times=kept["times"], _h_most=kept["h_most"], _begin=kept["begin"],
+            _t_end=kept["t_end"],
             _happened=(kept["which"], kept["event_rows"]), stopped=kept["stopped"],
             limit=kept["limit"],
         )  # fmt: skip
@@ -163,7 +189,10 @@ def simulate(
 ) -> AdaptiveRun:  # fmt: skip
     """`Model.simulate` with a tolerance; fixed: what belongs to fixed steps, and was given."""
     if model.tolerance is None:
-        raise ValueError("tol: not built; a scene asks for it with [run] tolerance = 1e-9")
+        raise ValueError(
+            "tol, times: not built; a scene asks for them with [run] tolerance = 1e-9 (of a run by "
+            "fixed steps run(times) gives the states at any times)"
+        )
     for name, value in fixed.items():
         if value is not None and (name, value) != ("every", 1):
             raise ValueError(f"{name}: belongs to fixed steps, tol to adaptive ones: give one")
@@ -258,7 +287,8 @@ def run(
     return AdaptiveRun(
         model, t0, rows.astype(model.dtype), mean, work.steps, said, p, 1, held, "gauss16",
         work.evaluations, tol=tol, rejected=work.rejected, held_back=work.held_back,
-        _times=stamps, _h_most=h_most, _happened=found_events.all(),
+        _times=stamps, _h_most=h_most, _begin=np.array([q, qd], model.dtype), _t_end=t_end,
+        _happened=found_events.all(),
         stopped=model.events[work.stopped - 1] if model.events and work.stopped else "",
         limit=work.limit if said == "accumulated" else float("nan"),
     )  # fmt: skip
@@ -305,12 +335,12 @@ def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Est
 
     # rows beside a jump may be on either side of it in another run
     jumps = np.isin(own.t, own.t[1:][np.diff(own.t) == 0])
-    kept = np.flatnonzero(~jumps & (own.t > own.t[0]))
+    kept = np.flatnonzero(~jumps & (own.t > own.t0))
     beside = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(x))))
 
     def again(tol: float, start: Array) -> Array:
         nq, out = model.nq, np.full_like(x, np.nan)
-        out[0] = start
+        out[own.t == own.t0] = start
         if len(kept):
             made = run(
                 model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], own._u,
@@ -321,11 +351,12 @@ def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Est
             out[kept[: len(made)]] = made.x
         return out[beside]
 
-    finer = again(max(own.tol / _FINER, least), x[0])
-    moved = again(own.tol, x[0] + size * scale * signs)
+    begin = np.ravel(own._begin).astype(float)
+    finer = again(max(own.tol / _FINER, least), begin)
+    moved = again(own.tol, begin + size * scale * signs)
     x = x[beside]
     error = np.maximum(np.abs(x - finer), eps * np.abs(x))
-    error[0] = 0.0
+    error[own.t == own.t0] = 0.0
     error[~np.isfinite(error)] = np.inf
     with np.errstate(invalid="ignore", divide="ignore"):
         grown = float(np.nanmax(np.abs(moved[-1] - x[-1]) / scale)) / size

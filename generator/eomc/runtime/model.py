@@ -94,11 +94,12 @@ class Model(Frames):
         warns where it is of another version of the scene.
         """
         kind, kept = saved.read(self, file)
-        if kind != "Run":
+        if kind == "BatchRun":
             raise ValueError(
                 f"{file}: is a run of many at once, which a scene has by [run] batch = true"
             )
-        return Run._of_kept(self, kept)
+        kinds: dict[str, type[Run]] = {"Run": Run, "AdaptiveRun": adaptive.AdaptiveRun}
+        return kinds[kind]._of_kept(self, kept)
 
     def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
         """A method's step and loop in C, steps at once, stages; what is kept and counted."""
@@ -221,7 +222,9 @@ class Model(Frames):
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
-        if tol is not None or (self.tolerance and h is None and steps is None and method is None):
+        if tol is not None or times is not None or (
+            self.tolerance and h is None and steps is None and method is None
+        ):  # fmt: skip
             fitted = adaptive.simulate(
                 self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, h=h,
                 steps=steps, method=method, every=every, control_period=control_period, out=out,

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .columns import Columns, File
     from .model import Model
 
+KINDS = ("Run", "AdaptiveRun", "BatchRun")
 _KIND = "eomc {} 1"  # and the version of what such a file holds
 
 
@@ -35,13 +36,13 @@ def write(run: Columns, path: Path) -> None:
 
 
 def read(model: Model, file: File) -> tuple[str, dict[str, Any]]:
-    """The kind of a saved run, "Run" or "BatchRun", and what it kept.
+    """The kind of a saved run, one of KINDS, and what it kept.
 
     Raises ValueError where the file is none, or of another scene; warns where it is of another
     version of the scene.
     """
     found = _arrays(file)
-    kind = next((k for k in ("Run", "BatchRun") if str(found.get("kind")) == _KIND.format(k)), "")
+    kind = next((k for k in KINDS if str(found.get("kind")) == _KIND.format(k)), "")
     if not kind:
         raise ValueError(f"{file}: was not written by run.save in this version of eomc")
     if found["scene"] != model.name:

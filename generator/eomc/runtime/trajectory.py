@@ -10,10 +10,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .arguments import Array
 from .balance import Balance, balance
 from .columns import Columns
+from .dense import states
 from .estimate import Estimate, estimate
 from .package import reduced
 
@@ -106,6 +108,14 @@ class Run(Columns):
     def t(self) -> Array:
         """The times of the rows, (n,), s."""
         return self.t0 + self.h * np.minimum(self.every * np.arange(len(self.q)), self.steps)
+
+    def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
+        """(q, qd) at any time within the run, t (...,): each (..., nq).
+
+        By a shorter step of the method from the last one before, so of its order. Raises ValueError
+        outside of the run, or where u was a function and rows don't tell what it gave.
+        """
+        return states(self, t)
 
     @property
     def u(self) -> Array:

@@ -1,0 +1,65 @@
+"""The state of a run at any time within it: a shorter step from the last one before."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arguments import Array
+
+if TYPE_CHECKING:
+    from .trajectory import Run
+
+_AT = 1e-12  # of a step: so near a time is that of the step itself
+
+
+def within(run: Run, t: ArrayLike) -> Array:
+    """Times as an array, or a ValueError where one is outside of the run."""
+    times = np.asarray(t, float)
+    begin, end = run.t0, float(run.t[-1])
+    slack = 1e-12 * max(abs(begin), abs(end), end - begin)
+    if times.size and not (times.min() >= begin - slack and times.max() <= end + slack):
+        raise ValueError(f"t: the run goes from {begin:g} s to {end:.9g} s")
+    return np.asarray(np.clip(times, begin, end))
+
+
+def states(run: Run, t: ArrayLike) -> tuple[Array, Array]:
+    """(q, qd), each of the shape of t with nq behind, by the run's method from the row before.
+
+    As exact as the run, where its forces are smooth: of the method's order. Inputs are held as in
+    the run. Raises ValueError outside of it, or where rows don't tell what a function gave as u.
+    """
+    times = within(run, t)
+    nq, h = run._model.nq, run.h
+    out = np.empty((2, times.size, nq), run._model.dtype)
+    steps = (times.ravel() - run.t0) / h
+    for k, (time, step) in enumerate(zip(times.ravel(), steps, strict=True)):
+        n = min(int(step + _AT), run.steps)
+        out[:, k] = _state(run, n, 0.0 if step - n < _AT else float(time - (run.t0 + n * h)))
+    q, qd = out.reshape(2, *times.shape, nq)
+    return q, qd
+
+
+def _state(run: Run, n: int, rest: float) -> Any:
+    """The state `rest` behind the n-th step."""
+    model, row = run._model, min(n // run.every, len(run) - 1)
+    q, qd, first = run.q[row], run.qd[row], row * run.every
+    for k in range(first, n):
+        q, qd = model.step(q, qd, run.h, *_given(run, k), run._params, run.method)
+    if rest > 0:
+        q, qd = model.step(q, qd, rest, *_given(run, n), run._params, run.method)
+    return q, qd
+
+
+def _given(run: Run, n: int) -> tuple[float, Any]:
+    """The time of the n-th step and the inputs over it."""
+    t, u = run.t0 + n * run.h, run._u
+    if u is None or (not callable(u) and not isinstance(u, str) and u.ndim == 1):
+        return t, u
+    if not callable(u) and not isinstance(u, str):
+        return t, u[min(n, len(u) - 1)]
+    if run._applied is None or run.every > 1:
+        raise ValueError("u was a function, which rows don't tell: take every=1")
+    return t, run._applied[n]
