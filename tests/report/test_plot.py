@@ -9,9 +9,11 @@ import pytest
 import sympy
 
 from eomc.base.errors import EomcError
+from eomc.base.names import GREEK
 from eomc.model.from_scene import from_scene
 from eomc.model.system import Output, System, symbol
 from eomc.report import plot
+from eomc.report.labels import mathtext
 from eomc.scene.read import read
 
 pytest.importorskip("matplotlib")
@@ -156,14 +158,14 @@ def test_polar_coordinates_hang_where_gravity_pulls():
     ],
 )
 def test_names_are_set_as_mathematics(name, printed):
-    assert plot.mathtext(name) == printed
+    assert mathtext(name) == printed
 
 
 def test_every_greek_letter_can_be_set():
     from matplotlib.mathtext import MathTextParser
 
-    for letter in plot.names.GREEK.values():
-        MathTextParser("agg").parse(plot.mathtext(f"{letter}_{letter}", rate=True))
+    for letter in GREEK.values():
+        MathTextParser("agg").parse(mathtext(f"{letter}_{letter}", rate=True))
 
 
 def test_without_matplotlib_one_sentence_says_what_to_do(tmp_path, monkeypatch):

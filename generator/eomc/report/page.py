@@ -191,7 +191,7 @@ def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
 
 
 def _styles(report: Report) -> dict[str, tuple[str, str]]:
-    from eomc.report.plot import COLOURS, INK
+    from eomc.report.style import COLOURS, INK
 
     colours = (*COLOURS, INK, "#999999")
     marks = "osD^vPX*"

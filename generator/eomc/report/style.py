@@ -1,0 +1,24 @@
+"""How figures look: colours, a light grid, thin lines."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Okabe and Ito's colours, distinct in every kind of colour vision; yellow left out on white
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+INK, FAINT = "#333333", "#DDDDDD"
+
+
+def plain(axes: Axes) -> None:
+    """Light grid, no box, thin lines."""
+    axes.grid(True, color=FAINT, linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(INK)
+    axes.tick_params(colors=INK, labelsize=9, length=3)
+    axes.ticklabel_format(axis="y", scilimits=(-3, 4), useMathText=True)
+    for line in axes.get_lines():
+        line.set_linewidth(1.3)
