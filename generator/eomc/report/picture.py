@@ -1,81 +1,53 @@
-"""The mechanism beside the curves of a run: drawn in the plane, or as a path."""
+"""The picture beside the curves of a run, by matplotlib: the mechanism, or a path."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
-from eomc.model.system import System, dot, t
+from eomc.base import texts
+from eomc.model.system import System
+from eomc.report.drawing import drawing
 from eomc.report.labels import label, mathtext, with_unit
+from eomc.report.marks import Drawing, Mark
 from eomc.report.style import COLOURS, INK, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Array = NDArray[np.float64]
-INSTANTS = 16  # at which the mechanism is shown
+
+INSTANTS = 16  # at which a small mechanism is shown; MANY: marks from which there are fewer
+MANY = 24
+AZIMUTH, ELEVATION = -60.0, 20.0  # degrees, from where drawings in space are seen
+BODY, GHOST = "#4D4D4D", 0.80  # of rods; the lightest grey of an earlier instant
+
+
+def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve | None:
+    """What stands beside the curves: the mechanism, where the scene says what it looks like.
+
+    Else the phase portrait of one coordinate, the path of two, nothing of more. t: (n,), s; q, qd:
+    (n, nq).
+    """
+    if not len(t):
+        return None
+    if made := drawing(system, t, q):
+        return Mechanism(t, made)
+    if len(system.q) == 1:
+        (c,) = system.coordinates
+        return Curve(np.hstack([q, qd]), (label(c), label(c, rate=True)), "Phase portrait")
+    if len(system.q) == 2:
+        first, second = map(label, system.coordinates)
+        return Curve(q, (first, second), "Configuration space")
+    return None
 
 
 @dataclass(frozen=True)
-class _Plane:
-    """Points moving in the plane; `parents` are paths that a rod joins them to, if any."""
-
-    t: Array
-    points: list[tuple[str, Array]]  # name and path, (n, 2)
-    parents: list[Array | None]
-    labels: tuple[str, str]
-
-    def draw(self, axes: Axes) -> None:
-        """The paths, and the mechanism at the beginning of the run, from light to dark."""
-        shown = self.points if len(self.points) <= 3 else self.points[-1:]
-        end = self._strobe(axes)
-        for (name, path), colour in zip(shown, COLOURS, strict=False):
-            axes.plot(*path.T, color=colour, label=f"path of {name}" if name else "path")
-            axes.plot(*path[-1], "o", color=colour, markersize=5, zorder=4)
-        plain(axes)
-        for line in axes.get_lines()[-2 * len(shown) :]:
-            line.set_linewidth(1.0)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_xlabel(self.labels[0])
-        axes.set_ylabel(self.labels[1])
-        axes.locator_params(nbins=7)
-        axes.set_title(f"In the plane{end}", fontsize=10, color=INK)
-        if len(shown) > 1 or len(self.points) > 1:
-            axes.legend(fontsize=9, frameon=False, loc="upper right")
-
-    def _strobe(self, axes: Axes) -> str:
-        """The rods at some instants; says when."""
-        both = zip(self.points, self.parents, strict=True)
-        rods = [(parent, path) for (_, path), parent in both if parent is not None]
-        if not rods:
-            axes.plot(0, 0, "+", color=INK, markersize=7, zorder=4)
-            return ""
-        last = self._stretch()
-        chosen = np.unique(np.linspace(0, last, INSTANTS).round().astype(int))
-        for k, i in enumerate(chosen):
-            shade = str(0.86 - 0.66 * k / max(len(chosen) - 1, 1))
-            for parent, path in rods:
-                axes.plot(*np.array([parent[i], path[i]]).T, color=shade, zorder=1.5, marker="o",
-                          markersize=2.5, solid_capstyle="round")  # fmt: skip
-        return f", rods from t = 0 to {self.t[last]:.3g} s"
-
-    def _stretch(self) -> int:
-        """The sample up to which the last point has gone about one and a half times its extent."""
-        path = self.points[-1][1]
-        extents = [np.ptp(points, axis=0) for _, points in self.points]
-        reach = max(float(np.max(extents)), 1e-12)
-        gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-        return min(int(np.searchsorted(gone, 1.5 * reach)), len(path) - 1)
-
-
-@dataclass(frozen=True)
-class _Path:
+class Curve:
     """One quantity against another: a phase portrait or a path in configuration space."""
 
     values: Array
@@ -94,110 +66,213 @@ class _Path:
         axes.set_title(f"{self.title}, from ring to dot", fontsize=10, color=INK)
 
 
-def picture(system: System, t: Array, q: Array, qd: Array) -> _Plane | _Path | None:
-    """What a person expects to see of the system next to its curves."""
-    if len(t) == 0:
-        return None
-    if plane := _plane(system, t, q) or _polar(system, t, q):
-        return plane
-    if len(system.q) == 1:
-        (c,) = system.coordinates
-        labels = (label(c), label(c, rate=True))
-        return _Path(np.hstack([q, qd]), labels, "Phase portrait")
-    if len(system.q) == 2:
-        first, second = map(label, system.coordinates)
-        return _Path(q, (first, second), "Configuration space")
-    return None
+@dataclass(frozen=True)
+class Mechanism:
+    """A drawing at the beginning of a run, from light to dark, with the paths of its points."""
+
+    t: Array
+    drawing: Drawing
+
+    def draw(self, axes: Axes) -> None:
+        """In the plane with its axes, in space seen from the side and a little from above."""
+        made = self.drawing
+        flat = seen(made)
+        paths = [(p.name, flat[:, p.point]) for p in made.paths]
+        last = self._stretch(flat)
+        ghosts = self._ghosts(last)
+        for k, i in enumerate(ghosts):
+            shade = str(GHOST - 0.35 * k / max(len(ghosts) - 1, 1))
+            still(axes, made, flat[i], shade)
+        for (name, path), colour in zip(paths, COLOURS, strict=False):
+            words = f"path of {_name(name)}" if name else "path"
+            axes.plot(*path.T, color=colour, linewidth=1.0, label=words, zorder=2)
+        if made.marks:
+            still(axes, made, flat[last])
+        for (_, path), colour in zip(paths, COLOURS, strict=False):
+            axes.plot(*path[-1], "o", color=colour, markersize=5, zorder=6)
+        frame(axes, made, flat)
+        end = f", t = 0 to {self.t[last]:.3g} s" if ghosts.size else ""
+        where = "In the plane" if made.plane else "In space"
+        axes.set_title(where + end, fontsize=10, color=INK)
+        if paths:
+            axes.legend(fontsize=8, frameon=False, loc="upper right")
+
+    def _ghosts(self, last: int) -> NDArray[np.int64]:
+        """The instants before the last that are shown."""
+        shapes = sum(mark.kind in LINES for mark in self.drawing.marks)
+        if not shapes or not last:
+            return np.array([], dtype=int)
+        springs = any(mark.kind in ("spring", "damper") for mark in self.drawing.marks)
+        few = 5 if springs else 8 if shapes > 6 or not self.drawing.plane else INSTANTS
+        count = few if shapes <= MANY else 3
+        return np.unique(np.linspace(0, last, count).round().astype(int))[:-1]
+
+    def _stretch(self, flat: Array) -> int:
+        """The sample up to which what moves most has gone one and a half times its extent."""
+        steps = np.nan_to_num(np.linalg.norm(np.diff(flat, axis=0), axis=2))
+        if not len(steps):
+            return 0
+        reach = max(float(np.nanmax(np.ptp(flat, axis=0), initial=0.0)), 1e-12)
+        furthest = steps[:, steps.sum(axis=0).argmax()]
+        gone = np.concatenate([[0.0], np.cumsum(furthest)])
+        return min(int(np.searchsorted(gone, 1.5 * reach)), len(flat) - 1)
 
 
-def _plane(system: System, t: Array, q: Array) -> _Plane | None:
-    """Points whose x and y the scene names, as definitions or as coordinates."""
-    named = _pairs([c.name for c in system.coordinates] + [s.name for s, _ in system.definitions])
-    found = _positions(system, t, q, named)
-    if not found:
-        return None
-    points = [(f"({mathtext(x)}, {mathtext(y)})", path) for (x, y), path in found.items()]
-    free = {c.name for c in system.coordinates}
-    anchors = [np.zeros((len(t), 2))]
-    for axis, name in enumerate("xy"):  # a cart on a rail
-        if name in free and not any(name in pair for pair in found):
-            rail = np.zeros((len(t), 2))
-            rail[:, axis] = q[:, [c.name for c in system.coordinates].index(name)]
-            anchors.insert(0, rail)
-    parents: list[Array | None] = []
-    before: list[Array] = []
-    for (x, _), path in found.items():
-        parents.append(None if x in free else _parent(path, before[::-1] + anchors))
-        before.append(path)
-    units = {c.unit for c in system.coordinates} | {p.unit for p in system.parameters}
-    unit = "m" if "m" in units else ""
-    x, y = map(mathtext, next(iter(found))) if len(found) == 1 else ("$x$", "$y$")
-    return _Plane(t, points, parents, (with_unit(x, unit), with_unit(y, unit)))
+def _name(name: str) -> str:
+    """A point's name, or the pair of names of its coordinates."""
+    if name.startswith("("):
+        return "(" + ", ".join(map(mathtext, name[1:-1].split(", "))) + ")"
+    return texts.figure(name.replace("_", " "))
 
 
-def _pairs(known: Sequence[str]) -> list[tuple[str, str]]:
-    """Names such as x_p and y_p, x1 and y1, tip_x and tip_y; not those that have a z as well."""
-    pairs = []
-    for name in known:
-        if found := re.fullmatch(r"(|.*_)x(|_.*|\d+)", name):
-            before, after = found.groups()
-            if f"{before}y{after}" in known and f"{before}z{after}" not in known:
-                pairs.append((name, f"{before}y{after}"))
-    return pairs
+# --- a view of space ------------------------------------------------------------------------------
 
 
-def _positions(
-    system: System, times: Array, q: Array, pairs: Sequence[tuple[str, str]]
-) -> dict[tuple[str, str], Array]:
-    """The paths (n, 2) of the pairs that are functions of q and t and move with q."""
-    body = _bodies(system)
-    of = {s.name: body[s] for s in (*system.q, *(s for s, _ in system.definitions))}
-    coordinates = set(system.q)
-    chosen = []
-    for pair in pairs:
-        used = of[pair[0]].free_symbols | of[pair[1]].free_symbols
-        rates = of[pair[0]].has(dot) or of[pair[1]].has(dot)
-        if not rates and used & coordinates and used <= coordinates | {t}:
-            chosen.append(pair)
-    flat = [of[name] for pair in chosen for name in pair]
-    values = sympy.lambdify((t, *system.q), flat, "numpy", cse=True)(times, *q.T)
-    columns = [np.broadcast_to(v, times.shape).astype(float) for v in values]
-    return {pair: np.column_stack(columns[2 * k : 2 * k + 2]) for k, pair in enumerate(chosen)}
+def basis(up: int) -> Array:
+    """What is to the right, upwards and towards the eye, a row each."""
+    a, e = np.radians([AZIMUTH, ELEVATION])
+    right = [-np.sin(a), np.cos(a), 0.0]
+    above = [-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)]
+    near = [np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]
+    return np.roll([right, above, near], (up - 2) % 3, axis=1)
 
 
-def _parent(path: Array, candidates: Sequence[Array]) -> Array:
-    """The nearest of the candidates, in their order, that keeps its distance; else the first."""
-    for candidate in candidates:
-        distance = np.linalg.norm(path - candidate, axis=1)
-        if np.ptp(distance) <= 1e-6 * np.max(distance):
-            return candidate
-    return candidates[0]
+def seen(made: Drawing) -> Array:
+    """The points as they are seen, (n, points, 2)."""
+    return made.points if made.plane else made.points @ basis(made.up)[:2].T
 
 
-def _bodies(system: System) -> dict[sympy.Symbol, sympy.Expr]:
-    """Every name as an expression in t, q and qd alone, parameters at their values."""
-    body: dict[sympy.Symbol, sympy.Expr] = {s: s for s in system.q}
-    body |= {p.symbol: sympy.Float(p.value) for p in system.parameters}
-    for s, expr in system.definitions:
-        body[s] = expr.xreplace(body)
-    return body
+def frame(axes: Axes, made: Drawing, flat: Array) -> None:
+    """Equal scales about all that is ever drawn; in the plane axes, in space three arrows."""
+    low, high = _bounds(flat)
+    size = max(float((high - low).max()), 1e-9)
+    margin = 0.06 * size
+    axes.update_datalim([low, high])
+    axes.margins(0.06)
+    axes.set_aspect("equal", adjustable="datalim")
+    if made.plane:
+        plain(axes, lines=False)
+        names = [mathtext(name) for name in made.labels]
+        axes.set_xlabel(with_unit(names[0], made.unit))
+        axes.set_ylabel(with_unit(names[1], made.unit))
+        axes.locator_params(nbins=7)
+        return
+    axes.set_axis_off()
+    length = 10.0 ** np.floor(np.log10(0.3 * size))
+    length *= max(m for m in (1, 2, 5) if m * length <= 0.3 * size)
+    x, y = (float(entry) - margin for entry in low)
+    for name, (right, above) in zip("xyz", basis(made.up)[:2].T * length, strict=True):
+        arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.8}
+        axes.annotate("", (x + right, y + above), (x, y), annotation_clip=False, arrowprops=arrow)
+        axes.text(x + 1.2 * right, y + 1.2 * above, f"${name}$", color=INK, fontsize=9,
+                  ha="center", va="center")  # fmt: skip
+    words = f"{length:g} {texts.figure(made.unit)}".strip()
+    axes.annotate(words, (x, y), (0, -12), textcoords="offset points", color=INK, fontsize=8,
+                  ha="center")  # fmt: skip
 
 
-def _polar(system: System, t: Array, q: Array) -> _Plane | None:
-    """The path of polar coordinates; the angle from straight down where gravity says so."""
-    index = {c.name: i for i, c in enumerate(system.coordinates)}
-    radius = next((index[n] for n in ("r", "rho") if n in index), None)
-    angle = next((index[n] for n in ("theta", "phi") if n in index), None)
-    if radius is None or angle is None or len(index) != 2:
-        return None
-    potential = system.potential.xreplace(_bodies(system))
-    at_one = potential.subs(system.q[radius], 1)
-    fall = sympy.N(at_one.subs(system.q[angle], 0) - at_one.subs(system.q[angle], sympy.pi))
-    downwards = bool(fall.is_negative)
-    r, phi = (mathtext(system.coordinates[i].name).strip("$") for i in (radius, angle))
-    across, along = q[:, radius] * np.sin(q[:, angle]), q[:, radius] * np.cos(q[:, angle])
-    path = np.column_stack([across, -along] if downwards else [along, across])
-    sine, cosine = rf"{r}\,\sin {phi}", rf"{r}\,\cos {phi}"
-    x, y = (sine, f"-{cosine}") if downwards else (cosine, sine)
-    unit = system.coordinates[radius].unit
-    return _Plane(t, [("", path)], [None], (with_unit(f"${x}$", unit), with_unit(f"${y}$", unit)))
+def _bounds(flat: Array) -> tuple[Array, Array]:
+    points = flat.reshape(-1, 2)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return np.zeros(2), np.ones(2)
+    return points.min(axis=0), points.max(axis=0)
+
+
+# --- a drawing at one instant ---------------------------------------------------------------------
+
+LINES = {"line": 1.8, "rod": 2.0, "arm": 1.0, "rail": 0.8, "spring": 1.0, "damper": 1.0, "box": 1.0,
+         "inertia": 0.5, "circle": 1.0}  # fmt: skip
+SYMBOLS = {"joint": ("o", 4.5, "white"), "slide": ("s", 6, "white"), "ground": ("^", 7, "#BBBBBB"),
+           "mass": ("o", 4, INK), "point": ("D", 3, INK), "dot": ("o", 5, INK),
+           "spiral": ("o", 9, "none")}  # fmt: skip
+SKIPPED = frozenset(("rail", "arm", "inertia"))  # at earlier instants
+
+
+def still(axes: Axes, made: Drawing, flat: Array, shade: str = "") -> None:
+    """The marks at one instant; in a shade of grey, without symbols, where it is an earlier one."""
+    widest = np.linalg.norm(np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0))
+    width = 0.02 * float(widest)
+    pairs = [frozenset(m.points) for m in made.marks if m.kind in ("spring", "damper")]
+    for mark in made.marks:
+        points = flat[list(mark.points)]
+        if not np.isfinite(points).all():
+            continue
+        if mark.kind in LINES:
+            if shade and (mark.kind in SKIPPED and len(made.marks) > 3):
+                continue
+            aside = width * 1.4 if pairs.count(frozenset(mark.points)) > 1 else 0.0
+            for line in outline(mark, points, width, aside):
+                axes.plot(
+                    *line.T, color=shade or (BODY if mark.kind != "line" else INK),
+                    linewidth=LINES[mark.kind] * (0.7 if shade else 1.0), zorder=1 if shade else 3,
+                    solid_capstyle="round", linestyle=(0, (4, 3)) if mark.kind == "rail" else "-",
+                    solid_joinstyle="round",
+                )  # fmt: skip
+        elif not shade:
+            symbol, size, face = SYMBOLS[mark.kind]
+            axes.plot(*points[0], symbol, color=INK, markersize=size, markerfacecolor=face,
+                      markeredgewidth=0.9, zorder=4)  # fmt: skip
+            if mark.kind == "mass" and len(points) == 2:  # how it is turned
+                way = points[1] - points[0]
+                tick = points[0] + way / np.linalg.norm(way) * 2 * width
+                axes.plot(*np.array([points[0], tick]).T, color=INK, linewidth=1.2, zorder=4)
+
+
+def outline(mark: Mark, points: Array, width: float, aside: float) -> Iterator[Array]:
+    """The lines of a mark, (k, 2) each. aside: how far springs and dampers stand apart."""
+    if mark.kind in ("box", "inertia"):
+        yield from _box(points)
+    elif mark.kind == "circle":
+        turn = np.linspace(0, 2 * np.pi, 49)[:, None]
+        yield (
+            points[0]
+            + np.cos(turn) * (points[1] - points[0])
+            + np.sin(turn) * (points[2] - points[0])
+        )
+    elif mark.kind in ("spring", "damper"):
+        yield from _along(points, width, aside, mark.kind)
+    else:
+        yield points
+
+
+def _box(points: Array) -> Iterator[Array]:
+    """The edges, from the centre and the tips of the half axes."""
+    center, halves = points[0], points[1:] - points[0]
+    if len(halves) == 2:
+        a, b = halves
+        yield center + _around(a, b)
+        return
+    a, b, c = halves
+    for side in (c, -c):
+        yield center + side + _around(a, b)
+    for corner in (a + b, a - b, -a - b, b - a):
+        yield center + np.array([corner + c, corner - c])
+
+
+def _around(a: Array, b: Array) -> Array:
+    """The corners of a parallelogram about the origin, the first again at the end."""
+    return np.array([a + b, a - b, -a - b, b - a, a + b])
+
+
+_COIL = 12  # half turns
+_DASHPOT = (  # along and across, from its one end to the other
+    ((0, 0), (0.4, 0)), ((0.65, 1), (0.4, 1), (0.4, -1), (0.65, -1)), ((0.55, 0.7), (0.55, -0.7)),
+    ((0.55, 0), (1, 0)),
+)  # fmt: skip
+
+
+def _along(points: Array, width: float, aside: float, kind: str) -> Iterator[Array]:
+    """A coil or a dashpot between two points."""
+    start, way = points[0], points[1] - points[0]
+    length = float(np.linalg.norm(way))
+    across = np.array([-way[1], way[0]]) / length if length else np.zeros(2)
+    shift = across * (aside if kind == "spring" else -aside)
+    if kind == "spring":
+        s = np.concatenate([[0.0, 0.15], 0.15 + 0.7 * (np.arange(_COIL) + 0.5) / _COIL, [0.85, 1]])
+        y = np.concatenate([[0, 0], np.resize([1.0, -1.0], _COIL), [0, 0]])
+        yield start + shift + s[:, None] * way + y[:, None] * across * width
+        return
+    for part in _DASHPOT:
+        s, y = np.array(part).T[:, :, None]
+        yield start + shift + s * way + y * across * width

@@ -12,13 +12,13 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK, FAINT = "#333333", "#DDDDDD"
 
 
-def plain(axes: Axes) -> None:
-    """Light grid, no box, thin lines."""
+def plain(axes: Axes, lines: bool = True) -> None:
+    """Light grid, no box, and of what is drawn so far thin lines."""
     axes.grid(True, color=FAINT, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(INK)
     axes.tick_params(colors=INK, labelsize=9, length=3)
     axes.ticklabel_format(axis="y", scilimits=(-3, 4), useMathText=True)
-    for line in axes.get_lines():
+    for line in axes.get_lines() if lines else ():
         line.set_linewidth(1.3)

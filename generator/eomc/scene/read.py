@@ -21,6 +21,7 @@ from eomc.scene import (
     toml_text,
     validate_bodies,
     validate_events,
+    validate_picture,
 )
 from eomc.scene.formulas import Formula, suggest
 from eomc.scene.scene import Coordinate, Input, Output, Quantity, Run, Scene
@@ -111,6 +112,7 @@ class _Check(Checker):
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
         events = list(validate_events.events(self, doc))
+        picture = validate_picture.picture(self, doc, known)
         outputs = self._outputs()
         self._asked()
         self._unused()
@@ -133,6 +135,7 @@ class _Check(Checker):
             events=tuple(events),
             run=self._run(),
             assembly=assembly,
+            picture=picture,
             places=self.places,
             warnings=tuple(self.problems),
         )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from eomc.base.errors import EomcError, Problem
 from eomc.scene.assembly import Assembly
 from eomc.scene.formulas import Formula
+from eomc.scene.picture import Picture
 from eomc.scene.scope import value_of
 from eomc.scene.source_map import SourceMap
 
@@ -125,6 +126,7 @@ class Scene:
     events: tuple[Event, ...]
     run: Run
     assembly: Assembly | None
+    picture: Picture | None
     places: SourceMap = field(repr=False, compare=False)
     warnings: tuple[Problem, ...] = ()
 

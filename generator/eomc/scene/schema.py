@@ -215,6 +215,26 @@ class EventTable(_Table):
     note: _Note = ""
 
 
+_Places = Annotated[tuple[spelling.Place, ...], pydantic.PlainValidator(spelling.places)]
+_Lines = Annotated[tuple[Any, ...], pydantic.PlainValidator(spelling.lines)]
+_Ends = Annotated[tuple[Any, ...], pydantic.PlainValidator(spelling.ends)]
+_Boxes = Annotated[tuple[Any, ...], pydantic.PlainValidator(spelling.boxes)]
+_Circles = Annotated[tuple[Any, ...], pydantic.PlainValidator(spelling.circles)]
+
+
+class PictureTable(_Table):
+    """[picture] as it is written."""
+
+    points: Annotated[dict[str, Any], pydantic.PlainValidator(spelling.named_points)] = {}
+    dots: _Places = ()
+    lines: _Lines = ()
+    springs: _Ends = ()
+    boxes: _Boxes = ()
+    circles: _Circles = ()
+    paths: _Places = ()
+    axes: Annotated[str, pydantic.PlainValidator(spelling.plane_axes)] = ""
+
+
 class Document(_Table):
     """A whole scene as it is written."""
 
@@ -237,6 +257,7 @@ class Document(_Table):
     damper: dict[str, DamperTable] = {}
     force: dict[str, ForceTable] = {}
     event: dict[str, EventTable] = {}
+    picture: PictureTable | None = None
     run: _Run = _Run()
 
 
@@ -264,6 +285,7 @@ _MODELS: Mapping[str, type[_Table]] = {
     "damper": DamperTable,
     "force": ForceTable,
     "event": EventTable,
+    "picture": PictureTable,
     "run": _Run,
 }
 
@@ -379,7 +401,7 @@ def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
     """Put something harmless in a faulty entry's place, so that the rest can be checked."""
     table, last = table_at(tree, path[:-1]), path[-1]
     given = table.get(last)
-    if isinstance(given, list) and given and all(isinstance(g, dict) for g in given):
+    if len(path) == 1 and isinstance(given, list) and all(isinstance(g, dict) for g in given):
         table[last] = {key: value for g in given for key, value in g.items()}  # [[parameters]]
     elif path in _HARMLESS:
         table[last] = _HARMLESS[path]

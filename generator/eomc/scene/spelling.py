@@ -109,3 +109,86 @@ def points(value: object) -> tuple[tuple[float | str, ...], ...]:
     if not (isinstance(value, list) and len(value) == 2):
         raise ValueError(f'must be two points, such as [[0, 0], ["l", 0]], here {toml(value)}')
     return tuple(map(vector, value))
+
+
+# --- [picture] ------------------------------------------------------------------------------------
+
+Place = str | tuple[float | str, ...]  # a name, or a vector
+
+
+def named_points(value: object) -> dict[str, tuple[float | str, ...]]:
+    """A table of vectors."""
+    if not isinstance(value, dict):
+        raise ValueError(
+            f'must be a table, such as {{ tip = ["x", "l*cos(theta)"] }}, here {toml(value)}'
+        )
+    return {name: vector(entries) for name, entries in value.items()}
+
+
+def _place(value: object) -> Place:
+    return value if isinstance(value, str) else vector(value)
+
+
+def places(value: object) -> tuple[Place, ...]:
+    """A list of points, each by its name or as a vector."""
+    if not isinstance(value, list):
+        raise ValueError(f'must be a list of points, such as ["tip"], here {toml(value)}')
+    return tuple(map(_place, value))
+
+
+def lines(value: object) -> tuple[tuple[Place, ...], ...]:
+    """A list of lines, each through two points or more."""
+    example = 'a list of lines, such as [["cart", "tip"]]'
+    if not isinstance(value, list):
+        raise ValueError(f"must be {example}, here {toml(value)}")
+    for line in value:
+        if not (isinstance(line, list) and len(line) >= 2):
+            raise ValueError(f"must be {example}, each through two points or more: {toml(line)}")
+    return tuple(map(places, value))
+
+
+def ends(value: object) -> tuple[tuple[Place, ...], ...]:
+    """A list of pairs of points."""
+    found = lines(value)
+    for pair in found:
+        if len(pair) != 2:
+            raise ValueError(f"each goes from a point to another, here there are {len(pair)}")
+    return found
+
+
+Solid = tuple[Place, tuple[float | str, ...], object]  # where, how large, how it is rotated
+
+
+def boxes(value: object) -> tuple[Solid, ...]:
+    """A list of boxes."""
+    return _solids(value, "size", '{ at = "cart", size = [0.4, 0.2] }')
+
+
+def circles(value: object) -> tuple[Solid, ...]:
+    """A list of circles."""
+    return _solids(value, "radius", '{ at = "wheel", radius = 0.1 }')
+
+
+def _solids(value: object, size: str, example: str) -> tuple[Solid, ...]:
+    keys = ("at", size, "rotation")
+    out = []
+    for given in value if isinstance(value, list) else [value]:
+        if not isinstance(given, dict) or not {"at", size} <= given.keys() <= {*keys}:
+            raise ValueError(
+                f"must be a list of tables with {keys[0]}, {keys[1]} and perhaps {keys[2]}, "
+                f"such as [{example}], here {toml(given)}"
+            )
+        extent = given[size]
+        large = vector(extent) if size == "size" else (entry(extent),)
+        turned = rotation(given["rotation"]) if "rotation" in given else None
+        out.append((_place(given["at"]), large, turned))
+    return tuple(out)
+
+
+def plane_axes(value: object) -> str:
+    """What a picture in the plane calls its axes."""
+    if value in ("xy", "xz", "yz"):
+        return str(value)
+    raise ValueError(
+        f'must be "xy", "xz" or "yz", what is drawn to the right and upwards, here {toml(value)}'
+    )

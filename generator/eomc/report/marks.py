@@ -1,0 +1,127 @@
+"""Points that move, and marks on them: what every drawing is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One thing drawn on some of a drawing's points.
+
+    kind: what it is, and how many points it has.
+
+    =========  ============================================================================
+    line       of a [picture], through two points or more
+    rod        two points of one body
+    arm        from a body's frame to its centre of mass
+    rail       what a slide travels along
+    spring     a coil between two points
+    damper     a dashpot between two points
+    box        a centre and the tips of its half axes: two in the plane, three in space
+    inertia    a box of the same mass and moments of inertia as a body
+    circle     a centre and the tips of two radii
+    joint      where a body turns; spiral: with a spring that turns
+    slide      a body on a rail
+    ground     what is fixed to the world
+    mass       a centre of mass, and in the plane another point to show how it is turned
+    point      a [[point]]
+    dot        a point of a [picture]
+    =========  ============================================================================
+    """
+
+    kind: str
+    points: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Path:
+    """The path of a point that has a name."""
+
+    name: str
+    point: int
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What is drawn at n instants.
+
+    points: (n, points, 2 or 3), in `unit`; not finite where a formula has no value. marks: from the
+    back to the front in the plane. axes: "xy", "xz", "yz" in the plane, "xyz" in space, seen with
+    axis `up` upwards. names: of the axes, where a scene has names for them.
+    """
+
+    points: Array
+    marks: tuple[Mark, ...]
+    paths: tuple[Path, ...]
+    axes: str
+    unit: str = "m"
+    names: tuple[str, ...] = ()
+    up: int = 2
+
+    @property
+    def plane(self) -> bool:
+        """Whether it lies in a plane."""
+        return len(self.axes) == 2
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What the axes are called."""
+        return self.names or tuple(self.axes)
+
+
+_ORDER = ("rail", "inertia", "box", "circle", "arm", "line", "rod", "spring", "damper", "ground",
+          "spiral", "joint", "slide", "point", "mass", "dot")  # fmt: skip
+HIDDEN = frozenset(("joint", "point"))  # marks that a like one at the same place hides
+
+
+@dataclass
+class Marks:
+    """Collects points and marks of a drawing at `count` instants; equal points are one."""
+
+    count: int
+    points: list[Array] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)
+    paths: list[Path] = field(default_factory=list)
+    _index: dict[bytes, int] = field(default_factory=dict)
+
+    def point(self, at: ArrayLike) -> int:
+        """The index of a point that moves, (n, 3), or stands, (3,)."""
+        path = np.ascontiguousarray(np.broadcast_to(np.asarray(at, dtype=float), (self.count, 3)))
+        path = path + 0.0  # no zero has a sign
+        key = path.tobytes()
+        if key not in self._index:
+            self._index[key] = len(self.points)
+            self.points.append(path)
+        return self._index[key]
+
+    def add(self, kind: str, *points: int) -> None:
+        """A mark, unless it is there already or would have no length."""
+        if len(points) > 1 and len(set(points)) == 1:
+            return
+        mark = Mark(kind, points)
+        if mark not in self.marks:
+            self.marks.append(mark)
+
+    def path(self, name: str, point: int) -> None:
+        """The path of a point, where it moves."""
+        moves = np.ptp(self.points[point], axis=0).max(initial=0.0) > 0
+        if moves and point not in [p.point for p in self.paths]:
+            self.paths.append(Path(name, point))
+
+    def drawing(
+        self, axes: str, unit: str = "m", names: tuple[str, ...] = (), up: int = 2
+    ) -> Drawing | None:
+        """The whole; None where there is nothing in it."""
+        if not self.marks and not self.paths:
+            return None
+        ordered = sorted(self.marks, key=lambda mark: _ORDER.index(mark.kind))
+        points = np.stack(self.points, axis=1)
+        if len(axes) == 2:
+            points = points[:, :, :2]
+        return Drawing(points, tuple(ordered), tuple(self.paths), axes, unit, names, up)

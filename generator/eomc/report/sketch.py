@@ -1,0 +1,273 @@
+"""What a scene declares of its shape, at many states at once: bodies, springs, its [picture].
+
+A second, plain forward kinematics from the scene's own text, with arrays for numbers: it shares
+nothing with the derivation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eomc.base import spatial
+from eomc.report.marks import Drawing, Marks
+from eomc.scene import formulas
+from eomc.scene.assembly import WORLD, Assembly, Between, Body, Turn
+from eomc.scene.formulas import Formula
+from eomc.scene.joints import JOINTS
+from eomc.scene.picture import Picture, Shape
+from eomc.scene.scene import Scene
+
+Array = NDArray[np.float64]
+Pose = tuple[Array, Array]  # at n states: the offset (n, 3) and rotation (n, 3, 3) of a frame
+PATHS = 3  # of points, at most
+
+ARRAYS: Mapping[str, Any] = {
+    **formulas.NUMERIC,
+    **{name: getattr(np, name) for name in "sin cos tan sinh cosh tanh exp log sqrt sign".split()},
+    "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2, "abs": np.abs,
+    "heaviside": lambda x: np.heaviside(x, 0.5),
+    "min": lambda *x: reduce(np.minimum, x),
+    "max": lambda *x: reduce(np.maximum, x),
+    "dot": lambda x: 0.0 * x,  # of what does not move, or it could not stand here
+}  # fmt: skip
+
+
+def declared(scene: Scene, values: Mapping[str, float], t: Array, q: Array) -> Drawing | None:
+    """The drawing of what a scene declares; None where that is nothing.
+
+    values: of parameters. t: (n,), s; q: (n, nq).
+    """
+    with np.errstate(all="ignore"):  # what has no value is not drawn
+        return _Sketch(scene, values, t, q).drawing()
+
+
+class _Sketch:
+    def __init__(self, scene: Scene, values: Mapping[str, float], t: Array, q: Array) -> None:
+        self.scene, self.n = scene, len(t)
+        self.known: dict[str, Any] = {
+            p.name: p.value for p in (*scene.constants, *scene.parameters)
+        }
+        self.known |= {name: values[name] for name in values.keys() & self.known.keys()}
+        self.known |= dict(zip([c.name for c in scene.coordinates], q.T, strict=True)) | {"t": t}
+        self.definitions = dict(scene.definitions)
+        self.marks = Marks(self.n)
+        still = np.zeros((self.n, 3)), np.broadcast_to(np.eye(3), (self.n, 3, 3))
+        self.poses: dict[str, Pose] = {WORLD: still}
+        self.seats: dict[str, Pose] = {}  # of joints, before they move
+        self.centers: dict[str, Array] = {}  # of mass, in the world
+
+    def drawing(self) -> Drawing | None:
+        assembly, picture = self.scene.assembly, self.scene.picture
+        if assembly:
+            self._place(assembly)
+            self._skeleton(assembly)
+        if picture:
+            for shape in picture.shapes:
+                self._shape(shape, picture)
+        if assembly and not self.marks.paths:
+            self._paths(assembly)
+        plane = assembly.plane if assembly else bool(picture and picture.axes != "xyz")
+        axes = picture.axes if picture else "xy" if plane else "xyz"
+        units = {c.unit for c in self.scene.coordinates} | {p.unit for p in self.scene.parameters}
+        unit = "m" if assembly or "m" in units else ""
+        return self.marks.drawing(axes, unit, up=self._up(assembly))
+
+    def _up(self, assembly: Assembly | None) -> int:
+        """Against gravity, where it has a direction."""
+        if assembly is None:
+            return 2
+        pull = np.abs([float(self._number(g)) for g in assembly.gravity])
+        return int(pull.argmax()) if pull.any() else 2
+
+    # --- values ----------------------------------------------------------------------------------
+
+    def _number(self, formula: Formula) -> Any:
+        return formulas.evaluate(formula, ARRAYS, self._lookup)
+
+    def _lookup(self, name: str) -> Any:
+        if name not in self.known:
+            if name in self.definitions:
+                self.known[name] = self._number(self.definitions[name])
+            else:
+                body, letter = name[:-2], name[-1]
+                self.known[name] = self.centers[body][:, "xyz".index(letter)]
+        return self.known[name]
+
+    def _vector(self, entries: Sequence[Formula]) -> Array:
+        """(n, 3)"""
+        columns = [np.broadcast_to(self._number(entry), self.n) for entry in entries]
+        return np.stack(columns, axis=1).astype(float)
+
+    def _rotation(self, turns: Sequence[Turn]) -> Array:
+        """(n, 3, 3)"""
+        R = self.poses[WORLD][1]
+        for turn in turns:
+            R = R @ self._about(np.eye(3)["xyz".index(turn.axis)], self._number(turn.angle))
+        return R
+
+    def _about(self, axis: Sequence[float] | Array, angle: Any) -> Array:
+        angle = np.broadcast_to(angle, self.n)
+        rows = spatial.about(tuple(axis), np.cos(angle), np.sin(angle))
+        return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+
+    # --- bodies ----------------------------------------------------------------------------------
+
+    def _place(self, assembly: Assembly) -> None:
+        """Where all frames are, first those on joints."""
+        for body in assembly.bodies:
+            if body.joint:
+                at, R = self.poses[body.parent]
+                if body.offset:
+                    at = at + _turned(R, self._vector(body.offset))
+                R = R @ self._rotation(body.rotation)
+                self.seats[body.name] = at, R
+                self.poses[body.name] = self._moved(body, at, R)
+                at, R = self.poses[body.name]
+                self.centers[body.name] = at + _turned(R, self._vector(body.center))
+        for body in assembly.bodies:
+            if body.position:
+                pose = self._vector(body.position), self._rotation(body.rotation)
+                self.poses[body.name], self.centers[body.name] = pose, pose[0]
+
+    def _moved(self, body: Body, at: Array, R: Array) -> Pose:
+        kind = JOINTS[body.joint]
+        along = zip(kind.motions, kind.along(body.axes), body.coordinates, strict=True)
+        for motion, axis, by in along:
+            unit = np.array(axis) / np.linalg.norm(axis)
+            moved = self._number(by)
+            if motion == "t":
+                at = at + _turned(R, np.broadcast_to(moved, self.n)[:, None] * unit)
+            else:
+                R = R @ self._about(unit, moved)
+        return at, R
+
+    def _skeleton(self, assembly: Assembly) -> None:
+        for body in assembly.bodies:
+            if body.joint:
+                self._join(body)
+            self._mass(body, assembly.plane)
+        laid: list[tuple[int, ...]] = []
+        for kind, some in (("spring", assembly.springs), ("damper", assembly.dampers)):
+            for end in some:
+                self._between(kind, end, assembly, laid)
+
+    def _join(self, body: Body) -> None:
+        """The joint of a body, and what holds it to the frame of its parent."""
+        marks, (seat, R) = self.marks, self.seats[body.name]
+        at = marks.point(seat)
+        if body.parent != WORLD:
+            marks.add("rod", marks.point(self.poses[body.parent][0]), at)
+        motions = JOINTS[body.joint].motions
+        if body.joint in ("free", "planar"):
+            return
+        if body.parent == WORLD and not body.point and "t" not in motions:
+            marks.add("ground", at)
+        if "t" in motions:
+            axis = JOINTS[body.joint].along(body.axes)[motions.index("t")]
+            way = np.broadcast_to(self._number(body.coordinates[motions.index("t")]), self.n)
+            unit = _turned(R, np.broadcast_to(np.array(axis) / np.linalg.norm(axis), (self.n, 3)))
+            ends = (marks.point(seat + x * unit) for x in (way.min(), way.max()))
+            marks.add("rail", *ends)
+            marks.add("slide", marks.point(self.poses[body.name][0]))
+        elif motions:
+            marks.add("joint", at)
+        if body.point:
+            marks.add("point", marks.point(self.poses[body.name][0]))
+
+    def _mass(self, body: Body, plane: bool) -> None:
+        """The centre of mass, and in space the box that has the body's mass and inertia."""
+        mass = float(self._number(body.mass))
+        xx, yy, zz, xy, xz, yz = (float(self._number(entry)) for entry in body.inertia)
+        if mass <= 0:
+            return
+        marks, center, (origin, R) = self.marks, self.centers[body.name], self.poses[body.name]
+        at = marks.point(center)
+        if body.joint:
+            marks.add("arm", marks.point(origin), at)
+        if plane:
+            radius = np.sqrt(max(zz, 0) / mass)  # of gyration
+            marks.add("mass", at, *([marks.point(center + radius * R[:, :, 0])] if radius else []))
+            return
+        # of a box with edges 2a, 2b, 2c: Ixx = m (b^2 + c^2)/3, ...
+        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        halves = np.sqrt(np.maximum(3 * (moments.sum() / 2 - moments) / mass, 0))
+        halves[halves < 1e-6 * halves.max(initial=0.0)] = 0
+        if halves.any():
+            tips = [
+                marks.point(center + h * (R @ axis)) for h, axis in zip(halves, axes.T, strict=True)
+            ]
+            marks.add("inertia", at, *tips)
+        marks.add("mass", at)
+
+    def _between(
+        self, kind: str, end: Between, assembly: Assembly, laid: list[tuple[int, ...]]
+    ) -> None:
+        """A spring or damper where its ends are known."""
+        marks = self.marks
+        if end.points and end.bodies:
+            points = []
+            for name, place in zip(end.bodies, end.points, strict=True):
+                at, R = self.poses[name]
+                points.append(marks.point(at + _turned(R, self._vector(place))))
+                marks.add("ground" if name == WORLD else "rod", *self._hold(name, points[-1]))
+            marks.add(kind, *points)
+            return
+        for body in assembly.bodies:
+            motions = JOINTS[body.joint].motions if body.joint else ""
+            by = [formula.text for formula in body.coordinates]
+            turns = end.turning and end.bodies and {body.name, body.parent} == {*end.bodies}
+            if motions == "r" and (turns or by == [end.coordinate]) and kind == "spring":
+                marks.add("spiral", marks.point(self.seats[body.name][0]))
+            elif motions == "t" and by == [end.coordinate]:
+                ends = (self.seats[body.name][0], self.poses[body.name][0])
+                marks.add(kind, *map(marks.point, ends))
+
+    def _hold(self, name: str, point: int) -> tuple[int, ...]:
+        """The points of what holds the end of a spring: the world at it, or a rod of the body."""
+        return (point,) if name == WORLD else (self.marks.point(self.poses[name][0]), point)
+
+    def _paths(self, assembly: Assembly) -> None:
+        """Of the points that the scene names, else of the one body that carries none."""
+        marks = self.marks
+        tips = [b.name for b in assembly.bodies if b.point]
+        if tips:
+            for name in tips[:PATHS]:
+                marks.path(name, marks.point(self.poses[name][0]))
+            return
+        parents = {b.parent for b in assembly.bodies if b.joint}
+        leaves = [b.name for b in assembly.bodies if b.name not in parents]
+        if len(leaves) == 1:
+            marks.path(leaves[0], marks.point(self.centers[leaves[0]]))
+
+    # --- the picture of a scene ------------------------------------------------------------------
+
+    def _shape(self, shape: Shape, picture: Picture) -> None:
+        marks = self.marks
+        at = [self._at(place.name, place.at) for place in shape.places]
+        points = [marks.point(x) for x, _ in at]
+        if shape.kind == "path":
+            name = shape.places[0].name
+            marks.path(name or f"point {len(marks.paths) + 1}", points[0])
+        elif shape.kind in ("dot", "line", "spring"):
+            marks.add(shape.kind, *points)
+        else:
+            center, R = at[0]
+            R = R @ self._rotation(shape.rotation)
+            sizes = [float(self._number(size)) for size in shape.size]
+            halves = sizes * 2 if shape.kind == "circle" else [size / 2 for size in sizes]
+            tips = (marks.point(center + h * R[:, :, k]) for k, h in enumerate(halves))
+            marks.add(shape.kind, points[0], *tips)
+
+    def _at(self, name: str, at: Sequence[Formula] | None) -> Pose:
+        """A place, and the axes there."""
+        return self.poses[name] if at is None else (self._vector(at), self.poses[WORLD][1])
+
+
+def _turned(R: Array, v: Array) -> Array:
+    turned: Array = np.einsum("nij,nj->ni", R, v)
+    return turned

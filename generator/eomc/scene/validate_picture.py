@@ -1,0 +1,134 @@
+"""The table [picture] of a scene: layout to a checked Picture. No SymPy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from eomc.base import names
+from eomc.scene.assembly import WORLD, Turn, Vector
+from eomc.scene.formulas import Formula, suggest
+from eomc.scene.picture import Picture, Place, Shape
+from eomc.scene.schema import Document
+from eomc.scene.scope import INPUT, VELOCITY, Checker, Path
+from eomc.scene.spelling import Place as Written
+from eomc.scene.validate_values import ORIGIN, ZERO
+
+_SIMPLE = (("dots", "dot"), ("lines", "line"), ("springs", "spring"), ("paths", "path"))
+
+
+def picture(check: Checker, doc: Document, known: Mapping[str, float]) -> Picture | None:
+    """What the scene wants drawn; None where it says nothing. Faults are reported to `check`.
+
+    known: the values of constants and parameters.
+    """
+    return _Picture(check, doc, known).checked() if doc.picture else None
+
+
+class _Picture:
+    def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
+        assert doc.picture is not None
+        self.check, self.known, self.table = check, known, doc.picture
+        self.bodies = [e.name for table in (doc.body, doc.point) for e in table.values()]
+        self.wide = len(doc.gravity) if doc.body and doc.gravity else 0  # 0: the first vector says
+        self.points: dict[str, Vector] = {}
+
+    def checked(self) -> Picture:
+        for name, at in self.table.points.items():
+            self._declare(name, at)
+        shapes = [*self._simple(), *self._solids()]
+        if not shapes and not self.check.faults:
+            self.check.say(
+                ("picture",),
+                "draws nothing: add dots, lines, springs, boxes, circles or paths, "
+                'such as lines = [["cart", "tip"]]',
+            )
+        axes = "xyz" if self.wide == 3 else self.table.axes or "xy"
+        if self.table.axes and self.wide == 3:
+            self.check.say(("picture", "axes"), "is for pictures in the plane: remove it")
+        return Picture(tuple(shapes), axes)
+
+    def _declare(self, name: str, at: tuple[float | str, ...]) -> None:
+        path = ("picture", "points", name)
+        if why := names.fault(name):
+            self.check.say(path, why)
+        elif name == WORLD or name in self.bodies:
+            what = "the frame that does not move" if name == WORLD else "a body or point already"
+            self.check.say(path, f"'{name}' is {what}: name the point otherwise")
+        self.points[name] = self._vector(path, at)
+
+    def _simple(self) -> Iterator[Shape]:
+        for key, kind in _SIMPLE:
+            for given in getattr(self.table, key):
+                many = given if key in ("lines", "springs") else (given,)
+                places = tuple(self._place(("picture", key), written) for written in many)
+                yield Shape(kind, places)
+
+    def _solids(self) -> Iterator[Shape]:
+        for key, kind in (("boxes", "box"), ("circles", "circle")):
+            path = ("picture", key)
+            for at, size, rotation in getattr(self.table, key):
+                place = self._place(path, at)
+                if kind == "box" and self.wide and len(size) != self.wide:
+                    where = "in the plane" if self.wide == 2 else "in space"
+                    words = {2: "two edges", 3: "three edges"}[self.wide]
+                    self.check.say(path, f"a box {where} has {words}, here {len(size)}")
+                large = tuple(self._size(path, entry) for entry in size)
+                yield Shape(kind, (place,), large, self._rotation(path, rotation))
+
+    def _place(self, path: Path, written: Written) -> Place:
+        if not isinstance(written, str):
+            return Place("", self._vector(path, written))
+        if written in self.points:
+            return Place(written, self.points[written])
+        if written == WORLD or written in self.bodies:
+            return Place(written, None)
+        known = [*self.points, *self.bodies]
+        near = suggest(written, known)
+        remedy = near or ': add it to [picture.points], such as tip = ["x", "l*cos(theta)"]'
+        self.check.say(path, f"'{written}' is no point{remedy}", text=written)
+        return Place(written, ORIGIN)
+
+    def _vector(self, path: Path, given: tuple[float | str, ...]) -> Vector:
+        self.wide = self.wide or len(given)
+        if len(given) != self.wide or self.wide not in (2, 3):
+            words = {2: "two entries, as the others here", 3: "three entries, as the others here"}
+            wanted = words.get(self.wide, "two entries in the plane and three in space")
+            self.check.say(path, f"a point has {wanted}, not {len(given)}")
+            return ORIGIN
+        made = [self._formula(path, entry) for entry in given]
+        x, y, z = (*made, ZERO)[:3]
+        return x, y, z
+
+    def _formula(self, path: Path, value: float | str) -> Formula:
+        """A formula of everything but inputs and velocities."""
+        check = self.check
+        formula = check.formula(path, value)
+        if formula is None:
+            return ZERO
+        kinds = check.kinds_of(formula.tree)
+        for kind in (INPUT, VELOCITY):
+            if kind in kinds:
+                why = f"a picture can't depend on {kind}: it shows where things are"
+                check.say(path, why, check.where(formula, kind), formula.text)
+        return formula
+
+    def _size(self, path: Path, value: float | str) -> Formula:
+        """A length of parameters, which is not negative."""
+        rule = "a size is made of numbers, constants and parameters"
+        formula = self.check.formula(path, value, self.known, rule)
+        if self.check.number(path, formula, self.known) < 0:
+            self.check.say(path, "a size is not negative", text=formula.text if formula else "")
+        return formula or ZERO
+
+    def _rotation(self, path: Path, given: Any) -> tuple[Turn, ...]:
+        if given is None:
+            return ()
+        if not isinstance(given, tuple):
+            if self.wide == 3:
+                why = 'in space a rotation names its axis: write [["z", "pi/2"]], or more turns'
+                self.check.say(path, why)
+            return (Turn("z", self._formula(path, given)),)
+        if self.wide == 2 and any(axis != "z" for axis, _ in given):
+            self.check.say(path, "in the plane a rotation is an angle: write it alone")
+        return tuple(Turn(axis, self._formula(path, angle)) for axis, angle in given)
