@@ -114,6 +114,21 @@ def test_what_lies_beside_a_built_module_needs_no_eomc() -> None:
             assert not imports(name), name
 
 
+def test_pictures_alone_are_asked_of_eomc_beside_a_built_module() -> None:
+    """By name, when a run is drawn; an import would be of no use where eomc is not installed."""
+    asking = [
+        name
+        for name in modules()
+        if room(name) == "runtime"
+        for node in ast.walk(tree(name))
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and node.value.startswith("eomc.")
+        and " " not in node.value
+    ]
+    assert asking == ["runtime.shown"]
+
+
 MODULE, FUNCTION = 450, 80  # lines
 
 

@@ -136,7 +136,11 @@ def load(
     """
     from eomc.toolchain import cache
 
-    return cache.load(build(scene, root, form=form, warn=warn))
+    module = cache.load(build(scene, root, form=form, warn=warn))
+    # what pictures are made from
+    own = os.path.abspath(scene) if isinstance(scene, (str, os.PathLike)) else scene
+    module._model.source = own
+    return module
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:

@@ -41,23 +41,30 @@ if TYPE_CHECKING:
     "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
 )
 @click.option("--plot", type=click.Path(path_type=Path), help="Draw them: FILE.png, .svg or .pdf.")
+@click.option(
+    "--animate",
+    type=click.Path(path_type=Path),
+    help="Let them move: FILE.html, a page that plays them; FILE.gif or .mp4, a film.",
+)
 @options.QUIET
 @options.JSON
 def command(
     scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str], h: float | None,
     duration: float | None, method: str | None, tol: float | None, every: int, out: Path | None,
-    plot: Path | None, quiet: bool, as_json: bool,
+    plot: Path | None, animate: Path | None, quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Simulate a scene; print the end, the error and the speed.
 
     \b
     eomc run scenes/cartpole.toml --plot cartpole.png
+    eomc run scenes/cartpole.toml --animate cartpole.html
     eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
     """
     from eomc.runtime.estimate import beyond_end
 
     _known_suffix(out, (".csv", ".npz"), "--out")
     _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
+    _known_suffix(animate, (".html", ".gif", ".mp4"), "--animate")
     with status_line(f"building {scene.stem}", quiet or as_json):
         module = pipeline.load(scene, root, warn=warn)
     values, q0, qd0 = _overrides(scene, module, parameters, start)
@@ -96,7 +103,11 @@ def command(
         system, rows = pipeline.read(scene).at(values), (done.t, done.q, done.qd, done.energy)
         words = balance.words if balance else ""
         plots.draw(system, *rows, plot, jacobi=jacobi, outputs=done.outputs, words=words)
-    summary = _summary(module, done, balance, seconds, unstable, ends, plot=plot, out=out)
+    if animate:
+        with status_line(f"drawing {animate.name}", quiet or as_json):
+            done.animate(animate)
+    files = {"plot": plot, "animate": animate, "out": out}
+    summary = _summary(module, done, balance, seconds, unstable, ends, **files)
     if as_json:
         say(json.dumps(summary, indent=1))
     elif not quiet:

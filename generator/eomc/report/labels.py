@@ -46,3 +46,21 @@ def rate_unit(unit: str, rate: bool) -> str:
 def with_unit(text: str, unit: str) -> str:
     """A text as it is printed, and its unit in brackets."""
     return f"{text} ({texts.figure(unit)})" if unit else text
+
+
+def html_name(name: str, rate: bool = False) -> str:
+    """A plain name as it is printed in a page: theta_1 as θ with a subscript.
+
+    >>> html_name("theta_1")
+    'θ<sub>1</sub>'
+    """
+    head, *rest = texts.name(name).split("_")
+    if digits := re.fullmatch(r"([A-Za-z]+?)(\d+)", head):
+        head, rest = digits[1], [digits[2], *rest]
+    symbol, *below = (_LETTERS.get(part, part) for part in (head, *rest))
+    if rate:
+        symbol += "\N{COMBINING DOT ABOVE}"
+    return f"{symbol}<sub>{','.join(below)}</sub>" if below else symbol
+
+
+_LETTERS = {word: letter for letter, word in names.GREEK.items()}

@@ -49,6 +49,8 @@ _MOST = 2**60  # steps, so that C can return four times as many
 class Model(Frames):
     """The functions of one compiled scene; the package hands them on under their own names."""
 
+    source: Any = None  # what eomc.load made it from, a path or a System; pictures need it
+
     def __init__(
         self, extension: Any, *, h: float, duration: float,
         methods: Mapping[str, tuple[int, int, float, float]], tolerance: float | None = None,

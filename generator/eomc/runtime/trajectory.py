@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array
 from .balance import Balance, balance
-from .columns import Columns
+from .columns import Columns, File
 from .dense import states
 from .estimate import Estimate, estimate
 from .package import reduced
+from .shown import by_eomc
 
 if TYPE_CHECKING:
     from .model import Model
@@ -193,6 +194,19 @@ class Run(Columns):
             for k, q, qd in self._model._by_time(name, self.t, self.q, self.qd)
         ]
         return np.concatenate(values)
+
+    def animate(
+        self, file: File | None = None, *others: Run, scene: Any = None, title: str | None = None
+    ) -> Any:
+        """The motion as a page that plays it, for browsers and notebooks, or as a film.
+
+        file: where it is written, a page .html, or a film .gif or .mp4, which need matplotlib;
+        others: runs that are shown beside it. scene: the path of the scene, where the module was
+        not loaded by eomc.load. Returns an Animation; see docs/pictures.md. Raises ImportError
+        without eomc, EomcError where it can't be drawn or written.
+        """
+        page = by_eomc("animation")
+        return page.animate([self, *others], file, scene=scene, title=title)
 
     def estimate(self, progress: Callable[[int, int], None] | None = None) -> Estimate:
         """The run's own error, by doing it again in shorter steps; kept in `error`.

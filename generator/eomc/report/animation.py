@@ -1,0 +1,255 @@
+"""The motion of runs as one page without a network, that plays it in real time, or as a film."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from eomc.base import texts
+from eomc.base.errors import EomcError
+from eomc.emit.render import environment
+from eomc.report.drawing import drawing
+from eomc.report.labels import html_name
+from eomc.report.marks import Drawing
+from eomc.report.origin import Source, system_of
+
+Array = NDArray[np.float64]
+
+FRAMES = 60  # rows a second of the motion, at most
+SMOOTH = 25  # rows a second from which positions between two rows are those between their points
+BYTES = 650_000  # of positions and curves before they are written as text, at most
+LEVELS = 32_767  # of a quantity from its middle to its ends
+FILMS = (".gif", ".mp4")
+COLOURS = 4  # curves in one panel, at most; more where units are few
+PANELS = 6
+SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 25, 100, 500)
+SHORT, LONG = 1.0, 60.0  # s that the motion is played in, where not in real time
+
+
+@dataclass(frozen=True)
+class Animation:
+    """A page that plays a motion; notebooks show it, `save` writes it."""
+
+    page: str
+
+    def save(self, file: str | os.PathLike[str]) -> None:
+        """Write the page. Raises EomcError where it can't be written."""
+        try:
+            Path(file).write_text(self.page, encoding="utf-8")
+        except OSError as fault:
+            words = fault.strerror or fault
+            raise EomcError(f"{texts.line(str(file))}: can't be written ({words})") from None
+
+    def _repr_html_(self) -> str:
+        """The page in a frame of its own."""
+        inside = html.escape(self.page)
+        style = "width:100%;height:34em;border:0"
+        return f'<iframe style="{style}" title="motion" srcdoc="{inside}"></iframe>'
+
+
+def animate(
+    runs: Sequence[Any],
+    file: str | os.PathLike[str] | None = None,
+    *,
+    scene: Source | None = None,
+    title: str | None = None,
+) -> Animation | None:
+    """The motion of runs, side by side.
+
+    file: .html, .gif or .mp4; None: nothing is written. scene: of the first run, as in system_of.
+    Returns the page, None of a film. Raises EomcError where it can't be drawn or written.
+    """
+    if file is not None and Path(file).suffix.lower() not in (".html", *FILMS):
+        raise EomcError(
+            f"{texts.line(str(file))}: a motion is written as .html, .gif or .mp4: end its name so"
+        )
+    systems = [system_of(run, scene if k == 0 else None) for k, run in enumerate(runs)]
+    if file is not None and Path(file).suffix.lower() in FILMS:
+        from eomc.report import film
+
+        film.write(systems, runs, Path(file), title)
+        return None
+    made = Animation(page(systems, runs, title))
+    if file is not None:
+        made.save(file)
+    return made
+
+
+def page(systems: Sequence[Any], runs: Sequence[Any], title: str | None = None) -> str:
+    """The text of the page."""
+    shown = [_Shown(s, run, len(runs)) for s, run in zip(systems, runs, strict=True)]
+    named = title or " and ".join(dict.fromkeys(s.title or s.name for s in systems))
+    lasting = max(one.rows[-1] - one.rows[0] for one in shown)
+    data = {"speed": _speed(lasting), "speeds": SPEEDS, "runs": [one.data() for one in shown]}
+    text = json.dumps(data, separators=(",", ":"))
+    safe = text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+    return (
+        environment()
+        .get_template("report/animation.html.jinja")
+        .render(
+            title=texts.html(named),
+            data=Markup(safe),
+            runs=[one.words() for one in shown],
+            speeds=[f"{speed:g}" for speed in SPEEDS],
+        )
+    )
+
+
+def _speed(seconds: float) -> float:
+    """Real time, unless the motion would then be over at once or not for a long while."""
+    if SHORT <= seconds <= LONG or not seconds:
+        return 1.0
+    wanted = seconds / (SHORT if seconds < SHORT else LONG / 2)
+    return min(SPEEDS, key=lambda speed: abs(math.log(speed / wanted)))
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve: its name and its values at the rows that are shown."""
+
+    name: str
+    values: Array
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Curves that share axes, and their unit."""
+
+    unit: str
+    lines: tuple[Line, ...]
+
+
+class _Shown:
+    """One run on the page."""
+
+    def __init__(self, system: Any, run: Any, count: int) -> None:
+        self.system, self.run = system, run
+        last = len(run.t) - 1
+        spacing = (run.t[last] - run.t[0]) / last if last else 1.0
+        step = max(round(1 / (FRAMES * spacing)), 1) if spacing > 0 else 1
+        made = drawing(system, run.t[:1], run.q[:1])
+        width = made.points[0].size if made else 0
+        numbers = width + 2 * len(system.q) + 1
+        most = max(BYTES // (2 * numbers * count), 2)  # rows
+        step = max(step, -(-last // most))
+        self.index = np.unique(np.append(np.arange(0, last + 1, step), last))
+        self.rows = np.asarray(run.t, dtype=float)[self.index]
+        q = np.asarray(run.q, dtype=float)
+        self.drawing = drawing(system, self.rows, q[self.index])
+        self.panels = list(_panels(system, run, self.index))
+
+    @property
+    def rate(self) -> float:
+        """Rows a second."""
+        lasting = self.rows[-1] - self.rows[0]
+        return (len(self.rows) - 1) / lasting if lasting else 0.0
+
+    def data(self) -> dict[str, Any]:
+        return {
+            "t": [float(self.rows[0]), float(self.rows[-1])],
+            "rows": _packed(self.rows),
+            "smooth": bool(self.rate >= SMOOTH),
+            "drawing": _drawn(self.drawing) if self.drawing else None,
+            "panels": [[_packed(line.values) for line in p.lines] for p in self.panels],
+        }
+
+    def words(self) -> dict[str, Any]:
+        """What the page says of the run."""
+        made = self.drawing
+        scale = np.ptp(made.points, axis=(0, 1)).max() / (2 * LEVELS) if made else 0.0
+        resolution = f"{len(self.rows)} rows, {self.rate:.3g} a second of the motion"
+        if made:
+            resolution += f"; positions to {scale:.1g} {made.unit}".rstrip()
+        kinds = dict.fromkeys(_KINDS[m.kind] for m in made.marks) if made else {}
+        return {
+            "title": texts.html(self.system.title or self.system.name),
+            "drawn": bool(made),
+            "plane": bool(made and made.plane),
+            "description": texts.html(
+                f"{self.system.title or self.system.name}, "
+                f"{'in the plane' if made and made.plane else 'in space'}: {', '.join(kinds)}"
+            ),
+            "resolution": resolution,
+            "panels": [
+                {
+                    "names": [Markup(html_name(line.name)) for line in panel.lines],
+                    "plain": ", ".join(line.name.replace("_", " ") for line in panel.lines),
+                    "unit": texts.html(panel.unit),
+                }
+                for panel in self.panels
+            ],
+        }
+
+
+_KINDS = {
+    "line": "lines", "rod": "bodies", "arm": "bodies", "rail": "rails", "spring": "springs",
+    "damper": "dampers", "box": "boxes", "inertia": "boxes of the inertias", "circle": "circles",
+    "joint": "joints", "spiral": "springs that turn", "slide": "slides", "ground": "supports",
+    "mass": "centres of mass", "point": "points", "dot": "points",
+}  # fmt: skip
+
+
+def _panels(system: Any, run: Any, index: NDArray[np.int64]) -> Iterator[Panel]:
+    """Coordinates by unit, their rates where there is room, outputs, inputs, energy."""
+    q = np.asarray(run.q, dtype=float)[index]
+    lines = [(c.unit, Line(c.name, q[:, k])) for k, c in enumerate(system.coordinates)]
+    lines += [
+        (o.unit, Line(o.name, np.asarray(run.outputs[o.name], dtype=float)[index]))
+        for o in system.outputs
+    ]
+    u = np.asarray(run.u, dtype=float)[index] if system.inputs else np.empty((len(index), 0))
+    lines += [(i.unit, Line(i.name, u[:, k])) for k, i in enumerate(system.inputs)]
+    units = dict.fromkeys(unit for unit, _ in lines)
+    apart = len(lines) <= PANELS - 1 and len(lines) <= COLOURS
+    for unit in units:
+        mine = tuple(line for of, line in lines if of == unit)
+        for group in [(line,) for line in mine] if apart else [mine]:
+            yield Panel(unit, group)
+    known = "J" if any(c.unit for c in system.coordinates) else ""
+    yield Panel(known, (Line("energy", np.asarray(run.energy, dtype=float)[index]),))
+
+
+def _packed(values: Array) -> dict[str, Any]:
+    """Values as 16 bits each between the least and the largest; what is not finite is -32768."""
+    finite = np.isfinite(values)
+    low = float(values[finite].min()) if finite.any() else 0.0
+    high = float(values[finite].max()) if finite.any() else 0.0
+    middle, half = low / 2 + high / 2, high / 2 - low / 2
+    scale = half / LEVELS if half > 0 else 1.0
+    with np.errstate(invalid="ignore"):
+        levels = np.where(finite, np.round((values - middle) / scale), -LEVELS - 1)
+    text = base64.b64encode(levels.astype("<i2").tobytes()).decode("ascii")
+    return {"data": text, "middle": middle, "scale": scale}
+
+
+def _drawn(made: Drawing) -> dict[str, Any]:
+    """Points that move and points that stand, and the marks on them."""
+    points = made.points
+    moves = np.ptp(np.nan_to_num(points, nan=1e300), axis=0).max(axis=1) > 0
+    order = np.argsort(~moves, kind="stable")
+    place = np.empty(len(order), dtype=int)
+    place[order] = np.arange(len(order))
+    moving = points[:, moves]
+    return {
+        "axes": made.axes,
+        "labels": [name.replace("_", " ") for name in made.labels],
+        "unit": made.unit,
+        "up": made.up,
+        "count": int(moves.sum()),
+        "moving": _packed(moving) if moving.size else None,
+        "still": [[float(f"{x:.9g}") if math.isfinite(x) else 0.0 for x in p]
+                  for p in points[0, ~moves]],
+        "marks": [[mark.kind, *(int(place[k]) for k in mark.points)] for mark in made.marks],
+        "paths": [[p.name.replace("_", " "), int(place[p.point])] for p in made.paths],
+    }  # fmt: skip

@@ -1,0 +1,36 @@
+"""From a run back to the system that it is a motion of."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from eomc import pipeline
+from eomc.base import texts
+from eomc.base.errors import EomcError
+from eomc.model.system import System
+
+Source = str | os.PathLike[str] | System
+
+
+def system_of(run: Any, scene: Source | None = None) -> System:
+    """The system of a run, with the parameters that the run was made with.
+
+    scene: where it is not what eomc.load made the module from, the path of a scene or a System.
+    Raises EomcError where there is none, or where the scene is another than the one that was built.
+    """
+    model = run._model
+    source = model.source if scene is None else scene
+    if source is None:
+        raise EomcError(
+            f"{model.name}: was imported without its scene, which says what is drawn: load it "
+            "with eomc.load, or give scene=PATH"
+        )
+    system = source if isinstance(source, System) else pipeline.read(source)
+    if system.digest != model.digest:
+        where = texts.line(system.file) or system.name
+        raise EomcError(
+            f"{where}: is not the scene that {model.name} was built from, or has changed since: "
+            "load it again with eomc.load"
+        )
+    return system.at(dict(zip(model.parameters, map(float, run._params), strict=True)))
