@@ -45,6 +45,7 @@ lint: .venv/dev
 golden: .venv/dev
 	$(BIN)/python tests/c/test_golden.py --accept
 	$(BIN)/python tests/scene/test_bad_scenes.py
+	PYTHONPATH=tests $(BIN)/python tests/report/test_drawing.py
 
 bench: build/bench/done
 	build/bench/bin/python benchmarks/loop.py

@@ -102,6 +102,7 @@ def page(systems: Sequence[Any], runs: Sequence[Any], title: str | None = None) 
             data=Markup(safe),
             runs=[one.words() for one in shown],
             speeds=[f"{speed:g}" for speed in SPEEDS],
+            travels=any(one.drawing and one.drawing.travels for one in shown),
         )
     )
 
@@ -246,6 +247,7 @@ def _drawn(made: Drawing) -> dict[str, Any]:
         "labels": [name.replace("_", " ") for name in made.labels],
         "unit": made.unit,
         "up": made.up,
+        "follow": made.extent if made.travels else 0,
         "count": int(moves.sum()),
         "moving": _packed(moving) if moving.size else None,
         "still": [[float(f"{x:.9g}") if math.isfinite(x) else 0.0 for x in p]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+FAR = 8.0  # times its own extent
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,20 @@ class Drawing:
         return len(self.axes) == 2
 
     @property
+    def extent(self) -> float:
+        """The largest extent that all its points have at an instant; 0 where none is known."""
+        with np.errstate(invalid="ignore"):
+            sizes = np.ptp(self.points, axis=1).max(axis=1, initial=0.0)
+        return float(sizes[np.isfinite(sizes)].max(initial=0.0))
+
+    @property
+    def travels(self) -> bool:
+        """Whether it goes so far that it would be a dot in a picture of all of it."""
+        still = self.points[np.isfinite(self.points).all(axis=(1, 2))]
+        whole = float(np.ptp(still, axis=(0, 1)).max(initial=0.0)) if len(still) else 0.0
+        return whole > FAR * self.extent > 0
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """What the axes are called."""
         return self.names or tuple(self.axes)
@@ -77,7 +92,6 @@ class Drawing:
 
 _ORDER = ("rail", "inertia", "box", "circle", "arm", "line", "rod", "spring", "damper", "ground",
           "spiral", "joint", "slide", "point", "mass", "dot")  # fmt: skip
-HIDDEN = frozenset(("joint", "point"))  # marks that a like one at the same place hides
 
 
 @dataclass
@@ -121,7 +135,11 @@ class Marks:
         if not self.marks and not self.paths:
             return None
         ordered = sorted(self.marks, key=lambda mark: _ORDER.index(mark.kind))
-        points = np.stack(self.points, axis=1)
+        used = sorted({k for m in ordered for k in m.points} | {p.point for p in self.paths})
+        place = {k: n for n, k in enumerate(used)}
+        marks = tuple(Mark(m.kind, tuple(place[k] for k in m.points)) for m in ordered)
+        paths = tuple(Path(p.name, place[p.point]) for p in self.paths)
+        points = np.stack([self.points[k] for k in used], axis=1)
         if len(axes) == 2:
             points = points[:, :, :2]
-        return Drawing(points, tuple(ordered), tuple(self.paths), axes, unit, names, up)
+        return Drawing(points, marks, paths, axes, unit, names, up)

@@ -13,7 +13,7 @@ from eomc.base import texts
 from eomc.model.system import System
 from eomc.report.drawing import drawing
 from eomc.report.labels import label, mathtext, with_unit
-from eomc.report.marks import Drawing, Mark
+from eomc.report.marks import FAR, Drawing, Mark
 from eomc.report.style import COLOURS, INK, plain
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Mechanism:
     def draw(self, axes: Axes) -> None:
         """In the plane with its axes, in space seen from the side and a little from above."""
         made = self.drawing
-        flat = seen(made)
+        flat = self._near(seen(made))
         paths = [(p.name, flat[:, p.point]) for p in made.paths]
         last = self._stretch(flat)
         ghosts = self._ghosts(last)
@@ -96,6 +96,13 @@ class Mechanism:
         axes.set_title(where + end, fontsize=10, color=INK)
         if paths:
             axes.legend(fontsize=8, frameon=False, loc="upper right")
+
+    def _near(self, flat: Array) -> Array:
+        """Of a mechanism that travels, the beginning, in which it can be seen."""
+        if not self.drawing.travels:
+            return flat
+        gone = np.abs(flat - flat[0]).max(axis=(1, 2))
+        return flat[: max(int(np.argmax(gone > FAR / 2 * self.drawing.extent)), 1)]
 
     def _ghosts(self, last: int) -> NDArray[np.int64]:
         """The instants before the last that are shown."""
@@ -168,7 +175,7 @@ def frame(axes: Axes, made: Drawing, flat: Array) -> None:
                   ha="center", va="center")  # fmt: skip
     words = f"{length:g} {texts.figure(made.unit)}".strip()
     axes.annotate(words, (x, y), (0, -12), textcoords="offset points", color=INK, fontsize=8,
-                  ha="center")  # fmt: skip
+                  ha="center", annotation_clip=False)  # fmt: skip
 
 
 def _bounds(flat: Array) -> tuple[Array, Array]:

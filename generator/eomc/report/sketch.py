@@ -150,6 +150,7 @@ class _Sketch:
         for body in assembly.bodies:
             if body.joint:
                 self._join(body)
+        for body in assembly.bodies:
             self._mass(body, assembly.plane)
         laid: list[tuple[int, ...]] = []
         for kind, some in (("spring", assembly.springs), ("damper", assembly.dampers)):
@@ -180,9 +181,8 @@ class _Sketch:
             marks.add("point", marks.point(self.poses[body.name][0]))
 
     def _mass(self, body: Body, plane: bool) -> None:
-        """The centre of mass, and in space the box that has the body's mass and inertia."""
+        """The centre of mass, and how the body is turned where no line of it shows that."""
         mass = float(self._number(body.mass))
-        xx, yy, zz, xy, xz, yz = (float(self._number(entry)) for entry in body.inertia)
         if mass <= 0:
             return
         marks, center, (origin, R) = self.marks, self.centers[body.name], self.poses[body.name]
@@ -190,19 +190,27 @@ class _Sketch:
         if body.joint:
             marks.add("arm", marks.point(origin), at)
         if plane:
-            radius = np.sqrt(max(zz, 0) / mass)  # of gyration
+            radius = np.sqrt(max(float(self._number(body.inertia[2])), 0) / mass)  # of gyration
             marks.add("mass", at, *([marks.point(center + radius * R[:, :, 0])] if radius else []))
             return
-        # of a box with edges 2a, 2b, 2c: Ixx = m (b^2 + c^2)/3, ...
+        lines = [m.points for m in marks.marks if m.kind in ("rod", "arm")]
+        held = body.joint not in ("", "free") and marks.point(origin) in [
+            first for first, _ in lines
+        ]
+        if not held:  # else its lines show how it is turned
+            self._inertia(body, mass, center, R)
+        marks.add("mass", at)
+
+    def _inertia(self, body: Body, mass: float, center: Array, R: Array) -> None:
+        """The box of a body's mass and inertia: with edges 2a, 2b, 2c Ixx is m (b^2 + c^2)/3."""
+        xx, yy, zz, xy, xz, yz = (float(self._number(entry)) for entry in body.inertia)
         moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         halves = np.sqrt(np.maximum(3 * (moments.sum() / 2 - moments) / mass, 0))
         halves[halves < 1e-6 * halves.max(initial=0.0)] = 0
         if halves.any():
-            tips = [
-                marks.point(center + h * (R @ axis)) for h, axis in zip(halves, axes.T, strict=True)
-            ]
-            marks.add("inertia", at, *tips)
-        marks.add("mass", at)
+            tips = (R @ axes * halves).transpose(2, 0, 1)
+            points = (self.marks.point(center + tip) for tip in tips)
+            self.marks.add("inertia", self.marks.point(center), *points)
 
     def _between(
         self, kind: str, end: Between, assembly: Assembly, laid: list[tuple[int, ...]]

@@ -1,0 +1,217 @@
+"""The page of a motion: one file, no network, text that is data; films, and what they need."""
+
+import base64
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from report.pictures import chain, humanoid, motion, scene, system
+
+from eomc.base.errors import EomcError
+from eomc.report import animation
+from eomc.report.labels import html_name
+from eomc.report.origin import system_of
+
+EVIL = "</script><img src=x onerror=alert(1)>"
+
+
+def page(made, title="", **how):
+    return animation.page([system(made, title)], [motion(made, **how)])
+
+
+def data(text):
+    (found,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', text)
+    return json.loads(found)
+
+
+def values(packed, shape=(-1,)):
+    levels = np.frombuffer(base64.b64decode(packed["data"]), dtype="<i2").astype(float)
+    return packed["middle"] + levels.reshape(shape) * packed["scale"]
+
+
+def test_nothing_is_asked_of_a_network():
+    text = page(scene("cartpole"))
+    assert "default-src 'none'" in text
+    assert not re.findall(r"https?:|//[a-z]+\.|@import|url\(|\bsrc=|\bhref=|<link|fetch\(", text)
+
+
+def test_titles_are_text():
+    text = animation.page([system(scene("cartpole"), EVIL)] * 2, [motion(scene("cartpole"))] * 2)
+    assert "<img" not in text and text.count("</script>") == 2
+    assert "&lt;img" in text
+    assert "<img" not in page(scene("cartpole"), title=EVIL)
+
+
+def test_names_in_the_data_are_text():
+    run = motion(scene("cartpole"))
+    odd = system(scene("cartpole"))
+    odd.coordinates = [SimpleNamespace(name="x", unit=EVIL), SimpleNamespace(name="y", unit="a<b")]
+    text = animation.page([odd], [run])
+    assert "<img" not in text and data(text)
+
+
+def test_positions_are_those_of_the_run_to_the_stated_resolution():
+    made = scene("cartpole")
+    run = motion(made)
+    given = data(animation.page([system(made)], [run]))["runs"][0]
+    shown = animation.drawing(system(made), run.t, run.q)
+    d = given["drawing"]
+    moving = values(d["moving"], (len(run.t), d["count"], 2))
+    (box,) = [m for m in d["marks"] if m[0] == "box"]
+    (own,) = [m for m in shown.marks if m.kind == "box"]
+    assert np.abs(moving[:, box[1:]] - shown.points[:, own.points]).max() <= d["moving"]["scale"]
+    assert d["moving"]["scale"] < 1e-4
+    assert np.abs(values(given["rows"]) - run.t).max() <= given["rows"]["scale"]
+    _, (theta,), (energy,) = given["panels"]
+    assert np.abs(values(theta) - run.q[:, 1]).max() <= theta["scale"] and energy["scale"] == 1
+
+
+def test_points_that_stand_are_written_once():
+    d = data(page(scene("kepler_orbit")))["runs"][0]["drawing"]
+    assert d["still"] == [[0, 0]] and d["count"] == 1
+
+
+@pytest.mark.parametrize("made", [chain, humanoid])
+def test_ten_seconds_are_less_than_a_megabyte(made):
+    text = page(made(), seconds=10.0, rows=10_001)
+    assert len(text) < 1_000_000
+    given = data(text)["runs"][0]
+    assert given["smooth"] and len(values(given["rows"])) >= 500
+
+
+def test_long_runs_are_thinned_and_the_page_says_to_what():
+    text = page(chain(), seconds=100.0, rows=100_001)
+    assert len(text) < 1_000_000
+    count = len(values(data(text)["runs"][0]["rows"]))
+    assert f"{count} rows, {(count - 1) / 100:.3g} a second" in text
+
+
+def test_it_plays_in_real_time_unless_that_would_be_nothing_to_see():
+    for seconds, speed in ((10, 1), (0.01, 0.01), (3600, 100)):
+        assert data(page(scene("cartpole"), seconds=seconds))["speed"] == speed
+
+
+def test_a_run_of_one_row_and_what_is_not_finite():
+    text = page(scene("cartpole"), rows=1)
+    assert len(values(data(text)["runs"][0]["rows"])) == 1
+    packed = animation._packed(np.array([1.0, np.nan, 3.0]))
+    assert np.frombuffer(base64.b64decode(packed["data"]), "<i2").tolist() == [
+        -32767,
+        -32768,
+        32767,
+    ]
+
+
+def test_without_a_drawing_there_are_the_curves():
+    made = system(scene("cartpole"))
+    made.scene, made.definitions = None, ()
+    text = animation.page([made], [motion(scene("cartpole"))])
+    assert 'class="stage"' not in text and text.count('class="panel"') == 3
+
+
+def test_many_coordinates_share_panels_by_unit():
+    text = page(humanoid())
+    assert text.count('class="panel"') == 3  # m, rad, J
+    assert text.count('class="name"') == 37
+
+
+def test_names_are_set_as_in_print():
+    assert html_name("theta_1", rate=True) == "θ\u0307<sub>1</sub>"
+    assert html_name("m_c") == "m<sub>c</sub>" and html_name("arm") == "arm"
+    with pytest.raises(ValueError, match="plain name"):
+        html_name("<b>")
+
+
+# --- of a built module ------------------------------------------------------------------------
+
+
+def test_a_loaded_module_knows_its_scene(modules, tmp_path):
+    run = modules("cartpole").simulate(duration=1.0, params={"l": 1.0})
+    assert system_of(run).at({}).parameters[2].value == 1.0
+    made = run.animate(tmp_path / "a.html", run, title="Two")
+    text = (tmp_path / "a.html").read_text()
+    assert text == made.page and "<h1>Two</h1>" in text and text.count('class="stage"') == 2
+    assert "srcdoc=" in made._repr_html_() and "<script" not in made._repr_html_()
+
+
+def test_without_its_scene_a_run_says_what_to_do(modules, tmp_path, monkeypatch):
+    run = modules("cartpole").simulate(duration=0.1)
+    monkeypatch.setattr(run._model, "source", None, raising=False)
+    with pytest.raises(EomcError, match=r"cartpole: .* load it with eomc.load, or give scene=PATH"):
+        run.animate()
+    assert run.animate(scene="scenes/cartpole.toml").page
+    with pytest.raises(EomcError, match="is not the scene that cartpole was built from"):
+        run.animate(scene="scenes/chain.toml")
+
+
+def test_without_eomc_a_run_says_what_to_do(modules, monkeypatch):
+    from importlib import import_module
+
+    run = modules("cartpole").simulate(duration=0.1)
+    shown = import_module(type(run).__module__.replace(".trajectory", ".shown"))
+
+    def missing(name):
+        raise ModuleNotFoundError(name, name="eomc")
+
+    monkeypatch.setattr(shown, "import_module", missing)
+    with pytest.raises(ImportError, match="pip install eomc"):
+        run.animate()
+
+
+def test_other_suffixes_and_folders_are_reported(tmp_path):
+    runs = [SimpleNamespace()]
+    with pytest.raises(EomcError, match=r"as \.html, \.gif or \.mp4"):
+        animation.animate(runs, tmp_path / "a.avi")
+    with pytest.raises(EomcError, match="can't be written"):
+        animation.Animation("").save(tmp_path / "nowhere" / "a.html")
+
+
+# --- films ------------------------------------------------------------------------------------
+
+
+def film(made, file, **how):
+    from eomc.report import film
+
+    film.write([system(made)], [motion(made, **how)], file, None)
+
+
+def test_a_gif_has_a_picture_for_each_instant(tmp_path):
+    pytest.importorskip("matplotlib")
+    image = pytest.importorskip("PIL.Image")
+    film(scene("simple_pendulum"), tmp_path / "a.gif", seconds=0.2)
+    with image.open(tmp_path / "a.gif") as made:
+        assert made.n_frames == 6 and made.info["duration"] == 40  # ms
+
+
+def test_films_that_can_not_be_made_say_why(tmp_path, monkeypatch):
+    animations = pytest.importorskip("matplotlib.animation")
+    monkeypatch.setattr(animations.FFMpegWriter, "isAvailable", classmethod(lambda _: False))
+    with pytest.raises(EomcError, match=r"ffmpeg: install it, or write \.gif"):
+        film(scene("cartpole"), tmp_path / "a.mp4")
+    with pytest.raises(EomcError, match="25001 pictures, and a film has at most 1500"):
+        film(scene("cartpole"), tmp_path / "a.gif", seconds=1000.0)
+    bare = system(scene("cartpole"))
+    bare.scene, bare.definitions = None, ()
+    from eomc.report.film import write
+
+    with pytest.raises(EomcError, match="says nothing about its shape"):
+        write([bare], [motion(scene("cartpole"))], tmp_path / "a.gif", None)
+
+
+def test_without_matplotlib_a_film_says_what_to_do(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "matplotlib.animation", None)
+    with pytest.raises(EomcError, match="films need matplotlib"):
+        film(scene("cartpole"), tmp_path / "a.gif")
+
+
+def test_pages_need_no_matplotlib(monkeypatch):
+    import sys
+
+    for name in [n for n in sys.modules if n.startswith("matplotlib")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert page(scene("cartpole"))

@@ -1,0 +1,217 @@
+"""The page of a motion in Chromium: it plays, smoothly, by keys and fingers, and stays at home."""
+
+import io
+import time
+from itertools import pairwise
+
+import browser
+import numpy as np
+import pytest
+from report.pictures import chain, humanoid, motion, scene, system
+
+from eomc.report import animation
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(bool(browser.MISSING), reason=browser.MISSING),
+]
+SLOWEST = 500  # ms from the navigation to the first picture
+STAGE = "document.querySelector('canvas.stage')"
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory):
+    with browser.chromium(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture
+def opened(window, tmp_path):
+    """Opens a page of scenes, and sees afterwards that nothing was logged or asked for."""
+    file = tmp_path / "motion.html"
+
+    def open_(*scenes, width=1000, seconds=2.0, rows=1201, title=None):
+        runs = [motion(made, seconds, rows) for made in scenes]
+        file.write_text(animation.page([*map(system, scenes)], runs, title), encoding="utf-8")
+        window.open(file, width)
+        window.wait("return document.documentElement.dataset.frames > 0")
+        return window
+
+    window.media(prefers_color_scheme="light", prefers_reduced_motion="no-preference")
+    yield open_
+    assert window.logged() == []
+    asked = [url for url in window.requested() if not url.startswith(("data:", "chrome"))]
+    assert {*asked} == {file.as_uri()}
+
+
+def stop(page, t):
+    page.run("document.getElementById('play').click()")
+    page.wait("return document.documentElement.dataset.playing === 'false'")
+    seek(page, t)
+
+
+def seek(page, part):
+    """To a part of the motion; waits until it is drawn."""
+    page.run("const s = document.getElementById('time'); s.value = arguments[0];"
+             "s.dispatchEvent(new Event('input'))", round(1000 * part))  # fmt: skip
+    time.sleep(0.1)
+
+
+def tip(page):
+    """Where the page says that the first path's point is drawn, in pixels of the window."""
+    return page.run(
+        f"const c = {STAGE}, r = c.getBoundingClientRect();"
+        "return [r.x + +c.dataset.x, r.y + +c.dataset.y].map(Math.round)"
+    )
+
+
+def pixel(page, at):
+    image = pytest.importorskip("PIL.Image")
+    with image.open(io.BytesIO(page.picture())) as shot:
+        return shot.convert("RGB").getpixel(tuple(at))
+
+
+def test_it_plays_in_real_time(opened):
+    page = opened(scene("simple_pendulum"), seconds=10.0)
+    assert page.data("playing") == "true"
+    begun, t = time.monotonic(), float(page.data("t"))
+    time.sleep(1.0)
+    went, took = float(page.data("t")) - t, time.monotonic() - begun
+    assert abs(went - took) < 0.3
+
+
+def test_the_pixel_where_the_tip_is_moves(opened):
+    page = opened(scene("simple_pendulum"))
+    stop(page, 0.0)
+    first = tip(page)
+    assert pixel(page, first) == (0, 0x72, 0xB2)
+    seek(page, 0.5)
+    second = tip(page)
+    assert np.hypot(*np.subtract(first, second)) > 20
+    assert pixel(page, second) == (0, 0x72, 0xB2) and pixel(page, first) != (0, 0x72, 0xB2)
+
+
+@pytest.mark.parametrize("made", [chain, humanoid])
+def test_sixty_frames_a_second_and_the_first_at_once(opened, made):
+    page = opened(made(), seconds=10.0, rows=10_001)
+    assert float(page.data("first")) < SLOWEST
+    time.sleep(2.5)
+    rate, drawn = float(page.data("rate")), float(page.data("drawn"))
+    size = page.run("return document.documentElement.outerHTML.length")
+    print(f"{made.__name__}: first frame after {page.data('first')} ms, {rate} frames a second, "
+          f"the slowest drawn in {drawn} ms; {size} bytes")  # fmt: skip
+    assert rate > 55 and drawn < 1000 / 60
+
+
+def test_keys_play_and_step(opened):
+    page = opened(scene("cartpole"))
+    page.keys(" ")
+    page.wait("return document.documentElement.dataset.playing === 'false'")
+    page.keys("\ue010")  # End
+    page.wait("return +document.documentElement.dataset.t === 2")
+    page.keys("\ue011")  # Home
+    page.wait("return +document.documentElement.dataset.t === 0")
+    page.keys("\ue014\ue014\ue012")  # right, right, left
+    page.wait("return Math.abs(document.documentElement.dataset.t - 0.01) < 1e-3")
+    page.keys(" ")
+    page.wait("return document.documentElement.dataset.playing === 'true'")
+
+
+def test_it_stops_at_the_end_unless_it_loops(opened):
+    page = opened(scene("cartpole"), seconds=1.0)
+    page.run("document.getElementById('loop').click()")
+    page.wait("return document.documentElement.dataset.playing === 'false'")
+    assert float(page.data("t")) == 1.0
+    page.run("document.getElementById('loop').click(); document.getElementById('play').click()")
+    page.wait("return document.documentElement.dataset.frames > 90")
+    assert page.data("playing") == "true"
+
+
+def test_speed_can_be_chosen(opened):
+    page = opened(scene("cartpole"), seconds=10.0)
+    page.run("const s = document.getElementById('speed'); s.selectedIndex = arguments[0];"
+             "s.dispatchEvent(new Event('change'))", animation.SPEEDS.index(5))  # fmt: skip
+    t = float(page.data("t"))
+    time.sleep(0.8)
+    assert float(page.data("t")) - t > 2.5
+
+
+@pytest.mark.parametrize("kind", ["mouse", "touch"])
+def test_dragging_turns_space_and_wheels_zoom(opened, kind):
+    page = opened(scene("furuta_pendulum"))
+    stop(page, 0.1)
+    where = [tip(page)]
+    page.drag((200, 300), (320, 300), kind)
+    time.sleep(0.1)
+    where.append(tip(page))
+    page.run(f"{STAGE}.dispatchEvent(new WheelEvent('wheel', {{deltaY: -400, cancelable: true}}))")
+    time.sleep(0.1)
+    where.append(tip(page))
+    assert all(np.hypot(*np.subtract(a, b)) > 10 for a, b in pairwise(where))
+    page.run("document.getElementById('reset').click()")
+    time.sleep(0.1)
+    assert tip(page) == where[0]
+
+
+def test_clicking_a_curve_goes_there(opened):
+    page = opened(scene("cartpole"))
+    at = page.run("const r = document.querySelector('canvas.panel').getBoundingClientRect();"
+                  "return [r.x + 52 + (r.width - 58) / 2, r.y + 20]")  # fmt: skip
+    page.drag((round(at[0]), round(at[1])), (round(at[0]), round(at[1])))
+    page.wait("return Math.abs(document.documentElement.dataset.t - 1) < 0.01")
+
+
+def test_runs_stand_side_by_side_in_one_time(opened):
+    page = opened(scene("cartpole"), scene("double_pendulum"), seconds=2.0)
+    boxes = page.run(
+        "return [...document.querySelectorAll('canvas.stage')]"
+        ".map(c => c.getBoundingClientRect()).map(r => [r.left, r.right, r.top])"
+    )
+    assert boxes[0][1] <= boxes[1][0] and boxes[0][2] == boxes[1][2]
+
+
+@pytest.mark.parametrize("width", [400, 1000])
+def test_nothing_is_wider_than_the_window(opened, width):
+    page = opened(scene("cartpole"), width=width)
+    assert page.run("return document.documentElement.scrollWidth") <= width
+    small = page.run("return [...document.querySelectorAll('canvas')].map(c => c.clientWidth)")
+    assert min(small) > 300
+    size = page.run(
+        "return parseFloat(getComputedStyle(document.querySelector('figcaption')).fontSize)"
+    )
+    assert size >= 13
+
+
+def test_colours_follow_the_reader(opened):
+    page = opened(scene("simple_pendulum"))
+    stop(page, 0.0)
+    light = page.run("return getComputedStyle(document.body).backgroundColor")
+    page.media(prefers_color_scheme="dark")
+    time.sleep(0.2)
+    assert page.run("return getComputedStyle(document.body).backgroundColor") != light
+    assert pixel(page, tip(page)) == (0x56, 0xB4, 0xE9)
+
+
+def test_it_waits_where_motion_is_not_wanted(opened, window):
+    window.media(prefers_reduced_motion="reduce")
+    page = opened(scene("cartpole"))
+    assert page.data("playing") == "false"
+
+
+def test_everything_has_a_name_for_those_who_listen(opened):
+    page = opened(scene("cartpole"))
+    bare = page.run(
+        "return [...document.querySelectorAll('canvas, button, input, select')].filter(e => "
+        "!(e.getAttribute('aria-label') || e.textContent.trim() || e.closest('label'))).length"
+    )
+    assert bare == 0
+    assert page.run("return document.getElementById('time').getAttribute('aria-valuetext')")
+    assert page.run(f"return {STAGE}.getAttribute('aria-label')").startswith(
+        "Cart-pole, in the plane"
+    )
+
+
+def test_titles_are_text(opened):
+    page = opened(scene("cartpole"), title="</script><img src=x onerror=document.title=1>")
+    assert page.run("return document.images.length") == 0
+    assert page.run("return document.querySelector('h1').textContent").startswith("</script>")

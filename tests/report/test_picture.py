@@ -1,0 +1,100 @@
+"""The picture beside the curves: what a drawing has is on the axes, and nothing else."""
+
+import numpy as np
+import pytest
+from report.pictures import motion, scene, system
+
+from eomc.report import picture
+from eomc.report.drawing import drawing
+
+pytest.importorskip("matplotlib")
+
+
+def axes():
+    from matplotlib.figure import Figure
+
+    return Figure().add_subplot()
+
+
+def drawn(name, **how):
+    made = scene(name)
+    run = motion(made, **how)
+    shown = picture.picture(system(made), run.t, run.q, run.qd)
+    on = axes()
+    shown.draw(on)
+    return shown, on, run
+
+
+def test_rods_join_the_cart_to_the_pole():
+    _, on, run = drawn("cartpole")
+    rods = [line.get_xydata() for line in on.get_lines() if len(line.get_xydata()) == 2]
+    assert len(rods) >= 5
+    assert np.allclose([np.linalg.norm(a - b) for a, b in rods], 2.0)  # l
+    assert np.allclose([a[1] for a, _ in rods], 0.0)
+    assert np.allclose(rods[0][0], run.q[0, 0] * np.array([1, 0]))
+    assert on.get_xlabel() == "$x$ (m)" and on.get_title().startswith("In the plane, t = 0 to")
+
+
+def test_earlier_instants_are_lighter():
+    _, on, _ = drawn("double_pendulum")
+    shades = [line.get_color() for line in on.get_lines() if line.get_zorder() == 1]
+    greys = [float(shade) for shade in shades]
+    assert greys == sorted(greys, reverse=True) and len({*greys}) == picture.INSTANTS - 1
+
+
+def test_space_is_seen_along_three_arrows_of_a_stated_length():
+    shown, on, _ = drawn("furuta_pendulum")
+    texts = [text.get_text() for text in on.texts]
+    assert [t for t in texts if t][:3] == ["$x$", "$y$", "$z$"]
+    assert any(t.endswith(" m") for t in texts) and not on.axison
+    right, above, near = picture.basis(2)
+    assert np.allclose(np.cross(right, above), near) and above[2] > 0.9 * np.hypot(*above[:2])
+    assert np.allclose(picture.basis(1) @ picture.basis(1).T, np.eye(3))
+    assert picture.basis(1)[1].argmax() == 1  # y upwards
+    assert picture.seen(shown.drawing).shape[2] == 2
+
+
+@pytest.mark.parametrize("name", ["suspension", "satellite", "crane", "heavy_top", "kepler_orbit"])
+def test_every_mark_is_drawn(name):
+    """As many lines and symbols as the drawing has at its last instant."""
+    made = drawn(name)[0].drawing
+    flat = picture.seen(made)[-1]
+    again = axes()
+    picture.still(again, made, flat)
+    lines = sum(
+        len([*picture.outline(m, flat[list(m.points)], 0.1, 0.0)])
+        for m in made.marks
+        if m.kind in picture.LINES
+    )
+    symbols = sum(m.kind in picture.SYMBOLS for m in made.marks)
+    turned = sum(m.kind == "mass" and len(m.points) == 2 for m in made.marks)
+    assert {m.kind for m in made.marks} <= {*picture.LINES, *picture.SYMBOLS}
+    assert len(again.get_lines()) == lines + symbols + turned > 0
+
+
+def test_a_spring_reaches_from_end_to_end():
+    (line,) = picture.outline(
+        picture.Mark("spring", (0, 1)), np.array([[0.0, 0], [3, 4]]), 0.1, 0.0
+    )
+    assert np.allclose(line[[0, -1]], [[0, 0], [3, 4]])
+    across = line @ np.array([-0.8, 0.6])
+    assert np.isclose(np.abs(across).max(), 0.1)
+
+
+def test_a_mechanism_that_travels_is_shown_where_it_starts():
+    made = scene("quadrotor")
+    run = motion(made)
+    run.q[:, 0] += 100 * run.t
+    shown = picture.Mechanism(run.t, drawing(system(made), run.t, run.q))
+    on = axes()
+    shown.draw(on)
+    assert on.dataLim.width < 20
+
+
+def test_what_has_no_value_is_left_out():
+    made = scene("simple_pendulum")
+    run = motion(made, rows=5)
+    run.q[2] = np.nan
+    on = axes()
+    picture.Mechanism(run.t, drawing(system(made), run.t, run.q)).draw(on)
+    assert on.get_lines()
