@@ -49,11 +49,13 @@ def with_unit(text: str, unit: str) -> str:
 
 
 def html_name(name: str, rate: bool = False) -> str:
-    """A plain name as it is printed in a page: theta_1 as θ with a subscript.
+    """A plain name as it is printed in a page: theta_1 as θ with a subscript, words as words.
 
-    >>> html_name("theta_1")
-    'θ<sub>1</sub>'
+    >>> html_name("theta_1"), html_name("wrist_1_joint")
+    ('θ<sub>1</sub>', 'wrist 1 joint')
     """
+    if re.search(r"[a-z]{2,}\d*_.*[a-z]{2,}", name) and not set(name.split("_")) & {*_LETTERS}:
+        return texts.name(name).replace("_", " ") + ("\N{COMBINING DOT ABOVE}" if rate else "")
     head, *rest = texts.name(name).split("_")
     if digits := re.fullmatch(r"([A-Za-z]+?)(\d+)", head):
         head, rest = digits[1], [digits[2], *rest]
