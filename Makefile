@@ -46,6 +46,7 @@ golden: .venv/dev
 	$(BIN)/python tests/c/test_golden.py --accept
 	$(BIN)/python tests/scene/test_bad_scenes.py
 	PYTHONPATH=tests $(BIN)/python tests/report/test_drawing.py
+	PYTHONPATH=tests $(BIN)/python tests/report/test_picture_images.py
 
 bench: build/bench/done
 	build/bench/bin/python benchmarks/loop.py

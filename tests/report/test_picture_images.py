@@ -1,0 +1,71 @@
+"""Pictures as they were seen and accepted: python tests/report/test_picture_images.py."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report.pictures import motion, scene, system
+
+from eomc.report import picture
+from eomc.report.drawing import drawing
+
+pytest.importorskip("matplotlib")
+Image = pytest.importorskip("PIL.Image")
+
+GOLDEN = Path(__file__).parent / "images"
+NAMES = """acrobot ball_beam bead_on_hoop cartpole chain crane furuta_pendulum heavy_top quadrotor
+satellite spring_pendulum suspension tumbling_box""".split()
+SIZE, BLOCK = 192, 8  # pixels
+TOLERANCE = 25  # of 255, of the mean of a block: versions of matplotlib smooth lines differently
+
+
+def drawn(made):
+    """The last instant and the paths, without axes and texts, whose fonts differ: (SIZE, SIZE)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    flat = picture.seen(made)
+    figure = Figure(figsize=(2, 2), dpi=SIZE / 2)
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1))
+    for path in made.paths:
+        axes.plot(*flat[:, path.point].T, linewidth=1.0)
+    picture.still(axes, made, flat[-1])
+    axes.update_datalim(flat.reshape(-1, 2))
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_axis_off()
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:, :, :3].mean(axis=2)
+
+
+def made(name):
+    what = scene(name)
+    run = motion(what)
+    return drawing(system(what), run.t, run.q)
+
+
+def apart(one, other):
+    blocks = (one - other).reshape(SIZE // BLOCK, BLOCK, SIZE // BLOCK, BLOCK).mean(axis=(1, 3))
+    return float(np.abs(blocks).max())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_the_picture_that_was_accepted(name):
+    with Image.open(GOLDEN / f"{name}.png") as was:
+        assert apart(drawn(made(name)), np.asarray(was.convert("L"), dtype=float)) < TOLERANCE
+
+
+def test_a_mark_that_is_missing_is_seen():
+    whole = made("cartpole")
+    image = drawn(whole)
+    for mark in whole.marks:
+        less = replace(whole, marks=tuple(m for m in whole.marks if m is not mark))
+        assert apart(image, drawn(less)) > TOLERANCE, mark.kind
+
+
+if __name__ == "__main__":
+    GOLDEN.mkdir(exist_ok=True)
+    for name in NAMES:
+        image = Image.fromarray(drawn(made(name)).astype(np.uint8)).quantize(16)
+        image.save(GOLDEN / f"{name}.png", optimize=True)
