@@ -138,7 +138,7 @@ def load(
 
     module = cache.load(build(scene, root, form=form, warn=warn))
     # what pictures are made from
-    own = os.path.abspath(scene) if isinstance(scene, (str, os.PathLike)) else scene
+    own = Path(os.path.abspath(scene)) if isinstance(scene, (str, os.PathLike)) else scene
     module._model.source = own
     return module
 

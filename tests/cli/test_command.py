@@ -49,12 +49,14 @@ def eomc(*words: str) -> Result:
 
 def test_a_new_scene_runs_as_it_is_written(here: Path) -> None:
     assert eomc("new", "crane").exit_code == 0
-    ran = eomc("run", "crane.toml", "--out", "run.csv", "--plot", "run.png")
+    ran = eomc("run", "crane.toml", "--out", "run.csv", "--plot", "run.png", "--animate", "a.html")
     assert ran.exit_code == 0, ran.output
     assert "error at the end about" in ran.output and "steps a second" in ran.output
     rows = np.genfromtxt("run.csv", delimiter=",", names=True)
     assert rows.dtype.names == ("t", "theta", "theta_dot", "torque", "energy") and len(rows) == 2001
     assert (here / "run.png").read_bytes().startswith(b"\x89PNG")
+    page = (here / "a.html").read_text(encoding="utf-8")
+    assert "<h1>Crane</h1>" in page and '"bob"' in page and "wrote a.html" in ran.output
     again = eomc("new", "crane")
     assert again.exit_code == 2 and "is there already" in again.output
 
@@ -117,6 +119,8 @@ def test_parameters_and_start_on_the_command_line(there: Path) -> None:
         (["run", "cartpole.toml", "--h", "0"], "h: 0 is not a step size"),
         (["run", "cartpole.toml", "--method", "dp8"], "which has rk4"),
         (["run", "cartpole.toml", "--out", "run.dat"], ".csv or .npz"),
+        (["run", "cartpole.toml", "--animate", "run.avi"], ".html or .gif or .mp4"),
+        (["run", "cartpole.toml", "--animate", "nowhere/a.html"], "can't be written"),
         (["build", "cartpol.toml"], "did you mean 'cartpole.toml'?"),
         (["build", "cartpole.toml", "--build", "cartpole.toml/x"], "can't be written"),
         (["new", "class"], "Python keyword"),

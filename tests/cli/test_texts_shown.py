@@ -170,11 +170,24 @@ def test_the_commands_print_no_text_raw(here: Path) -> None:
     file = "f\x1b]0;owned\x07[red]\n'\".toml"
     Path(file).write_text(filled({k: every for k, _ in fields()}), encoding="utf-8")
     assert "built in" in said("build", file)
-    out = said("run", file, "--out", "x.csv", "--plot", "x.svg", "--build", "b\x1b[31m")
+    out = said(
+        "run",
+        file,
+        "--out",
+        "x.csv",
+        "--plot",
+        "x.svg",
+        "--animate",
+        "x.html",
+        "--build",
+        "b\x1b[31m",
+    )
     assert out.startswith(every)
     assert json.loads(said("run", file, "--json"))["scene"] == "fields"
     assert Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,u,energy"  # names only
     ElementTree.parse("x.svg")
+    page = Path("x.html").read_text(encoding="utf-8")
+    assert str(texts.html(every)) in page and every not in page
     for form in ([], ["--cost"], ["--python"], ["--latex"]):
         said("show", file, *form)
     namespace: dict[str, Any] = {}
