@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from hashlib import blake2b
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -108,7 +109,7 @@ class Marks:
         """The index of a point that moves, (n, 3), or stands, (3,)."""
         path = np.ascontiguousarray(np.broadcast_to(np.asarray(at, dtype=float), (self.count, 3)))
         path = path + 0.0  # no zero has a sign
-        key = path.tobytes()
+        key = blake2b(path.tobytes()).digest()
         if key not in self._index:
             self._index[key] = len(self.points)
             self.points.append(path)
