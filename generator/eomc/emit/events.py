@@ -7,7 +7,7 @@ from fractions import Fraction
 from math import cos, pi, prod
 
 from eomc.emit import c_function as c
-from eomc.emit.adaptive import BUSY, Form, Stepping, run, steps
+from eomc.emit.adaptive import BUSY, METHOD, Form, Stepping, run, steps
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
@@ -37,6 +37,23 @@ def slopes(x: Row) -> Sequence[Row]:
     for i, row in enumerate(rows):
         row[i] = -sum(row, Fraction(0))
     return tuple(map(tuple, rows))
+
+
+def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
+    """Of (2 c - 1)^n, n below `count`, from 0 to each of x, once or twice."""
+    signs = [Fraction((-1) ** n) for n in range(count + 3)]
+
+    def once(n: int, at: Fraction) -> Fraction:
+        power = Fraction(1)
+        for _ in range(n + 1):
+            power *= 2 * at - 1
+        return (power - signs[n + 1]) / (2 * (n + 1))
+
+    def twice(n: int, at: Fraction) -> Fraction:
+        return (once(n + 1, at) - signs[n + 1] * at) / (2 * (n + 1))
+
+    integral = (once, twice)[times - 1]
+    return [tuple(integral(n, at) for n in range(count)) for at in x]
 
 
 def views(functions: Functions, form: Form) -> Iterator[Adaptive | Events | AdaptiveRun]:
@@ -97,6 +114,9 @@ def _events(made: Stepping) -> Events:
         samples=SAMPLES,
         nodes=numbers(x, target.real),
         slopes=matrix(slopes(x), target.real),
+        stages=METHOD.stages,
+        once=c.in_braces(numbers(row, target.real) for row in integrals(x, METHOD.stages, 1)),
+        twice=c.in_braces(numbers(row, target.real) for row in integrals(x, METHOD.stages, 2)),
         directions=tuple(DIRECTIONS[e.direction] for e in system.events),
         actions=tuple(ACTIONS.index(e.action) for e in system.events),
         jumps=jumps,

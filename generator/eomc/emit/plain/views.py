@@ -331,6 +331,9 @@ class Events(Named):
     samples: int
     nodes: tuple[str, ...]
     slopes: tuple[str, ...]
+    stages: int
+    once: tuple[str, ...]
+    twice: tuple[str, ...]
     directions: tuple[int, ...]
     actions: tuple[int, ...]
     jumps: bool
