@@ -31,10 +31,10 @@ demo: .venv/demo
 test: .venv/dev
 	$(PYTEST) -m "not slow"
 
-test-all: .venv/robots
+test-all: .venv/robots build/katex/done
 	$(PYTEST)
 
-test-slow: .venv/robots
+test-slow: .venv/robots build/katex/done
 	$(PYTEST) -m slow
 
 lint: .venv/dev
@@ -53,6 +53,12 @@ bench: build/bench/done
 	build/bench/bin/python benchmarks/peers.py
 	build/bench/bin/python benchmarks/bodies.py
 	build/bench/bin/python benchmarks/digits.py
+
+# what the LaTeX of equations is compiled with, where npm is there; else that test is skipped
+build/katex/done:
+	@mkdir -p build/katex
+	@if command -v npm >/dev/null; then npm install --silent --prefix build/katex katex@0.16.11; fi
+	@touch $@
 
 build/bench/done: pyproject.toml benchmarks/requirements.txt
 	$(PYTHON) -m venv build/bench

@@ -12,14 +12,19 @@ from eomc.base.version import __version__
 from eomc.pipeline import build, load, read, sources
 
 __all__ = [
-    "EomcError", "SceneError", "System", "__version__", "build", "dot", "load", "read", "sources",
+    "EomcError", "SceneError", "System", "__version__", "build", "dot", "equations", "load", "read",
+    "sources",
 ]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    """System and dot, imported when they are asked for: SymPy takes half a second."""
+    """What needs SymPy, imported when it is asked for: that takes half a second."""
     if name in ("System", "dot"):
         from eomc.model import system
 
         return getattr(system, name)
+    if name == "equations":
+        from eomc.report.equations import equations
+
+        return equations
     raise AttributeError(f"module 'eomc' has no attribute {name!r}")

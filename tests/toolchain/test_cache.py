@@ -158,15 +158,15 @@ def test_what_a_build_depends_on(
     for part in ("templates", "csrc"):
         shutil.copytree(resources.folder(part), tmp_path / "clone" / part)
     monkeypatch.setattr(resources, "PACKAGE", generator)
-    cache._generator_digest.cache_clear()
+    cache.generator_digest.cache_clear()
     try:
         assert not new()  # an exact copy
         with (generator / "derive" / "tape.py").open("a") as file:
             file.write("\n")
-        cache._generator_digest.cache_clear()
+        cache.generator_digest.cache_clear()
         assert new()
     finally:
-        cache._generator_digest.cache_clear()
+        cache.generator_digest.cache_clear()
 
 
 # --- what goes wrong -----------------------------------------------------------------------------

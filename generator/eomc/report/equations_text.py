@@ -2,110 +2,136 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 import sympy
-from sympy import Expr
+from sympy import Expr, MatrixBase
 from sympy.printing.str import StrPrinter
 
 from eomc.base import texts
-from eomc.base.errors import EomcError
 from eomc.derive import lagrange
-from eomc.emit import c_expression
-from eomc.model.symbols import ALONG
 from eomc.model.system import System, t
+from eomc.model.tree import Tree
 from eomc.program import program
 from eomc.program.routes import ROUTES
-from eomc.verify import symbolic
+from eomc.report.typeset import WIDE, Typesetter
+from eomc.runtime.labels import tex
 
-WRITTEN_OUT = 400  # operations of D, C and bias up to which a person may want them written out
-LONG = 10**12  # above or below the line of a fraction, which is then shown as a decimal
-TINY = 1e-25  # a factor below it is what rounding left of a zero
+if TYPE_CHECKING:
+    from eomc.report.equations import Equations, Terms
 
-_MATRICES = ("D", "C", "g", "tau")
-_SCALARS = ("kinetic", "potential", "jacobi", "power")
+DECLARED = 60  # definitions, at most, that are shown of a system too large to write out
+
 _MEANING = {
+    "kinetic": "kinetic energy",
+    "potential": "potential energy",
+    "L": "Lagrangian K - P",
     "D": "mass matrix",
     "C": "Coriolis matrix, Christoffel form",
     "g": "potential forces",
     "tau": "generalized forces",
-    "kinetic": "kinetic energy",
-    "potential": "potential energy",
     "jacobi": "Jacobi integral, conserved in place of K + P",
     "power": "power into the system",
 }
-_SYMBOL = {"kinetic": "K", "potential": "P", "jacobi": "h", "power": "power", "tau": "tau"}
+_SYMBOL = {"kinetic": "K", "potential": "P", "jacobi": "h", "power": "power", "tau": "τ"}
+_LATEX = {**_SYMBOL, "tau": r"\tau", "power": r"\dot h"}
 
 
-def equations(system: System, form: str = "text") -> str:
-    """D, C, g and what else there is of D qdd + C qd + g = tau.
-
-    form: "text" (Unicode), "latex" or "python". The equations are the reference's, simplified:
-    written out, as a textbook has them. Written out, those of a large system are no use to anyone:
-    as text it is shown as the assignments that compute it, and refused otherwise.
-    """
-    made = program.build(lagrange.derive(system))
-    shown = [made[name].cost.flops for name in ("D", "C", "bias") if name in made]
-    long = len(shown) < 3 or sum(shown) > WRITTEN_OUT
-    if long or not symbolic.is_small(system):
-        if form != "text":
-            raise EomcError(
-                f"{system.name}: its equations would fill pages: 'eomc show' without --{form} "
-                "prints them as the assignments that compute them"
-            )
-        return _assignments(made)
-    plain = symbolic.derive(system)
-    found = plain.simplified
-    values = {name: _readable(getattr(found, name)) for name in (*_MATRICES, *_SCALARS)}
-    if sympy.expand(plain.jacobi - plain.energy) == 0:
-        del values["jacobi"]
-    values = {
-        name: value
-        for name, value in values.items()
-        if name in ("D", "C", "g", "kinetic", "potential") or not _nothing(value)
-    }
-    return {"text": _text, "latex": _latex, "python": _python}[form](system, values)
+def _values(found: Equations) -> dict[str, Expr | MatrixBase]:
+    """What is shown, by its name."""
+    values = {name: getattr(found, name) for name in _MEANING}
+    if all(e == 0 for e in found.tau):
+        del values["tau"]
+    return {name: value for name, value in values.items() if value is not None}
 
 
-def _readable(value: Expr | sympy.MatrixBase) -> Expr | sympy.MatrixBase:
-    """With decimals for fractions that nobody reads, as those of 50 digits of slanted axes.
-
-    At 30 digits more of them fall together, and what rounding left of zeros is gone.
-    """
-    if isinstance(value, sympy.MatrixBase):
-        return value.applyfunc(_readable)
-    if not _long(value):
-        return value
-    short = sympy.trigsimp(_rounded(sympy.expand(value)))
-    plain = _rounded(sympy.expand(short))  # each factor whole again
-    return plain.xreplace({x: sympy.Float(x, 15) for x in _long(plain)})
+# --- text -----------------------------------------------------------------------------------------
 
 
-def _rounded(e: Expr) -> Expr:
-    return e.xreplace(
-        {x: sympy.Rational(str(sympy.Float(x, 30))) if abs(x) > TINY else 0 for x in _long(e)}
-    )
-
-
-def _long(e: Expr) -> set[sympy.Rational]:
-    return {x for x in e.atoms(sympy.Rational) if max(abs(x.p), x.q) >= LONG}
-
-
-def _nothing(value: Expr | sympy.MatrixBase) -> bool:
-    return all(e == 0 for e in value) if isinstance(value, sympy.MatrixBase) else value == 0
-
-
-def _text(system: System, values: dict[str, Expr]) -> str:
-    names = {c.qd: sympy.Symbol(_dotted(c.name)) for c in system.coordinates}
-    order = ", ".join(c.name for c in system.coordinates)
-    title = texts.line(system.title)
-    parts = [f"{title}: D q̈ + C q̇ + g = {'τ' if 'tau' in values else '0'},  q = ({order})"]
+def text(found: Equations) -> str:
+    """For a terminal, WIDE columns and an indent."""
+    system, write = found.system, Typesetter(found.system)
+    values = _values(found)
+    right = "τ" if "tau" in values else "0"
+    parts = [_wrapped(f"{_title(system)}: D q̈ + C q̇ + g = {right}, q = ({_order(system)})")]
+    lines = []
+    for left, force in zip(found.left, found.forces, strict=True):
+        lines += [
+            *write.text_lines([write.term(a, b) for a, b in _flat(left)], _terms(write, force)),
+            "",
+        ]
+    parts.append(_part("equations of motion", lines[:-1]))
     for name, value in values.items():
-        shown = sympy.pretty(value.xreplace(names), use_unicode=True, wrap_line=False)
-        head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}:"
-        parts.append(head + "\n" + "\n".join("    " + line for line in shown.splitlines()))
+        head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}"
+        parts.append(_part(head, list(_value_lines(write, name, value))))
     if system.outputs:
-        lines = (f"    {name} = {formula}" for name, formula in _outputs(system))
-        parts.append("outputs, dot(...) the rate:\n" + "\n".join(lines))
+        made: list[str] = []
+        for name, formula in _outputs(system):
+            made += _named_lines(write, name, formula)
+        parts.append(_part("outputs", made))
     return "\n\n".join(parts)
+
+
+def _part(head: str, lines: list[str]) -> str:
+    return "\n".join([f"{head}:", *("    " + line if line else "" for line in lines)])
+
+
+def _title(system: System) -> str:
+    return texts.line(system.title or system.name)
+
+
+def _order(system: System) -> str:
+    return ", ".join(c.name for c in system.coordinates)
+
+
+def _wrapped(words: str) -> str:
+    return "\n    ".join(textwrap.wrap(words, WIDE, break_on_hyphens=False))
+
+
+def _flat(terms: Terms) -> Iterator[tuple[Expr, Expr]]:
+    """Sums that stand alone as terms of their own."""
+    for monomial, c in terms:
+        if monomial == 1:
+            yield from ((sympy.S.One, part) for part in sympy.Add.make_args(c))
+        else:
+            yield monomial, c
+
+
+def _terms(write: Typesetter, e: Expr) -> list[tuple[bool, Expr]]:
+    return [] if e == 0 else write.terms(e)
+
+
+def _value_lines(write: Typesetter, name: str, value: Expr | MatrixBase) -> Iterator[str]:
+    """An energy, or a matrix: by its entries that are not 0, where it is too wide."""
+    if not isinstance(value, MatrixBase):
+        yield from _sum_lines(write, value)
+        return
+    block = write.text(write.ordered(value))
+    if block.width() <= WIDE:
+        yield from (line.rstrip() for line in str(block).splitlines())
+        return
+    for (i, j), entry in _entries(name, value):
+        yield from _named_lines(write, f"{_SYMBOL.get(name, name)}_{i}{j}", entry)
+
+
+def _sum_lines(write: Typesetter, e: Expr) -> list[str]:
+    return write.text_lines(write.terms(e))
+
+
+def _named_lines(write: Typesetter, name: str, e: Expr) -> list[str]:
+    """name = sum, its lines broken."""
+    return write.text_lines([(False, sympy.Symbol(name))], write.terms(e))
+
+
+def _entries(name: str, value: MatrixBase) -> Iterator[tuple[tuple[str, str], Expr]]:
+    """Entries that are not 0, by row and column from 1; of a symmetric matrix a half."""
+    comma = "," if value.rows > 9 else ""
+    for i in range(value.rows):
+        for j in range(value.cols):
+            if value[i, j] != 0 and not (name == "D" and j < i):
+                yield (str(i + 1), f"{comma}{j + 1}" if value.cols > 1 else ""), value[i, j]
 
 
 def _outputs(system: System) -> list[tuple[str, Expr]]:
@@ -116,29 +142,44 @@ def _outputs(system: System) -> list[tuple[str, Expr]]:
     return [(o.name, o.formula.xreplace(known)) for o in system.outputs]
 
 
-def _dotted(name: str) -> str:
-    """theta2 -> thetadot2, which SymPy prints as a dotted theta with a subscript 2."""
-    base = name.split("_")[0].rstrip("0123456789") or name
-    return f"{base}dot{name[len(base) :]}"
+# --- LaTeX ----------------------------------------------------------------------------------------
 
 
-def _latex(system: System, values: dict[str, Expr]) -> str:
-    names = {s: rf"\dot{{{sympy.latex(q)}}}" for s, q in zip(system.qd, system.q, strict=True)}
-    symbols = {"tau": r"\tau", "kinetic": "K", "potential": "P", "jacobi": "h", "power": r"\dot h"}
-    lines = [
-        rf"  {symbols.get(name, name)} &= {sympy.latex(value, symbol_names=names)} \\"
-        for name, value in values.items()
-    ]
-    names |= {c.qdd: rf"\ddot{{{sympy.latex(c.q)}}}" for c in system.coordinates}
-    lines += [
-        rf"  \mathrm{{{_escaped(name)}}} &= {sympy.latex(value, symbol_names=names)} \\"
-        for name, value in _outputs(system)
-    ]
-    return "\n".join([r"\begin{align*}", *lines, r"\end{align*}"])
+def latex(found: Equations) -> str:
+    """Environments of amsmath, one for the equations of motion and one for what is in them."""
+    return "\n".join(r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in bodies(found))
 
 
-def _escaped(name: str) -> str:
-    return name.replace("_", r"\_")
+def bodies(found: Equations) -> list[str]:
+    """What stands in each environment: the equations of motion; energies, matrices, outputs."""
+    system, write = found.system, Typesetter(found.system)
+    motion = []
+    for left, force in zip(found.left, found.forces, strict=True):
+        terms = [write.term(a, b) for a, b in _flat(left)]
+        first, *more = write.latex_lines(terms, _terms(write, force))
+        motion += [f"  & {first}", *(rf"  & \quad {line}" for line in more)]
+    lines = []
+    for name, value in _values(found).items():
+        symbol = _LATEX.get(name, name)
+        if isinstance(value, MatrixBase):
+            if write.text(write.ordered(value)).width() <= WIDE:
+                lines.append(f"  {symbol} &= {write.latex(write.ordered(value))}")
+                continue
+            for (i, j), entry in _entries(name, value):
+                lines += _latex_sum(write, f"{symbol}_{{{i}{j}}}", entry)
+        else:
+            lines += _latex_sum(write, symbol, value)
+    for name, formula in _outputs(system):
+        lines += _latex_sum(write, tex(name), formula)
+    return [" \\\\\n".join(each) for each in (motion, lines)]
+
+
+def _latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
+    first, *more = write.latex_lines(write.terms(value))
+    return [f"  {symbol} &= {first}", *(rf"  & \quad {line}" for line in more)]
+
+
+# --- Python ---------------------------------------------------------------------------------------
 
 
 class _Exact(StrPrinter):  # type: ignore[misc]
@@ -150,10 +191,19 @@ class _Exact(StrPrinter):  # type: ignore[misc]
     _print_Half = _print_Rational
 
 
-def _python(system: System, values: dict[str, Expr]) -> str:
-    symbols = [*system.q, *system.qd, *system.u, *(p.symbol for p in system.parameters), t]
+def python(found: Equations) -> str:
+    """Source that makes them again, exactly."""
+    system = found.system
+    symbols = [
+        *system.q,
+        *system.qd,
+        *system.qdd,
+        *system.u,
+        *(p.symbol for p in system.parameters),
+        t,
+    ]
     names = ", ".join(s.name for s in symbols)
-    title = texts.docstring(texts.line(system.title))
+    title = texts.docstring(_title(system))
     lines = [
         f'"""{title}: D qdd + C qd + g = tau, as SymPy matrices."""',
         "",
@@ -161,44 +211,81 @@ def _python(system: System, values: dict[str, Expr]) -> str:
         "",
         f'{names} = symbols("{names}", real=True)',
     ]
-    for name, value in values.items():
-        is_matrix = isinstance(value, sympy.MatrixBase)
-        text = _Exact().doprint(value.tolist() if is_matrix else value)
-        text = f"Matrix({text})" if is_matrix else text
-        lines.append(f"{name + '_' if name in {s.name for s in symbols} else name} = {text}")
+    taken = {s.name for s in symbols}
+    for name, value in _values(found).items():
+        is_matrix = isinstance(value, MatrixBase)
+        made = _Exact().doprint(value.tolist() if is_matrix else value)
+        made = f"Matrix({made})" if is_matrix else made
+        lines.append(f"{name + '_' if name in taken else name} = {made}")
+    pairs = ", ".join(
+        f"Eq({_Exact().doprint(e.lhs)}, {_Exact().doprint(e.rhs)})" for e in found.scalar
+    )
+    lines.append(f"{'scalar_' if 'scalar' in taken else 'scalar'} = [{pairs}]")
     return "\n".join(lines)
 
 
-def _assignments(made: program.Program) -> str:
-    """D, C, g and tau as short lists of assignments, the form in which they are computed."""
-    names = [c.name for c in made.system.coordinates]
-    parts = [f"{texts.line(made.system.title)}: D qdd + C qd + g = tau, q = ({', '.join(names)})"]
-    for name in (n for whole in _MATRICES for n in (whole, f"{whole}_column") if n in made):
-        body = c_expression.body(made[name], made.system.name, {})
-        lines = [line.removeprefix("const double ").rstrip(";") for line in body.lines]
-        n = len(names)
-        for k, result in enumerate(body.results):
-            place = f"{names[k // n]}, {names[k % n]}" if name in ("D", "C") else names[k]
-            lines.append(f"{name}[{place}] = {result}")
-        meaning = _MEANING.get(name) or f"{name[0]} e for a direction e = ({names[0]}{ALONG}, ...)"
-        parts.append(f"{name}, {meaning}:\n" + c_expression.indent(lines))
-    return "\n\n".join(parts)
+# --- what is too large, and costs -----------------------------------------------------------------
+
+
+def large(system: System) -> str:
+    """What the equations of a large system come from, and what it costs to compute them."""
+    write = Typesetter(system)
+    parts = [
+        _wrapped(f"{_title(system)}: D q̈ + C q̇ + g = τ, q = ({_order(system)})"),
+        "Written out, these equations would fill many pages. They are those of L = K - P,\n"
+        "d/dt ∂L/∂q̇ - ∂L/∂q = τ.",
+    ]
+    tree = system.tree
+    if tree is not None:
+        parts.append(_recursion(tree, write))
+    known = system.definitions
+    if tree is None and len(known) <= DECLARED:
+        energies = [("K", system.kinetic), ("P", system.potential)]
+        made: list[str] = []
+        for name, e in [*((str(s), e) for s, e in known), *energies]:
+            made += _named_lines(write, name, e)
+        parts.append(_part("energies, over definitions; a dot is d/dt", made))
+    return "\n\n".join([*parts, "What computes them:", _costs(system)])
+
+
+def _recursion(tree: Tree, write: Typesetter) -> str:
+    """The recursion of Newton and Euler (Featherstone, 2008, table 5.1)."""
+    lines = [
+        "outward from parent p; S is the joint's axis, v a twist, a its rate, f a wrench:",
+        "    v = X v_p + S q̇",
+        "    a = X a_p + S q̈ + v × S q̇",
+        "inward:",
+        "    f = I a + v ×* I v + the sum of Xᵀ f over its children",
+        "    τ = S · f",
+        "",
+    ]
+    for link in tree.links:
+        parent = "the world" if link.parent < 0 else tree.links[link.parent].name
+        how = f"{'turns about' if link.turns else 'slides along'} {'xyz'[link.axis]}"
+        by = str(write.text(write.ordered(link.q))).strip()
+        lines.append(f"{link.name} on {parent}: {how} by {by if len(by) <= 40 else '...'}")
+    return _part(f"Newton and Euler's recursion over {len(tree.links)} elementary joints", lines)
 
 
 def cost(system: System) -> str:
     """The operations of each generated function, by each route, and why one was taken."""
+    head = f"{_title(system)}: operations of one call, those on parameters alone left out"
+    return f"{head}\n\n{_costs(system)}"
+
+
+def _costs(system: System) -> str:
     made = program.build(lagrange.derive(system))
-    lines = [
-        f"{texts.line(system.title)}: operations of one call, those on parameters alone left out",
-        "",
-    ]
+    lines = []
     wide = max(map(len, made.functions))
     routes: dict[str, None] = {}
     for name, function in made.functions.items():
         others = [f"{r} {c.flops}" for r, c in function.routes if r != function.route]
         others += [f"{r} {why}" for r, why in made.passed_over.items() if name == "acceleration"]
-        choice = f"  ({function.route}; {', '.join(others)})" if others else ""
-        lines.append(f"{name:{wide}}  {function.cost.flops:5d} flops: {function.cost}{choice}")
+        lines.append(f"{name:{wide}}  {function.cost.flops:5d} flops: {function.cost}")
+        if others:
+            choice = f"({function.route}; {', '.join(others)})"
+            lines += textwrap.wrap(choice, WIDE - wide, initial_indent=" " * (wide + 2),
+                                   subsequent_indent=" " * (wide + 3))  # fmt: skip
         routes |= dict.fromkeys(r for r, _ in function.routes)
     if len(routes) > 1:
         lines += ["", "Of each function the route of least weight is taken that loses no digits:"]

@@ -48,7 +48,7 @@ class Built:
 
 
 @lru_cache(maxsize=1)
-def _generator_digest() -> str:
+def generator_digest() -> str:
     """What the generator is: its version and the text of all its parts."""
     total = hashlib.sha256(__version__.encode())
     for name, file in resources.parts():
@@ -60,7 +60,7 @@ def key(scene_digest: str, form: str = "fast") -> str:
     """The digest of all that a build depends on: scene, generator, flags, compiler, processor."""
     small, large = compiler_for(0), compiler_for(MANY + 1)
     parts = (
-        scene_digest, form, _generator_digest(), small.identity, large.identity,
+        scene_digest, form, generator_digest(), small.identity, large.identity,
         STANDARD, *flags(form), processor(), sys.version,
         str(sysconfig.get_config_var("EXT_SUFFIX")),
     )  # fmt: skip

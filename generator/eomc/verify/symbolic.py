@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,10 +21,10 @@ from sympy import Expr, ImmutableMatrix
 from eomc.base.errors import EomcError
 from eomc.model.system import System, dot, t
 from eomc.verify.oracle import MATRICES, SCALARS, Answer, Values, Vector
+from eomc.verify.shorter import shorter
 from eomc.verify.taylor import Jets
 
 WRITTEN_OUT = 10_000  # some seconds of SymPy at five links
-SIMPLIFIED_WORK = 200_000  # squares of operations, added up: a few seconds of SymPy
 
 
 @lru_cache(maxsize=16)
@@ -67,7 +67,8 @@ def derive(system: System) -> Reference:
 
     bias = p.jacobian(q) * qd + p.diff(t) - gradient(K, q) + gradient(P, q)
     forces = system.forces or (sympy.S.Zero,) * len(q)
-    tau = ImmutableMatrix([expand(e) for e in forces]) - gradient(R, system.qd)
+    friction = gradient(R, system.qd)
+    tau = ImmutableMatrix([expand(e) for e in forces]) - friction
     for y, force in system.applied:
         tau += gradient(expand(y), q) * expand(force)
     return Reference(
@@ -77,6 +78,7 @@ def derive(system: System) -> Reference:
         g=bias.xreplace(rest),
         bias=bias,
         tau=tau,
+        friction=friction,
         kinetic=K,
         potential=P,
         energy=K + P,
@@ -156,7 +158,8 @@ def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
 class Reference(Answer):
     """The equations of `system` as expressions over q, qd, t, u and the parameters.
 
-    D, C: (nq, nq); g, bias, tau: (nq, 1); signals: (nu, 1), the inputs by default.
+    D, C: (nq, nq); g, bias, tau, friction: (nq, 1), tau = Q - friction; signals: (nu, 1), the
+    inputs by default.
     """
 
     system: System
@@ -165,6 +168,7 @@ class Reference(Answer):
     g: ImmutableMatrix
     bias: ImmutableMatrix
     tau: ImmutableMatrix
+    friction: ImmutableMatrix
     kinetic: Expr
     potential: Expr
     energy: Expr
@@ -182,21 +186,21 @@ class Reference(Answer):
 
     @cached_property
     def simplified(self) -> Reference:
-        """The same in shorter forms, for people to read; what would take SymPy long stays."""
-        names = ("D", "C", "g", "tau")
-        entries = {e for name in names for e in getattr(self, name)}
-        entries |= {self.kinetic, self.potential, self.jacobi, self.power}
-        short: dict[Expr, Expr] = {}
-        left = SIMPLIFIED_WORK
-        for e in sorted(entries, key=lambda e: (e.count_ops(), str(e))):
-            left -= e.count_ops() ** 2
-            short[e] = _shorter(e) if left > 0 else e
-        D, C, g, tau = (getattr(self, name).applyfunc(short.__getitem__) for name in names)
-        K, P, jacobi, power = map(
-            short.__getitem__, (self.kinetic, self.potential, self.jacobi, self.power)
+        """The same in shorter forms, for people to read."""
+
+        @cache
+        def short(e: Expr) -> Expr:
+            return shorter(e, self.system.qd)
+
+        D, C, g, bias, tau, friction = (
+            getattr(self, name).applyfunc(short)
+            for name in ("D", "C", "g", "bias", "tau", "friction")
         )
+        K, P, power = map(short, (self.kinetic, self.potential, self.power))
+        conserved = sympy.expand(self.jacobi - self.energy) == 0
+        jacobi = K + P if conserved else short(self.jacobi)
         return replace(
-            self, D=D, C=C, g=g, bias=C * ImmutableMatrix(self.system.qd) + g, tau=tau,
+            self, D=D, C=C, g=g, bias=bias, tau=tau, friction=friction,
             kinetic=K, potential=P, energy=K + P, jacobi=jacobi, power=power,
         )  # fmt: skip
 
@@ -291,9 +295,3 @@ _SIZE = sympy.Function("size")  # not Abs, of which SymPy makes parts of complex
 
 # what `math` has no name for
 _NAMED = {"sign": _sign, "Heaviside": _heaviside, "DiracDelta": _dirac_delta, "size": abs}
-
-
-def _shorter(e: Expr) -> Expr:
-    """The shorter of `e` and its expanded, trigonometrically simplified, factored form."""
-    short = sympy.factor_terms(sympy.trigsimp(sympy.expand(e)))
-    return min((e, short), key=lambda form: form.count_ops())

@@ -1,0 +1,67 @@
+"""Names and units as figures and formulas print them; copied beside a built module."""
+
+from __future__ import annotations
+
+import re
+
+_SMALL = (
+    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau "
+    "upsilon phi chi psi omega"
+).split()
+_LARGE = "Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega".split()
+GREEK = {word: rf"\{word}" for word in (*_SMALL, *_LARGE)} | {"omicron": "o"}
+_DOTS = ("", r"\dot", r"\ddot")
+
+
+def tex(name: str, dots: int = 0) -> str:
+    r"""A name in LaTeX: theta1 and theta_1 as \theta_{1}, m_c as m_{\mathrm{c}}, x_prime as x'.
+
+    dots: 1 for its rate, 2 for its acceleration. Words of several letters stand upright.
+
+    >>> tex("theta_1", 1), tex("arm", 2)
+    ('\\dot{\\theta}_{1}', '\\ddot{\\mathrm{arm}}')
+    """
+    head, *rest = (part for part in name.split("_") if part)
+    if digits := re.fullmatch(r"([A-Za-z]+?)(\d+)", head):
+        head, rest = digits[1], [digits[2], *rest]
+    symbol = head if len(head) == 1 else _upright(head)
+    if dots:
+        symbol = f"{_DOTS[dots]}{{{symbol}}}"
+    primes = "'" * rest.count("prime")
+    below = ",".join(_upright(part) for part in rest if part != "prime")
+    return symbol + primes + (f"_{{{below}}}" if below else "")
+
+
+def _upright(word: str) -> str:
+    if greek := GREEK.get(word):
+        return greek
+    if digits := re.fullmatch(r"([A-Za-z]+?)(\d+)", word):
+        return _upright(digits[1]) + digits[2]
+    return word if word.isdigit() else rf"\mathrm{{{word}}}"
+
+
+def mathtext(name: str, rate: bool = False) -> str:
+    r"""A name as figures print it.
+
+    >>> mathtext("theta_1", rate=True)
+    '$\\dot{\\theta}_{1}$'
+    """
+    return f"${tex(name, int(rate))}$"
+
+
+def rate_unit(unit: str, rate: bool) -> str:
+    """The unit, or that of the rate; "" where there is none."""
+    if not unit or not rate:
+        return unit
+    return f"{unit}/s" if re.fullmatch(r"\w+", unit) else f"({unit})/s"
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A text as it is printed, and its unit in brackets."""
+    return f"{text} ({plain(unit)})" if unit else text
+
+
+def plain(text: str) -> str:
+    """Free text in a figure: in one line, without what steers a terminal; a dollar is a dollar."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return shown.replace("$", r"\$")

@@ -1,0 +1,210 @@
+"""Shorter forms of expressions, for people to read: polynomials in sines, cosines and rates.
+
+SymPy's `trigsimp` takes minutes where expressions are long. Those of mechanics are polynomials in
+velocities, whose coefficients are polynomials in sines and cosines: each coefficient is written in
+a few forms, and the shortest is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import sympy
+from sympy import Expr, Symbol, cos, sin
+from sympy.polys.polyerrors import PolynomialError
+from sympy.polys.rings import PolyElement, sring
+
+LONG = 400  # terms of a polynomial, beyond which it stays as it is
+_Angles = dict[Expr, list[Expr]]  # by angle: its sine and cosine among the generators
+
+
+def shorter(e: Expr, rates: Sequence[Symbol] = ()) -> Expr:
+    """An equal form of `e` of as few operations, coefficients of the rates by themselves.
+
+    Exact. What is no polynomial in its parts stays as it is.
+    """
+    e = sympy.sympify(e)
+    return min((e, by_rates(e, rates)), key=lambda form: form.count_ops())
+
+
+def by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
+    """A sum of products of rates, each with the shortest coefficient that was found."""
+    terms = coefficients(e, rates)
+    if terms is None:
+        return _coefficient(e)
+    return sympy.factor_terms(sympy.Add(*(monomial * c for monomial, c in terms)))
+
+
+def coefficients(e: Expr, rates: Sequence[Symbol]) -> list[tuple[Expr, Expr]] | None:
+    """Pairs (product of rates, coefficient): `e` is their sum. None: no polynomial in the rates."""
+    if not rates or not e.has(*rates):
+        made = _coefficient(e)
+        return [(sympy.S.One, made)] if made != 0 else []
+    try:
+        polynomial = sympy.Poly(e, *rates)
+    except PolynomialError:
+        return None
+    found = [(m, _coefficient(c)) for m, c in polynomial.terms()]
+    return [
+        (sympy.Mul(*(r**k for r, k in zip(rates, powers, strict=True))), c)
+        for powers, c in found
+        if c != 0
+    ]
+
+
+@lru_cache(maxsize=10_000)
+def _coefficient(e: Expr) -> Expr:
+    """The shortest of some forms of a polynomial in sines and cosines, without common factors."""
+    e = _inside(e)
+    try:
+        ring, polynomial = sring(e)
+    except (PolynomialError, sympy.CoercionFailed):
+        return e
+    if len(polynomial) > LONG:
+        return e
+    waves = [g for g in ring.symbols if isinstance(g, (sin, cos))]
+    angles: _Angles = {g.args[0]: [sin(g.args[0]), cos(g.args[0])] for g in waves}
+    forms = [e, polynomial.as_expr(), *_reduced(polynomial, angles)]
+    if angles:
+        forms += [sums := _sums(polynomial, list(angles), False)]
+        if len(angles) > 1:
+            forms += [_sums(polynomial, list(angles), True)]
+        forms += _again(sums)
+    forms += [sympy.factor_terms(form) for form in forms]
+    return min(forms, key=_length)
+
+
+def _length(e: Expr) -> tuple[int, int, str]:
+    """Of forms as short as each other, that without double angles."""
+    doubled = sum(f.args[0].is_Mul and f.args[0].args[0].is_Number for f in e.atoms(sin, cos))
+    return (int(e.count_ops()) + int(doubled), int(doubled), str(e))
+
+
+def _inside(e: Expr) -> Expr:
+    """`e` with what is no polynomial, such as roots and quotients, short inside."""
+    outer = [a for a in e.atoms(sympy.Function, sympy.Pow) if _opaque(a)]
+    if not outer:
+        return e
+    return e.xreplace({a: a.func(*(_coefficient(x) for x in a.args)) for a in _maximal(outer)})
+
+
+def _opaque(a: Expr) -> bool:
+    if isinstance(a, sympy.Pow):
+        return bool(not (a.exp.is_Integer and a.exp > 0) and a.base.is_Add)
+    return not isinstance(a, (sin, cos)) and not a.is_Atom
+
+
+def _maximal(parts: list[Expr]) -> list[Expr]:
+    return [a for a in parts if not any(b is not a and b.has(a) for b in parts)]
+
+
+def _reduced(polynomial: PolyElement, angles: _Angles) -> list[Expr]:
+    """By sin^2 + cos^2 = 1: without squares of cosines, and without squares of sines."""
+    ring = polynomial.ring
+    named = dict(zip(ring.symbols, ring.gens, strict=True))
+    forms = []
+    pairs = [[named.get(f) for f in both] for both in angles.values()]
+    for which in (0, 1):
+        reduced = polynomial
+        for both in pairs:
+            this, other = both[which], both[1 - which]
+            if this is not None and other is not None:
+                reduced = _without_squares(reduced, this, other)
+        forms.append(_grouped(reduced))
+    return forms
+
+
+def _grouped(polynomial: PolyElement) -> Expr:
+    """Its terms gathered by their sines and cosines."""
+    ring = polynomial.ring
+    found: dict[Expr, list[Expr]] = {}
+    for powers, c in polynomial.terms():
+        parts = [g**n for g, n in zip(ring.symbols, powers, strict=True)]
+        trig = sympy.Mul(*(x for x in parts if x.has(sin, cos)))
+        rest = sympy.Mul(ring.domain.to_sympy(c), *(x for x in parts if not x.has(sin, cos)))
+        found.setdefault(trig, []).append(rest)
+    return sympy.Add(*(sympy.factor_terms(sympy.Add(*cs)) * x for x, cs in found.items()))
+
+
+def _without_squares(polynomial: PolyElement, this: PolyElement, other: PolyElement) -> PolyElement:
+    """1 - other^2 for this^2, both generators."""
+    ring = polynomial.ring
+    k = ring.gens.index(this)
+    made = ring.zero
+    for powers, c in polynomial.terms():
+        n = powers[k]
+        rest = (*powers[:k], n % 2, *powers[k + 1 :])
+        made += ring.term_new(rest, c) * (1 - other**2) ** (n // 2)
+    return made
+
+
+def _sums(polynomial: PolyElement, angles: list[Expr], crossed: bool) -> Expr:
+    """Products of sines and cosines as sums: cos a cos b = (cos(a - b) + cos(a + b))/2.
+
+    crossed: only where two angles meet; squares of one stay.
+    """
+    ring = polynomial.ring
+    total: dict[Expr, list[Expr]] = {}
+    for powers, c in polynomial.terms():
+        rest: list[Expr] = [ring.domain.to_sympy(c)]
+        trig: list[Expr] = []
+        for g, n in zip(ring.symbols, powers, strict=True):
+            if isinstance(g, (sin, cos)):
+                trig += [g] * n
+            elif n:
+                rest.append(g**n)
+        if crossed and len({f.args[0] for f in trig}) < 2:
+            waves = {sympy.Mul(*trig): sympy.S.One}
+        else:
+            waves = _waves(trig)
+        for wave, size in waves.items():
+            total.setdefault(wave, []).append(sympy.Mul(size, *rest))
+    return sympy.Add(
+        *(sympy.Mul(wave, sympy.factor_terms(sympy.Add(*cs))) for wave, cs in total.items())
+    )
+
+
+def _waves(trig: list[Expr]) -> dict[Expr, Expr]:
+    """A product of sines and cosines as a sum of single ones, by their sizes."""
+    found: dict[Expr, Expr] = {sympy.S.One: sympy.S.One}
+    for f in trig:
+        made: dict[Expr, Expr] = {}
+        for wave, size in found.items():
+            for new, part in _times(wave, f):
+                sign, new = (-1, -new) if new.is_Mul else (1, new)
+                made[new] = made.get(new, sympy.S.Zero) + sign * part * size
+        made.pop(sympy.S.Zero, None)
+        found = made
+    return found
+
+
+def _times(wave: Expr, f: Expr) -> list[tuple[Expr, Expr]]:
+    """A single wave, or 1, times another."""
+    half = sympy.S.Half
+    if wave is sympy.S.One:
+        return [(f, sympy.S.One)]
+    a, b = wave.args[0], f.args[0]
+    less, more = sympy.expand(a - b), sympy.expand(a + b)
+    if isinstance(wave, cos) and isinstance(f, cos):
+        return [(cos(less), half), (cos(more), half)]
+    if isinstance(wave, sin) and isinstance(f, sin):
+        return [(cos(less), half), (cos(more), -half)]
+    if isinstance(wave, sin):
+        return [(sin(less), half), (sin(more), half)]
+    return [(sin(more), half), (sin(less), -half)]  # sin(-x) becomes -sin(x)
+
+
+def _again(e: Expr) -> list[Expr]:
+    """Of a sum of waves: those of double angles as squares, by cos 2a = 1 - 2 sin^2 a."""
+    doubled = {f: f.args[0] / 2 for f in e.atoms(sin, cos) if f.args[0].as_coeff_Mul()[0] == 2}
+    if not doubled:
+        return []
+    forms = []
+    for squares in (sin, cos):
+        by = {}
+        for f, a in doubled.items():
+            square = 1 - 2 * sin(a) ** 2 if squares is sin else 2 * cos(a) ** 2 - 1
+            by[f] = 2 * sin(a) * cos(a) if isinstance(f, sin) else square
+        forms.append(sympy.expand(e.xreplace(by)))
+    return forms

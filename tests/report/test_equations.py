@@ -1,0 +1,249 @@
+"""Equations as they are taught: the right ones, in their order, of at most 100 columns."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+from cases import SCENES
+from click.testing import CliRunner
+from sympy import Eq, cos, sin, symbols
+from sympy.printing.pretty.stringpict import stringPict
+
+import eomc
+from eomc import pipeline
+from eomc.base.errors import EomcError
+from eomc.cli.main import main
+from eomc.report import equations_text
+from eomc.report.equations import of, written
+from eomc.report.typeset import Typesetter
+from eomc.runtime.labels import tex
+from eomc.verify import symbolic
+
+ALL = sorted(SCENES.glob("*.toml"))
+SMALL = [f for f in ALL if f.stem not in ("chain", "tumbling_box")]
+KATEX = Path(__file__).parents[2] / "build" / "katex" / "node_modules"
+
+
+def same(found: Eq, left: sympy.Expr, right: sympy.Expr = sympy.S.Zero) -> bool:
+    return bool(sympy.simplify(found.lhs - found.rhs - left + right) == 0)
+
+
+def test_the_tutorials_cart_pole() -> None:
+    found = eomc.equations(SCENES / "cartpole_tutorial.toml")
+    q2, v2, a1, a2 = symbols("q2 q2_dot q1_ddot q2_ddot", real=True)
+    mc, mp, r, g = symbols("mc mp l g", real=True)
+    first, second = found.scalar
+    assert same(first, (mc + mp) * a1 - mp * r * cos(q2) * a2 / 2 + mp * r * sin(q2) * v2**2 / 2)
+    assert same(second, -mp * r * cos(q2) * a1 / 2 + mp * r**2 * a2 / 3 - mp * g * r * sin(q2))
+    assert first.rhs == second.rhs == 0
+    assert sympy.expand(found.L - found.kinetic + found.potential) == 0
+
+
+def test_inputs_stand_on_the_right_and_friction_on_the_left() -> None:
+    made = eomc.System.make(
+        "slider", ["x"], "m*x_dot**2/2", "k*x**2/2", dissipation="c*x_dot**2/2",
+        forces={"x": "F - k_3*x**3"}, inputs={"F": 0},
+        parameters=dict.fromkeys(("m", "k", "c", "k_3"), 1),
+    )  # fmt: skip
+    (found,) = of(made).scalar
+    m, k, c, k_3, F = symbols("m k c k_3 F", real=True)
+    x, v, a = symbols("x x_dot x_ddot", real=True)
+    assert sympy.expand(found.lhs - (m * a + c * v + k * x)) == 0
+    assert sympy.expand(found.rhs - (F - k_3 * x**3)) == 0
+    assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in equations_text.latex(of(made))
+    text = unicodedata.normalize("NFC", str(of(made)))
+    assert unicodedata.normalize("NFC", "m⋅ẍ + c⋅ẋ + k⋅x = F - k₃⋅x") in text
+
+
+@pytest.mark.parametrize("file", SMALL, ids=lambda f: f.stem)
+def test_scalar_equations_are_those_of_the_reference(file: Path) -> None:
+    system = pipeline.read(file)
+    found, reference = of(system), symbolic.derive(system)
+    rng = np.random.default_rng(1)
+    values = [p.value for p in system.parameters]
+    for _ in range(3):
+        q, qd, qdd, u = (
+            rng.uniform(0.2, 1.0, len(s)) for s in (system.q, *[system.q] * 2, system.u)
+        )
+        named = dict(zip((p.symbol for p in system.parameters), values, strict=True))
+        for symbols_, x in ((system.q, q), (system.qd, qd), (system.qdd, qdd), (system.u, u)):
+            named |= dict(zip(symbols_, x, strict=True))
+        named[symbolic.t] = 0.7
+        made = [float((e.lhs - e.rhs).subs(named).evalf()) for e in found.scalar]
+        state = {"q": q, "qd": qd, "t": 0.7, "u": u}
+        D, bias, tau = (reference.evaluate(name, **state) for name in ("D", "bias", "tau"))
+        wanted = D @ qdd + bias - tau
+        assert np.allclose(made, wanted, rtol=1e-9, atol=1e-9 * abs(wanted).max())
+
+
+def test_terms_stand_as_a_textbook_has_them() -> None:
+    latex = equations_text.latex(of(pipeline.read(SCENES / "spring_pendulum.toml")))
+    assert (
+        r"& m \ddot{r} - m r \dot{\theta}^{2} + k \left(r - l_{0}\right) - m g \cos {\theta} = 0"
+        in latex
+    )
+    assert (
+        r"& m r^{2} \ddot{\theta} + 2 m r \dot{r} \dot{\theta} + m g r \sin {\theta} = 0" in latex
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "dots", "said"),
+    [
+        ("theta_1", 0, r"\theta_{1}"),
+        ("theta1", 1, r"\dot{\theta}_{1}"),
+        ("arm", 2, r"\ddot{\mathrm{arm}}"),
+        ("m_c", 0, r"m_{\mathrm{c}}"),
+        ("m_pole", 0, r"m_{\mathrm{pole}}"),
+        ("x_prime", 1, r"\dot{x}'"),
+        ("x_prime_2", 0, "x'_{2}"),
+        ("Omega", 0, r"\Omega"),
+        ("Alpha", 0, r"\mathrm{Alpha}"),
+        ("l_theta2", 0, r"l_{\theta2}"),
+    ],
+)
+def test_names(name: str, dots: int, said: str) -> None:
+    assert tex(name, dots) == said
+
+
+QUAD = """
+eomc = 1
+name = "quad"
+[coordinates]
+a = { start = 0.5 }
+b = { start = 0.5 }
+c = { start = 0.5 }
+d = { start = 0.5 }
+[parameters]
+mass = 1.0
+length = 1.0
+g = 9.81
+[definitions]
+x1 = "length*sin(a)"
+y1 = "-length*cos(a)"
+x2 = "x1 + length*sin(b)"
+y2 = "y1 - length*cos(b)"
+x3 = "x2 + length*sin(c)"
+y3 = "y2 - length*cos(c)"
+x4 = "x3 + length*sin(d)"
+y4 = "y3 - length*cos(d)"
+[energy]
+kinetic = "mass*(dot(x1)**2 + dot(y1)**2 + dot(x2)**2 + dot(y2)**2 + dot(x3)**2 + dot(y3)**2 + \
+dot(x4)**2 + dot(y4)**2)/2"
+potential = "mass*g*(y1 + y2 + y3 + y4)"
+[outputs]
+tip = "dot(x4)*y4 + a_ddot"
+"""
+
+
+def test_of_four_links_each_entry_stands_by_itself(tmp_path: Path) -> None:
+    file = tmp_path / "quad.toml"
+    file.write_text(QUAD, encoding="utf-8")
+    found = eomc.equations(file)
+    text, latex = str(found), found._repr_latex_()
+    assert "D₁₂ = 3⋅mass⋅length ⋅cos(a - b)" in text
+    assert r"D_{34} &= \mathrm{mass} \mathrm{length}^{2} \cos{\left(c - d \right)}" in latex
+    assert "D_{43}" not in latex
+    assert r"\frac{d}{dt} \left(" in latex and "d/dt" in text
+    assert max(stringPict(line).width() for line in text.splitlines()) <= 100
+    assert max(map(len, re.sub(r"\\[a-z]+|[{}]", "", latex).splitlines())) <= 150
+
+
+@pytest.mark.parametrize("file", ALL, ids=lambda f: f.stem)
+def test_text_is_mathematics_of_at_most_100_columns(file: Path) -> None:
+    text = written(pipeline.read(file))
+    assert not re.search(r"\*\*|;$|\bdouble\b|\bw\d+ =|\w\[", text, re.M), text
+    assert max(stringPict(line).width() for line in text.splitlines()) <= 100
+
+
+def test_what_is_too_large_says_what_it_comes_from_and_what_it_costs() -> None:
+    system = pipeline.read(SCENES / "chain.toml")
+    text = written(system)
+    assert "would fill many pages" in text and "link2 on link1: turns about z by θ₂" in text
+    assert re.search(r"acceleration +\d+ flops", text)
+    for form in ("latex", "python"):
+        with pytest.raises(EomcError, match="would fill many pages"):
+            written(system, form)
+    with pytest.raises(EomcError, match="would fill many pages"):
+        eomc.equations(system)
+
+
+def test_what_is_too_wide_for_a_line_is_broken() -> None:
+    made = eomc.System.make(
+        "wide", ["x"], "m*x_dot**2/2", f"k*sqrt({' + '.join(f'(x - a_{i})**2' for i in range(9))})",
+        parameters={"m": 1, "k": 1, **{f"a_{i}": 1 for i in range(9)}},
+    )  # fmt: skip
+    text = str(of(made))
+    assert max(stringPict(line).width() for line in text.splitlines()) <= 100
+    write = Typesetter(made)
+    terms = write.terms(sum(symbols("a:z")))
+    assert len(write.rows(terms, 40)) > 2
+    assert [t for row in write.rows(terms, 40) for t in row] == terms
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    shutil.copy(SCENES / "cartpole.toml", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def show(*words: str) -> str:
+    done = CliRunner().invoke(main, ["show", *words])
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_what_was_shown_is_kept_until_the_scene_changes(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = show("cartpole.toml")
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "read", lambda scene: pytest.fail("derived again"))
+        assert show("cartpole.toml") == first
+    text = (here / "cartpole.toml").read_text(encoding="utf-8")
+    (here / "cartpole.toml").write_text(text.replace("m_c", "m_k"), encoding="utf-8")
+    assert "m_k" not in first and "mₖ" in show("cartpole.toml")
+    (kept,) = (here / "build" / ".shown").glob("*.json")
+    kept.write_text(json.dumps({"key": 1}), encoding="utf-8")  # damaged
+    assert "mₖ" in show("cartpole.toml")
+
+
+def test_nothing_is_kept_where_nothing_can_be_written(here: Path) -> None:
+    (here / "build").write_text("in the way")
+    assert "mass matrix" in show("cartpole.toml")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not shutil.which("node") or not (KATEX / "katex").is_dir(),
+    reason="node or KaTeX is not there: make build/katex/done",
+)
+def test_latex_compiles_in_katex(tmp_path: Path) -> None:
+    parts = {f.stem: equations_text.bodies(of(pipeline.read(f))) for f in SMALL}
+    file = tmp_path / "bodies.json"
+    file.write_text(json.dumps(parts), encoding="utf-8")
+    script = """
+        const katex = require('katex'), fs = require('fs');
+        const parts = JSON.parse(fs.readFileSync(process.argv[1]));
+        let n = 0;
+        for (const [name, bodies] of Object.entries(parts)) for (const body of bodies) {
+            const text = '\\\\begin{align*}\\n' + body + '\\n\\\\end{align*}';
+            katex.renderToString(text, {displayMode: true, throwOnError: true, strict: 'error'});
+            n++;
+        }
+        console.log(n);
+    """
+    done = subprocess.run(
+        ["node", "-e", script, str(file)], env=os.environ | {"NODE_PATH": str(KATEX)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) == 2 * len(SMALL)
