@@ -102,7 +102,10 @@ def command(
         jacobi = done.jacobi if own.has_jacobi else None
         system, rows = pipeline.read(scene).at(values), (done.t, done.q, done.qd, done.energy)
         words = balance.words if balance else ""
-        plots.draw(system, *rows, plot, jacobi=jacobi, outputs=done.outputs, words=words)
+        inputs = dict(zip(module.inputs, done.u.T, strict=True)) if module.inputs else {}
+        plots.draw(
+            system, *rows, plot, jacobi=jacobi, outputs=done.outputs, words=words, inputs=inputs
+        )
     if animate:
         with status_line(f"drawing {animate.name}", quiet or as_json):
             done.animate(animate)

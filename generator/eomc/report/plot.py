@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from eomc.base import texts
 from eomc.base.errors import EomcError
-from eomc.model.system import Coordinate, Output, System
+from eomc.model.system import Coordinate, System
 from eomc.report import picture as pictures
-from eomc.report.labels import label, mathtext, rate_unit, with_unit
+from eomc.report.labels import mathtext, rate_unit, with_unit
 from eomc.report.style import COLOURS, INK, plain
+from eomc.runtime.plot import Curve, against, grouped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,25 +30,24 @@ _NONE: Outputs = {}
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
-ROWS = 4  # of coordinates, at most; beyond that several share axes
 SAMPLES = 20_000  # of a run that are drawn, at most
 
 
 def draw(
     system: System, t: Array, q: Array, qd: Array, energy: Array, path: str | Path, *,
     jacobi: Array | None = None, title: str | None = None, outputs: Outputs = _NONE,
-    words: str = "",
+    words: str = "", inputs: Outputs = _NONE,
 ) -> None:  # fmt: skip
     """Write the figure of a run to `path`; its suffix says how: .png, .svg or .pdf.
 
-    t: (n,), s; q, qd: (n, nq); energy: (n,); jacobi: (n,), where it is not the energy; outputs:
-    (n,) by name; words: what was put in and lost. Raises EomcError without matplotlib, with another
-    suffix, or where the file can't be written.
+    t: (n,), s; q, qd: (n, nq); energy: (n,); jacobi: (n,), where it is not the energy; outputs,
+    inputs: (n,) by name; words: what was put in and lost. Raises EomcError without matplotlib, with
+    another suffix, or where the file can't be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise EomcError(f"{path}: a picture is written as {', '.join(SUFFIXES)}: end its name so")
-    made = figure(system, t, q, qd, energy, title, jacobi, outputs, words)
+    made = figure(system, t, q, qd, energy, title, jacobi, outputs, words, inputs)
     import matplotlib
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
@@ -61,15 +61,16 @@ def draw(
 def figure(
     system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None = None,
     jacobi: Array | None = None, outputs: Outputs = _NONE, words: str = "",
+    inputs: Outputs = _NONE,
 ) -> Figure:  # fmt: skip
-    """The figure of a run. t: (n,), s; q, qd: (n, nq); energy, jacobi, each of outputs: (n,)."""
+    """The figure of a run. t: (n,), s; q, qd: (n, nq); energy, jacobi, each other: (n,)."""
     try:
         import matplotlib.figure
     except ImportError:
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
         name = title or system.title or system.name
-        return _figure(system, t, q, qd, energy, name, jacobi, outputs, words)
+        return _figure(system, t, q, qd, energy, name, jacobi, outputs, words, inputs)
 
 
 def _figure(
@@ -82,6 +83,7 @@ def _figure(
     jacobi: Array | None,
     outputs: Outputs,
     words: str,
+    inputs: Outputs,
 ) -> Figure:
     from matplotlib.figure import Figure
 
@@ -90,25 +92,38 @@ def _figure(
     if jacobi is not None:
         jacobi = np.asarray(jacobi, dtype=float)[::every]
 
-    groups, asked = _groups(system), _by_unit(system, outputs)
+    moving = [
+        (Curve(c.name, q[:, i], c.unit, "coordinates"), _rate(c, qd[:, i]))
+        for i, c in enumerate(system.coordinates)
+    ]
+    rates = {c.name: rate for c, rate in moving}
+    groups = grouped([c for c, _ in moving])
+    below = grouped(
+        [
+            Curve(x.name, np.asarray(values[x.name], float)[::every], x.unit, kind)
+            for kind, some, values in (
+                ("inputs", system.inputs, inputs), ("outputs", system.outputs, outputs)
+            )
+            for x in some
+            if x.name in values
+        ]
+    )  # fmt: skip
     picture = pictures.picture(system, t, q, qd)
-    rows = len(groups) + len(asked) + 1
-    made = Figure(figsize=(12, min(2.1 * rows + 0.5, 9)), layout="constrained")
+    rows = len(groups) + len(below) + 1
+    height = min(2.1 * rows + 0.5, max(9, 1.5 * rows))
+    made = Figure(figsize=(12, height), layout="constrained")
     made.suptitle(texts.figure(title), fontsize=13, color=INK)
     widths = [1, 1, 1.35] if picture else [1, 1]
     grid = made.add_gridspec(rows, len(widths), width_ratios=widths)
 
     first: Axes | None = None
     for row, group in enumerate(groups):
-        for column, values in enumerate((q, qd)):
+        for column, curves in enumerate((group, [rates[c.name] for c in group])):
             axes = made.add_subplot(grid[row, column], sharex=first)
             first = first or axes
-            shown = [system.coordinates[i] for i in group]
-            _against_time(axes, t, values[:, group], shown, rate=column == 1)
-    for row, some in enumerate(asked, len(groups)):
-        axes = made.add_subplot(grid[row, :2], sharex=first)
-        values = np.column_stack([np.asarray(outputs[o.name], float)[::every] for o in some])
-        _against_time(axes, t, values, some, rate=False, kind="outputs")
+            _curves(axes, t, curves)
+    for row, group in enumerate(below, len(groups)):
+        _curves(made.add_subplot(grid[row, :2], sharex=first), t, group)
     axes = made.add_subplot(grid[-1, :2], sharex=first)
     unit = "J" if any(c.unit for c in system.coordinates) else ""
     _energy(axes, t, energy, jacobi, unit, words)
@@ -124,42 +139,15 @@ def _figure(
 # --- against time ---------------------------------------------------------------------------------
 
 
-def _groups(system: System) -> list[list[int]]:
-    """Which coordinates share axes: none up to ROWS, beyond that those of one unit."""
-    n = len(system.coordinates)
-    if n <= ROWS:
-        return [[i] for i in range(n)]
-    units = [c.unit for c in system.coordinates]
-    groups = []
-    for unit in dict.fromkeys(units):
-        mine = [i for i in range(n) if units[i] == unit]
-        size = max(len(COLOURS), -(-n // ROWS))
-        parts = -(-len(mine) // size)
-        groups += [list(map(int, part)) for part in np.array_split(mine, parts)]
-    return groups
+def _rate(c: Coordinate, values: Array) -> Curve:
+    return Curve(c.name, values, rate_unit(c.unit, True), "velocities", mathtext(c.name, True))
 
 
-def _by_unit(system: System, outputs: Outputs) -> list[list[Output]]:
-    """Which outputs share axes: none up to ROWS, beyond that those of one unit."""
-    mine = [o for o in system.outputs if o.name in outputs]
-    if len(mine) <= ROWS:
-        return [[o] for o in mine]
-    return [[o for o in mine if o.unit == unit] for unit in dict.fromkeys(o.unit for o in mine)]
-
-
-def _against_time(
-    axes: Axes, t: Array, values: Array, coordinates: Sequence[Coordinate | Output], rate: bool,
-    kind: str = "coordinates",
-) -> None:  # fmt: skip
-    for c, x, colour in zip(coordinates, values.T, _colours(len(coordinates)), strict=True):
-        axes.plot(t, x, color=colour, label=mathtext(c.name, rate))
+def _curves(axes: Axes, t: Array, curves: Sequence[Curve]) -> None:
+    axes.set_prop_cycle(color=_colours(len(curves)))
+    lines = against(axes, t, curves)
     plain(axes)
-    first = coordinates[0]
-    if len(coordinates) == 1:
-        axes.set_ylabel(label(first, rate))
-    else:
-        axes.set_ylabel(with_unit("velocities" if rate else kind, rate_unit(first.unit, rate)))
-        lines = axes.get_lines()
+    if len(lines) > 1:
         some = lines if len(lines) <= 8 else [lines[0], lines[len(lines) // 2], lines[-1]]
         axes.legend(handles=some, fontsize=8, frameon=False, ncols=1, loc="center left",
                     bbox_to_anchor=(1.0, 0.5), handlelength=1.0, borderaxespad=0.2)  # fmt: skip

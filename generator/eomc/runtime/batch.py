@@ -25,6 +25,7 @@ from .arguments import (
     machine_memory,
     unmasked,
 )
+from .batch_plot import Fans
 from .batch_work import WORTH, Work
 from .columns import Columns, File
 from .model import LARGE, RARELY, SOME, Model
@@ -36,7 +37,7 @@ _KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as th
 
 
 @dataclass(eq=False, repr=False)
-class BatchRun(Columns):
+class BatchRun(Fans, Columns):
     """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
 
     status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the

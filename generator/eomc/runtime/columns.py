@@ -110,7 +110,7 @@ class Columns:
 
     def to_pandas(self) -> Any:
         """A pandas.DataFrame of the columns over t; of a batch over instance and t."""
-        pandas = _imported("pandas", "to_pandas")
+        pandas = imported("pandas", "to_pandas")
         columns = self.to_dict()
         t = columns.pop("t")
         if self._axes == ("t",):
@@ -121,7 +121,7 @@ class Columns:
 
     def to_xarray(self) -> Any:
         """An xarray.Dataset of the columns over t, of a batch over instance and t; with units."""
-        xarray = _imported("xarray", "to_xarray")
+        xarray = imported("xarray", "to_xarray")
         model, columns = self._model, self.to_dict()
         units = dict(model.units)
         units |= {f"{c}_dot": f"{units[c]}/s" for c in model.coordinates if units.get(c)}
@@ -135,14 +135,15 @@ class Columns:
         return xarray.Dataset(variables, coords={"t": t}, attrs=attributes)
 
 
-def _imported(package: str, function: str) -> Any:
+def imported(package: str, function: str) -> Any:
     """A package that a module does not need otherwise."""
     try:
         return import_module(package)
     except ModuleNotFoundError as fault:
-        if fault.name != package:
+        name = package.split(".")[0]
+        if fault.name != name:
             raise
         raise ModuleNotFoundError(
-            f"{function}: {package} is not installed: pip install {package}, or take to_dict()",
-            name=package,
+            f"{function}: {name} is not installed: pip install {name}, or take to_dict()",
+            name=name,
         ) from None

@@ -43,9 +43,13 @@ def _upright(word: str) -> str:
 def mathtext(name: str, rate: bool = False) -> str:
     r"""A name as figures print it.
 
-    >>> mathtext("theta_1", rate=True)
-    '$\\dot{\\theta}_{1}$'
+    The rate of a word is d/dt of it: matplotlib sets a dot on one of its letters.
+
+    >>> mathtext("theta_1", rate=True), mathtext("arm", rate=True)
+    ('$\\dot{\\theta}_{1}$', '$\\mathrm{d}\\,\\mathrm{arm}/\\mathrm{d}t$')
     """
+    if rate and tex(name).startswith(r"\mathrm"):
+        return rf"$\mathrm{{d}}\,{tex(name)}/\mathrm{{d}}t$"
     return f"${tex(name, int(rate))}$"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,7 +17,10 @@ from .balance import Balance, balance
 from .columns import Columns, File
 from .dense import states
 from .estimate import Estimate, estimate
+from .notebook import html
 from .package import reduced
+from .plot import plot
+from .section import crossings
 from .shown import by_eomc
 
 if TYPE_CHECKING:
@@ -194,6 +197,39 @@ class Run(Columns):
             for k, q, qd in self._model._by_time(name, self.t, self.q, self.qd)
         ]
         return np.concatenate(values)
+
+    def plot(
+        self, *names: str, phase: Any = None, section: Mapping[str, Array] | None = None,
+        other: Run | Sequence[Run] = (), labels: Sequence[str] | None = None,
+        wrap: bool | str | Sequence[str] = False, ax: Any = None, axes: Any = None, **style: Any,
+    ) -> Any:  # fmt: skip
+        """Curves over time by name; coordinates, inputs, outputs and energy where none is given.
+
+        Names of one kind, unit and size share a panel. phase: a coordinate, drawn over its rate, a
+        pair of names, or a list of such; section: what `section` returns, drawn there as points.
+        other: runs beside this one, dashed; labels: names of the runs, in a legend. wrap: angles
+        from -pi to pi, those in rad or the named ones, without lines where they jump. ax: one Axes
+        for all, axes: one a panel. style: for matplotlib's `plot`. Returns the Axes, an array of
+        several. Raises ModuleNotFoundError without matplotlib, KeyError for unknown names.
+        """
+        return plot(self, names, phase, section, other, labels, wrap, ax, axes, style)
+
+    def section(
+        self, name: str, value: float = 0.0, *, rising: bool | None = None,
+        period: float | None = None,
+    ) -> dict[str, Array]:  # fmt: skip
+        """All columns (m,) where one of them crosses a value: a Poincaré section.
+
+        rising: only where it grows, or only where it falls. period: whole periods above and below
+        the value count too, as 2 pi of an angle, or of t that of a drive. Each column is a cubic
+        through four rows: errors go as the fourth power of the time between rows, and crossings
+        closer than rows are missed, so keep every=1. Raises ValueError below four rows.
+        """
+        return crossings(self.to_dict(), name, value, rising, period)
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the end, the verdict, a small picture where matplotlib is there."""
+        return html(self)
 
     def animate(
         self, file: File | None = None, *others: Run, scene: Any = None, title: str | None = None

@@ -1,0 +1,102 @@
+"""Many runs at once in one picture: fans of quantiles, lines, ends over parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from .arguments import Array, not_one_of
+from .labels import mathtext, with_unit
+from .plot import Curve, Source, against, given_axes, new_axes
+
+
+class Fans:
+    """What draws a batch."""
+
+    def plot(
+        self, *names: str, quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),
+        lines: int | None = None, over: Any = None, wrap: bool | str | Sequence[str] = False,
+        ax: Any = None, axes: Any = None, **style: Any,
+    ) -> Any:  # fmt: skip
+        """A panel for each name, the coordinates where none is given: fans over time.
+
+        quantiles: bands of the instances that have got so far; an odd one is a line. lines: so many
+        instances as lines instead. over: "instance", a parameter or numbers (batch,), over which
+        the last value of each is drawn instead. Else as `Run.plot`.
+        """
+        return fan(self, names, quantiles, lines, over, wrap, ax, axes, style)
+
+
+def fan(
+    run: Any, names: Sequence[str], quantiles: Iterable[float], lines: int | None, over: Any,
+    wrap: bool | Collection[str], ax: Any, axes: Any, style: Mapping[str, Any],
+) -> Any:  # fmt: skip
+    """See `Fans.plot`."""
+    source = Source(run, wrap)
+    curves = [source.curve(name) for name in ([*names] or source.coordinates)]
+    if ax is None and axes is None:
+        made = new_axes(len(curves))
+    else:
+        made = given_axes(ax, axes, len(curves))
+    for place, curve in zip(made, curves, strict=True):
+        if over is not None:
+            _ends(place, curve, *_over(run, over), style)
+        elif lines is not None:
+            for k in np.unique(np.linspace(0, len(run) - 1, min(lines, len(run))).astype(int)):
+                each = replace(curve, values=curve.values[k])
+                against(place, source.t, [each], **{"linewidth": 0.6, "color": "C0", **style})
+        else:
+            _bands(place, source.t, curve, sorted(quantiles), style)
+        if over is None:
+            place.set_ylabel(with_unit(curve.text, curve.unit))
+    if over is None:
+        made[-1].set_xlabel(with_unit(mathtext("t"), "s"))
+    return made[0] if len(made) == 1 else np.array(made)
+
+
+def _bands(axes: Any, t: Array, curve: Curve, quantiles: Sequence[float], style: Any) -> None:
+    """Between quantiles that lie as far from the middle, and the median."""
+    alive = ~np.isnan(curve.values).all(axis=0)  # rows that some instance has
+    t, values = t[alive], curve.values[:, alive]
+    found = np.nanquantile(values, quantiles, axis=0)
+    colour = style.get("color", "C0")
+    pairs = len(quantiles) // 2
+    for k in range(pairs):
+        low, high = quantiles[k], quantiles[-1 - k]
+        axes.fill_between(
+            t, found[k], found[-1 - k], color=colour, alpha=0.15 + 0.35 * (k + 1) / (pairs + 1),
+            linewidth=0, label=f"{100 * low:g} to {100 * high:g} %",
+        )  # fmt: skip
+    if len(quantiles) % 2:
+        axes.plot(t, found[pairs], **{"color": colour, "label": "median", **style})
+    axes.legend()
+
+
+def _over(run: Any, over: Any) -> tuple[str, Array]:
+    """What instances differ by: their number, a parameter, or numbers (batch,)."""
+    if isinstance(over, str) and over == "instance":
+        return "instance", np.arange(len(run), dtype=float)
+    if isinstance(over, str):
+        names = run._model.parameters
+        if over not in names:
+            raise ValueError(not_one_of("over", over, ("instance", *names)))
+        unit = run._model.units.get(over, "")
+        values = np.broadcast_to(run._params[:, names.index(over)], (len(run),))
+        return with_unit(mathtext(over), unit), values
+    values = np.asarray(over, float)
+    if values.shape != (len(run),):
+        raise ValueError(f"over: shape {values.shape}, expected ({len(run)},)")
+    return "", values
+
+
+def _ends(axes: Any, curve: Curve, label: str, x: Array, style: Any) -> None:
+    """The last row that each instance has."""
+    good = np.isfinite(curve.values)
+    last = curve.values.shape[1] - 1 - np.argmax(good[:, ::-1], axis=1)
+    y = np.where(good.any(axis=1), curve.values[np.arange(len(last)), last], np.nan)
+    axes.plot(x, y, **{"linestyle": "none", "marker": ".", **style})
+    axes.set_xlabel(label)
+    axes.set_ylabel(with_unit(f"{curve.text} at the end", curve.unit))

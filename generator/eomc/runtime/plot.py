@@ -1,0 +1,252 @@
+"""Curves of runs, phase portraits and sections, drawn with matplotlib; copied beside a module.
+
+Names, units and values alone are drawn here, in the style that matplotlib is set to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .arguments import Array
+from .columns import imported
+from .labels import mathtext, plain, rate_unit, with_unit
+
+TOGETHER = 6  # curves of one panel, about; of more coordinates than this a few panels are made
+ALIKE = 30.0  # how much larger the largest curve of a panel may be than its smallest
+PANELS = 4  # of one kind, beyond which sizes no longer count
+DRAWN = 20_000  # rows of a curve, at most
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A named quantity over the rows of a run; kind: "coordinates", "velocities", "outputs", ..."""
+
+    name: str
+    values: Array
+    unit: str = ""
+    kind: str = ""
+    symbol: str = ""
+
+    @property
+    def text(self) -> str:
+        """Its name as mathematics."""
+        return self.symbol or mathtext(self.name)
+
+
+def grouped(curves: Sequence[Curve]) -> list[list[Curve]]:
+    """Curves by panels: those of one kind, unit and size together, few enough to be told apart."""
+    made: list[list[Curve]] = []
+    for kind in dict.fromkeys((c.kind, c.unit) for c in curves):
+        mine = [c for c in curves if (c.kind, c.unit) == kind]
+        parts = _by_size(mine)
+        for part in parts if len(parts) <= PANELS else [mine]:
+            count = -(-len(part) // max(TOGETHER, -(-len(curves) // PANELS)))
+            size = -(-len(part) // count)
+            made += [part[k : k + size] for k in range(0, len(part), size)]
+    return made
+
+
+def _by_size(curves: Sequence[Curve]) -> list[list[Curve]]:
+    """In their order; a curve goes to the first panel that it neither dwarfs nor vanishes in."""
+    panels: list[tuple[list[Curve], list[float]]] = []
+    for curve in curves:
+        finite = curve.values[np.isfinite(curve.values)]
+        size = float(np.max(np.abs(finite), initial=0.0))
+        for members, sizes in panels:
+            some = [x for x in (*sizes, size) if x > 0]
+            if not some or max(some) <= ALIKE * min(some):
+                members.append(curve)
+                sizes.append(size)
+                break
+        else:
+            panels.append(([curve], [size]))
+    return [members for members, _ in panels]
+
+
+def wrapped(values: Array) -> Array:
+    """Angles in [-pi, pi)."""
+    return np.asarray((values + np.pi) % (2 * np.pi) - np.pi)
+
+
+def broken(x: Array, y: Array, *angles: Array) -> tuple[Array, Array]:
+    """Rows of a curve with nan where an angle jumps by a turn, so that no line is drawn there."""
+    jumps = np.flatnonzero(sum(np.abs(np.diff(a)) > np.pi for a in angles)) + 1
+    return np.insert(x, jumps, np.nan), np.insert(y, jumps, np.nan)
+
+
+def against(
+    axes: Any, x: Array, curves: Sequence[Curve], suffix: str = "", **style: Any
+) -> list[Any]:
+    """Curves over x with their labels; its axis says what they are, in which unit."""
+    every = max(len(x) // DRAWN, 1)
+    lines = []
+    for curve in curves:
+        at, values = x[::every], np.asarray(curve.values, float)[::every]
+        if curve.kind == "angles":
+            at, values = broken(at, values, values)
+        lines += axes.plot(at, values, label=curve.text + suffix, **style)
+    first = curves[0]
+    axes.set_ylabel(with_unit(first.text if len(curves) == 1 else first.kind, first.unit))
+    return lines
+
+
+class Source:
+    """The curves of a run by name, with what they are."""
+
+    def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
+        model = run._model
+        self.run, self.t = run, np.asarray(run.t, float)
+        self.coordinates = tuple(model.coordinates)
+        self._units = dict(model.units)
+        self._energy = "J" if any(self._units.get(c) for c in model.coordinates) else ""
+        self._inputs, self._outputs = tuple(model.inputs), tuple(model.outputs)
+        if wrap is True:
+            wrap = [c for c in model.coordinates if self._units.get(c) == "rad"]
+        self._wrap = {wrap} if isinstance(wrap, str) else set(wrap or ())
+        for name in self._wrap:
+            run[name]  # KeyError, with the names there are
+
+    def default(self) -> list[str]:
+        """What is drawn where no name is given."""
+        return [*self.coordinates, *self._inputs, *self._outputs, "energy"]
+
+    def curve(self, name: str) -> Curve:
+        """A column by its name. Raises KeyError with the names there are."""
+        values = np.asarray(self.run[name], float)
+        rate = name.removesuffix("_dot")
+        if name != rate and rate in self.coordinates:
+            unit = rate_unit(self._units.get(rate, ""), True)
+            return Curve(name, values, unit, "velocities", mathtext(rate, True))
+        if name in self._wrap:
+            return Curve(name, wrapped(values), self._units.get(name, ""), "angles")
+        kinds = {"coordinates": self.coordinates, "inputs": self._inputs, "outputs": self._outputs}
+        for kind, names in kinds.items():
+            if name in names:
+                return Curve(name, values, self._units.get(name, ""), kind)
+        if name == "t":
+            return Curve(name, values, "s", "time")
+        symbol = {"energy": "energy", "jacobi": "Jacobi's integral"}.get(name, "")
+        return Curve(name, values, self._energy, "energy", symbol)
+
+
+def plot(
+    run: Any, names: Sequence[str], phase: Any, section: Mapping[str, Array] | None, other: Any,
+    labels: Sequence[str] | None, wrap: bool | Collection[str], ax: Any, axes: Any,
+    style: Mapping[str, Any],
+) -> Any:  # fmt: skip
+    """See `Run.plot`."""
+    others = [other] if hasattr(other, "_model") else [*(other or ())]
+    sources = [Source(each, wrap) for each in (run, *others)]
+    suffixes = _suffixes(len(sources), labels)
+    pairs = _pairs(phase, sources[0])
+    asked = [*names] or ([] if pairs else sources[0].default())
+    panels = grouped([sources[0].curve(name) for name in asked])
+    if ax is not None and panels:
+        panels = [[c for panel in panels for c in panel]]
+    count = len(panels) + len(pairs)
+    if ax is None and axes is None:
+        made = new_axes(len(panels), len(pairs))
+    else:
+        made = given_axes(ax, axes, count)
+    for place, panel in zip(made, panels, strict=False):
+        _panel(place, sources, [c.name for c in panel], suffixes, style)
+    for place, (x, y) in zip(made[len(panels) :], pairs, strict=True):
+        _portrait(place, sources, x, y, suffixes, section, style)
+    return made[0] if count == 1 else np.array(made)
+
+
+def _suffixes(count: int, labels: Sequence[str] | None) -> list[str]:
+    if labels is None:
+        return ["", *(f" ({k})" for k in range(2, count + 1))]
+    if isinstance(labels, str) or len(labels) != count:
+        raise ValueError(f"labels: give {count}, one a run")
+    return [f", {plain(str(label))}" for label in labels]
+
+
+def _pairs(phase: Any, source: Source) -> list[tuple[str, str]]:
+    """(x, y) of each portrait: of a coordinate over its rate, or of two names."""
+    if phase is None:
+        return []
+    if isinstance(phase, tuple) and len(phase) == 2 and all(isinstance(x, str) for x in phase):
+        return [phase]
+    if not isinstance(phase, str):
+        return [pair for each in phase for pair in _pairs(each, source)]
+    if phase not in source.coordinates:
+        known = ", ".join(source.coordinates)
+        raise ValueError(f"phase: '{phase}' is no coordinate ({known}): give a pair of names")
+    return [(phase, f"{phase}_dot")]
+
+
+def new_axes(panels: int, portraits: int = 0) -> list[Any]:
+    """New axes: panels below each other over one time, portraits beside them."""
+    pyplot = imported("matplotlib.pyplot", "plot")
+    width, height = 10.5 if panels and portraits else 6.4, max(4.8, 1.7 * panels, 3.2 * portraits)
+    figure = pyplot.figure(figsize=(width, height), layout="constrained")
+    columns = figure.subfigures(1, 2, squeeze=False)[0] if panels and portraits else [figure]
+    made: list[Any] = []
+    if panels:
+        made += columns[0].subplots(panels, 1, sharex=True, squeeze=False)[:, 0].tolist()
+    if portraits:
+        made += columns[-1].subplots(portraits, 1, squeeze=False)[:, 0].tolist()
+    return made
+
+
+def given_axes(ax: Any, axes: Any, count: int) -> list[Any]:
+    """Those that were given, one a panel; ValueError for another number."""
+    if ax is not None and axes is not None:
+        raise ValueError("ax, axes: give one of them")
+    made = [ax] if ax is not None else [*np.ravel(axes)]
+    if len(made) != count:
+        name = "ax" if ax is not None else "axes"
+        raise ValueError(f"{name}: {len(made)} for {count} panels: give axes=, one a panel")
+    return made
+
+
+def _panel(
+    axes: Any, sources: Sequence[Source], names: Sequence[str], suffixes: Sequence[str],
+    style: Mapping[str, Any],
+) -> None:  # fmt: skip
+    colours: list[Any] = []
+    for k, (source, suffix) in enumerate(zip(sources, suffixes, strict=True)):
+        curves = [source.curve(name) for name in names]
+        for i, curve in enumerate(curves):
+            own = {"color": colours[i], "linestyle": ("--", ":", "-.")[(k - 1) % 3]} if k else {}
+            lines = against(axes, source.t, [curve], suffix, **own, **style)
+            colours += [line.get_color() for line in lines] if not k else []
+    units = dict.fromkeys(c.unit for c in curves)
+    kinds = dict.fromkeys(c.kind for c in curves)
+    if len(curves) > 1:
+        words, unit = (next(iter(x)) if len(x) == 1 else "" for x in (kinds, units))
+        axes.set_ylabel(with_unit(words, unit) if words else plain(unit))
+    if len(axes.get_lines()) > 1:
+        axes.legend()
+    if axes.get_subplotspec() is None or axes.get_subplotspec().is_last_row():
+        axes.set_xlabel(with_unit(mathtext("t"), "s"))
+
+
+def _portrait(
+    axes: Any, sources: Sequence[Source], x: str, y: str, suffixes: Sequence[str],
+    section: Mapping[str, Array] | None, style: Mapping[str, Any],
+) -> None:  # fmt: skip
+    """y over x; of a section, its points alone."""
+    for source, suffix in zip(sources, suffixes, strict=True):
+        first, second = source.curve(x), source.curve(y)
+        if section is not None:
+            at = [replace(c, values=np.asarray(section[c.name], float)) for c in (first, second)]
+            values = [wrapped(c.values) if c.kind == "angles" else c.values for c in at]
+            axes.plot(*values, **{"linestyle": "none", "marker": ".", **style})
+            break
+        every = max(len(source.t) // DRAWN, 1)
+        a, b = first.values[::every], second.values[::every]
+        angles = [x for curve, x in ((first, a), (second, b)) if curve.kind == "angles"]
+        if angles:
+            a, b = broken(a, b, *angles)
+        axes.plot(a, b, label=(suffix.lstrip(", ") or "run"), **style)
+    axes.set_xlabel(with_unit(first.text, first.unit))
+    axes.set_ylabel(with_unit(second.text, second.unit))
+    if len(sources) > 1 and section is None:
+        axes.legend()

@@ -1,0 +1,249 @@
+"""Curves of runs: which panels there are, what is in them, whose axes they are drawn in."""
+
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+from eomc.runtime.labels import mathtext, rate_unit
+from eomc.runtime.notebook import html
+from eomc.runtime.plot import Curve, broken, grouped, wrapped
+
+matplotlib = pytest.importorskip("matplotlib")
+matplotlib.use("Agg")
+from matplotlib import pyplot  # noqa: E402 - where it is there
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    pyplot.close("all")
+
+
+@pytest.fixture(scope="module")
+def run(driven: ModuleType):
+    return driven.simulate(duration=2.0, u={"force": 0.5})
+
+
+def labels(axes) -> list[str]:
+    return [a.get_ylabel() for a in np.ravel(axes)]
+
+
+def test_without_names_coordinates_inputs_and_energy_have_panels(run) -> None:
+    axes = run.plot()
+    wanted = ["$x$ (m)", r"$\theta$ (rad)", r"$\mathrm{force}$ (N)", "energy (J)"]
+    assert labels(axes) == wanted and axes[-1].get_xlabel() == "$t$ (s)"
+    assert [a.get_xlabel() for a in axes[:-1]] == [""] * 3
+    for a, name in zip(axes, ("x", "theta", "force", "energy"), strict=True):
+        (line,) = a.get_lines()
+        assert np.array_equal(line.get_xdata(), run.t)
+        assert np.array_equal(line.get_ydata(), run[name])
+
+
+def test_outputs_and_rates_by_name(everything: ModuleType) -> None:
+    run = everything.simulate(duration=0.2)
+    axes = run.plot("tip", "theta_dot", "pull")
+    assert labels(axes) == [r"$\mathrm{tip}$ (m)", r"$\dot{\theta}$ (rad/s)", r"$\mathrm{pull}$"]
+    assert np.array_equal(axes[0].get_lines()[0].get_ydata(), run.outputs["tip"])
+    with pytest.raises(KeyError, match="did you mean 'tip'"):
+        run.plot("tipp")
+
+
+def test_phase_portraits_stand_beside_the_curves(run) -> None:
+    axes = run.plot("theta", phase=["theta", ("x", "theta")])
+    assert len(axes) == 3
+    assert np.array_equal(axes[1].get_lines()[0].get_xydata().T, [run.theta, run.theta_dot])
+    assert (axes[2].get_xlabel(), axes[2].get_ylabel()) == ("$x$ (m)", r"$\theta$ (rad)")
+    alone = run.plot(phase="theta")
+    assert np.array_equal(alone.get_lines()[0].get_ydata(), run.theta_dot)
+    with pytest.raises(ValueError, match="'force' is no coordinate"):
+        run.plot(phase="force")
+
+
+def test_axes_can_be_given_and_are_returned(run) -> None:
+    _, mine = pyplot.subplots(2)
+    assert all(a is b for a, b in zip(run.plot("x", "theta", axes=mine), mine, strict=True))
+    assert run.plot("x", "theta", ax=mine[0], color="red", linewidth=3) is mine[0]
+    assert [a.get_color() for a in mine[0].get_lines()[1:]] == ["red", "red"]
+    before = len(pyplot.get_fignums())
+    with pytest.raises(ValueError, match="axes: 2 for 4 panels"):
+        run.plot(axes=mine)
+    with pytest.raises(ValueError, match="give one of them"):
+        run.plot("x", ax=mine[0], axes=mine)
+    assert len(pyplot.get_fignums()) == before
+
+
+def test_the_style_is_the_users(run) -> None:
+    with pyplot.rc_context({"lines.linewidth": 4.5, "axes.prop_cycle": pyplot.cycler(color=["k"])}):
+        (line,) = run.plot("x").get_lines()
+    assert line.get_linewidth() == 4.5 and line.get_color() == "k"
+
+
+def test_runs_are_compared_in_colours_of_their_names(driven: ModuleType, run) -> None:
+    other = driven.simulate(duration=1.0, u=lambda t, q, qd: [-q[0]], control_period=0.05)
+    axes = run.plot("x", "force", other=other, labels=["held", "law_1"])
+    for a, name in zip(axes, ("x", "force"), strict=True):
+        first, second = a.get_lines()
+        assert np.array_equal(second.get_ydata(), other[name])
+        assert first.get_color() == second.get_color() and second.get_linestyle() == "--"
+        said = [text.get_text() for text in a.get_legend().get_texts()]
+        assert said == [f"{mathtext(name)}, held", f"{mathtext(name)}, law_1"]
+    with pytest.raises(ValueError, match="labels: give 2"):
+        run.plot("x", other=[other], labels=["one"])
+
+
+def test_wrapped_angles_have_breaks_and_no_jumps(modules: Modules) -> None:
+    run = modules("simple_pendulum").simulate(qd0=[9.0], duration=5.0)
+    assert run.theta[-1] > 8
+    (line,) = run.plot("theta", wrap=True).get_lines()
+    drawn = line.get_ydata()
+    assert np.nanmax(np.abs(drawn)) <= np.pi
+    assert np.isnan(drawn).sum() == np.sum(np.diff(np.floor((run.theta + np.pi) / (2 * np.pi))))
+    assert np.nanmax(np.abs(np.diff(drawn))) < 0.1
+    portrait = run.plot(phase="theta", wrap="theta").get_lines()[0].get_xdata()
+    assert np.isnan(portrait).sum() == np.isnan(drawn).sum()
+    with pytest.raises(KeyError, match="'thetta'"):
+        run.plot("theta", wrap=["thetta"])
+
+
+def test_sections_are_exact_to_the_fourth_power_of_the_rows(modules: Modules) -> None:
+    """x = cos(t/2) falls through 1/2 at 2 pi/3, and 4 pi later."""
+    spring = modules("mass_spring")
+    params = {"m": 4.0, "k": 1.0}
+    for every in (1, 50, 100, 200):
+        run = spring.simulate([1.0], [0.0], h=0.002, duration=20.0, every=every, params=params)
+        found = run.section("x", 0.5, rising=False)
+        assert np.allclose(found["x"], 0.5, atol=1e-12)
+        speed = np.sqrt(0.75) / 2
+        # of the cubic between its middle nodes, the fourth derivative of x below 0.6/16
+        bound = 0.5625 / 24 * 0.6 / 16 * (every * 0.002) ** 4
+        error = abs(found["t"] - (2 * np.pi / 3 + 4 * np.pi * np.arange(2)))
+        assert (error < bound / speed + 1e-11).all()
+        assert np.allclose(found["x_dot"], -speed, atol=bound + 1e-11)
+    assert len(run.section("x")["t"]) == 3 and len(run.section("x", rising=True)["t"]) == 1
+    assert np.allclose(run.section("t", 1.0, period=4.0)["t"], [1, 5, 9, 13, 17])
+    assert np.allclose(run.section("x", 0.5)["x"], 0.5) and not len(run.section("x", 2.0)["t"])
+    with pytest.raises(ValueError, match="3 rows, where a cubic needs 4"):
+        spring.simulate(steps=2).section("x")
+    points = run.plot(phase="x", section=run.section("t", period=4.0)).get_lines()[0]
+    assert points.get_linestyle() == "None" and len(points.get_xdata()) == 5
+
+
+def test_curves_of_one_kind_unit_and_size_share_a_panel() -> None:
+    sizes = {"a": 1, "b": 2, "c": 1000, "d": 1, "e": 0}
+    curves = [
+        Curve(n, np.array([0, x, np.nan]), "m" * (n != "d"), "coordinates")
+        for n, x in sizes.items()
+    ]
+    assert [[c.name for c in g] for g in grouped(curves)] == [["a", "b", "e"], ["c"], ["d"]]
+    many = [Curve(f"x{k}", np.ones(2), "m", "coordinates") for k in range(30)]
+    assert [len(g) for g in grouped(many)] == [8, 8, 8, 6]
+    spread = [Curve(f"x{k}", np.full(2, 100.0**k), "m") for k in range(6)]
+    assert [len(g) for g in grouped(spread)] == [6]
+
+
+def test_wrapping() -> None:
+    assert np.allclose(
+        wrapped(np.array([0, 3.2, -3.2, 7.0])), [0, 3.2 - 2 * np.pi, 2 * np.pi - 3.2, 7 - 2 * np.pi]
+    )
+    x, y = broken(np.arange(3.0), np.array([3.0, -3.0, -2.9]), np.array([3.0, -3.0, -2.9]))
+    assert np.array_equal(np.isnan(y), [False, True, False, False]) and np.isnan(x[1])
+
+
+def test_rates_of_words_and_of_units() -> None:
+    assert mathtext("arm", True) == r"$\mathrm{d}\,\mathrm{arm}/\mathrm{d}t$"
+    assert [rate_unit(u, True) for u in ("m", "", "N m")] == ["m/s", "", "(N m)/s"]
+
+
+def test_batches_are_fans_lines_or_ends(modules: Modules) -> None:
+    module = modules.of_text(BATCH)
+    masses = np.linspace(1, 2, 21)
+    runs = module.simulate_batch(np.full((21, 1), 1.0), params={"m": masses}, steps=40)
+    axes = runs.plot("x", quantiles=(0.1, 0.5, 0.9))
+    (median,) = axes.get_lines()
+    assert np.allclose(median.get_ydata(), np.median(runs["x"], axis=0))
+    (band,) = axes.collections
+    low, high = np.quantile(runs["x"], (0.1, 0.9), axis=0)
+    edges = band.get_paths()[0].vertices
+    assert np.isclose(edges[:, 1].max(), high.max()) and np.isclose(edges[:, 1].min(), low.min())
+    assert axes.get_ylabel() == "$x$ (m)" and axes.get_xlabel() == "$t$ (s)"
+    assert len(runs.plot("x", lines=5).get_lines()) == 5
+    points = runs.plot("x", over="m").get_lines()[0]
+    assert np.array_equal(points.get_xydata().T, [masses, runs["x"][:, -1]])
+    assert np.array_equal(runs.plot("x", over=3 * masses).get_lines()[0].get_xdata(), 3 * masses)
+    assert runs.plot("x", over="instance").get_xlabel() == "instance"
+    with pytest.raises(ValueError, match="did you mean 'm'"):
+        runs.plot("x", over="M")
+    with pytest.raises(ValueError, match=r"shape \(2,\), expected \(21,\)"):
+        runs.plot("x", over=[1, 2])
+
+
+BATCH = """
+eomc = 1
+name = "many"
+[coordinates]
+x = { unit = "m", start = 1.0 }
+[parameters]
+m = { value = 1.0, unit = "kg" }
+[energy]
+kinetic = "m*x_dot**2/2"
+potential = "x**2/2"
+[run]
+h = 0.05
+duration = 2.0
+batch = true
+"""
+
+
+def test_ends_of_instances_that_stopped_are_their_last_good_rows(modules: Modules) -> None:
+    runs = modules.of_text(BATCH).simulate_batch(np.ones((2, 1)), steps=10)
+    runs.q[1, 4:] = np.nan
+    y = runs.plot("x", over="instance").get_lines()[0].get_ydata()
+    assert np.array_equal(y, [runs.q[0, -1, 0], runs.q[1, 3, 0]])
+
+
+def test_a_notebook_shows_the_end_the_verdict_and_a_picture(driven: ModuleType) -> None:
+    run = driven.simulate(duration=0.5)
+    page = run._repr_html_()
+    assert "status: ok" in page and f"{run.q[-1, 1]:.9g} rad" in page
+    assert page.count('src="data:image/png;base64,') == 1 and "http" not in page
+    run.estimate()
+    assert run.error.verdict in run._repr_html_()
+    assert not pyplot.get_fignums()
+
+
+def test_a_notebook_shows_free_text_escaped(modules: Modules, monkeypatch) -> None:
+    run = modules("mass_spring").simulate(steps=5)
+    model = run._model
+    monkeypatch.setattr(model, "title", "<script>$x$\x1b")
+    monkeypatch.setitem(model.units, "x", '"><b>')
+    page = html(run)
+    assert "&lt;script&gt;$x$\\x1b" in page and "<script>" not in page and "<b>&" not in page[20:]
+    assert "&quot;&gt;&lt;b&gt;" in page
+
+
+def test_without_matplotlib_an_error_names_the_remedy(modules: Modules) -> None:
+    """In a process of its own: matplotlib can't be forgotten."""
+    folder = modules("mass_spring").__path__[0]
+    code = """
+import importlib.abc, sys
+class No(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name.split(".")[0] in ("matplotlib", "eomc"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, No())
+import mass_spring
+run = mass_spring.simulate(steps=5)
+run.section("x")
+try:
+    run.plot()
+except ModuleNotFoundError as fault:
+    print(fault)
+"""
+    at = Path(folder).parent
+    done = subprocess.run([sys.executable, "-c", code], cwd=at, capture_output=True, text=True)
+    assert "plot: matplotlib is not installed: pip install matplotlib" in done.stdout, done.stderr
