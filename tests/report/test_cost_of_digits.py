@@ -6,6 +6,7 @@ import json
 import math
 import re
 import warnings
+from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -58,6 +59,27 @@ def test_errors_of_rk4_are_those_of_theory() -> None:
             # of K + P = 9/2; K and P change by 9/2 each
             assert p.energy == pytest.approx(12 * z**5 / 72 / 2, rel=0.1)
             assert p.evaluations == 4 * p.steps
+
+
+def test_no_number_of_digits_is_left_out() -> None:
+    r = measured()
+    rows = page.digit_rows(r)
+    assert [row[0] for row in rows] == [str(d) for d in range(3, 16)]
+    for row in rows:
+        best = r.best(int(row[0]))
+        assert row[1] == (best.method if best else "out of reach")
+    said = []
+    for words in page.recommendations(r):
+        first, last = re.match(r"for (\d+)(?: to (\d+))? digits up to", words).groups()
+        said += range(int(first), int(last or first) + 1)
+        reached = {r.best(d) for d in range(int(first), int(last or first) + 1)}
+        assert len(reached) == 1 and (None in reached) == ("out of reach" in words)
+    assert said == [*range(3, 16)]
+    rk4 = r.lines[0]
+    coarse = replace(rk4, points=tuple(p for p in rk4.points if p.along > 1e-8))
+    worse = replace(r, lines=(coarse,))
+    assert [row[1] for row in page.digit_rows(worse)][5:] == ["out of reach"] * 8
+    assert page.recommendations(worse)[-1].startswith("for 8 to 15 digits up to t = 4 s: out of")
 
 
 def test_order_stability_and_rounding() -> None:
@@ -155,8 +177,6 @@ def test_the_page_is_one_file_with_its_pictures() -> None:
 
 @pytest.mark.slow
 def test_names_are_escaped_on_the_page() -> None:
-    from dataclasses import replace
-
     pytest.importorskip("matplotlib")
     text = page.page(replace(measured(), title="<script>"))
     assert "<script>" not in text and "&lt;script&gt;" in text

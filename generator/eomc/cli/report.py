@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from eomc import pipeline
 from eomc.cli import files, options
 from eomc.cli.terminal import progress_bar, say, shown
 
@@ -23,19 +24,21 @@ def command(
 ) -> None:
     """Measure what every digit costs: each stepper over a range of h, against 25 digits or more.
 
-    Writes a page with pictures, build/NAME/report.html.
+    Writes a page, build/NAME/report.html: what the scene is, its equations and motion, then speed
+    against error.
 
     \b
     eomc report scenes/cartpole.toml
     eomc report scenes/cartpole.toml --digits 8
     """
-    from eomc.report import cost_of_digits
+    from eomc.report import cost_of_digits, presented
     from eomc.report import page as pages
 
     measured = []
     for scene in scenes:
+        system = pipeline.read(scene)
         with progress_bar(f"measuring {scene.stem}", quiet) as progress:
-            made = cost_of_digits.measure(scene, root, progress=progress)
+            made = cost_of_digits.measure(system, root, progress=progress)
         measured.append(pages.as_dict(made))
         if digits is not None:
             say(f"{made.scene}: {pages.recommendation(made, digits)}")
@@ -43,7 +46,7 @@ def command(
         if not quiet:
             say(pages.table(made))
         page = root / made.scene / "report.html"
-        files.write_text(page, pages.page(made))
+        files.write_text(page, pages.page(made, presented.of(system, made, root)))
         if not quiet:
             say(f"\nwrote {shown(page)}\n")
     if file is not None:

@@ -15,6 +15,7 @@ from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.emit.render import environment
 from eomc.report.cost_of_digits import CONDITION, DIGITS, LOST, Point, Report
+from eomc.report.presented import Presented
 
 EXPLAINED = """\
 Usable h: the largest measured with an error below 1 all along. Stable to: by the eigenvalues of
@@ -22,9 +23,11 @@ the linearised motion; steps up to it let no difference grow, though their error
 more than the motion. Rounding from: the h below which finer steps don't help."""
 
 
-def recommendation(report: Report, digits: float) -> str:
-    """For 6 digits up to t = 10 s: dp8 with h = 40 ms, 0.1 ms of computing."""
-    found, what = report.best(digits), f"for {digits:g} digits up to t = {report.duration:g} s"
+def recommendation(report: Report, digits: float, to: float | None = None) -> str:
+    """For 6 digits up to t = 10 s: dp8 with h = 40 ms, 0.1 ms of computing. to: so many as well."""
+    found = report.best(digits)
+    span = f"{digits:g}" if to is None or to == digits else f"{digits:g} to {to:g}"
+    what = f"for {span} digits up to t = {report.duration:g} s"
     if found is None:
         p = report.finest
         if not p.along < LOST:
@@ -42,14 +45,26 @@ def recommendation(report: Report, digits: float) -> str:
 
 def recommendations(report: Report) -> list[str]:
     """One for each run that is the best for some digits, and one for what is out of reach."""
-    best: dict[Point | None, str] = {}
+    spans: list[tuple[Point | None, list[int]]] = []
     for digits in DIGITS:
         found = report.best(digits)
-        best.pop(found, None)  # the most digits that it is the best for
-        best[found] = recommendation(report, digits)
-        if found is None:
-            break
-    return list(best.values())
+        if not spans or spans[-1][0] is not found:
+            spans.append((found, []))
+        spans[-1][1].append(digits)
+    return [recommendation(report, digits[0], digits[-1]) for _, digits in spans]
+
+
+def digit_rows(report: Report) -> list[tuple[str, ...]]:
+    """Of each number of digits: the texts of stepper, h, steps, evaluations and computing."""
+    made: list[tuple[str, ...]] = []
+    for digits in DIGITS:
+        p = report.best(digits)
+        if p is None:
+            made.append((str(digits), "out of reach", "-", "-", "-", "-"))
+        else:
+            times = (_time(p.h), str(p.steps), str(p.evaluations), _time(p.seconds))
+            made.append((str(digits), p.method, *times))
+    return made
 
 
 def remarks(report: Report) -> list[str]:
@@ -142,8 +157,11 @@ def _for_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def page(report: Report) -> str:
-    """The report as one HTML page with its pictures in it. Raises EomcError without matplotlib."""
+def page(report: Report, about: Presented | None = None) -> str:
+    """The report as one HTML page with its pictures in it; about: what the scene is.
+
+    Raises EomcError without matplotlib.
+    """
     shown = report.best(6) or report.finest
     runs = [
         (
@@ -157,6 +175,8 @@ def page(report: Report) -> str:
     template = environment().get_template("report/report.html.jinja")
     return template.render(
         report=report,
+        about=about,
+        digit_rows=digit_rows(report),
         title=texts.html(report.title),
         rows=rows(report),
         recommendations=recommendations(report),
@@ -177,17 +197,17 @@ def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
     try:
         import matplotlib
         from matplotlib.figure import Figure
+
+        from eomc.report.plot import svg
     except ImportError:
         raise EomcError("the page of a report needs matplotlib: pip install matplotlib") from None
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "eomc", "font.size": 10}):
+    with matplotlib.rc_context({"font.size": 10, "text.usetex": False}):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.add_subplot()
         axes.grid(color="#DDDDDD", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
         draw(axes)
-        text = io.StringIO()
-        figure.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
-    return Markup(text.getvalue()[text.getvalue().index("<svg") :])
+        return svg(figure)
 
 
 def _styles(report: Report) -> dict[str, tuple[str, str]]:

@@ -5,11 +5,13 @@ Needs matplotlib, an optional extra, and no display: figures are made without py
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from eomc.base import texts
@@ -56,6 +58,16 @@ def draw(
             made.savefig(path, dpi=150, metadata=undated)
     except OSError as fault:
         raise EomcError(f"{path}: can't be written ({fault.strerror or fault})") from None
+
+
+def svg(made: Figure) -> Markup:
+    """A figure as text of SVG, for a page; the same for the same figure."""
+    import matplotlib
+
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "eomc"}):
+        made.savefig(text, format="svg", metadata={"Date": None}, transparent=True)
+    return Markup(text.getvalue()[text.getvalue().index("<svg") :])
 
 
 def figure(
@@ -112,7 +124,8 @@ def _figure(
     rows = len(groups) + len(below) + 1
     height = min(2.1 * rows + 0.5, max(9, 1.5 * rows))
     made = Figure(figsize=(12, height), layout="constrained")
-    made.suptitle(texts.figure(title), fontsize=13, color=INK)
+    if title.strip():
+        made.suptitle(texts.figure(title), fontsize=13, color=INK)
     widths = [1, 1, 1.35] if picture else [1, 1]
     grid = made.add_gridspec(rows, len(widths), width_ratios=widths)
 

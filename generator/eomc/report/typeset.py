@@ -35,15 +35,16 @@ class Typesetter:
         dotted |= {c.qd: (c.name, 1) for c in system.coordinates}
         dotted |= {c.qdd: (c.name, 2) for c in system.coordinates}
         self._rank: dict[Symbol, tuple[int, int]] = {t: (3, 0)}
-        for group, symbols in enumerate(
-            ([p.symbol for p in system.parameters], [], [], system.q, system.qd, system.qdd)
-        ):
+        parameters = [p.symbol for p in system.parameters]
+        for group, symbols in enumerate((parameters, [], [], system.q, system.qd, system.qdd)):
             self._rank |= {s: (group, i) for i, s in enumerate(symbols)}
         self._rates = (*system.qdd, *system.qd)
         self._text = _Text({s: Symbol(_dotted(name, n)) for s, (name, n) in dotted.items()})
         self._blocks: dict[Expr, prettyForm] = {}
         self._line = _Line({s: Symbol(_dotted(name, n)) for s, (name, n) in dotted.items()})
-        self._latex = _Latex({s: tex(name, n) for s, (name, n) in dotted.items()})
+        every = (*(c.name for c in system.coordinates), *map(str, (*system.u, *parameters)))
+        words = any(tex(name).startswith(r"\mathrm") for name in every)
+        self._latex = _Latex({s: tex(name, n) for s, (name, n) in dotted.items()}, words)
 
     def terms(self, e: Expr) -> list[Term]:
         """The terms of a sum, ordered, without their signs."""
@@ -242,10 +243,11 @@ class _Line(StrPrinter):  # type: ignore[misc]
 
 
 class _Latex(LatexPrinter):  # type: ignore[misc]
-    """LaTeX with upright words; sin θ without brackets."""
+    """LaTeX with upright words, a thin space between factors where there are any; sin θ bare."""
 
-    def __init__(self, names: dict[Symbol, str]) -> None:
-        super().__init__({"order": "none", "fold_func_brackets": True})
+    def __init__(self, names: dict[Symbol, str], words: bool) -> None:
+        settings = {"order": "none", "fold_func_brackets": True}
+        super().__init__(settings | ({"mul_symbol": r" \, "} if words else {}))
         self._names = names
 
     def _print_Symbol(self, e: Symbol, style: str = "plain") -> str:

@@ -1,0 +1,131 @@
+"""The report as the scene's own page: what it is, its equations, its motion; nothing is fetched."""
+
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import browser
+import pytest
+from conftest import ROOT, needs
+from payloads import PAYLOADS
+
+from eomc import pipeline
+from eomc.base import texts
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.report import cost_of_digits, equations, mathml, page, presented
+from eomc.scene.read import parse
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("latex2mathml")
+
+REPORTS = ROOT / "build" / "tests" / "reports"
+SLIDER = """
+eomc = 1
+name = "slider"
+title = "A <b>slider</b>"
+note = "On a rail, & pushed."
+[coordinates]
+x = { unit = "m", start = 1.0, rate = 0.5, note = "from the <wall>" }
+[parameters]
+m_c = { value = 2.0, unit = "kg" }
+k = { value = 3.0, unit = "N/m" }
+[inputs]
+push = { unit = "N", signal = "sin(t)" }
+[energy]
+kinetic = "m_c*x_dot**2/2"
+potential = "k*x**2/2"
+[forces]
+x = "push"
+[outputs]
+far = { formula = "2*x", unit = "m" }
+[run]
+h = 0.01
+duration = 2.0
+"""
+
+
+def system() -> System:
+    return from_scene(parse(SLIDER, "slider.toml"))
+
+
+@cache
+def made() -> str:
+    needs("gcc")
+    report = cost_of_digits.measure(system(), REPORTS, longest=0.005, methods=("rk4", "dp8"))
+    return page.page(report, presented.of(system(), report, REPORTS))
+
+
+def test_equations_become_mathml() -> None:
+    first, rest = mathml.lines(equations.of(system()))
+    ((more, line),) = first
+    assert not more and line.startswith("<math") and 'displaystyle="true"' in line
+    assert "<mi>k</mi>" in line and "push" in re.sub("<[^>]+>", "", line)
+    symbols = [re.sub("<[^>]+>", "", line)[0] for _, line in rest[:6]]
+    assert symbols == ["K", "P", "L", "D", "C", "g"]
+    swing = equations.of(pipeline.read(ROOT / "scenes" / "furuta_pendulum.toml"))
+    first, _ = mathml.lines(swing)
+    assert [more for more, _ in first] == [False, True, False]
+    assert '<mo lspace="0.17em" rspace="0.17em">sin</mo>' in first[0][1]
+
+
+@pytest.mark.slow
+def test_the_page_says_what_the_scene_is() -> None:
+    text = made()
+    for said in (
+        "On a rail, &amp; pushed.", "from the &lt;wall&gt;", "m<sub>c</sub>", "1, 0.5", "N/m",
+        "A &lt;b&gt;slider&lt;/b&gt;", "Equations of motion", "Motion", "Speed against error",
+    ):  # fmt: skip
+        assert said in text, said
+    assert text.count("<math") == text.count("</math>") >= 9
+    assert text.count("<svg") == 4 and "<script" not in text
+    assert not re.search(r"(src|href)=\"(?!#)", text)
+    assert "prefers-color-scheme: dark" in text
+
+
+@pytest.mark.slow
+def test_a_scene_too_large_to_write_out_says_how_it_is_computed() -> None:
+    needs("gcc")
+    chain = pipeline.read(ROOT / "scenes" / "chain.toml")
+    chain = replace(chain, run=replace(chain.run, duration=0.2))
+    report = cost_of_digits.measure(chain, REPORTS, longest=0.002, methods=("rk4",))
+    about = presented.of(chain, report, REPORTS)
+    assert not about.equations and "link2 on link1: turns about z" in about.text
+    assert "<pre>Chain of links" in page.page(report, about)
+
+
+@pytest.mark.parametrize("given", ["page", "latex", "escape", "attribute"])
+def test_free_text_is_escaped(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = PAYLOADS[given]
+    monkeypatch.setattr(presented, "_motion", lambda *_: ("", ""))
+    whole = system()
+    noted = replace(whole.coordinates[0], unit=text, note=text)
+    about = presented.of(replace(whole, note=text, coordinates=(noted,)), None, Path())  # type: ignore[arg-type]
+    assert about.note == texts.html(texts.flat(text))
+    assert about.coordinates[0][2:] == (texts.html(texts.flat(text)),) * 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(browser.MISSING), reason=browser.MISSING)
+def test_in_a_browser_nothing_is_fetched_and_400_pixels_are_enough(tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    file.write_text(made(), encoding="utf-8")
+    with browser.chromium(tmp_path / "profile") as window:
+        dark = {}
+        for scheme in ("light", "dark"):
+            window.media(prefers_color_scheme=scheme)
+            window.open(file, 500)  # Chromium's least width of a window
+            window.run("document.body.style.width = '400px'; document.body.style.margin = '0'")
+            dark[scheme] = window.run("return getComputedStyle(document.body).backgroundColor")
+            wide = window.run("return document.documentElement.scrollWidth")
+            assert wide <= window.run("return window.innerWidth")
+            inside = "return [...document.body.children].filter(e => e.offsetWidth > 400).length"
+            assert window.run(inside) == 0
+            heights = """return [...document.querySelectorAll('math')]
+                .map(m => m.getBoundingClientRect().height)"""
+            assert min(window.run(heights)) > 10  # they are set
+        assert dark["light"] != dark["dark"]
+        assert window.logged() == []
+        asked = [url for url in window.requested() if not url.startswith(("data:", "chrome"))]
+        assert {*asked} == {file.as_uri()}
