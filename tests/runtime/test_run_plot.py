@@ -1,5 +1,6 @@
 """Curves of runs: which panels there are, what is in them, whose axes they are drawn in."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -211,8 +212,10 @@ def test_a_notebook_shows_the_end_the_verdict_and_a_picture(driven: ModuleType) 
     page = run._repr_html_()
     assert "status: ok" in page and f"{run.q[-1, 1]:.9g} rad" in page
     assert page.count('src="data:image/png;base64,') == 1 and "http" not in page
-    run.estimate()
-    assert run.error.verdict in run._repr_html_()
+    error = run.estimate()
+    assert f"error at the end about {max(error.q[-1].max(), error.qd[-1].max()):.1g}" in html(run)
+    run.error = dataclasses.replace(error, verdict="steps < motion")
+    assert "not resolved: steps &lt; motion" in html(run)
     assert not pyplot.get_fignums()
 
 

@@ -16,7 +16,8 @@ from eomc.report import equations_text
 from eomc.verify import symbolic
 from eomc.verify.shorter import coefficients
 
-DERIVED = 20_000  # operations of D, C and bias as they are derived, up to which they are simplified
+EXPANDED = 30_000  # as symbolic.is_small counts: seconds for K without definitions
+DERIVED = 4_000  # operations of D, C and bias as they are derived, up to which they are simplified
 WRITTEN_OUT = 1_000  # operations of the scalar equations, which then fill a page or two
 LONG = 10**12  # above or below the line of a fraction, which is then shown as a decimal
 TINY = 1e-25  # a factor below it is what rounding left of a zero
@@ -80,9 +81,9 @@ def equations(scene: System | ScenePath) -> Equations:
 
 def of(system: System) -> Equations:
     """The equations of a system, simplified. Raises EomcError where they would fill many pages."""
-    if not symbolic.is_small(system):
+    if not symbolic.is_small(system, EXPANDED):
         raise too_long(system)
-    plain = symbolic.derive(system)
+    plain = symbolic.derive(symbolic.written_out(system))
     if sum(e.count_ops() for name in ("D", "C", "bias") for e in getattr(plain, name)) > DERIVED:
         raise too_long(system)
     found = plain.simplified

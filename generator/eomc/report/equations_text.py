@@ -22,6 +22,8 @@ from eomc.runtime.labels import tex
 if TYPE_CHECKING:
     from eomc.report.equations import Equations, Terms
 
+LENGTH = 3_000  # characters of one environment, about: KaTeX takes no more than a page
+GOES_ON = r"  & \quad "  # how a line begins that goes on with the last
 DECLARED = 60  # definitions, at most, that are shown of a system too large to write out
 
 _MEANING = {
@@ -146,18 +148,30 @@ def _outputs(system: System) -> list[tuple[str, Expr]]:
 
 
 def latex(found: Equations) -> str:
-    """Environments of amsmath, one for the equations of motion and one for what is in them."""
+    """Environments of amsmath: the equations of motion, then what is in them."""
     return "\n".join(r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in bodies(found))
 
 
 def bodies(found: Equations) -> list[str]:
-    """What stands in each environment: the equations of motion; energies, matrices, outputs."""
+    """What stands in each environment: equations of motion, or of the rest, as many as fit."""
+    made: list[str] = []
+    for lines in latex_lines(found):
+        made.append("")
+        for line in lines:
+            if len(made[-1]) > LENGTH and not line.startswith(GOES_ON):
+                made.append("")
+            made[-1] += (" \\\\\n" if made[-1] else "") + line
+    return made
+
+
+def latex_lines(found: Equations) -> tuple[list[str], list[str]]:
+    """The lines of the equations of motion; those of energies, matrices and outputs."""
     system, write = found.system, Typesetter(found.system)
     motion = []
     for left, force in zip(found.left, found.forces, strict=True):
         terms = [write.term(a, b) for a, b in _flat(left)]
         first, *more = write.latex_lines(terms, _terms(write, force))
-        motion += [f"  & {first}", *(rf"  & \quad {line}" for line in more)]
+        motion += [f"  & {first}", *(GOES_ON + line for line in more)]
     lines = []
     for name, value in _values(found).items():
         symbol = _LATEX.get(name, name)
@@ -171,12 +185,12 @@ def bodies(found: Equations) -> list[str]:
             lines += _latex_sum(write, symbol, value)
     for name, formula in _outputs(system):
         lines += _latex_sum(write, tex(name), formula)
-    return [" \\\\\n".join(each) for each in (motion, lines)]
+    return motion, lines
 
 
 def _latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
     first, *more = write.latex_lines(write.terms(value))
-    return [f"  {symbol} &= {first}", *(rf"  & \quad {line}" for line in more)]
+    return [f"  {symbol} &= {first}", *(GOES_ON + line for line in more)]
 
 
 # --- Python ---------------------------------------------------------------------------------------

@@ -16,20 +16,18 @@ _SPACED = r'<mo lspace="0.17em" rspace="0.17em">\1</mo>'
 
 
 def lines(found: Equations) -> tuple[list[tuple[bool, Markup]], list[tuple[bool, Markup]]]:
-    """The lines of both bodies of the LaTeX: whether one goes on with the last, and its MathML.
+    """The lines of the equations of motion, and of the rest: whether each goes on with the last.
 
     Raises EomcError without latex2mathml.
     """
-    first, second = (
-        [_line(x) for x in body.split(" \\\\\n")] for body in equations_text.bodies(found)
-    )
+    first, second = ([_line(x) for x in lines] for lines in equations_text.latex_lines(found))
     return first, second
 
 
 def _line(text: str) -> tuple[bool, Markup]:
-    left, _, right = text.strip().partition("&")
-    more = right.lstrip().startswith(r"\quad")
-    return more, _made((left + right).replace(r"\quad", "", 1).strip())
+    more = text.startswith(equations_text.GOES_ON)
+    left, _, right = text.partition("&")
+    return more, _made((left + right.replace(r"\quad", "", int(more))).strip())
 
 
 @cache

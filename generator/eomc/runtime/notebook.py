@@ -22,8 +22,8 @@ def html(run: Any) -> str:
     words.append(f"status: {run.status}" if run.status == "ok" else run.message)
     if run.error is not None:
         error = max(float(np.max(x[-1])) for x in (run.error.q, run.error.qd))
-        words.append(f"error at the end about {error:.1g}: {run.error.verdict}")
-    rows = []
+        words.append(run.error.warning or f"error at the end about {error:.1g}")
+    rows = ["<tr><td>at the end</td></tr>"]
     for k, name in enumerate(model.coordinates[:SHOWN]):
         unit = plain(model.units.get(name, ""))
         q, qd = f"{run.q[-1, k]:.9g}", f"{run.qd[-1, k]:.9g}"

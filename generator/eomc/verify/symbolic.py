@@ -21,7 +21,7 @@ from sympy import Expr, ImmutableMatrix
 from eomc.base.errors import EomcError
 from eomc.model.system import System, dot, t
 from eomc.verify.oracle import MATRICES, SCALARS, Answer, Values, Vector
-from eomc.verify.shorter import shorter
+from eomc.verify.shorter import by_rates, shorter
 from eomc.verify.taylor import Jets
 
 WRITTEN_OUT = 10_000  # some seconds of SymPy at five links
@@ -88,6 +88,19 @@ def derive(system: System) -> Reference:
     )
 
 
+def written_out(system: System) -> System:
+    """The same system without definitions, its energies in short forms: quick to derive from."""
+    expand = _expander(system)
+    energies = (expand(e) for e in (system.kinetic, system.potential, system.dissipation))
+    kinetic, potential, dissipation = (by_rates(e, system.qd) for e in energies)
+    return replace(
+        system, kinetic=kinetic, potential=potential, dissipation=dissipation, definitions=(),
+        forces=tuple(map(expand, system.forces)),
+        applied=tuple((shorter(expand(y)), expand(force)) for y, force in system.applied),
+        outputs=(),
+    )  # fmt: skip
+
+
 def of(system: System) -> Reference | Jets:
     """The independent answer: written out where that is small, else by Taylor arithmetic.
 
@@ -96,9 +109,9 @@ def of(system: System) -> Reference | Jets:
     return derive(system) if is_small(system) else Jets(system)
 
 
-def is_small(system: System) -> bool:
+def is_small(system: System, most: float = WRITTEN_OUT) -> bool:
     """Whether `derive` takes seconds at most."""
-    return _written_out(system) <= WRITTEN_OUT
+    return _written_out(system) <= most
 
 
 def _written_out(system: System) -> float:
