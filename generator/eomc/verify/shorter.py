@@ -15,6 +15,7 @@ from sympy import Expr, Symbol, cos, sin
 from sympy.polys.polyerrors import PolynomialError
 from sympy.polys.rings import PolyElement, sring
 
+CANDIDATES = 4  # forms, the shortest of some, whose common factors are taken out
 LONG = 400  # terms of a polynomial, beyond which it stays as it is
 _Angles = dict[Expr, list[Expr]]  # by angle: its sine and cosine among the generators
 
@@ -65,14 +66,17 @@ def _coefficient(e: Expr) -> Expr:
         return e
     waves = [g for g in ring.symbols if isinstance(g, (sin, cos))]
     angles: _Angles = {g.args[0]: [sin(g.args[0]), cos(g.args[0])] for g in waves}
-    forms = [e, polynomial.as_expr(), *_reduced(polynomial, angles)]
+    forms = [e, polynomial.as_expr()]
     if angles:
-        forms += [sums := _sums(polynomial, list(angles), False)]
+        reduced = _reduced(polynomial, angles)
+        forms += map(_grouped, reduced)
+        fewest = min((polynomial, *reduced), key=len)
+        sums = _sums(fewest, False)
+        forms += [sums, *_again(sums)]
         if len(angles) > 1:
-            forms += [_sums(polynomial, list(angles), True)]
-        forms += _again(sums)
-    forms += [sympy.factor_terms(form) for form in forms]
-    return min(forms, key=_length)
+            forms += [_sums(fewest, True)]
+    shortest = sorted(forms, key=_length)[:CANDIDATES]
+    return min(shortest + [sympy.factor_terms(form) for form in shortest], key=_length)
 
 
 def _length(e: Expr) -> tuple[int, int, str]:
@@ -99,7 +103,7 @@ def _maximal(parts: list[Expr]) -> list[Expr]:
     return [a for a in parts if not any(b is not a and b.has(a) for b in parts)]
 
 
-def _reduced(polynomial: PolyElement, angles: _Angles) -> list[Expr]:
+def _reduced(polynomial: PolyElement, angles: _Angles) -> list[PolyElement]:
     """By sin^2 + cos^2 = 1: without squares of cosines, and without squares of sines."""
     ring = polynomial.ring
     named = dict(zip(ring.symbols, ring.gens, strict=True))
@@ -111,7 +115,7 @@ def _reduced(polynomial: PolyElement, angles: _Angles) -> list[Expr]:
             this, other = both[which], both[1 - which]
             if this is not None and other is not None:
                 reduced = _without_squares(reduced, this, other)
-        forms.append(_grouped(reduced))
+        forms.append(reduced)
     return forms
 
 
@@ -139,27 +143,29 @@ def _without_squares(polynomial: PolyElement, this: PolyElement, other: PolyElem
     return made
 
 
-def _sums(polynomial: PolyElement, angles: list[Expr], crossed: bool) -> Expr:
+def _sums(polynomial: PolyElement, crossed: bool) -> Expr:
     """Products of sines and cosines as sums: cos a cos b = (cos(a - b) + cos(a + b))/2.
 
     crossed: only where two angles meet; squares of one stay.
     """
     ring = polynomial.ring
-    total: dict[Expr, list[Expr]] = {}
+    places = [k for k, g in enumerate(ring.symbols) if isinstance(g, (sin, cos))]
+    products: dict[tuple[int, ...], list[Expr]] = {}  # what stands at each product of these
     for powers, c in polynomial.terms():
-        rest: list[Expr] = [ring.domain.to_sympy(c)]
-        trig: list[Expr] = []
-        for g, n in zip(ring.symbols, powers, strict=True):
-            if isinstance(g, (sin, cos)):
-                trig += [g] * n
-            elif n:
-                rest.append(g**n)
+        others = (
+            g**n for g, n in zip(ring.symbols, powers, strict=True) if not isinstance(g, (sin, cos))
+        )
+        rest = sympy.Mul(ring.domain.to_sympy(c), *others)
+        products.setdefault(tuple(powers[k] for k in places), []).append(rest)
+    total: dict[Expr, list[Expr]] = {}
+    for powers, rests in products.items():
+        trig = [ring.symbols[k] for k, n in zip(places, powers, strict=True) for _ in range(n)]
         if crossed and len({f.args[0] for f in trig}) < 2:
             waves = {sympy.Mul(*trig): sympy.S.One}
         else:
             waves = _waves(trig)
         for wave, size in waves.items():
-            total.setdefault(wave, []).append(sympy.Mul(size, *rest))
+            total.setdefault(wave, []).extend(size * rest for rest in rests)
     return sympy.Add(
         *(sympy.Mul(wave, sympy.factor_terms(sympy.Add(*cs))) for wave, cs in total.items())
     )
