@@ -8,6 +8,7 @@ import subprocess
 import sys
 import unicodedata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,16 @@ from eomc.verify import symbolic
 
 ALL = sorted(SCENES.glob("*.toml"))
 SMALL = [f for f in ALL if f.stem != "chain"]
+QUICK = ("cartpole_tutorial", "spring_pendulum", "furuta_pendulum", "kapitza_pendulum")
+
+
+def scenes(files: list[Path]) -> list[Any]:
+    """As parameters, most of them slow."""
+    return [
+        pytest.param(f, id=f.stem, marks=() if f.stem in QUICK else pytest.mark.slow) for f in files
+    ]
+
+
 KATEX = Path(__file__).parents[2] / "build" / "katex" / "node_modules"
 
 
@@ -66,7 +77,7 @@ def test_inputs_stand_on_the_right_and_friction_on_the_left() -> None:
     assert unicodedata.normalize("NFC", "m⋅ẍ + c⋅ẋ + k⋅x = F - k₃⋅x") in text
 
 
-@pytest.mark.parametrize("file", SMALL, ids=lambda f: f.stem)
+@pytest.mark.parametrize("file", scenes(SMALL))
 def test_scalar_equations_are_those_of_the_reference(file: Path) -> None:
     system = pipeline.read(file)
     found, reference = of(system), symbolic.derive(system)
@@ -161,7 +172,7 @@ def test_of_four_links_each_entry_stands_by_itself(tmp_path: Path) -> None:
     assert max(map(len, re.sub(r"\\[a-z]+|[{}]", "", latex).splitlines())) <= 150
 
 
-@pytest.mark.parametrize("file", ALL, ids=lambda f: f.stem)
+@pytest.mark.parametrize("file", scenes(ALL))
 def test_text_is_mathematics_of_at_most_100_columns(file: Path) -> None:
     text = written(pipeline.read(file))
     assert not re.search(r"\*\*|;$|\bdouble\b|\bw\d+ =|\w\[", text, re.M), text
