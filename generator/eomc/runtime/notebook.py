@@ -18,19 +18,20 @@ SHOWN = 12  # coordinates in the table, at most
 def html(run: Any) -> str:
     """A run as HTML; free text of the scene is escaped, no request leaves it."""
     model = run._model
-    words = [f"{run.steps} steps of {run.method}, h = {run.h:g} s, to t = {run.t[-1]:g} s"]
+    words = [f"{run.steps} steps of {run.method}, {run.told}"]
+    words += [f"to t = {run.t[-1]:g} s"] if len(run) else []
     words.append(f"status: {run.status}" if run.status == "ok" else run.message)
     if run.error is not None:
         error = max(float(np.max(x[-1])) for x in (run.error.q, run.error.qd))
         words.append(run.error.warning or f"error at the end about {error:.1g}")
-    rows = ["<tr><td>at the end</td></tr>"]
-    for k, name in enumerate(model.coordinates[:SHOWN]):
+    rows = ["<tr><td>at the end</td></tr>"] if len(run) else []
+    for k, name in enumerate(model.coordinates[:SHOWN] if len(run) else ()):
         unit = plain(model.units.get(name, ""))
         q, qd = f"{run.q[-1, k]:.9g}", f"{run.qd[-1, k]:.9g}"
         cells = (name, f"{q} {unit}", f"{name}_dot", f"{qd} {unit and unit + '/s'}")
         rows.append("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in cells) + "</tr>")
-    if more := len(model.coordinates) - SHOWN:
-        rows += [f"<tr><td>and {more} more</td></tr>"] if more > 0 else []
+    if (more := len(model.coordinates) - SHOWN) > 0:
+        rows.append(f"<tr><td>and {more} more</td></tr>")
     title = plain(model.title or model.name).replace(r"\$", "$")
     parts = [f"<b>{escape(title)}</b>", *(escape(plain(w)) for w in words)]
     return f"<div>{'<br>'.join(parts)}<table>{''.join(rows)}</table>{_picture(run)}</div>"
