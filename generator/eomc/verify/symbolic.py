@@ -109,9 +109,9 @@ def of(system: System) -> Reference | Jets:
     return derive(system) if is_small(system) else Jets(system)
 
 
-def is_small(system: System, most: float = WRITTEN_OUT) -> bool:
-    """Whether `derive` takes seconds at most."""
-    return _written_out(system) <= most
+def is_small(system: System, most: float | None = None) -> bool:
+    """Whether `derive` takes seconds at most; or what is to have at most so many operations."""
+    return _written_out(system) <= (WRITTEN_OUT if most is None else most)
 
 
 def _written_out(system: System) -> float:
