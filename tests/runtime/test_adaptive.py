@@ -100,6 +100,18 @@ def test_a_run_tells_the_state_at_any_time(kepler: ModuleType) -> None:
         run(7.0)
 
 
+def test_curves_and_sections_have_states_between_long_steps(kepler: ModuleType) -> None:
+    run = kepler.simulate(duration=3.0)
+    coarse, fine = len(run), run._drawn
+    assert coarse < 100 and len(fine) >= 1000 and len(run) == coarse
+    assert np.isin(run.t, fine.t).all()
+    assert np.allclose(fine["energy"], run.energy[0], rtol=1e-7)
+    at = run.section("x")["t"]
+    assert len(at) and np.abs(run(at)[0][:, 0]).max() < 1e-6
+    held = kepler.simulate(times=np.linspace(0, 3, 2000))
+    assert held._drawn is held
+
+
 @pytest.mark.parametrize("every", [1, 7])
 def test_fixed_steps_tell_it_to_their_order(driven: ModuleType, every: int) -> None:
     times, errors = np.linspace(0.0, 1.0, 23), []

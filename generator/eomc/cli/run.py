@@ -99,12 +99,13 @@ def command(
     if plot:
         from eomc.report import plot as plots
 
-        jacobi = done.jacobi if own.has_jacobi else None
-        system, rows = pipeline.read(scene).at(values), (done.t, done.q, done.qd, done.energy)
+        drawn = done._drawn
+        jacobi = drawn.jacobi if own.has_jacobi else None
+        system, rows = pipeline.read(scene).at(values), (drawn.t, drawn.q, drawn.qd, drawn.energy)
         words = balance.words if balance else ""
-        inputs = dict(zip(module.inputs, done.u.T, strict=True)) if module.inputs else {}
+        inputs = dict(zip(module.inputs, drawn.u.T, strict=True)) if module.inputs else {}
         plots.draw(
-            system, *rows, plot, jacobi=jacobi, outputs=done.outputs, words=words, inputs=inputs
+            system, *rows, plot, jacobi=jacobi, outputs=drawn.outputs, words=words, inputs=inputs
         )
     if animate:
         with status_line(f"drawing {animate.name}", quiet or as_json):

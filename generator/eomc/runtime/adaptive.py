@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from time import perf_counter
@@ -33,6 +34,7 @@ _EVENTS = 1024  # of one call
 _ROOM = 256  # steps of the first call
 _MOST = 2**20  # of one call
 _STIFF = 50  # steps that sweeps have held back, from which a run says so
+_DRAWN = 1_000  # rows of a curve, at least
 _FINER = 100.0  # the tolerance over that of the run by which an error is found
 
 
@@ -139,6 +141,16 @@ class AdaptiveRun(Run):
     def __repr__(self) -> str:
         how = "" if self.status == "ok" else f"{self.status} after "
         return f"<Run of {self._model.name}: {how}{self.steps} steps, tolerance {self.tol:g}>"
+
+    @property
+    def _drawn(self) -> Run:
+        """Itself, with rows between where steps are too long for curves."""
+        if len(self) < 2 or len(self) >= _DRAWN or callable(self._u) or isinstance(self._u, str):
+            return self
+        times = np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _DRAWN))
+        made = copy(self)
+        made._rows, made._times, made._energy = self(times), times, None
+        return made
 
     def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
         self.error = _error(self, progress)

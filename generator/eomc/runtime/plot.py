@@ -98,7 +98,7 @@ class Source:
     """The curves of a run by name, with what they are."""
 
     def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
-        model = run._model
+        model, run = run._model, getattr(run, "_drawn", run)
         self.run, self.t = run, np.asarray(run.t, float)
         self.coordinates = tuple(model.coordinates)
         self._units = dict(model.units)

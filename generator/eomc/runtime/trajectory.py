@@ -225,7 +225,12 @@ class Run(Columns):
         through four rows: errors go as the fourth power of the time between rows, and crossings
         closer than rows are missed, so keep every=1. Raises ValueError below four rows.
         """
-        return crossings(self.to_dict(), name, value, rising, period)
+        return crossings(self._drawn.to_dict(), name, value, rising, period)
+
+    @property
+    def _drawn(self) -> Run:
+        """Itself, with rows near enough for curves."""
+        return self
 
     def _repr_html_(self) -> str:
         """For notebooks: the end, the verdict, a small picture where matplotlib is there."""
