@@ -277,6 +277,23 @@ class Arguments:
         array: Array = out
         return array
 
+    def _movable(self, x: Array, name: str) -> None:
+        """A ValueError where C can't move these states in place."""
+        found = f"a {type(x).__name__}"
+        if isinstance(unmasked(x, name), np.ndarray):
+            right, flags = x.dtype == self.dtype and x.shape[1:] == (self.nq,), x.flags
+            if right and flags.carray:
+                return
+            order = "" if flags.c_contiguous else ", not C-contiguous"
+            order += "" if flags.aligned else ", not aligned"
+            order += "" if flags.writeable else ", read-only"
+            found = f"an array of {x.dtype}, shape {x.shape}{order}"
+        raise ValueError(
+            f"{name}: {found}; moved in place, it has to be a writeable, C-contiguous array of "
+            f"{self.dtype}, shape (n, {self.nq}): make it one with numpy.require(x, "
+            f"'{self.dtype}', 'CAW'), or give out=, a pair of such arrays for the result"
+        )
+
     def _pair(self, out: Any, shape: tuple[int, ...]) -> tuple[Array, Array]:
         """Arrays for positions and velocities: those given, or new ones."""
         if out is None:

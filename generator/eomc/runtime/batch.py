@@ -30,7 +30,7 @@ from .batch_work import WORTH, Work
 from .columns import Columns, File
 from .model import LARGE, RARELY, SOME, Model
 from .package import reduced
-from .trajectory import STATUS, Interrupted, Run
+from .trajectory import STATUS, Interrupted
 
 _NAMES = np.array([*STATUS, "interrupted"])
 _KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as the fields go
@@ -216,16 +216,21 @@ class BatchModel(Model):
     def load_run(self, file: File) -> Any:
         """A run or batch that `save` has written to an .npz file; see `Model.load_run`."""
         kind, kept = saved.read(self, file)
-        return (Run if kind == "Run" else BatchRun)._of_kept(self, kept)
+        if kind == "AdaptiveBatchRun":
+            from . import batch_adaptive
+
+            return batch_adaptive.AdaptiveBatchRun._of_kept(self, kept)
+        return BatchRun._of_kept(self, kept) if kind == "BatchRun" else self._single(kind, kept)
 
     def simulate_batch(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
         params: Any = None, u: ArrayLike | None = None, threads: int | None = None,
         method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Callable[[int, int], None] | None = None, tol: float | None = None,
+        times: ArrayLike | None = None, h_most: float | None = None,
     ) -> BatchRun:  # fmt: skip
-        """Trajectories of many instances by fixed steps; see `simulate` for what is not here.
+        """Trajectories of many instances; see `simulate` for what is not here.
 
         q0, qd0: (batch, nq), or (nq,) for all alike. params: a dict of numbers or (batch,)
         arrays, Params, or an array (batch, np). u: None, the scene's signals; (nu,) or
@@ -233,7 +238,21 @@ class BatchModel(Model):
         dict of all inputs by name, numbers, (batch,), (batch, steps) or (1, steps).
         threads: as many as there are processors where None. An instance that can't go on has its
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
+        tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
+        at the start and the end where None.
         """
+        if tol is not None or times is not None or (
+            self.tolerance and h is None and steps is None and method is None
+        ):  # fmt: skip
+            from . import batch_adaptive  # which needs this file
+
+            fitted, whole = batch_adaptive.simulate(
+                self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most, h=h,
+                steps=steps, method=method, every=every, control_period=control_period,
+            )  # fmt: skip
+            if not whole:
+                raise Interrupted(fitted)
+            return fitted
         step = self._stepper(method, "batch")
         if progress is not None and not callable(progress):
             raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
@@ -335,23 +354,6 @@ class BatchModel(Model):
             1 if table is not None and len(table) > 1 else 0, address(self._whole[1], status),
         )  # fmt: skip
         return status
-
-    def _movable(self, x: Array, name: str) -> None:
-        """A ValueError where C can't move these states in place."""
-        found = f"a {type(x).__name__}"
-        if isinstance(unmasked(x, name), np.ndarray):
-            right, flags = x.dtype == self.dtype and x.shape[1:] == (self.nq,), x.flags
-            if right and flags.carray:
-                return
-            order = "" if flags.c_contiguous else ", not C-contiguous"
-            order += "" if flags.aligned else ", not aligned"
-            order += "" if flags.writeable else ", read-only"
-            found = f"an array of {x.dtype}, shape {x.shape}{order}"
-        raise ValueError(
-            f"{name}: {found}; moved in place, it has to be a writeable, C-contiguous array of "
-            f"{self.dtype}, shape (n, {self.nq}): make it one with numpy.require(x, "
-            f"'{self.dtype}', 'CAW'), or give out=, a pair of such arrays for the result"
-        )
 
     def _instances(
         self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int

@@ -96,10 +96,14 @@ class Model(Frames):
         warns where it is of another version of the scene.
         """
         kind, kept = saved.read(self, file)
-        if kind == "BatchRun":
+        if kind.endswith("BatchRun"):
             raise ValueError(
                 f"{file}: is a run of many at once, which a scene has by [run] batch = true"
             )
+        return self._single(kind, kept)
+
+    def _single(self, kind: str, kept: Mapping[str, Any]) -> Run:
+        """A run of one, by its kind and what was kept of it."""
         kinds: dict[str, type[Run]] = {"Run": Run, "AdaptiveRun": adaptive.AdaptiveRun}
         return kinds[kind]._of_kept(self, kept)
 
