@@ -241,9 +241,7 @@ class BatchModel(Model):
         tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
         at the start and the end where None.
         """
-        if tol is not None or times is not None or (
-            self.tolerance and h is None and steps is None and method is None
-        ):  # fmt: skip
+        if tol is not None or times is not None or self._fits(h, steps, method):
             from . import batch_adaptive  # which needs this file
 
             fitted, whole = batch_adaptive.simulate(

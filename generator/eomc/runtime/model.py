@@ -228,9 +228,7 @@ class Model(Frames):
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
-        if tol is not None or times is not None or (
-            self.tolerance and h is None and steps is None and method is None
-        ):  # fmt: skip
+        if tol is not None or times is not None or self._fits(h, steps, method):
             fitted = adaptive.simulate(
                 self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, h=h,
                 steps=steps, method=method, every=every, control_period=control_period, out=out,
@@ -280,6 +278,10 @@ class Model(Frames):
             q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress, hold
         )
         return self._finished(result, estimate)
+
+    def _fits(self, *fixed: Any) -> bool:
+        """Whether runs are by the scene's tolerance, nothing being asked of fixed steps."""
+        return bool(self.tolerance) and all(x is None for x in fixed)
 
     def _finished(self, run: Run, estimate: bool) -> Run:
         """A run as `simulate` returns it: with warnings to its caller, and its error if asked."""
