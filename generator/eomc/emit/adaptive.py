@@ -35,7 +35,7 @@ class Form:
 
     sweep: of a sweep from *a to b. start: of the accelerations f at q, qd. extent: of vectors of
     coordinates. constants: whether what parameters decide is a struct c; compute_constants: its
-    call, which fails where there are none.
+    call, which fails where there are none. lanes: a macro before loops over stages.
     """
 
     around: tuple[CArgument, ...]
@@ -44,6 +44,7 @@ class Form:
     extent: str
     constants: bool = False
     compute_constants: str = ""
+    lanes: str = ""
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,9 @@ def steps(made: Stepping) -> Adaptive:
         c=numbers(m.c, real),
         b=numbers(rounded(m.b, real), real),
         bA=numbers(m.b_a, real),
-        powers=matrix(m.powers, real),
+        lanes=form.lanes and f"{form.lanes} ",
+        total=_total([f"x[{i}]" for i in range(m.stages)]),
+        powers=matrix(list(zip(*m.powers, strict=True)), real),
         last=numbers(m.legendre(m.stages - 1), real),
         before=numbers(m.legendre(m.stages - 2), real),
         timed=target.driven,
@@ -170,3 +173,12 @@ def run(made: Stepping, happen: str = "", restart: str = "") -> AdaptiveRun:
         row_before=kept.call(q="q_at", qd="qd_at", **to),
         look=made.within.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
     )
+
+
+def _total(terms: list[str]) -> str:
+    """Their sum by halves, which waits for three additions in place of seven, of eight."""
+    half = len(terms) // 2
+    if not half:
+        return terms[0]
+    parts = (_total(terms[:half]), _total(terms[half:]))
+    return " + ".join(f"({part})" if " " in part else part for part in parts)

@@ -210,15 +210,17 @@ def _library_text(lane: Lane, show: Show) -> str:
             L=lane.end,
             mask=lane.mask,
             count=f"{lane.target.PREFIX}_{lane.name.upper()}_COUNT",
-            calls=tuple(_library(lane.accelerations, n) for n in lane.calls),
+            calls=tuple(_library(lane.accelerations, n, lane.end == "_wide") for n in lane.calls),
         )
     )
 
 
-def _library(s: Accelerations, name: str) -> views.Library:
-    """A function of the mathematics library."""
+def _library(s: Accelerations, name: str, wide: bool) -> views.Library:
+    """A function of the mathematics library; wide: over a register."""
     called = C_NAMES.get(name, name)
-    return views.Library(called, called + s.target.real.function_suffix, name in TWO)
+    letter = "d" if s.target.real is DOUBLE else "s"
+    whole = f"__builtin_ia32_sqrtp{letter}512_mask(x, x, -1, 4)" if wide and name == "sqrt" else ""
+    return views.Library(called, called + s.target.real.function_suffix, name in TWO, whole)
 
 
 def _two_points(made: Steppers) -> views.TwoPoints:
@@ -280,4 +282,5 @@ def _adaptive(made: Steppers) -> adaptive.Form:
     return adaptive.Form(
         made.stepping(one), sweep, made.accelerate(one, a="f"), one.extent,
         bool(made.accelerations.constants), runs.constants_call(made),
+        f"{one.target.PREFIX}_LANES",
     )  # fmt: skip

@@ -12,11 +12,15 @@ from eomc.emit.plain.views import Computed, Named, Parameter, Prefixed
 
 @dataclass(frozen=True)
 class Library:
-    """A function of the mathematics library over a lane. two: of two arguments."""
+    """A function of the mathematics library over a lane. two: of two arguments.
+
+    whole: of a lane as wide as AVX-512's registers, in an instruction; else "".
+    """
 
     name: str
     c: str
     two: bool
+    whole: str
 
 
 @dataclass(frozen=True)

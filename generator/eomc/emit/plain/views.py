@@ -281,8 +281,9 @@ class Nodes(Named):
 class Adaptive:
     """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
 
-    method: what its C names begin with. powers, last, before: from accelerations at the stages to
-    their polynomial's powers and its parts in the last two of Legendre's. most: sweeps of a step.
+    method: what its C names begin with. total: the sum of x[0], ... over the stages. powers, last,
+    before: from accelerations at the stages, one a row, to their polynomial's powers, and to its
+    parts in the last two of Legendre's. most: sweeps of a step. lanes: before loops over stages.
     """
 
     TEMPLATE: ClassVar[str] = "c/adaptive.c"
@@ -301,6 +302,8 @@ class Adaptive:
     c: tuple[str, ...]
     b: tuple[str, ...]
     bA: tuple[str, ...]
+    lanes: str
+    total: str
     powers: tuple[str, ...]
     last: tuple[str, ...]
     before: tuple[str, ...]
