@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import isfinite
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 LOOSEST = 1e-2
 STAGES = 8
-_LEAST = {"float64": 1e-15, "float32": 5e-7}
+_LEAST = {8: 1e-15, 4: 5e-7}  # by bytes of a number
 _TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
 _EVENTS = 1024  # of one call
 _ROOM = 256  # steps of the first call
@@ -213,10 +214,11 @@ def simulate(
             "u: adaptive steps take the scene's signals, or one value an input, held over the "
             "run; a function or a table is for fixed steps: give h="
         )
-    start = model.start
-    q, qd = model._one(*(own if x is None else x for x, own in zip((q0, qd0), start, strict=True)))
+    q, qd = model._start
+    if q0 is not None or qd0 is not None:
+        q, qd = model._one(q if q0 is None else q0, qd if qd0 is None else qd0)
     t0, held = as_number(t0, "t0"), model._inputs(u)
-    p = np.array(model._parameters(params))
+    p = model._p0 if params is None else model._parameters(params).copy()
     tol = as_tolerance(model.tolerance if tol is None else tol, model.dtype)
     most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
     if times is None:
@@ -243,63 +245,67 @@ def run(
 ) -> AdaptiveRun:  # fmt: skip
     """A run from checked arguments, whatever its status; times (n,) later than t0."""
     address, real, null = model._c
-    nq, work = model.nq, model._ffi.new("adaptive_work *")
-    x, at = np.concatenate([q, qd]).astype(model.dtype), np.array([t0], model.dtype)
-    at_u = null if u is None else address(real, u)
-    given, done, room = null, 0, _ROOM
-    if times is not None:
-        asked = np.ascontiguousarray(times, model.dtype)
-        rows = np.empty((2, len(asked), nq), model.dtype)
-        given = address(real, asked)
+    nq, dtype, work = model.nq, model.dtype, model._ffi.new("adaptive_work *")
+    x, at, start = np.concatenate([q, qd]), np.array([t0], dtype), np.empty((2, nq), dtype)
+    start[0], start[1] = q, qd
+    at_x, at_t, at_u = address(real, x), address(real, at), model._pointer(u)
+    at_p = model._at[2] if p is model._p0 else address(real, p)
+    each = 2 if model.events else 1  # rows of a step, beside a jump
+    room, filled, spent = _ROOM, 0, 0.0  # steps of a call, rows of both that are, s of a call
     pieces: list[tuple[Array, Array]] = []
+    stamps = (
+        np.empty(1 + each * room, dtype) if times is None else np.ascontiguousarray(times, dtype)
+    )
+    both = np.empty((2, len(stamps), nq), dtype)
+    if times is None:
+        stamps[0], both[:, 0], filled = t0, start, 1
+    to_t, to_q = address(real, stamps), address(real, both)
     found_events = _Found(model)
 
     def kept() -> None:
-        nonlocal done
-        if times is None:
-            pieces.append((stamps[: work.rows].copy(), both[:, : work.rows].copy()))
-        done += work.rows
+        nonlocal filled
+        filled += work.rows
         work.rows = 0
         found_events.keep(work)
 
     said = "ok"
     try:
-        while at[0] < t_end:
+        while at[0] < t_end and said == "ok" and not (model.events and work.stopped):
+            if spent:
+                if progress is not None:
+                    progress(round(1000 * (float(at[0]) - t0) / (t_end - t0)), 1000)
+                room = min(longer(room, spent), _MOST)
+            left = len(stamps) - filled
+            if times is None and left < each:
+                pieces.append((stamps[:filled], both[:, :filled]))
+                left, filled = each * room, 0
+                stamps, both = np.empty(left, dtype), np.empty((2, left, nq), dtype)
+                to_t, to_q = address(real, stamps), address(real, both)
             begun = perf_counter()
-            if times is None:
-                most = 2 * room if model.events else room  # two rows beside a jump
-                stamps, both = np.empty(most, model.dtype), np.empty((2, most, nq), model.dtype)
-                to_t, to_q, to_qd = (address(real, a) for a in (stamps, both[0], both[1]))
-            else:
-                left = rows[:, done:]
-                to_t, to_q, to_qd = null, address(real, left[0]), address(real, left[1])
-                given = address(real, asked[done:])
             found = model._lib.adaptive(
-                address(real, x), address(real, at), t_end, tol, h_most, at_u, room, given,
-                0 if times is None else len(asked) - done, to_t, to_q, to_qd,
-                *found_events.room(), address(real, p), work,
+                at_x, at_t, t_end, tol, h_most, at_u, left // each if times is None else room,
+                null if times is None else to_t + filled, 0 if times is None else left,
+                to_t + filled if times is None else null, to_q + nq * filled,
+                to_q + nq * (len(stamps) + filled), *found_events.room(), at_p, work,
             )  # fmt: skip
+            spent = perf_counter() - begun
             kept()
             said = "accumulated" if found == len(STATUS) else STATUS[found]
-            if said != "ok" or (model.events and work.stopped):
-                break
-            if progress is not None:
-                progress(round(1000 * (float(at[0]) - t0) / (t_end - t0)), 1000)
-            room = min(longer(room, perf_counter() - begun), _MOST)
+        if progress is not None and said == "ok":
+            progress(1000, 1000)
     except KeyboardInterrupt:
         kept()
         said = "interrupted"
-    if times is None:
-        stamps = np.concatenate([[t0], *(t for t, _ in pieces)]).astype(model.dtype)
-        rows = np.concatenate([np.array([[q], [qd]]), *(r for _, r in pieces)], axis=1)
-    else:
-        stamps, rows = asked[:done], rows[:, :done]
+    stamps, both = stamps[:filled], both[:, :filled]
+    if pieces:
+        stamps = np.concatenate([*(t for t, _ in pieces), stamps])
+        both = np.concatenate([*(rows for _, rows in pieces), both], axis=1)
     mean = (float(at[0]) - t0) / work.steps if work.steps else t_end - t0
     held = None if u is None else u.copy()
     return AdaptiveRun(
-        model, t0, rows.astype(model.dtype), mean, work.steps, said, p, 1, held, "gauss16",
+        model, t0, both, mean, work.steps, said, p, 1, held, "gauss16",
         work.evaluations, tol=tol, rejected=work.rejected, held_back=work.held_back,
-        _times=stamps, _h_most=h_most, _begin=np.array([q, qd], model.dtype), _t_end=t_end,
+        _times=stamps, _h_most=h_most, _begin=start, _t_end=t_end,
         _happened=found_events.all(),
         stopped=model.events[work.stopped - 1] if model.events and work.stopped else "",
         limit=work.limit if said == "accumulated" else float("nan"),
@@ -340,7 +346,7 @@ def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Est
     """The error of a run, beside one of a hundredth of its tolerance, and from a moved start."""
     model, x = own._model, own.x.astype(float)
     eps = float(np.finfo(model.dtype).eps) / 2
-    least = float(_LEAST[model.dtype.name])
+    least = _LEAST[model.dtype.itemsize]
     scale = scales(x)
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
@@ -392,7 +398,7 @@ def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Est
 
 def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
     """A tolerance that the numbers have digits for, or a ValueError."""
-    least = _LEAST[dtype.name]
+    least = _LEAST[dtype.itemsize]
     number = as_number(tol, "tol")
     if not least <= number <= LOOSEST:
         raise ValueError(f"tol: {number:g}: give one between {least:.1g} and {LOOSEST:g}")
@@ -405,8 +411,8 @@ def as_times(times: ArrayLike, t0: float, dtype: np.dtype[Any]) -> Array:
         found = np.ascontiguousarray(times, dtype)
     except (TypeError, ValueError):
         raise ValueError(f"times: {times!r} is not an array of numbers") from None
-    if found.ndim != 1 or not len(found) or not np.isfinite(found).all():
+    if found.ndim != 1 or not len(found) or not (isfinite(found[0]) and isfinite(found[-1])):
         raise ValueError("times: expected a row of finite numbers, in s")
-    if found[0] < t0 or (np.diff(found) <= 0).any():
+    if found[0] < t0 or not (found[1:] > found[:-1]).all():
         raise ValueError(f"times: expected ascending times from t0 = {t0:g} s on")
     return found
