@@ -1,6 +1,6 @@
 # make demo    set up, build and check the cart-pole scenes, run one, draw it
 # make test    set up, run the quick tests
-# make bench   against others (an environment of 2.6 GB, a C++ compiler); writes benchmarks/RESULTS.md, DIGITS.md
+# make bench   against others (an environment of 2.6 GB, a C++ compiler); writes benchmarks/*.md
 # make test-all, make test-slow, make lint, make golden, make clean
 
 PYTHON ?= python3
@@ -53,6 +53,7 @@ bench: build/bench/done
 	build/bench/bin/python benchmarks/peers.py
 	build/bench/bin/python benchmarks/bodies.py
 	build/bench/bin/python benchmarks/digits.py
+	build/bench/bin/python benchmarks/adaptive.py
 
 # what the LaTeX of equations is compiled with, where npm is there; else that test is skipped
 build/katex/done:

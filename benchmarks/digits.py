@@ -32,6 +32,7 @@ from peers import CORES, HERE, Case
 from physics import Function, Matrices, Numbers
 from runners import Array
 from scipy.integrate import ode, odeint, solve_ivp
+from searching import fewest, quick
 
 import eomc
 from eomc.integrators import tableaux
@@ -117,33 +118,10 @@ def trusted(case: Case) -> tuple[Error, float]:
 # --- who runs ------------------------------------------------------------------------------------
 
 
-def quick(run: Callable[[], object]) -> float:
-    """Seconds, the least of some; of what is slow, of one."""
-    times: list[float] = []
-    while not times or (len(times) < 15 and sum(times) < 0.02):
-        begun = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - begun)
-    return min(times)
-
-
 def quickest(ways: list[Way]) -> Way:
     """By turns, since the machine may be slow for a while."""
     turns = [[quick(way.run) for way in ways] for _ in range(1 if len(ways) == 1 else 3)]
     return ways[int(np.argmin(np.min(turns, axis=0)))]
-
-
-def fewest(error: Callable[[int], float], wanted: float, worth: Callable[[int], bool]) -> int:
-    """The least number of steps that reaches the error, to 2 %; 0 where it is not worth it."""
-    low, high = 0, 16
-    while not error(high) <= wanted:
-        low, high = high, math.ceil(high * 1.25)
-        if not worth(high):
-            return 0
-    while high - low > max(1, high // 50):
-        middle = (low + high) // 2
-        low, high = (low, middle) if error(middle) <= wanted else (middle, high)
-    return high
 
 
 def ours(module: ModuleType, case: Case, error: Error, wanted: float) -> Way:

@@ -14,13 +14,10 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import platform
-import subprocess
 import tempfile
 import time
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import calls
@@ -34,15 +31,14 @@ import solvers
 import work
 import xla
 from comparing import Peer, Row, compare, quartiles
+from machine import CORES
+from machine import machine as described
 from runners import Array, Run, timed
 from work import CASES, HERE, Case, load, write
 
 import eomc
 from eomc.derive import lagrange
 from eomc.program import program
-from eomc.toolchain import compiler
-
-CORES = os.sched_getaffinity(0)
 
 # ours over theirs at most, and behind it what is hoped for
 BARS = {
@@ -295,18 +291,7 @@ sympy""".split()
 
 def machine() -> str:
     """The machine in words, versions and flags."""
-    info = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    name = next((x.split(":")[1].strip() for x in info.splitlines() if "model name" in x), "")
-    width = "AVX-512" if "avx512f" in info else "AVX2, no AVX-512" if "avx2" in info else "no AVX2"
-    compiled = subprocess.run(
-        [*compiler.find_compiler().command, "--version"], capture_output=True, text=True, check=True
-    ).stdout.splitlines()[0]
-    versions = ", ".join(f"{p} {version(p)}" for p in PACKAGES)
-    return (
-        f"{name} ({width}), {len(CORES)} virtual cores shared with other work; "
-        f"Python {platform.python_version()}, {versions}; {compiled}, "
-        f"`{' '.join((compiler.STANDARD, *compiler.flags()))}`."
-    )
+    return described(PACKAGES)
 
 
 def findings(rows: list[Row]) -> str:

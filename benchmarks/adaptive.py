@@ -1,0 +1,334 @@
+"""Adaptive steps against heyoka's Taylor integrator and our fixed steps; writes ADAPTIVE.md.
+
+    python benchmarks/adaptive.py [--rounds 40] [--only WORD]
+
+Cases of tests/data/cases.json without constraints, to errors of 1e-9 and 1e-12 at the end. Each
+takes its loosest tolerance, in steps of sqrt 10, or longest step that reaches it; of several forms
+that do, the quickest. Then all run in turns on one pinned core; of each the least time counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from machine import CORES, machine
+from searching import fewest, quick
+from taylor import Array, Options, Taylor
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+sys.path.insert(0, str(ROOT / "tests"))
+
+from cases import cases, scene_text  # noqa: E402
+
+import eomc  # noqa: E402
+from eomc.model.from_scene import from_scene  # noqa: E402
+from eomc.scene.read import parse  # noqa: E402
+
+TARGETS = (1e-9, 1e-12)
+EACH, MEDIAN = 0.8, 0.4  # bars: our time over heyoka's
+METHODS = ("rk4", "dp8", "gauss8", "gauss16")
+LONG = 0.1  # s, of a run; the search takes dozens
+WORTH = 1.0  # s: fixed steps that take longer are not looked for
+NONE = 1e-3  # who errs by more at every tolerance has no answer
+LOOSEST, TIGHTEST = 4, 30  # tolerances 10^(-k/2), all that eomc takes
+JUMPS = ("coulomb_friction",)  # whose right-hand side jumps, which heyoka can't say
+
+
+@dataclass(frozen=True)
+class Way:
+    """Who runs, with which setting, the call, and its error."""
+
+    setting: str
+    run: Callable[[], object]
+    error: float
+
+
+class Search:
+    """Errors by tolerance 10^(-k/2), each computed once."""
+
+    def __init__(self, error: Callable[[float], float]) -> None:
+        self.error = cache(lambda k: error(10.0 ** (-k / 2)))
+
+    def loosest(self, wanted: float) -> int | None:
+        """The first k that reaches it; None: none does."""
+        return next((k for k in range(LOOSEST, TIGHTEST + 1) if self.error(k) <= wanted), None)
+
+    def floor(self) -> float:
+        """The least error of all."""
+        return min(self.error(k) for k in range(LOOSEST, TIGHTEST + 1))
+
+
+class Case:
+    """A case with its module and heyoka's integrators."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        asked = f"[run]\nmethod = {list(METHODS)}\ntolerance = 1e-9"
+        text = scene_text(name).replace("[run]", asked.replace("'", '"'))
+        system = from_scene(parse(text, f"{name}.toml"))
+        self.module: ModuleType = eomc.load(system, ROOT / "build" / "adaptive")
+        self.end = float(cases()[name]["t_end"])
+        self.right = np.array(cases()[name]["q_ref"], float)
+        self.theirs = Taylor(system, self.end)
+        self.mine = Search(lambda tol: self.error(self.module.simulate(tol=tol)))
+        self.heyoka = Search(lambda tol: self.off(self.theirs.run(tol, self.first)()))
+        self.fewest: dict[str, int] = {}
+
+    @property
+    def first(self) -> Options:
+        """With which tolerances are looked for."""
+        return Options(compact_mode=self.theirs.n > 4)
+
+    def off(self, q: Array) -> float:
+        """max_i |q_i - q_ref_i| / max(1, max_i |q_ref_i|)."""
+        found = float(np.max(np.abs(q - self.right)) / max(1.0, np.max(np.abs(self.right))))
+        return found if math.isfinite(found) else math.inf
+
+    def error(self, run: Any) -> float:
+        """That of a run at the end, inf where it stopped."""
+        return self.off(run.q[-1]) if run.status == "ok" else math.inf
+
+    def fixed(self, wanted: float, least: float) -> Way | None:
+        """The quickest method at its longest step; None: none within some time."""
+        found: list[Way] = []
+        bound = max(WORTH, 3 * least)
+        for method in METHODS:
+
+            def run(steps: int, method: str = method) -> Any:
+                h = self.end / steps
+                return self.module.simulate(h=h, steps=steps, every=steps, method=method)
+
+            off = cache(lambda steps, run=run: self.error(run(steps)))
+            bad = cache(lambda steps, run=run, limit=bound: quick(partial(run, steps)) < limit)
+            if steps := fewest(off, wanted, bad, within=20):
+                call = partial(run, steps)
+                found.append(Way(f"{method} {steps}", call, off(steps)))
+                bound = min(bound, 2 * quick(call))
+        return min(found, key=lambda way: quick(way.run)) if found else None
+
+    def alone(self, tol: float) -> Callable[[], object]:
+        """Our loop in C, called with nothing around it."""
+        model = self.module._model
+        (address, real, null), work = model._c, model._ffi.new("adaptive_work *")
+        start, nothing = np.concatenate(model.start), bytes(model._ffi.sizeof(work[0]))
+        x, t = start.copy(), np.zeros(1)
+        at_x, at_t, at_p = address(real, x), address(real, t), model._at[2]
+        memory, many = model._ffi.buffer(work), 2**40
+
+        def run() -> None:
+            x[:] = start
+            t[0] = 0.0
+            memory[:] = nothing
+            model._lib.adaptive(
+                at_x, at_t, self.end, tol, 0.0, null, many, null, 0, null, null, null, at_p, work
+            )
+
+        return run
+
+    def taylor(self, k: int, wanted: float) -> tuple[Way, Options]:
+        """heyoka at a tolerance in its quickest form."""
+        tol, found = 10.0 ** (-k / 2), list[tuple[float, Way, Options]]()
+        for options in self.theirs.options():
+            run = self.theirs.run(tol, options)
+            if (error := self.off(run())) <= wanted or options == self.first:
+                found.append((quick(run), Way(f"{tol:.0e}", run, error), options))
+        found.sort(key=lambda entry: entry[0])
+        # the machine is noisy: the best two once more, by turns
+        again = [min(quick(way.run) for _ in range(3)) for _, way, _ in found[:2]]
+        return found[int(np.argmin(again))][1:]
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of the table; least times in us. said: which floor the target is."""
+
+    name: str
+    wanted: float
+    said: str
+    ours: str
+    mine: Way
+    fixed: Way | None
+    theirs: Way | None
+    how: str
+    times: Array
+
+    @property
+    def ratio(self) -> float:
+        """Our time over heyoka's, nan where that has no answer."""
+        return float(self.times[0] / self.times[3])
+
+    @property
+    def met(self) -> bool:
+        return not self.ratio > EACH
+
+    def __str__(self) -> str:
+        own, alone, fixed, other = (f"{x:.4g}" for x in self.times)
+        steps = f"{self.fixed.setting} | {fixed}" if self.fixed else f"over {WORTH:g} s | "
+        heyoka = "no answer | | | |"
+        if self.theirs is not None:
+            heyoka = (
+                f"{self.how} | {self.theirs.setting} | {self.theirs.error:.1e} | {other} "
+                f"| {self.ratio:.2f}{'' if self.met else ' **lost**'} |"
+            )
+        return (
+            f"| {self.name} | {self.wanted:.0e}{self.said} | {self.ours} | {self.mine.setting} "
+            f"| {self.mine.error:.1e} | {own} | {alone} | {steps} | {heyoka}"
+        )
+
+
+def timed(ways: list[Callable[[], object] | None], rounds: int) -> Array:
+    """The least us of each, all in turns for some tenths of ms; what is slow in fewer rounds."""
+    first = [math.nan if way is None else quick(way) for way in ways]
+    counts = [1 if math.isnan(s) else max(1, round(4e-4 / s)) for s in first]
+    rounds = max(3, min(rounds, round(20 / float(np.nansum(first)))))
+    times = np.full((rounds, len(ways)), np.nan)
+    for k in range(rounds):
+        for i, way in enumerate(ways):
+            if way is not None:
+                begun = time.perf_counter()
+                for _ in range(counts[i]):
+                    way()
+                times[k, i] = (time.perf_counter() - begun) / counts[i] * 1e6
+    return np.array([np.min(column) for column in times.T])
+
+
+def lines(name: str, rounds: int, most: float) -> Iterator[Line | str]:
+    """A line for each target; a sentence where there is none."""
+    case = Case(name)
+    if any(quick(run) > most for run in (
+        partial(case.module.simulate, tol=1e-9), case.theirs.run(1e-9, case.first)
+    )):  # fmt: skip
+        yield f"{name} (a run to 1e-9 takes over {most:g} s)"
+        return
+    before = 0.0
+    for target in TARGETS:
+        wanted, said = target, ""
+        mine, heyoka = case.mine.loosest(target), case.heyoka.loosest(target)
+        if mine is None or heyoka is None:
+            floors = {
+                who: search.floor()
+                for who, search, k in (("ours", case.mine, mine), ("heyoka", case.heyoka, heyoka))
+                if k is None
+            }
+            if floors.get("ours", 0.0) > NONE:
+                yield f"{name} (no double-precision method has an answer)"
+                return
+            answered = {who: floor for who, floor in floors.items() if floor <= NONE}
+            if answered:
+                who = max(answered, key=lambda who: answered[who])
+                wanted = float(f"{2 * answered[who]:.0e}")
+                said = f" (floor{'' if len(answered) == 2 else ' of ' + who})"
+            if wanted == before:
+                continue
+            mine, heyoka = case.mine.loosest(wanted), case.heyoka.loosest(wanted)
+        before = wanted
+        assert mine is not None
+        yield line(case, wanted, said, mine, heyoka, rounds)
+
+
+def line(case: Case, wanted: float, said: str, k: int, other: int | None, rounds: int) -> Line:
+    tol = 10.0 ** (-k / 2)
+    call = partial(case.module.simulate, tol=tol)
+    run = call()
+    own = Way(f"{tol:.0e}", call, case.mine.error(k))
+    theirs, how = None, ""
+    if other is not None:
+        theirs, options = case.taylor(other, wanted)
+        order, steps = case.theirs.steps(10.0 ** (-other / 2), options)
+        how = f"{order} x {steps}, {options}"
+    fixed = case.fixed(wanted, quick(call))
+    ways = [call, case.alone(tol), fixed and fixed.run, theirs and theirs.run]
+    times = timed(ways, rounds)
+    ours = f"{run.steps}+{run.rejected}, {run.evaluations}"
+    return Line(case.name, wanted, said, ours, own, fixed, theirs, how, times)
+
+
+# --- the page ------------------------------------------------------------------------------------
+
+HEAD = """\
+# Adaptive steps
+
+Written by `python benchmarks/adaptive.py`: the cases of `tests/data/cases.json` without constraints, to
+errors of {targets} at the end: max |q - q_ref| / max(1, max |q_ref|). Whole runs in us, the
+least of {rounds} rounds in which all run in turns on one core; *ratio* is `module.simulate(tol=...)`
+over heyoka's `taylor_adaptive`.
+
+{machine}
+
+| case | target | ours: steps+rejected, evaluations | tol | error | us | in C | fixed: method, steps | us | heyoka: order x steps, form | tol | error | us | ratio |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|---|
+"""  # noqa: E501
+TAIL = """
+- *Target*: where rounding keeps one of the two from it, twice the least error that this one reaches
+  at any tolerance, so that both can ("floor"; it is left out where it says the same twice).
+- Ours: the loosest tolerance, in steps of sqrt 10, that reaches the target. *In C*: the same loop,
+  no rows kept, called with nothing around it.
+- Fixed: the quickest of {methods}, each at its longest step that reaches the target, within 5 %.
+- heyoka: its loosest tolerance, in the same steps; accelerations from the same K and P by SymPy,
+  parameters folded in, expanded or simplified, solved by Cramer's rule or LDL^T, or by its own
+  `lagrangian`; with and without `fast_math`, above four coordinates also in compact mode: the
+  quickest of all. Compilation is not counted.
+- Left out: {left}.
+"""
+
+
+def findings(found: list[Line]) -> str:
+    """How many meet the bars, and which are lost."""
+    rated = [line.ratio for line in found if line.theirs is not None]
+    lost = [f"{x.name} to {x.wanted:.0e} ({x.ratio:.2f})" for x in found if not x.met]
+    alone = [x.name for x in found if x.theirs is None]
+    middle = float(np.median(rated)) if rated else math.nan
+    return (
+        f"\nAt most {EACH:g} of heyoka's time on each: {len(found) - len(lost)} of {len(found)}. "
+        f"Median {middle:.2f}, bar {MEDIAN:g} {'met' if middle <= MEDIAN else '**missed**'}.\n\n"
+        f"Lost: {', '.join(lost) or 'none'}.\n"
+        + (f"\nheyoka has no answer: {', '.join(alone)}.\n" if alone else "")
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=40)
+    parser.add_argument("--most", type=float, default=LONG, help="s of a run; left out above")
+    parser.add_argument("--only", default="", help="a word in the case; writes no page")
+    options = parser.parse_args()
+    os.sched_setaffinity(0, {min(CORES)})
+    warnings.simplefilter("ignore", RuntimeWarning)  # of steps that are too long
+    found: list[Line] = []
+    left = [f"{name} (its right-hand side jumps)" for name in JUMPS]
+    for name, case in cases().items():
+        if case["constraints"] or name in JUMPS or options.only not in name:
+            continue
+        for line in lines(name, options.rounds, options.most):
+            print(line, flush=True)
+            if isinstance(line, str):
+                left.append(line)
+            else:
+                found.append(line)
+    print(findings(found))
+    if not options.only:
+        packages = ("eomc", "heyoka", "numpy", "sympy")
+        text = HEAD.format(
+            targets=" and ".join(f"{x:g}" for x in TARGETS), rounds=options.rounds,
+            machine=machine(packages),
+        )  # fmt: skip
+        text += "\n".join(map(str, found)) + "\n" + findings(found)
+        text += TAIL.format(methods=", ".join(METHODS), left="; ".join(left))
+        (HERE / "ADAPTIVE.md").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
