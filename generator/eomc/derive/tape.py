@@ -12,9 +12,10 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 from enum import IntEnum
 
 import sympy
-from sympy import Add, Expr, Mul, Pow, S, Symbol
+from sympy import Add, Expr, Mul, Pow, S, Symbol, tanh
 
 from eomc.base.errors import EomcError
+from eomc.derive.atoms import is_negative, split
 
 _ROUGH = (sympy.DiracDelta, sympy.Derivative, sympy.Subs)
 
@@ -59,6 +60,7 @@ class Tape:
         self._rhs: dict[Symbol, Expr] = {}  # of functions, and of others where they were asked for
         self._late: dict[Symbol, tuple[_Late, Expr]] = {}
         self.squares: dict[Symbol, Symbol] = {}  # sin(a) <-> cos(a), where both are there
+        self._cosh: dict[Symbol, Expr] = {}  # names that are the cosh of an atom
         self._partial: dict[tuple[Symbol, Symbol], Expr] = {}
         self._pairs: dict[tuple[Symbol, Symbol], Expr] = {}
         self._atoms: dict[tuple[Expr, Symbol], Expr] = {}
@@ -79,6 +81,8 @@ class Tape:
         if made.is_Add or made.is_Mul or made.is_Pow:  # sin(-a) has become -sin(a)
             return self.define(made)
         found = self._name(made)
+        if isinstance(made, sympy.cosh):
+            self._cosh[found] = made.args[0]
         for one, other in ((sympy.sin, sympy.cos), (sympy.cos, sympy.sin)):
             if isinstance(made, one) and (partner := self._known.get(other(made.args[0]))):
                 self.squares |= {found: partner, partner: found}
@@ -201,6 +205,12 @@ class Tape:
     def _of_powers(self, powers: Powers) -> Expr:
         """What stands for a product of powers of names."""
         powers = {name: power for name, power in powers.items() if power is not S.Zero}
+        for cosh, x in [(name, self._cosh[name]) for name in powers if name in self._cosh]:
+            sinh = self._known.get(sympy.sinh(x))
+            n = min(powers[sinh], -powers[cosh]) if sinh in powers else S.Zero
+            if n.is_Integer and n > 0:  # tanh, which does not overflow: a slope of log(cosh(x))
+                rest = self._of_powers(powers | {sinh: powers[sinh] - n, cosh: powers[cosh] + n})
+                return self.times(rest, self._of_powers({self.define(tanh(x)): n}))
         if not powers:
             return S.One
         if len(powers) == 1 and S.One in powers.values():
@@ -431,20 +441,3 @@ class Tape:
             if changed:
                 new[symbol] = self.define(self.rhs(symbol).xreplace(changed))
         return [self.define(output.xreplace(new)) for output in outputs]
-
-
-def split(atom: Expr) -> tuple[Expr, Symbol | None]:
-    """(number, name) of what `define` returned; the name is None where it is a number."""
-    if atom.is_Symbol:
-        return S.One, atom
-    if atom.is_number:
-        return atom, None
-    if len(atom.args) == 2 and atom.args[1].is_Symbol:
-        return atom.args[0], atom.args[1]
-    symbol = next(iter(atom.free_symbols))
-    return Mul(*(f for f in atom.args if f is not symbol)), symbol
-
-
-def is_negative(number: Expr) -> bool:
-    """Whether a number is below zero; of fractions without asking SymPy, which takes long."""
-    return bool(number.p < 0 if number.is_Rational else number.is_negative)

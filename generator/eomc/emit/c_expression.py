@@ -12,7 +12,8 @@ import sympy
 from sympy import Expr, S
 
 from eomc.base.errors import EomcError
-from eomc.derive.tape import Stage, is_negative
+from eomc.derive.atoms import is_negative
+from eomc.derive.tape import Stage
 from eomc.program.ir import Call, Function, Operand, Product, Sum, Value, rename
 from eomc.program.trig import pair_of
 

@@ -8,7 +8,8 @@ from dataclasses import replace
 import sympy
 from sympy import Expr, S, Symbol
 
-from eomc.derive.tape import Stage, Tape, split
+from eomc.derive.atoms import split
+from eomc.derive.tape import Stage, Tape
 from eomc.program.draft import Draft
 from eomc.program.ir import Assignment, Call, Cost, Function, Operand, Product, Sum, Value, rename
 from eomc.program.tidy import tidy

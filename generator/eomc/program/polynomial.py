@@ -13,7 +13,8 @@ from fractions import Fraction
 
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
-from eomc.derive.tape import Stage, Tape, split
+from eomc.derive.atoms import split
+from eomc.derive.tape import Stage, Tape
 
 Monomial = tuple[tuple[str, Fraction], ...]  # ((name, exponent), ...), sorted by name
 Polynomial = dict[Monomial, Expr]

@@ -9,7 +9,8 @@ from itertools import combinations
 
 from sympy import Expr, S
 
-from eomc.derive.tape import Stage, is_negative
+from eomc.derive.atoms import is_negative
+from eomc.derive.tape import Stage
 from eomc.program.draft import Draft
 from eomc.program.ir import Operand, Product, Sum
 

@@ -1,0 +1,40 @@
+"""Tapes: what is written is a normal form."""
+
+from __future__ import annotations
+
+import pytest
+from sympy import Expr, Symbol, cosh, log, sinh, sqrt, tanh
+
+from eomc.derive.tape import Stage, Tape
+
+x, a = Symbol("x", real=True), Symbol("a", real=True)
+
+
+def written(tape: Tape, atom: Expr) -> Expr:
+    """What stands for an atom, in leaves."""
+    while names := [s for s in atom.free_symbols if s not in tape.leaves]:
+        atom = atom.xreplace({s: tape.rhs(s) for s in names})
+    return atom
+
+
+@pytest.mark.parametrize(
+    "given, wanted",
+    [
+        (sinh(x) / cosh(x), tanh(x)),
+        (a * sinh(x) ** 3 / cosh(x) ** 2, a * sinh(x) * tanh(x) ** 2),
+        (sinh(-2 * x) * tanh(2 * x) / cosh(2 * x), -(tanh(2 * x) ** 2)),
+        (sinh(x) / cosh(2 * x), sinh(x) / cosh(2 * x)),
+        (sinh(x) * cosh(x), sinh(x) * cosh(x)),
+        (sinh(x) / sqrt(cosh(x)), sinh(x) / sqrt(cosh(x))),
+    ],
+)
+def test_a_sinh_over_its_cosh_is_a_tanh(given: Expr, wanted: Expr) -> None:
+    """Of large x both overflow."""
+    tape = Tape({x: Stage.POSITION, a: Stage.PARAMETER})
+    assert written(tape, tape.define(given)) == wanted
+
+
+def test_the_slope_of_log_cosh_is_a_tanh() -> None:
+    tape = Tape({x: Stage.POSITION, a: Stage.PARAMETER})
+    (slope,) = tape.gradient([(tape.define(a * log(cosh(x / 2))), x**0)], [x])
+    assert written(tape, slope) == a * tanh(x / 2) / 2
