@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,25 @@ def test_an_entry_that_is_one_cosine_is_judged_by_itself(
     found = vanishing(Comparison(scene_system("cartpole"), module, np.random.default_rng(0), 4))
     assert isinstance(found, float)
     assert found > 1e6 * LIMIT if wrong and bend is shifted else (found > LIMIT) == wrong
+
+
+@pytest.mark.parametrize("size, judged", [(1e-17, False), (1e-9, True)])
+def test_what_is_left_of_constants_that_cancel_is_no_cosine(
+    modules: Modules, size: float, judged: bool
+) -> None:
+    """The reference's g[0] is 0, and here so little times cos(theta)."""
+    check = Comparison(scene_system("cartpole"), modules("cartpole"), np.random.default_rng(0), 4)
+    right = check.reference.evaluate
+
+    def evaluate(name: str, q: Any, *rest: Any) -> Any:
+        found = np.array(right(name, q, *rest))
+        if name == "g":
+            found[..., 0] += size * np.cos(q[..., 1])
+        return found
+
+    check.reference = SimpleNamespace(evaluate=evaluate)  # type: ignore[assignment]
+    found = vanishing(check)
+    assert isinstance(found, float) and (found > LIMIT) == judged
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ import numpy as np
 from eomc.model.system import System
 from eomc.verify import (
     rows_adaptive,
+    rows_derivatives,
     rows_discretize,
     rows_frames,
     rows_limits,
@@ -32,7 +33,6 @@ from eomc.verify.rows_refusals import Refusals
 from eomc.verify.rows_runs import Runs
 from eomc.verify.sampling import VALUES
 
-SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference
 SKEW_LIMIT = 1e-6  # of D's rate of change, by differences good to 1e-10; a wrong sign makes 1
 
 
@@ -98,10 +98,7 @@ def property_rows(made: Comparison) -> None:
     row("D > 0", 0, "least eigenvalue of D, scaled", made.definiteness, least=True)
     row("bias = C qd + g", LIMIT, rounding, made.bias)
     row("D qdd + bias = tau", LIMIT, rounding, made.motion)
-    slope_limit = max(SLOPE_LIMIT, LIMIT * made.eps)
-    for name in ("linearize", "sensitivity"):
-        if made.has(name):
-            row(name, slope_limit, "of the largest derivative", partial(made.slopes, name))
+    rows_derivatives.report(made)
     if made.dtype == np.float64:  # single precision leaves its differences too few digits
         row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", made.skewness)
         made.convergence_rows()

@@ -181,27 +181,27 @@ class Convergence:
             if (one := ladder(power)) and not math.isnan(best := one.best(least)):
                 return best
         low = next((k for k in LOWER if (one := ladder(k)) and one.exact), LOWER[-1])
-        before, moved = math.nan, False
+        before, moved, bent = math.nan, False, False
         for power in range(low, MOST + 1):
             if not (one := ladder(power)):
                 continue
             if not math.isnan(best := one.best(least)):
                 return best
             if abs(one.settled - before) <= ALIKE:  # and nan is not
-                if not self._bends(at, method, one.span):
+                bent = bent or self._bends(at, method, one.span)
+                if not bent:  # which longer spans are too
                     return one.settled
-                moved = True
             before, moved = one.settled, moved or not one.exact
         if not any(ladders.values()):
             raise RuntimeError(f"no run by {method} gets to its end")
         return math.nan if moved else math.inf
 
     def _bends(self, at: Place, method: str, span: float) -> bool:
-        """Whether another method is of a low order over a span too: steps leap over a bend."""
+        """Whether another method is of low orders over a span too: steps leap over a bend."""
         for other in self.methods:
             least = min(METHODS[other].order, SEEN) - ORDER_MARGIN
             one = self._ladder(at, other, span) if other != method else None
-            if one and math.isnan(one.best(least)) and one.settled < least:
+            if one and math.isnan(one.best(least)) and sum(clear for _, clear in one.orders) > 1:
                 return True
         return False
 

@@ -2,7 +2,8 @@
 
 Beside a multiple of a quarter turn an error of the reduction by 1e-17 is lost in most sums, but not
 in an entry of D or g that is one sine times something else. The reference says which are: at
-neighbouring doubles they are in proportion to the sine.
+neighbouring doubles they are in proportion to the sine, and larger than what is left of constants
+that cancel.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ import numpy as np
 
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import State
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import Expected
 
 LIMIT = 100.0  # units; a constant of the reduction that is off makes 1e9
 QUARTERS = (1, 2, -3, 4, -7, 1024, -99_999, 667_542)  # the last ones near 2^20 rad
@@ -37,12 +38,12 @@ def report(check: Comparison) -> None:
 
 def vanishing(check: Comparison) -> float | Finding:
     """The largest error of an entry that is one sine times something, in roundings of itself."""
-    s, errors = check.few(2)[-1].state, list[float]()
+    e, errors = check.few(2)[-1], list[float]()
     for i in map(int, np.flatnonzero(check.sampler.angles)):
         for quarters in QUARTERS:
-            found = dict(_beside(check, i, quarters, s))
+            found = dict(_beside(check, i, quarters, e))
             if max(found.values(), default=0.0) > LIMIT:
-                again = [dict(_beside(check, i, quarters, near)) for near in _near(s)]
+                again = [dict(_beside(check, i, quarters, near)) for near in _near(e)]
                 each = {k: [x, *(a.get(k, 0.0) for a in again)] for k, x in found.items()}
                 found = {k: min(x) for k, x in each.items() if np.ptp(x) <= CLEAR * max(x)}
             errors += found.values()
@@ -51,15 +52,17 @@ def vanishing(check: Comparison) -> float | Finding:
     return max(errors)
 
 
-def _near(s: State) -> list[State]:
-    return [replace(s, q=s.q * (1 + nudge), t=s.t * (1 + nudge)) for nudge in NUDGES]
+def _near(e: Expected) -> Iterator[Expected]:
+    s = e.state
+    for nudge in NUDGES:
+        yield replace(e, state=replace(s, q=s.q * (1 + nudge), t=s.t * (1 + nudge)))
 
 
 def _beside(
-    check: Comparison, i: int, quarters: int, s: State
+    check: Comparison, i: int, quarters: int, e: Expected
 ) -> Iterator[tuple[tuple[str, int], float]]:
     """The errors of entries with coordinate i at so many quarter turns."""
-    angle = quarters * (math.pi / 2)
+    s, angle = e.state, quarters * (math.pi / 2)
     angles = angle + np.array(NEIGHBOURS) * math.ulp(angle)
     sines = np.array([math.cos(x) if quarters % 2 else math.sin(x) for x in angles.tolist()])
     states = [replace(s, q=np.where(np.arange(len(s.q)) == i, x, s.q)) for x in angles]
@@ -69,10 +72,11 @@ def _beside(
             expected = np.reshape(known, (len(states), -1))
             parts = expected / sines[:, None]
             found = np.reshape([check.ask(name, x) for x in states], expected.shape)
+            least = LIMIT * check.eps * np.ravel(e.size[name])
             for k, (part, entry, value) in enumerate(
                 zip(parts.T, expected.T, found.T, strict=True)
             ):
-                if np.all(part) and np.ptp(part) <= ALIKE * np.max(np.abs(part)):
+                if np.all(np.abs(part) > least[k]) and np.ptp(part) <= ALIKE * np.max(np.abs(part)):
                     yield (name, k), _error(value - entry, entry, check.eps)
 
 
