@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify import derivatives
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.sampling import FARTHEST, NUDGE
@@ -256,9 +257,17 @@ class Runs:
         return float(np.max(errors, initial=0))
 
     def solved(self, e: Expected) -> Expected:
-        """With what a rounding of q makes of velocities, to which stages are solved for."""
-        rounded = np.abs(e.state.q) / self.h**2
-        return replace(e, size={**e.size, "acceleration": e.size["acceleration"] + rounded})
+        """With what a rounding of q makes of velocities, to which stages are solved for.
+
+        The accelerations of all coordinates follow such velocities.
+        """
+        s, n, rounded = e.state, len(e.state.q), np.abs(e.state.q) / self.h
+        scale = np.array([self.sampler.spread, self.sampler.speed])
+        with np.errstate(all="ignore"):
+            by = derivatives.by_differences(self.sampler.reference, s, scale, self.sampler.defaults)
+            slopes = np.fmax.reduce([np.abs(J[:, n : 2 * n]) for J, _ in by])
+        gain = e.size["acceleration"] + rounded / self.h + slopes @ rounded
+        return replace(e, size={**e.size, "acceleration": gain})
 
     def far_steps(self, s: State, acceleration: Vector) -> float:
         """Some steps from there; acceleration: the size of what is rounded in one."""
