@@ -21,9 +21,10 @@ from eomc.scene.read import parse
 from eomc.verify import rows_derivatives
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
+from eomc.verify.finding import Finding
 from eomc.verify.report import Report
 from eomc.verify.rows_derivatives import slopes, told
-from eomc.verify.rows_runs import Runs
+from eomc.verify.rows_runs import FINE, Runs
 from eomc.verify.sampling import State
 
 # Right modules of which a row about orders, advised steps or balances once said FAILED.
@@ -237,7 +238,7 @@ def test_right_modules_pass(modules: Modules, what: str) -> None:
 
 # what the author of scenes wrote when a row of a right module once said FAILED
 SEEDS = """400000 500399 500434 500578 500643 500672 700053 800095 800167 800199 800410
-800476 900093 910099""".split()
+800476 900093 910099 920113 920124 920312""".split()
 
 
 @pytest.mark.parametrize("seed", tiers(SEEDS))
@@ -343,6 +344,21 @@ def test_rounding_is_not_judged_where_steps_leap_over_a_bend(
     bends = "max" in potential
     assert row.passed == bends and row.judged != bends
     assert (row.unit == "not judged: steps leap over max") == bends
+
+
+@pytest.mark.parametrize("finer", [60.0, 20.0])
+def test_what_shorter_steps_make_less_is_no_rounding(
+    modules: Modules, monkeypatch: pytest.MonkeyPatch, finer: float
+) -> None:
+    """As of friction that turns within a thousandth of a step."""
+    found = dict(zip(FINE, (99.0, finer), strict=True))
+    monkeypatch.setattr(Runs, "rounded", lambda *given: found[given[-1]])
+    text = WELL.replace(', "gauss8", "gauss16"', "")
+    made = from_scene(parse(text, "test.toml"))
+    module = modules.unoptimised(text)
+    runs = Runs(Comparison(made, module, np.random.default_rng(0), 4))
+    steep = Finding(finer, "forces are so steep that shorter steps differ less")
+    assert runs.fine("rk4") == (finer if finer > 50 else steep)
 
 
 def test_advice_near_stiff_friction_is_judged_by_eigenvalues(modules: Modules) -> None:
