@@ -227,3 +227,11 @@ def test_terms_multiplied_out() -> None:
     terms = 2e4 * (1 + math.cos(1e-3)) + 1e-3 / 7 + 0.125 + 0.5 * math.sin(1e-3)
     assert answer.terms(at) == pytest.approx(terms, rel=1e-14)
     assert abs(answer.evaluate("potential", at["q"])) < 1e-6 * terms
+
+
+def test_where_D_is_singular_there_is_no_acceleration() -> None:
+    """Of one state, and of some among others."""
+    reference = derive(System.make("pole", {x: 1.0}, x**2 * v**2 / 2, x**3))
+    assert math.isnan(reference.acceleration([0.0], [1.0])[0])
+    found = reference.acceleration([[0.0], [2.0]], [[1.0], [1.0]], params={})
+    assert np.isnan(found[0, 0]) and found[1, 0] == pytest.approx(-3.5)

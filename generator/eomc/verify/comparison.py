@@ -232,10 +232,7 @@ class Comparison:
                 return np.moveaxis(ends, 0, 1)
 
             with np.errstate(all="ignore"):
-                try:
-                    expected, size = self.sampler.reach(reference, s)
-                except np.linalg.LinAlgError:
-                    continue
+                expected, size = self.sampler.reach(reference, s)
             most = spread * (1 if h > self.system.run.h else FARTHEST)
             if not np.all(np.abs(expected - [s.q, s.qd]) < most):
                 continue
@@ -259,10 +256,7 @@ class Comparison:
         steps = steps or min(self.effort.run, max(1, round(self.system.run.duration / h)))
         key = id(s), h, steps  # the states live as long
         if key not in self.motions:
-            try:
-                self.motions[key] = self._motion(s, h, steps)
-            except np.linalg.LinAlgError:  # of the reference: it comes to where D is singular
-                return None
+            self.motions[key] = self._motion(s, h, steps)
         t, x, growth = self.motions[key]
         if len(t) < 2:
             return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
@@ -75,7 +76,7 @@ class Answer(ABC):
         u: ArrayLike | None = None,
         params: Mapping[str, Any] | None = None,
     ) -> Vector:
-        """Solve D qdd = tau - bias: (nq,). Raises numpy.linalg.LinAlgError where D is singular."""
+        """Solve D qdd = tau - bias: (nq,). nan where D is singular."""
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         return self._acceleration(q, qd, t, u, self._values(params))
 
@@ -141,7 +142,14 @@ class Answer(ABC):
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Vector:
         D, force = self._motion(q, qd, t, u, values)
-        return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
+        try:
+            return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
+        except np.linalg.LinAlgError:  # of one of the states at least
+            found = np.full(force.shape, np.nan)
+            for k in np.ndindex(force.shape[:-1]):
+                with suppress(np.linalg.LinAlgError):
+                    found[k] = np.linalg.solve(D[k], force[k])
+            return found
 
     def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
