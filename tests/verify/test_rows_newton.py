@@ -75,6 +75,12 @@ def test_newtons_method_takes_the_step_that_sweeps_take() -> None:
     assert 1 < count < 10
 
 
+def test_plain_sweeps_contract_as_the_squares_of_their_weights_do() -> None:
+    """Of an oscillator: h^2 w^2 times the largest eigenvalue of A A, which is 1/12 of gauss4."""
+    slopes = np.array([[-9.0, 0.0]])
+    assert one_step.contraction(METHODS["gauss4"], slopes, 0.5) == pytest.approx(9 / 48)
+
+
 def test_states_of_which_one_overflows_have_no_step() -> None:
     """Sweeps that diverge are not answers of the states that have not overflowed yet."""
 

@@ -56,18 +56,20 @@ def test_an_entry_that_is_one_cosine_is_judged_by_itself(
     assert found > 1e6 * LIMIT if wrong and bend is shifted else (found > LIMIT) == wrong
 
 
-@pytest.mark.parametrize("size, judged", [(1e-17, False), (1e-9, True)])
-def test_what_is_left_of_constants_that_cancel_is_no_cosine(
-    modules: Modules, size: float, judged: bool
+@pytest.mark.parametrize(
+    "size, near, judged", [(1e-17, 0, False), (1e-9, 1, False), (1e-9, 0, True)]
+)
+def test_what_is_left_of_a_sum_that_cancels_is_no_cosine(
+    modules: Modules, size: float, near: float, judged: bool
 ) -> None:
-    """The reference's g[0] is 0, and here so little times cos(theta)."""
+    """The reference's g[0] is 0, and here so little times cos(theta); or so far out alone."""
     check = Comparison(scene_system("cartpole"), modules("cartpole"), np.random.default_rng(0), 4)
     right = check.reference.evaluate
 
     def evaluate(name: str, q: Any, *rest: Any) -> Any:
         found = np.array(right(name, q, *rest))
         if name == "g":
-            found[..., 0] += size * np.cos(q[..., 1])
+            found[..., 0] += size * np.cos(q[..., 1]) + near * (np.abs(q[..., 1]) < 100)
         return found
 
     check.reference = SimpleNamespace(evaluate=evaluate)  # type: ignore[assignment]

@@ -65,6 +65,21 @@ def slopes(a: Acceleration, q: Vector, qd: Vector, t: float, scale: Vector) -> V
     return np.asarray(((f[: 2 * n] - f[2 * n :]) / (2 * np.diag(by)[:, None])).T)
 
 
+def contraction(m: Method, slopes: Vector, h: float) -> float:
+    """By how much a plain sweep makes errors of an implicit method's stages less, at the end.
+
+    slopes: (nq, 2 nq), da/dq and da/dqd.
+    """
+    return float(np.max(np.abs(np.linalg.eigvals(_sweep(m, slopes, h)))))
+
+
+def _sweep(m: Method, slopes: Vector, h: float) -> Vector:
+    """(S nq, S nq): what a plain sweep makes of errors of the accelerations at the stages."""
+    A, AA = (_square(rows, m.stages) for rows in (m.a, m.a_squared))
+    n = len(slopes)
+    return np.asarray(h * np.kron(A, slopes[:, n:]) + h**2 * np.kron(AA, slopes[:, :n]))
+
+
 def by_newton(
     m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: float, h: float
 ) -> tuple[Vector, int]:
@@ -79,7 +94,7 @@ def by_newton(
     first = acceleration(q[None], qd[None], np.array([t]))[0]
     scale = np.array([np.abs(q) + 1, np.abs(qd) + 1])
     J = slopes(acceleration, q, qd, t, scale)
-    M = np.eye(S * n) - h * np.kron(A, J[:, n:]) - h**2 * np.kron(AA, J[:, :n])
+    M = np.eye(S * n) - _sweep(m, J, h)
     a, count, last = np.tile(first, (S, 1)), 0, np.inf
     while count < SWEEPS:
         places = q + h * np.outer(c, qd) + h**2 * AA @ a

@@ -30,6 +30,7 @@ STEPS = 3
 NEAR = 1e-6  # of how far things go: the start beside the equilibrium, linear for two plain sweeps
 LINEAR = 0.01  # the same: as far as a run may go from there
 SEARCH = 40  # for an equilibrium
+PLAIN = 1 / 7  # by which plain sweeps contract: they get there in fewer than twenty
 MOST = 12  # sweeps of a step by the reference: more say that the motion is not linear
 EXTRA = 8.0  # sweeps a step: what the module may need more, to see that plain ones do not contract
 OFF = 1e4  # roundings of the end, magnified as the fastest mode does
@@ -82,9 +83,7 @@ class Newton:
         And where plain sweeps get there, if slowly: the module may leave it at these.
         """
         m, s = METHODS[method], place.start
-        with np.errstate(all="ignore"):
-            plain = one_step.step(m, self.accelerations, s.q, s.qd, s.t, h)
-        if np.all(np.isfinite(plain)):
+        if one_step.contraction(m, place.slopes, h) < PLAIN:
             return None
         x, counts = np.array([s.q, s.qd]), []
         rows = [x]

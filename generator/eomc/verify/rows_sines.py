@@ -9,7 +9,7 @@ that cancel.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,7 @@ QUARTERS = (1, 2, -3, 4, -7, 1024, -99_999, 667_542)  # the last ones near 2^20 
 NEIGHBOURS = range(-2, 3)  # doubles beside each
 ALIKE = 1e-6  # an entry over its sine, at neighbours
 CLEAR = 0.1  # of an error: what neighbours may differ by, where it is no rounding of a sum
+Errors = dict[tuple[str, int], float]  # of entries of D and g
 NUDGES = (1e-6, 2e-6, 3e-6)  # of other coordinates, which change what sums round, no sine
 
 
@@ -37,19 +38,31 @@ def report(check: Comparison) -> None:
 
 
 def vanishing(check: Comparison) -> float | Finding:
-    """The largest error of an entry that is one sine times something, in roundings of itself."""
+    """The largest error of an entry that is one sine times something, in roundings of itself.
+
+    It is so at all quarter turns where that sine vanishes: what is so at some may be a sum that
+    cancels there, as 1 - tanh(x)**2 does far out.
+    """
     e, errors = check.few(2)[-1], list[float]()
     for i in map(int, np.flatnonzero(check.sampler.angles)):
-        for quarters in QUARTERS:
-            found = dict(_beside(check, i, quarters, e))
-            if max(found.values(), default=0.0) > LIMIT:
-                again = [dict(_beside(check, i, quarters, near)) for near in _near(e)]
-                each = {k: [x, *(a.get(k, 0.0) for a in again)] for k, x in found.items()}
-                found = {k: min(x) for k, x in each.items() if np.ptp(x) <= CLEAR * max(x)}
-            errors += found.values()
+        for odd in (0, 1):
+            places = [n for n in QUARTERS if n % 2 == odd]
+            found = [dict(_beside(check, i, n, e)) for n in places]
+            alone = set.intersection(*map(set, found))
+            for quarters, here in zip(places, found, strict=True):
+                errors += _sure(check, i, quarters, e, {k: here[k] for k in alone})
     if not errors:
         return Finding(math.inf, "no entry of D or g is one sine times something")
     return max(errors)
+
+
+def _sure(check: Comparison, i: int, quarters: int, e: Expected, found: Errors) -> Iterable[float]:
+    """The errors that are the same with other coordinates moved a little."""
+    if max(found.values(), default=0.0) <= LIMIT:
+        return found.values()
+    again = [dict(_beside(check, i, quarters, near)) for near in _near(e)]
+    each = {k: [x, *(a.get(k, 0.0) for a in again)] for k, x in found.items()}
+    return [min(x) for x in each.values() if np.ptp(x) <= CLEAR * max(x)]
 
 
 def _near(e: Expected) -> Iterator[Expected]:
