@@ -298,11 +298,12 @@ class Comparison:
         """The energy that a run reports, at the states that it reports."""
         s = self.few(2)[-1].state
         run = self.simulate(s, steps=2)
+        far = FARTHEST * np.array([self.sampler.spread, self.sampler.speed])
         errors = []
         for row, found in zip(_rows(run, s), run.energy, strict=True):
-            energy, size = self.sampler.energy(row)
-            if np.isfinite(energy):
-                errors.append(self.units(found, energy, size))
+            if np.all(np.abs(np.subtract([row.q, row.qd], [s.q, s.qd])) < far):
+                energy, size = self.sampler.energy(row)
+                errors += [self.units(found, energy, size)] if np.isfinite(energy) else []
         return float(np.max(errors, initial=0))
 
     def ask(self, name: str, s: State) -> Vector:
