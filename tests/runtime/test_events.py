@@ -251,3 +251,86 @@ def test_what_an_event_can_not_be_is_said(old: str, new: str, words: str) -> Non
     with pytest.raises(SceneError) as fault:
         parse(BALL.replace(old, new, 1), "events.toml")
     assert words in str(fault.value)
+
+
+FREE = """eomc = 1
+name = "free_body"
+[coordinates]
+x = {{ start = {x}, rate = {v} }}
+[parameters]
+a = {a}
+[energy]
+kinetic = "x_dot**2/2"
+potential = "-a*x"
+{events}
+"""
+
+
+def free(events: str, x: float = 0.0, v: float = 1.0, a: float = 0.0) -> ModuleType:
+    """A body under a constant force."""
+    return built(FREE.format(x=x, v=v, a=a, events=events))
+
+
+def event(name: str, when: str, *lines: str) -> str:
+    return "\n".join(["[[event]]", f'name = "{name}"', f'when = "{when}"', *lines])
+
+
+def test_each_of_a_close_pair_has_its_own_time() -> None:
+    module = free(event("pair", "(x - 0.3)*(x - 0.3001)"), x=1.0, v=0.0, a=-1.0)
+    run = module.simulate(duration=2.0)
+    exact = [math.sqrt(2 * (1 - x)) for x in (0.3001, 0.3)]
+    assert run.events["pair"].t == pytest.approx(exact, abs=1e-12)
+
+
+def test_a_zero_that_is_touched_is_none_that_is_crossed() -> None:
+    module = free(event("touch", "x", 'action = "stop"'), x=1.0, v=-2.0, a=2.0)
+    for tol in (1e-6, 1e-9, 1e-13):
+        run = module.simulate(duration=2.0, tol=tol)
+        assert run.t[-1] == 2.0 and len(run.events["touch"]) == 0
+    low = module.simulate(q0=[1 - 1e-6], duration=2.0)
+    assert low.stopped == "touch" and low.t[-1] == pytest.approx(1 - 1e-3, abs=1e-9)
+
+
+def test_events_of_one_formula_see_the_same_crossings() -> None:
+    pair = "(x - 0.7)*(x - 0.702)"
+    module = free(event("both", pair) + "\n" + event("up", pair, 'direction = "rising"'))
+    run = module.simulate(duration=2.0)
+    assert run.events["both"].t == pytest.approx([0.7, 0.702], abs=1e-13)
+    assert run.events["up"].t == pytest.approx([0.702], abs=1e-13)
+
+
+def test_at_rest_at_a_zero_it_first_has_to_leave() -> None:
+    run = free(event("begin", "x - 1", 'action = "stop"'), x=1.0, v=0.0, a=-1.0).simulate(duration=1)
+    assert run.t[-1] == 1.0 and run.stopped == ""
+
+
+def test_a_jump_to_no_state_ends_the_run_at_it_and_says_which() -> None:
+    module = free(event("gap", "x - 0.5", 'action = "jump"', 'x_dot = "sqrt(x - 10)"'))
+    with pytest.warns(RuntimeWarning, match="event 'gap' jumps to no finite state"):
+        run = module.simulate(duration=2.0)
+    assert run.status == "not finite" and run.t[-1] == pytest.approx(0.5, abs=1e-13)
+    assert run.q[-1, 0] == pytest.approx(0.5) and len(run.events["gap"]) == 1
+
+
+def test_a_stopped_run_has_an_error_and_a_jumping_one_no_balance(ball: ModuleType) -> None:
+    run = ball.simulate(params={"far": 0.7}, duration=5.0, estimate=True)
+    assert run.stopped == "away" and max(run.error.end.values()) < 1e-9 and run.error.resolved
+    assert ball.simulate(duration=1.0).balance() is None
+    assert ball.simulate(duration=0.3).balance().left < 1e-9
+    with pytest.warns(RuntimeWarning, match="ever sooner"):
+        resting = ball.simulate(duration=10.0)
+    assert resting.estimate().resolved
+
+
+def test_fixed_steps_have_no_events(ball: ModuleType) -> None:
+    assert ball.simulate(h=0.01, steps=3).events == {}
+    with pytest.raises(ValueError, match="h: belongs to fixed steps"):
+        ball.simulate(h=0.01, h_most=0.1)
+
+
+def test_single_precision_has_a_tolerance_that_it_can_keep() -> None:
+    text = BALL.replace("bouncing", "float_ball").replace("[run]", '[run]\nreal = "float"')
+    run = built(text).simulate(duration=1.0)
+    assert run.events["impact"].t == pytest.approx([impacts(0.8, 1)[0]], rel=1e-5)
+    with pytest.raises(SceneError, match="a float can keep 5e-07 at best"):
+        parse(text.replace("[run]", "[run]\ntolerance = 1e-9"), "float.toml")

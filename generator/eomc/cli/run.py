@@ -248,6 +248,8 @@ def _print_summary(
         say(f"  event {name}: {len(times)} times{last}")
     for name, part in summary["saturated"].items():
         say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
+    if module._model.events and summary["tolerance"] is None:
+        say("  fixed steps pass over the scene's events: leave out --h and --method")
     for words in (summary["beyond_stability"], summary["beyond_duration"]):
         if words:
             say(f"  {words}")

@@ -15,7 +15,7 @@ from eomc.emit.plain.views import Adaptive, AdaptiveRun, Events
 from eomc.integrators.tableaux import Row
 
 SAMPLES = 9  # values in a step
-APART = 2e-4  # parts of a step between values that make a slope
+APART = 1e-6  # parts of a step between values that make a slope
 ACTIONS = ("record", "stop", "jump")
 DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
 
@@ -104,13 +104,14 @@ def _events(made: Stepping) -> Events:
     at = {"q": "q_at", "qd": "qd_at"}
     within = {"t": f"{c.member('x', 'from')} + z*{c.member('x', 'size')}", **at}
     reached = {"t": "reached", **at}
-    x = nodes()
+    x, apart = nodes(), APART if target.real.epsilon < 1e-10 else 1e-3
     return Events(
         **functions.names,
         method=method,
         fabs=f"fabs{end}",
         sqrt=f"sqrt{end}",
         eps=target.literal(target.real.epsilon),
+        tiny=target.literal(1e-30),
         samples=SAMPLES,
         nodes=numbers(x, target.real),
         slopes=matrix(slopes(x), target.real),
@@ -121,7 +122,7 @@ def _events(made: Stepping) -> Events:
         actions=tuple(ACTIONS.index(e.action) for e in system.events),
         jumps=jumps,
         busy=BUSY,
-        apart=target.literal(APART),
+        apart=target.literal(apart),
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
         width=f"(1 + 2*{functions.NQ})",
@@ -133,9 +134,9 @@ def _events(made: Stepping) -> Events:
         bracket=bracketed.call(high="node[j]", at_high="g[j]"),
         bracket_dip=bracketed.call(high="z", at_high="value[k]"),
         happened=happened,
-        cross=crossing.call(k="i", g="g[i]"),
-        look_before=looked.call(g="value", z=f"z - {target.literal(APART / 2)}"),
-        look_behind=looked.call(g="value", z=f"z + {target.literal(APART / 2)}"),
+        cross=crossing.call(**{"k": "i", "from": "from[i]", "g": "g[i]"}),
+        look_before=looked.call(g="value", z=f"z - {target.literal(apart / 2)}"),
+        look_behind=looked.call(g="value", z=f"z + {target.literal(apart / 2)}"),
         inside=made.within.call(),
         values_there=values.call(events="value", **within),
         restart=restart,

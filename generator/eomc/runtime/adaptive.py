@@ -36,6 +36,7 @@ _ROOM = 256  # steps of the first call
 _MOST = 2**20  # of one call
 _STIFF = 50  # steps that sweeps have held back, from which a run says so
 _DRAWN = 1_000  # rows of a curve, at least
+_EVEN = 8  # rows a step, as equally spaced ones need them
 _FINER = 100.0  # the tolerance over that of the run by which an error is found
 
 
@@ -84,6 +85,8 @@ class AdaptiveRun(Run):
         done = f"{self.steps} steps, {self.told}"
         if self.status == "ok":
             return done
+        if self.status == "not finite" and self.stopped:
+            return f"event '{self.stopped}' jumps to no finite state at t = {self.t[-1]:.9g} s"
         if self.status == "accumulated":
             return (
                 f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
@@ -150,6 +153,13 @@ class AdaptiveRun(Run):
             return self
         times = np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _DRAWN))
         made = copy(self)
+        made._rows, made._times, made._energy = self(times), times, None
+        return made
+
+    def _even(self) -> Run:
+        if (np.diff(self.t) == 0).any() or len(self) < 2:
+            return self
+        made, times = copy(self), np.linspace(self.t[0], self.t[-1], _EVEN * (self.steps + 1))
         made._rows, made._times, made._energy = self(times), times, None
         return made
 
@@ -367,6 +377,9 @@ def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Est
             if made.status == "interrupted":
                 raise KeyboardInterrupt
             out[kept[: len(made)]] = made.x
+            if own.stopped and made.stopped == own.stopped:  # a hair sooner or later
+                found = made.events[own.stopped]
+                out[-1] = np.concatenate([found.q[-1], found.qd[-1]])
         return out[beside]
 
     begin = np.ravel(own._begin).astype(float)
@@ -381,7 +394,9 @@ def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Est
         digits = np.clip(-np.log10(error[-1] / scale), 0.0, -np.log10(eps)) + 0.0
     names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
     end, right = (dict(zip(names, map(float, x), strict=True)) for x in (error[-1], digits))
-    words = [f"the run stopped at t = {own.t[-1]:.6g} s"] if own.status != "ok" else []
+    words = []
+    if own.status not in ("ok", "accumulated"):
+        words.append(f"the run stopped at t = {own.t[-1]:.6g} s")
     if grown * eps > _TENTH:
         words.append(f"chaotic: a difference at the start grows {grown:.1g} times or more")
     if (error > _TENTH * scale).any():

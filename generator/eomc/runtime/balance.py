@@ -59,13 +59,14 @@ class Balance:
 
 
 def balance(run: Run) -> Balance | None:
-    """The balance of a run; None where inputs change from step to step, which rows do not show."""
+    """The balance of a run; None where it jumps, or inputs change from step to step, unseen."""
     if run._u is not None and np.ndim(run._u) != 1:
         return None
     if not np.isfinite(run.jacobi).all():
         return None
-    if run.every > 1:
-        run = run._again(1, 1, None, None)  # all its rows: few may look smooth and not be
+    run = run._even()  # all its rows: few may look smooth and not be
+    if (np.diff(run.t) == 0).any():  # the state jumps
+        return None
     model, energy = run._model, run.jacobi.astype(float)
     none = np.zeros(model.nu) if model.nu else None
     power, rest = (run._values("power", u=u).astype(float) for u in (run._u, none))

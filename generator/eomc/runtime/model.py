@@ -228,7 +228,8 @@ class Model(Frames):
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
-        if tol is not None or times is not None or self._fits(h, steps, method):
+        given = tol is not None or times is not None or h_most is not None
+        if given or self._fits(h, steps, method):
             fitted = adaptive.simulate(
                 self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, h=h,
                 steps=steps, method=method, every=every, control_period=control_period, out=out,

@@ -167,10 +167,20 @@ class Run(Columns):
         """
         return self._values("jacobi")
 
+    @property
+    def events(self) -> Mapping[str, Any]:
+        """What adaptive steps find by the scene's events; fixed steps pass over them: empty."""
+        return {}
+
+    def _even(self) -> Run:
+        """With rows equally far apart, as many as there are steps, or enough to draw it."""
+        return self if self.every == 1 else self._again(1, 1, None, None)
+
     def balance(self) -> Balance | None:
         """What inputs and forces put in and what was lost, J, and the error that this leaves.
 
-        None where inputs are held that the rows or the power's formula don't tell: take every=1.
+        None where the state jumps, or inputs are held that the rows or the power's formula don't
+        tell: take every=1.
         """
         return balance(self)
 

@@ -41,6 +41,8 @@ from eomc.scene.toml_text import MAX_BYTES
 
 _NOT_SI = "mm cm km g gram ms min rpm inch ft lb lbs".split()
 
+LEAST_OF_FLOAT = 5e-7  # a tolerance, of single precision
+
 
 def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = None) -> Scene:
     """Read and check a scene file, with other values in place of those of its parameters.
@@ -112,6 +114,7 @@ class _Check(Checker):
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
         events = list(validate_events.events(self, doc))
+        run = self._run()
         picture = validate_picture.picture(self, doc, known)
         outputs = self._outputs()
         self._asked()
@@ -133,7 +136,7 @@ class _Check(Checker):
             forces=forces,
             outputs=tuple(outputs),
             events=tuple(events),
-            run=self._run(),
+            run=run,
             assembly=assembly,
             picture=picture,
             places=self.places,
@@ -143,8 +146,12 @@ class _Check(Checker):
     def _run(self) -> Run:
         """How it is run; events are found by adaptive steps."""
         asked = self.doc.run.model_dump()
+        single = asked["real"] == "float"
         if self.doc.event and asked["tolerance"] is None:
-            asked["tolerance"] = 1e-9
+            asked["tolerance"] = 1e-5 if single else 1e-9
+        if single and (asked["tolerance"] or 1) < LEAST_OF_FLOAT:
+            why = f'a float can keep {LEAST_OF_FLOAT:g} at best: take that, or real = "double"'
+            self.say(("run", "tolerance"), why)
         return Run(**asked)
 
     # document and names

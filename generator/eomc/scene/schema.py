@@ -355,6 +355,8 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
     if path[0] == "event" and last in ("direction", "action"):
         known = DIRECTIONS if last == "direction" else ACTIONS
         return f"unknown {last} {here}: known are {', '.join(known)}"
+    if path == ("run", "tolerance"):
+        return f"must be a number from 1e-15 to 1e-2, here {here}"
     if kind == "greater_than":
         return f"must be greater than zero, here {here}"
     if kind == "finite_number":

@@ -21,7 +21,10 @@ def events(check: Checker, doc: Document) -> Iterator[Event]:
             why = f"'{entry.name}' is an event already: rename one of the two"
             check.say(("event", k, "name"), why, text=entry.name)
         seen.add(entry.name)
-        when = check.formula(("event", k, "when"), entry.when)
+        path = ("event", k, "when")
+        if path in check.mended:  # which is reported
+            continue
+        when = check.formula(path, entry.when)
         jump = tuple(_jump(check, doc, k, entry))
         if when and not any(when.names()):
             check.say(("event", k, "when"), "never crosses zero: it has no names", text=when.text)

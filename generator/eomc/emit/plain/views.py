@@ -331,6 +331,7 @@ class Events(Named):
     fabs: str
     sqrt: str
     eps: str
+    tiny: str
     samples: int
     nodes: tuple[str, ...]
     slopes: tuple[str, ...]
