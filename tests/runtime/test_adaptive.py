@@ -112,6 +112,14 @@ def test_curves_and_sections_have_states_between_long_steps(kepler: ModuleType) 
     assert held._drawn is held
 
 
+def test_a_section_is_as_exact_as_the_steps(kepler: ModuleType) -> None:
+    run = kepler.simulate(tol=1e-12, duration=3 * PERIOD)
+    found = run.section("y", rising=False)  # at the farthest point, half a period on
+    assert found["t"] == pytest.approx(PERIOD * np.array([0.5, 1.5, 2.5]), abs=1e-9)
+    assert found["x"] == pytest.approx([-1.9] * 3, abs=1e-9)
+    assert np.abs(found["y"]).max() < 1e-12
+
+
 @pytest.mark.parametrize("every", [1, 7])
 def test_fixed_steps_tell_it_to_their_order(driven: ModuleType, every: int) -> None:
     times, errors = np.linspace(0.0, 1.0, 23), []

@@ -300,7 +300,9 @@ def test_events_of_one_formula_see_the_same_crossings() -> None:
 
 
 def test_at_rest_at_a_zero_it_first_has_to_leave() -> None:
-    run = free(event("begin", "x - 1", 'action = "stop"'), x=1.0, v=0.0, a=-1.0).simulate(duration=1)
+    run = free(event("begin", "x - 1", 'action = "stop"'), x=1.0, v=0.0, a=-1.0).simulate(
+        duration=1
+    )
     assert run.t[-1] == 1.0 and run.stopped == ""
 
 

@@ -119,6 +119,7 @@ class Report:
     eigenvalue: complex
     condition: tuple[float, float, Vector]
     corners: str
+    events: str
     t: Vector
     coordinates: tuple[str, ...]
     skipped: Mapping[str, str]
@@ -178,6 +179,7 @@ def measure(
         eigenvalue=complex(fastest),
         condition=(at, *place),
         corners=reference_solution.corners(system),
+        events=", ".join(e.name for e in system.events),
         t=reference.t,
         coordinates=tuple(module.coordinates),
         skipped=skipped,

@@ -95,6 +95,11 @@ def remarks(report: Report) -> list[str]:
         )
     else:
         said.append(f"D is regular: its condition number is at most {condition:.2g}, {place}.")
+    if report.events:
+        said.append(
+            f"The scene has events ({report.events}); fixed steps, and so all figures here, pass "
+            "over them."
+        )
     if report.corners:
         said.append(
             f"Forces or energies jump or bend ({report.corners}): past a jump every fixed step "

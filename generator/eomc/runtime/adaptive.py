@@ -17,10 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .adaptive_error import LEAST, error_of
 from .arguments import Array, as_number, as_step_size
 from .dense import within
-from .estimate import Estimate, scales
+from .estimate import Estimate
 from .package import reduced
+from .section import crossings
 from .slices import longer
 from .trajectory import SAID, STATUS, Run, state_text
 
@@ -28,16 +30,12 @@ if TYPE_CHECKING:
     from .model import Model
 
 LOOSEST = 1e-2
-STAGES = 8
-_LEAST = {8: 1e-15, 4: 5e-7}  # by bytes of a number
-_TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
 _EVENTS = 1024  # of one call
 _ROOM = 256  # steps of the first call
 _MOST = 2**20  # of one call
 _STIFF = 50  # steps that sweeps have held back, from which a run says so
 _DRAWN = 1_000  # rows of a curve, at least
 _EVEN = 8  # rows a step, as equally spaced ones need them
-_FINER = 100.0  # the tolerance over that of the run by which an error is found
 
 
 @dataclass(frozen=True)
@@ -151,20 +149,54 @@ class AdaptiveRun(Run):
         """Itself, with rows between where steps are too long for curves."""
         if len(self) < 2 or len(self) >= _DRAWN or callable(self._u) or isinstance(self._u, str):
             return self
-        times = np.union1d(self.t, np.linspace(self.t[0], self.t[-1], _DRAWN))
+        return self._with(np.linspace(self.t[0], self.t[-1], _DRAWN + 1)[1:-1])
+
+    def _with(self, times: Array) -> AdaptiveRun:
+        """Itself, with rows at some times within among its own."""
+        whole = np.concatenate([self.t, times])
+        order = np.argsort(whole, kind="stable")
+        both = zip((self.q, self.qd), self(times), strict=True)
+        return self._at(whole[order], np.array([np.concatenate(x)[order] for x in both]))
+
+    def _at(self, times: Array, rows: Array) -> AdaptiveRun:
+        """Itself with other rows, (2, n, nq)."""
         made = copy(self)
-        made._rows, made._times, made._energy = self(times), times, None
+        for name in ("q", "qd", "outputs"):  # which are kept once they were made
+            made.__dict__.pop(name, None)
+        made._rows, made._times, made._energy = rows, times, None
         return made
+
+    def section(
+        self, name: str, value: float = 0.0, *, rising: bool | None = None,
+        period: float | None = None,
+    ) -> dict[str, Array]:  # fmt: skip
+        """As of any run, with crossings placed by states within the steps: as exact as these.
+
+        Raises ValueError where the state jumps: events find crossings there.
+        """
+        if (np.diff(self.t) == 0).any():
+            raise ValueError("section: the state jumps; make an [[event]] of it, which is exact")
+        parts, ends = np.arange(1, _EVEN) / _EVEN, self.t[[0, -1]]
+        between = (self.t[:-1, None] + np.diff(self.t)[:, None] * parts).ravel()
+        found = crossings(self._with(between).to_dict(), name, value, rising, period)
+        times, by = found["t"], 1e-6 * float(np.max(np.diff(self.t), initial=0.0))
+        turns = 0.0 if period is None else period * np.round((found[name] - value) / period)
+        for _ in range(2):  # Newton's method
+            places = times, np.clip(times - by, *ends), np.clip(times + by, *ends)
+            here, one, other = (self._at(x, np.array(self(x)))[name] for x in places)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step = (here - value - turns) / (other - one) * (places[2] - places[1])
+            times = np.clip(np.where(np.isfinite(step), times - step, times), *ends)
+        return self._at(times, np.array(self(times))).to_dict()
 
     def _even(self) -> Run:
         if (np.diff(self.t) == 0).any() or len(self) < 2:
             return self
-        made, times = copy(self), np.linspace(self.t[0], self.t[-1], _EVEN * (self.steps + 1))
-        made._rows, made._times, made._energy = self(times), times, None
-        return made
+        times = np.linspace(self.t[0], self.t[-1], _EVEN * (self.steps + 1))
+        return self._at(times, np.array(self(times)))
 
     def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
-        self.error = _error(self, progress)
+        self.error = error_of(self, run, progress)
         if words := self.error.warning:
             warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
         return self.error
@@ -352,68 +384,9 @@ class _Found:
         return np.concatenate(which), np.concatenate(rows)
 
 
-def _error(own: AdaptiveRun, progress: Callable[[int, int], None] | None) -> Estimate:
-    """The error of a run, beside one of a hundredth of its tolerance, and from a moved start."""
-    model, x = own._model, own.x.astype(float)
-    eps = float(np.finfo(model.dtype).eps) / 2
-    least = _LEAST[model.dtype.itemsize]
-    scale = scales(x)
-    size = max(1e4 * eps, 100 * own.tol)
-    signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
-
-    # rows beside a jump may be on either side of it in another run
-    jumps = np.isin(own.t, own.t[1:][np.diff(own.t) == 0])
-    kept = np.flatnonzero(~jumps & (own.t > own.t0))
-    beside = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(x))))
-
-    def again(tol: float, start: Array) -> Array:
-        nq, out = model.nq, np.full_like(x, np.nan)
-        out[own.t == own.t0] = start
-        if len(kept):
-            made = run(
-                model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], own._u,
-                own._params, own._h_most, progress,
-            )  # fmt: skip
-            if made.status == "interrupted":
-                raise KeyboardInterrupt
-            out[kept[: len(made)]] = made.x
-            if own.stopped and made.stopped == own.stopped:  # a hair sooner or later
-                found = made.events[own.stopped]
-                out[-1] = np.concatenate([found.q[-1], found.qd[-1]])
-        return out[beside]
-
-    begin = np.ravel(own._begin).astype(float)
-    finer = again(max(own.tol / _FINER, least), begin)
-    moved = again(own.tol, begin + size * scale * signs)
-    x = x[beside]
-    error = np.maximum(np.abs(x - finer), eps * np.abs(x))
-    error[own.t == own.t0] = 0.0
-    error[~np.isfinite(error)] = np.inf
-    with np.errstate(invalid="ignore", divide="ignore"):
-        grown = float(np.nanmax(np.abs(moved[-1] - x[-1]) / scale)) / size
-        digits = np.clip(-np.log10(error[-1] / scale), 0.0, -np.log10(eps)) + 0.0
-    names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
-    end, right = (dict(zip(names, map(float, x), strict=True)) for x in (error[-1], digits))
-    words = []
-    if own.status not in ("ok", "accumulated"):
-        words.append(f"the run stopped at t = {own.t[-1]:.6g} s")
-    if grown * eps > _TENTH:
-        words.append(f"chaotic: a difference at the start grows {grown:.1g} times or more")
-    if (error > _TENTH * scale).any():
-        row = int(np.argmax((error > _TENTH * scale).any(axis=1)))
-        words.append(
-            f"the error exceeds a tenth of the motion from t = {own.t[row]:.4g} s on: take a "
-            "tighter tolerance, or a shorter duration"
-        )
-    return Estimate(
-        error[:, : model.nq], error[:, model.nq :], end, right, 2 * STAGES, float("nan"), grown,
-        "; ".join(words),
-    )  # fmt: skip
-
-
 def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
     """A tolerance that the numbers have digits for, or a ValueError."""
-    least = _LEAST[dtype.itemsize]
+    least = LEAST[dtype.itemsize]
     number = as_number(tol, "tol")
     if not least <= number <= LOOSEST:
         raise ValueError(f"tol: {number:g}: give one between {least:.1g} and {LOOSEST:g}")
