@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import subprocess
 from pathlib import Path
 from types import ModuleType
 
@@ -336,3 +337,50 @@ def test_single_precision_has_a_tolerance_that_it_can_keep() -> None:
     assert run.events["impact"].t == pytest.approx([impacts(0.8, 1)[0]], rel=1e-5)
     with pytest.raises(SceneError, match="a float can keep 5e-07 at best"):
         parse(text.replace("[run]", "[run]\ntolerance = 1e-9"), "float.toml")
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_the_c_compiles_without_a_word_and_does_as_python(real: str, tmp_path: Path) -> None:
+    text = BALL.replace("bouncing", f"ball_{real}").replace("[run]", f'[run]\nreal = "{real}"')
+    made = eomc.sources(from_scene(parse(text, "c.toml")))
+    name, P = made.name, made.name.upper()
+    for folder in ("", "fast"):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        for end in "hc":
+            file = f"{folder}/{name}.{end}".lstrip("/")
+            (tmp_path / file).write_text(made.files[file], encoding="utf-8")
+    (tmp_path / "main.c").write_text(
+        f"""#include "{name}.h"
+#include <stdio.h>
+int main(void)
+{{
+    {real} q[{P}_NQ] = {{ 0, 1 }}, qd[{P}_NQ] = {{ 1, 0 }}, t = 0, rows[64*(1 + 2*{P}_NQ)];
+    {name}_gauss16_adaptive_memory memory = {{ 0 }};
+    {name}_status status;
+    int which[64];
+    long found;
+
+    {name}_gauss16_adaptive(q, qd, &t, 2, ({real})1e-5, 0, 1000, NULL, 0, NULL, NULL, NULL,
+                            64, &found, which, rows, &{name}_defaults, &memory, &status);
+    for (long k = 0; k < found; k++)
+        printf("%d %.17g\\n", which[k], (double)rows[(1 + 2*{P}_NQ)*k]);
+    return (int)status;
+}}
+""",
+        encoding="utf-8",
+    )
+    module = built(text)
+    run = module.simulate(tol=1e-5, duration=2.0)
+    for folder, flags in (("", STRICT), ("fast", ["-Wall", "-Wextra", "-Werror"])):
+        source = tmp_path / folder / f"{name}.c"
+        options = ["-O1", f"-I{tmp_path / folder}", "-o", f"a{folder}"]
+        compiled("cc", *flags, "-c", str(source), cwd=tmp_path)
+        compiled("cc", "main.c", str(source), *options, "-lm", cwd=tmp_path)
+        said = subprocess.run([str(tmp_path / f"a{folder}")], capture_output=True, text=True)
+        lines = [line.split() for line in said.stdout.splitlines()]
+        assert said.returncode == 0
+        for k, named in enumerate(("impact", "top")):
+            times = [float(t) for number, t in lines if int(number) == k]
+            assert times == pytest.approx(
+                run.events[event].t, rel=1e-12 if real == "double" else 1e-4
+            )
