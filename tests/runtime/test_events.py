@@ -11,6 +11,7 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
+from compilers import STRICT, compiled
 
 import eomc
 from eomc.base.errors import SceneError
@@ -381,6 +382,5 @@ int main(void)
         assert said.returncode == 0
         for k, named in enumerate(("impact", "top")):
             times = [float(t) for number, t in lines if int(number) == k]
-            assert times == pytest.approx(
-                run.events[event].t, rel=1e-12 if real == "double" else 1e-4
-            )
+            near = 1e-12 if real == "double" else 1e-4
+            assert times == pytest.approx(run.events[named].t, rel=near)
