@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import pickle
 import subprocess
@@ -256,7 +257,7 @@ def test_what_an_event_can_not_be_is_said(old: str, new: str, words: str) -> Non
 
 
 FREE = """eomc = 1
-name = "free_body"
+name = "{name}"
 [coordinates]
 x = {{ start = {x}, rate = {v} }}
 [parameters]
@@ -270,7 +271,8 @@ potential = "-a*x"
 
 def free(events: str, x: float = 0.0, v: float = 1.0, a: float = 0.0) -> ModuleType:
     """A body under a constant force."""
-    return built(FREE.format(x=x, v=v, a=a, events=events))
+    name = f"free_{hashlib.sha256(repr((events, x, v, a)).encode()).hexdigest()[:8]}"
+    return built(FREE.format(name=name, x=x, v=v, a=a, events=events))
 
 
 def event(name: str, when: str, *lines: str) -> str:

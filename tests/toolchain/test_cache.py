@@ -282,6 +282,18 @@ def test_a_build_that_is_killed_leaves_the_old_module(
         assert gravity(root) == 2 * built
 
 
+@pytest.mark.usefixtures("quickly_compiled")
+def test_bytecode_of_the_build_before_is_not_taken(scene: Path, root: Path, found: None) -> None:
+    """Python knows it by the second and the size of its source, which may be the same."""
+    files = sorted((root / "simple_pendulum").glob("*.py"))
+    ahead = time.time() + 100
+    for file in files:
+        os.utime(file, (ahead, ahead))
+    scene.write_text(CHANGED, encoding="utf-8")
+    assert eomc.build(scene, root).fresh
+    assert all(int(file.stat().st_mtime) > int(ahead) for file in files)
+
+
 def test_two_builds_at_once_both_end_well(scene: Path, root: Path) -> None:
     """One of them builds, the other waits and finds."""
     both = [started(scene, root) for _ in range(2)]
