@@ -1,6 +1,7 @@
 # make demo    set up, build and check the cart-pole scenes, run one, draw it
 # make test    set up, run the quick tests
 # make bench   against others (an environment of 2.6 GB, a C++ compiler); writes benchmarks/*.md
+# make wheel   a wheel and an sdist into dist/
 # make test-all, make test-slow, make lint, make golden, make clean
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
 # some shells forbid bytecode: every command then takes four seconds to start, instead of 0.7
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all test-slow lint golden bench clean
+.PHONY: demo wheel test test-all test-slow lint golden bench clean
 
 demo: .venv/demo
 	@$(BIN)/eomc build $(DEMO)
@@ -27,6 +28,10 @@ demo: .venv/demo
 	@echo "the C to embed:      build/cartpole/cartpole.h, build/cartpole/cartpole.c"
 	@echo "the Python module:   PYTHONPATH=build $(BIN)/python -c 'import cartpole; print(cartpole.simulate())'"
 	@echo "the command:         $(BIN)/eomc --help"
+
+wheel: .venv/bin/python
+	@$(BIN)/python -m pip install --quiet "hatchling>=1.26"
+	@$(BIN)/python -m hatchling build -d dist
 
 test: .venv/dev
 	$(PYTEST) -m "not slow"
@@ -54,6 +59,7 @@ bench: build/bench/done
 	build/bench/bin/python benchmarks/bodies.py
 	build/bench/bin/python benchmarks/digits.py
 	build/bench/bin/python benchmarks/adaptive.py
+	build/bench/bin/python benchmarks/constrained.py
 
 # what the LaTeX of equations is compiled with, where npm is there; else that test is skipped
 build/katex/done:
@@ -67,7 +73,7 @@ build/bench/done: pyproject.toml benchmarks/requirements.txt
 	@touch $@
 
 clean:
-	rm -rf build
+	rm -rf build dist
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -81,7 +87,8 @@ clean:
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	@touch $@ .venv/demo
 
-# half a gigabyte of robots, and the simulator that they are held against
+# half a gigabyte of robots, the simulator that they are held against, compilers for other machines,
+# importers of units of FMI
 .venv/robots: .venv/dev
-	$(BIN)/python -m pip install --quiet --editable ".[robots]"
+	$(BIN)/python -m pip install --quiet --editable ".[robots,cross,fmu]"
 	@touch $@

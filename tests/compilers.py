@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
+import shutil
 import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 STRICT = """-std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wdouble-promotion -Wshadow
 -Werror""".split()
@@ -17,3 +22,12 @@ def compiled(*command: str, cwd: Path) -> None:
     """Without a word from the compiler."""
     done = run(*command, cwd=cwd)
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+def clang(cpp: bool = False) -> list[str]:
+    """The command of clang, or of the one in ziglang; a test is skipped where neither is there."""
+    if path := shutil.which("clang++" if cpp else "clang"):
+        return [path]
+    if importlib.util.find_spec("ziglang") is None:
+        pytest.skip("neither clang nor ziglang is installed")
+    return [sys.executable, "-m", "ziglang", "c++" if cpp else "cc"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import shutil
 import signal
+import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -162,8 +163,9 @@ def tiers(values: Iterable[Any], *quick: Any) -> list[Any]:
 
 
 def needs(compiler: str) -> str:
-    """The path of a compiler; where it isn't there, the test is skipped and says so."""
-    path = shutil.which(compiler)
+    """The path of a compiler, or of what pip installed; where it isn't there, the test is skipped
+    and says so."""
+    path = shutil.which(compiler) or shutil.which(compiler, path=str(Path(sys.executable).parent))
     if path is None:
         pytest.skip(f"{compiler} is not installed")
     return path

@@ -128,6 +128,14 @@ joint = "prismatic"
 coordinates = "x"
 axis = [1, 0]
 mass = "m"
+[[point]]
+name = "tip"
+note = "@"
+body = "cart"
+[[force]]
+note = "@"
+body = "cart"
+force = [0.1, 0]
 [[spring]]
 note = "@"
 coordinate = "x"
@@ -136,6 +144,12 @@ stiffness = "k"
 note = "@"
 coordinate = "x"
 damping = "1"
+[[event]]
+name = "middle"
+note = "@"
+when = "x"
+[outputs]
+y = { formula = "2*x", unit = "@", note = "@" }
 [run]
 h = 0.01
 duration = 0.1
@@ -150,7 +164,9 @@ def quoted(text: str) -> str:
 
 def fields() -> list[tuple[int, str]]:
     """Which @ of SCENE is which key."""
-    where, found, counts = "", [], {"body": "cart", "spring": "1", "damper": "1"}
+    where, found = "", []
+    counts = {"body": "cart", "point": "tip", "force": "1"}
+    counts |= {"spring": "1", "damper": "1", "event": "1"}
     for text in SCENE.splitlines():
         if text.startswith("["):
             where = text.strip("[]")
@@ -184,6 +200,8 @@ def with_texts(made: System, text: str, file: str | None = None) -> System:
         coordinates=tuple(replace(c, unit=text, note=text) for c in made.coordinates),
         parameters=tuple(replace(p, unit=text, note=text) for p in made.parameters),
         inputs=tuple(replace(i, unit=text, note=text) for i in made.inputs),
+        outputs=tuple(replace(o, unit=text, note=text) for o in made.outputs),
+        events=tuple(replace(e, unit=text, note=text) for e in made.events),
     )
 
 

@@ -63,10 +63,13 @@ class Outcome:
 def outcome(seed: int, negate: bool, root: Path) -> Outcome:
     """The scene of that number derived, built under `root` and checked."""
     began = time.perf_counter()
-    made, module = None, None
+    made, module, plain = None, None, None
     try:
         made = from_scene(parse(scene_text(seed), f"{seed}.toml"))
-        module = _built(eomc.sources(made, EXTENSION), root / "right")
+        sources = eomc.sources(made, EXTENSION)
+        module = _built(sources, root / "right")
+        if not negate:  # what is wrong is to be seen without a right one beside it
+            plain = _built(sources, root / "plain", "plain")
     except Exception as fault:
         return Outcome(seed, "not built", _words(fault))
     what = ""
@@ -79,7 +82,7 @@ def outcome(seed: int, negate: bool, root: Path) -> Outcome:
         if not negated.changes(right, module, seed):
             return Outcome(seed, "unchanged", what)
     try:
-        report = check(made, module, seed=seed)
+        report = check(made, module, plain=plain, seed=seed)
     except Exception as fault:
         return Outcome(seed, "check raised", _words(fault))
     verdict = ("caught", "wrong pass") if negate else ("false alarm", "passed")
@@ -99,20 +102,20 @@ def _words(fault: Exception) -> str:
     return f"{type(fault).__name__}: {str(fault)[-600:]}"
 
 
-def _built(sources: Sources, folder: Path) -> ModuleType:
-    """The module of these sources, compiled and bound in half the time that a build takes.
+def _built(sources: Sources, folder: Path, form: str = "fast") -> ModuleType:
+    """The module of a form of these sources, compiled and bound in half the time of a build.
 
     The binding is a library that cffi opens, instead of an extension with Python's headers.
     """
     folder.mkdir(parents=True)
     for file, text in sources.files.items():
-        if file.startswith("fast/") or file.endswith(".py"):
+        if file.startswith("fast/") == (form == "fast") or file.endswith(".py"):
             (folder / file.removeprefix("fast/")).write_text(text, encoding="utf-8")
     binding = re.sub(r"^static (?=(int|long|void) )", "", sources.binding, flags=re.M)
     (folder / "binding.c").write_text(
         "#include <stddef.h>\n#include <stdint.h>\n" + binding, encoding="utf-8"
     )
-    flags = ["-std=gnu99", "-fPIC", "-shared", "-Wl,-Bsymbolic", *compiler.flags()]
+    flags = [compiler.standard(form), "-fPIC", "-shared", "-Wl,-Bsymbolic", *compiler.flags()]
     command = [*compiler.find_compiler().command, *flags, f"{sources.name}.c", "binding.c", "-lm"]
     done = subprocess.run(
         [*command, "-o", "library.so"], cwd=folder, capture_output=True, text=True, check=False

@@ -119,6 +119,20 @@ def test_the_path_of_the_tip_is_in_the_file() -> None:
     assert table["y"] == pytest.approx(-np.cos(upper) - np.cos(lower), abs=1e-12)
 
 
+@pytest.mark.skipif(
+    not all(map(importlib.util.find_spec, ("fmpy", "pythonfmu3"))),
+    reason="FMPy and PythonFMU3 are not installed: pip install 'eomc[fmu]'",
+)
+def test_a_controller_that_is_another_unit_holds_the_arm() -> None:
+    text = said("fmu_pid.py")
+    angle, highest = numbers(text, r"at (\S+) rad, at most (\S+);")
+    assert angle == pytest.approx(1.2, abs=1e-3) and 1.2 < highest < 1.5
+    motor, weight = numbers(text, r"holds (\S+) N m, the weight pulls (\S+) N m")
+    assert motor == pytest.approx(weight, abs=1e-2)
+    assert weight == pytest.approx(1.5 * 9.81 * 0.5 * np.sin(angle), abs=1e-3)
+    assert text.strip() in (ROOT / "docs" / "fmu.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.slow
 def test_an_arm_is_held_and_pushed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco", reason="robot files come with pip install 'eomc[robots]'")
@@ -149,5 +163,6 @@ def test_the_documents_name_each() -> None:
 def test_they_stand_on_their_own() -> None:
     """Each says how to run it; the scene lies beside them."""
     for file in sorted(EXAMPLES.glob("*.py")):
-        assert f"python docs/examples/{file.name}" in file.read_text(encoding="utf-8")
+        how = "pythonfmu3 build -f" if file.name.endswith("_unit.py") else "python"
+        assert f"{how} docs/examples/{file.name}" in file.read_text(encoding="utf-8")
     assert Path(EXAMPLES / "balance.toml").is_file()

@@ -9,11 +9,11 @@ from typing import Any
 
 from eomc.base.errors import EomcError, SceneError
 from eomc.base.version import __version__
-from eomc.pipeline import build, load, read, sources
+from eomc.pipeline import build, export_fmu, load, read, sources
 
 __all__ = [
-    "EomcError", "SceneError", "System", "__version__", "build", "dot", "equations", "load", "read",
-    "sources",
+    "EomcError", "SceneError", "System", "__version__", "build", "dot", "equations", "export_fmu",
+    "load", "read", "sources",
 ]  # fmt: skip
 
 

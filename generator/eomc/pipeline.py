@@ -9,6 +9,7 @@ scene.read, system.from_scene, lagrange.derive, program.build, render.render, ca
 from __future__ import annotations
 
 import gc
+import hashlib
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,13 +17,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, SceneError
 
 if TYPE_CHECKING:
     from eomc.base.errors import Problem
+    from eomc.emit.fmu.files import Unit
     from eomc.emit.render import Sources
     from eomc.model.system import System
+    from eomc.program.program import Program
     from eomc.toolchain.cache import Built
+    from eomc.toolchain.fmu import Exported
 
 
 ScenePath = str | os.PathLike[str]
@@ -45,14 +49,26 @@ def _garbage_kept() -> Iterator[None]:
 
 @_garbage_kept()
 def read(scene: ScenePath) -> System:
-    """The checked scene as a SymPy system. Raises SceneError with every fault."""
+    """The checked scene as a SymPy system, its start assembled where there are constraints.
+
+    Raises SceneError with every fault.
+    """
     from eomc.model.from_scene import from_scene
     from eomc.scene import read as scenes
 
     _refuse_other(scene, "")
     if not isinstance(scene, (str, os.PathLike)):
         raise EomcError(f"give the path of a scene, here {scene!r}")
-    return from_scene(scenes.read(scene))
+    return _assembled(from_scene(scenes.read(scene)))
+
+
+def _assembled(system: System) -> System:
+    """With its start assembled, where it has constraints."""
+    if not system.constraints:
+        return system
+    from eomc.program import assembly
+
+    return assembly.assembled(system)
 
 
 @_garbage_kept()
@@ -63,17 +79,58 @@ def sources(
     warn: Callable[[Problem], None] | None = None,
 ) -> Sources:
     """The generated files of a system, as text. warn is called with each warning."""
-    from eomc.derive import lagrange
     from eomc.emit import render
+
+    return render.render(_program(system, warn), extension)
+
+
+def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
+    from eomc.derive import lagrange
     from eomc.program import program
 
     if isinstance(system, (str, os.PathLike)):
         raise EomcError(f"give a System, such as eomc.read({str(system)!r})")
+    system = _assembled(system)
     derived = program.build(lagrange.derive(system))
     for problem in (*system.warnings, *program.inertia(derived)):
         if warn is not None:
             warn(problem)
-    return render.render(derived, extension)
+    return derived
+
+
+@_garbage_kept()
+def unit(
+    system: System, version: int = 2, *, warn: Callable[[Problem], None] | None = None
+) -> Unit:
+    """The files of a unit of FMI 2 or 3, as text. warn is called with each warning."""
+    from eomc.emit import render
+
+    if version not in (2, 3):
+        raise EomcError(f"version: FMI 2 or 3, here {version!r}")
+    if system.constraints:  # an importer that integrates would leave them
+        raise SceneError([system.problem("constraints", "have no unit of FMI yet")])
+    return render.unit(_program(system, warn), version)
+
+
+def export_fmu(
+    scene: ScenePath | System,
+    out: ScenePath | None = None,
+    version: int = 2,
+    *,
+    binary: bool = True,
+    warn: Callable[[Problem], None] | None = None,
+) -> Exported:
+    """A unit of FMI 2 or 3 of a scene file or a System, in the file `out`, by default NAME.fmu.
+
+    It has sources and, where there is a compiler and unless `binary` is false, a binary for this
+    machine; an older file is replaced. warn is called with each warning.
+    Raises SceneError for a faulty scene, EomcError for what else fails.
+    """
+    from eomc.toolchain import fmu
+
+    _refuse_other(scene, "" if out is None else out)
+    made = unit(read(scene) if isinstance(scene, (str, os.PathLike)) else scene, version, warn=warn)
+    return fmu.export(made, Path(f"{made.name}.fmu" if out is None else out), binary)
 
 
 def build(
@@ -94,7 +151,9 @@ def build(
 
     _refuse_other(scene, root)
     if not isinstance(scene, (str, os.PathLike)):
-        made, name, digest = scene, scene.name, scene.digest
+        # what was replaced in a System has left its digest as it was
+        made, name = scene, scene.name
+        digest = hashlib.sha256(f"{scene.digest} {scene!r}".encode()).hexdigest()
     else:
         made = None
         name, digest = name_and_digest(Path(scene))
@@ -106,9 +165,62 @@ def build(
         made = read(scene)
 
     def texts(extension: str) -> Sources:
+        _tell_preparing(warn)
         return sources(made, extension, warn=warn)
 
     return cache.build(made.name, wanted, texts, Path(root), form)
+
+
+def write_c(
+    scene: ScenePath,
+    folder: ScenePath,
+    prefix: str | None = None,
+    *,
+    warn: Callable[[Problem], None] | None = None,
+) -> dict[str, str]:
+    """Write the C of a scene file into `folder`, and return its files' texts by name.
+
+    No compiler is called. prefix: what names and files begin with, by default the scene's name.
+    Raises SceneError for a faulty scene, EomcError for what else fails.
+    """
+    from dataclasses import replace
+
+    from eomc.base import names
+    from eomc.toolchain import c_folder
+
+    if prefix is not None and (why := names.module_fault(prefix)):
+        raise EomcError(f"--prefix: {why}")
+    made = read(scene)
+    made = made if prefix is None else replace(made, name=prefix)
+    files = sources(made, warn=warn).embeddable
+    c_folder.write(files, Path(folder))
+    return files
+
+
+def write_wheel(
+    scene: ScenePath, folder: ScenePath, *, warn: Callable[[Problem], None] | None = None
+) -> Path:
+    """Write a wheel of the compiled module of a scene file into `folder`; its path.
+
+    Raises SceneError for a faulty scene, EomcError for what else fails.
+    """
+    from eomc.toolchain import wheel
+
+    made = read(scene)
+    text = Path(scene).read_bytes()
+    _tell_preparing(warn)
+    return wheel.build(
+        sources(made, wheel.COMPILED, warn=warn), text, made.digest, made.title, Path(folder)
+    )
+
+
+def _tell_preparing(warn: Callable[[Problem], None] | None) -> None:
+    """A note where the compiler's first call takes long."""
+    from eomc.base.errors import Problem
+    from eomc.toolchain.compiler import preparing
+
+    if warn is not None and (why := preparing()):
+        warn(Problem(why, severity="note"))
 
 
 def _refuse_other(scene: object, root: object) -> None:

@@ -34,6 +34,7 @@ from payloads import (
     generated,
     nothing_ran,
     payloads,
+    quoted,
     tokens,
     with_texts,
 )
@@ -50,6 +51,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.report import equations_text
 from eomc.report.equations import written
+from eomc.scene import schema
 from eomc.scene.read import parse
 
 # one of a kind
@@ -95,6 +97,22 @@ def hidden(text: str, lines: bool) -> bool:
     )
 
 
+def test_every_free_text_that_a_scene_may_have_is_crossed() -> None:
+    """So that a new table is not forgotten here; those of one model count as one."""
+    checked = (texts.checked_line, texts.checked_lines)
+    models = {"": schema.Document, **schema._MODELS}
+    known = {
+        (model, name)
+        for model in models.values()
+        for name, field in model.model_fields.items()
+        if any(getattr(rule, "func", None) in checked for rule in field.metadata)
+    }
+    ways = (key.split(".") for _, key in fields())
+    crossed = {(models[way[0] if len(way) > 1 else ""], way[-1]) for way in ways}
+    crossed.add((schema.LoopTable, "note"))  # which is read alone, below
+    assert crossed == known and len(known) > 12
+
+
 @pytest.mark.parametrize(
     ("which", "key"), tiers(fields(), *range(0, len(fields()), 4)), ids=[key for _, key in fields()]
 )
@@ -115,6 +133,43 @@ def test_the_reader_refuses_hidden_characters_and_names_line_and_key(which: int,
                 assert f"{key.split('.')[-1]} = " in written.splitlines()[problem.line - 1]
             assert not RAW.search(str(fault))
         assert refused == hidden(given, lines=key.endswith("note")), name
+
+
+LOOP = """eomc = 1
+name = "mesh"
+gravity = [0, 0]
+[coordinates]
+a = { unit = "rad" }
+b = { unit = "rad" }
+[[body]]
+name = "one"
+joint = "revolute"
+coordinates = "a"
+inertia = 1
+[[body]]
+name = "two"
+joint = "revolute"
+coordinates = "b"
+inertia = 1
+[[loop]]
+name = "gears"
+joint = "gear"
+coordinates = ["a", "b"]
+ratio = 2
+note = "@"
+"""
+
+
+@payloads
+def test_the_note_of_a_loop(given: str) -> None:
+    """Of scenes that are read, and not generated from so far."""
+    try:
+        parse(LOOP.replace('"@"', quoted(given)), "f.toml")
+        refused = False
+    except SceneError as fault:
+        refused = True
+        assert not RAW.search(str(fault))
+    assert refused == hidden(given, lines=True)
 
 
 def test_ordinary_texts_and_notes_of_several_lines_pass() -> None:
@@ -259,7 +314,7 @@ def test_all_payloads_at_once_build_import_and_run(
     every = " ".join(PAYLOADS.values())
     made = replace(with_texts(derived().system, every), digest="0" * 64)
     title, units, doc = runs(made, tmp_path, monkeypatch)
-    assert title == every and units == dict.fromkeys(("x", "m", "g", "u"), every)
+    assert title == every and units == dict.fromkeys(("x", "m", "g", "u", "y"), every)
     assert texts.line(every) in doc
 
 
@@ -270,7 +325,7 @@ def test_each_payload_builds_imports_and_runs(
 ) -> None:
     made = replace(with_texts(derived().system, given), digest="0" * 64)
     title, units, _ = runs(made, tmp_path, monkeypatch)
-    assert title == given and units == dict.fromkeys(("x", "m", "g", "u"), given)
+    assert title == given and units == dict.fromkeys(("x", "m", "g", "u", "y"), given)
 
 
 @pytest.mark.parametrize(

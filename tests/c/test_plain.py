@@ -33,6 +33,30 @@ STRICT = """-std=c99 -pedantic -Wall -Wextra -Wconversion -Wdouble-promotion -Ws
 PLAIN = ROOT / "build" / "tests" / "plain"
 STEPPERS = 'method = ["rk4", "dp8", "euler", "gauss4", "gauss6", "gauss8", "gauss16"]\n'
 NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
+# rows, a time in the forces, an input
+ROD = """
+eomc = 1
+name = "rod"
+[coordinates]
+x = { start = 0.6 }
+y = { start = -0.8 }
+[parameters]
+m = 1.0
+l = 1.0
+g = 9.81
+[inputs]
+f = { signal = "sin(t)" }
+[energy]
+kinetic = "m*(x_dot**2 + y_dot**2)/2"
+potential = "m*g*y"
+[forces]
+x = "f"
+[constraints]
+rod = "x**2 + y**2 - l**2"
+[run]
+h = 0.005
+duration = 1.0
+"""
 # by name: the scene, and what it has under [run] besides
 WISHES = {
     "steppers": ("cartpole", STEPPERS + 'linearize = "parameters"\n'),
@@ -42,6 +66,7 @@ WISHES = {
     "single": ("suspension", 'real = "float"\ndiscretize = true\nmethod = ["rk4", "gauss4"]\n'),
     "slopes": ("cartpole", "linearize = true\n"),
     "everything": ("", 'method = ["rk4", "dp8", "euler"]\n'),
+    "rod": ("rod", 'method = ["rk4", "gauss4"]\n'),
 }
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -51,8 +76,8 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 def made(name: str) -> System:
     """A scene of scenes/, or one of WISHES."""
     source, run = WISHES.get(name, (name, ""))
-    path = SCENES / f"{source}.toml"
-    text = path.read_text(encoding="utf-8") if source else EVERYTHING
+    own = {"": EVERYTHING, "rod": ROD}
+    text = own.get(source) or (SCENES / f"{source}.toml").read_text(encoding="utf-8")
     text = text.replace("[run]\n", "[run]\n" + run)
     if name in WISHES:
         text = re.sub(r"^name *= .*", f'name = "plain_{name}"', text, count=1, flags=re.MULTILINE)

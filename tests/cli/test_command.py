@@ -61,12 +61,36 @@ def test_a_new_scene_runs_as_it_is_written(here: Path) -> None:
     assert again.exit_code == 2 and "is there already" in again.output
 
 
+def test_scenes_that_come_with_eomc_are_listed_and_copied(here: Path) -> None:
+    shipped = {file.stem for file in SCENES.glob("*.toml")}
+    own, others = eomc("list").output.split("with eomc come")
+    assert "cartpole.toml" in own and "acrobot" not in own
+    assert {line.split()[0] for line in others.splitlines()[1:]} == shipped
+    found = json.loads(eomc("list", "--json").output)
+    assert {row["name"] for row in found if row["shipped"]} == shipped
+    assert not [row for row in json.loads(eomc("list", ".", "--json").output) if row["shipped"]]
+    for words, name in ((["--from", "acrobot"], "acrobot"), (["arm", "--from", "acrobot"], "arm")):
+        assert eomc("new", *words).exit_code == 0
+        text = (here / f"{name}.toml").read_text(encoding="utf-8")
+        assert pipeline.read(here / f"{name}.toml").name == name
+        assert text.replace(f'"{name}"', '"acrobot"', 1) == (SCENES / "acrobot.toml").read_text()
+    assert eomc("new").exit_code == 0 and pipeline.read(here / "pendulum.toml").name == "pendulum"
+
+
+def test_every_scene_that_comes_with_eomc_has_its_name_in_one_place(here: Path) -> None:
+    for file in SCENES.glob("*.toml"):
+        (here / "renamed.toml").unlink(missing_ok=True)
+        assert eomc("new", "renamed", "--from", file.stem).exit_code == 0
+        assert pipeline.name_and_digest(here / "renamed.toml")[0] == "renamed"
+
+
 def test_build_check_and_list(here: Path) -> None:
     assert "built in" in eomc("build", "cartpole.toml").output
     assert "up to date" in eomc("build", "cartpole.toml").output
     checked = eomc("check", "cartpole.toml", "--json")
     assert checked.exit_code == 0 and json.loads(checked.output)[0]["passed"] is True
-    rows = {row["name"]: row["built"] for row in json.loads(eomc("list", "--json").output)}
+    found = json.loads(eomc("list", "--json").output)
+    rows = {row["name"]: row["built"] for row in found if not row["shipped"]}
     assert rows == {"cartpole": True, "kapitza_pendulum": False}
     scene = here / "cartpole.toml"
     scene.write_text(scene.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
@@ -124,6 +148,9 @@ def test_parameters_and_start_on_the_command_line(there: Path) -> None:
         (["build", "cartpol.toml"], "did you mean 'cartpole.toml'?"),
         (["build", "cartpole.toml", "--build", "cartpole.toml/x"], "can't be written"),
         (["new", "class"], "Python keyword"),
+        (["new", "--from", "cartpol"], "did you mean 'cartpole'?"),
+        (["new", "--from", "../scenes/cartpole"], "is no scene that comes with eomc"),
+        (["new", "import", "--from", "cartpole"], "Python keyword"),
         (["list", "nowhere"], "is not a folder"),
     ],
 )

@@ -159,8 +159,8 @@ def test_hostile_file_names(here: Path) -> None:
         output = said("build", "no " + file, status=2)
         assert len(output.splitlines()) == 1 and "there is no such file" in output
         assert "one would replace" in said("build", file, str(here / file), status=2)
-    assert len(said("list").splitlines()) == len(PAYLOADS)
-    assert len(json.loads(said("list", "--json"))) == len(PAYLOADS)
+    assert len(said("list", ".").splitlines()) == len(PAYLOADS)
+    assert len(json.loads(said("list", ".", "--json"))) == len(PAYLOADS)
 
 
 @pytest.mark.slow
@@ -194,7 +194,7 @@ def test_the_commands_print_no_text_raw(here: Path) -> None:
     exec(said("show", file, "--python"), namespace)
     said("check", file)
     said("dof", file)
-    assert every in said("list") and json.loads(said("list", "--json"))[0]["title"] == every
+    assert every in said("list") and json.loads(said("list", ".", "--json"))[0]["title"] == every
 
 
 def test_the_command_prints_through_its_border_alone() -> None:

@@ -20,11 +20,12 @@ from eomc.emit import render, views
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
 from eomc.emit.fast import views as fast_views
+from eomc.emit.fmu import views as fmu_views
 from eomc.emit.plain import views as plain_views
 from eomc.emit.public import Public
 from eomc.program import program
 
-MODULES = (views, plain_views, fast_views)
+MODULES = (views, plain_views, fast_views, fmu_views)
 FOUND = {v for m in MODULES for v in vars(m).values() if dataclasses.is_dataclass(v)}
 VIEWS = sorted((v for v in FOUND if hasattr(v, "TEMPLATE")), key=lambda v: str(v.TEMPLATE))
 INCLUDED = "c/evaluations.c"  # by the sources of both forms
@@ -49,9 +50,9 @@ def test_a_view_has_what_its_template_asks_for(view: Any) -> None:
     assert view.__dataclass_params__.frozen
 
 
-def test_every_template_of_c_and_python_has_a_view() -> None:
+def test_every_template_of_code_has_a_view() -> None:
     root = resources.folder("templates")
-    there = [p for part in ("c", "python") for p in (root / part).rglob("*.jinja")]
+    there = [p for part in ("c", "python", "fmu") for p in (root / part).rglob("*.jinja")]
     names = {p.relative_to(root).as_posix().removesuffix(".jinja") for p in there}
     shown = {view.TEMPLATE for view in VIEWS if not view.TEMPLATE.startswith("report/")}
     assert names == shown | {INCLUDED}

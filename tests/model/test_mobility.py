@@ -15,6 +15,7 @@ from eomc.cli.main import main
 from eomc.model import kinematics, mobility
 from eomc.model.from_scene import from_scene
 from eomc.model.mobility import Mobility
+from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 
 
@@ -362,3 +363,85 @@ def test_the_command(tmp_path: Path) -> None:
     assert done.exit_code == 0 and "arm: 1 freedom in space" in done.output
     reported = json.loads(CliRunner().invoke(main, ["dof", str(path), "--json"]).output)
     assert (reported["M"], reported["rank"], reported["joints"]) == (1, 1, {"revolute": 1})
+
+
+FOUR_BAR = """
+eomc = 1
+name = "four_bar"
+gravity = [0, -9.81]
+
+[coordinates]
+q1 = { unit = "rad", start = "pi/3" }
+q2 = { unit = "rad", start = -0.6 }
+q3 = { unit = "rad", start = 1.4 }
+"""
+BARS = (
+    body("crank", "revolute", "q1", inertia="0.1", center="[0.5, 0]"),
+    body("coupler", "revolute", "q2", "crank", inertia="0.5", offset="[1, 0]"),
+    body("rocker", "revolute", "q3", inertia="0.4", offset="[3.5, 0]"),
+    '[[loop]]\nname = "pin"\njoint = "revolute"\nbodies = ["coupler", "rocker"]\n'
+    "points = [[3, 0], [2.5, 0]]\n",
+)
+
+
+def test_loops_and_rows_count():
+    found = mobility.count(parse(FOUR_BAR + "\n".join(BARS)))
+    assert (found.M, found.coordinates, dict(found.loops)) == (1, 3, {"revolute": 1})
+    assert "in loops 1 revolute (f = 1)" in found.table()
+    row = '\n[constraints]\ndrive = "q1 - t"\n'
+    driven = mobility.count(parse(FOUR_BAR + row + "\n".join(BARS)))
+    assert driven.M == 0
+    assert "M = d(N - 1 - j) + sum f - constraints = 3(4 - 1 - 4) + 4 - 1 = 0" in driven.table()
+
+
+def test_dof_tells_rank_and_the_assembled_start(tmp_path: Path) -> None:
+    file = tmp_path / "four_bar.toml"
+    file.write_text(FOUR_BAR.replace("1.4 }", "1.4, guess = true }") + "\n".join(BARS))
+    done = CliRunner().invoke(main, ["dof", str(file), "--json"])
+    assert done.exit_code == 2  # q2 is held
+    assert "q2" in done.output
+    file.write_text(file.read_text().replace("-0.6 }", "-0.6, guess = true }"))
+    done = CliRunner().invoke(main, ["dof", str(file), "--json"])
+    found = json.loads(done.output)
+    assert (found["M"], found["constraints"]["rank"], found["constraints"]["freedoms"]) == (1, 2, 1)
+    q = found["constraints"]["q"]
+    ends = [
+        np.exp(1j * q["q1"]) + 3 * np.exp(1j * (q["q1"] + q["q2"])),
+        3.5 + 2.5 * np.exp(1j * q["q3"]),
+    ]
+    assert abs(ends[0] - ends[1]) < 1e-14
+    shown = CliRunner().invoke(main, ["dof", str(file)]).output
+    assert "2 rows of constraints on 3 coordinates, rank 2 of 2" in shown
+    assert "assembled start: q1 = 1.04719755, q2 = " in shown
+
+
+def test_dof_of_a_scene_without_bodies(tmp_path: Path) -> None:
+    file = tmp_path / "rod.toml"
+    file.write_text(
+        'eomc = 1\nname = "rod"\n[coordinates]\nx = { start = 0.6 }\n'
+        "y = { start = -1, guess = true }\n"
+        '[energy]\nkinetic = "x_dot**2 + y_dot**2"\n[constraints]\nrod = "x**2 + y**2 - 1"\n'
+    )
+    shown = CliRunner().invoke(main, ["dof", str(file)]).output
+    assert shown.startswith("1 row of constraints on 2 coordinates, rank 1 of 1\n  1 freedom left")
+
+
+def warnings(written):
+    return assembled(from_scene(parse(written))).warnings
+
+
+def test_a_loop_that_is_closed_by_another_turn_is_told():
+    written = (
+        'eomc = 1\nname = "welded"\ngravity = [0, -9.81]\n[coordinates]\n'
+        "x = { guess = true }\ny = { guess = true }\n"
+        'a = { unit = "rad", start = ANGLE, guess = true }\nb = { unit = "rad", start = 0.2 }\n'
+        + body("plate", "planar", "x y a", inertia="0.1")
+        + body("arm", "revolute", "b", inertia="0.1")
+        + '[[loop]]\nname = "seam"\njoint = "weld"\nbodies = ["arm", "plate"]\n'
+        "points = [[1, 0], [0, 0]]\n"
+    )
+    told = {
+        angle: [w.key for w in warnings(written.replace("ANGLE", angle)) if w.severity == "warning"]
+        for angle in ("2.9", "0.9")
+    }
+    assert told == {"2.9": ["loop.seam"], "0.9": []}

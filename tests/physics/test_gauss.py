@@ -18,6 +18,8 @@ from conftest import MODULES, Modules
 import eomc
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import METHODS
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
 from eomc.verify.check import check
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -207,6 +209,26 @@ def test_no_convergence_is_told_and_the_last_state_kept() -> None:
     evaluations, (q, qd), status = counted(path, "gauss8", 1.0, 20)
     assert status == 3
     assert np.isfinite([q, qd]).all() and evaluations < 20 * 4 * 200
+
+
+@pytest.mark.parametrize(
+    ("form", "method", "h"), [("fast", "gauss8", 20.0), ("plain", "gauss6", 40.0)]
+)
+def test_stages_are_sought_anew_where_derivatives_in_the_middle_lead_astray(
+    form: str, method: str, h: float
+) -> None:
+    """A quartic well in long steps: from the start of each Newton's method gets there."""
+    text = (
+        'eomc = 1\nname = "quartic"\n[coordinates]\nx = { rate = 3e-5 }\n'
+        '[energy]\nkinetic = "x_dot**2/2"\npotential = "0.05*x**2 + 2e3*x**4"\n'
+        '[run]\nmethod = ["gauss8", "gauss6"]\n'
+    )
+    made = from_scene(parse(text, "quartic.toml"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of h beyond what follows the motion
+        run = eomc.load(made, MODULES, form=form).simulate(h=h, steps=20, method=method)
+    assert (run.status, run.steps) == ("ok", 20)
+    assert np.ptp(run.energy) < 1e-2 * run.energy[0]
 
 
 def test_runs_are_the_same_however_they_are_cut(modules: Modules) -> None:

@@ -19,6 +19,7 @@ from eomc.emit import coefficients
 from eomc.emit.c_expression import DOUBLE, FLOAT, Real
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import DP8, METHODS, Method
+from eomc.verify.advice import Advice
 from eomc.verify.comparison import Comparison
 from eomc.verify.convergence import Convergence, Finding
 
@@ -119,8 +120,9 @@ def test_a_wrong_coefficient_is_found_by_check(
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     path = tmp_path / "cartpole.toml"
     path.write_text(text.replace("[run]", '[run]\nmethod = ["rk4", "dp8"]'), encoding="utf-8")
-    for row in ("closing", "advised", "beside"):  # which say nothing of it
-        monkeypatch.setattr(Convergence, row, lambda *_: Finding(math.nan, "not looked at"))
+    for of, row in ((Convergence, "closing"), (Advice, "advised"), (Convergence, "beside")):
+        # which say nothing of it
+        monkeypatch.setattr(of, row, lambda *_: Finding(math.nan, "not looked at"))
     made = Comparison(eomc.read(path), eomc.load(path, tmp_path), np.random.default_rng(0), 4)
     made.convergence_rows()
     assert [row.name for row in made.rows if not row.passed] == ["order of dp8"]

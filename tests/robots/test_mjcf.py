@@ -232,7 +232,7 @@ def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
     before = """<size nstack="3"/><option viscosity="1" timestep="0.1"><flag contact="disable"/>
       </option><asset><mesh file="deep/hand.stl"/></asset><nonsense/>"""
     after = """<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>
-      <equality><joint joint1="j" joint2="k"/></equality>
+      <equality><joint joint1="j" active="false"/></equality>
       <contact><exclude body1="a" body2="m"/></contact><sensor><clock name="c"/></sensor>"""
     robot = model(tmp_path, inside, before, after)
     for words in (
@@ -255,7 +255,7 @@ def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
         ("flags", "contact=disable"),
         ("assets", "mesh deep/hand.stl"),
         ("tendons", "t"),
-        ("equality", "joint j and k"),
+        ("equality", "not active", "joint_j"),
         ("contact pairs", "exclude a and m"),
         ("sensors", "c"),
         ("settings", "size"),

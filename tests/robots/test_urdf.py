@@ -184,7 +184,7 @@ def joint(name: str, parent: str, child: str, rest: str = "") -> str:
     ("old", "new", "reported"),
     [
         ("</robot>", joint("back", "slide", "upper-arm") + "</robot>",
-         "joint back: its child link 'upper-arm' is held by joint 'shoulder' already: a closed"),
+         "joint back: its child link 'upper-arm' is held by joint 'shoulder' already: bodies"),
         ('<parent link="base"/>', '<parent link="tool"/>',
          "the links hold one another in a loop (upper-arm on slide on upper-arm)"),
         ("</robot>", '<link name="lonely"/></robot>', "2 links have no parent (base, lonely)"),

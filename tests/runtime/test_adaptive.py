@@ -236,3 +236,31 @@ def test_check_compares_both_forms_with_the_reference(scene: str, real: str) -> 
         report = check(system, eomc.load(system, BUILDS), plain=plain, states=4)
     rows = [row for row in report.rows if "adaptive" in row.name]
     assert len(rows) == 4 and all(row.passed for row in rows), rows
+
+
+def test_the_plain_form_has_the_method_by_fixed_steps_beside(tmp_path: Path) -> None:
+    scene = tmp_path / "swing.toml"
+    scene.write_text(
+        'eomc = 1\nname = "swing"\n[coordinates]\na = { start = 1.0 }\n'
+        '[energy]\nkinetic = "a_dot**2/2"\npotential = "-cos(a)"\n'
+        '[run]\nmethod = ["gauss16", "gauss4"]\ntolerance = 1e-9\nh = 0.1\nduration = 2\n',
+        encoding="utf-8",
+    )
+    plain = eomc.load(scene, tmp_path, form="plain")
+    fitted, fixed = plain.simulate(), plain.simulate(h=0.1)
+    np.testing.assert_allclose(fitted.q[-1], fixed.q[-1], atol=1e-8)
+
+
+def test_the_error_of_a_run_in_single_precision_is_found(tmp_path: Path) -> None:
+    scene = tmp_path / "swing.toml"
+    scene.write_text(
+        'eomc = 1\nname = "single"\n[coordinates]\na = { start = 1.0 }\n'
+        '[energy]\nkinetic = "a_dot**2/2"\npotential = "-cos(a)"\n'
+        '[run]\nreal = "float"\ntolerance = 1e-4\nduration = 5\n',
+        encoding="utf-8",
+    )
+    run = eomc.load(scene, tmp_path).simulate()
+    finer = eomc.load(scene, tmp_path).simulate(tol=1e-6)
+    assert not run.estimate().verdict
+    assert 1e-8 < run.estimate().end["a"] < 1e-3
+    assert abs(run.q[-1, 0] - finer.q[-1, 0]) < 1e-3

@@ -6,6 +6,7 @@ import hashlib
 import math
 import pickle
 import subprocess
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -386,3 +387,47 @@ int main(void)
             times = [float(t) for number, t in lines if int(number) == k]
             near = 1e-12 if real == "double" else 1e-4
             assert times == pytest.approx(run.events[named].t, rel=near)
+
+
+@pytest.mark.parametrize("action", ["record", "stop"])
+def test_c_without_jumps_gives_no_warning(tmp_path: Path, action: str) -> None:
+    events = event("top", "x", f'action = "{action}"')
+    text = FREE.format(name="no_jumps", x=0.0, v=1.0, a=0.0, events=events)
+    made = eomc.sources(from_scene(parse(text, "no_jumps.toml"))).files
+    for folder, flags in (("", STRICT), ("fast", ["-Wall", "-Wextra", "-Werror"])):
+        at = tmp_path / folder
+        at.mkdir(exist_ok=True)
+        for name in ("no_jumps.h", "no_jumps.c"):
+            (at / name).write_text(made[f"{folder}/{name}".lstrip("/")], encoding="utf-8")
+        compiled("cc", *flags, "-c", "no_jumps.c", cwd=at)
+
+
+def test_what_is_all_rounding_ends_soon() -> None:
+    module = free(event("noise", "sin(x)**2 + cos(x)**2 - 1", 'action = "stop"'))
+    begun = time.perf_counter()
+    assert module.simulate(duration=20.0, h_most=0.1).steps < 2000
+    assert time.perf_counter() - begun < 1.0
+
+
+def test_a_batch_by_fixed_steps_passes_over_events_too() -> None:
+    text = BALL.replace("bouncing", "passing_many").replace("[run]", "[run]\nbatch = true")
+    module = built(text)
+    with pytest.warns(RuntimeWarning, match="fixed steps pass over the scene's events"):
+        module.simulate_batch(h=0.01, duration=1.0)
+
+
+def test_two_jumps_a_rounding_apart_do_not_accumulate(tmp_path: Path) -> None:
+    """A wall that is met when a clock strikes: both jump, one after the other."""
+    scene = tmp_path / "walls.toml"
+    scene.write_text(
+        'eomc = 1\nname = "struck"\n[coordinates]\n'
+        "x = { rate = 1.0 }\ny = { start = 0.25, rate = 1.0 }\n"
+        '[energy]\nkinetic = "(x_dot**2 + y_dot**2)/2"\n[run]\ntolerance = 1e-12\nduration = 3\n'
+        '[[event]]\nname = "wall"\nwhen = "1 - x**2"\naction = "jump"\nx_dot = "-0.5*x_dot"\n'
+        '[[event]]\nname = "clock"\nwhen = "t - 1"\naction = "jump"\ny_dot = "2*y_dot"\n',
+        encoding="utf-8",
+    )
+    run = eomc.load(scene, tmp_path).simulate()
+    assert run.status == "ok"
+    np.testing.assert_allclose(run.q[-1], [0.0, 5.25], atol=1e-12)
+    np.testing.assert_allclose(run.qd[-1], [-0.5, 2.0], atol=1e-12)

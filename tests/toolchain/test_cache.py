@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from multiprocessing import get_context
 from multiprocessing.context import ForkProcess
 from pathlib import Path
@@ -397,3 +398,11 @@ def test_a_relative_root_survives_another_current_folder(
         monkeypatch.chdir(tmp_path / place)
         assert eomc.load(scene, "build").g([1.0]).size == 1
         scene.write_text(CHANGED, encoding="utf-8")
+
+
+def test_a_system_of_which_something_was_replaced_is_built_anew(tmp_path: Path) -> None:
+    made = eomc.System.make("swing", {"a": 1.0}, "a_dot**2/2", "-cos(a)")
+    assert eomc.load(made, tmp_path).methods == ("rk4",)
+    other = replace(made, run=replace(made.run, methods=("dp8",)))
+    assert eomc.load(other, tmp_path).methods == ("dp8",)
+    assert not pipeline.build(other, tmp_path).fresh

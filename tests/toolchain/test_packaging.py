@@ -30,7 +30,7 @@ def ran(*command: str, at: Path, **variables: str) -> str:
 def expected() -> set[str]:
     """The files of the package, as a wheel has them."""
     places = {ROOT / "generator/eomc": "eomc"}
-    places |= {ROOT / kind: f"eomc/{kind}" for kind in ("templates", "csrc")}
+    places |= {ROOT / kind: f"eomc/{kind}" for kind in ("templates", "csrc", "scenes")}
     return {
         f"{place}/{file.relative_to(folder).as_posix()}"
         for folder, place in places.items()

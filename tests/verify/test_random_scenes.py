@@ -239,7 +239,8 @@ def test_right_modules_pass(modules: Modules, what: str) -> None:
 # what the author of scenes wrote when a row of a right module once said FAILED
 SEEDS = """400000 500399 500434 500578 500643 500672 700053 800095 800167 800199 800410
 800476 900093 910099 920113 920124 920312
-930199 940014 950333 950375 970109""".split()
+930199 940014 950333 950375 970109 980083, 2350034 2301127 2301434 2301494
+2400025 2500430 2502147 2502851 2502869""".split()
 
 
 @pytest.mark.parametrize("seed", tiers(SEEDS))
@@ -366,6 +367,38 @@ def test_advice_near_stiff_friction_is_judged_by_eigenvalues(modules: Modules) -
     (row,) = (r for r in right(DRAG, modules).rows if r.name == "h of rk4")
     assert row.passed and row.limit == 2 and 1 <= row.error < 1.1
     assert "eigenvalues" in row.unit
+
+
+LEAVING = """eomc = 1
+name = "leaving"
+[coordinates]
+x = { start = 0.5, rate = 0.2 }
+y = { start = 0.3 }
+[parameters]
+k = 1.7e4
+[energy]
+kinetic = "0.3*x_dot**2 + (2 + sin(x))*y_dot**2/4 + y_dot**2"
+potential = "k*x**2/2 - 12*exp(-y**2) + x*y"
+[run]
+method = ["rk4", "gauss16"]
+h = 0.02
+duration = 1.0
+"""
+
+
+def test_steps_too_long_for_the_motion_do_not_say_how_far_it_goes(modules: Modules) -> None:
+    """RK4 is lost in steps of this h: what it says of the motion after some is nothing."""
+    module = modules.unoptimised(LEAVING)
+    made = from_scene(parse(LEAVING, "test.toml"))
+    comparison = Comparison(made, module, np.random.default_rng(0), None)
+    assert comparison.simulate(comparison.sampler.start).status == "not finite"
+    assert np.allclose(comparison.sampler.spread, [0.5, 0.3], rtol=0.1)
+    assert np.allclose(comparison.sampler.speed, [84, 3], rtol=0.1)
+    stiff = comparison.advice.stiff
+    assert np.all(np.abs([stiff.q, stiff.qd]) < 101 * comparison.advice.scale)
+    report = right(LEAVING, modules)
+    (row,) = (r for r in report.rows if r.name == "h of gauss16")
+    assert row.judged and report.passed, report.table()
 
 
 def test_a_method_of_order_1_balances_power_at_order_1(modules: Modules) -> None:

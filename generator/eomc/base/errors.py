@@ -31,6 +31,10 @@ class FolderError(EomcError):
         return super().__str__()
 
 
+class NoCompilerError(EomcError):
+    """There is no C compiler."""
+
+
 @dataclass(frozen=True)
 class Problem:
     """One fault. `column` counts from 0; `line` from 1, 0 where there is no line to show."""

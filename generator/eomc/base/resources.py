@@ -1,4 +1,4 @@
-"""Templates, hand-written C and runtime files: in the package in a wheel, above it in a clone."""
+"""Templates, hand-written C, scenes, runtime files: inside the package, or above it in a clone."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def folder(kind: str) -> Path:
-    """The folder `templates` or `csrc`."""
+    """The folder `templates`, `csrc` or `scenes`."""
     installed = PACKAGE / kind
     return installed if installed.is_dir() else PACKAGE.parent.parent / kind
 
@@ -17,6 +17,11 @@ def folder(kind: str) -> Path:
 def text(kind: str, name: str) -> str:
     """The text of one of its files."""
     return (folder(kind) / name).read_text(encoding="utf-8")
+
+
+def scenes() -> dict[str, Path]:
+    """The scenes that come with eomc: their files by name."""
+    return {file.stem: file for file in sorted(folder("scenes").glob("*.toml"))}
 
 
 def runtime(batch: bool) -> dict[str, str]:

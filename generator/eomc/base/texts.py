@@ -126,6 +126,13 @@ def html(text: str) -> str:
     return escape(line(text))
 
 
+def xml(text: str) -> str:
+    """A text in an attribute of XML."""
+    from markupsafe import escape
+
+    return str(escape(line(text)))
+
+
 def toml(text: str) -> str:
     """A text as TOML writes it, in quotes, such as the reader accepts."""
     return json.dumps(line(text), ensure_ascii=False)
@@ -161,7 +168,7 @@ class FreeText:
         return bool(self.text)
 
     def __str__(self) -> NoReturn:
-        raise TypeError("free text is printed as .comment, .line or .python")
+        raise TypeError("free text is printed as .comment, .line, .xml or .python")
 
     def __repr__(self) -> str:
         return "FreeText(...)"  # what prints a list of them
@@ -175,6 +182,11 @@ class FreeText:
     def comment(self) -> str:
         """For a C comment."""
         return comment(self._one())
+
+    @property
+    def xml(self) -> str:
+        """For an attribute of XML."""
+        return xml(self._one())
 
     @property
     def python(self) -> str:

@@ -18,24 +18,49 @@ from eomc.cli.terminal import progress_bar, say, shown, warn
 @click.command("build")
 @options.SCENES
 @options.BUILD
+@click.option(
+    "--c",
+    "folder",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Write only the C, into DIR: no compiler is needed, and no Python module made.",
+)
+@click.option(
+    "--prefix",
+    metavar="NAME",
+    help="With --c: what names and files begin with, to have two versions in one program.",
+)
+@click.option(
+    "--wheel",
+    is_flag=True,
+    help="Write a wheel of the module here, for pip; it needs NumPy and cffi, and no eomc.",
+)
 @options.QUIET
 @options.JSON
-def command(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> None:
+def command(
+    scenes: Sequence[Path], root: Path, folder: Path | None, prefix: str | None, wheel: bool,
+    quiet: bool, as_json: bool,
+) -> None:  # fmt: skip
     """Derive, generate and compile: a package and embeddable C in build/NAME/.
 
     \b
     eomc build scenes/cartpole.toml
     PYTHONPATH=build python -c "import cartpole; print(cartpole.simulate())"
     cd build/cartpole && cc -std=c99 -O2 -I. main.c cartpole.c -lm && ./a.out
+    eomc build scenes/cartpole.toml --c firmware/cartpole
+    eomc build scenes/cartpole.toml --wheel && pip install ./cartpole-*.whl
     """
-    named: dict[str, Path] = {}
-    for scene in scenes:
-        name = pipeline.name_and_digest(scene)[0]
-        if name and (other := named.setdefault(name, scene)) != scene:
-            raise EomcError(
-                f"{shown(other)} and {shown(scene)} are both named '{name}': one would replace "
-                "the other"
-            )
+    if wheel and folder is not None:
+        raise EomcError("--wheel and --c: choose one")
+    if folder is not None:
+        _write_c(scenes, folder, prefix, quiet, as_json)
+        return
+    if prefix is not None:
+        raise EomcError("--prefix: goes with --c DIR")
+    _refuse_twins(scenes)
+    if wheel:
+        _write_wheels(scenes, quiet, as_json)
+        return
     done = []
     with progress_bar("building", quiet or as_json) as progress:
         for k, scene in enumerate(scenes):
@@ -52,3 +77,46 @@ def command(scenes: Sequence[Path], root: Path, quiet: bool, as_json: bool) -> N
                 say(f"{shown(built.folder)}/: {said}")
     if as_json:
         say(json.dumps(done, indent=1))
+
+
+def _refuse_twins(scenes: Sequence[Path]) -> None:
+    """Raise EomcError where two scenes have one name."""
+    named: dict[str, Path] = {}
+    for scene in scenes:
+        name = pipeline.name_and_digest(scene)[0]
+        if name and (other := named.setdefault(name, scene)) != scene:
+            raise EomcError(
+                f"{shown(other)} and {shown(scene)} are both named '{name}': one would replace "
+                "the other"
+            )
+
+
+def _write_wheels(scenes: Sequence[Path], quiet: bool, as_json: bool) -> None:
+    """A wheel of each scene, in the current folder."""
+    done = []
+    with progress_bar("building", quiet or as_json) as progress:
+        for k, scene in enumerate(scenes):
+            wheel = pipeline.write_wheel(scene, Path(), warn=warn)
+            progress(k + 1, len(scenes))
+            done.append({"scene": str(scene), "wheel": str(wheel)})
+            if not quiet and not as_json:
+                say(f"wrote {shown(wheel)}")
+    if as_json:
+        say(json.dumps(done, indent=1))
+
+
+def _write_c(
+    scenes: Sequence[Path], folder: Path, prefix: str | None, quiet: bool, as_json: bool
+) -> None:
+    """The C of one scene, in a folder of its own."""
+    if len(scenes) > 1:
+        raise EomcError(f"--c: takes one scene, since {shown(folder)} holds the C of one")
+    files = pipeline.write_c(scenes[0], folder, prefix, warn=warn)
+    if as_json:
+        say(
+            json.dumps(
+                {"scene": str(scenes[0]), "folder": str(folder), "files": [*files]}, indent=1
+            )
+        )
+    elif not quiet:
+        say(f"wrote {shown(folder)}/: {', '.join(files)}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -17,11 +18,34 @@ from eomc.cli.terminal import say
 def command(scene: Path, as_json: bool) -> None:
     """Count a scene's freedoms, from its bodies and joints, and say which are redundant.
 
+    Of a scene with constraints or loops also the rank of their rows and the freedoms that they
+    leave, which rows are redundant, how near the start is to a singular position, and where it is
+    assembled.
+
     \b
     eomc dof scenes/arm.toml
+    eomc dof scenes/slider_crank.toml
     """
     from eomc.model import mobility
     from eomc.scene import read as scenes
 
-    counted = mobility.count(scenes.read(scene))
-    say(json.dumps(counted.as_dict(), indent=1) if as_json else counted.table())
+    read = scenes.read(scene)
+    counted: dict[str, Any] = {"scene": read.name}
+    lines = []
+    if not read.constrained or (read.assembly and read.assembly.bodies):
+        found = mobility.count(read)
+        counted, lines = found.as_dict(), [found.table()]
+    if read.constrained:
+        from eomc import pipeline
+
+        system = pipeline.read(scene)
+        assert system.closure is not None
+        counted["constraints"] = {
+            **system.closure.as_dict(),
+            "q": {c.name: c.start for c in system.coordinates},
+            "qd": {f"{c.name}_dot": c.rate for c in system.coordinates},
+        }
+        lines.append(system.closure.table())
+        start = (f"{c.name} = {c.start:.9g}" for c in system.coordinates)
+        lines.append(f"  assembled start: {', '.join(start)}")
+    say(json.dumps(counted, indent=1) if as_json else "\n".join(lines))

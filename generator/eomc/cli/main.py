@@ -1,4 +1,4 @@
-"""The command: eomc new, import, build, check, run, report, show, dof, list.
+"""The command: eomc new, import, build, check, run, report, show, export, dof, list.
 
 Exit status: 0, 1 where a check failed or a run could not go on, 2 for bad input. A command is
 imported when it is called, and what takes time to import (SymPy, pydantic, rich) where it is
@@ -18,7 +18,7 @@ from eomc.base.version import __version__
 from eomc.cli import terminal
 from eomc.cli.terminal import fail, say
 
-COMMANDS = "build check dof import list new report run show".split()
+COMMANDS = "build check dof export import list new report run show".split()
 
 
 class _Group(terminal.Group):

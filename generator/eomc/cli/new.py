@@ -2,32 +2,65 @@
 
 from __future__ import annotations
 
+import re
+
 import click
 
-from eomc.base import texts
+from eomc.base import resources, texts
 from eomc.base.errors import EomcError
 from eomc.cli import files
 from eomc.cli.terminal import say, shown
 
+DEFAULT = "pendulum"  # what the template is
+
 
 @click.command("new")
-@click.argument("name")
-def command(name: str) -> None:
+@click.argument("name", required=False)
+@click.option(
+    "--from", "source", metavar="SCENE",
+    help="A scene that comes with eomc, as 'eomc list' has them; by default a driven pendulum.",
+)  # fmt: skip
+def command(name: str | None, source: str | None) -> None:
     """Write a scene to start from: scenes/NAME.toml, or NAME.toml where there is no scenes/.
+
+    NAME is by default what the scene is called that it starts from.
 
     \b
     eomc new crane
+    eomc new --from cartpole
+    eomc new crane --from cartpole
     """
     from eomc.base import names
-    from eomc.emit.render import environment
 
+    if name is None:
+        name = source or DEFAULT
+    copied = None if source is None else _copied(source, name)
     if why := names.module_fault(name):
         raise EomcError(why)
-    text = (
-        environment()
-        .get_template("scene/scene.toml.jinja")
-        .render(name=name, title=name.replace("_", " ").capitalize())
-    )
     path = files.scene_path(name)
-    files.write_new(path, text)
+    files.write_new(path, _made(name) if copied is None else copied)
     say(f"wrote {shown(path)}; try: eomc run {texts.command(str(path))}")
+
+
+def _made(name: str) -> str:
+    """The driven pendulum under this name."""
+    from eomc.emit.render import environment
+
+    title = name.replace("_", " ").capitalize()
+    return environment().get_template("scene/scene.toml.jinja").render(name=name, title=title)
+
+
+def _copied(source: str, name: str) -> str:
+    """A scene that comes with eomc, under this name. Raises EomcError where there is none."""
+    known = resources.scenes()
+    if source not in known:
+        import difflib
+
+        near = difflib.get_close_matches(source, known, n=1)
+        meant = f"did you mean '{near[0]}'? " if near else ""
+        raise EomcError(
+            f"--from {shown(source)}: is no scene that comes with eomc; {meant}they are "
+            + ", ".join(known)
+        )
+    text = known[source].read_text(encoding="utf-8")
+    return re.sub(rf'^(name *= *)"{source}"', rf'\1"{name}"', text, count=1, flags=re.MULTILINE)

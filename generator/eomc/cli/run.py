@@ -84,7 +84,7 @@ def command(
             seconds = time.perf_counter() - begun
     except module.Interrupted as stop:  # what was done is kept
         done, seconds = stop.run, time.perf_counter() - begun
-    except (ValueError, MemoryError) as fault:
+    except (ValueError, MemoryError, module.MotionError) as fault:
         raise EomcError(str(fault).replace("every=", "--every")) from None
     stopped = done.status == "interrupted"
     if done.status == "ok" and seconds < 2:
@@ -209,7 +209,7 @@ def _summary(
             "largest_change": float(np.max(np.abs(energy - energy[0]))),
             "balance": dataclasses.asdict(balance) if balance else None,
         },
-        "events": {name: e.t.tolist() for name, e in getattr(done, "events", {}).items()},
+        "events": {name: e.t.tolist() for name, e in done.events.items()},
         "stopped_by": getattr(done, "stopped", "") or None,
         "saturated": _saturated(module, done),
         "jacobi_change": None

@@ -8,7 +8,7 @@ import click
 
 from eomc import pipeline
 from eomc.cli import options
-from eomc.cli.terminal import say, status_line
+from eomc.cli.terminal import say, status_line, warn
 from eomc.toolchain import kept
 
 
@@ -20,6 +20,10 @@ from eomc.toolchain import kept
     "--python", "form", flag_value="python", help="Python source that makes the matrices."
 )
 @click.option("--cost", "form", flag_value="cost", help="Operations of each generated function.")
+@click.option(
+    "--sizes", "form", flag_value="sizes",
+    help="Bytes of code and stack of each function of the plain C, as $CC makes them by -Os.",
+)  # fmt: skip
 def command(scene: Path, root: Path, form: str | None) -> None:
     """Print the equations of motion, L, D, C, g and the rest, as text for a terminal.
 
@@ -27,6 +31,9 @@ def command(scene: Path, root: Path, form: str | None) -> None:
     eomc show scenes/cartpole.toml
     eomc show scenes/cartpole.toml --latex
     """
+    if form == "sizes":
+        say(_sizes(scene))
+        return
     name, digest = pipeline.name_and_digest(scene)
 
     def made() -> dict[str, str]:
@@ -44,3 +51,32 @@ def command(scene: Path, root: Path, form: str | None) -> None:
     if found["warnings"]:
         say(found["warnings"], err=True)
     say(found["text"])
+
+
+def _sizes(scene: Path) -> str:
+    """What a compiler makes of the plain C, as a table."""
+    import shlex
+
+    from eomc.toolchain import sizes
+    from eomc.toolchain.compiler import find_compiler
+
+    compiler = find_compiler()
+    with status_line("deriving", False):
+        made = pipeline.sources(pipeline.read(scene), warn=warn)
+        found = sizes.measure(made.files, made.name, compiler)
+    rows: list[tuple[str, ...]] = [("function", "code", "stack", "with calls")]
+    for f in found.functions:
+        told = (f.code, f.stack, f.deepest)
+        rows.append((f.name, *("-" if n is None else str(n) for n in told)))
+    wide = max(len(row[0]) for row in rows)
+    library = sorted(
+        {x for f in found.functions for x in f.calls} - {f.name for f in found.functions}
+    )
+    lines = [
+        f"{made.name}.c: bytes of code and stack, by {shlex.join(found.command)}", "",
+        *(f"{name:{wide}}  {code:>6}  {stack:>6}  {deep:>10}" for name, code, stack, deep in rows),
+        "",
+        f"in all {found.code} of code, {found.constants} of constants, {found.writable} writable",
+    ]  # fmt: skip
+    lines += [f"stack of libraries left out: {', '.join(library)}"] if library else []
+    return "\n".join((*lines, *found.faults))

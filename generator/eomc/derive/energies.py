@@ -24,6 +24,7 @@ class Energies:
     signals: list[Expr]
     points: dict[Symbol, Expr]  # w -> y
     applied: list[tuple[Expr, Expr]]  # the velocity of a position, and the force there
+    rows: list[Expr]  # of constraints
 
 
 def directions(system: System) -> dict[Symbol, Symbol]:
@@ -74,6 +75,7 @@ def on_tape(
     applied = [(dot(y), force) for y, force in system.applied]
     ends = [kinetic, potential, system.dissipation, *forces, *(i.signal for i in system.inputs)]
     ends += [e for pair in applied for e in pair]
+    ends += [row.formula for row in system.constraints]
     for defined, expr in needed(system.definitions, ends):
         known[defined] = tape.named(value(expr), defined.name)
     return Energies(
@@ -85,6 +87,7 @@ def on_tape(
         [value(i.signal) for i in system.inputs],
         points,
         [(value(v), value(force)) for v, force in applied],
+        [value(row.formula) for row in system.constraints],
     )
 
 

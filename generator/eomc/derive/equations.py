@@ -10,6 +10,7 @@ import sympy
 from sympy import Expr, S, Symbol
 
 from eomc.base.errors import SceneError
+from eomc.derive.constraints import Constraints, constraints
 from eomc.derive.energies import Energies, directions
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import Tape
@@ -41,7 +42,7 @@ class Equations(Motion):
     """The equations of motion. C: as D; kinetic, potential: K and P.
 
     jacobi: p.qd - K + P, what is conserved without forces and explicit time; None where it is
-    K + P. power: d(jacobi)/dt; 0 for a conservative system.
+    K + P. power: d(jacobi)/dt without what constraints do; 0 for a conservative system.
     """
 
     tape: Tape
@@ -51,6 +52,7 @@ class Equations(Motion):
     potential: Expr
     jacobi: Expr | None
     power: Expr
+    rows: Constraints | None
 
 
 def equations(system: System, e: Energies, motion: Motion) -> Equations:
@@ -80,6 +82,7 @@ def equations(system: System, e: Energies, motion: Motion) -> Equations:
         potential=e.potential,
         jacobi=jacobi,
         power=power,
+        rows=constraints(system, e),
     )
 
 

@@ -46,7 +46,8 @@ class Derivation:
     lagrange: over the program of K and P; newton_euler: recursively, where there are bodies on
     joints; None where that way was not gone. The rest are the accelerations, each by one way of
     solving D qdd = b: Lagrange's D by L D L^T, D of composite bodies by L D L^T, articulated
-    bodies, link multipliers; or why it was not tried, or None where there is nothing to try.
+    bodies, link multipliers; or why it was not tried, or None where there is nothing to try, as
+    where there are constraints (kkt.py).
     """
 
     system: System
@@ -65,7 +66,7 @@ def derive(system: System) -> Derivation:
     Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral); C from
     Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
     """
-    lagrange = newton_euler = articulated = composite = None
+    lagrange = newton_euler = articulated = composite = multipliers = None
     places = len(needed(system.definitions, (system.kinetic, system.potential)))
     ldl: Way = f"{places} world coordinates to differentiate"
     try:
@@ -73,7 +74,7 @@ def derive(system: System) -> Derivation:
             lagrange, ldl, multipliers = _by_lagrange(system)
         if system.tree is not None:
             newton_euler, articulated, composite = _by_newton_euler(system, system.tree)
-        if lagrange is None:
+        if lagrange is None and not system.constraints:
             multipliers = _by_multipliers(system)
     except RoughError:  # P and R are differentiated once, K twice
         message = (
@@ -88,6 +89,8 @@ def _by_lagrange(system: System) -> tuple[Equations, Way, Way]:
     """The equations, and accelerations by L D L^T and by multipliers."""
     e = on_tape(system, system.kinetic, system.potential)
     motion = _lagrange(system, e)
+    if system.constraints:
+        return equations(system, e, motion), None, None
     _refuse_massless(system, motion.D)
     multipliers, operations = _by_multipliers(system), work(motion.D)
     ldl: Way = f"{operations} flops for elimination alone"
@@ -118,7 +121,8 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, Way, Way]:
         g=_sums(tape, rest.g, placed(recursion.gravity_forces())),
         balance=_sums(tape, rest.balance, [-x for x in bias]),
     )
-    articulated = _by_articulated_bodies(system, recursion, rest)
+    constrained = bool(system.constraints)
+    articulated = None if constrained else _by_articulated_bodies(system, recursion, rest)
     operations = recursion.elimination()
     long = isinstance(articulated, Solution) and operations > _length(articulated)
     if long and len(q) > MOST_ROWS:
@@ -129,9 +133,10 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, Way, Way]:
         whole = [*map(placed, columns)]  # by column; of symmetric entries one is kept
         rows = [[whole[min(i, j)][max(i, j)] for j in range(len(q))] for i in range(len(q))]
         D = tuple(_sums(tape, *pair) for pair in zip(rest.D, rows, strict=True))
-        _refuse_massless(system, D)
-    composite: Way = f"{operations} flops for elimination alone"
-    if not long:
+        if not constrained:
+            _refuse_massless(system, D)
+    composite: Way = None if constrained else f"{operations} flops for elimination alone"
+    if not long and not constrained:
         composite = solve(tape, D, motion.balance)
     e.kinetic = tape.total([e.kinetic, recursion.kinetic_energy()])
     e.potential = tape.total([e.potential, recursion.potential_energy()])

@@ -23,7 +23,8 @@ class Solution:
 
     order: the order in which coordinates are eliminated; pivots: those of L diag(pivots) L^T, all
     positive where D is positive definite, each paired with a value of the size of its origin.
-    matrix: what is eliminated, D or, for the forces that hold links together, S.
+    matrix: what is eliminated, D or, for the forces that hold links together, S. multipliers: of
+    constraints, where there are.
     """
 
     tape: Tape
@@ -31,6 +32,7 @@ class Solution:
     order: tuple[int, ...]
     pivots: Pairs
     matrix: str = "D"
+    multipliers: Vector = ()
 
 
 # qdd by one way of solving; or why that was not tried; or None where there is nothing to try

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from sympy import Expr, S, Symbol
@@ -23,13 +24,13 @@ class Outputs:
     slopes: Rows
 
 
-def outputs(system: System, sloped: bool) -> Outputs:
-    """The system's outputs, with slopes where it is `sloped`.
+def outputs(system: System, sloped: bool, more: Sequence[Symbol] = ()) -> Outputs:
+    """The system's outputs, with slopes where it is `sloped`. more: what they read besides.
 
     Raises SceneError where a derivative is needed that does not exist.
     """
     try:
-        return _outputs(system, sloped)
+        return _outputs(system, sloped, more)
     except RoughError:
         message = (
             "a derivative of something that jumps is needed (sign or heaviside, in dot(...) or for "
@@ -44,8 +45,8 @@ def signal_slopes(system: System) -> Outputs:
     return outputs(replace(system, outputs=signals, inputs=()), sloped=True)
 
 
-def _outputs(system: System, sloped: bool) -> Outputs:
-    tape = Tape(leaves(system, *system.qdd))
+def _outputs(system: System, sloped: bool, more: Sequence[Symbol]) -> Outputs:
+    tape = Tape(leaves(system, *system.qdd, *more))
     state = (*system.q, *system.qd)
     rates = {**dict(zip(state, (*system.qd, *system.qdd), strict=True)), t: S.One}
     known: dict[Symbol, Expr] = {}

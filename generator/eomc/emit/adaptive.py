@@ -10,12 +10,16 @@ from eomc.emit import c_function as c
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers, rounded
 from eomc.emit.functions import Functions
-from eomc.emit.plain.views import Adaptive, AdaptiveRun
+from eomc.emit.plain.adaptive_views import (
+    Adaptive,
+    AdaptiveRun,
+)
 from eomc.integrators.tableaux import GAUSS16
 
 METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
+LOOSEST = 1e-2  # tolerance
 BUSY = 32  # events in one step, from which on it ends there
 
 
@@ -35,7 +39,8 @@ class Form:
 
     sweep: of a sweep from *a to b. start: of the accelerations f at q, qd. extent: of vectors of
     coordinates. constants: whether what parameters decide is a struct c; compute_constants: its
-    call, which fails where there are none. lanes: a macro before loops over stages.
+    call, which fails where there are none. lanes: a macro before loops over stages. project: the
+    call that ends a step on constraints, if there are: of what it adds, or of its `whole` end.
     """
 
     around: tuple[CArgument, ...]
@@ -45,6 +50,8 @@ class Form:
     constants: bool = False
     compute_constants: str = ""
     lanes: str = ""
+    project: str = ""
+    whole: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,6 +121,7 @@ def steps(made: Stepping) -> Adaptive:
     end = real.function_suffix
     known = {"a": "&a", "rough": "&rough", "sweeps": "&sweeps"}
     return Adaptive(
+        prefix=functions.prefix,
         PREFIX=functions.PREFIX,
         real=functions.real,
         title=TITLE,
@@ -136,6 +144,8 @@ def steps(made: Stepping) -> Adaptive:
         before=numbers(m.legendre(m.stages - 2), real),
         timed=target.driven,
         events=bool(target.system.events),
+        project=form.project,
+        whole=form.whole,
         settle=made.settle,
         sweep=form.sweep,
         step=made.step,
@@ -156,13 +166,21 @@ def run(made: Stepping, happen: str = "", restart: str = "") -> AdaptiveRun:
         tuple(c.filled(functions.real, n) for n in ("q_row", "qd_row", "q", "qd")),
     )  # fmt: skip
     to = {"q_row": row["q_rows"], "qd_row": row["qd_rows"]}
-    takes_p = "p" in {a.name for a in made.rest} or bool(form.compute_constants or happen)
+    takes_p = "p" in {a.name for a in made.rest} or bool(
+        form.compute_constants or happen or form.project
+    )
+
+    def projected(**state: str) -> str:
+        return functions.public.project.call(held="0", **state) if form.project else ""
+
     return AdaptiveRun(
         **functions.names,
         method=made.method,
         constants=form.constants,
         unread_p=target.needs_p and not takes_p,
         compute_constants=form.compute_constants,
+        loosest=target.literal(LOOSEST),
+        tightest=target.literal(1e-15 if target.real.epsilon < 1e-10 else 5e-7),
         events=bool(happen),
         busy=BUSY,
         run=functions.public.adaptive(METHOD.name),
@@ -172,6 +190,8 @@ def run(made: Stepping, happen: str = "", restart: str = "") -> AdaptiveRun:
         row=kept.call(q="x.q", qd="x.qd", **to),
         row_before=kept.call(q="q_at", qd="qd_at", **to),
         look=made.within.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
+        project_row=projected(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]"),
+        project_restart=projected(q="x.q", qd="x.qd", t="x.t"),
     )
 
 

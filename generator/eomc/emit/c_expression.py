@@ -29,6 +29,7 @@ C_NAMES = {
     "min": "fmin",
     "max": "fmax",
 }
+PIVOT = "pivot_inverse"  # a function of ours
 
 _STAGE_COMMENTS = {
     Stage.TIME: "time and inputs",
@@ -187,11 +188,16 @@ class Printer:
             sign = self._sign(value.args[0])
             half = "0.5" + self.real.suffix
             return (sign, 4) if value.function == "sign" else (f"{half} + {half}*{sign}", 1)
-        c_name = C_NAMES[value.function] + self.real.function_suffix
+        ours = value.function == PIVOT
+        c_name = PIVOT if ours else C_NAMES[value.function] + self.real.function_suffix
         if self.real.lane:
             c_name = f"{self.prefix}_{c_name}_{self.real.lane}"
+        elif ours:
+            c_name = f"{self.prefix}_{c_name}"
         args = [self.in_lane(a) for a in value.args]
         text = f"{c_name}({args[0]})" if len(args) == 1 else ""
+        if ours:
+            text = f"{c_name}({', '.join(args)})"
         if not text:  # min and max of several: pair by pair
             text = args[0]
             for arg in args[1:]:

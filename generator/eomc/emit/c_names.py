@@ -23,13 +23,14 @@ _OURS = frozenset(
     "q qd qdd t t0 u p c a h i j r s v D C g K P bias tau power energy now k n good status first "
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
     "moving constants along column slopes outputs applied count failures point E poses velocities "
-    "accelerations jacobians forces wrenches momentum events after".split()
+    "accelerations jacobians forces wrenches momentum events after phi rates lambda reactions "
+    "d far total singular".split()
 )
 
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
 # that is called so has another name in C
 OWN = frozenset(
-    "ACCUMULATED AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE LANES NE NF NOINLINE "
+    "ACCUMULATED AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE LANES LOCKED NC NE NF NOINLINE "
     "NOT_FINITE NO_CONVERGENCE NQ NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL "
     "WIDE_BYTES WIDE_COUNT".split()
 )
@@ -74,6 +75,7 @@ class Target:
         indexed = [*(c.name for c in self.system.coordinates), *self.input_names]
         outputs = [f"OUT_{o.name}" for o in self.system.outputs]
         outputs += [f"EVENT_{e.name}" for e in self.system.events]
+        outputs += [f"CONSTRAINT_{c.name}" for c in self.system.constraints]
         names = [*indexed, *outputs, *(f"FRAME_{f.name}" for f in self.system.asked)]
         wishes = [f"{self.PREFIX}_{name}" for name in names]
         return dict(zip(names, _unique(wishes, taken), strict=True))
@@ -92,6 +94,11 @@ class Target:
     def wrenches(self) -> list[Symbol]:
         """The entries of forces and moments at the frames."""
         return wrenches(self.system)
+
+    @property
+    def multipliers(self) -> list[str]:
+        """Those of constraints, as reactions read them."""
+        return [c.multiplier.name for c in self.system.constraints]
 
     @property
     def needs_p(self) -> bool:
@@ -113,7 +120,8 @@ class Target:
     @cached_property
     def driven(self) -> bool:
         """Whether motion depends on the time, by itself or by the signals."""
-        return TIME in self.program["acceleration"].uses or self.signal_t
+        moved = [f for n in ("acceleration", "correction") if (f := self.program.functions.get(n))]
+        return any(TIME in f.uses for f in moved) or self.signal_t
 
     @cached_property
     def sincos(self) -> bool:
@@ -164,6 +172,7 @@ class Target:
         if s.reads_qdd:
             read += [(c.qdd.name, state("qdd", c.name)) for c in s.coordinates]
         read += [(w.name, f"wrenches[{k}]") for k, w in enumerate(self.wrenches)]
+        read += [(x, f"lambda[{k}]") for k, x in enumerate(self.multipliers)]
         read += [(name, inputs("u", name)) for name in self.input_names]
         read += [(c.q.name + ALONG, state("along", c.name)) for c in s.coordinates]
         read += [(c.qd.name + ALONG, f"along[{NQ} + {self.enum[c.name]}]") for c in s.coordinates]
@@ -186,6 +195,7 @@ class Target:
             "qd": frozenset(x.name for x in s.qd),
             "qdd": frozenset(x.name for x in s.qdd) if s.reads_qdd else frozenset(),
             "wrenches": frozenset(x.name for x in self.wrenches),
+            "lambda": frozenset(self.multipliers),
             "t": frozenset({TIME}),
             "u": frozenset(self.input_names),
             "p": frozenset(p.name for p in s.parameters),

@@ -100,6 +100,45 @@ KINDS: Mapping[str, Kind] = {
     "momentum": Kind(
         "momentum", "momentum", True, False, "Of all bodies that move, rotors aside: {momentum}."
     ),
+    "constraints": Kind(
+        "phi", "c", True, False, "What is zero along every motion: the constraints, in their order."
+    ),
+    "constraint_rates": Kind(
+        "rates",
+        "c",
+        True,
+        False,
+        "A qd + dphi/dt of holonomic constraints, psi of others: zero along every motion too.",
+    ),
+    "constraint_jacobian": Kind(
+        "A",
+        "c*n",
+        False,
+        False,
+        "A = dphi/dq of holonomic constraints, dpsi/dqd of others, by rows.",
+    ),
+    "constraint_slopes": Kind(
+        "slopes",
+        "c*n",
+        True,
+        False,
+        "Of what constraint_rates gives, the derivatives along q, by rows; those along qd are A.",
+    ),
+    "multipliers": Kind(
+        "lambda",
+        "c",
+        True,
+        True,
+        "lambda in D qdd + C qd + g = tau + A^T lambda, one a constraint as it is written.",
+    ),
+    "reactions": Kind(
+        "reactions",
+        "l*6",
+        True,
+        False,
+        "Of each loop {reaction} on its second body, by the multipliers lambda.",
+        given="lambda",
+    ),
     "applied": Kind(
         "applied", "m", True, True, "The inputs as they act: u, or the signals, within limits."
     ),
@@ -114,11 +153,13 @@ _PLANE = {
     "pose": "x, y, angle",
     "twist": "the velocity of its origin (2) and the angular one",
     "momentum": "mass, its centre (2), momentum (2), that about the centre",
+    "reaction": "the force (2) and the moment",
 }
 _SPACE = {
     "pose": "position (3), rotation matrix by rows (9)",
     "twist": "the velocity of its origin (3) and the angular one (3)",
     "momentum": "mass, its centre (3), momentum (3), that about the centre (3)",
+    "reaction": "the force (3) and the moment (3)",
 }
 
 
@@ -130,7 +171,7 @@ def doc(target: Target, name: str) -> str:
 def extent(target: Target, shape: str) -> str:
     """How many numbers that is, in C."""
     s, NQ, NU = target.system, f"{target.PREFIX}_NQ", f"{target.PREFIX}_NU"
-    NY, NF, NE = (f"{target.PREFIX}_{n}" for n in ("NY", "NF", "NE"))
+    NY, NF, NE, NC = (f"{target.PREFIX}_{n}" for n in ("NY", "NF", "NE", "NC"))
     pose, twist, momentum = (3, 3, 6) if s.plane else (12, 6, 10)
     return {
         "n*n": f"{NQ}*{NQ}",
@@ -146,6 +187,9 @@ def extent(target: Target, shape: str) -> str:
         "f*twist": f"{NF}*{twist}",
         "f*twist*n": f"{NF}*{twist}*{NQ}",
         "momentum": str(momentum),
+        "c": NC,
+        "c*n": f"(int){NC}*{NQ}",  # C++20 has no product of two enumerations
+        "l*6": str(sum(len(r.values) for r in s.reactions)),
     }.get(shape, "")
 
 

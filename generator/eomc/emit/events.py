@@ -11,7 +11,11 @@ from eomc.emit.adaptive import BUSY, METHOD, Form, Stepping, run, steps
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
-from eomc.emit.plain.views import Adaptive, AdaptiveRun, Events
+from eomc.emit.plain.adaptive_views import (
+    Adaptive,
+    AdaptiveRun,
+    Events,
+)
 from eomc.integrators.tableaux import Row
 
 SAMPLES = 9  # values in a step
@@ -125,6 +129,7 @@ def _events(made: Stepping) -> Events:
         apart=target.literal(apart),
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
+        chance=target.literal(1e-6),
         width=f"(1 + 2*{functions.NQ})",
         looked=looked,
         values=values.call(events="g", **within),

@@ -16,15 +16,21 @@ from eomc.emit.c_expression import REALS, Block, Body, Real, several
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, sentence, unclashed
 from eomc.emit.evaluations import KINDS, doc, source
-from eomc.emit.plain.views import Computed, Indexed, Parameter
+from eomc.emit.plain.parts import (
+    Computed,
+)
+from eomc.emit.plain.views import (
+    Indexed,
+    Parameter,
+)
 from eomc.emit.public import Public
-from eomc.model.symbols import Coordinate, Event, Input, Output
+from eomc.model.symbols import Constraint, Coordinate, Event, Input, Output
 from eomc.program import outline
 from eomc.program.ir import Function
 from eomc.program.program import Program
 
 STATE = ("q", "qd")
-READ = (*STATE, "qdd", "wrenches", "t", "u", "p")
+READ = (*STATE, "qdd", "wrenches", "lambda", "t", "u", "p")
 FEW = 16  # statements that are read at a glance, without comments between them
 
 
@@ -125,7 +131,7 @@ class Functions:
     def pointers(self, function: Function, *names: str) -> tuple[CArgument, ...]:
         """The arguments that a static function needs, arrays as pointers."""
         needed = [n for n in names if function.uses & self.brought[n]]
-        arrays = (*STATE, "qdd", "wrenches", "along")
+        arrays = (*STATE, "qdd", "wrenches", "lambda", "along")
         return tuple(c.given(self.real, n) if n in arrays else self.argument(n) for n in needed)
 
     # the scene's signals
@@ -302,6 +308,25 @@ class Functions:
         return Computed(made, parts, values)
 
     @cached_property
+    def correction(self) -> Computed | None:
+        """What q and qd lack for constraints to hold, where there are; static."""
+        function = self.target.program.functions.get("correction")
+        if function is None:
+            return None
+        return self.static(function, "projection", "d", sentence(function), fails=True)
+
+    @cached_property
+    def corrected(self) -> CFunction:
+        """A state behind a step, moved onto the constraints; of the plain form."""
+        state = (*(c.filled(self.real, n) for n in "rv"), self.argument("q"))
+        read = self.read(self.target.program["correction"]) if self.correction else frozenset()
+        more = self.usual(*(n for n in ("t", "p") if n in read))
+        far = CArgument("int *", "singular")
+        return CFunction(
+            f"{self.prefix}_projected", self.status, (*state, *more, far), qualifier="static"
+        )
+
+    @cached_property
     def acceleration(self) -> Computed:
         """qdd, with a status."""
         function = self.target.program["acceleration"]
@@ -338,9 +363,11 @@ def of(program: Program, real: Real | None = None) -> Functions:
 
 
 def indexed(
-    plain: Functions, some: Sequence[Coordinate | Event | Input | Output], prefix: str = ""
+    plain: Functions,
+    some: Sequence[Constraint | Coordinate | Event | Input | Output],
+    prefix: str = "",
 ) -> tuple[Indexed, ...]:
-    """Coordinates, inputs, outputs or events with their enumerators."""
+    """Coordinates, inputs, outputs, constraints or events with their enumerators."""
     enum = plain.target.enum
     return tuple(Indexed(enum[prefix + x.name], heading.words(x.unit, x.note)) for x in some)
 

@@ -6,6 +6,7 @@ import math
 
 from eomc.base.texts import FreeText
 from eomc.emit import adaptive
+from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import cast, member
 from eomc.emit.c_names import Target
 from eomc.emit.evaluations import KINDS, takes_qdd, takes_t
@@ -20,17 +21,21 @@ from eomc.emit.views import (
     Face,
     Main,
     Named,
+    Stub,
 )
 from eomc.integrators.tableaux import METHODS
 
 _OF_STEPS = ("Phi", "Gamma")
-TIMED = ("energy", "jacobi", "tau", "power", "outputs")  # what runs ask for at each of their rows
+TIMED = (
+    "energy jacobi tau power outputs constraints constraint_rates multipliers reactions"
+).split()  # what runs ask for at each of their rows
 ROWS = 200  # of main.c, about
 FUNCTIONS = (
     "C D acceleration advice applied bias discretize energy equilibrium g jacobi kinetic_energy "
     "linearize load_run output potential_energy power rhs sensitivity signal simulate "
     "simulate_batch step step_batch tau"
 ).split()
+CONSTRAINED = "constraint_jacobian constraint_rates constraints multipliers project".split()
 ASKED = {  # what only scenes have that ask for it in [run]
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
     "inverse_dynamics": ("inverse_dynamics",),
@@ -80,7 +85,11 @@ def _bound(target: Target) -> tuple[Bound, ...]:
             rows[kind.given] = f"u + {extents[kind.given]}*k"
         call = function.call(**at, **rows)
         solve = Public(target).acceleration.call(**at) if takes_qdd(target, name) else ""
-        found.append(Bound(name, call if kind.out else f"out[k] = {call}", solve))
+        # what SciPy calls takes doubles alone
+        alone = not kind.out and target.real is DOUBLE and not {"t", "u", "qdd"} & set(extents)
+        at_x = function.call(q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target))
+        text = call if kind.out else f"out[k] = {call}"
+        found.append(Bound(name, text, solve, at_x if alone else ""))
     return tuple(found)
 
 
@@ -146,6 +155,7 @@ def binding(target: Target) -> Binding:
         real=target.real.name,
         evaluations=_bound(target),
         acceleration=public.acceleration.call(qdd=f"out + {NQ}*k", **at),
+        project=public.project.call(**at) if target.system.constraints else "",
         linearization=linear.call(**at, **matrices) if _linearized(target) else "",
         batch=target.system.run.batch,
         methods=_methods(target),
@@ -161,8 +171,8 @@ def _linearized(target: Target) -> bool:
 def declarations(bound: Binding) -> Declarations:
     """What cffi is told."""
     return Declarations(
-        bound.real, bound.evaluations, bound.linearization, bound.batch, bound.methods,
-        bound.adaptive,
+        bound.real, bound.evaluations, bound.project, bound.linearization, bound.batch,
+        bound.methods, bound.adaptive,
     )  # fmt: skip
 
 
@@ -170,13 +180,27 @@ def _timed(target: Target, name: str) -> bool:
     return takes_t(target, name) or (target.driven and takes_qdd(target, name))
 
 
+def _functions(target: Target) -> tuple[str, ...]:
+    """The model's functions that are public in the package."""
+    s, run = target.system, target.system.run
+    functions = [n for n in FUNCTIONS if run.batch or not n.endswith("_batch")]
+    functions += CONSTRAINED if s.constraints else ()
+    functions += ["reactions"] if s.reactions else ()
+    functions += ["tangent"] if s.constraints and run.linearize else ()
+    functions += [n for key, names in ASKED.items() if getattr(run, key) for n in names]
+    return tuple(sorted(functions))
+
+
+def stub(target: Target) -> Stub:
+    """The package's types."""
+    return Stub(tuple(stamp(target)), target.system.run.batch, _functions(target))
+
+
 def face(target: Target, extension: str) -> Face:
     """The Python package's __init__."""
     s, written = target.system, target.as_written
     units = {c.name: c.unit for c in s.coordinates} | {p.name: p.unit for p in s.parameters}
     units |= {i.name: i.unit for i in s.inputs} | {o.name: o.unit for o in s.outputs}
-    functions = [n for n in FUNCTIONS if s.run.batch or not n.endswith("_batch")]
-    functions += [n for key, names in ASKED.items() if getattr(s.run, key) for n in names]
     return Face(
         title=FreeText(s.title),
         stamp=tuple(stamp(target)),
@@ -195,16 +219,20 @@ def face(target: Target, extension: str) -> Face:
         input_units=FreeText({written(i.name): i.unit for i in s.inputs}),
         output_units=FreeText({o.name: o.unit for o in s.outputs}),
         frames=tuple(f.name for f in s.asked),
-        plane=bool(s.plane and (s.asked or s.run.momentum)),
+        plane=bool(s.plane and (s.asked or s.run.momentum or s.reactions)),
         units=FreeText({written(name): unit for name, unit in units.items() if unit}),
         start=([c.start for c in s.coordinates], [c.rate for c in s.coordinates]),
         h=s.run.h,
         duration=s.run.duration,
         tolerance=s.run.tolerance,
         events=tuple(e.name for e in s.events),
+        constraints=tuple(c.name for c in s.constraints),
+        held=(*(c.held for c in s.coordinates), *(c.held_rate for c in s.coordinates)),
+        holonomic=sum(c.holonomic for c in s.constraints),
+        reactions=tuple(r.name for r in s.reactions),
         timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,
         methods=tuple(METHODS[name] for name in s.run.methods),
-        functions=tuple(sorted(functions)),
+        functions=_functions(target),
         asked=tuple(x for x in ASKED.items() if not getattr(s.run, x[0])),
     )

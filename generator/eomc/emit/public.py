@@ -26,6 +26,7 @@ class Public:
             "qd": given(real, "qd", f"{target.PREFIX}_NQ"),
             "qdd": given(real, "qdd", f"{target.PREFIX}_NQ"),
             "wrenches": given(real, "wrenches", extent(target, "f*twist")),
+            "lambda": given(real, "lambda", extent(target, "c")),
             "t": CArgument(real, "t") if target.driven else None,
             "h": CArgument(real, "h"),
             "u": given(real, "u") if target.system.inputs else None,
@@ -71,8 +72,20 @@ class Public:
         widths = {"A_q": NQ, "A_qd": NQ}
         if target.system.inputs:
             widths["B"] = f"{target.PREFIX}_NU"
-        out = (filled(target.real.name, name, f"{NQ}*{w}") for name, w in widths.items())
+        # C++20 has no product of two enumerations
+        out = (
+            filled(target.real.name, name, f"{NQ}*{w}" if w == NQ else f"(int){NQ}*{w}")
+            for name, w in widths.items()
+        )
         return self._status("linearization", *out, *self.usual(*STATE, "t", "u", "p"))
+
+    @property
+    def project(self) -> CFunction:
+        """A state moved onto the constraints, with a status."""
+        names = ("D", "constraints", "constraint_jacobian", "constraint_rates")
+        t = self.usual(*["t"] if any(takes_t(self.target, n) for n in names) else [])
+        held = given("int", "held")
+        return self._status("project", *self._moved, *t, held, *self.usual("p"))
 
     def step(self, method: str) -> CFunction:
         """One step in place."""

@@ -18,12 +18,14 @@ import jinja2
 from eomc.base import resources
 from eomc.base.texts import docstring
 from eomc.base.texts import name as plain
-from eomc.emit import package, selftest, views
+from eomc.emit import embedding, package, selftest, views
 from eomc.emit.c_expression import REALS, indent
 from eomc.emit.c_names import Target
 from eomc.emit.c_safe_names import borne
 from eomc.emit.fast import files as fast
 from eomc.emit.fast import views as fast_views
+from eomc.emit.fmu import files as fmu
+from eomc.emit.fmu import views as fmu_views
 from eomc.emit.plain import steppers
 from eomc.emit.plain import views as plain_views
 from eomc.program.outline import weight
@@ -36,15 +38,21 @@ FAST = "fast"  # the folder of the form of C that the Python module is compiled 
 class Sources:
     """The text of the generated files by name, and what the extension is made of besides.
 
-    binding: C between the scene's functions and Python, with its cdef. operations: how many all
-    functions have together, which tells how long a compiler takes.
+    binding: C between the scene's functions and Python, with its cdef. stub: the package's types.
+    operations: how many all functions have together, which tells how long a compiler takes.
     """
 
     name: str
     files: Mapping[str, str]
     binding: str
     cdef: str
+    stub: str
     operations: int
+
+    @property
+    def embeddable(self) -> dict[str, str]:
+        """The files that a C program may need, without those of the Python package."""
+        return {file: text for file, text in self.files.items() if not file.endswith(".py")}
 
 
 @cache
@@ -79,10 +87,17 @@ def _bytecode() -> jinja2.BytecodeCache | None:
     return jinja2.FileSystemBytecodeCache(str(folder), "eomc-template-%s.cache")
 
 
-def show(view: views.View | plain_views.View | fast_views.View) -> str:
+def show(view: views.View | plain_views.View | fast_views.View | fmu_views.View) -> str:
     """A view by its template."""
     given = {field.name: getattr(view, field.name) for field in fields(view)}
     return environment().get_template(view.TEMPLATE + ".jinja").render(given)
+
+
+def _plain_names(program: Program) -> None:
+    """Raise ValueError where a name could not stand in code."""
+    s = program.system
+    for given in (*s.coordinates, *s.parameters, *s.inputs, *(d for d, _ in s.definitions), s):
+        plain(given.name)
 
 
 def render(program: Program, extension: str) -> Sources:
@@ -90,11 +105,9 @@ def render(program: Program, extension: str) -> Sources:
 
     Same program, same text.
     """
-    s = program.system
-    for given in (*s.coordinates, *s.parameters, *s.inputs, *(d for d, _ in s.definitions), s):
-        plain(given.name)
+    _plain_names(program)
     program, written = borne(program)
-    run = s.run
+    run = program.system.run
     target = Target(program, REALS[run.real], written)
     binding = package.binding(target)
     name = program.system.name
@@ -106,10 +119,20 @@ def render(program: Program, extension: str) -> Sources:
             **{f"{FAST}/{file}": text for file, text in fast.files(made, show).items()},
             "main.c": show(package.main(target)),
             "selftest.c": show(selftest.view(target)),
+            "CMakeLists.txt": show(embedding.cmake(target)),
+            f"{name}.pc.in": show(embedding.pkg_config(target)),
+            "costs.txt": show(embedding.costs(target)),
             "__init__.py": show(package.face(target, extension)),
             **resources.runtime(run.batch),
         },
         binding=show(binding),
         cdef=show(package.declarations(binding)),
+        stub=show(package.stub(target)),
         operations=sum(map(weight, program.functions.values())),
     )
+
+
+def unit(program: Program, version: int) -> fmu.Unit:
+    """The unit of FMI 2 or 3 of a program."""
+    _plain_names(program)
+    return fmu.unit(program, version, show, show)

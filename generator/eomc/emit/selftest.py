@@ -35,6 +35,11 @@ def view(target: Target) -> SelfTest:
     far = (_state(target, x, LARGE[double]) for x in _large(target))
     large = list(islice(filter(None, far), STATES))
     now = {"t": target.zero, "u": "NULL", "p": f"&{target.prefix}_defaults"}
+    constrained = {
+        name: public.evaluation(name).call(**now)
+        for name in ("constraint_jacobian", "multipliers")
+        if name in target.program
+    }
     return SelfTest(
         title=FreeText(target.system.title),
         stamp=tuple(stamp(target)),
@@ -49,6 +54,8 @@ def view(target: Target) -> SelfTest:
         bias=public.evaluation("bias").call(**now),
         tau=public.evaluation("tau").call(**now) if "tau" in target.program else "",
         acceleration=public.acceleration.call(**now),
+        jacobian=constrained.get("constraint_jacobian", ""),
+        multipliers=constrained.get("multipliers", ""),
     )
 
 

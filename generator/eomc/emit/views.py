@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.integrators.tableaux import Method
+from eomc.program.ir import Cost
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class State:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """c/selftest.c.jinja. large_tolerance: 0 without large angles. The last four: calls."""
+    """c/selftest.c.jinja. large_tolerance: 0 without large angles. The last six: calls."""
 
     TEMPLATE: ClassVar[str] = "c/selftest.c"
     title: FreeText
@@ -59,18 +60,71 @@ class SelfTest:
     bias: str
     tau: str
     acceleration: str
+    jacobian: str
+    multipliers: str
+
+
+@dataclass(frozen=True)
+class CMake:
+    """c/CMakeLists.txt.jinja: a library of the C, for add_subdirectory and find_package."""
+
+    TEMPLATE: ClassVar[str] = "c/CMakeLists.txt"
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    PREFIX: str
+    version: str
+
+
+@dataclass(frozen=True)
+class PkgConfig:
+    """c/package.pc.in.jinja, which CMake fills in and installs."""
+
+    TEMPLATE: ClassVar[str] = "c/package.pc.in"
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    version: str
+
+
+@dataclass(frozen=True)
+class Counted:
+    """A function of mechanics and its operations."""
+
+    name: str
+    cost: Cost
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """A step of a method, and in words what it calls."""
+
+    name: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Costs:
+    """c/costs.txt.jinja. width: of the column of names."""
+
+    TEMPLATE: ClassVar[str] = "c/costs.txt"
+    stamp: tuple[FreeText, ...]
+    prefix: str
+    width: int
+    functions: tuple[Counted, ...]
+    steps: tuple[Stepped, ...]
 
 
 @dataclass(frozen=True)
 class Bound:
     """A function of the scene in the binding: its name, and its call for row k of many.
 
-    solve: the call for the accelerations that it reads, if it does.
+    solve: the call for the accelerations that it reads, if it does. at: of a number that depends on
+    the state alone, its call at x.
     """
 
     name: str
     call: str
     solve: str
+    at: str
 
 
 @dataclass(frozen=True)
@@ -96,7 +150,7 @@ class BoundAdaptive:
 
 @dataclass(frozen=True)
 class Binding:
-    """python/binding.c.jinja. linearization: its call, if there is one."""
+    """python/binding.c.jinja. project, linearization: their calls, if there are."""
 
     TEMPLATE: ClassVar[str] = "python/binding.c"
     prefix: str
@@ -104,6 +158,7 @@ class Binding:
     real: str
     evaluations: tuple[Bound, ...]
     acceleration: str
+    project: str
     linearization: str
     batch: bool
     methods: tuple[BoundMethod, ...]
@@ -118,6 +173,7 @@ class Declarations:
     TEMPLATE: ClassVar[str] = "python/binding.cdef"
     real: str
     evaluations: tuple[Bound, ...]
+    project: str
     linearization: str
     batch: bool
     methods: tuple[BoundMethod, ...]
@@ -163,11 +219,44 @@ class Face:
     duration: float
     tolerance: float | None
     events: tuple[str, ...]
+    constraints: tuple[str, ...]
+    held: tuple[bool, ...]
+    holonomic: int
+    reactions: tuple[str, ...]
     timed: tuple[str, ...]
     batch: bool
     methods: tuple[Method, ...]
     functions: tuple[str, ...]
     asked: tuple[tuple[str, tuple[str, ...]], ...]
+
+
+@dataclass(frozen=True)
+class Stub:
+    """python/stub.pyi.jinja: the package as type checkers see it."""
+
+    TEMPLATE: ClassVar[str] = "python/stub.pyi"
+    stamp: tuple[FreeText, ...]
+    batch: bool
+    functions: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Form:
+    """An extension of a wheel: its name, and what the processor must have, as Linux calls it."""
+
+    name: str
+    extension: str
+    needs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """python/compiled.py.jinja: which of several extensions is loaded."""
+
+    TEMPLATE: ClassVar[str] = "python/compiled.py"
+    prefix: str
+    version: str
+    forms: tuple[Form, ...]
 
 
 @dataclass(frozen=True)
@@ -181,4 +270,16 @@ class Quad:
     call: str
 
 
-View = Main | SelfTest | Binding | Declarations | Face | Quad
+View = (
+    Main
+    | SelfTest
+    | CMake
+    | PkgConfig
+    | Costs
+    | Binding
+    | Declarations
+    | Face
+    | Stub
+    | Compiled
+    | Quad
+)

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import sympy
 from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
-from eomc.model import algebra, growth, limits
+from eomc.model import algebra, constraints, growth, limits
+from eomc.model.loops import Closed
 from eomc.model.multibody import Builder, Terms
-from eomc.model.symbols import Coordinate, Event, Input, Output, Parameter, symbol, t
+from eomc.model.symbols import (
+    Constraint,
+    Coordinate,
+    Event,
+    Input,
+    Output,
+    Parameter,
+    Reaction,
+    symbol,
+    t,
+)
 from eomc.model.system import System
 from eomc.scene.formulas import Formula, FormulaError
 from eomc.scene.scene import Scene
@@ -28,6 +39,7 @@ class _Formulas:
         given = [*(p.name for p in scene.parameters), *(i.name for i in scene.inputs)]
         self.known |= {name: symbol(name) for name in given}
         self.problems: list[Problem] = []
+        self.doubts: list[Problem] = []
         self.sizes: dict[str, growth.Size] = {}  # of constants and definitions
 
     def value(self, key: str, formula: Formula) -> Expr:
@@ -78,6 +90,41 @@ class _Formulas:
             jump = ((name, self.value(f"event.{k}.{name}", formula)) for name, formula in e.jump)
             yield Event(e.name, when, e.direction, e.action, tuple(jump), note=e.note)
 
+    def constraints(
+        self,
+        coordinates: Sequence[Coordinate],
+        definitions: Sequence[tuple[Symbol, Expr]],
+        closed: Iterable[Closed],
+    ) -> tuple[tuple[Constraint, ...], tuple[Reaction, ...]]:
+        """The rows of [constraints] and of loops, holonomic ones first, and the reactions."""
+        written = {c.name: c.formula for c in self.scene.constraints}
+
+        def problem(row: Constraint, message: str, severity: str) -> Problem:
+            if row.loop:
+                return self.scene.problem(f"loop.{row.loop}", message, severity=severity)
+            key, formula = f"constraints.{row.name}.formula", written[row.name]
+            return self.scene.problem(key, f"'{formula.shown}' {message}", formula, severity)
+
+        rows = [
+            Constraint(
+                c.name, self.value(f"constraints.{c.name}.formula", c.formula), True, c.unit, c.note
+            )
+            for c in self.scene.constraints
+        ]
+        if self.problems:  # a formula without a value is 0
+            return (), ()
+        values = {p.name: p.value for p in self.scene.parameters}
+        found = constraints.Rows(
+            coordinates,
+            definitions,
+            {symbol(name): value for name, value in values.items()},
+            lambda row, message: self.problems.append(problem(row, message, "error")),
+            lambda row, message: self.doubts.append(problem(row, message, "warning")),
+        )
+        kept = [found.settled(loop) for loop in closed]
+        rows += [row for loop in kept for row in loop.rows]
+        return found.sorted(rows), tuple(r for loop in kept for r in loop.reactions)
+
     def outputs(self, kinetic: Expr, potential: Expr) -> Iterator[Output]:
         """The outputs, which may use accelerations and energies."""
         accelerations = (f"{c.name}_ddot" for c in self.scene.coordinates)
@@ -103,12 +150,14 @@ def from_scene(scene: Scene) -> System:
     zero = sympy.S.Zero
     kinetic_energy = sympy.Add(kinetic, more.kinetic, *more.tree_kinetic)
     potential_energy = sympy.Add(potential, more.potential, *more.tree_potential)
+    coordinates = tuple(
+        Coordinate(c.name, c.unit, q, qd, c.note, c.held, c.held_rate)
+        for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
+    )
+    rows, reactions = made.constraints(coordinates, definitions, more.closed)
     system = System(
         name=scene.name,
-        coordinates=tuple(
-            Coordinate(c.name, c.unit, q, qd, c.note)
-            for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
-        ),
+        coordinates=coordinates,
         kinetic=kinetic_energy,
         potential=potential_energy,
         dissipation=value("energy.dissipation", scene.dissipation) + more.dissipation,
@@ -123,13 +172,15 @@ def from_scene(scene: Scene) -> System:
         inputs=tuple(made.inputs()),
         definitions=tuple(definitions),
         events=tuple(made.events()),
+        constraints=rows,
+        reactions=reactions,
         outputs=tuple(made.outputs(kinetic_energy, potential_energy)),
         run=scene.run,
         title=scene.title,
         note=scene.note,
         file=scene.file,
         digest=scene.digest,
-        warnings=(*scene.warnings, *_at_the_start(scene)),
+        warnings=(*scene.warnings, *made.doubts, *_at_the_start(scene)),
         place=scene.problem,
         scene=scene,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import sympy
@@ -11,11 +12,21 @@ from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
 from eomc.base import names
-from eomc.base.errors import EomcError
-from eomc.model import given
+from eomc.base.errors import EomcError, Problem
+from eomc.model import constraints, given
 from eomc.model.algebra import UNDEFINED
 from eomc.model.rewrite import JumpError, rewritten
-from eomc.model.symbols import Coordinate, Input, Output, Parameter, dot, symbol, t
+from eomc.model.symbols import (
+    Constraint,
+    Coordinate,
+    Input,
+    Output,
+    Parameter,
+    dot,
+    needed,
+    symbol,
+    t,
+)
 from eomc.scene.scene import Run
 
 if TYPE_CHECKING:
@@ -98,11 +109,12 @@ class Maker:
     def make(
         self, of: type[System], coordinates: Any, kinetic: Any, potential: Any,
         parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
-        definitions: Mapping[Any, Any], outputs: Mapping[str, Any], units: Mapping[Any, str],
+        definitions: Mapping[Any, Any], outputs: Mapping[str, Any],
+        rows: Mapping[str, Any], guess: Sequence[Any], units: Mapping[Any, str],
         title: str, run: Run, limits: Mapping[Any, Any],
     ) -> System:  # fmt: skip
         """The system, of the class `of`."""
-        starts = given.symbols(coordinates, "coordinates", 0.0)
+        starts = given.symbols(coordinates, "coordinates", None)
         parameters = given.mapping(parameters, "parameters", "{m: 2.0}")
         forces = given.by_name(forces, "forces", "{x: F}")
         definitions = given.mapping(definitions, "definitions", "{y: l*cos(theta)}")
@@ -112,22 +124,8 @@ class Maker:
                 raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
-        made = []
-        for one, start in starts.items():
-            name = self._name_of(one, "coordinate")
-            c = Coordinate(
-                name, units.get(given.name_of(one), ""), *given.start(start, f"start of {name}")
-            )
-            self.map[one] = c.q
-            if isinstance(one, AppliedUndef):
-                time = one.args[0]
-                self.map[sympy.Derivative(one, time)] = c.qd
-                self.map[time] = t
-            else:
-                self.map[Symbol(f"{one}_dot", **one.assumptions0)] = c.qd
-                if one == symbol(one.name):
-                    self.map[Symbol(one.name)], self.map[Symbol(f"{one}_dot")] = c.q, c.qd
-            made.append(c)
+        made = [self._coordinate(one, units, start) for one, start in starts.items()]
+        made = self._held(made, [*starts], guess, bool(rows))
         declared = [self._parameter(p, v, units) for p, v in parameters.items()]
         pending = given.symbols(inputs, "inputs", 0)
         given_inputs = {i: self._declare(i, "input") for i in pending}
@@ -146,7 +144,7 @@ class Maker:
         given_energies = {"kinetic": kinetic, "potential": potential, "dissipation": dissipation}
         energies = {role: expression(energy, role) for role, energy in given_energies.items()}
         for role, energy in energies.items():
-            given.check_smooth(energy, role, dict(ordered), self.fixed.keys())
+            given.check_smooth(energy, role, dict(ordered), self.fixed.keys(), f"the {role} energy")
         made_of: dict[str, Any] = {
             "name": self.name,
             "coordinates": tuple(made),
@@ -157,12 +155,100 @@ class Maker:
             "parameters": tuple(declared),
             "inputs": tuple(self._inputs(pending, given_inputs, units, ends)),
             "definitions": tuple(ordered),
-            "outputs": tuple(self._outputs(outputs, starts, made, units)),
+            **self._constraints(rows, made, ordered, given_inputs.values(), units),
+            "outputs": tuple(self._outputs(outputs, starts, made, units, [*map(str, rows)])),
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
         }
         digest = hashlib.sha256(sympy.srepr(sorted(made_of.items())).encode()).hexdigest()
         return of(**made_of, digest=digest, renamed=tuple(self.renamed))
+
+    def _coordinate(self, one: Any, units: Mapping[Any, str], start: Any) -> Coordinate:
+        """A coordinate, whose symbols are known from here on; what is given of it is held."""
+        name = self._name_of(one, "coordinate")
+        start, rate = given.start(start, f"start of {name}")
+        c = Coordinate(
+            name,
+            units.get(given.name_of(one), ""),
+            start or 0.0,
+            rate or 0.0,
+            held=start is not None,
+            held_rate=rate is not None,
+        )
+        self.map[one] = c.q
+        if isinstance(one, AppliedUndef):
+            time = one.args[0]
+            self.map[sympy.Derivative(one, time)] = c.qd
+            self.map[time] = t
+        else:
+            self.map[Symbol(f"{one}_dot", **one.assumptions0)] = c.qd
+            if one == symbol(one.name):
+                self.map[Symbol(one.name)], self.map[Symbol(f"{one}_dot")] = c.q, c.qd
+        return c
+
+    def _held(
+        self, made: Sequence[Coordinate], given_as: Sequence[Any], guess: Any, rows: bool
+    ) -> list[Coordinate]:
+        """The coordinates, all held where there are no rows, else those that are no guess."""
+        if isinstance(guess, str) or not isinstance(guess, (list, tuple, set, frozenset)):
+            raise given.fault("guess", f"give a list of coordinates, such as [x], here {guess!r}")
+        guessed = {given.name_of(given.symbol_of(one, "guess")) for one in guess}
+        if unknown := sorted(guessed - {given.name_of(one) for one in given_as}):
+            raise given.fault("guess", f"{', '.join(unknown)} not among the coordinates")
+        if guessed and not rows:
+            raise given.fault("guess", "constraints move a guess, and there are none: leave it out")
+        free = [given.name_of(one) in guessed for one in given_as]
+        return [
+            replace(
+                c,
+                held=not rows or (c.held and not moves),
+                held_rate=not rows or (c.held_rate and not moves),
+            )
+            for c, moves in zip(made, free, strict=True)
+        ]
+
+    def _constraints(
+        self, rows: Any, made: Sequence[Coordinate], ordered: Sequence[tuple[Symbol, Expr]],
+        inputs: Iterable[str], units: Mapping[Any, str],
+    ) -> dict[str, Any]:  # fmt: skip
+        """The rows of constraints, under their key of the system where there are any."""
+        if not isinstance(rows, Mapping):
+            example = '{"rod": x**2 + y**2 - l**2}'
+            raise given.fault("constraints", f"give a dict, such as {example}, here {rows!r}")
+        found = []
+        moving = (s.name for c in made for s in (c.qd, c.qdd))
+        taken = {*self.taken, *moving, "energy"}
+        for one, formula in rows.items():
+            if not isinstance(one, (str, Symbol)):
+                raise given.fault("constraints", f"{one!r} is not a name")
+            name, role = str(one), f"constraint {one}"
+            if why := names.fault(name):
+                raise EomcError(f"System.make: constraints: {why}")
+            if name in taken:
+                raise EomcError(f"System.make: {role}: the name '{name}' is taken already")
+            expr = self._expression(formula, role)
+            given.check_smooth(expr, role, dict(ordered), self.fixed.keys(), "it")
+            uses = expr.free_symbols.union(*(e.free_symbols for _, e in needed(ordered, [expr])))
+            if held := sorted(s.name for s in uses & {symbol(i) for i in inputs}):
+                why = f"{held[0]} is an input, whose rate nobody knows: let it act through forces"
+                raise given.fault(role, why)
+            found.append(Constraint(name, expr, unit=units.get(name, "")))
+
+        def fault(row: Constraint, message: str) -> None:
+            raise given.fault(f"constraint {row.name}", f"{row.formula} {message}")
+
+        doubts: list[Problem] = []
+
+        def doubt(row: Constraint, message: str) -> None:
+            message = f"{row.formula} {message}"
+            doubts.append(
+                Problem(
+                    message, f"constraints.{row.name}", f"System {self.name}", severity="warning"
+                )
+            )
+
+        checked = constraints.Rows(made, ordered, {}, fault, doubt).sorted(found)
+        return {"constraints": checked, "warnings": tuple(doubts)} if found else {}
 
     def _inputs(
         self, signals: Mapping[Any, Any], used: Mapping[Any, str], units: Mapping[Any, str],
@@ -198,7 +284,7 @@ class Maker:
 
     def _outputs(
         self, outputs: Any, starts: Iterable[Any], made: Sequence[Coordinate],
-        units: Mapping[Any, str],
+        units: Mapping[Any, str], rows: Sequence[str],
     ) -> Iterator[Output]:  # fmt: skip
         """The outputs, which may use accelerations."""
         for one, c in zip(starts, made, strict=True):
@@ -215,6 +301,8 @@ class Maker:
             if why := names.fault(str(name)):
                 raise EomcError(f"System.make: outputs: {why}")
             expr = self._expression(formula, f"output {name}")
+            if str(name) in rows:
+                raise given.fault("outputs", f"'{name}' is a constraint already: rename one")
             yield Output(str(name), expr, units.get(name, ""))
 
     def _declare(self, one: Any, role: str) -> str:

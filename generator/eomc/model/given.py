@@ -96,10 +96,12 @@ def check_functions(expr: Expr, role: str) -> None:
         queue += more
 
 
-def check_smooth(expr: Expr, role: str, definitions: Mapping[Symbol, Expr], fixed: Any) -> None:
+def check_smooth(
+    expr: Expr, role: str, definitions: Mapping[Symbol, Expr], fixed: Any, what: str
+) -> None:
     """Raise EomcError where `expr`, which is differentiated, has a function that jumps.
 
-    fixed: symbols that do not vary, in which such functions do not jump.
+    fixed: symbols that do not vary, in which such functions do not jump. what: it is, in words.
     """
     queue, seen = [expr], {expr}
     while queue:
@@ -109,7 +111,7 @@ def check_smooth(expr: Expr, role: str, definitions: Mapping[Symbol, Expr], fixe
                 name = type(jump).__name__
                 raise fault(
                     role,
-                    f"{name}(...) jumps, and the {role} energy is differentiated: use Abs, Min or "
+                    f"{name}(...) jumps, and {what} is differentiated: use Abs, Min or "
                     "Max (Max(x, 0)**2 for a stop), a smooth tanh(x/width), or give the force "
                     "itself in forces",
                 )
@@ -131,13 +133,13 @@ def number(given: Any, role: str) -> float:
     return value
 
 
-def start(given: Any, role: str) -> tuple[float, float]:
-    """A start, or a (start, rate) pair."""
-    if not isinstance(given, (tuple, list)):
-        return number(given, role), 0.0
-    if len(given) != 2:
+def start(given: Any, role: str) -> tuple[float | None, float | None]:
+    """A start, or a (start, rate) pair; None where there is none."""
+    pair = given if isinstance(given, (tuple, list)) else (given, None)
+    if len(pair) != 2:
         raise fault(role, f"give a start, or a pair (start, rate), here {given!r}")
-    return number(given[0], role), number(given[1], role)
+    one, other = (None if x is None else number(x, role) for x in pair)
+    return one, other
 
 
 def mapping(given: Any, role: str, example: str) -> Mapping[Any, Any]:

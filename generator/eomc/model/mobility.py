@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from eomc.model.kinematics import Array, Kinematics, Null
 from eomc.scene import formulas
 from eomc.scene.assembly import Assembly, Body, Damper, Spring
 from eomc.scene.formulas import Formula
-from eomc.scene.joints import JOINTS
+from eomc.scene.joints import CLOSINGS, JOINTS
 
 if TYPE_CHECKING:
     from eomc.scene.scene import Scene
@@ -34,10 +35,11 @@ TOGETHER = 1e-12  # apart, relative to how far both are from the origin: that is
 
 @dataclass(frozen=True)
 class Mobility:
-    """What was counted and found. freedoms: of each joint, by kind; M: the count.
+    """What was counted and found. joints, loops: how many of each kind; M: the count.
 
     coordinates: of the scene; rank: how many move the bodies independently, almost everywhere.
-    remarks: in words, what is redundant, missing or singular.
+    constraints: the rows that are written by hand. remarks: in words, what is redundant, missing or
+    singular.
     """
 
     scene: str
@@ -48,20 +50,28 @@ class Mobility:
     coordinates: int
     rank: int
     remarks: tuple[str, ...]
+    loops: Mapping[str, int] = field(default_factory=dict)
+    constraints: int = 0
 
     def table(self) -> str:
         """For people."""
-        kinds = ", ".join(
-            f"{n} {kind} (f = {_freedoms(kind, self.d)})" for kind, n in self.joints.items()
-        )
-        j, total = self.bodies, sum(n * _freedoms(k, self.d) for k, n in self.joints.items())
-        where = "in the plane" if self.d == 3 else "in space"
+        d, freedoms = self.d, partial(_freedoms, d=self.d)
+        kinds = [f"{n} {kind} (f = {freedoms(kind)})" for kind, n in self.joints.items()]
+        closing = [f"{n} {kind} (f = {_left(kind, d)})" for kind, n in self.loops.items()]
+        if closing:
+            kinds.append("in loops " + ", ".join(closing))
+        loops = sum(self.loops.values())
+        j, total = self.bodies + loops, sum(n * freedoms(k) for k, n in self.joints.items())
+        total += sum(n * _left(k, d) for k, n in self.loops.items())
+        rows = f" - {self.constraints}" if self.constraints else ""
+        where = "in the plane" if d == 3 else "in space"
+        where += ", by the count" if loops or rows else ""
         lines = [
             f"{self.scene}: {self.M} {plural('freedom', self.M)} {where}",
             f"  N = {self.bodies + 1} links, the world among them",
-            f"  j = {j} joints: {kinds}",
-            f"  M = d(N - 1 - j) + sum f = {self.d}({self.bodies + 1} - 1 - {j}) + {total} "
-            f"= {self.M}",
+            f"  j = {j} joints: {', '.join(kinds)}",
+            f"  M = d(N - 1 - j) + sum f{' - constraints' if rows else ''} = "
+            f"{d}({self.bodies + 1} - 1 - {j}) + {total}{rows} = {self.M}",
             f"  {self.coordinates} {plural('coordinate', self.coordinates)}, {self.rank} of them "
             "independent in how they move the bodies",
             *(f"  - {remark}" for remark in self.remarks),
@@ -72,8 +82,8 @@ class Mobility:
         """For JSON."""
         return {
             "scene": self.scene, "d": self.d, "N": self.bodies + 1, "joints": dict(self.joints),
-            "M": self.M, "coordinates": self.coordinates, "rank": self.rank,
-            "remarks": list(self.remarks),
+            "loops": dict(self.loops), "M": self.M, "coordinates": self.coordinates,
+            "rank": self.rank, "remarks": list(self.remarks),
         }  # fmt: skip
 
 
@@ -88,7 +98,9 @@ def count(scene: Scene) -> Mobility:
     placed = [body for body in assembly.bodies if not body.joint]
     bodies = [body for body in assembly.bodies if not body.point]
     joints = Counter(body.joint or FORMULAS for body in bodies)
-    M = sum(n * _freedoms(kind, d) for kind, n in joints.items())  # a tree: N - 1 - j = 0
+    loops = Counter(loop.joint for loop in assembly.loops)
+    tree = sum(n * _freedoms(kind, d) for kind, n in joints.items())  # there N - 1 - j = 0
+    closed = sum(n * (d - _left(kind, d)) for kind, n in loops.items())
     kinematics = Kinematics(scene, assembly)
     names = kinematics.coordinates
     found = list(kinematics.states())
@@ -99,13 +111,16 @@ def count(scene: Scene) -> Mobility:
     remarks = [
         *_fixed(assembly),
         *_shared(assembly, {*names}),
-        *_formulas_fix(placed, d, names, rank, M),
-        *_moves_nothing(generic, names, bool(scene.kinetic.names())),
+        *_formulas_fix(placed, d, names, rank, tree),
+        *_moves_nothing(generic, names, scene),
         *_in_a_row(assembly, kinematics),
         *_singular_start(kinematics, generic),
         *(f"{problem.key}: {problem.message}" for problem in meeting(scene)),
     ]
-    return Mobility(scene.name, d, len(bodies), joints, M, len(names), rank, (*remarks,))
+    M, rows = tree - closed - len(scene.constraints), len(scene.constraints)
+    return Mobility(
+        scene.name, d, len(bodies), joints, M, len(names), rank, (*remarks,), loops, rows
+    )
 
 
 def meeting(scene: Scene) -> list[Problem]:
@@ -161,6 +176,11 @@ def _freedoms(kind: str, d: int) -> int:
     return d if kind == FORMULAS else len(JOINTS[kind].motions)
 
 
+def _left(kind: str, d: int) -> int:
+    """The freedoms that a joint of a loop leaves."""
+    return d - len(CLOSINGS[kind].rows(plane=d == 3))
+
+
 # --- what there is to say -------------------------------------------------------------------------
 
 
@@ -197,9 +217,11 @@ def _formulas_fix(
         )
 
 
-def _moves_nothing(at: Null, names: Sequence[str], by_hand: bool) -> Iterator[str]:
+def _moves_nothing(at: Null, names: Sequence[str], scene: Scene) -> Iterator[str]:
     """Coordinates that no body depends on, or that move bodies only in combinations."""
-    result = "D is singular" + (" unless [energy] gives it inertia" if by_hand else "")
+    ways = ["[energy] gives it inertia"] if any(scene.kinetic.names()) else []
+    ways += ["a constraint decides it"] if scene.constrained else []
+    result = f"D is singular unless {' or '.join(ways)}" if ways else "D is singular"
     for row in at.moves:
         yield f"redundant: {_combination(row, names)} moves no body; {result}"
     known = at.moves

@@ -15,11 +15,12 @@ from sympy import Add, Expr, S, Symbol
 
 from eomc.base import spatial
 from eomc.base.spatial import apply, plus, product, scaled, transposed
-from eomc.model import exact
+from eomc.model import exact, loops
 from eomc.model.exact import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
+from eomc.model.loops import Closed
 from eomc.model.symbols import dot, symbol
 from eomc.model.tree import Frame, Link, Tree
-from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Spring
+from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Loop, Spring
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 
@@ -44,6 +45,7 @@ class Terms:
     applied: list[tuple[Expr, Expr]] = field(default_factory=list)  # forces at positions
     links: list[Link] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
+    closed: list[Closed] = field(default_factory=list)  # by each loop
     rates: dict[Symbol, Symbol] = field(default_factory=dict)  # of the coordinates of joints
     still: Vector = ZERO
     gravity: Vector = ZERO
@@ -230,6 +232,8 @@ class Builder:
             self._damper(f"damper.{k + 1}", damper)
         for k, force in enumerate(self.assembly.forces):
             self._apply(f"force.{k + 1}", force)
+        for loop in self.assembly.loops:
+            self.terms.closed.append(self._close(f"loop.{loop.name}", loop))
 
     def _frame(self, name: str, place: _Place) -> Frame:
         if name in self.loads:
@@ -253,6 +257,19 @@ class Builder:
                 row, other = place.R[(axis + 2) % 3], place.R[(axis + 1) % 3]
                 applied += ((y, torque[axis] * x) for y, x in zip(row, other, strict=True))
         applied[:] = [(y, f) for y, f in applied if f != 0 and y.free_symbols]
+
+    def _close(self, key: str, loop: Loop) -> Closed:
+        """A joint that closes a loop, or a gear."""
+        if loop.ratio and loop.offset:
+            ratio = self.value(f"{key}.ratio", loop.ratio)
+            return loops.gear(loop, ratio, self.value(f"{key}.offset", loop.offset))
+        ends = []
+        for name, given in zip(loop.bodies, loop.points, strict=True):
+            place, point = self.places[name], self._vector(f"{key}.points", given)
+            ends.append(loops.End(plus(place.at, apply(place.R, point)), place.R))
+        length = self.value(f"{key}.length", loop.length) if loop.length else S.Zero
+        turned = self._rotation(f"{key}.rotation", loop)
+        return loops.close(loop, self.assembly.plane, (ends[0], ends[1]), turned, length)
 
     def _put(self, body: Body) -> None:
         assert body.position is not None
@@ -327,9 +344,9 @@ class Builder:
         x, y, z = (self.value(key, formula) for formula in formulas)
         return (x, y, z)
 
-    def _rotation(self, key: str, body: Body) -> Matrix:
+    def _rotation(self, key: str, turned: Body | Loop) -> Matrix:
         R = ONE
-        for turn in body.rotation:
+        for turn in turned.rotation:
             angle = self.value(key, turn.angle)
             R = product(R, rotation_about("xyz".index(turn.axis), angle))
         return R

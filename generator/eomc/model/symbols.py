@@ -14,6 +14,7 @@ t = Symbol("t", real=True)
 
 # behind a name: a direction's entry along it; no name of a user's ends so
 ALONG = "_along_"
+MULTIPLIER = "_lambda_"  # likewise behind a constraint's name, its Lagrange multiplier
 
 
 class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
@@ -27,6 +28,24 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
         return rf"\left({rate}\right)^{{{exp}}}" if exp else rate
 
 
+class pivot_inverse(sympy.Function):  # type: ignore[misc]  # noqa: N801 - as the tape has it
+    """1/pivot where the pivot is more than a limit, else 0: (pivot, limit)."""
+
+    nargs = 2
+    is_real = True
+
+    @classmethod
+    def eval(cls, pivot: Expr, limit: Expr) -> Expr | None:
+        """Of numbers a number."""
+        if not (pivot.is_number and limit.is_number):
+            return None
+        return 1 / pivot if pivot > limit else sympy.S.Zero
+
+    def fdiff(self, argindex: int = 1) -> Expr:
+        """That of 1/pivot; the limit does not count."""
+        return -(self**2) if argindex == 1 else sympy.S.Zero
+
+
 @lru_cache(maxsize=10_000)  # SymPy takes ten times as long to find one that it has
 def symbol(name: str) -> Symbol:
     """The symbol of a name; all of a system's symbols are real."""
@@ -35,13 +54,18 @@ def symbol(name: str) -> Symbol:
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A generalized coordinate `q` and its velocity `qd`; `start` in `unit`, `rate` in unit/s."""
+    """A generalized coordinate `q` and its velocity `qd`; `start` in `unit`, `rate` in unit/s.
+
+    held, held_rate: whether constraints leave them as they are when a start is assembled.
+    """
 
     name: str
     unit: str = ""
     start: float = 0.0
     rate: float = 0.0
     note: str = ""
+    held: bool = True
+    held_rate: bool = True
 
     @property
     def q(self) -> Symbol:
@@ -120,6 +144,41 @@ class Event(_Named):
     jump: tuple[tuple[str, Expr], ...] = ()
     unit: str = ""
     note: str = ""
+
+
+@dataclass(frozen=True)
+class Constraint(_Named):
+    """What is zero along every motion: a formula over t, coordinates, parameters and definitions.
+
+    holonomic: of positions and t alone; else it is linear in the rates. loop: the [[loop]] that the
+    row is of. redundant: whether the other rows say the same, so that none is solved for it.
+    """
+
+    formula: Expr
+    holonomic: bool = True
+    unit: str = ""
+    note: str = ""
+    loop: str = ""
+    redundant: bool = False
+
+    @property
+    def multiplier(self) -> Symbol:
+        """The row's Lagrange multiplier, in reactions."""
+        return symbol(f"{self.name}{MULTIPLIER}")
+
+
+@dataclass(frozen=True)
+class Reaction(_Named):
+    """What a [[loop]] does to the second of its bodies, over definitions and multipliers.
+
+    values: the force (2) and the moment about the joint's point in the plane; force (3) and moment
+    (3) in space, along the world's axes. branches: 1 where the joint is closed as it is meant;
+    rows of its axes hold after some other turns too, where one of these is 0 or -1.
+    """
+
+    values: tuple[Expr, ...]
+    note: str = ""
+    branches: tuple[Expr, ...] = ()
 
 
 def needed(

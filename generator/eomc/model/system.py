@@ -15,14 +15,38 @@ from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
+from eomc.model.closure import Closure
 from eomc.model.limits import within
-from eomc.model.symbols import Coordinate, Event, Input, Output, Parameter, dot, symbol, t
+from eomc.model.symbols import (
+    Constraint,
+    Coordinate,
+    Event,
+    Input,
+    Output,
+    Parameter,
+    Reaction,
+    dot,
+    symbol,
+    t,
+)
 from eomc.model.tree import Frame, Tree
 from eomc.scene.scene import Run, Scene
 
 LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision, in C
 
-__all__ = ["Coordinate", "Event", "Input", "Output", "Parameter", "System", "dot", "symbol", "t"]
+__all__ = [
+    "Constraint",
+    "Coordinate",
+    "Event",
+    "Input",
+    "Output",
+    "Parameter",
+    "Reaction",
+    "System",
+    "dot",
+    "symbol",
+    "t",
+]
 
 
 @dataclass(frozen=True)
@@ -31,11 +55,13 @@ class System:
 
     `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
     `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate; to it come the forces
-    F that are `applied` at positions y, pairs (y, F), each with F dy/dq. `tree`: the bodies
+    F that are `applied` at positions y, pairs (y, F), each with F dy/dq. `constraints`: what is
+    zero, holonomic ones first; with A their derivatives along q (along qd, where not holonomic) and
+    multipliers lambda, A^T lambda stands beside Q; `reactions` are of the loops. `tree`: the bodies
     that are held by joints, whose energies are part of K and P. `frames`: of bodies and points, in
     space or in the `plane`. `digest` names what the system was
     made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
-    was read from, where it was.
+    was read from, where it was. `closure`: what its constraints leave, once its start is assembled.
     """
 
     name: str
@@ -49,6 +75,8 @@ class System:
     definitions: tuple[tuple[Symbol, Expr], ...] = ()
     outputs: tuple[Output, ...] = ()
     events: tuple[Event, ...] = ()
+    constraints: tuple[Constraint, ...] = ()
+    reactions: tuple[Reaction, ...] = ()
     applied: tuple[tuple[Expr, Expr], ...] = ()
     tree: Tree | None = None
     frames: tuple[Frame, ...] = ()
@@ -62,6 +90,7 @@ class System:
     warnings: tuple[Problem, ...] = field(default=(), compare=False)
     place: Callable[..., Problem] | None = field(default=None, compare=False, repr=False)
     scene: Scene | None = field(default=None, compare=False, repr=False)
+    closure: Closure | None = field(default=None, compare=False, repr=False)
 
     @property
     def q(self) -> tuple[Symbol, ...]:
@@ -126,6 +155,8 @@ class System:
         inputs: Mapping[Any, Any] | Sequence[Any] = (),
         definitions: Mapping[Any, Any] | None = None,
         outputs: Mapping[str, Any] | None = None,
+        constraints: Mapping[str, Any] | None = None,
+        guess: Sequence[Any] = (),
         units: Mapping[Any, str] | None = None,
         title: str = "",
         h: float = 0.001,
@@ -144,9 +175,12 @@ class System:
         plain symbols the velocity of `theta` is the symbol `theta_dot`; with dynamicsymbols
         it is `theta.diff()`. parameters, inputs (to their default signal) and definitions are
         mappings from symbols, outputs from names; `theta_ddot`, or the second derivative of a
-        dynamicsymbol, is an acceleration there. limits: mapping from inputs to pairs, the least and
-        largest value that acts, None for no such. Names that C can't bear (`\theta`, `lambda`) are
-        replaced, and `renamed` says how. Raises EomcError where something is undeclared.
+        dynamicsymbol, is an acceleration there. constraints: mapping from names to what is zero,
+        over coordinates and t, or linear in the velocities; assembling the start moves coordinates
+        without a start (None, or a list of coordinates alone) and those in `guess`. limits: mapping
+        from inputs to pairs, the least and largest value that acts, None for no such. Names that C
+        can't bear (`\theta`, `lambda`) are replaced, and `renamed` says how. Raises EomcError where
+        something is undeclared.
 
         >>> from sympy.physics.mechanics import dynamicsymbols
         >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
@@ -158,7 +192,8 @@ class System:
         system = from_sympy.Maker(name).make(
             cls, coordinates, kinetic, potential, given.or_none(parameters), dissipation,
             given.or_none(forces), inputs, given.or_none(definitions), given.or_none(outputs),
-            given.or_none(units), title, run, given.or_none(limits),
+            given.or_none(constraints), guess, given.or_none(units), title, run,
+            given.or_none(limits),
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
@@ -189,6 +224,7 @@ class System:
             *(("force", e) for pair in self.applied for e in pair),
             *((f"outputs.{o.name}", o.formula) for o in self.outputs),
             *(("event", x) for e in self.events for x in (e.when, *(f for _, f in e.jump))),
+            *((f"constraints.{c.name}", c.formula) for c in self.constraints),
         ]
         numbers += [(key, n) for key, e in expressions for n in e.atoms(sympy.Number)]
         for key, n in numbers:

@@ -21,13 +21,17 @@ LOST = 2  # times the rounding of another route: a route that has more is not ta
 
 @dataclass(frozen=True)
 class Candidate:
-    """A function by one route: results and (pivot, diagonal) pairs on a tape, and their names."""
+    """A function by one route: results and (pivot, diagonal) pairs on a tape, and their names.
+
+    order: in which coordinates are eliminated; multipliers: of constraints, beside accelerations.
+    """
 
     tape: Tape
     outputs: Sequence[Expr]
     checks: Sequence[tuple[Expr, Expr]] = ()
     labels: Sequence[str] = ()
     order: tuple[int, ...] = ()
+    multipliers: Sequence[Expr] = ()
 
 
 def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Function:

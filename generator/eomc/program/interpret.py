@@ -19,14 +19,22 @@ _DOUBLES: Mapping[str, Callable[..., Any]] = {
     "number": float,
     "pow": math.pow,
     "reciprocal": lambda x: 1 / x,
+    "pivot_inverse": lambda pivot, limit: 1 / pivot if pivot > limit else 0,
 }
+
+
+@cache
+def context() -> Any:
+    """The numbers of 40 digits, mpmath's."""
+    mp = mpmath.mp.clone()
+    mp.dps = 40
+    return mp
 
 
 @cache
 def _many_digits() -> Mapping[str, Callable[..., Any]]:
     """The same in 40 digits."""
-    mp = mpmath.mp.clone()
-    mp.dps = 40
+    mp = context()
     return {
         **_DOUBLES,
         **{name: getattr(mp, name) for name in formulas.ELEMENTARY},
@@ -51,7 +59,50 @@ def evaluator(
     function: Function, exact: bool = False, unit: float = 2.0**-52
 ) -> Callable[[Mapping[str, float]], tuple[list[float], bool]]:
     """`evaluate` of one function for many states: its numbers are converted once."""
-    of = _many_digits() if exact else _DOUBLES
+    run, atom = _steps(function, _many_digits() if exact else _DOUBLES)
+    outputs = [atom(o) for o in function.outputs]
+    checks = [(atom(pivot), atom(diagonal)) for pivot, diagonal in function.checks]
+    tolerance = 8 * unit * max(1, len(checks))
+
+    def evaluated(values: Mapping[str, float]) -> tuple[list[float], bool]:
+        known = run(values)
+        try:
+            results = [float(c * known[n]) for c, n in outputs]
+        except TypeError:  # a complex number
+            raise ValueError(f"{function.name} is not real") from None
+        if not all(map(math.isfinite, results)):
+            raise ValueError(f"{function.name} is not finite")
+        return results, all(
+            c * known[n] > (0 if (c, n) == (e, m) else tolerance * (e * known[m]))
+            for (c, n), (e, m) in checks
+        )
+
+    return evaluated
+
+
+def exact_evaluator(function: Function) -> Callable[[Mapping[str, Any]], list[Any]]:
+    """The results of a function in 40 digits, not rounded; values: floats or such numbers by name.
+
+    Raises ArithmeticError or ValueError where a result is not a finite, real number.
+    """
+    mp = context()
+    run, atom = _steps(function, _many_digits())
+    outputs = [atom(o) for o in function.outputs]
+
+    def evaluated(values: Mapping[str, Any]) -> list[Any]:
+        known = run(values)
+        results = [mp.mpmathify(c * known[n]) for c, n in outputs]
+        if not all(isinstance(x, mp.mpf) and mp.isfinite(x) for x in results):
+            raise ValueError(f"{function.name} is not finite and real")
+        return results
+
+    return evaluated
+
+
+def _steps(
+    function: Function, of: Mapping[str, Callable[..., Any]]
+) -> tuple[Callable[[Mapping[str, Any]], dict[str, Any]], Callable[[Operand], tuple[Any, str]]]:
+    """What carries the assignments out, in the algebra `of`, and what converts an operand."""
     number = lru_cache(maxsize=None)(of["number"])  # most are 1 and -1
 
     def atom(o: Operand) -> tuple[Any, str]:
@@ -67,26 +118,14 @@ def evaluator(
             steps.append((a.name, _multiplied, number(v.coefficient), v.factors))
         else:
             steps.append((a.name, _called, of[v.function], [atom(o) for o in v.args]))
-    outputs = [atom(o) for o in function.outputs]
-    checks = [(atom(pivot), atom(diagonal)) for pivot, diagonal in function.checks]
-    tolerance = 8 * unit * max(1, len(checks))
 
-    def evaluated(values: Mapping[str, float]) -> tuple[list[float], bool]:
+    def run(values: Mapping[str, Any]) -> dict[str, Any]:
         known: dict[str, Any] = {"": 1, **values}  # a number alone has no name
         for name, do, first, rest in steps:
             known[name] = do(known, first, rest)
-        try:
-            results = [float(c * known[n]) for c, n in outputs]
-        except TypeError:  # a complex number
-            raise ValueError(f"{function.name} is not real") from None
-        if not all(map(math.isfinite, results)):
-            raise ValueError(f"{function.name} is not finite")
-        return results, all(
-            c * known[n] > (0 if (c, n) == (e, m) else tolerance * (e * known[m]))
-            for (c, n), (e, m) in checks
-        )
+        return known
 
-    return evaluated
+    return run, atom
 
 
 def _added(known: Mapping[str, Any], constant: Any, terms: Sequence[tuple[Any, str]]) -> Any:

@@ -142,7 +142,7 @@ def _cost(body: Sequence[Assignment], outputs: Sequence[Operand]) -> Cost:
             muls += sum(abs(w) != 1 for w, _ in v.terms)
         elif isinstance(v, Product):
             muls += len(v.factors) - 1 + (abs(v.coefficient) != 1)
-        elif v.function == "reciprocal":
+        elif v.function in ("reciprocal", "pivot_inverse"):
             divs += 1
         elif v.function in ("sin", "cos"):
             angles.add(v.args)

@@ -17,6 +17,7 @@ from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import ALONG, Output, symbol
 from eomc.model.system import System, t
+from eomc.program import constrained
 from eomc.program.admissible import Candidate, cheapest
 from eomc.program.interpret import evaluator, nearby
 from eomc.program.ir import Call, Function
@@ -80,6 +81,7 @@ def build(derived: Derivation) -> Program:
     for made in _derivatives(system, taken):
         functions[made.name] = replace(made, route=best.route)
     more = (
+        *constrained.functions(derived, taken),
         *_outputs(system),
         *_events(system),
         *_applied(system),
@@ -110,7 +112,8 @@ def _solving(solution: Solution, system: System) -> Candidate:
     labels = [f"{name}_ddot" for name in names]
     pair = (solution.matrix.lower(), solution.matrix)
     labels += [f"{what}_{names[k]}" for k in solution.order for what in pair]
-    return Candidate(solution.tape, solution.acceleration, solution.pivots, labels, solution.order)
+    found = (solution.acceleration, solution.pivots, labels, solution.order, solution.multipliers)
+    return Candidate(solution.tape, *found)
 
 
 def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
@@ -218,6 +221,7 @@ def _unsuited(program: Program) -> list[Problem]:
                 "an explicit method, or one with fewer stages"
             )
             out.append(s.problem("run.method", message))
+    out += constrained.unsuited(s)
     swept = [name for name in implicit if METHODS[name].sweeps]
     if swept and (jumps := _jumps(program)):
         message = (

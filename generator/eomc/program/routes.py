@@ -12,6 +12,7 @@ from functools import cached_property
 
 from sympy import Expr
 
+from eomc.derive import kkt
 from eomc.derive.equations import Equations
 from eomc.derive.lagrange import Derivation
 from eomc.derive.ldl import Rows, Way, solve
@@ -53,7 +54,12 @@ class Functions:
     notes: tuple[str, ...]
 
 
-def _by_ldl(_: System, order: str) -> str:
+def _by_ldl(system: System, order: str) -> str:
+    if system.constraints:
+        return (
+            "a = qdd by L diag(d) L^T of the KKT matrix [[D, A^T], [A, 0]], eliminated in the "
+            f"order {order}, each row of A as soon as the coordinates that it reads are gone."
+        )
     return f"a = qdd by D = L diag(d) L^T, eliminated in the order {order}."
 
 
@@ -75,6 +81,15 @@ class Route:
     penalty: float = 1.0
 
 
+def _power(e: Equations) -> Expr:
+    """Into the system, with what constraints do that time moves: lambda A qd."""
+    if e.rows is None or not any(e.rows.moved):
+        return e.power
+    multipliers = kkt.accelerations(e.tape, e.D, e.balance, e.rows).multipliers
+    works = [e.tape.times(x, v) for x, v in zip(multipliers, e.rows.moved, strict=True)]
+    return e.tape.total([e.power, *works])
+
+
 def _functions(e: Equations | None) -> Functions | None:
     if e is None:
         return None
@@ -87,8 +102,8 @@ def _functions(e: Equations | None) -> Functions | None:
     wanted["energy"] = [e.tape.define(e.kinetic + e.potential)]
     if e.jacobi is not None:
         wanted["jacobi"] = [e.jacobi]
-    if e.power != 0:
-        wanted["power"] = [e.power]
+    if (power := _power(e)) != 0:
+        wanted["power"] = [power]
     if e.signals:
         wanted["signal"] = e.signals
     return Functions(e.tape, wanted, e.notes)
@@ -105,13 +120,25 @@ def _expanded_functions(material: Material) -> Functions | None:
 
 
 def _expanded(material: Material) -> Way:
-    return solve(*material.expanded) if material.expanded else None
+    if material.expanded is None:
+        return None
+    rows = material.lagrange.rows if material.lagrange else None
+    return kkt.accelerations(*material.expanded, rows) if rows else solve(*material.expanded)
 
 
 def _cancelled(material: Material) -> Way:
     if material.expander is None or material.expanded is None:
         return None
-    return solve(*material.expanded, material.expander.short)
+    rows = material.lagrange.rows if material.lagrange else None
+    short = material.expander.short
+    if rows:
+        return kkt.accelerations(*material.expanded, rows, short)
+    return solve(*material.expanded, short)
+
+
+def _constrained(e: Equations | None) -> Way:
+    """Under constraints, over equations as they are."""
+    return kkt.accelerations(e.tape, e.D, e.balance, e.rows) if e and e.rows else None
 
 
 def _by_articulated_bodies(_: System, order: str) -> str:
@@ -136,7 +163,7 @@ ROUTES: Mapping[str, Route] = {
         Route(
             "lagrange",
             "Lagrange over the program of K and P",
-            lambda m: m.derived.ldl,
+            lambda m: m.derived.ldl or _constrained(m.lagrange),
             lambda m: _functions(m.lagrange),
         ),
         Route("expanded", "the same, multiplied out", _expanded, _expanded_functions),
@@ -150,7 +177,7 @@ ROUTES: Mapping[str, Route] = {
         Route(
             "composite",
             "Newton and Euler, D of composite bodies, L D L^T",
-            lambda m: m.derived.composite,
+            lambda m: m.derived.composite or _constrained(m.derived.newton_euler),
         ),
         Route(
             "newton-euler",

@@ -10,7 +10,7 @@ from sympy import Expr, ImmutableMatrix
 
 from eomc import pipeline
 from eomc.base.errors import EomcError
-from eomc.model.system import System
+from eomc.model.system import System, symbol
 from eomc.pipeline import ScenePath
 from eomc.report import equations_text
 from eomc.verify import symbolic
@@ -29,6 +29,7 @@ Terms = list[tuple[Expr, Expr]]  # a product of accelerations or rates, and its 
 class Equations:
     """D q̈ + C q̇ + g = tau and what it comes from, as SymPy expressions over the scene's names.
 
+    With constraints, zero = 0 (m, 1), it is tau + A^T lambda, A (m, nq) and lambda (m,) symbols.
     D, C: (nq, nq); g, tau: (nq, 1), tau = forces - friction. kinetic, potential: K and P;
     jacobi, power: Jacobi's integral and its rate, None where they say nothing more. `str` prints
     them, at most 100 columns wide; a notebook shows them typeset.
@@ -44,11 +45,25 @@ class Equations:
     g: ImmutableMatrix
     tau: ImmutableMatrix
     forces: ImmutableMatrix
+    zero: ImmutableMatrix
+    A: ImmutableMatrix
     kinetic: Expr
     potential: Expr
     jacobi: Expr | None
     power: Expr | None
     left: tuple[Terms, ...]  # of each scalar equation
+
+    @property
+    def multipliers(self) -> tuple[sympy.Symbol, ...]:
+        """Of the constraints."""
+        return tuple(symbol(f"lambda_{c.name}") for c in self.system.constraints)
+
+    @property
+    def right(self) -> ImmutableMatrix:
+        """The right sides of the scalar equations: forces, and A^T lambda."""
+        if not self.multipliers:
+            return self.forces
+        return self.forces + self.A.T * sympy.Matrix(self.multipliers)
 
     @property
     def L(self) -> Expr:
@@ -57,8 +72,11 @@ class Equations:
 
     @cached_property
     def scalar(self) -> tuple[sympy.Eq, ...]:
-        """d/dt dL/dqd - dL/dq + friction = forces, one equation a coordinate, unevaluated."""
-        sides = zip(self.left, self.forces, strict=True)
+        """d/dt dL/dqd - dL/dq + friction = forces, one equation a coordinate, unevaluated.
+
+        Under constraints the right side has A^T lambda besides.
+        """
+        sides = zip(self.left, self.right, strict=True)
         return tuple(
             sympy.Eq(sympy.Add(*(a * b for a, b in terms)), right, evaluate=False)
             for terms, right in sides
@@ -96,6 +114,7 @@ def of(system: System) -> Equations:
         raise too_long(system)
     return Equations(
         system, D, C, g, tau, (plain.tau + plain.friction).applyfunc(readable),
+        plain.constraints.applyfunc(readable), plain.constraint_jacobian.applyfunc(readable),
         readable(_energy(plain.kinetic, system)), readable(_energy(plain.potential, system)),
         readable(found.jacobi) if found.jacobi != found.energy else None,
         readable(found.power) if found.power != 0 else None, left,

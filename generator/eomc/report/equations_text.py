@@ -12,7 +12,7 @@ from sympy.printing.str import StrPrinter
 
 from eomc.base import texts
 from eomc.derive import lagrange
-from eomc.model.system import System, t
+from eomc.model.system import Constraint, System, t
 from eomc.model.tree import Tree
 from eomc.program import program
 from eomc.program.routes import ROUTES
@@ -34,6 +34,7 @@ _MEANING = {
     "C": "Coriolis matrix, Christoffel form",
     "g": "potential forces",
     "tau": "generalized forces",
+    "A": "derivatives of the constraints along q, or q̇ where they are of rates",
     "jacobi": "Jacobi integral, conserved in place of K + P",
     "power": "power into the system",
 }
@@ -44,6 +45,8 @@ _LATEX = {**_SYMBOL, "tau": r"\tau", "power": r"\dot h"}
 def _values(found: Equations) -> dict[str, Expr | MatrixBase]:
     """What is shown, by its name."""
     values = {name: getattr(found, name) for name in _MEANING}
+    if not found.system.constraints:
+        del values["A"]
     if all(e == 0 for e in found.tau):
         del values["tau"]
     return {name: value for name, value in values.items() if value is not None}
@@ -55,21 +58,25 @@ def _values(found: Equations) -> dict[str, Expr | MatrixBase]:
 def text(found: Equations) -> str:
     """For a terminal, WIDE columns and an indent."""
     system, write = found.system, Typesetter(found.system)
-    values = _values(found)
-    right = "τ" if "tau" in values else "0"
-    parts = [_wrapped(f"{_title(system)}: D q̈ + C q̇ + g = {right}, q = ({_order(system)})")]
+    values, made = _values(found), list[str]()
+    parts = [_wrapped(f"{_title(system)}: {_head('tau' in values, system)}")]
     lines = []
-    for left, force in zip(found.left, found.forces, strict=True):
+    for left, force in zip(found.left, found.right, strict=True):
         lines += [
             *write.text_lines([write.term(a, b) for a, b in _flat(left)], _terms(write, force)),
             "",
         ]
     parts.append(_part("equations of motion", lines[:-1]))
+    if system.constraints:
+        made = []
+        for c, zero in zip(system.constraints, found.zero, strict=True):
+            made += [*write.text_lines(write.terms(zero), []), *_told(c)]
+        parts.append(_part("constraints", made))
     for name, value in values.items():
         head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}"
         parts.append(_part(head, list(_value_lines(write, name, value))))
     if system.outputs:
-        made: list[str] = []
+        made = []
         for name, formula in _outputs(system):
             made += _named_lines(write, name, formula)
         parts.append(_part("outputs", made))
@@ -82,6 +89,19 @@ def _part(head: str, lines: list[str]) -> str:
 
 def _title(system: System) -> str:
     return texts.line(system.title or system.name)
+
+
+def _head(driven: bool, system: System) -> str:
+    """The form of the equations, and the order of q."""
+    right = [*(["τ"] * driven), *(["Aᵀλ"] * bool(system.constraints))]
+    return f"D q̈ + C q̇ + g = {' + '.join(right) or '0'}, q = ({_order(system)})"
+
+
+def _told(c: Constraint) -> list[str]:
+    """What is to be said of a constraint beside its formula."""
+    said = [f"{c.name}: of {'positions' if c.holonomic else 'rates'}"]
+    said += ["implied by others, its multiplier 0"] if c.redundant else []
+    return [f"    {', '.join(said)}"]
 
 
 def _order(system: System) -> str:
@@ -168,9 +188,12 @@ def latex_lines(found: Equations) -> tuple[list[str], list[str]]:
     """The lines of the equations of motion; those of energies, matrices and outputs."""
     system, write = found.system, Typesetter(found.system)
     motion = []
-    for left, force in zip(found.left, found.forces, strict=True):
+    for left, force in zip(found.left, found.right, strict=True):
         terms = [write.term(a, b) for a, b in _flat(left)]
         first, *more = write.latex_lines(terms, _terms(write, force))
+        motion += [f"  & {first}", *(GOES_ON + line for line in more)]
+    for zero in found.zero:
+        first, *more = write.latex_lines(write.terms(zero), [])
         motion += [f"  & {first}", *(GOES_ON + line for line in more)]
     lines = []
     for name, value in _values(found).items():
@@ -213,6 +236,7 @@ def python(found: Equations) -> str:
         *system.qd,
         *system.qdd,
         *system.u,
+        *found.multipliers,
         *(p.symbol for p in system.parameters),
         t,
     ]
@@ -245,7 +269,7 @@ def large(system: System) -> str:
     """What the equations of a large system come from, and what it costs to compute them."""
     write = Typesetter(system)
     parts = [
-        _wrapped(f"{_title(system)}: D q̈ + C q̇ + g = τ, q = ({_order(system)})"),
+        _wrapped(f"{_title(system)}: {_head(True, system)}"),
         "Written out, these equations would fill many pages. They are those of L = K - P,\n"
         "d/dt ∂L/∂q̇ - ∂L/∂q = τ.",
     ]

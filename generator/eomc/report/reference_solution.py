@@ -326,13 +326,19 @@ def _digits(off: Any, size: float) -> float:
 
 
 class _Plain:
-    """The reference's D, bias, tau and signals with mpmath numbers."""
+    """The reference's D, bias, tau, constraints and signals with mpmath numbers."""
 
     def __init__(self, system: System) -> None:
         r = symbolic.derive(system)
         symbols = (*system.q, *system.qd, time_symbol, *system.u)
         symbols += tuple(p.symbol for p in system.parameters)
-        parts = [*r.D, *(r.tau - r.bias)]
+        rows = [k for k, c in enumerate(system.constraints) if not c.redundant]
+        A, gamma = r.constraint_jacobian, r.gamma
+        # D qdd - A^T lambda = tau - bias, A qdd = -gamma
+        whole = sympy.BlockMatrix([[r.D, -A[rows, :].T], [A[rows, :], sympy.zeros(len(rows))]])
+        matrix = whole.as_explicit() if rows else r.D
+        parts = [*matrix, *(r.tau - r.bias), *(-gamma[k] for k in rows)]
+        self.size = len(system.coordinates) + len(rows)
         # Floats are the doubles that they are
         exact = [e.xreplace({f: sympy.Rational(f) for f in e.atoms(sympy.Float)}) for e in parts]
         self.n, self.m = len(system.coordinates), len(system.inputs)
@@ -341,14 +347,14 @@ class _Plain:
         self.signals = sympy.lambdify(symbols, list(r.signals), modules="mpmath", cse=True)
 
     def acceleration(self, q: list[Any], qd: list[Any], t: Any) -> list[Any]:
-        """Qdd from D qdd = tau - bias."""
+        """Qdd from D qdd = tau - bias + A^T lambda."""
         u = [mpmath.mpf(0)] * self.m
         if self.m:
             u = self.signals(*q, *qd, t, *u, *self.parameters)
         v = self.values(*q, *qd, t, *u, *self.parameters)
-        n = self.n
-        D = mpmath.matrix([v[i * n : (i + 1) * n] for i in range(n)])
-        return list(mpmath.lu_solve(D, mpmath.matrix(v[n * n :])))
+        n = self.size
+        matrix = mpmath.matrix([v[i * n : (i + 1) * n] for i in range(n)])
+        return list(mpmath.lu_solve(matrix, mpmath.matrix(v[n * n :])))[: self.n]
 
     def over(self, x: list[Any], t: Any, span: Any, deadline: float) -> list[Any] | None:
         """The state after `span`, by extrapolated midpoint steps; None where time is up."""

@@ -87,6 +87,36 @@ class Drive:
 
 
 @dataclass(frozen=True)
+class RobotLoop:
+    """A joint, "spherical" or "weld", that closes a loop between two bodies or with the world.
+
+    points: where it is in the frame of each, m. rotation: of the second frame in the first.
+    """
+
+    name: str
+    joint: str
+    bodies: tuple[str, str]
+    points: tuple[Vector, Vector]
+    rotation: Matrix = IDENTITY
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Sums of coordinates, each with its factor: first - zero = sum a_k (second - at)^k.
+
+    polynomial: a_0 to a_4. unit: of the row.
+    """
+
+    name: str
+    first: tuple[tuple[float, str], ...]
+    second: tuple[tuple[float, str], ...]
+    zero: float
+    at: float
+    polynomial: tuple[float, ...]
+    unit: str = ""
+
+
+@dataclass(frozen=True)
 class Robot:
     """A tree of bodies, parents first; gravity in m/s^2; what the file has besides, in words."""
 
@@ -95,6 +125,8 @@ class Robot:
     gravity: Vector
     bodies: tuple[RobotBody, ...]
     drives: tuple[Drive, ...] = ()
+    loops: tuple[RobotLoop, ...] = ()
+    couplings: tuple[Coupling, ...] = ()
     left_out: tuple[str, ...] = ()
 
     @property
@@ -121,7 +153,10 @@ def fixed(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
 
 
 def settled(robot: Robot) -> Robot:
-    """The robot with joints fixed at their start that mimic what does not move; no loose drives."""
+    """The robot with joints fixed at their start that mimic what does not move.
+
+    Drives of what is not there are left out, loops and couplings too, and these are told.
+    """
     there = {m.name for m in robot.motions}
     bodies = []
     for body in robot.bodies:
@@ -133,7 +168,22 @@ def settled(robot: Robot) -> Robot:
             body = replace(body, note=joined(body.note, note))
         bodies.append(body)
     drives = tuple(d for d in robot.drives if d.coordinate in there)
-    return replace(robot, bodies=tuple(bodies), drives=drives)
+    known = {WORLD, *(body.name for body in bodies)}
+    loops = tuple(loop for loop in robot.loops if known.issuperset(loop.bodies))
+    couplings = tuple(
+        c for c in robot.couplings if there.issuperset(q for _, q in (*c.first, *c.second))
+    )
+    lost = {loop.name for loop in robot.loops} - {loop.name for loop in loops}
+    lost |= {c.name for c in robot.couplings} - {c.name for c in couplings}
+    told = ("constraints of what is cut off or locked: " + ", ".join(sorted(lost)),) if lost else ()
+    return replace(
+        robot,
+        bodies=tuple(bodies),
+        drives=drives,
+        loops=loops,
+        couplings=couplings,
+        left_out=(*told, *robot.left_out),
+    )
 
 
 def free_motions(of: str = "") -> tuple[Motion, ...]:

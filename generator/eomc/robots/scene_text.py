@@ -13,17 +13,19 @@ from eomc.base.texts import line, toml
 from eomc.robots.inertias import indefinite, unbalanced
 from eomc.robots.robot import (
     BARE,
+    Coupling,
     Drive,
     Mimic,
     Motion,
     Robot,
     RobotBody,
+    RobotLoop,
     joined,
     without_dust,
 )
 from eomc.robots.rotations import SNAP, Vector, turns_of
 from eomc.scene.assembly import WORLD
-from eomc.scene.joints import JOINTS
+from eomc.scene.joints import CLOSINGS, JOINTS
 
 _NAME = 32  # characters of a name, so that what is made of it ("_torque", "_dot") fits too
 
@@ -120,10 +122,27 @@ def _named(robot: Robot) -> Robot:
         )
         note = _renamed(body.name, name, body.note)
         out.append(replace(body, name=name, parent=bodies[body.parent], motions=motions, note=note))
+    rows = [f"_{kind}" for joint in CLOSINGS.values() for kind in joint.space]
+    loops = tuple(
+        replace(loop, name=fit(loop.name, "", *rows), bodies=(bodies[one], bodies[other]))
+        for loop in robot.loops
+        for one, other in [loop.bodies]
+    )
+    couplings = tuple(
+        replace(
+            c,
+            name=fit(c.name, ""),
+            first=tuple((by, coordinates[q]) for by, q in c.first),
+            second=tuple((by, coordinates[q]) for by, q in c.second),
+        )
+        for c in robot.couplings
+    )
     name = names.plain(robot.name)[:_NAME].rstrip("_")
     if names.module_fault(name):
         name += "_robot"
-    return replace(robot, name=name, bodies=tuple(out), drives=drives)
+    return replace(
+        robot, name=name, bodies=tuple(out), drives=drives, loops=loops, couplings=couplings
+    )
 
 
 def _of(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
@@ -187,7 +206,7 @@ def scene_text(robot: Robot) -> str:
     parts = [
         "\n".join(head),
         _table("", about),
-        _table("[coordinates]", {m.name: _coordinate(m) for m in robot.motions}),
+        _table("[coordinates]", {m.name: _coordinate(m, robot) for m in robot.motions}),
     ]
     if robot.drives:
         parts.append(_table("[inputs]", {d.name: _input(d, units) for d in robot.drives}))
@@ -199,6 +218,10 @@ def scene_text(robot: Robot) -> str:
             if motion.rest:
                 spring["length"] = _length(motion.rest, motion.unit)
             parts.append(_table("[[spring]]", spring))
+    parts += [_table("[[loop]]", _loop(loop)) for loop in robot.loops]
+    parts += [_table("[[loop]]", _gear(c)) for c in robot.couplings if _is_gear(c)]
+    if rows := {c.name: _row(c) for c in robot.couplings if not _is_gear(c)}:
+        parts.append(_table("[constraints]", rows))
     return "\n\n".join(parts) + "\n"
 
 
@@ -234,10 +257,65 @@ def _length(x: float, of: str) -> str:
     return angle(x) if of == "rad" else number(x)
 
 
-def _coordinate(m: Motion) -> str:
+def _loop(loop: RobotLoop) -> dict[str, str]:
+    """The keys of a [[loop]] between bodies."""
+    entry = {
+        "name": toml(loop.name),
+        "joint": toml(loop.joint),
+        "bodies": _each([toml(body) for body in loop.bodies]),
+        "points": _each([vector(point) for point in loop.points]),
+    }
+    if turns := turns_of(loop.rotation):
+        entry["rotation"] = _turns(turns)
+    return entry
+
+
+def _is_gear(c: Coupling) -> bool:
+    """Whether one coordinate is a multiple of another, and a number."""
+    single = [by for by, _ in (*c.first, *c.second)] == [1.0, 1.0] and len(c.first) == 1
+    return single and c.polynomial[1] != 0 and not any(c.polynomial[2:])
+
+
+def _gear(c: Coupling) -> dict[str, str]:
+    """The keys of a gear."""
+    (_, driven), (_, driving) = c.first[0], c.second[0]
+    ratio = c.polynomial[1]
+    offset = c.zero + c.polynomial[0] - ratio * c.at
+    entry = {
+        "name": toml(c.name),
+        "joint": toml("gear"),
+        "coordinates": _each([toml(driving), toml(driven)]),
+        "ratio": number(ratio),
+    }
+    return {**entry, "offset": number(offset)} if offset else entry
+
+
+def _row(c: Coupling) -> str:
+    """A coupling as a row of constraints."""
+    second = _less(_sum(c.second), c.at)
+    second = second if second.isidentifier() else f"({second})"
+    powers = [f"{number(a)}*{second}**{k}" for k, a in enumerate(c.polynomial) if a and k]
+    terms = [number(c.polynomial[0])] * bool(c.polynomial[0]) + powers
+    right = " + ".join(terms).replace("**1", "").replace("+ -", "- ")
+    text = _less(_sum(c.first), c.zero) + (f" - ({right})" if right else "")
+    unit = f", unit = {toml(c.unit)}" if c.unit else ""
+    return f"{{ formula = {toml(text)}{unit} }}"
+
+
+def _sum(terms: Sequence[tuple[float, str]]) -> str:
+    shown = [{1.0: q, -1.0: f"-{q}"}.get(by, f"{number(by)}*{q}") for by, q in terms]
+    return " + ".join(shown).replace("+ -", "- ") or "0"
+
+
+def _less(text: str, x: float) -> str:
+    return f"{text} - {number(x)}".replace("- -", "+ ") if x else text
+
+
+def _coordinate(m: Motion, robot: Robot) -> str:
     start = f", start = {_length(m.start, m.unit)}" if m.start else ""
     note = f", note = {toml(m.note)}" if m.note else ""
-    return f"{{ unit = {toml(m.unit)}{start}{note} }}"
+    guess = ", guess = true" if robot.loops or robot.couplings else ""
+    return f"{{ unit = {toml(m.unit)}{start}{guess}{note} }}"
 
 
 def _input(drive: Drive, units: Mapping[str, str]) -> str:
@@ -262,8 +340,7 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
     if any(body.offset):
         entry["place" if body.point else "offset"] = vector(body.offset)
     if turns := turns_of(body.rotation):
-        shown = (f'["{axis}", {angle(by)}]' for axis, by in turns)
-        entry["rotation"] = f"[{', '.join(shown)}]"
+        entry["rotation"] = _turns(turns)
     if body.axes and body.axes != JOINTS[body.joint].defaults:
         entry["axis"] = _each([vector(axis) for axis in body.axes])
     if body.mass:
@@ -283,6 +360,11 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
     if body.note:
         entry["note"] = toml(body.note)
     return entry
+
+
+def _turns(turns: Sequence[tuple[str, float]]) -> str:
+    shown = (f'["{axis}", {angle(by)}]' for axis, by in turns)
+    return f"[{', '.join(shown)}]"
 
 
 def _moved_by(m: Motion) -> str:

@@ -302,8 +302,9 @@ class _Reader:
             if other := holds.get(joint.child):
                 self.say(
                     f"joint {joint.name}",
-                    f"its child link '{joint.child}' is held by joint '{other.name}' already: a "
-                    "closed loop of bodies is not modelled, remove one of the two joints",
+                    f"its child link '{joint.child}' is held by joint '{other.name}' already: "
+                    "bodies of a URDF hang in a tree, remove one of the two joints and close the "
+                    "loop by a [[loop]] in the scene",
                 )
             else:
                 holds[joint.child] = joint

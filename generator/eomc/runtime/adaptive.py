@@ -134,7 +134,7 @@ class AdaptiveRun(Run):
     @property
     def _remark(self) -> str:
         if self.held_back < max(_STIFF, self.steps // 8):
-            return ""
+            return self._singular
         return (
             f"{self.held_back} of {self.steps} steps were held back by a stiff motion: fixed steps "
             "of gauss8 may be quicker"
@@ -243,14 +243,7 @@ def simulate(
     times: ArrayLike | None, h_most: float | None, **fixed: Any,
 ) -> AdaptiveRun:  # fmt: skip
     """`Model.simulate` with a tolerance; fixed: what belongs to fixed steps, and was given."""
-    if model.tolerance is None:
-        raise ValueError(
-            "tol, times: not built; a scene asks for them with [run] tolerance = 1e-9 (of a run by "
-            "fixed steps run(times) gives the states at any times)"
-        )
-    for name, value in fixed.items():
-        if value is not None and (name, value) != ("every", 1):
-            raise ValueError(f"{name}: belongs to fixed steps, tol to adaptive ones: give one")
+    tol, most = as_limits(model, tol, h_most, fixed)
     if u is not None and (callable(u) or np.ndim(u) > 1):
         raise ValueError(
             "u: adaptive steps take the scene's signals, or one value an input, held over the "
@@ -261,16 +254,12 @@ def simulate(
         q, qd = model._one(q if q0 is None else q0, qd if qd0 is None else qd0)
     t0, held = as_number(t0, "t0"), model._inputs(u)
     p = model._p0 if params is None else model._parameters(params).copy()
-    tol = as_tolerance(model.tolerance if tol is None else tol, model.dtype)
-    most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
     if times is None:
-        span = model.duration if duration is None else as_number(duration, "duration")
-        if span < 0:
-            raise ValueError(f"duration: {span:g} is not a time in s")
-        found = run(model, q, qd, t0, t0 + span, tol, None, held, p, most, progress)
+        end = as_end(model, t0, duration)
+        found = run(model, q, qd, t0, end, tol, None, held, p, most, progress)
     else:
         if duration is not None:
-            raise ValueError("times: say where the run ends; give times or duration, not both")
+            raise ValueError(BOTH)
         rows = as_times(times, t0, model.dtype)
         first = int(rows[0] == t0)
         end = float(rows[-1])
@@ -332,7 +321,7 @@ def run(
             )  # fmt: skip
             spent = perf_counter() - begun
             kept()
-            said = "accumulated" if found == len(STATUS) else STATUS[found]
+            said = STATUS[found]
         if progress is not None and said == "ok":
             progress(1000, 1000)
     except KeyboardInterrupt:
@@ -344,7 +333,7 @@ def run(
         both = np.concatenate([*(rows for _, rows in pieces), both], axis=1)
     mean = (float(at[0]) - t0) / work.steps if work.steps else t_end - t0
     held = None if u is None else u.copy()
-    return AdaptiveRun(
+    made = AdaptiveRun(
         model, t0, both, mean, work.steps, said, p, 1, held, "gauss16",
         work.evaluations, tol=tol, rejected=work.rejected, held_back=work.held_back,
         _times=stamps, _h_most=h_most, _begin=start, _t_end=t_end,
@@ -352,6 +341,10 @@ def run(
         stopped=model.events[work.stopped - 1] if model.events and work.stopped else "",
         limit=work.limit if said == "accumulated" else float("nan"),
     )  # fmt: skip
+    if model.constraint_names:
+        made.singular_steps = work.singular
+        made.first_singular = work.first if work.singular else made.first_singular
+    return made
 
 
 class _Found:
@@ -382,6 +375,33 @@ class _Found:
             return self.which[:0], self.rows[:0]
         which, rows = zip(*self.pieces, strict=True)
         return np.concatenate(which), np.concatenate(rows)
+
+
+BOTH = "times: say where the run ends; give times or duration, not both"
+
+
+def as_limits(
+    model: Model, tol: float | None, h_most: float | None, fixed: Mapping[str, Any]
+) -> tuple[float, float]:
+    """(tolerance, longest step or 0); fixed: what belongs to fixed steps, and may be given."""
+    if model.tolerance is None:
+        raise ValueError(
+            "tol, times: not built; a scene asks for them with [run] tolerance = 1e-9 (of a run by "
+            "fixed steps run(times) gives the states at any times)"
+        )
+    for name, value in fixed.items():
+        if value is not None and (name, value) != ("every", 1):
+            raise ValueError(f"{name}: belongs to fixed steps, tol to adaptive ones: give one")
+    most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
+    return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most
+
+
+def as_end(model: Model, t0: float, duration: float | None) -> float:
+    """The time at which a run ends."""
+    span = model.duration if duration is None else as_number(duration, "duration")
+    if span < 0:
+        raise ValueError(f"duration: {span:g} is not a time in s")
+    return float(t0 + span)
 
 
 def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:

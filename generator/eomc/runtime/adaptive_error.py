@@ -37,7 +37,7 @@ def error_of(
     beside = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(x))))
 
     def again(tol: float, start: Array) -> Array:
-        nq, out = model.nq, np.full_like(x, np.nan)
+        nq, out, start = model.nq, np.full_like(x, np.nan), start.astype(model.dtype)
         out[own.t == own.t0] = start
         if len(kept):
             made = run(

@@ -119,6 +119,10 @@ class Arguments:
         q, qd = self._start
         return q.copy(), qd.copy()
 
+    def _bytes(self, rows: int) -> int:
+        """What q and qd of so many rows take."""
+        return rows * 2 * self.nq * self.dtype.itemsize
+
     def _constant(self, values: Sequence[float]) -> Array:
         array = np.array(values, self.dtype)
         array.flags.writeable = False

@@ -241,7 +241,8 @@ class BatchModel(Model):
         tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
         at the start and the end where None.
         """
-        if tol is not None or times is not None or self._fits(h, steps, method):
+        given = tol is not None or times is not None or h_most is not None
+        if given or self._fits(h, steps, method):
             from . import batch_adaptive  # which needs this file
 
             fitted, whole = batch_adaptive.simulate(
@@ -260,7 +261,7 @@ class BatchModel(Model):
         hold = as_period(control_period, h)
         if u is None and control_period is not None and self.nu:
             raise ValueError("control_period: a batch follows the signals: give u, a row a period")
-        starts, table, held, count = self._instances(q0, qd0, params, u, -(-steps // hold))
+        starts, table, held, count = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
         if held is not None and hold > 1 and held.shape[1] > 1:
             held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])
         rows = 1 + steps // every + (steps % every > 0)
@@ -354,11 +355,13 @@ class BatchModel(Model):
         return status
 
     def _instances(
-        self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int
-    ) -> tuple[tuple[Array, Array], Array, Array | None, int]:
+        self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int,
+        t0: float | None = None,
+    ) -> tuple[tuple[Array, Array], Array, Array | None, int]:  # fmt: skip
         """((q, qd), parameters, inputs, batch), one row an instance; a single one serves for all.
 
-        q and qd may be what was given: they are to be read only, and not known to be finite.
+        q and qd may be what was given: they are to be read only, and not known to be finite. t0:
+        when they start, on the constraints.
         """
         start = self._start
         q = self._rows_of(start[0] if q0 is None else q0, "q0")
@@ -381,6 +384,8 @@ class BatchModel(Model):
 
         whole = (count, self.nq)  # broadcast_to takes a while even where nothing is to be done
         q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
+        if t0 is not None:
+            q, qd = self._assembled_rows(q, qd, table, t0)
         return (q, qd), table, held, count
 
     def _rows_of(self, given: ArrayLike, name: str) -> Array:

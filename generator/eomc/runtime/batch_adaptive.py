@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import wait
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from time import perf_counter
@@ -13,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .adaptive import as_times, as_tolerance
-from .arguments import Array, as_count, as_number, as_step_size
+from .adaptive import BOTH, as_end, as_limits, as_times
+from .arguments import Array, as_number
 from .batch import BatchRun
-from .batch_work import _pool
+from .batch_work import all_of, as_threads
 from .package import reduced
 from .slices import longer
 from .trajectory import STATUS
@@ -52,7 +50,7 @@ class AdaptiveBatchRun(BatchRun):
     @cached_property
     def status(self) -> Array:
         """How each ended."""
-        return np.asarray(np.array([*STATUS, "accumulated", "interrupted"])[self._codes])
+        return np.asarray(np.array([*STATUS, "interrupted"])[self._codes])
 
     @property
     def message(self) -> str:
@@ -87,23 +85,15 @@ def simulate(
     h_most: float | None, **fixed: Any,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
     """`simulate_batch` by a tolerance, and whether it is whole, not cut off by Ctrl-C."""
-    if model.tolerance is None:
-        raise ValueError("tol, times: not built; a scene asks for them with [run] tolerance = 1e-9")
-    for name, value in fixed.items():
-        if value is not None and (name, value) != ("every", 1):
-            raise ValueError(f"{name}: belongs to fixed steps, tol to adaptive ones: give one")
-    tol = as_tolerance(model.tolerance if tol is None else tol, model.dtype)
-    most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
+    tol, most = as_limits(model, tol, h_most, fixed)
     t0 = as_number(t0, "t0")
-    if times is not None and duration is not None:
-        raise ValueError("times: say where the run ends; give times or duration, not both")
     if times is None:
-        span = model.duration if duration is None else as_number(duration, "duration")
-        if span < 0:
-            raise ValueError(f"duration: {span:g} is not a time in s")
-        times = [t0, t0 + span] if span else [t0]
+        end = as_end(model, t0, duration)
+        times = [t0, end] if end > t0 else [t0]
+    elif duration is not None:
+        raise ValueError(BOTH)
     rows = as_times(times, t0, model.dtype)
-    starts, table, held, _ = model._instances(q0, qd0, params, u, 1)
+    starts, table, held, _ = model._instances(q0, qd0, params, u, 1, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
     work = _Work(model, np.ascontiguousarray(np.hstack([q, qd])), t0, rows, tol, most, held, table)
     whole = work.run(threads, progress)
@@ -111,7 +101,7 @@ def simulate(
     for values in work.rows:
         values[~kept] = np.nan
     counts = np.array([[w.steps, w.evaluations, w.rejected] for w in work.works])
-    codes = np.where((work.status == 0) & work.open, len(STATUS) + 1, work.status).astype("i")
+    codes = np.where((work.status == 0) & work.open, len(STATUS), work.status).astype("i")
     span = float(rows[-1]) - t0
     made = AdaptiveBatchRun(
         model, t0, work.rows[0], work.rows[1], span / max(1.0, float(counts[:, 0].mean())),
@@ -135,7 +125,7 @@ class _Work:
         self.rows = np.empty((2, count, n, model.nq), model.dtype)
         self.kept, self.status = np.zeros(count, "l"), np.zeros(count, "i")
         self.works = model._ffi.new("adaptive_work[]", count)
-        self.open, self.stop = np.ones(count, bool), False
+        self.open, self.stop, self.ended = np.ones(count, bool), False, 0
         if times[0] == t0:
             self.kept[:] = 1
             self.rows[0, :, 0], self.rows[1, :, 0] = x[:, : model.nq], x[:, model.nq :]
@@ -143,33 +133,14 @@ class _Work:
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
         count = len(self.x)
-        if threads is None:
-            threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-        threads = as_count(threads, "threads", 1)
-        groups = [(at, min(at + _GROUP, count)) for at in range(0, count, _GROUP)]
-        try:
-            if threads == 1 or len(groups) == 1:
-                for k, group in enumerate(groups):
-                    self._group(*group)
-                    if progress is not None:
-                        progress(k + 1, len(groups))
-                return True
-            waiting = {_pool(threads).submit(self._group, *group) for group in groups}
-            while waiting:
-                ended, waiting = wait(waiting, timeout=0.05)
-                for future in ended:
-                    future.result()
-                if progress is not None:
-                    progress(len(groups) - len(waiting), len(groups))
-        except KeyboardInterrupt:
-            self.stop = True
-            for future in () if threads == 1 or len(groups) == 1 else waiting:
-                future.cancel()
-            return False
-        return True
+        groups = [(at, min(_GROUP, count - at)) for at in range(0, count, _GROUP)]
+        return all_of(
+            self, groups, as_threads(threads), lambda: progress and progress(self.ended, count)
+        )
 
-    def _group(self, at: int, end: int) -> None:
-        """Instances at, ..., end - 1 to the end, some steps of each at once."""
+    def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
+        """Instances at, ..., at + count - 1 to the end, some steps of each at once."""
+        end = at + count
         model, pointer = self.model, self.model._pointer
         null, n, many = model._c[2], len(self.times), _FEW
         u_each = self.held is not None and len(self.held) > 1
@@ -180,7 +151,7 @@ class _Work:
         while more and not self.stop:
             begun = perf_counter()
             more = model._lib.adaptive_batch(
-                end - at, pointer(self.x[at:end]), pointer(self.t[at:end]), *self.limits, u,
+                count, pointer(self.x[at:end]), pointer(self.t[at:end]), *self.limits, u,
                 model.nu if u_each else 0, many, pointer(self.times), n,
                 pointer(self.rows[0, at:end]), pointer(self.rows[1, at:end]),
                 pointer(self.table[at:end] if p_each else self.table), int(p_each),
@@ -188,5 +159,8 @@ class _Work:
                 address(integer, self.status[at:end]),
             )  # fmt: skip
             many = min(longer(many, perf_counter() - begun), 2**40)
+            look()
         if not more:
             self.open[at:end] = False
+            self.ended += count  # a figure for the bar; threads may lose one another's
+            look()

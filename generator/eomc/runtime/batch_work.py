@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -56,49 +56,15 @@ class Work:
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
         count = self.count
-        threads = None if threads is None else as_count(threads, "threads", 1)
+        threads = as_threads(threads)
         if count * self.steps < WORTH:
             threads = 1
-        elif threads is None:
-            threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         tiles = -(-count // _GROUP)
         size = _GROUP * max(1, min(_TILES, tiles // (_SHARES * threads) if threads > 1 else tiles))
         groups = [(at, min(size, count - at)) for at in range(0, count, size)]
         self._begin_all(threads if len(groups) > 1 else 1)
-        return self._all_of(groups, threads, progress)
-
-    def _all_of(
-        self,
-        groups: list[tuple[int, int]],
-        threads: int,
-        progress: Callable[[int, int], None] | None,
-    ) -> bool:
-        total = self.count * self.steps
-        if threads == 1 or len(groups) == 1:
-            try:
-                for group in groups:
-                    self._group(*group, lambda: progress and progress(self.moved, total))
-            except KeyboardInterrupt:
-                return False
-            return True
-        pool = _pool(threads)
-        waiting: set[Future[None]] = {pool.submit(self._group, *group) for group in groups}
-        try:
-            while waiting:
-                ended, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_EXCEPTION)
-                for future in ended:
-                    future.result()
-                if progress is not None:
-                    progress(self.moved, total)
-        except BaseException as fault:
-            self.stop = True
-            for future in waiting:
-                future.cancel()
-            wait(waiting)
-            if isinstance(fault, KeyboardInterrupt):
-                return False
-            raise
-        return True
+        total = count * self.steps
+        return all_of(self, groups, threads, lambda: progress and progress(self.moved, total))
 
     def _begin_all(self, threads: int) -> None:
         """The starts of all into what is moved, and into the first rows.
@@ -158,6 +124,51 @@ class Work:
             model._paces[kind] = max(1e-10, spent / (many * count))
             many = longer(many, spent, _SECONDS)
             look()
+
+
+class Grouped(Protocol):
+    """Work that is done in groups: `_group` does one, and leaves off where `stop` is set."""
+
+    stop: bool
+
+    def _group(self, at: int, count: int, look: Callable[[], object] = ...) -> None: ...
+
+
+def all_of(
+    work: Grouped, groups: list[tuple[int, int]], threads: int, look: Callable[[], object]
+) -> bool:
+    """All groups, in threads; look: called now and then. False where Ctrl-C came in between."""
+    if threads == 1 or len(groups) == 1:
+        try:
+            for group in groups:
+                work._group(*group, look)
+        except KeyboardInterrupt:
+            return False
+        return True
+    pool = _pool(threads)
+    waiting: set[Future[None]] = {pool.submit(work._group, *group) for group in groups}
+    try:
+        while waiting:
+            ended, waiting = wait(waiting, timeout=_SECONDS, return_when=FIRST_EXCEPTION)
+            for future in ended:
+                future.result()
+            look()
+    except BaseException as fault:
+        work.stop = True
+        for future in waiting:
+            future.cancel()
+        wait(waiting)
+        if isinstance(fault, KeyboardInterrupt):
+            return False
+        raise
+    return True
+
+
+def as_threads(threads: Any) -> int:
+    """So many; as many as there are processors where None."""
+    if threads is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    return as_count(threads, "threads", 1)
 
 
 _pools: dict[int, ThreadPoolExecutor] = {}

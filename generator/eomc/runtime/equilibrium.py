@@ -26,6 +26,11 @@ def equilibrium(
     which cost a step some digits and the result none. Where more is free than they determine, each
     step is the shortest. u None: the signals, also where they depend on q.
     """
+    if model.constraint_names:
+        raise ValueError(
+            "equilibrium: is not for scenes with constraints, whose forces it does not know: let "
+            "the motion come to rest by damping"
+        )
     n, known = model.nq, (*model.coordinates, *model.inputs)
     if strange := [name for name in free if name not in known]:
         raise ValueError(not_one_of("free", strange[0], known))

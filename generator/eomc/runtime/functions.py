@@ -17,7 +17,8 @@ from .slices import slices
 from .trajectory import SAID, STATUS, MotionError, state_text
 
 _OF_POSITION = (
-    "D", "g", "potential_energy", "frame_poses", "frame_jacobians", "frame_forces"
+    "D", "g", "potential_energy", "frame_poses", "frame_jacobians", "frame_forces",
+    "constraint_jacobian",
 )  # fmt: skip
 _ROWS = 20_000  # rows times coordinates squared in one call, some ms at most
 
@@ -226,10 +227,10 @@ class Functions(Arguments):
                 found = self._lib.acceleration(
                     many, to + k, from_q + k, from_qd + k, time, inputs, p
                 )
-                if found & 3:
+                if found & 7:
                     break
-        if found & 3:
-            done, said = first + (found >> 2), STATUS[found & 3]
+        if found & 7:
+            done, said = first + (found >> 3), STATUS[found & 7]
             where = state_text(np.atleast_2d(at)[done], np.atleast_2d(moving)[done])
             what = SAID[said] if said == "singular" else "the acceleration is not finite there"
             raise MotionError(f"at {where}: {what}", said)

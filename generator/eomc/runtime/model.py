@@ -27,14 +27,14 @@ from .arguments import (
     machine_memory,
 )
 from .columns import File
+from .constrained import Constrained, Rows
 from .discretize import discretize
 from .equilibrium import equilibrium
 from .estimate import advice, beyond_end
-from .frames import Frames
 from .laws import Law, Sampled
 from .package import reduced
 from .slices import longer
-from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
+from .trajectory import PASSED_OVER, SAID, STATUS, Interrupted, MotionError, Run, state_text
 
 Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
@@ -46,7 +46,7 @@ RARELY = 2**48  # steps from row to row, more than any run makes
 _MOST = 2**60  # steps, so that C can return four times as many
 
 
-class Model(Frames):
+class Model(Constrained):
     """The functions of one compiled scene; the package hands them on under their own names."""
 
     source: Any = None  # what eomc.load made it from, a path or a System; pictures need it
@@ -54,12 +54,13 @@ class Model(Frames):
     def __init__(
         self, extension: Any, *, h: float, duration: float,
         methods: Mapping[str, tuple[int, int, float, float]], tolerance: float | None = None,
-        events: tuple[str, ...] = (), **scene: Any,
+        events: tuple[str, ...] = (), constrained: tuple[Any, ...] = (), **scene: Any,
     ) -> None:  # fmt: skip
         """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
         super().__init__(extension, **scene)
         self.h, self.duration, self.tolerance = h, duration, tolerance
         self.events = events
+        self._rows = Rows(*constrained)
         self.methods = tuple(methods)
         self._facts = dict(methods)
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
@@ -104,15 +105,14 @@ class Model(Frames):
 
     def _single(self, kind: str, kept: Mapping[str, Any]) -> Run:
         """A run of one, by its kind and what was kept of it."""
-        kinds: dict[str, type[Run]] = {"Run": Run, "AdaptiveRun": adaptive.AdaptiveRun}
-        return kinds[kind]._of_kept(self, kept)
+        return (Run if kind == "Run" else adaptive.AdaptiveRun)._of_kept(self, kept)
 
     def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
         """A method's step and loop in C, steps at once, stages; what is kept and counted."""
         step, run = (getattr(self._lib, f"{name}_{what}") for what in ("step", "run"))
         work = self._ffi.typeof(f"{name}_work *")
         counted = getattr(self._lib, f"{name}_evaluations", None)
-        short = -1 if counted else min(_MANY - 1, _CHUNK // self.nq)
+        short = -1 if counted or self._rows.names else min(_MANY - 1, _CHUNK // self.nq)
         return step, run, short, stages, work, counted
 
     def step(
@@ -228,6 +228,7 @@ class Model(Frames):
         A run that can't go on keeps what it has, warns, and says in `status` and `message` where
         and why. Ctrl-C raises Interrupted, which holds the run so far.
         """
+        q0, qd0 = self._assembled(q0, qd0, t0, params)
         given = tol is not None or times is not None or h_most is not None
         if given or self._fits(h, steps, method):
             fitted = adaptive.simulate(
@@ -260,7 +261,7 @@ class Model(Frames):
                 if run(
                     address(real, rows), null, from_q, from_qd, t0, h, steps, null, 0,
                     every, at_p, null,
-                ) == 4 * steps:  # fmt: skip
+                ) == 8 * steps:  # fmt: skip
                     return Run(
                         self, t0, rows, h, steps, "ok", p, every, None, method, stages * steps
                     )
@@ -298,8 +299,11 @@ class Model(Frames):
         self, q: Array, qd: Array, h: float, t: float, u: Array | None, p: Array, method: str,
         whose: str = "",
     ) -> None:  # fmt: skip
-        """Warn, once a method and step size, where h is beyond the stability limit at a state."""
+        """Warn, once a method and step size, of h beyond the stability limit, and of events."""
         self._warned.add((method, h))
+        if self.events and "events" not in self._warned:
+            self._warned.add("events")
+            warnings.warn(f"{self.name}: {PASSED_OVER}", RuntimeWarning, stacklevel=3)
         if words := advice(self, q, qd, h, t, u, p, method):
             warnings.warn(f"{self.name}: {whose}{words}", RuntimeWarning, stacklevel=3)
 
@@ -372,7 +376,7 @@ class Model(Frames):
         # a step of an implicit method may solve for all its stages
         done, chunk = 0, hold if law else _CHUNK // (nq**3 if counted else nq) or 1
         # what goes from one call to the next, and what is counted; a single call may do without
-        single = steps <= chunk and counted is None
+        single = steps <= chunk and counted is None and not self._rows.names
         work = null if single else self._ffi.new(work_type)
         try:
             while True:
@@ -388,7 +392,7 @@ class Model(Frames):
                 found = run(
                     to_q, to_qd, from_q, from_qd, t0, h, count, at_u, stride, every, at_p, work
                 )
-                done, said = found >> 2, STATUS[found & 3]
+                done, said = found >> 3, STATUS[found & 7]
                 if said != "ok":
                     break
                 if progress is not None and done:
@@ -407,13 +411,11 @@ class Model(Frames):
         evaluations = counted(work) if counted else stages * done
         given = law.law if law else None if held is None else held.copy()
         made = Run(self, t0, both, h, done, said, p, every, given, method, evaluations)
+        self._tell(made, method, work)
         if law:
             made._hold = hold
             made._applied = law.rows(len(made), self.nu)
         return made
-
-    def _bytes(self, rows: int) -> int:
-        return rows * 2 * self.nq * self.dtype.itemsize
 
     def _table(
         self, u: Any, steps: int, every: int, hold: int

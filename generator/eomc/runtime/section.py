@@ -6,13 +6,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .arguments import Array
+from .arguments import Array, not_one_of
 
 
 def crossings(
     columns: Mapping[str, Array], name: str, value: float, rising: bool | None, period: float | None
 ) -> dict[str, Array]:
     """See `Run.section`: all columns where one of them crosses a value, by cubics through rows."""
+    if name not in columns:
+        raise KeyError(not_one_of("section", name, tuple(columns)))
     t, f = columns["t"], np.asarray(columns[name], float) - value
     n = len(t)
     if n < 4:

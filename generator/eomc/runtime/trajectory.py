@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from .arguments import Array
 from .balance import Balance, balance
 from .columns import Columns, File
+from .constrained_run import ConstrainedRun
 from .dense import states
 from .estimate import Estimate, estimate
 from .notebook import html
@@ -26,14 +27,17 @@ from .shown import by_eomc
 if TYPE_CHECKING:
     from .model import Model
 
-STATUS = ("ok", "singular", "not finite", "no convergence")
+STATUS = ("ok", "singular", "not finite", "no convergence", "accumulated", "locked")
 SAID = {
     "singular": "D is not positive definite there, so no acceleration exists",
     "not finite": "the state would no longer be finite: the step may be too long, "
     "or the motion runs into a singularity",
     "no convergence": "the iteration for the step does not converge: take a smaller h",
+    "locked": "no state near obeys the constraints: they contradict one another there, or the step "
+    "is far too long",
     "interrupted": "interrupted",
 }
+PASSED_OVER = "fixed steps pass over the scene's events: give tol=, not h, steps or method"
 _LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
 
 
@@ -77,10 +81,11 @@ class _Half:
 
 
 @dataclass(eq=False, repr=False)
-class Run(Columns):
+class Run(ConstrainedRun, Columns):
     """A trajectory: t (n,), q (n, nq), qd (n, nq), u (n, nu), status; by name run["theta_dot"].
 
-    status: "ok", "singular", "not finite", "no convergence" or "interrupted"; a run that is not ok
+    status: "ok", "singular", "not finite", "no convergence", under constraints "locked", or
+    "interrupted"; a run that is not ok
     ends with its last good state, and `message` says where and why. energy (n,): K + P, computed
     when it is asked for; `steps` were done by `method`, of size h, and a row kept of `every` so
     many. evaluations: of accelerations. error: an Estimate, where it was asked for.
@@ -193,12 +198,15 @@ class Run(Columns):
         model = self._model
         if not model.outputs:
             return {}
-        if self._u is None or (self._applied is None and self._u.ndim == 1):
-            values = self._values("outputs", model.output, u=self._u)
-        else:
-            each = zip(self.q, self.qd, self.t.tolist(), self.u, strict=True)
-            values = np.array([model.output(*row, self._params) for row in each])
+        values = self._driven("outputs", model.output)
         return dict(zip(model.outputs, np.ascontiguousarray(values.T), strict=True))
+
+    def _driven(self, name: str, function: Callable[..., Any]) -> Array:
+        """What a function of the state and the inputs gives at each row."""
+        if self._u is None or (self._applied is None and self._u.ndim == 1):
+            return self._values(name, function, u=self._u)
+        each = zip(self.q, self.qd, self.t.tolist(), self.u, strict=True)
+        return np.array([function(*row, self._params) for row in each])
 
     def _values(self, name: str, function: Callable[..., Any] | None = None, **held: Any) -> Array:
         function = function or getattr(self._model, name)
@@ -305,6 +313,7 @@ class Run(Columns):
             "q": self.q, "qd": self.qd, "t0": self.t0, "h": self.h, "steps": self.steps,
             "status": self.status, "params": self._params, "every": self.every, "held": held,
             "method": self.method, "evaluations": self.evaluations, "applied": self._applied,
+            "singular_steps": self.singular_steps, "first_singular": self.first_singular,
         }  # fmt: skip
 
     @classmethod
@@ -316,6 +325,8 @@ class Run(Columns):
             kept["params"], kept["every"], u, kept["method"], kept["evaluations"],
         )  # fmt: skip
         run._applied = applied
+        for name in ("singular_steps", "first_singular"):
+            setattr(run, name, kept.get(name, getattr(run, name)))
         return run
 
     def _state(self) -> dict[str, Any]:
@@ -379,11 +390,7 @@ class Run(Columns):
     @property
     def _remark(self) -> str:
         """What is to be said of a run that is whole, or ""."""
-        model = self._model
-        if not model.events or "events" in model._warned:
-            return ""
-        model._warned.add("events")
-        return "fixed steps pass over the scene's events: give tol= instead of h, steps or method"
+        return self._singular
 
     def __len__(self) -> int:
         return len(self.q)

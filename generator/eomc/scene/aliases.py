@@ -43,6 +43,12 @@ ALIASES_OF = {
         "at": "point", "position": "point", "place": "point", "offset": "point", "link": "body",
         "F": "force", "direction": "force", "moment": "torque", "M": "torque", "axes": "frame",
     },
+    "loop": {
+        "type": "joint", "kind": "joint", "between": "bodies", "body": "bodies", "point": "points",
+        "anchors": "points", "ends": "points", "axes": "axis", "direction": "axis", "l": "length",
+        "distance": "length", "coordinate": "coordinates", "angle": "rotation", "factor": "ratio",
+        "multiplier": "ratio", "orientation": "rotation", "rpy": "rotation", "id": "name",
+    },
     "event": {
         "condition": "when", "function": "when", "if": "when", "expr": "when", "zero": "when",
         "type": "action", "then": "action", "do": "action", "id": "name",

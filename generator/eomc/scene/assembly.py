@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from eomc.scene.formulas import Formula
+from eomc.scene.joints import CLOSINGS
 
 WORLD = "world"  # the frame that does not move, as a parent and at the ends of springs
 
@@ -107,6 +108,36 @@ class Force:
 
 
 @dataclass(frozen=True)
+class Loop:
+    """A joint that closes a tree of bodies, or a gear between two coordinates.
+
+    joint: a key of joints.CLOSINGS. points (m) and axes (unit vectors) are in the frames of the
+    first and the second of the `bodies`, "world" among them. rotation: how the second body's frame
+    stands in the first's. length: m, of a distance. A gear holds the second of its `coordinates` at
+    ratio times the first plus offset.
+    """
+
+    name: str
+    joint: str
+    bodies: tuple[str, ...] = ()
+    points: tuple[Vector, ...] = ()
+    axes: tuple[tuple[float, float, float], ...] = ()
+    rotation: tuple[Turn, ...] = ()
+    length: Formula | None = None
+    coordinates: tuple[str, ...] = ()
+    ratio: Formula | None = None
+    offset: Formula | None = None
+    note: str = ""
+
+    def rows(self, plane: bool) -> dict[str, str]:
+        """What it keeps at zero, and the name of the row of each."""
+        kinds = CLOSINGS[self.joint].rows(plane)
+        if len(kinds) == 1:
+            return {kinds[0]: self.name}
+        return {kind: f"{self.name}_{kind}" for kind in kinds}
+
+
+@dataclass(frozen=True)
 class Assembly:
     """The bodies, parents before children, and what acts between them; gravity in m/s^2."""
 
@@ -116,3 +147,4 @@ class Assembly:
     springs: tuple[Spring, ...] = ()
     dampers: tuple[Damper, ...] = ()
     forces: tuple[Force, ...] = ()
+    loops: tuple[Loop, ...] = ()

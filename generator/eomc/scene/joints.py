@@ -1,4 +1,4 @@
-"""The kinds of joints: the one table of what each is.
+"""The kinds of joints: the tables of what moves each, and of what closes each in a loop.
 
 A joint is a row of elementary motions, turns and slides, each along or about an axis of the frame
 that those before it have moved. A new kind made of these is one more entry here.
@@ -65,5 +65,48 @@ JOINTS = {
         others=("floating",),
     ),
 }
+
+
+@dataclass(frozen=True)
+class Closing:
+    """What a joint between two bodies of a tree, which closes a loop, keeps at zero.
+
+    plane, space: its rows, empty where there is no such joint. x, y, z: from the first body's point
+    to the second's, along the world's axes; u, v: along two directions across the first axis;
+    ru, rv: the second axis out of the first, about u and v; rx, ry, rz: the second frame out of the
+    first; cross: the cosine between two axes; all others are the whole of it. axes: how many it has
+    in space; in the plane one, where u is a row. defaults: those of a scene that gives none.
+    """
+
+    plane: tuple[str, ...] = ()
+    space: tuple[str, ...] = ()
+    axes: int = 0
+    defaults: tuple[Axis, ...] = ()
+    others: tuple[str, ...] = ()
+
+    def rows(self, plane: bool) -> tuple[str, ...]:
+        """Those in the plane or in space."""
+        return self.plane if plane else self.space
+
+
+CLOSINGS = {
+    "revolute": Closing(
+        ("x", "y"), ("x", "y", "z", "ru", "rv"), 1, (Z, Z), ("hinge", "pin", "rotational")
+    ),
+    "spherical": Closing((), ("x", "y", "z"), others=("ball", "connect", "point", "coincident")),
+    "weld": Closing(("x", "y", "rz"), ("x", "y", "z", "rx", "ry", "rz"), others=("fixed", "rigid")),
+    "prismatic": Closing(
+        ("u", "rz"), ("u", "v", "rx", "ry", "rz"), 1, (), ("slider", "slide", "translational")
+    ),
+    "cylindrical": Closing((), ("u", "v", "ru", "rv"), 1, (Z, Z)),
+    "universal": Closing((), ("x", "y", "z", "cross"), 2, (X, Y), ("cardan", "hooke")),
+    "point-on-line": Closing(
+        ("u",), ("u", "v"), 1, (), ("point_on_line", "line", "slot", "pin-in-slot")
+    ),
+    "distance": Closing(("length",), ("length",), others=("rod", "rope", "link")),
+    "gear": Closing(("ratio",), ("ratio",), others=("gears", "belt", "mimic", "coupling")),
+}
+
+CLOSING_MEANT = {other: kind for kind, joint in CLOSINGS.items() for other in joint.others}
 
 MEANT = {other: kind for kind, joint in JOINTS.items() for other in joint.others}

@@ -14,10 +14,7 @@ LONGEST = 60  # characters of a text that may be a number with its unit
 
 # --- tables ---------------------------------------------------------------------------------------
 
-_FREE = (
-    "its coordinates are independent. Choose as many as there are freedoms, or hold together by a "
-    "stiff [[spring]] what must not part"
-)
+_CONTACT = "what may part again is a stiff force, max(x, 0)**2 in [energy], or an [[event]]"
 _START = "starts stand with their coordinates: theta = { start = 0.5, rate = 0 }"
 _RUN = "how a scene is run stands in [run]: h, duration, method"
 _LOSS = (
@@ -29,7 +26,7 @@ _ENERGY = "write [energy] with kinetic and potential, of which it is the differe
 
 # by the name of a table that scenes do not have
 TABLES: Mapping[str, str] = {
-    **dict.fromkeys(("constraint", "constraints", "loop", "loops", "contact"), _FREE),
+    **dict.fromkeys(("contact", "contacts"), _CONTACT),
     **dict.fromkeys(("initial", "initial_conditions", "start", "starts", "ic", "state"), _START),
     **dict.fromkeys(("states", "velocities", "velocity", "rates", "rate"), _START),
     **dict.fromkeys(("simulation", "sim", "solver", "settings", "options", "config"), _RUN),
@@ -46,6 +43,7 @@ _ONE_TABLE: Mapping[str, str] = {
     "inputs": 'F = { unit = "N" }',
     "definitions": 'y = "l*cos(theta)"',
     "forces": 'x = "F - b*x_dot"',
+    "constraints": 'rod = "x**2 + y**2 - l**2"',
 }
 _OF_FORCES = {"body", "point", "force", "torque", "frame"}
 

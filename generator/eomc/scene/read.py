@@ -20,6 +20,7 @@ from eomc.scene import (
     schema,
     toml_text,
     validate_bodies,
+    validate_constraints,
     validate_events,
     validate_picture,
 )
@@ -114,6 +115,8 @@ class _Check(Checker):
         forces = self._forces()
         assembly = validate_bodies.assemble(self, doc, known)
         events = list(validate_events.events(self, doc))
+        constraints = list(validate_constraints.constraints(self, doc))
+        validate_constraints.guesses(self, doc)
         run = self._run()
         picture = validate_picture.picture(self, doc, known)
         outputs = self._outputs()
@@ -136,6 +139,7 @@ class _Check(Checker):
             forces=forces,
             outputs=tuple(outputs),
             events=tuple(events),
+            constraints=tuple(constraints),
             run=run,
             assembly=assembly,
             picture=picture,
@@ -216,7 +220,8 @@ class _Check(Checker):
                     f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
                 )
         self._output_names(seen)
-        for table in ("coordinates", "parameters", "constants", "inputs", "outputs"):
+        units = ("coordinates", "parameters", "constants", "inputs", "outputs", "constraints")
+        for table in units:
             for name, entry in getattr(doc, table).items():
                 self._unit((table, name), entry.unit, getattr(entry, "start", 0))
         return seen
@@ -278,11 +283,17 @@ class _Check(Checker):
             return found
 
         out = []
+        free = not (self.doc.constraints or self.doc.loop)
         for name, entry in self.doc.coordinates.items():
             start = formula(("coordinates", name, "start"), entry.start)
             rate = formula(("coordinates", name, "rate"), entry.rate)
+            held = {
+                key: free or (key in entry.model_fields_set and not entry.guess)
+                for key in ("start", "rate")
+            }
             if start and rate:
-                out.append(Coordinate(name, entry.unit, start, rate, entry.note))
+                coordinate = Coordinate(name, entry.unit, start, rate, entry.note, *held.values())
+                out.append(coordinate)
         return out
 
     def _definitions(self) -> None:

@@ -20,15 +20,17 @@ from eomc.scene.source_map import ARRAYS
 MAX_ENTRIES = 10_000  # that repetition makes
 MAX_TEXT = 5_000_000  # characters of these
 
-_TABLES = ("constants", "parameters", "coordinates", "inputs", "definitions", "forces")
+_TABLES = (
+    "constants", "parameters", "coordinates", "inputs", "definitions", "forces", "constraints",
+)  # fmt: skip
 _PLAIN = ("definitions", "forces")  # whose entries are formulas, not tables
 _WORDS = ("unit", "note", "title", "repeat")  # keys whose texts are for people
 # no formulas
-_NAMED = ("body", "point")  # arrays whose entries have names
+_NAMED = ("body", "point", "loop")  # arrays whose entries have names
 _NAMES = ("name", "parent", "joint", "coordinate", "bodies", "body", "frame")
 _ARRAYS_MEANT = {
     "bodies": "body", "Body": "body", "link": "body", "links": "body", "springs": "spring",
-    "Spring": "spring", "dampers": "damper", "Damper": "damper",
+    "Spring": "spring", "dampers": "damper", "Damper": "damper", "loops": "loop", "Loop": "loop",
 }  # fmt: skip
 
 _INDEXED = re.compile(r"(?<!\w)([A-Za-z_]\w*)\s*\[([^\[\]]*)\]", re.ASCII)

@@ -15,13 +15,18 @@ from eomc.scene.source_map import SourceMap
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A generalized coordinate; its velocity is `<name>_dot`. Start in `unit`, rate in unit/s."""
+    """A generalized coordinate; its velocity is `<name>_dot`. Start in `unit`, rate in unit/s.
+
+    held, held_rate: whether constraints leave them as they are when a start is assembled.
+    """
 
     name: str
     unit: str
     start: Formula
     rate: Formula
     note: str
+    held: bool = True
+    held_rate: bool = True
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,16 @@ class Input:
 @dataclass(frozen=True)
 class Output:
     """A quantity that is asked for: a formula over everything that a motion has."""
+
+    name: str
+    unit: str
+    formula: Formula
+    note: str
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """What is zero along every motion: a formula of coordinates and t, or linear in the rates."""
 
     name: str
     unit: str
@@ -124,11 +139,17 @@ class Scene:
     forces: Mapping[str, Formula]
     outputs: tuple[Output, ...]
     events: tuple[Event, ...]
+    constraints: tuple[Constraint, ...]
     run: Run
     assembly: Assembly | None
     picture: Picture | None
     places: SourceMap = field(repr=False, compare=False)
     warnings: tuple[Problem, ...] = ()
+
+    @property
+    def constrained(self) -> bool:
+        """Whether there are constraints or loops."""
+        return bool(self.constraints or (self.assembly and self.assembly.loops))
 
     def start(
         self, parameters: Mapping[str, float] | None = None

@@ -37,6 +37,7 @@ class _Coordinate(_Table):
     unit: _Line = ""
     start: _Value = 0.0
     rate: _Value = 0.0
+    guess: pydantic.StrictBool = False
     note: _Note = ""
 
 
@@ -59,7 +60,7 @@ class _Input(_Table):
 
 
 class OutputTable(_Table):
-    """An output as it is written."""
+    """An output or a constraint as it is written."""
 
     formula: _Value
     unit: _Line = ""
@@ -85,32 +86,15 @@ _Methods = Annotated[
 ]
 
 
-def _linearized(value: object) -> bool | str:
-    """Whether derivatives are wanted, those along the parameters too."""
-    if isinstance(value, bool) or value == "parameters":
-        return value
-    raise ValueError(f'must be true, false or "parameters", here {spelling.toml(value)}')
-
-
-def _asked(value: object) -> bool | tuple[str, ...]:
-    """Whether all frames are wanted, or which."""
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, list) and all(isinstance(name, str) for name in value):
-        return tuple(dict.fromkeys(value))
-    example = 'true, or a list of bodies and points such as ["tip"]'
-    raise ValueError(f"must be {example}, here {spelling.toml(value)}")
-
-
 class _Run(_Table):
     h: _Positive = 0.001
     duration: _Positive = 10.0
     methods: _Methods = pydantic.Field(default=("rk4",), alias="method")
     real: Literal[REALS] = "double"  # type: ignore[valid-type]
     batch: pydantic.StrictBool = False
-    linearize: Annotated[bool | str, pydantic.PlainValidator(_linearized)] = False
+    linearize: Annotated[bool | str, pydantic.PlainValidator(spelling.linearized)] = False
     discretize: pydantic.StrictBool = False
-    frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(_asked)] = False
+    frames: Annotated[bool | tuple[str, ...], pydantic.PlainValidator(spelling.asked)] = False
     inverse_dynamics: pydantic.StrictBool = False
     momentum: pydantic.StrictBool = False
     tolerance: _Tolerance | None = None
@@ -133,6 +117,7 @@ _Rotation = Annotated[
 _Axes = Annotated[tuple[tuple[float, ...], ...], pydantic.PlainValidator(spelling.axes)]
 _Names = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.names)]
 _TwoNames = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.two_names)]
+_TwoCoordinates = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.two_coordinates)]
 _Torque = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(spelling.each)]
 _Points = Annotated[tuple[tuple[float | str, ...], ...], pydantic.PlainValidator(spelling.points)]
 
@@ -203,6 +188,22 @@ class ForceTable(_Table):
     note: _Note = ""
 
 
+class LoopTable(_Table):
+    """A [[loop]] as it is written; None where a key is not there."""
+
+    name: pydantic.StrictStr
+    joint: pydantic.StrictStr
+    bodies: _TwoNames | None = None
+    points: _Points | None = None
+    axis: _Axes | None = None
+    rotation: _Rotation | None = None
+    length: _Value | None = None
+    coordinates: _TwoCoordinates | None = None
+    ratio: _Value | None = None
+    offset: _Value | None = None
+    note: _Note = ""
+
+
 class EventTable(_Table):
     """An [[event]] as it is written; other keys are coordinates and velocities after a jump."""
 
@@ -250,12 +251,14 @@ class Document(_Table):
     definitions: dict[str, _Value] = {}
     energy: _Energy
     forces: dict[str, _Value] = {}
+    constraints: dict[str, _Formula] = {}
     outputs: dict[str, _Formula] = {}
     body: dict[str, BodyTable] = {}
     point: dict[str, PointTable] = {}
     spring: dict[str, SpringTable] = {}
     damper: dict[str, DamperTable] = {}
     force: dict[str, ForceTable] = {}
+    loop: dict[str, LoopTable] = {}
     event: dict[str, EventTable] = {}
     picture: PictureTable | None = None
     run: _Run = _Run()
@@ -271,19 +274,23 @@ def read(tree: Mapping[str, Any]) -> Document:
 
 # --- faults in words ---
 
-_FIRST_KEY = {"coordinates": "start", "inputs": "signal", "outputs": "formula"}
+_FIRST_KEY = {
+    "coordinates": "start", "inputs": "signal", "outputs": "formula", "constraints": "formula",
+}  # fmt: skip
 _MODELS: Mapping[str, type[_Table]] = {
     "coordinates": _Coordinate,
     "parameters": QuantityTable,
     "constants": QuantityTable,
     "inputs": _Input,
     "outputs": OutputTable,
+    "constraints": OutputTable,
     "energy": _Energy,
     "body": BodyTable,
     "point": PointTable,
     "spring": SpringTable,
     "damper": DamperTable,
     "force": ForceTable,
+    "loop": LoopTable,
     "event": EventTable,
     "picture": PictureTable,
     "run": _Run,
@@ -389,6 +396,8 @@ _MISSING: Mapping[tuple[str, ...], str] = {
     ("point", "body"): 'name the body that it is fixed to: body = "..."',
     ("spring", "stiffness"): 'add stiffness = "..."',
     ("damper", "damping"): 'add damping = "..."',
+    ("loop", "name"): 'give the loop a name: name = "..."',
+    ("loop", "joint"): 'say what closes it: joint = "revolute" or another',
     ("event", "name"): 'give the event a name: name = "..."',
     ("event", "when"): 'add when = "...", whose zeros are the event',
     ("force", "body"): 'name the body that it acts on, body = "..."; a force along a coordinate '
@@ -409,6 +418,8 @@ def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
         table[last] = _HARMLESS[path]
     elif len(path) == 3 and last in _NEEDED:
         table[last] = f"{path[0]}_{path[1]}" if last == "name" else 1.0
+    elif path[0] == "loop" and last == "joint":
+        table[last] = ""
     elif len(path) == 3 and last == "body" and path[0] in ("force", "point"):
         table[last] = next((b["name"] for b in tree.get("body", {}).values() if "name" in b), "")
     elif len(path) == 2 and path[0] in ("definitions", "forces"):

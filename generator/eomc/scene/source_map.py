@@ -16,7 +16,7 @@ MAX_TRIED = 4_000_000  # characters given to tomllib, some seconds
 MAX_SEARCHED = 20_000_000  # characters searched for the columns of faults; then lines do
 
 # tables that may stand many times, in [[two brackets]]
-ARRAYS = ("body", "point", "spring", "damper", "force", "event")
+ARRAYS = ("body", "point", "spring", "damper", "force", "loop", "event")
 
 Path = tuple[str, ...]
 

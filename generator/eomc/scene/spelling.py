@@ -104,11 +104,39 @@ def two_names(value: object) -> tuple[str, ...]:
     return found
 
 
+def two_coordinates(value: object) -> tuple[str, ...]:
+    """Two coordinates."""
+    found = names(value)
+    if len(found) != 2:
+        raise ValueError(f'must name two coordinates, such as ["phi", "psi"], here {toml(value)}')
+    return found
+
+
 def points(value: object) -> tuple[tuple[float | str, ...], ...]:
     """Two points."""
     if not (isinstance(value, list) and len(value) == 2):
         raise ValueError(f'must be two points, such as [[0, 0], ["l", 0]], here {toml(value)}')
     return tuple(map(vector, value))
+
+
+# --- [run] ---------------------------------------------------------------------------------------
+
+
+def linearized(value: object) -> bool | str:
+    """Whether derivatives are wanted, those along the parameters too."""
+    if isinstance(value, bool) or value == "parameters":
+        return value
+    raise ValueError(f'must be true, false or "parameters", here {toml(value)}')
+
+
+def asked(value: object) -> bool | tuple[str, ...]:
+    """Whether all frames are wanted, or which."""
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, list) and all(isinstance(name, str) for name in value):
+        return tuple(dict.fromkeys(value))
+    example = 'true, or a list of bodies and points such as ["tip"]'
+    raise ValueError(f"must be {example}, here {toml(value)}")
 
 
 # --- [picture] ------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ def assemble(check: Checker, doc: Document, known: Mapping[str, float]) -> Assem
     known: the values of constants and parameters. Faults are reported to `check`; with faults the
     assembly is not to be used.
     """
-    if not (doc.body or doc.point or doc.spring or doc.damper or doc.force):
+    if not (doc.body or doc.point or doc.spring or doc.damper or doc.force or doc.loop):
         if doc.gravity is not None:
             check.say(
                 ("gravity",),
@@ -72,6 +72,7 @@ class _Bodies(Joints):
         springs = [self._spring(("spring", k), e) for k, e in self.doc.spring.items()]
         dampers = [self._damper(("damper", k), e) for k, e in self.doc.damper.items()]
         forces = [self._force(("force", k), e) for k, e in self.doc.force.items()]
+        loops = [self._loop(("loop", k), e) for k, e in self.doc.loop.items()]
         return Assembly(
             plane=self.wide == 2,
             gravity=gravity,
@@ -79,6 +80,7 @@ class _Bodies(Joints):
             springs=tuple(springs),
             dampers=tuple(dampers),
             forces=tuple(forces),
+            loops=tuple(loop for loop in loops if loop),
         )
 
     # --- the scene ------------------------------------------------------------------------------
@@ -258,7 +260,7 @@ class _Bodies(Joints):
             self.check.say(
                 (*place, "body" if place[0] == "point" else "parent"),
                 f"the parents form a loop: {ring_text(ring)}; let one of them be held by the "
-                "world, and close the loop with stiff springs",
+                "world, and close the loop with a [[loop]]",
                 text=ring[1],
             )
             for name in ring[1:]:

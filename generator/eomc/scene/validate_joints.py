@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -11,11 +10,11 @@ from eomc.scene.formulas import Formula, nearest, suggest
 from eomc.scene.joints import JOINTS, MEANT, Z
 from eomc.scene.schema import BodyTable, Document, PointTable
 from eomc.scene.scope import Checker, Path
-from eomc.scene.validate_springs import Springs
+from eomc.scene.validate_loops import Loops
 from eomc.scene.validate_values import ZERO
 
 
-class Joints(Springs):
+class Joints(Loops):
     """Checks what holds and moves bodies."""
 
     def __init__(self, check: Checker, doc: Document, known: Mapping[str, float]) -> None:
@@ -152,16 +151,9 @@ class Joints(Springs):
             count = "one axis" if wanted == 1 else "two axes, such as [[1, 0, 0], [0, 1, 0]]"
             check.say(path, f"a {joint} joint has {count}, here {len(given)}")
             return ()
-        axes: list[tuple[float, float, float]] = []
-        for axis in given:
-            if not self._fits(path, len(axis)):
-                return ()
-            size = math.hypot(*axis)
-            if size < 1e-9:
-                check.say(path, "the axis has no length, so no direction: give it one")
-                return ()
-            x, y, *third = (entry / size for entry in axis)
-            axes.append((x, y, third[0] if third else 0.0))
+        axes = [found for axis in given if (found := self._unit(path, axis))]
+        if len(axes) < len(given):
+            return ()
         if len(axes) == 2 and abs(sum(a * b for a, b in zip(*axes, strict=True))) > 1 - 1e-9:
             check.say(
                 path, "the two axes are parallel, so the two angles are one: turn one of them"

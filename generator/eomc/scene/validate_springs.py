@@ -64,6 +64,17 @@ class Springs(Values):
         x, y, *third = (self.check.formula(path, entry) or ZERO for entry in given)
         return x, y, third[0] if third else ZERO
 
+    def _two(self, path: Path, bodies: tuple[str, ...], what: str) -> tuple[str, str]:
+        """Two bodies, the world among them, that are not the same."""
+        for name in bodies:
+            if name != WORLD and name not in self.names:
+                remedy = suggest(name, [WORLD, *self.names]) or ": declare it as a [[body]]"
+                self.check.say(path, f"there is no body '{name}'{remedy}", text=name)
+        first, second = bodies
+        if first == second:
+            self.check.say(path, f"{what} between two bodies, here both are '{first}'")
+        return first, second
+
     def _between(self, path: Path, entry: SpringTable | DamperTable) -> dict[str, Any]:
         """What a spring or damper acts on."""
         check, what = self.check, path[0]
@@ -89,15 +100,7 @@ class Springs(Values):
                 )
             return {"coordinate": entry.coordinate}
         assert entry.bodies is not None
-        for name in entry.bodies:
-            if name != WORLD and name not in self.names:
-                remedy = suggest(name, [WORLD, *self.names]) or ": declare it as a [[body]]"
-                check.say((*path, "bodies"), f"there is no body '{name}'{remedy}", text=name)
-        first, second = entry.bodies
-        if first == second:
-            check.say(
-                (*path, "bodies"), f"a {what} acts between two bodies, here both are '{first}'"
-            )
+        first, second = self._two((*path, "bodies"), entry.bodies, f"a {what} acts")
         if entry.turning:
             if self.wide == 3:
                 check.say(

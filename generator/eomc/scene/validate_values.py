@@ -96,6 +96,17 @@ class Values:
         )
         return False
 
+    def _unit(self, path: Path, axis: Sequence[float]) -> tuple[float, float, float] | None:
+        """An axis of length one; None where it has a fault."""
+        if not self._fits(path, len(axis)):
+            return None
+        size = math.hypot(*axis)
+        if size < 1e-9:
+            self.check.say(path, "the axis has no length, so no direction: give it one")
+            return None
+        x, y, *third = (entry / size for entry in axis)
+        return x, y, third[0] if third else 0.0
+
     def _rotation(
         self, path: Path, given: Any, formula: Callable[[Path, float | str], Formula]
     ) -> tuple[Turn, ...]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, NoCompilerError
 
 # no -ffast-math: it breaks the reduction of angles and the checks for singular D
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize")
@@ -44,10 +44,21 @@ def find_compiler() -> Compiler:
         import ziglang
 
         return Compiler((sys.executable, "-m", "ziglang", "cc"), f"ziglang {ziglang.__file__}")
-    raise EomcError(
+    raise NoCompilerError(
         "no C compiler found: install gcc or clang (Debian: apt install gcc), "
         "or 'pip install ziglang', which brings one"
     )
+
+
+def preparing() -> str:
+    """What there is to say before ziglang's first call, which takes a minute; "" otherwise."""
+    if not find_compiler().identity.startswith("ziglang"):
+        return ""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    kept = Path(os.environ.get("ZIG_GLOBAL_CACHE_DIR") or Path(home) / "zig")
+    if (kept / "o").is_dir():
+        return ""
+    return "ziglang prepares its libraries: the first build takes a minute or two, others seconds"
 
 
 def _words(variable: str, text: str) -> list[str]:
@@ -82,7 +93,7 @@ def flags(form: str = "fast") -> tuple[str, ...]:
     Vector registers that the C asks for are as wide as there are; what compilers put into some by
     themselves is quicker in half of AVX-512's: a chain of five takes 0.85 of the time.
     """
-    given = _given_flags()
+    given = given_flags()
     if given is not None:
         return given
     if form == "plain":
@@ -92,10 +103,11 @@ def flags(form: str = "fast") -> tuple[str, ...]:
 
 def binding_flags() -> tuple[str, ...]:
     """Those of the binding: $EOMC_CFLAGS or -O1, since its speed is that of the calls in it."""
-    return _given_flags() or ("-O1",)
+    return given_flags() or ("-O1",)
 
 
-def _given_flags() -> tuple[str, ...] | None:
+def given_flags() -> tuple[str, ...] | None:
+    """The words of $EOMC_CFLAGS; None where it is not set."""
     given = os.environ.get("EOMC_CFLAGS")
     return None if given is None else tuple(_words("EOMC_CFLAGS", given))
 

@@ -20,10 +20,12 @@ if TYPE_CHECKING:
 
 
 def build(
-    made: Sources, extension: str, folder: Path, library: str, compiler: Compiler, form: str
-) -> None:
+    made: Sources, extension: str, folder: Path, library: str, compiler: Compiler, form: str,
+    optimised: Sequence[str] | None = None,
+) -> None:  # fmt: skip
     """Compile the sources that lie in `folder` and link `library` there; it can be loaded then.
 
+    optimised: other flags than those of the form.
     Raises EomcError where the compiler fails, with its own words.
     """
     import cffi
@@ -37,7 +39,15 @@ def build(
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
     common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
     jobs = [
-        [*common, standard(form), *flags(form), "-c", f"{at}{name}.c", "-o", "scene.o"],
+        [
+            *common,
+            standard(form),
+            *(optimised or flags(form)),
+            "-c",
+            f"{at}{name}.c",
+            "-o",
+            "scene.o",
+        ],
         [*common, STANDARD, *binding_flags(), *include, "-c", f"{at}binding.c", "-o", "binding.o"],
     ]
     running = []

@@ -15,6 +15,7 @@ import numpy as np
 from eomc.model.system import System
 from eomc.verify import (
     rows_adaptive,
+    rows_constraints,
     rows_derivatives,
     rows_discretize,
     rows_frames,
@@ -51,6 +52,8 @@ def check(
     if made.expected:
         value_rows(made)
         property_rows(made)
+        if system.constraints:
+            rows_constraints.report(made, plain)
         compiled = hasattr(module, "_model")
         if compiled:  # what is compiled has several ways to one answer
             module._model._warned.add("events")  # which fixed steps are to pass over here
@@ -95,9 +98,11 @@ def property_rows(made: Comparison) -> None:
     """Add the rows about the module alone, and those by differences."""
     row, rounding = made.row, "units of rounding"
     row("D = D^T", LIMIT, rounding, made.symmetry)
-    row("D > 0", 0, "least eigenvalue of D, scaled", made.definiteness, least=True)
+    if not made.system.constraints:  # the KKT matrix has to be regular, D need not
+        row("D > 0", 0, "least eigenvalue of D, scaled", made.definiteness, least=True)
     row("bias = C qd + g", LIMIT, rounding, made.bias)
-    row("D qdd + bias = tau", LIMIT, rounding, made.motion)
+    force = "tau + A^T lambda" if made.system.constraints else "tau"
+    row(f"D qdd + bias = {force}", LIMIT, rounding, made.motion)
     rows_derivatives.report(made)
     if made.dtype == np.float64:  # single precision leaves its differences too few digits
         row("Ddot - 2C + dD/dt skew", SKEW_LIMIT, "of D's rate", made.skewness)

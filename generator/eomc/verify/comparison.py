@@ -15,7 +15,8 @@ import sympy
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import System
 from eomc.verify import one_step
-from eomc.verify.convergence import ORDER_MARGIN, PARTS, SEEN, Convergence, Place
+from eomc.verify.advice import PARTS, Advice
+from eomc.verify.convergence import ORDER_MARGIN, SEEN, Convergence, Place
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import Row
@@ -28,6 +29,7 @@ from eomc.verify.sampling import (
     Sampler,
     State,
     ask,
+    started,
     units,
 )
 from eomc.verify.symbolic import of
@@ -36,6 +38,11 @@ from eomc.verify.taylor import Jets
 GROWTH_LIMIT = 1e4  # a run is compared as far as it magnifies a difference by no more
 LONGER = 16.0  # times the scene's h: a long step
 SHORTER = tuple(4.0**-k for k in range(7))  # parts of it, until stages are found by sweeps
+
+
+def _corrected(e: Expected) -> Vector | float:
+    """What rounding of constraints makes of a state that is put onto them: (2, nq), 0 without."""
+    return e.size.get("place", 0.0)
 
 
 def _rows(run: Any, s: State) -> list[State]:
@@ -115,12 +122,17 @@ class Comparison:
     def advice_row(self, method: str) -> None:
         """At which part of the advised h a run is lost: not at an eighth of it, but at twice it."""
         unit = "of the advised h, where runs are lost"
-        find = partial(self.convergence.advised, method)
+        find = partial(self.advice.advised, method)
         self.row(f"h of {method}", PARTS[0], unit, find, least=True)
         row = self.rows[-1]
         if not row.passed and self.corners:
             note = f"not judged: no matter with {self.corners}"
             self.rows[-1] = replace(row, passed=True, unit=note, judged=False)
+
+    @cached_property
+    def advice(self) -> Advice:
+        """The rows about the step sizes that the module advises."""
+        return Advice(self.convergence)
 
     @cached_property
     def convergence(self) -> Convergence:
@@ -130,7 +142,10 @@ class Comparison:
         return Convergence(
             self.module,
             self.methods,
-            [Place(e.state, float(e.size["jacobi"])) for e in usual],
+            [
+                Place(replace(e.state, t=self.begin(e.state)), float(e.size["jacobi"]))
+                for e in usual
+            ],
             self.expected[0].state,
             np.array([self.sampler.spread, self.sampler.speed]),
             self.system.run.h,
@@ -197,7 +212,8 @@ class Comparison:
                 return None
             found = self.module.step(s.q, s.qd, h=h, t=s.t, u=s.u, params=s.params)
             gain = h * e.size["acceleration"]
-            return self.units(found, expected, size + np.array([h * (np.abs(s.qd) + gain), gain]))
+            size = size + np.array([h * (np.abs(s.qd) + gain), gain]) + _corrected(e)
+            return self.units(found, expected, size)
 
         return largest(map(error, self.few(self.effort.few)), "all steps are thrown far")
 
@@ -229,6 +245,10 @@ class Comparison:
                     return self.reference.acceleration(q, qd, t, **given)
 
                 ends = one_step.step(METHODS[method], acceleration, q, qd, t, h)
+                if self.system.constraints:
+                    params = given.get("params")
+                    q, qd = ends
+                    ends = np.array(self.reference.corrected(q, qd, t + h, params))
                 return np.moveaxis(ends, 0, 1)
 
             with np.errstate(all="ignore"):
@@ -238,7 +258,9 @@ class Comparison:
                 continue
             run = self.simulate(s, method=method, h=h, steps=1, t0=s.t)
             if run.status == "ok":
-                size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain])
+                size = size + np.array([h * (np.abs(s.qd) + h * gain), h * gain]) + _corrected(e)
+                if METHODS[method].newton:  # stages end at what a rounding of q makes of rates
+                    size[1] += np.abs(s.q) / h
                 return self.units([run.q[-1], run.qd[-1]], expected, size)
             refused, lost = True, lost + (run.status == "no convergence")
             if lost == 2:
@@ -279,7 +301,8 @@ class Comparison:
         q, qd = (np.array([x, x + d]) for x, d in zip((s.q, s.qd), by, strict=True))
         u = None if s.u is None else np.array([s.u, s.u])
         with np.errstate(all="ignore"):
-            t, *found = self.reference.simulate(q, qd, h=h, steps=steps, u=u, params=s.params)
+            begin = self.begin(s)
+            t, *found = self.reference.simulate(q, qd, h, steps, u=u, params=s.params, t0=begin)
             x, y = np.moveaxis(np.stack(found, axis=1), 2, 0)
             growth = np.max(np.abs(y - x) / spread, axis=(1, 2)) / NUDGE
             far = np.max(np.abs(x - x[:1]) / spread, axis=(1, 2))
@@ -288,8 +311,15 @@ class Comparison:
         sure = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
         return t[:sure], x[:sure], growth[:sure, None, None]
 
+    def begin(self, s: State) -> float:
+        """When runs from a state begin: where rows may stand in time, when it is on them."""
+        return s.t if self.system.constraints else 0.0
+
     def simulate(self, s: State, **how: Any) -> Any:
         """The module's run from a state."""
+        if begin := self.begin(s):
+            how.setdefault("t0", begin)
+        s = started(self.module, s)
         with warnings.catch_warnings():  # a run that stops early is looked at here
             warnings.simplefilter("ignore", RuntimeWarning)
             return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
@@ -389,11 +419,15 @@ class Comparison:
         return self.largest(error)
 
     def motion(self) -> float:
-        """D qdd + bias = tau."""
+        """D qdd + bias = tau, + A^T lambda under constraints."""
 
         def error(e: Expected) -> float:
             names = ("D", "acceleration", "bias", "tau")
             D, qdd, bias, tau = (ask(self.module, name, e.state) for name in names)
+            if self.system.constraints:
+                rows = ("multipliers", "constraint_jacobian")
+                multipliers, A = (ask(self.module, name, e.state) for name in rows)
+                tau = tau + multipliers @ A
             return self.units(D @ qdd + bias, tau, e.size["motion"])
 
         return self.largest(error)

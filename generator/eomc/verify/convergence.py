@@ -1,4 +1,4 @@
-"""What a module's runs say of its steppers: orders, balances of power, advice on h.
+"""What a module's runs say of its steppers: orders and balances of power; `advice` has that on h.
 
 The rules are such that a right module is not blamed where nothing can be
 seen, and a wrong one is wherever it can be:
@@ -9,8 +9,6 @@ seen, and a wrong one is wherever it can be:
   rounding and a hundredth of the motion, as of high orders in a stiff motion, are not judged.
 - A balance of power closes at the order of the method and of Simpson's rule, or down to rounding. A
   wrong power leaves a rest that no halving changes.
-- An advised h is compared with runs; where these leave the place that it is about, as stiff
-  friction near rest, with the eigenvalues of differences of the accelerations.
 """
 
 from __future__ import annotations
@@ -19,7 +17,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +25,7 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
+from eomc.verify.sampling import started
 
 if TYPE_CHECKING:
     from eomc.verify.sampling import State
@@ -45,18 +43,7 @@ BALANCE_SPANS = (-6, -4, -2, 0, 1, 3, 5, 7, 9, 11)  # powers of 2, of h
 BESIDE = (1 - 1e-3, 1 + 1e-3)  # times a state: hardly changes what is smooth, but its roundings
 CLOSED = 1e3  # roundings of the energy: a balance is closed
 RESOLVED = 1e-3  # of the motion: two methods are compared where halving h changes no more
-NUDGE = 1e-6  # relative change at the start, from which growth is estimated
 DRAWS = 2  # of starts moved by a rounding
-
-# An advised h is compared with runs of SPAN times its length, in steps of these parts of it. The
-# limit is that of the motion as it is linear at one place, and the motion goes on from there.
-FINE, PARTS, SPAN = 1 / 64, (1 / 8, 1 / 4, 1 / 2, 1, 2), 8
-BLOWN = 1e3  # times what a difference grows by in fine steps: unstable
-OFF = 0.1  # of the motion: the end of a stable run with steps as long as its limit is no answer
-LINEAR = 1e-9  # of the motion: a difference this small grows in proportion, where forces are stiff
-APART = 2.0  # times the limit of the eigenvalues: an advised h further off is wrong
-PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
-AHEAD = 2000  # steps of the scene's h in which these lie
 
 
 @dataclass(frozen=True)
@@ -125,6 +112,9 @@ class Convergence:
         """A run from a state, whatever its status."""
         if method != self.methods[0]:
             how["method"] = method
+        if getattr(self.module, "constraint_names", ()):  # rows may stand in time
+            how.setdefault("t0", s.t)
+            s = started(self.module, s)
         with warnings.catch_warnings():  # a run that stops early is looked at here
             warnings.simplefilter("ignore", RuntimeWarning)
             return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
@@ -324,119 +314,6 @@ class Convergence:
         place = (s.q,) if name == "potential_energy" else (s.q, s.qd)
         inputs = {"u": s.u} if name in ("power", "acceleration") else {}
         return np.asarray(getattr(self.module, name)(*place, t=s.t, params=s.params, **inputs))
-
-    # --- advice -----------------------------------------------------------------------------------
-
-    def advised(self, method: str) -> Finding:
-        """The least of PARTS of the advised h with which a run is lost.
-
-        From where the start of the motion allows the shortest h. Lost: it stops, or a difference
-        grows BLOWN times as much as in fine steps, or, in steps longer than advised, it ends OFF.
-        inf where there is nothing to test, with why. Where runs do not agree with the advice, or
-        it is longer than the motion, but eigenvalues agree, it is right, though the motion does not
-        stay where it holds: how far it is from the eigenvalues' then, times.
-        """
-        if method == "euler" and self._velocities_matter():
-            return Finding(math.inf, "for forces of positions alone")
-        longest = self._longest(method, self.stiff, 1e3 * self.duration)
-        if math.isinf(longest):
-            return Finding(math.inf, "no mode turns or decays")
-        eigen = self._by_eigenvalues(method)
-        apart = max(longest / eigen, eigen / longest)
-        unit = "times the eigenvalues' h; runs leave where it holds"
-        near = Finding(apart, unit=unit, limit=APART) if apart <= APART else None
-        if near and longest > self.duration:
-            return near
-        fine, grown = self._ends(method, longest, FINE)
-        if not math.isfinite(grown):
-            return Finding(math.inf, "the motion does not go on")
-        lost = math.nan
-        for part in PARTS:
-            end, growth = self._ends(method, longest, part)
-            wrong = part > 1 and not float(np.max(np.abs(end - fine))) <= OFF
-            if wrong or not growth <= BLOWN * max(1.0, grown):
-                lost = part
-                break
-        return near if near and not lost > PARTS[0] else Finding(lost)
-
-    @cached_property
-    def stiff(self) -> State:
-        """Where, along the start of the motion, the shortest h is advised."""
-        start = self.start
-        method = next(m for m in self.methods if math.isfinite(min(METHODS[m].limits)))
-        steps = min(AHEAD, math.ceil(self.duration / self.h))
-        every = max(1, steps * max(1, len(start.q) // 8) // PLACES)
-        found, longest = start, 1e3 * self.duration
-        run = self.run(start, method, steps=steps, every=every)
-        for t, q, qd in zip(run.t, run.q, run.qd, strict=True):
-            s = replace(start, q=np.array(q), qd=np.array(qd), t=float(t))
-            if (here := self._longest(method, s, longest)) < longest:
-                found, longest = s, here
-        return found
-
-    def _longest(self, method: str, s: State, most: float) -> float:
-        """The longest h that the module does not advise against at a state, to 5 %; inf: `most`."""
-        low = most
-        while self._warns(method, s, low):
-            low /= 2
-        if low == most:
-            return math.inf
-        high = 2 * low
-        while high > 1.05 * low:
-            middle = math.sqrt(low * high)
-            low, high = (low, middle) if self._warns(method, s, middle) else (middle, high)
-        return high
-
-    def _velocities_matter(self) -> bool:
-        """Whether accelerations hang on velocities."""
-        s = self.places[-1].state
-        still = replace(s, qd=0 * s.qd)
-        one, other = (self.ask("acceleration", x) for x in (s, still))
-        return not np.array_equal(one, other)
-
-    def _warns(self, method: str, s: State, h: float) -> bool:
-        """Whether the module advises against h at a state."""
-        told = self.module.advice(s.q, s.qd, h, params=s.params, method=method, t0=s.t)
-        return told is not None
-
-    def _ends(self, method: str, longest: float, part: float) -> tuple[Vector, float]:
-        """The end of a run over SPAN times `longest`, scaled, and the growth of a difference.
-
-        The larger of that of a small difference and of one so small that stiff forces, which are
-        soon at their bounds, are linear in it.
-        """
-        s = self.stiff
-        signs = np.random.default_rng(1).choice([-1.0, 1.0], self.scale.shape)
-        steps, ends = round(SPAN / part), []
-        for by in (0.0, NUDGE, LINEAR):
-            q, qd = np.array([s.q, s.qd]) + by * signs * self.scale
-            how = {"h": part * longest, "steps": steps, "every": steps, "t0": s.t}
-            run = self.run(replace(s, q=q, qd=qd), method, **how)
-            if str(run.status) != "ok":
-                return np.full(self.scale.shape, math.inf), math.inf
-            ends.append(np.array([run.q[-1], run.qd[-1]]) / self.scale)
-        grown = (np.max(np.abs(ends[k] - ends[0])) / by for k, by in ((1, NUDGE), (2, LINEAR)))
-        return ends[0], float(max(grown))
-
-    def _by_eigenvalues(self, method: str) -> float:
-        """The longest stable h of the motion linearised at `stiff`, by differences; s."""
-        s, n = self.stiff, self.scale.shape[1]
-        x = np.array([s.q, s.qd])
-        A = np.zeros((2 * n, 2 * n))
-        A[:n, n:] = np.eye(n)
-        for k in range(2 * n):
-            by = np.zeros(2 * n)
-            by[k] = LINEAR**0.5 * 1e-2 * self.scale.flat[k]
-            ends = [
-                self.ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
-                for moved in (x + by.reshape(2, n), x - by.reshape(2, n))
-            ]
-            A[n:, k] = (ends[0] - ends[1]) / (2 * by[k])
-        values = np.linalg.eigvals(A)
-        turning, decay = METHODS[method].limits
-        rates = np.max(np.abs(values.imag)) / turning, np.max(-values.real) / decay
-        fastest = float(max(rates))
-        return 1 / fastest if fastest > 0 else math.inf
 
 
 def _judged(found: Iterable[float], pick: Callable[[Iterable[float]], float], why: str) -> Finding:

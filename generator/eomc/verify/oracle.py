@@ -1,13 +1,14 @@
 """What an independent answer can be asked, and RK4 in plain Python on top of it.
 
-`reference.Reference` answers from expressions written out, `jets.Jets` by Taylor arithmetic along
-the definitions. Both take many states at once, as leading rows of their arguments.
+`symbolic.Reference` answers from expressions written out, `taylor.Jets` by Taylor arithmetic along
+the definitions. Both take many states at once, as leading rows of their arguments. Constraints are
+solved for by `kkt`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cached_property
 from typing import Any
@@ -18,11 +19,18 @@ from numpy.typing import ArrayLike, NDArray
 from eomc.base.errors import EomcError
 from eomc.model.system import System
 from eomc.scene.formulas import suggest
+from eomc.verify import kkt
+
+ROWS, RATES = ("D", "constraint_jacobian", "constraints"), "constraint_rates"
+CORRECTIONS = 12  # of a step, at most
+CORRECTED = 1e-8  # of a coordinate: a correction whose square is rounding
+SLOPE = (4 / 5, -1 / 5, 4 / 105, -1 / 280)  # central differences of order 8 (Fornberg, 1988)
+LEAP = 0.02  # of a coordinate, in the differences of one
 
 Vector = NDArray[np.float64]
 Values = tuple[Any, ...]  # of the parameters, in the system's order: floats, or one a row
 
-MATRICES = ("D", "C")
+MATRICES = ("D", "C", "constraint_jacobian")
 SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "magnitude")
 
 
@@ -60,9 +68,11 @@ class Answer(ABC):
         """The value of `name`: a float, an (nq,) or (nu,) vector or an (nq, nq) matrix.
 
         name: D, C, g, bias, tau, kinetic, potential, energy, jacobi, power or signals, as in
-        `reference.derive`. q, qd: (nq,), m or rad per coordinate and their rates, qd None at
-        rest; u: (nu,), None for the scene's signals; params: values in place of defaults. nan
-        where a formula has no real value. Raises EomcError where params names no parameter.
+        `symbolic.derive`, or of the m constraints constraints (m,), constraint_jacobian (m, nq),
+        constraint_rates (m,) or gamma (m,). q, qd: (nq,), m or rad per coordinate and their rates,
+        qd None at rest; u: (nu,), None for the scene's signals; params: values in place of
+        defaults. nan where a formula has no real value. Raises EomcError where params names no
+        parameter.
         """
         q = np.asarray(q, float)
         qd = np.zeros_like(q) if qd is None else np.asarray(qd, float)
@@ -76,9 +86,47 @@ class Answer(ABC):
         u: ArrayLike | None = None,
         params: Mapping[str, Any] | None = None,
     ) -> Vector:
-        """Solve D qdd = tau - bias: (nq,). nan where D is singular."""
+        """Solve D qdd = tau - bias, under constraints D qdd = tau - bias + A^T lambda: (nq,).
+
+        nan where D is singular.
+        """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         return self._acceleration(q, qd, t, u, self._values(params))
+
+    def multipliers(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        t: ArrayLike = 0.0,
+        u: ArrayLike | None = None,
+        params: Mapping[str, Any] | None = None,
+    ) -> Vector:
+        """Those of the m constraints, (m,); 0 of rows that are redundant."""
+        q, qd = np.asarray(q, float), np.asarray(qd, float)
+        _, found = self._constrained(q, qd, t, u, self._values(params))
+        whole = np.zeros((*q.shape[:-1], len(self.system.constraints)))
+        whole[..., self.solved] = found
+        return whole
+
+    def project(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        t: ArrayLike = 0.0,
+        params: Mapping[str, Any] | None = None,
+    ) -> tuple[Vector, Vector]:
+        """q and qd put onto the constraints, by Newton's method in the metric of D, to rounding.
+
+        Each correction is the least. nan where none is found.
+        """
+        q, qd = np.asarray(q, float), np.asarray(qd, float)
+        return self._each(self._onto, q, qd, np.asarray(t, float), self._values(params))
+
+    def corrected(
+        self, q: Vector, qd: Vector, t: ArrayLike, params: Mapping[str, Any] | None = None
+    ) -> tuple[Vector, Vector]:
+        """q and qd behind a step, corrected as a step is."""
+        return self._each(self._corrected, q, qd, np.asarray(t, float), self._values(params))
 
     def step(
         self,
@@ -89,7 +137,7 @@ class Answer(ABC):
         u: ArrayLike | None = None,
         params: Mapping[str, Any] | None = None,
     ) -> tuple[Vector, Vector]:
-        """One step of the classical Runge-Kutta method of order 4: q and qd at t + h.
+        """One step of the classical Runge-Kutta method of order 4: q and qd at t + h, corrected.
 
         u None: the scene's signals at every stage; u given: held over the step.
         """
@@ -105,6 +153,7 @@ class Answer(ABC):
         every: int = 1,
         u: ArrayLike | None = None,
         params: Mapping[str, Any] | None = None,
+        t0: float = 0.0,
     ) -> tuple[Vector, Vector, Vector]:
         """Run from the start: t (n,) and q, qd (n, nq), rows every `every` steps and the last.
 
@@ -116,11 +165,11 @@ class Answer(ABC):
         h = self.system.run.h if h is None else h
         steps = round(self.system.run.duration / h) if steps is None else steps
         values = self._values(params)
-        rows = [(0.0, q, qd)]
+        rows = [(t0, q, qd)]
         for n in range(steps):
-            q, qd = self._step(q, qd, h, n * h, u, values)
+            q, qd = self._step(q, qd, h, t0 + n * h, u, values)
             if (n + 1) % every == 0 or n + 1 == steps:
-                rows.append(((n + 1) * h, q, qd))
+                rows.append((t0 + (n + 1) * h, q, qd))
         times, qs, qds = zip(*rows, strict=True)
         return np.array(times), np.array(qs), np.array(qds)
 
@@ -138,9 +187,22 @@ class Answer(ABC):
                 raise EomcError(f"'{name}' is not a parameter{suggest(name, values)}")
         return tuple((values | dict(params)).values())
 
+    @cached_property
+    def solved(self) -> list[int]:
+        """The constraints that accelerations are solved for."""
+        return [k for k, c in enumerate(self.system.constraints) if not c.redundant]
+
+    @cached_property
+    def _holonomic(self) -> Vector:
+        """1 for rows of positions, 0 for those of rates, of the constraints solved for."""
+        rows = self.system.constraints
+        return np.array([float(rows[k].holonomic) for k in self.solved])
+
     def _acceleration(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
     ) -> Vector:
+        if self.system.constraints:
+            return self._constrained(q, qd, t, u, values)[0]
         D, force = self._motion(q, qd, t, u, values)
         try:
             return np.asarray(np.linalg.solve(D, force[..., None])[..., 0])
@@ -150,6 +212,72 @@ class Answer(ABC):
                 with suppress(np.linalg.LinAlgError):
                     found[k] = np.linalg.solve(D[k], force[k])
             return found
+
+    def _constrained(
+        self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
+    ) -> tuple[Vector, Vector]:
+        """qdd and the multipliers of the rows that are solved for."""
+        D, force = self._motion(q, qd, t, u, values)
+        A, gamma = (
+            self._value(name, q, qd, t, u, values) for name in ("constraint_jacobian", "gamma")
+        )
+        return kkt.solve(D, A[..., self.solved, :], force, -gamma[..., self.solved])
+
+    def _each(
+        self, of: Callable[..., tuple[Vector, Vector]], q: Vector, qd: Vector, t: Any,
+        values: Values,
+    ) -> tuple[Vector, Vector]:  # fmt: skip
+        """What `of` makes of each state."""
+        if q.ndim == 1:
+            return of(q, qd, t, values)
+        times, *each = (np.broadcast_to(x, len(q)).tolist() for x in (t, *values))
+        params = zip(*each, strict=True) if each else [()] * len(q)
+        ends = np.array([of(*state) for state in zip(q, qd, times, params, strict=True)])
+        return ends[:, 0], ends[:, 1]
+
+    def _row(self, name: str, q: Vector, qd: Vector, t: Any, values: Values) -> Vector:
+        """D, or what is asked of the rows that are solved for."""
+        u = np.zeros(len(self.system.inputs))
+        found = np.asarray(self._value(name, q, qd, t, u, values))
+        return found if name == "D" else found[self.solved]
+
+    def _onto(self, q: Vector, qd: Vector, t: Any, values: Values) -> tuple[Vector, Vector]:
+        """`project` of one state."""
+
+        def rows(x: Vector) -> tuple[Vector, Vector, Vector]:
+            D, A, off = (self._row(name, x, qd, t, values) for name in ROWS)
+            return D, A, self._holonomic * off
+
+        q, left = kkt.onto(q, rows)
+        if not left < 1e-10:
+            return np.full_like(q, np.nan), np.full_like(q, np.nan)
+        D, A, _ = rows(q)
+        for _ in range(2):  # linear in qd: the second takes what the first has rounded
+            by, _ = kkt.solve(D, A, np.zeros(len(q)), -self._row(RATES, q, qd, t, values))
+            qd = qd + by
+        return q, qd
+
+    def _corrected(self, q: Vector, qd: Vector, t: Any, values: Values) -> tuple[Vector, Vector]:
+        """One state behind a step: q and qd corrected together, until corrections of q are small.
+
+        Both with the matrix before the correction, the rates where it leads to the first order.
+        nan where that does not get there.
+        """
+        rest = np.zeros(len(q))
+        for _ in range(CORRECTIONS):
+            D, A, off = (self._row(name, q, qd, t, values) for name in ROWS)
+            dq, _ = kkt.solve(D, A, rest, -self._holonomic * off)
+            part = min(1 / 16, LEAP / max(float(np.max(np.abs(dq))), LEAP))
+            slope = np.zeros_like(off)
+            for k, weight in enumerate(SLOPE, start=1):
+                ends = [self._row(RATES, q + x * dq, qd, t, values) for x in (-k * part, k * part)]
+                slope += weight / part * (ends[1] - ends[0])
+            moved = self._row(RATES, q, qd, t, values) + slope
+            dqd, _ = kkt.solve(D, A, rest, -moved)
+            q, qd = q + dq, qd + dqd
+            if np.all(np.abs(dq) <= CORRECTED * (np.abs(q) + 1e-3 * np.max(np.abs(q)))):
+                return q, qd
+        return np.full_like(q, np.nan), np.full_like(q, np.nan)
 
     def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
@@ -168,7 +296,10 @@ class Answer(ABC):
         a3 = self._acceleration(q + h / 2 * v2, v3, t + h / 2, u, values)
         v4 = qd + h * a3
         a4 = self._acceleration(q + h * v3, v4, t + h, u, values)
+        q = q + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
+        qd = qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
         return (
-            q + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4),
-            qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4),
+            self._each(self._corrected, q, qd, t + h, values)
+            if self.system.constraints
+            else (q, qd)
         )

@@ -24,7 +24,7 @@ from eomc.verify.sampling import NUDGE, State
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
 
-LIMIT, UNIT = 10.0, "tolerances a step, times growth"
+LIMIT, UNIT = 0.1, "tolerances a step, times growth"
 STEPS = (12, 6, 3)  # of a run that is compared, the first in which a difference grows little
 LEAST = {"float64": 1e-15, "float32": 5e-7}  # tolerance
 ROUNDING = 1e3  # in a tolerance's place, where that is smaller

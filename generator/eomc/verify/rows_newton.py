@@ -53,7 +53,12 @@ class _Place:
 
 
 def report(check: Comparison) -> None:
-    """Add the rows; single precision leaves a motion beside an equilibrium too few digits."""
+    """Add the rows; single precision leaves a motion beside an equilibrium too few digits.
+
+    Not under constraints, where a step is put back onto them after its stages are found.
+    """
+    if check.system.constraints:
+        return
     newton = Newton(check)
     for method in check.methods:
         if METHODS[method].newton and check.dtype == np.float64:

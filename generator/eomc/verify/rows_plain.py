@@ -8,23 +8,28 @@ from __future__ import annotations
 
 import copy
 import warnings
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify import one_step
 from eomc.verify.comparison import GROWTH_LIMIT
+from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.sampling import NUDGE, VALUES, State, ask, nudged
+from eomc.verify.sampling import NUDGE, VALUES, State, ask, nudged, started
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
     from eomc.verify.sampling import Expected
 
 STEPS = 24  # of a run by each method
-SHORTER = 16  # by how much, where sweeps are few and fixed: what they leave is then rounding
+# by how much, where sweeps are few and fixed, until what they leave is rounding
+SHORTER = (16, 64, 256)
+CLEAR = 7  # sweeps of Newton's method with derivatives at the start, which any way to them finds
 BOTH = (*VALUES, "acceleration")
 
 
@@ -82,31 +87,78 @@ def _linearization(of: Comparison, plain: Any) -> float:
     return float(np.max([error(e) for e in of.few(of.effort.few)]))
 
 
-def _runs(of: Comparison, plain: Any, method: str) -> float:
+def _runs(of: Comparison, plain: Any, method: str) -> float | Finding:
     """A short run of each form from the start and from a random state, as far as it can be said."""
+    found = (_least_off(of, plain, method, e) for e in of.few(2))
+    return largest(found, "a difference grows too much in one step")
+
+
+def _least_off(of: Comparison, plain: Any, method: str, e: Expected) -> float | None:
+    """From one state, in steps that are short enough; None where not even one can be compared."""
+    least = None
+    for part in SHORTER if METHODS[method].sweeps else (1,):
+        off = _run_off(of, plain, method, e, of.system.run.h / part)
+        least = off if least is None or (off is not None and off < least) else least
+        if least is not None and least <= LIMIT:
+            break
+    return least
+
+
+def _run_off(of: Comparison, plain: Any, method: str, e: Expected, h: float) -> float | None:
+    """The same in steps of h.
+
+    Raises RuntimeError where one form ends before the other though the step can be made.
+    """
     spread = np.array([of.sampler.spread, of.sampler.speed])
+    s = e.state
 
-    def run(module: Any, s: State, by: float) -> Vector:
-        h = of.system.run.h / (SHORTER if METHODS[method].sweeps else 1)
-        with warnings.catch_warnings():  # a run that stops early ends in both forms alike
+    def run(module: Any, by: Vector) -> Any:
+        at = started(module, replace(s, q=s.q + by[0], qd=s.qd + by[1]))
+        with warnings.catch_warnings():  # a run that stops early is looked at below
             warnings.simplefilter("ignore", RuntimeWarning)
-            made = module.simulate(
-                q0=s.q + by * spread[0], qd0=s.qd + by * spread[1], u=s.u, params=s.params,
-                h=h, steps=STEPS, method=method,
+            return module.simulate(
+                q0=at.q, qd0=at.qd, u=s.u, params=s.params, h=h, steps=STEPS,
+                method=method, t0=s.t,
             )  # fmt: skip
-        return np.stack([made.q, made.qd], axis=1).astype(float)
 
-    def error(e: Expected) -> float:
-        one, other = run(of.module, e.state, 0.0), run(plain, e.state, 0.0)
-        if len(one) != len(other):
-            raise RuntimeError(f"{len(one) - 1} steps of the fast form, {len(other) - 1} of plain")
-        near = run(of.module, e.state, NUDGE)[: len(one)]
-        rows = len(near)
-        growth = np.max(np.abs(near - one[:rows]) / spread, axis=(1, 2)) / NUDGE
-        growth = np.maximum.accumulate(np.maximum(growth, 1.0))
-        honest = int(np.sum(growth < GROWTH_LIMIT))
-        steps = np.arange(1, honest + 1)[:, None, None]
-        size = steps * (growth[:honest, None, None] * spread + np.abs(one[:honest]))
-        return of.units(other[:honest], one[:honest], size)
+    one, other = run(of.module, 0 * spread), run(plain, 0 * spread)
+    both = min(len(one), len(other))
+    rows, others = (np.stack([x.q, x.qd], axis=1)[:both].astype(float) for x in (one, other))
+    growth = np.ones(both)
+    for sign in (1, np.where(np.arange(len(s.q)) % 2, -1, 1)):  # which excites the fastest modes
+        near = run(of.module, NUDGE * sign * spread)
+        grown = np.full(both, np.inf)
+        known = min(both, len(near))
+        moved = np.stack([near.q, near.qd], axis=1)[:known].astype(float)
+        with np.errstate(all="ignore"):
+            grown[:known] = np.max(np.abs(moved - rows[:known]) / spread, axis=(1, 2)) / NUDGE
+        growth = np.fmax(growth, np.where(np.isnan(grown), np.inf, grown))
+    growth = np.maximum.accumulate(growth)
+    honest = int(np.sum(growth < GROWTH_LIMIT))
+    if len(one) != len(other) and honest == both and _can_go_on(of, method, s, rows[-1], h, both):
+        raise RuntimeError(f"{len(one) - 1} steps of the fast form, {len(other) - 1} of plain")
+    if honest < 2:
+        return None
+    kick = h * e.size["acceleration"]  # of whose rounding a step makes a difference
+    size = growth[:honest, None, None] * (spread + np.array([h * kick, kick]))
+    size = np.arange(1, honest + 1)[:, None, None] * (size + np.abs(rows[:honest]))
+    off = of.units(others[:honest], rows[:honest], size)
+    if off > LIMIT and METHODS[method].implicit:  # others may be found to half their digits
+        clear = (_can_go_on(of, method, s, x, h, k + 1) for k, x in enumerate(rows[: honest - 1]))
+        honest = 1 + next((k for k, found in enumerate(clear) if not found), honest - 1)
+        off = of.units(others[:honest], rows[:honest], size[:honest])
+    return off if honest > 1 else None
 
-    return float(np.max([error(e) for e in of.few(2)]))
+
+def _can_go_on(of: Comparison, method: str, s: State, x: Vector, h: float, rows: int) -> bool:
+    """Whether the next step is clear: of an implicit method, by plain sweeps or few of Newton's."""
+    m, t = METHODS[method], s.t + (rows - 1) * h
+
+    def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
+        held = None if s.u is None else np.broadcast_to(s.u, (*q.shape[:-1], len(s.u)))
+        return of.reference.acceleration(q, qd, t, held, s.params)
+
+    with np.errstate(all="ignore"):
+        if np.all(np.isfinite(one_step.step(m, acceleration, x[0], x[1], t, h))):
+            return True
+        return m.newton and one_step.by_newton(m, acceleration, x[0], x[1], t, h)[1] <= CLEAR

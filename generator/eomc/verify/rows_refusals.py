@@ -55,17 +55,22 @@ class Refusals:
     def report(self) -> None:
         """Add them."""
         row = self.check.row
-        unit = "states judged wrongly"
+        if not self.check.system.constraints:  # which hold what has no inertia of its own
+            self.report_singular()
+        row("not finite", 0, "calls that do not refuse", self.odd)
+        for method in self.check.methods:
+            find = partial(self.overflow, method)
+            row(f"{method} too long", 0, "runs that end otherwise", find)
+
+    def report_singular(self) -> None:
+        """Add those about D that is singular."""
+        row, unit = self.check.row, "states judged wrongly"
         row("singular D", 0, unit, self.definite)
         if not self.singular:
             last = self.check.rows[-1]
             self.check.rows[-1] = replace(last, unit=unit + ": D is regular at all that were tried")
         row("singular D: refusals", 0, "calls that do not refuse", self.refuse)
         row("singular D in a run", 0, "runs that go on", self.run_into)
-        row("not finite", 0, "calls that do not refuse", self.odd)
-        for method in self.check.methods:
-            find = partial(self.overflow, method)
-            row(f"{method} too long", 0, "runs that end otherwise", find)
 
     # where D is singular
 
@@ -159,7 +164,7 @@ class Refusals:
         found = model._lib.acceleration(
             1, model._pointer(a), model._pointer(q), model._pointer(qd), s.t, model._pointer(u),
             model._pointer(p),
-        ) & 3  # fmt: skip
+        ) & 7  # fmt: skip
         clean = bool(np.all(a == MARK)) if found else bool(np.all(np.isfinite(a)))
         return found, clean
 

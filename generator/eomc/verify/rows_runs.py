@@ -102,7 +102,7 @@ def drive(
             model._pointer(qd), s.t, h, end - done, model._pointer(u), stride, every,
             model._pointer(p), work,
         )  # fmt: skip
-        done, status = found >> 2, found & 3
+        done, status = found >> 3, found & 7
         if status:
             break
     return Driven(rows, done, status)
@@ -118,7 +118,7 @@ class Runs:
         self.starts = check.few(2)
         self.states = [e.state for e in self.starts]
         self.few = FEWER if check.large else FEW
-        faster = [replace(s, qd=k * s.qd) for s in self.states for k in SPEEDS]
+        faster = [self.sampler.onto(replace(s, qd=k * s.qd)) for s in self.states for k in SPEEDS]
         self.turning = [e for s in faster if check.moves(s) and (e := self._expected(s))]
 
     def _expected(self, s: State) -> Expected | None:
@@ -233,8 +233,11 @@ class Runs:
         for e in self.check.few(2):
             s = e.state
             turns = 2 * np.pi * np.round(TURNS / 2 / np.pi) * self.sampler.angles
-            t = LATE if self.model._timed else 0.0
+            held = bool(self.check.system.constraints)  # which do not hold at another time
+            t = LATE if self.model._timed and not held else 0.0
             at = replace(s, q=s.q + turns * self.random.choice([-1, 1], len(s.q)), t=s.t + t)
+            if held and not self.holds(at):
+                continue
             with np.errstate(all="ignore"):
                 far = self.sampler.expected(at)
             if far is None or not self.sampler.regular(at):
@@ -258,6 +261,11 @@ class Runs:
                     solved = self.solved(far) if METHODS[method].newton else far
                     errors.append(self.check.one_step_of(method, solved, self.h) or 0.0)
         return float(np.max(errors, initial=0))
+
+    def holds(self, s: State) -> bool:
+        """Whether constraints hold with angles turned so far: gears need turns of their own."""
+        off, size = self.sampler.reach(partial(self.sampler.reference.evaluate, "constraints"), s)
+        return bool(np.all(np.abs(off) <= 1e3 * self.check.eps * size))
 
     def solved(self, e: Expected) -> Expected:
         """With what a rounding of q makes of velocities, to which stages are solved for.

@@ -8,6 +8,7 @@ that f is made of: sqrt(D_ii D_jj) for D_ij, D qd times a rate for forces, K and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,14 +17,19 @@ from typing import Any
 import numpy as np
 from sympy import Symbol
 
+from eomc.verify import kkt
 from eomc.verify.oracle import Answer, Vector
 
 EPS = 2.0**-52
 CONDITION_LIMIT = 1e8  # of D with its diagonal scaled to 1: beyond, a state says little
+REGULAR = 1e-6  # singular values of the scaled KKT matrix: the least of a state
+TINY = 1e-12  # the same, of a row without terms
+HOLDS = 1e-9  # of the terms of a row: what it may be at a state, redundant rows too
 NUDGE = 1e-6  # relative change of an input from which its influence is estimated
 FARTHEST = 100.0  # of the spread: steps that lead further are not compared
 MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
+HALVINGS, RESOLVED = 5, 0.1  # of steps ahead, until how far things go changes by so little
 FARTHER = 8.0  # times as far from the start, where a term that is small near it counts
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 
@@ -61,6 +67,10 @@ VALUES = {
 }
 
 
+OF_POSITIONS = ("D", "g", "potential_energy", "constraint_jacobian")  # what takes no rates
+OF_INPUTS = ("tau", "power", "acceleration", "multipliers")
+
+
 @dataclass(frozen=True)
 class State:
     """Where to evaluate: q, qd (nq,), t in s, u (nu,) or None for the signals, params or None."""
@@ -74,9 +84,17 @@ class State:
 
 def ask(module: Any, name: str, s: State) -> Vector:
     """The module's value of that name."""
-    place = (s.q,) if name in ("D", "g", "potential_energy") else (s.q, s.qd)
-    inputs = {"u": s.u} if name in ("tau", "power", "acceleration") else {}
+    place = (s.q,) if name in OF_POSITIONS else (s.q, s.qd)
+    inputs = {"u": s.u} if name in OF_INPUTS else {}
     return np.asarray(getattr(module, name)(*place, t=s.t, params=s.params, **inputs), float)
+
+
+def started(module: Any, s: State) -> State:
+    """The state as a run starts from it: on the module's constraints, nothing held."""
+    if not getattr(module, "constraint_names", ()):
+        return s
+    q, qd = module.project(s.q, s.qd, t=s.t, params=s.params)
+    return replace(s, q=np.asarray(q, float), qd=np.asarray(qd, float))
 
 
 def nudged(s: State, defaults: Mapping[str, float]) -> list[State]:
@@ -136,24 +154,36 @@ class Sampler:
         self.system = system = reference.system
         self.defaults = {p.name: p.value for p in system.parameters}
         self.rejected = 0
-        start = self.start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
+        self.start = State(*np.array([(c.start, c.rate) for c in system.coordinates]).T)
         # how far things go: from the start, from what happens next, else 1 of the unit
         slides, turns = set[Symbol](), set[Symbol]()
         for link in system.tree.links if system.tree else ():
             (turns if link.turns else slides).update(link.q.free_symbols)
         slides -= turns
         self.angles = np.array([c.unit == "rad" and c.q not in slides for c in system.coordinates])
-        turned = start.q + self.angles  # as what rests where it starts moves from elsewhere
-        far, fast = np.max([self._ahead(q, effort) for q in (start.q, turned)], axis=0)
+        far, fast = self._ahead(effort)
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
         self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
 
-    def _ahead(self, q: Vector, effort: Effort) -> Vector:
-        """(2, nq): how far coordinates and velocities get from there, 0 where it is not finite."""
-        start, h = self.start, effort.stride * self.system.run.h
-        with np.errstate(all="ignore"):
-            _, *x = self.reference.simulate(q, start.qd, h=h, steps=effort.ahead)
-        return np.array([np.nan_to_num(np.max(np.abs(y), axis=0), posinf=0) for y in x])
+    def _ahead(self, effort: Effort) -> Vector:
+        """(2, nq): how far coordinates and velocities get, 0 where it is not finite.
+
+        In steps so short that half of them make no difference: the scene's own may be too long for
+        its motion, which then goes to 1e40. From the start, and turned from there, as what rests
+        where it starts moves from elsewhere.
+        """
+        start, h, steps = self.start, effort.stride * self.system.run.h, effort.ahead
+        q = np.array([start.q, start.q + self.angles])
+        qd = np.array([start.qd, start.qd])
+        found = np.full((2, *q.shape), math.inf)
+        for part in (2**k for k in range(HALVINGS + 1)):
+            before = found
+            with np.errstate(all="ignore"):
+                _, *x = self.reference.simulate(q, qd, h=h / part, steps=steps * part)
+                found = np.array([np.max(np.abs(y), axis=0) for y in x])
+                if np.all(np.abs(found - before) <= RESOLVED * found + NOISE):
+                    break
+        return np.asarray(np.max(np.nan_to_num(found, posinf=0), axis=1))
 
     def states(self, count: int) -> list[Expected]:
         """The start, some states with the parameters' defaults, then all at random."""
@@ -193,17 +223,44 @@ class Sampler:
         if given and self.system.inputs:
             signals = np.abs(self.reference.evaluate("signals", q, qd, t))
             u = random.normal(size=len(signals)) * np.where(signals > 0, signals, 1)
-        # a parameter that is 0 by default, such as a friction, is tried too
-        factors = np.exp(random.uniform(-0.5, 0.5, len(self.defaults)))
+        # a parameter that is 0 by default, such as a friction, is tried too; a loop may not close
+        # with lengths that are far from the scene's
+        some = nearness if self.system.constraints else 1.0
+        factors = np.exp(some * random.uniform(-0.5, 0.5, len(self.defaults)))
         params = {
             name: value * factor if value else factor - 0.5
             for (name, value), factor in zip(self.defaults.items(), factors.tolist(), strict=True)
         }
-        return State(q, qd, t, u, None if usual else params)
+        return self.onto(State(q, qd, t, u, None if usual else params))
+
+    def onto(self, s: State) -> State:
+        """The state put onto the constraints; nan where that leads nowhere, or some row is off."""
+        if not self.system.constraints:
+            return s
+        with np.errstate(all="ignore"):
+            q, qd = self.reference.project(s.q, s.qd, s.t, s.params)
+        found = replace(s, q=q, qd=qd)
+        rows = [
+            self.reach(partial(self.reference.evaluate, name), found)
+            for name in ("constraints", "constraint_rates")
+        ]
+        if all(np.all(np.abs(off) <= HOLDS * size + TINY) for off, size in rows):
+            return found
+        return replace(s, q=np.full_like(q, np.nan), qd=np.full_like(q, np.nan))
+
+    def rows(self, name: str, s: State) -> Vector:
+        """Of the constraints that are solved for."""
+        found = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
+        return np.asarray(found)[self.reference.solved]
 
     def regular(self, s: State) -> bool:
-        """D finite and far from singular, and positive definite where we chose the parameters."""
+        """D finite and far from singular, and positive definite where we chose the parameters.
+
+        Under constraints the KKT matrix is to be far from singular.
+        """
         D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
+        if self.system.constraints:
+            return kkt.regular(D, self.rows("constraint_jacobian", s), REGULAR)
         diagonal = np.abs(np.diag(D))
         if not (np.all(np.isfinite(D)) and np.all(diagonal > 0)):
             return False
@@ -218,7 +275,12 @@ class Sampler:
         for name, field in VALUES.items():
             value[name], reach[name] = self.reach(partial(self.reference.evaluate, field), s)
         D, qd = value["D"], np.abs(s.qd)
-        qdd = np.asarray(np.linalg.solve(D, value["tau"] - value["bias"]), float)
+        if self.system.constraints:
+            given = (s.q, s.qd, s.t, s.u, s.params)
+            qdd = self.reference.acceleration(*given)
+            value["multipliers"] = self.reference.multipliers(*given)
+        else:
+            qdd = np.asarray(np.linalg.solve(D, value["tau"] - value["bias"]), float)
         value["acceleration"] = qdd
         if not all(np.all(np.isfinite(x)) for x in value.values()):
             return None
@@ -238,8 +300,42 @@ class Sampler:
             "power": reach["power"] + force @ qd,
             "motion": inertia @ np.abs(qdd) + force,
         }
-        size["acceleration"] = np.abs(np.linalg.inv(D)) @ size["motion"]
+        if self.system.constraints:
+            self._rows_of(s, value, size)
+        else:
+            size["acceleration"] = np.abs(np.linalg.inv(D)) @ size["motion"]
         return Expected(s, value, size)
+
+    def _rows_of(self, s: State, value: dict[str, Vector], size: dict[str, Vector]) -> None:
+        """Values of the constraints; sizes of these, multipliers, accelerations and corrections."""
+        for name in ("constraint_jacobian", "constraints", "constraint_rates", "gamma"):
+            value[name], size[name] = self.reach(partial(self.reference.evaluate, name), s)
+        A, a, n = size["constraint_jacobian"], np.abs(value["acceleration"]), len(s.q)
+        scale = kkt.scales(value["D"], value["constraint_jacobian"])
+
+        def whole(x: Vector) -> Vector:
+            """Of each row what x makes, were its largest part along that row."""
+            return np.asarray(A @ np.abs(x) + np.max(np.abs(x) / scale[:n]) / scale[n:])
+
+        size["constraints"] = size["constraints"] + whole(s.q)
+        size["constraint_rates"] = size["constraint_rates"] + whole(s.qd)
+        motion = size["motion"] + np.abs(value["multipliers"]) @ A
+        size["motion"] = np.maximum(motion, np.max(motion * scale[:n]) / scale[:n])
+        # of rows that move by themselves in time
+        pushed = value["multipliers"] @ value["constraint_jacobian"] @ s.qd
+        value["power"] = value["power"] + pushed
+        size["power"] = size["power"] + np.abs(value["multipliers"]) @ A @ np.abs(s.qd)
+        solved = self.reference.solved
+        spread = kkt.inverse(value["D"], value["constraint_jacobian"][solved])
+        rounded = [size["motion"], (size["gamma"] + whole(a))[solved]]
+        both = spread @ np.concatenate(rounded)
+        size["acceleration"] = both[:n]
+        size["multipliers"] = np.zeros(len(A))
+        size["multipliers"][solved] = both[n:]
+        # what rounding of the rows makes of a state that is put onto them
+        size["place"] = np.array([
+            spread[:n, n:] @ size[name][solved] for name in ("constraints", "constraint_rates")
+        ])  # fmt: skip
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
         """K + P and its size."""

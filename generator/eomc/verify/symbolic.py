@@ -40,7 +40,9 @@ def derive(system: System) -> Reference:
       so that bias = C qd + g, and Ddot - 2C + dD/dt is skew-symmetric;
     - tau = Q - dR/dqd;
     - jacobi = p.qd - K + P, which is K + P where K is purely quadratic, and changes at the rate
-      power = tau.qd - dL/dt, L = K - P at fixed q and qd.
+      power = tau.qd - dL/dt, L = K - P at fixed q and qd; tau is without what constraints do;
+    - of constraints phi(q, t), then psi(q, qd, t): A = dphi/dq, then dpsi/dqd; rates
+      A qd + dphi/dt, then psi; gamma = d(rates)/dt at qdd = 0, so that A qdd + gamma = 0.
 
     The last few are kept, with their functions: a report asks for the same in three places.
     Raises EomcError where K is not quadratic in the velocities, or where a definition can't be
@@ -71,8 +73,13 @@ def derive(system: System) -> Reference:
     tau = ImmutableMatrix([expand(e) for e in forces]) - friction
     for y, force in system.applied:
         tau += gradient(expand(y), q) * expand(force)
+    zero, A, rates, gamma = _rows(system, expand)
     return Reference(
         system=system,
+        constraints=zero,
+        constraint_jacobian=A,
+        constraint_rates=rates,
+        gamma=gamma,
         D=D,
         C=ImmutableMatrix(len(q), len(q), coriolis),
         g=bias.xreplace(rest),
@@ -88,6 +95,25 @@ def derive(system: System) -> Reference:
     )
 
 
+def _rows(
+    system: System, expand: Callable[[Expr], Expr]
+) -> tuple[ImmutableMatrix, ImmutableMatrix, ImmutableMatrix, ImmutableMatrix]:
+    """Of the constraints: what is zero, A, its rates without qdd, and gamma."""
+    q, qd, m = system.q, ImmutableMatrix(system.qd), len(system.constraints)
+    zero = ImmutableMatrix(m, 1, [expand(c.formula) for c in system.constraints])
+    n = sum(c.holonomic for c in system.constraints)
+    if not all(c.holonomic for c in system.constraints[:n]):
+        raise EomcError(f"{system.name}: constraints of positions stand before those of rates")
+    phi, psi = zero[:n, :], zero[n:, :]
+    A = phi.jacobian(q).col_join(psi.jacobian(system.qd)) if m else ImmutableMatrix(0, len(q), [])
+    for row, c in zip(A[n:, :].tolist(), system.constraints[n:], strict=True):
+        if any(sympy.simplify(e).has(*system.qd) for e in row if e.has(*system.qd)):
+            raise EomcError(f"{system.name}: the constraint {c.name} is not linear in the rates")
+    rates = (phi.jacobian(q) * qd + phi.diff(t)).col_join(psi) if m else zero
+    gamma = rates.jacobian(q) * qd + rates.diff(t) if m else zero
+    return zero, ImmutableMatrix(A), ImmutableMatrix(rates), ImmutableMatrix(gamma)
+
+
 def written_out(system: System) -> System:
     """The same system without definitions, its energies in short forms: quick to derive from."""
     expand = _expander(system)
@@ -98,6 +124,8 @@ def written_out(system: System) -> System:
         forces=tuple(map(expand, system.forces)),
         applied=tuple((shorter(expand(y)), expand(force)) for y, force in system.applied),
         outputs=(),
+        constraints=tuple(replace(c, formula=expand(c.formula)) for c in system.constraints),
+        reactions=(),
     )  # fmt: skip
 
 
@@ -132,7 +160,8 @@ def _written_out(system: System) -> float:
 
     for name, body in system.definitions:
         sizes[name], reach[name] = size(body), reach[body]
-    return size(system.kinetic) * len(system.q) ** 2 + size(system.potential)
+    rows = sum(size(c.formula) for c in system.constraints) * len(system.q)
+    return size(system.kinetic) * len(system.q) ** 2 + size(system.potential) + rows
 
 
 def _expander(system: System) -> Callable[[Expr], Expr]:
@@ -171,11 +200,16 @@ def _free_of(e: Expr, velocities: Sequence[sympy.Symbol]) -> Expr:
 class Reference(Answer):
     """The equations of `system` as expressions over q, qd, t, u and the parameters.
 
-    D, C: (nq, nq); g, bias, tau, friction: (nq, 1), tau = Q - friction; signals: (nu, 1), the
+    constraints, constraint_rates, gamma: (m, 1); constraint_jacobian: (m, nq); D, C: (nq, nq);
+    g, bias, tau, friction: (nq, 1), tau = Q - friction; signals: (nu, 1), the
     inputs by default.
     """
 
     system: System
+    constraints: ImmutableMatrix
+    constraint_jacobian: ImmutableMatrix
+    constraint_rates: ImmutableMatrix
+    gamma: ImmutableMatrix
     D: ImmutableMatrix
     C: ImmutableMatrix
     g: ImmutableMatrix

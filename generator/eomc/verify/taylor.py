@@ -54,6 +54,10 @@ _WANTED: Mapping[str, Mapping[str, str]] = {
     "power": {"K": "x", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
     "signals": {"u": "value"},
     "motion": {"K": "vs x vv", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
+    "constraints": {"phi": "value", "psi": "value"},
+    "constraint_jacobian": {"phi": "x", "psi": "v"},
+    "constraint_rates": {"phi": "s", "psi": "value"},
+    "gamma": {"phi": "xs", "psi": "s"},
 }
 
 
@@ -78,6 +82,12 @@ class Jets(Answer):
                 "the kinetic energy is not quadratic in the velocities, or can't be seen to be: "
                 "write it as a sum of products. Friction belongs in 'dissipation' or [forces]"
             )
+        rates = (c for c in system.constraints if not c.holonomic)
+        for c, index in zip(rates, made.roots["psi"], strict=True):
+            if made.ops[index].degree > 1:
+                raise EomcError(
+                    f"{system.name}: the constraint {c.name} is not linear in the rates"
+                )
         self._plans: dict[str, tuple[tuple[int, Op, Fields], ...]] = {}
 
     def _value(
@@ -113,11 +123,11 @@ class Jets(Answer):
         found[~np.isfinite(found.reshape(len(found), -1)).all(axis=1)] = math.nan
         return found
 
-    def _acceleration(
+    def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
-    ) -> Vector:
+    ) -> tuple[Vector, Vector]:
         both = self._value("motion", q, qd, t, u, values)  # D and tau - bias beside it
-        return np.asarray(np.linalg.solve(both[..., :-1], both[..., -1:])[..., 0])
+        return both[..., :-1], both[..., -1]
 
     def _outputs(self, name: str, state: Point) -> Vector:
         """The values of `name`, a row a state."""
@@ -168,9 +178,32 @@ class Jets(Answer):
                 work = np.sum(tau() * state.qd, axis=1, keepdims=True)
                 explicit = part("K", "x", nq + 1) - part("P", "x", nq + 1)
                 found = work - explicit[:, nq:]
+            case "constraints" | "constraint_jacobian" | "constraint_rates" | "gamma":
+                found = self._rows_of(name, jets, state)
             case _:
                 found = each("u")
         return np.array(found[:, 0] if name in SCALARS else found)
+
+    def _rows_of(self, name: str, jets: Mapping[int, Jet], state: Point) -> Vector:
+        """What is asked of the constraints: (b, m), or (b, m, nq) the Jacobian A."""
+        b, nq = state.q.shape
+
+        def part(index: int, field: str, *shape: int) -> Vector:
+            return np.broadcast_to(jets.get(index, {}).get(field, 0.0), (b, *shape))
+
+        phi, psi = self._list.roots["phi"], self._list.roots["psi"]
+        match name:
+            case "constraints":
+                found = [part(k, "value", 1) for k in (*phi, *psi)]
+            case "constraint_jacobian":
+                found = [part(k, "x", nq + 1)[:, None, :nq] for k in phi]
+                found += [part(k, "v", nq)[:, None] for k in psi]
+            case "constraint_rates":
+                found = [part(k, "s", 1) for k in phi] + [part(k, "value", 1) for k in psi]
+            case _:
+                bends = (np.sum(part(k, "xs", nq + 1) * state.d, axis=1) for k in phi)
+                found = [bend[:, None] for bend in bends] + [part(k, "s", 1) for k in psi]
+        return np.concatenate(found, axis=1)
 
     def _run(self, name: str, state: Point) -> dict[int, Jet]:
         if name not in self._plans:
@@ -219,6 +252,8 @@ class _List:
         roots = {"K": [s.kinetic], "P": [s.potential], "R": [s.dissipation], "Q": forces}
         roots |= {"u": [i.signal for i in s.inputs]}
         roots |= {"y": [y for y, _ in s.applied], "F": [force for _, force in s.applied]}
+        roots |= {"phi": [c.formula for c in s.constraints if c.holonomic]}
+        roots |= {"psi": [c.formula for c in s.constraints if not c.holonomic]}
         self.roots = {name: [self.node(e) for e in exprs] for name, exprs in roots.items()}
 
     def add(self, op: Op) -> int:

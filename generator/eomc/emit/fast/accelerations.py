@@ -41,8 +41,10 @@ class Accelerations:
         """What parameters alone decide, as a function of its own; and the rest."""
         first, rest = outline.staged(self.whole, self.own)
         kept = [o.name for o in first.outputs]
-        if "signal" in self.target.program:  # steps have no other parameters
-            read = self.target.program["signal"].uses
+        others = ("signal", "correction")  # what else steps read parameters for
+        there = [f for n in others if (f := self.target.program.functions.get(n))]
+        if there:
+            read = frozenset[str]().union(*(f.uses for f in there))
             kept = [n for n in self.own if n in kept or n in read] + [
                 n for n in kept if n not in self.own
             ]
@@ -69,7 +71,8 @@ class Accelerations:
     def parts(self) -> two_point.Parts | None:
         """Of the two-point form, which RK4 takes in double precision."""
         target = self.target
-        if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
+        constrained = bool(target.system.constraints)
+        if target.real is not DOUBLE or constrained or "rk4" not in target.system.run.methods:
             return None
         early = {a.name for a in self.whole.early}
         return two_point.apart(self.rotated[1], self.angles, target.system, {*self.own, *early})

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 
 from eomc.base import resources
 from eomc.base.texts import FreeText
-from eomc.emit import adaptive, events, heading
+from eomc.emit import adaptive, corrected, events, heading
 from eomc.emit import c_function as c
-from eomc.emit.c_expression import C_NAMES, DOUBLE
+from eomc.emit.c_expression import C_NAMES, DOUBLE, PIVOT
 from eomc.emit.c_names import Target
 from eomc.emit.derivatives import derivatives
-from eomc.emit.fast import runs, views
+from eomc.emit.fast import projection, runs, views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, Lane
 from eomc.emit.fast.runs import ahead_count
@@ -30,7 +30,7 @@ Show = Callable[[views.View | plain_views.View], str]  # a view by its template
 
 # what stands in csrc for names, types and sizes of a lane
 PLACEHOLDERS = ("BITS_OF_SIZE", "INTEGER", "LANE_ALIGNED", "LANE_BYTES", "LANE_COUNT", "REAL")
-TWO = ("atan2", "pow", "min", "max")  # of two arguments
+TWO = ("atan2", "pow", "min", "max", PIVOT)  # of two arguments
 
 
 def steppers(target: Target) -> Steppers:
@@ -71,6 +71,7 @@ def files(made: Steppers, show: Show) -> dict[str, str]:
             evaluations=functions.evaluations,
             acceleration=functions.acceleration,
             solved=tuple(heading.solved(target)),
+            constrained=bool(target.system.constraints),
             slopes=show(slopes).rstrip("\n") if slopes else "",
             lanes=tuple(filter(None, _lanes(made, show))),
             steppers=tuple(_steppers(made, show)),
@@ -146,6 +147,10 @@ def _lanes(made: Steppers, show: Show) -> Iterator[str]:
     if _wide(made):
         yield _library_text(made.wide, show)
         yield _lane(made, made.wide, show)
+    if made.functions.correction:
+        yield show(corrected.project(made.functions))
+        for lane in (made.one, *([made.wide] * batch)):
+            yield show(projection.view(made.functions, lane))
     if batch:
         yield show(
             views.Blocks(
@@ -216,7 +221,9 @@ def _library_text(lane: Lane, show: Show) -> str:
 
 
 def _library(s: Accelerations, name: str, wide: bool) -> views.Library:
-    """A function of the mathematics library; wide: over a register."""
+    """A function of the mathematics library, or ours; wide: over a register."""
+    if name == PIVOT:
+        return views.Library(name, name, True, "")
     called = C_NAMES.get(name, name)
     letter = "d" if s.target.real is DOUBLE else "s"
     whole = f"__builtin_ia32_sqrtp{letter}512_mask(x, x, -1, 4)" if wide and name == "sqrt" else ""
@@ -283,4 +290,7 @@ def _adaptive(made: Steppers) -> adaptive.Form:
         made.stepping(one), sweep, made.accelerate(one, a="f"), one.extent,
         bool(made.accelerations.constants), runs.constants_call(made),
         f"{one.target.PREFIX}_LANES",
+        projection.projected(one).call(t=f"{c.member('x', 't')} + h", singular="&singular")
+        if made.functions.correction
+        else "",
     )  # fmt: skip

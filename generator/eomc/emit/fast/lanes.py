@@ -17,7 +17,9 @@ from eomc.emit.c_expression import FOUR, Block, Body, Printer, Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, sentence, unclashed
 from eomc.emit.fast.accelerations import Accelerations
-from eomc.emit.plain.views import Computed
+from eomc.emit.plain.parts import (
+    Computed,
+)
 from eomc.program import outline
 from eomc.program.ir import Call, Function, Sum
 from eomc.program.trig import Angle
@@ -375,7 +377,8 @@ class Lane:
     def calls(self) -> tuple[str, ...]:
         """Functions of the mathematics library that the lane has to have."""
         read = [self.accelerations.whole]
-        read += [self.target.program["signal"]] if "signal" in self.target.program else []
+        others = ("signal", "correction")
+        read += [f for n in others if (f := self.target.program.functions.get(n))]
         names = {
             a.value.function
             for f in read

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from eomc.emit.fast import views
 from eomc.emit.fast.lanes import NOINLINE
+from eomc.emit.fast.projection import projected
 from eomc.emit.fast.steppers import Steppers
 from eomc.integrators.tableaux import RK4, Method
 
@@ -26,6 +27,7 @@ def state(made: Steppers, m: Method) -> views.State:
         sweeps=m.sweeps,
         implicit=m.implicit,
         inputs=bool(lane.target.system.inputs),
+        constrained=bool(made.functions.correction),
     )
 
 
@@ -33,6 +35,8 @@ def kept(made: Steppers, m: Method) -> int:
     """Numbers of the state that the header gives room for."""
     n, angles, s = len(made.one.target.names), len(made.accelerations.angles), m.stages
     size = 4 * made.one.width + 32
+    if made.functions.correction:
+        size += 4
     if predicts(made, m):
         size += n + 2 * angles + 5 * ahead_count(angles)
     if m.newton:
@@ -81,6 +85,9 @@ def loop(made: Steppers, m: Method) -> views.Loop:
         predicted_call=f"{lane.prefix}_rk4_predicted({', '.join(predicted)})",
         advance=advance.call(**here),
         otherwise=alone.call(**here) if m is RK4 and s.angles else "",
+        project=projected(lane).call(q="x.q", qd="x.qd", t="t + h", singular="&singular")
+        if made.functions.correction
+        else "",
     )
 
 
@@ -107,6 +114,12 @@ def batch(made: Steppers, m: Method) -> views.Batch:
         compute_constants=constants_call(made),
         compute_own=lane.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
         alone=alone.call(q="at", qd="moving", u="given"),
+        project=projected(made.wide).call(q="from[b].q", qd="from[b].qd", t="t + h", c="&from[b].c")
+        if made.functions.correction
+        else "",
+        project_alone=projected(lane).call(q="at", qd="moving", t="t + h", singular="&singular")
+        if made.functions.correction
+        else "",
     )
 
 

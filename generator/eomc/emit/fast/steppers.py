@@ -16,7 +16,9 @@ from eomc.emit.fast import views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, NOINLINE, Lane
 from eomc.emit.functions import Functions
-from eomc.emit.plain.views import Slopes
+from eomc.emit.plain.views import (
+    Slopes,
+)
 from eomc.integrators.tableaux import METHODS, RK4, Method, Row
 from eomc.program import two_point
 
@@ -49,7 +51,8 @@ class Steppers:
         """Whether RK4 predicts the angles of one trajectory."""
         s = self.accelerations
         few = 0 < len(s.angles) < two_point.FEWEST
-        return few and s.target.real is DOUBLE and not self.two_point
+        free = not (self.two_point or s.target.system.constraints)
+        return few and s.target.real is DOUBLE and free
 
     @property
     def methods(self) -> tuple[Method, ...]:

@@ -7,7 +7,14 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.views import Computed, Named, Parameter, Prefixed
+from eomc.emit.plain.parts import (
+    Computed,
+    Named,
+    Prefixed,
+)
+from eomc.emit.plain.views import (
+    Parameter,
+)
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,7 @@ class Source(Named):
     evaluations: tuple[Computed, ...]
     acceleration: Computed
     solved: tuple[str, ...]
+    constrained: bool
     slopes: str
     lanes: tuple[str, ...]
     steppers: tuple[str, ...]
@@ -329,11 +337,15 @@ class State(Named):
     sweeps: int
     implicit: bool
     inputs: bool
+    constrained: bool
 
 
 @dataclass(frozen=True)
 class Loop(Named):
-    """c/fast/run.c.jinja. advance: one step; otherwise: where that failed, without shortcuts."""
+    """c/fast/run.c.jinja. advance: one step; otherwise: where that failed, without shortcuts.
+
+    project: the call that ends a step on the constraints, if there are.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/run.c"
     extent: str
@@ -353,6 +365,7 @@ class Loop(Named):
     predicted_call: str
     advance: str
     otherwise: str
+    project: str
 
 
 @dataclass(frozen=True)
@@ -376,6 +389,8 @@ class Batch(Named):
     compute_constants: str
     compute_own: str
     alone: str
+    project: str
+    project_alone: str
 
 
 View = (

@@ -7,7 +7,7 @@ from dataclasses import replace
 from math import isfinite, sqrt
 
 from eomc.base.texts import FreeText
-from eomc.emit import adaptive, events, heading
+from eomc.emit import adaptive, corrected, events, heading
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
@@ -16,9 +16,11 @@ from eomc.emit.coefficients import tableau
 from eomc.emit.derivatives import derivatives
 from eomc.emit.evaluations import source
 from eomc.emit.functions import Functions, handshake, indexed, of, parameters
+from eomc.emit.plain.parts import (
+    Computed,
+)
 from eomc.emit.plain.views import (
     AdaptiveDeclared,
-    Computed,
     Declared,
     Explicit,
     Gauss,
@@ -55,6 +57,8 @@ def files(
         view for m, run in zip(methods, loops, strict=True) for view in (stepper(plain, m), run)
     ]
     views += [*derivatives(plain), *_adaptive(plain)]
+    if onto := corrected.plain(plain):
+        views[:0] = [onto, corrected.project(plain)]
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
     texts = (
@@ -90,6 +94,7 @@ def header(
         coordinates=indexed(plain, s.coordinates),
         inputs=indexed(plain, s.inputs),
         outputs=indexed(plain, s.outputs, "OUT_"),
+        constraints=indexed(plain, s.constraints, "CONSTRAINT_"),
         events=indexed(plain, s.events, "EVENT_"),
         frames=tuple(target.enum[f"FRAME_{f.name}"] for f in s.asked),
         parameters=parameters(plain),
@@ -97,6 +102,7 @@ def header(
         timed=target.driven,
         functions=tuple(x.function for x in found),
         linearization=slopes.linearization if slopes else None,
+        project=plain.public.project if s.constraints else None,
         methods=tuple(
             Declared(
                 m.name, _titled(m), m.implicit, room, plain.public.step(m.name),
@@ -128,6 +134,7 @@ def source_view(plain: Functions, slopes: str, steppers: Sequence[str]) -> Sourc
         evaluations=plain.evaluations,
         acceleration=plain.acceleration,
         solved=tuple(heading.solved(target)),
+        constrained=bool(s.constraints),
         slopes=slopes,
         steppers=tuple(steppers),
         adaptive=s.run.tolerance is not None,
@@ -200,12 +207,17 @@ def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
     """The view of the function that computes one step."""
     if m.implicit:
         return _gauss(plain, m)
-    accelerate = plain.acceleration.function.call
+    accelerate, step = plain.acceleration.function.call, plain.public.step(m.name)
+    advance, correct = _advance(plain, m)
+    inner = advance.call(singular="&singular")
     if m is RK4:
         return RungeKutta4(
             **plain.names,
             about=_about(m),
-            step=plain.public.step(m.name),
+            step=step,
+            advance=advance,
+            advance_call=inner,
+            correct=correct,
             first=accelerate(qdd="a1"),
             second=accelerate(qdd="a2", q="r", qd="v", t="t + h/2"),
             third=accelerate(qdd="a3", q="r", qd="v", t="t + h/2"),
@@ -214,11 +226,27 @@ def stepper(plain: Functions, m: Method) -> RungeKutta4 | Explicit | Gauss:
     return Explicit(
         **plain.names,
         about=_about(m),
-        step=plain.public.step(m.name),
+        step=step,
+        advance=advance,
+        advance_call=inner,
+        correct=correct,
         stages=m.stages,
         **tableau(m, plain.target.real),
         stage=accelerate(qdd="a[i]", q="r", qd="v", t="t + c[i]*h"),
     )
+
+
+def _advance(plain: Functions, m: Method) -> tuple[CFunction, str]:
+    """The step of an explicit method, inside of the public one where constraints have more to tell;
+    the call that ends it on these.
+    """
+    step = plain.public.step(m.name)
+    if not plain.correction:
+        return step, ""
+    told = plain.corrected.arguments[-1]
+    name = f"{plain.prefix}_{m.name}"
+    inner = CFunction(name, plain.status, (*step.arguments, told), qualifier="static")
+    return inner, plain.corrected.call(t="t + h")
 
 
 def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
@@ -249,7 +277,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     around = plain.usual(*plain.state, "h", "u", "p")
     shared = implicit(plain, [m])
     stages = CFunction(
-        f"{method}_stages",
+        f"{method}_evaluated",
         plain.status,
         (
             *(c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid")),
@@ -265,7 +293,8 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     )
     one = plain.public.step(m.name)
     count = CArgument("long *", "evaluations")
-    solve = CFunction(method, plain.status, (*one.arguments, count), qualifier="static")
+    told = plain.corrected.arguments[-1:] if plain.correction else ()
+    solve = CFunction(method, plain.status, (*one.arguments, count, *told), qualifier="static")
     return Gauss(
         **plain.names,
         title=m.title,
@@ -288,7 +317,8 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
         sweep=stages.call(),
         matrix_start=matrix_function.call(),
         matrix_mid=matrix_function.call(q="q_mid", qd="qd_mid", t="t + h/2"),
-        solve_call=solve.call(evaluations="&evaluations"),
+        solve_call=solve.call(evaluations="&evaluations", singular="&singular"),
+        correct=plain.corrected.call(t="t + h") if plain.correction else "",
     )
 
 
@@ -312,7 +342,12 @@ def _adaptive(plain: Functions) -> list[View]:
         sweep=sweep,
         stage=accelerate(qdd="f", q="r", qd="v", t="t + c[i]*h"),
     )
-    form = adaptive.Form(around, sweep.call(b="&b"), accelerate(qdd="f"), plain.NQ)
+    end = f"{c.member('x', 't')} + h"
+    onto = plain.corrected.call(r="at", v="moving", t=end, singular="&singular")
+    form = adaptive.Form(
+        around, sweep.call(b="&b"), accelerate(qdd="f"), plain.NQ,
+        project=onto if plain.correction else "", whole=True,
+    )  # fmt: skip
     return [nodes, *events.views(plain, form)]
 
 
@@ -321,13 +356,16 @@ def loop(plain: Functions, m: Method) -> Loop:
     NQ, real = plain.NQ, plain.real
     run = plain.public.run(m.name)
     one = stepper(plain, m)
-    advance = one.solve if isinstance(one, Gauss) else one.step
+    advance = one.solve if isinstance(one, Gauss) else one.advance
     return Loop(
         **plain.names,
         implicit=m.implicit,
+        constrained=bool(plain.correction),
         run=run,
         batch=plain.public.batch(m.name) if plain.target.system.run.batch else None,
-        one_step=advance.call(t=f"t0 + ({real})(first + n)*h", u="u ? u + u_stride*n : 0"),
+        one_step=advance.call(
+            t=f"t0 + ({real})(first + n)*h", u="u ? u + u_stride*n : 0", singular="&singular"
+        ),
         run_one=run.call(
             q=f"q + {NQ}*k", qd=f"qd + {NQ}*k", u="u ? u + u_instance*k : 0", u_stride="u_step",
             q_rows="to_q", qd_rows="to_qd", p="p + p_instance*k", memory="0", status="&found",

@@ -7,21 +7,9 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
-
-
-@dataclass(frozen=True)
-class Prefixed:
-    """What every template names: the scene's prefix, and the type of numbers."""
-
-    prefix: str
-    real: str
-
-
-@dataclass(frozen=True)
-class Named(Prefixed):
-    """And the prefix of macros and enumerators."""
-
-    PREFIX: str
+from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Events
+from eomc.emit.plain.constraint_views import Corrected, Project
+from eomc.emit.plain.parts import Computed, Named
 
 
 @dataclass(frozen=True)
@@ -39,28 +27,6 @@ class Parameter:
     name: str
     value: str
     words: FreeText
-
-
-@dataclass(frozen=True)
-class Computed:
-    """A function that is computed from the program.
-
-    parts: the static functions that it calls: pieces of a long one, or one column of a matrix.
-    values: the struct in which pieces hand values on. column_call: where it is a loop over columns.
-    """
-
-    function: CFunction
-    parts: tuple[CFunction, ...] = ()
-    values: str = ""
-    column_call: str = ""
-    out: str = ""
-    symmetric: bool = False
-
-    @property
-    def text(self) -> str:
-        """All of it, where it is no loop over columns."""
-        texts = (self.values, *(f.definition for f in self.parts), self.function.definition)
-        return "\n\n".join(filter(None, texts))
 
 
 @dataclass(frozen=True)
@@ -104,6 +70,7 @@ class Header(Named):
     coordinates: tuple[Indexed, ...]
     inputs: tuple[Indexed, ...]
     outputs: tuple[Indexed, ...]
+    constraints: tuple[Indexed, ...]
     events: tuple[Indexed, ...]
     frames: tuple[str, ...]
     parameters: tuple[Parameter, ...]
@@ -111,6 +78,7 @@ class Header(Named):
     timed: bool
     functions: tuple[CFunction, ...]
     linearization: CFunction | None
+    project: CFunction | None
     methods: tuple[Declared, ...]
     adaptive: AdaptiveDeclared | None
     busy: int
@@ -130,6 +98,7 @@ class Source(Named):
     evaluations: tuple[Computed, ...]
     acceleration: Computed
     solved: tuple[str, ...]
+    constrained: bool
     slopes: str
     steppers: tuple[str, ...]
     adaptive: bool
@@ -188,11 +157,18 @@ class Derivative(Named):
 
 @dataclass(frozen=True)
 class RungeKutta4(Named):
-    """c/plain/rk4.c.jinja: the calls of the four accelerations."""
+    """c/plain/rk4.c.jinja: the calls of the four accelerations.
+
+    advance: the step, which under constraints also tells whether a row has no multiplier behind it;
+    correct: the call that moves its end onto the constraints.
+    """
 
     TEMPLATE: ClassVar[str] = "c/plain/rk4.c"
     about: tuple[str, ...]
     step: CFunction
+    advance: CFunction
+    advance_call: str
+    correct: str
     first: str
     second: str
     third: str
@@ -201,11 +177,17 @@ class RungeKutta4(Named):
 
 @dataclass(frozen=True)
 class Explicit(Named):
-    """c/plain/explicit.c.jinja: a tableau, and the call of a stage's accelerations."""
+    """c/plain/explicit.c.jinja: a tableau, and the call of a stage's accelerations.
+
+    advance, correct: as of RungeKutta4.
+    """
 
     TEMPLATE: ClassVar[str] = "c/plain/explicit.c"
     about: tuple[str, ...]
     step: CFunction
+    advance: CFunction
+    advance_call: str
+    correct: str
     stages: int
     c: tuple[str, ...]
     A: tuple[str, ...]
@@ -260,6 +242,7 @@ class Gauss(Named):
     matrix_start: str
     matrix_mid: str
     solve_call: str
+    correct: str
 
 
 @dataclass(frozen=True)
@@ -278,119 +261,12 @@ class Nodes(Named):
 
 
 @dataclass(frozen=True)
-class Adaptive:
-    """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
-
-    method: what its C names begin with. total: the sum of x[0], ... over the stages. powers, last,
-    before: from accelerations at the stages, one a row, to their polynomial's powers, and to its
-    parts in the last two of Legendre's. most: sweeps of a step. lanes: before loops over stages.
-    """
-
-    TEMPLATE: ClassVar[str] = "c/adaptive.c"
-    PREFIX: str
-    real: str
-    title: str
-    method: str
-    extent: str
-    stages: int
-    f: str
-    fabs: str
-    sqrt: str
-    eps: str
-    tiny: str
-    most: int
-    c: tuple[str, ...]
-    b: tuple[str, ...]
-    bA: tuple[str, ...]
-    lanes: str
-    total: str
-    powers: tuple[str, ...]
-    last: tuple[str, ...]
-    before: tuple[str, ...]
-    timed: bool
-    events: bool
-    settle: CFunction
-    sweep: str
-    step: CFunction
-    start: str
-    settled: str
-    within: CFunction
-    settled_within: str
-
-
-@dataclass(frozen=True)
-class Events(Named):
-    """c/events.c.jinja: functions that find events in an adaptive step, and calls in them.
-
-    samples: the parts of a step at which events are looked at, nodes; slopes: of the polynomial
-    through values there. busy: the most events in one step; apart, near, close: parts of a step.
-    """
-
-    TEMPLATE: ClassVar[str] = "c/events.c"
-    method: str
-    fabs: str
-    sqrt: str
-    eps: str
-    tiny: str
-    samples: int
-    nodes: tuple[str, ...]
-    slopes: tuple[str, ...]
-    stages: int
-    once: tuple[str, ...]
-    twice: tuple[str, ...]
-    directions: tuple[int, ...]
-    actions: tuple[int, ...]
-    jumps: bool
-    busy: int
-    apart: str
-    near: str
-    close: str
-    width: str
-    looked: CFunction
-    values: str
-    bracketed: CFunction
-    crossing: CFunction
-    look_value: str
-    bracket: str
-    bracket_dip: str
-    happened: CFunction
-    cross: str
-    look_before: str
-    look_behind: str
-    inside: str
-    values_there: str
-    restart: CFunction
-    values_before: str
-    jump: str
-    values_after: str
-
-
-@dataclass(frozen=True)
-class AdaptiveRun(Named):
-    """c/adaptive_run.c.jinja: the loop over adaptive steps, rows and events."""
-
-    TEMPLATE: ClassVar[str] = "c/adaptive_run.c"
-    method: str
-    constants: bool
-    unread_p: bool
-    compute_constants: str
-    events: bool
-    busy: int
-    run: CFunction
-    advance: str
-    happen: str
-    restart: str
-    row: str
-    row_before: str
-    look: str
-
-
-@dataclass(frozen=True)
 class Loop(Named):
     """c/plain/run.c.jinja: run and batch of one method, and the calls in them."""
 
     TEMPLATE: ClassVar[str] = "c/plain/run.c"
     implicit: bool
+    constrained: bool
     run: CFunction
     batch: CFunction | None
     one_step: str
@@ -398,6 +274,6 @@ class Loop(Named):
 
 
 View = (
-    Header | Source | Slopes | Derivative | RungeKutta4 | Explicit | Implicit | Gauss | Nodes
-    | Adaptive | Events | AdaptiveRun | Loop
+    Header | Source | Slopes | Corrected | Project | Derivative | RungeKutta4 | Explicit | Implicit
+    | Gauss | Nodes | Adaptive | Events | AdaptiveRun | Loop
 )  # fmt: skip

@@ -68,6 +68,14 @@ class Report:
         """Keep that the thing `name`, of a kind, is left out."""
         self.left.setdefault(kind, []).append(name)
 
+    def read(self, kind: str, name: str) -> None:
+        """Something that was left out is read after all."""
+        those = self.left.get(kind, [])
+        if name in those:
+            those.remove(name)
+            if not those:
+                del self.left[kind]
+
     def lines(self) -> tuple[str, ...]:
         """What is left out, one line a kind."""
         lines = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from eomc.base.spatial import apply, cross, dot, plus, point_inertia, six, transposed
@@ -66,11 +66,15 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class Reader:
-    """What every step of reading needs: settings, default classes, and where faults go."""
+    """What every step of reading needs: settings, default classes, and where faults go.
+
+    sites: those with names, found on the way.
+    """
 
     settings: Settings
     classes: Classes
     report: Report
+    sites: dict[str, Placed] = field(default_factory=dict)
 
     def given(self, placed: Placed, kind: str) -> Given:
         """What a tag has, with what its class gives: its own, or the childclass around it."""

@@ -10,6 +10,7 @@ from eomc.base.errors import SceneError
 from eomc.base.spatial import plus, scaled, six
 from eomc.robots.mjcf import masses
 from eomc.robots.mjcf.actuators import actuated, started
+from eomc.robots.mjcf.equality import constrained
 from eomc.robots.mjcf.file import Given, Report, classes_of, load, settings_of, unknown
 from eomc.robots.mjcf.joints import Found, fresh, joint_of, named
 from eomc.robots.mjcf.masses import STILL, Mass, Placed, Pose, Reader
@@ -26,7 +27,6 @@ GENERATORS = {"replicate", "composite", "flexcomp", "attach", "plugin", "skin"}
 SECTIONS = {
     "asset": "assets",
     "tendon": "tendons",
-    "equality": "equality constraints (loops, couplings)",
     "contact": "contact pairs and exclusions",
     "sensor": "sensors",
     "custom": "custom data",
@@ -34,7 +34,7 @@ SECTIONS = {
     "deformable": "deformables",
 }
 SETTINGS = {"visual", "statistic", "size"}  # of MuJoCo's viewer and memory; never of the motion
-READ = {"compiler", "option", "default", "worldbody", "actuator", "keyframe"}
+READ = {"compiler", "option", "default", "worldbody", "equality", "actuator", "keyframe"}
 
 
 def read(path: str | Path, include: bool = False) -> Robot:
@@ -59,7 +59,8 @@ def read(path: str | Path, include: bool = False) -> Robot:
         raise SceneError(report.faults)
     settings = settings_of(root, report)
     reader = Reader(settings, classes_of(root, report), report)
-    bodies, joints = _bodies(root, reader)
+    bodies, joints, anchors = _bodies(root, reader)
+    loops, couplings = constrained(root, _moving(bodies, joints), joints, anchors, reader)
     joints, drives = actuated(root, joints, reader)
     joints = started(root, joints, report)
     if settings.totalmass > 0:
@@ -74,6 +75,8 @@ def read(path: str | Path, include: bool = False) -> Robot:
         gravity=settings.gravity,
         bodies=_moving(bodies, joints),
         drives=drives,
+        loops=loops,
+        couplings=couplings,
         left_out=report.lines(),
     )
 
@@ -90,10 +93,11 @@ def _geom_left_out(placed: Placed, reader: Reader) -> None:
 # ---- the tree
 
 
-def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
+def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], dict[str, Vector]]:
     """The bodies, parents first and in the file's order, and the joints in the order of qpos.
 
-    Each joint is that of one body, in the order of the bodies that move.
+    Each joint is that of one body, in the order of the bodies that move. The third is where the
+    frames of bodies stand in those of the file.
     """
     report, settings = reader.report, reader.settings
     worlds = list(root.each("worldbody"))
@@ -114,6 +118,7 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
         reader.own([*worlds, root][0]).fault("there is no <body> in <worldbody>")
     bodies: list[RobotBody] = []
     joints: list[Found] = []
+    anchors: dict[str, Vector] = {}
     seen: dict[str, set[str]] = {"body": {WORLD}, "joint": set()}
 
     def called(tag: Tag, kind: str, otherwise: str) -> str:
@@ -154,6 +159,7 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
         chain, own, anchor = _chain(name, parent, still, pose, own, mass, names["body"], report)
         seen["body"].update(body.name for body in chain)
         bodies += chain
+        anchors[name] = anchor
         joints += own
         back = Pose(scaled(anchor, -1.0), IDENTITY)
         waiting += [
@@ -161,7 +167,7 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found]]:
             for p in reversed(inner)
             if p.tag.kind == "body"
         ]
-    return bodies, named(joints)
+    return bodies, named(joints), anchors
 
 
 def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Placed]:
@@ -184,6 +190,8 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
         elif inner.kind in {"body", "joint", "freejoint", "geom", "inertial"}:
             found.append(placed)
         elif inner.kind in ORNAMENTS:
+            if inner.kind == "site" and name:
+                reader.sites[name] = placed
             report.leave(f"{inner.kind}s", name)
         elif inner.kind in GENERATORS:
             report.leave(f"<{inner.kind}> and all that it adds, masses too", name or f"in {body}")

@@ -1,0 +1,65 @@
+"""Constraints on a tape: what is zero, its Jacobian A, and what A qdd has to be.
+
+A row is phi(q, t) = 0, of rate A qd + phi_t, or psi(q, qd, t) = 0, linear in qd, its own rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import sympy
+from sympy import Expr, S
+
+from eomc.derive.energies import Energies
+from eomc.derive.ldl import Rows, Vector
+from eomc.model.system import System, t
+
+DROPPED = {"double": sympy.Float("1e-9"), "float": sympy.Float("1e-5")}
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """Rows of a system, on the tape of its equations: m of them, holonomic ones first.
+
+    values (m,); jacobian (m, nq); rates (m,): A qd + phi_t, and psi; rest (m,): what A qdd lacks to
+    the rate of `rates`. moved (m,): what A qd is where `rates` are 0, by what time alone moves.
+    holonomic: how many are; solved: those that accelerations are solved for,
+    which leaves redundant ones out. drop: a pivot that is this part of what it was, or less, tells
+    a row that depends on others in this position: nothing is solved for it there.
+    """
+
+    values: Vector
+    jacobian: Rows
+    rates: Vector
+    rest: Vector
+    moved: Vector
+    holonomic: int
+    solved: tuple[int, ...]
+    drop: Expr
+
+
+def constraints(system: System, e: Energies) -> Constraints | None:
+    """The rows of a system whose energies are on the tape of e; None where it has none."""
+    if not system.constraints:
+        return None
+    tape, q, qd = e.tape, system.q, system.qd
+    along = {**dict(zip(q, qd, strict=True)), t: S.One}
+    count = sum(c.holonomic for c in system.constraints)
+    phi, psi = e.rows[:count], e.rows[count:]
+    rates = [*tape.forward(phi, along), *psi]
+    by = [tape.gradient([(row, S.One)], q) for row in phi]
+    by += [tape.gradient([(row, S.One)], qd) for row in psi]
+    still = dict.fromkeys(qd, S.Zero)
+    moved = [*tape.forward(phi, {t: S.One}), *tape.substitute(psi, still)]
+    solved = tuple(k for k, c in enumerate(system.constraints) if not c.redundant)
+    return Constraints(
+        tuple(e.rows), tuple(map(tuple, by)), tuple(rates), tuple(tape.forward(rates, along)),
+        tuple(tape.scaled(S.NegativeOne, x) for x in moved), count, solved,
+        DROPPED[system.run.real],
+    )  # fmt: skip
+
+
+def chosen(some: Sequence[Expr], rows: Constraints) -> list[Expr]:
+    """Those of the rows that are solved for."""
+    return [some[k] for k in rows.solved]

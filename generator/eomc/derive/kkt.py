@@ -1,0 +1,182 @@
+"""Accelerations under constraints: the KKT matrix by L diag(d) L^T, unrolled, in a safe order.
+
+    D a - A^T lambda = b        [D  A^T] [   a   ]   [b]
+    A a              = c        [A   0 ] [-lambda] = [c]
+
+A row's pivot is taken once all coordinates that the row reads are gone, and never earlier: then it
+is one of -A D^-1 A^T over those, which is as safe as the Schur complement, and sparse. The order is
+fixed at generation. A row's pivot that is a billionth of what it was, or less, is dropped: 0 stands
+for its inverse, its multiplier is 0. That is right where a row depends on others in some positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import sympy
+from sympy import Expr, S
+
+from eomc.derive.constraints import Constraints, chosen
+from eomc.derive.ldl import Pairs, Rows, Solution, Vector
+from eomc.derive.tape import Tape
+from eomc.model.symbols import pivot_inverse
+
+Pattern = Mapping[int, set[int]]
+
+
+@dataclass(frozen=True)
+class Factors:
+    """L diag(d) L^T of a KKT matrix: coordinates first, then rows.
+
+    steps: in their order what is eliminated, the inverse of its pivot, and L below it. pivots: of
+    coordinates, all positive, paired with the entries they were. inverses: of the rows' pivots, 0
+    where one is dropped.
+    """
+
+    tape: Tape
+    count: int
+    steps: tuple[tuple[int, Expr, Mapping[int, Expr]], ...]
+    pivots: Pairs
+    inverses: Vector
+
+    def solve(
+        self, b: Sequence[Expr], c: Sequence[Expr], short: Callable[[Expr], Expr]
+    ) -> tuple[Vector, Vector]:
+        """a and lambda. short: rewrites what elimination makes."""
+        tape, y = self.tape, [*b, *c]
+        for k, _, factors in self.steps:
+            for i, factor in factors.items():
+                y[i] = short(tape.define(y[i] - factor * y[k]))
+        x: dict[int, Expr] = {}
+        for k, inverse, factors in reversed(self.steps):
+            rest = [tape.define(-factor * x[i]) for i, factor in factors.items()]
+            x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *rest))
+        n, m = self.count, len(self.steps) - self.count
+        return tuple(x[i] for i in range(n)), tuple(tape.define(-x[n + r]) for r in range(m))
+
+
+def factors(
+    tape: Tape,
+    D: Rows,
+    A: Rows,
+    drop: Expr,
+    short: Callable[[Expr], Expr] = lambda atom: atom,
+) -> Factors:
+    """The KKT matrix of D and A, factored. drop: the part of itself below which a pivot is none."""
+    n = len(D)
+    M = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
+    for r, row in enumerate(A):
+        for j, entry in enumerate(row):
+            if entry != 0:
+                M[n + r, j] = M[j, n + r] = entry
+    order = _order(_pattern(M, n + len(A)), n, tape, M)
+    whole: dict[int, Expr] = {}  # of rows: what coordinates alone have made of the pivot
+    left, steps, pivots = set(order), [], []
+    inverses: dict[int, Expr] = {}
+    for k in order:
+        left.remove(k)
+        below = {i: M[i, k] for i in sorted(left) if (i, k) in M}
+        if k < n:
+            pivots.append((M[k, k], tape.define(D[k][k])))
+            inverse = tape.define(1 / M[k, k])
+        else:
+            pivot = tape.define(-M.get((k, k), S.Zero))
+            limit = tape.define(drop * whole[k]) if pivot != whole.get(k, S.Zero) else S.Zero
+            inverses[k] = tape.define(pivot_inverse(pivot, limit))
+            inverse = tape.define(-inverses[k])
+        found = {i: tape.define(a * inverse) for i, a in below.items()}
+        for i, factor in found.items():
+            for j, a in below.items():
+                if j <= i:
+                    part = tape.define(-factor * a)
+                    M[i, j] = M[j, i] = short(tape.define(M.get((i, j), S.Zero) + part))
+                    if i == j >= n and k < n:
+                        whole[i] = short(tape.define(whole.get(i, S.Zero) - part))
+        steps.append((k, inverse, found))
+    rows = tuple(inverses[n + r] for r in range(len(A)))
+    return Factors(tape, n, tuple(steps), tuple(pivots), rows)
+
+
+def _pattern(M: Mapping[tuple[int, int], Expr], size: int) -> Pattern:
+    return {i: {j for j in range(size) if j != i and (i, j) in M} for i in range(size)}
+
+
+def _order(pattern: Pattern, n: int, tape: Tape, M: Mapping[tuple[int, int], Expr]) -> list[int]:
+    """The order with the fewest operations: rows as soon as they are ready, or at the end."""
+    stage = [tape.stage_of(M[i, i]) if i < n and (i, i) in M else 0 for i in range(len(pattern))]
+    found = []
+    for early in (True, False):
+        left = {i: set(to) for i, to in pattern.items()}
+        order, work = list[int](), 0
+        while left:
+            ready = [i for i in left if i < n]
+            if early or not ready:
+                ready += [i for i in left if i >= n and not any(j in left for j in pattern[i])]
+            k = min(ready, key=lambda i: (len(left[i]), stage[i], i))
+            row = left.pop(k)
+            work += len(row) * (len(row) + 6) + 2
+            for i in row:
+                left[i] = (left[i] | row) - {i, k}
+            order.append(k)
+        found.append((work, order))
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def accelerations(
+    tape: Tape,
+    D: Rows,
+    b: Sequence[Expr],
+    rows: Constraints,
+    short: Callable[[Expr], Expr] = lambda atom: atom,
+) -> Solution:
+    """qdd and the multipliers of all rows, 0 of redundant ones."""
+    A = tuple(chosen(rows.jacobian, rows))
+    c = [tape.scaled(S.NegativeOne, x) for x in chosen(rows.rest, rows)]
+    D, b = with_mass(tape, D, b, A, c)
+    made = factors(tape, D, A, rows.drop, short)
+    a, some = made.solve(b, c, short)
+    multipliers = [S.Zero] * len(rows.values)
+    for k, x in zip(rows.solved, some, strict=True):
+        multipliers[k] = x
+    order = tuple(k for k, _, _ in made.steps if k < len(D))
+    return Solution(tape, a, order, made.pivots, "D", tuple(multipliers))
+
+
+def with_mass(
+    tape: Tape, D: Rows, b: Sequence[Expr], A: Rows, c: Sequence[Expr]
+) -> tuple[Rows, Sequence[Expr]]:
+    """D + A^T A and b + A^T c where a coordinate has no inertia of its own, as D and b elsewhere.
+
+    The accelerations and multipliers are the same, exactly: A a = c.
+    """
+    n = range(len(D))
+    if all(D[i][i] != 0 for i in n):
+        return D, b
+
+    def added(first: Expr, i: int, other: Sequence[Expr]) -> Expr:
+        parts = [tape.times(row[i], x) for row, x in zip(A, other, strict=True)]
+        return tape.total([first, *parts])
+
+    more = tuple(tuple(added(D[i][j], i, [row[j] for row in A]) for j in n) for i in n)
+    return more, [added(b[i], i, c) for i in n]
+
+
+def correction(
+    tape: Tape, D: Rows, rows: Constraints, q: Sequence[sympy.Symbol]
+) -> tuple[Vector, Pairs]:
+    """What is added to q and qd so that rows hold, and the inverses of the rows' pivots.
+
+    Newton's step in the metric of D: the least change dq with A dq = -phi, then that of qd with
+    rates that are taken at q + dq, to the first order. Second: the pivots, as `Solution` has them.
+    """
+    n, A = len(D), tuple(chosen(rows.jacobian, rows))
+    D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A))
+    made = factors(tape, D, A, rows.drop)
+    positions = [S.Zero if k >= rows.holonomic else -rows.values[k] for k in rows.solved]
+    zero, same = [S.Zero] * n, lambda atom: atom
+    dq, _ = made.solve(zero, positions, same)
+    moved = tape.forward(rows.rates, dict(zip(q, dq, strict=True)))
+    rates = [tape.total([x, y]) for x, y in zip(rows.rates, moved, strict=True)]
+    dqd, _ = made.solve(zero, [tape.scaled(S.NegativeOne, rates[k]) for k in rows.solved], same)
+    return (*dq, *dqd, *made.inverses), made.pivots

@@ -1,0 +1,81 @@
+"""Steps that end on the constraints, for both forms of C."""
+
+from __future__ import annotations
+
+from eomc.emit.c_function import CFunction
+from eomc.emit.c_names import Target
+from eomc.emit.functions import Functions
+from eomc.emit.plain.constraint_views import (
+    Corrected,
+    Project,
+)
+from eomc.emit.plain.parts import (
+    Computed,
+)
+
+APART = 1e-12  # of the squares of all coordinates together: a coordinate that is less is 0
+
+
+def width(target: Target) -> int:
+    """Numbers of a correction: of q, of qd, of the rows' pivots."""
+    return len(target.program["correction"].outputs)
+
+
+def view(
+    functions: Functions, correction: Computed, function: CFunction, call: str, *,
+    lane: str = "", L: str = "", mask: str = "", extent: str = "", increments: bool = False,
+) -> Corrected:  # fmt: skip
+    """The view for one form and lane."""
+    target = functions.target
+    return Corrected(
+        PREFIX=functions.PREFIX,
+        real=functions.real,
+        L=L,
+        lane=lane or functions.real,
+        mask=mask,
+        extent=extent or functions.NQ,
+        size=width(target),
+        increments=increments,
+        correction=correction,
+        function=function,
+        call=call,
+        near=target.literal(8 * target.real.epsilon),
+        apart=target.literal(APART),
+    )
+
+
+def plain(functions: Functions) -> Corrected | None:
+    """That of the plain form, where there are constraints."""
+    correction = functions.correction
+    if correction is None:
+        return None
+    call = correction.function.call(q="r", qd="v")
+    return view(functions, correction, functions.corrected, call)
+
+
+def project(functions: Functions) -> Project:
+    """The view of `project`, for either form."""
+    target, public = functions.target, functions.public
+    end, eps = target.real.function_suffix, target.real.epsilon
+    D, A, phi, rates = (
+        public.evaluation(name)
+        for name in ("D", "constraint_jacobian", "constraints", "constraint_rates")
+    )
+    return Project(
+        **functions.names,
+        fabs=f"fabs{end}",
+        sqrt=f"sqrt{end}",
+        holonomic=sum(c.holonomic for c in target.system.constraints),
+        function=public.project,
+        call_D=D.call(q="at"),
+        call_A=A.call(q="at"),
+        call_phi=phi.call(phi="lack", q="at", qd="moving"),
+        call_rates=rates.call(rates="lack", q="at", qd="moving"),
+        dependent=target.literal(64 * eps),
+        small=target.literal((64 * eps) ** 2),
+        enough=target.literal((4096 * eps) ** 2),
+        loose=target.literal(4096 * eps),
+        rounded=target.literal(4 * eps),
+        redundant=tuple(k for k, c in enumerate(target.system.constraints) if c.redundant),
+        tiny=target.literal(1e-30),
+    )

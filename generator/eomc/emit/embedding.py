@@ -1,0 +1,37 @@
+"""What lies beside the C for those who embed it: CMake and pkg-config files, a table of costs."""
+
+from __future__ import annotations
+
+from eomc.base.version import __version__
+from eomc.emit.c_names import Target
+from eomc.emit.evaluations import KINDS, source
+from eomc.emit.heading import stamp
+from eomc.emit.views import CMake, Costs, Counted, PkgConfig, Stepped
+from eomc.integrators.tableaux import METHODS
+
+
+def cmake(target: Target) -> CMake:
+    """The view of CMakeLists.txt."""
+    return CMake(tuple(stamp(target)), target.prefix, target.PREFIX, __version__)
+
+
+def pkg_config(target: Target) -> PkgConfig:
+    """The view of NAME.pc.in."""
+    return PkgConfig(tuple(stamp(target)), target.prefix, __version__)
+
+
+def costs(target: Target) -> Costs:
+    """The view of costs.txt: the functions of the header in its order, then the methods' steps."""
+    names = (*KINDS, "acceleration", "linearization")
+    functions = tuple(Counted(f.name, f.cost) for name in names if (f := source(target, name)))
+    steps = tuple(Stepped(f"{name}_step", _step(name)) for name in target.system.run.methods)
+    width = max(map(len, [*(f.name for f in functions), *(m.name for m in steps)]))
+    return Costs(tuple(stamp(target)), target.prefix, width, functions, steps)
+
+
+def _step(name: str) -> str:
+    """What one step calls."""
+    m = METHODS[name]
+    if m.implicit:
+        return f"{m.stages} accelerations an iteration, until the stages settle"
+    return f"{m.stages} accelerations" if m.stages > 1 else "1 acceleration"

@@ -1,0 +1,53 @@
+"""Steps of the fast form that end on the constraints, over a lane."""
+
+from __future__ import annotations
+
+from eomc.emit import c_function as c
+from eomc.emit import corrected
+from eomc.emit.c_function import CArgument, CFunction
+from eomc.emit.c_names import sentence
+from eomc.emit.fast.lanes import NOINLINE, Lane
+from eomc.emit.functions import Functions
+from eomc.emit.plain.constraint_views import Corrected
+from eomc.emit.plain.parts import Computed
+from eomc.program.program import TIME
+
+
+def view(functions: Functions, lane: Lane) -> Corrected:
+    """The view of a lane."""
+    made = _correction(lane)
+    call = made.function.call(q="at", qd="moving")
+    return corrected.view(
+        functions, made, projected(lane), call, lane=lane.real.name, L=lane.end, mask=lane.mask,
+        extent=lane.extent, increments=True,
+    )  # fmt: skip
+
+
+def projected(lane: Lane) -> CFunction:
+    """What a step adds, so changed that it ends on the constraints."""
+    out = tuple(c.filled(lane.real.name, n) for n in "rv")
+    told = () if lane.name else (CArgument("int *", "singular"),)
+    return CFunction(
+        f"{lane.prefix}_projected{lane.end}",
+        lane.mask if lane.name else f"{lane.prefix}_status",
+        (*out, *map(lane.argument, _placed(lane)), *told),
+        qualifier=lane.qualifiers[NOINLINE],
+    )
+
+
+def _correction(lane: Lane) -> Computed:
+    """What q and qd lack for the constraints to hold."""
+    function = lane.target.program["correction"]
+    own = {n: c.member("c", n) for n in lane.accelerations.own}
+    places = [f"d[{k}]" for k in range(len(function.outputs))]
+    return lane.computed(
+        function, "projection", c.filled(lane.real.name, "d"), places, doc=sentence(function),
+        takes=_placed(lane), constants=own,
+    )  # fmt: skip
+
+
+def _placed(lane: Lane) -> tuple[str, ...]:
+    """What constraints are read from: q, qd, t, c, as far as they are."""
+    timed = TIME in lane.target.program["correction"].uses
+    names = ("q", "qd", *(["t"] if timed else []), "c")
+    return tuple(n for n in lane.there if n in names)

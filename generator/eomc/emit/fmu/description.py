@@ -1,0 +1,112 @@
+"""modelDescription.xml of both versions: variables, units, what depends on what."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from eomc.base.texts import FreeText
+from eomc.base.version import __version__
+from eomc.emit.c_names import Target
+from eomc.emit.fmu import units
+from eomc.emit.fmu.dependencies import Dependencies, Names
+from eomc.emit.fmu.variables import Variable, Variables, has_signals, variables
+from eomc.emit.fmu.views import Attributes, Described, Description2, Description3, Unknown
+from eomc.program.program import TIME
+
+
+def view(
+    target: Target, version: int, token: str, sources: Sequence[str]
+) -> Description2 | Description3:
+    """The view for FMI 2 or 3. sources: the files to be compiled."""
+    s, known = target.system, variables(target)
+    behind = Dependencies(target.program, has_signals(target))
+    structure = _Structure(target, known, version)
+    rates = [*zip(known.der_q, (frozenset({x.name}) for x in s.qd), strict=True)]
+    rates += zip(known.der_qd, behind.accelerations, strict=True)
+    outputs = [
+        (v, frozenset({x.name})) for v, x in zip((*known.q, *known.qd), (*s.q, *s.qd), strict=True)
+    ]
+    computed = [*zip(known.outputs, behind.outputs, strict=True)]
+    about = [("description", s.title), ("version", s.digest[:16])]
+    experiment = [("startTime", "0"), ("stopTime", repr(s.run.duration))]
+    tolerance, h = s.run.tolerance, repr(s.run.h)
+    experiment += [("stepSize", h)] if tolerance is None else [("tolerance", repr(tolerance))]
+    common: dict[str, Any] = {
+        "prefix": target.prefix,
+        "token": token,
+        "tool": f"eomc {__version__}",
+        "about": _free(about),
+        "derivatives": "true" if s.run.sloped else "false",
+        "experiment": _free(experiment),
+        "units": _units(known),
+        # that of FMI 2 needs no time, and some importers take it for a fault
+        "variables": tuple(_described(v, version) for v in known if v.reference or version == 3),
+        "outputs": structure.unknowns([*outputs, *computed]),
+        "rates": structure.unknowns(rates),
+        "initial": structure.unknowns([*rates, *computed], initial=True),
+    }
+    if version == 2:
+        return Description2(**common, indicators=len(known.indicators), sources=tuple(sources))
+    crossings = zip(known.indicators, behind.events, strict=True)
+    return Description3(**common, crossings=structure.unknowns(crossings))
+
+
+class _Structure:
+    """Names of a program's values to references of variables."""
+
+    def __init__(self, target: Target, known: Variables, version: int) -> None:
+        s = target.system
+        found = {x.name: v for x, v in zip((*s.q, *s.qd), (*known.q, *known.qd), strict=True)}
+        found |= {x.name: v for x, v in zip(s.inputs, known.inputs, strict=True)}
+        if version == 3:
+            found[TIME] = known.time
+        self._moving = {n: (v.reference,) for n, v in found.items()}
+        found |= {p.name: v for p, v in zip(s.parameters, known.parameters, strict=True)}
+        self._all: dict[str, tuple[int, ...]] = {n: (v.reference,) for n, v in found.items()}
+        for i in s.inputs:  # which may follow their signals
+            self._all[i.name] += tuple(v.reference for v in known.switches)
+
+    def unknowns(
+        self, pairs: Iterable[tuple[Variable, Names]], initial: bool = False
+    ) -> tuple[Unknown, ...]:
+        """What depends on what; initial: before the start, when it does on parameters too."""
+        of = self._all if initial else self._moving
+        return tuple(
+            Unknown(v.reference, tuple(sorted({r for n in names for r in of.get(n, ())})))
+            for v, names in pairs
+        )
+
+
+def _free(pairs: Iterable[tuple[str, str]]) -> Attributes:
+    return tuple((key, FreeText(text)) for key, text in pairs if text)
+
+
+def _units(known: Variables) -> tuple[Described, ...]:
+    """Those that are used and whose meaning is plain."""
+    found = {v.unit: meaning for v in known if (meaning := units.parsed(v.unit)) is not None}
+    return tuple(
+        Described("Unit", _free([("name", text)]), _free(meaning.attributes))
+        for text, meaning in found.items()
+    )
+
+
+def _described(v: Variable, version: int) -> Described:
+    unit = v.unit if units.parsed(v.unit) is not None else ""
+    # an input's start is always exact, and FMI 2 forbids to say so
+    initial = "" if v.causality == "input" else v.initial
+    outer = _free(
+        [
+            ("name", v.name),
+            ("valueReference", str(v.reference)),
+            ("description", v.words),
+            ("causality", v.causality),
+            ("variability", v.variability),
+            ("initial", initial),
+        ]
+    )
+    derivative = "" if v.derivative is None else str(v.derivative)
+    inner = _free([("unit", unit), ("start", v.start), ("derivative", derivative)])
+    if version == 2:
+        return Described("Boolean" if v.boolean else "Real", outer, inner)
+    return Described("Boolean" if v.boolean else "Float64", outer, inner)

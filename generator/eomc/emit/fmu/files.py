@@ -1,0 +1,74 @@
+"""All that a unit of FMI is made of but its binary, as text by the name that it has inside."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from eomc.base import resources
+from eomc.emit import c_function
+from eomc.emit.c_expression import REALS
+from eomc.emit.c_names import Target
+from eomc.emit.c_safe_names import borne
+from eomc.emit.fmu import description, scene
+from eomc.emit.fmu.views import BuildDescription, View
+from eomc.emit.plain import steppers
+from eomc.emit.plain.views import View as PlainView
+from eomc.program.outline import weight
+from eomc.program.program import Program
+
+VERSIONS = (2, 3)
+# of the standard, and what is written by hand over it
+_HEADERS = {
+    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
+    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
+}
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit of FMI 2 or 3. sources: the files below sources/ that are compiled.
+
+    operations: how many the scene's functions have, which tells how long a compiler takes.
+    """
+
+    name: str
+    version: int
+    files: Mapping[str, str]
+    sources: tuple[str, ...]
+    operations: int
+
+
+def unit(
+    program: Program, version: int, show: Callable[[View], str], plain: Callable[[PlainView], str]
+) -> Unit:
+    """The unit of a program. show, plain: a view by its template.
+
+    Same program, same text.
+    """
+    safe, written = borne(program)
+    target = Target(safe, REALS[safe.system.run.real], written)
+    name = target.prefix
+    sources = (f"{name}.c", f"fmi/fmi{version}.c")
+
+    def made(token: str) -> dict[str, str]:
+        files = {
+            "modelDescription.xml": show(description.view(target, version, token, sources)),
+            "sources/fmi/scene.h": c_function.laid_out(show(scene.view(target, token))),
+        }
+        if version == 3:
+            files["sources/buildDescription.xml"] = show(BuildDescription(name, sources))
+        return files | texts
+
+    texts = {f"sources/{file}": text for file, text in steppers.files(safe, plain).items()}
+    texts |= {
+        f"sources/fmi/{file}": resources.text("csrc", f"fmi/{file}")
+        for file in (*_HEADERS[version], f"fmi{version}.c", "unit.h")
+    }
+    texts["documentation/licenses/fmi-headers.txt"] = resources.text("csrc", "fmi/LICENSE.txt")
+    whole = "\0".join(f"{file}\0{text}" for file, text in sorted(made("").items()))
+    digest = hashlib.sha256(whole.encode(errors="surrogateescape")).hexdigest()
+    token = "-".join((digest[:8], digest[8:12], digest[12:16], digest[16:20], digest[20:32]))
+    operations = sum(map(weight, safe.functions.values()))
+    return Unit(name, version, made(token), sources, operations)

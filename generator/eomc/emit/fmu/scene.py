@@ -1,0 +1,65 @@
+"""C between a scene and the hand-written layer: its functions with one signature in every scene."""
+
+from __future__ import annotations
+
+from eomc.base.texts import FreeText
+from eomc.emit import adaptive, heading
+from eomc.emit.c_names import Target
+from eomc.emit.evaluations import source, takes_qdd
+from eomc.emit.events import ACTIONS, DIRECTIONS
+from eomc.emit.fmu.variables import input_starts
+from eomc.emit.fmu.views import SceneCalls, SceneEvent
+from eomc.emit.public import Public
+
+ENERGIES = ("kinetic_energy", "potential_energy", "energy")
+STEPS = 10_000  # of one call of adaptive steps
+
+
+def view(target: Target, token: str) -> SceneCalls:
+    """The view of a scene. token: what modelDescription.xml says too."""
+    s, public = target.system, Public(target)
+    by_tolerance = s.run.tolerance is not None
+    method = s.run.methods[0]
+    asked = {name: _called(target, name) for name in (*ENERGIES, "outputs", "events", "jumps")}
+    kept = adaptive.METHOD.name + "_adaptive" if by_tolerance else method
+    return SceneCalls(
+        title=FreeText(s.title),
+        stamp=heading.stamp(target)[0],
+        token=token,
+        prefix=target.prefix,
+        PREFIX=target.PREFIX,
+        real=target.real.name,
+        h=repr(s.run.h),
+        tolerance=repr(s.run.tolerance or 0.0),
+        memory=f"{target.prefix}_{kept}_memory",
+        inputs=tuple(map(target.literal, input_starts(target))),
+        parameters=tuple(p.name for p in s.parameters),
+        output_count=len(s.outputs),
+        events=tuple(
+            SceneEvent(e.name, DIRECTIONS[e.direction], ACTIONS.index(e.action)) for e in s.events
+        ),
+        feedback=target.signal_state,
+        solved=bool(asked["outputs"]) and takes_qdd(target, "outputs"),
+        acceleration=public.acceleration.call(),
+        signal=_called(target, "signal"),
+        outputs=asked["outputs"],
+        energies=tuple(asked[name] for name in ENERGIES),
+        values=asked["events"],
+        jumps=asked["jumps"],
+        run="" if by_tolerance else public.run(method).call(
+            h="(unitReal)unitStep", u_stride="0", every="0", q_rows="NULL", qd_rows="NULL",
+            status="&status",
+        ),
+        step="" if by_tolerance else public.step(method).call(),
+        adaptive=public.adaptive(adaptive.METHOD.name).call(
+            h_most="0", steps=str(STEPS), times="NULL", count="0", t_rows="NULL", q_rows="NULL",
+            qd_rows="NULL", room="unitRoom", status="&status",
+        ) if by_tolerance else "",
+        linearization=public.linearization.call() if s.run.sloped else "",
+        output_slopes=_called(target, "output_slopes"),
+    )  # fmt: skip
+
+
+def _called(target: Target, name: str) -> str:
+    """The call of an evaluation function, "" where the scene has none."""
+    return Public(target).evaluation(name).call() if source(target, name) is not None else ""

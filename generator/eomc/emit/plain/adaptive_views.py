@@ -1,0 +1,127 @@
+"""What the templates of adaptive steps and events ask for, in both forms of C: a view each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from eomc.emit.c_function import CFunction
+from eomc.emit.plain.parts import Named
+
+
+@dataclass(frozen=True)
+class Adaptive:
+    """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
+
+    method: what its C names begin with. total: the sum of x[0], ... over the stages. powers, last,
+    before: from accelerations at the stages, one a row, to their polynomial's powers, and to its
+    parts in the last two of Legendre's. most: sweeps of a step. lanes: before loops over stages.
+    project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/adaptive.c"
+    prefix: str
+    PREFIX: str
+    real: str
+    title: str
+    method: str
+    extent: str
+    stages: int
+    f: str
+    fabs: str
+    sqrt: str
+    eps: str
+    tiny: str
+    most: int
+    c: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    lanes: str
+    total: str
+    powers: tuple[str, ...]
+    last: tuple[str, ...]
+    before: tuple[str, ...]
+    timed: bool
+    events: bool
+    project: str
+    whole: bool
+    settle: CFunction
+    sweep: str
+    step: CFunction
+    start: str
+    settled: str
+    within: CFunction
+    settled_within: str
+
+
+@dataclass(frozen=True)
+class Events(Named):
+    """c/events.c.jinja: functions that find events in an adaptive step, and calls in them.
+
+    samples: the parts of a step at which events are looked at, nodes; slopes: of the polynomial
+    through values there. busy: the most events in one step; apart, near, close: parts of a step;
+    chance: of the time between jumps, below which the next one has come by chance.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/events.c"
+    method: str
+    fabs: str
+    sqrt: str
+    eps: str
+    tiny: str
+    samples: int
+    nodes: tuple[str, ...]
+    slopes: tuple[str, ...]
+    stages: int
+    once: tuple[str, ...]
+    twice: tuple[str, ...]
+    directions: tuple[int, ...]
+    actions: tuple[int, ...]
+    jumps: bool
+    busy: int
+    apart: str
+    near: str
+    close: str
+    chance: str
+    width: str
+    looked: CFunction
+    values: str
+    bracketed: CFunction
+    crossing: CFunction
+    look_value: str
+    bracket: str
+    bracket_dip: str
+    happened: CFunction
+    cross: str
+    look_before: str
+    look_behind: str
+    inside: str
+    values_there: str
+    restart: CFunction
+    values_before: str
+    jump: str
+    values_after: str
+
+
+@dataclass(frozen=True)
+class AdaptiveRun(Named):
+    """c/adaptive_run.c.jinja: the loop over adaptive steps, rows and events."""
+
+    TEMPLATE: ClassVar[str] = "c/adaptive_run.c"
+    method: str
+    constants: bool
+    unread_p: bool
+    compute_constants: str
+    loosest: str
+    tightest: str
+    events: bool
+    busy: int
+    run: CFunction
+    advance: str
+    happen: str
+    restart: str
+    row: str
+    row_before: str
+    look: str
+    project_row: str
+    project_restart: str

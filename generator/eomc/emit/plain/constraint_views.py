@@ -1,0 +1,61 @@
+"""What the templates of constraints ask for, in both forms of C: one frozen view each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from eomc.emit.c_function import CFunction
+from eomc.emit.plain.parts import Computed, Named
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """c/corrected.c.jinja, for both forms of C: a step's end moved onto the constraints.
+
+    L, lane, mask: of the lane, L "" for one number. increments: whether r, v are what a step adds.
+    near, apart: squares of parts of a coordinate, and of all, beyond which a correction is large.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/corrected.c"
+    PREFIX: str
+    real: str
+    L: str
+    lane: str
+    mask: str
+    extent: str
+    size: int
+    increments: bool
+    correction: Computed
+    function: CFunction
+    call: str
+    near: str
+    apart: str
+
+
+@dataclass(frozen=True)
+class Project(Named):
+    """c/project.c.jinja, for both forms of C: a state moved onto the constraints, and calls in it.
+
+    dependent: the part of a row's square below which it depends on others; small: of the square of
+    q, where a change is rounding; enough: where what rows lack is; loose: of the terms of a rate;
+    rounded: the same of rows and rates, where a state is left as it is; redundant: rows that the
+    others imply.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/project.c"
+    fabs: str
+    sqrt: str
+    holonomic: int
+    function: CFunction
+    call_D: str
+    call_A: str
+    call_phi: str
+    call_rates: str
+    dependent: str
+    small: str
+    enough: str
+    loose: str
+    rounded: str
+    redundant: tuple[int, ...]
+    tiny: str

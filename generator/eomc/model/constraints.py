@@ -1,0 +1,166 @@
+"""Rows of constraints: those of positions, those linear in the rates, and what no row can be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import sympy
+from sympy import Expr, Symbol
+
+from eomc.model import loops
+from eomc.model.loops import Closed
+from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
+
+NEAR = 1e-9  # m, or rad: a row that is off by less is zero
+LONGEST = 80  # characters of a position that a message writes out
+
+NOTHING_MOVES = (
+    "has no coordinates or rates, so that no motion can make it zero: write what is to be zero, "
+    "such as x**2 + y**2 - l**2"
+)
+NOT_LINEAR = (
+    "is not linear in the rates: a row of rates is a sum of rates, each times a factor of "
+    "coordinates, t and parameters, as in x_dot*sin(psi) - y_dot*cos(psi); what is no such sum "
+    "is a force or a control law, in [forces]"
+)
+_DRIFTS = "is the rate of a position, and where rates alone are held, the position drifts: "
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How an expression depends on rates.
+
+    degree: 0, 1, or 2 for all that is not linear. moves: what else it varies with: 0 nothing, 1 the
+    time, 2 coordinates. exact: of degree 1, sums of rates and dot(...) with constant factors, and
+    functions of time: the rate of a position.
+    """
+
+    degree: int = 0
+    moves: int = 0
+    exact: bool = False
+
+
+_FIXED, _TIME, _POSITION, _RATE = Rates(), Rates(0, 1), Rates(0, 2), Rates(1, 2, True)
+_NONLINEAR = Rates(2, 2)
+
+
+class Dependence:
+    """How expressions depend on rates, definitions followed."""
+
+    def __init__(
+        self, coordinates: Iterable[Coordinate], definitions: Iterable[tuple[Symbol, Expr]]
+    ) -> None:
+        self.known: dict[Expr, Rates] = {t: _TIME}
+        for c in coordinates:
+            self.known |= {c.q: _POSITION, c.qd: _RATE}
+        for name, e in definitions:
+            self.known[name] = self.of(e)
+
+    def of(self, e: Expr) -> Rates:
+        """That of an expression over coordinates, rates, t, parameters and the definitions."""
+        found = self.known.get(e)
+        if found is None:
+            found = self._made(e, [self.of(part) for part in e.args])
+            self.known[e] = found
+        return found
+
+    def _made(self, e: Expr, parts: Sequence[Rates]) -> Rates:
+        degree = max((p.degree for p in parts), default=0)
+        moves = max((p.moves for p in parts), default=0)
+        if isinstance(e, dot):
+            (inside,) = parts
+            return (_FIXED, _TIME, _RATE)[inside.moves] if not inside.degree else _NONLINEAR
+        if degree == 0:
+            return Rates(0, moves)
+        if isinstance(e, sympy.Add):
+            exact = all(p.exact or (p.degree == 0 and p.moves < 2) for p in parts)
+            return Rates(degree, moves, exact and degree == 1)
+        if isinstance(e, sympy.Mul):
+            degree = sum(p.degree for p in parts)
+            factors = [p for p in parts if p.degree == 0]
+            still = all(p.moves == 0 for p in factors)
+            return Rates(min(degree, 2), moves, degree == 1 and still and self._exact(parts))
+        return _NONLINEAR
+
+    @staticmethod
+    def _exact(parts: Iterable[Rates]) -> bool:
+        return all(p.exact for p in parts if p.degree)
+
+
+class Rows:
+    """What rows are, and what is wrong with them, over a system's coordinates and definitions.
+
+    values: of the parameters. fault, doubt: called with a row and what is wrong with it.
+    """
+
+    def __init__(
+        self,
+        coordinates: Sequence[Coordinate],
+        definitions: Sequence[tuple[Symbol, Expr]],
+        values: Mapping[Symbol, float],
+        fault: Callable[[Constraint, str], None],
+        doubt: Callable[[Constraint, str], None],
+    ) -> None:
+        self.coordinates = coordinates
+        self.definitions = definitions
+        self.values = values
+        self.fault = fault
+        self.doubt = doubt
+        self.depends = Dependence(coordinates, definitions)
+
+    def sorted(self, rows: Iterable[Constraint]) -> tuple[Constraint, ...]:
+        """The rows, holonomic ones first, each told what it is."""
+        holonomic, others = [], []
+        for row in rows:
+            found = self.depends.of(row.formula)
+            if found.moves < 2:
+                self.fault(row, NOTHING_MOVES)
+            elif found.degree > 1:
+                self.fault(row, NOT_LINEAR)
+            elif found.degree == 0:
+                holonomic.append(row)
+            else:
+                if found.exact:
+                    self.doubt(row, _DRIFTS + _instead(row.formula, self.coordinates))
+                others.append(replace(row, holonomic=False))
+        return (*holonomic, *others)
+
+    def settled(self, closed: Closed) -> Closed:
+        """A loop without the rows that no coordinate changes; each is reported."""
+        kept, still = loops.settled(closed, self._fixed)
+        far = [(row, value) for row, value in still if not abs(value) <= NEAR]
+        for row, value in far:
+            why = f"can't close: its row {row.name} is {value:.6g} wherever its bodies move"
+            self.fault(row, f"{why}: check its points and axes")
+        if not kept.rows and not far:
+            self.fault(still[0][0], "its bodies do not move against each other: leave it out")
+        elif still and not far:
+            row, names = still[0][0], ", ".join(row.name for row, _ in still)
+            what = "a row that is" if len(still) == 1 else "rows that are"
+            why = f"has {what} zero wherever its bodies move, left out: {names}"
+            self.doubt(row, f"{why}; what they would carry is not determined, and counts as zero")
+        return kept
+
+    def _fixed(self, e: Expr) -> float | None:
+        """The value of what no coordinate changes; None of anything else."""
+        if self.depends.of(e).moves == 2:
+            return None
+        known: dict[Expr, Expr] = {name: sympy.Float(v) for name, v in self.values.items()}
+        for name, formula in needed(self.definitions, [e]):
+            known[name] = formula.xreplace(known)
+        value = e.xreplace(known).evalf()
+        return float(value) if value.is_number else math.inf  # of t: no such loop stays closed
+
+
+def _instead(rate: Expr, coordinates: Iterable[Coordinate]) -> str:
+    """What to write in place of the rate of a position."""
+    positions: Mapping[Expr, Expr] = {c.qd: c.q for c in coordinates}
+    terms = sympy.Add.make_args(rate)
+    plain = all(term.has(dot) or term.free_symbols & positions.keys() for term in terms)
+    position = rate.replace(dot, lambda e: e).xreplace(positions)
+    shown = str(position)
+    if not plain or len(shown) > LONGEST:
+        return "write the position itself, less its value at the start"
+    return f"write the position itself, {shown}, less its value at the start"

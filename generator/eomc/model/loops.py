@@ -1,0 +1,183 @@
+"""Joints that close loops: their rows over the bodies' frames, and what they do to a body.
+
+With p from the first body's point to the second's, a and u axes of the first and b of the second,
+a row is one of
+  p.e, along an axis of the world: both points meet;
+  p.u, across an axis of the first body: the second's point stays on a line;
+  a.b = 0: axes at right angles; such rows are regular where the joint is closed, and of a second
+  frame that is out by a small rotation d they are d along the axis that the row is named after;
+  (p.p - l^2)/2 = 0: the points stay l apart.
+Where the second body's point moves by dp and its frame rotates by dr, these change by dp.e, dp.u,
+dr.(b x a) and dp.p: each multiplier times what stands beside dp is a force on the second body at
+its point, beside dr a moment. The first body feels the opposite, at the same place. Rows a.b = 0
+hold after some other turns too: a reaction's branches are 1 where the joint is closed as is meant,
+and one of them is 0 or -1 elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from sympy import Expr, Float, S
+
+from eomc.base.spatial import apply, cross, dot, plus, product, scaled, transposed
+from eomc.model import exact
+from eomc.model.exact import ZERO, Matrix, Vector
+from eomc.model.symbols import Constraint, Reaction, needed, symbol, t
+from eomc.scene.assembly import Loop
+
+if TYPE_CHECKING:
+    from eomc.model.system import System
+
+
+@dataclass(frozen=True)
+class End:
+    """A body at a joint: the point in the world, and its frame's rotation."""
+
+    point: Vector
+    R: Matrix
+
+
+@dataclass(frozen=True)
+class _Pull:
+    """A row, and what a multiplier of one does to the second body: a force, a moment."""
+
+    row: Expr
+    force: Vector = ZERO
+    moment: Vector = ZERO
+
+
+@dataclass
+class Closed:
+    """A loop's rows and its reaction, which a gear has not."""
+
+    rows: list[Constraint]
+    reactions: list[Reaction] = field(default_factory=list)
+
+
+def close(loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length: Expr) -> Closed:
+    """The rows of one loop between bodies, and its reaction.
+
+    turned: how the second frame stands in the first when closed; length: of a distance, m.
+    """
+    first, second = ends
+    R = (product(first.R, turned), second.R)
+    p = plus(second.point, scaled(first.point, S.NegativeOne))
+    kinds = loop.rows(plane)
+    pulls = {**_of_points(p, length), **dict(_of_frames(*R))}
+    if loop.axes:
+        pulls |= _of_axes(loop.axes, plane, (first.R, second.R), p)
+    made, force, moment = list[Constraint](), ZERO, ZERO
+    for kind, name in kinds.items():
+        pull = pulls[kind]
+        unit = {"length": "m^2"}.get(kind, "m" if kind in "xyzuv" else "")
+        row = Constraint(name, pull.row, True, unit, loop.note, loop.name)
+        made.append(row)
+        force = plus(force, scaled(pull.force, row.multiplier))
+        moment = plus(moment, scaled(pull.moment, row.multiplier))
+    values = (*force[:2], moment[2]) if plane else (*force, *moment)
+    branches = [*_branches(kinds, *R)]
+    if "ru" in kinds:
+        a, b = (apply(end.R, _unit(axis)) for end, axis in zip(ends, loop.axes, strict=True))
+        branches.append(dot(a, b))
+    return Closed(made, [Reaction(loop.name, values, loop.note, tuple(branches))])
+
+
+def _of_points(p: Vector, length: Expr) -> dict[str, _Pull]:
+    """Rows of what is between two points."""
+    along = {kind: _Pull(p[k], force=exact.ONE[k]) for k, kind in enumerate("xyz")}
+    return {**along, "length": _Pull((dot(p, p) - length**2) / 2, force=p)}
+
+
+def _of_axes(
+    axes: Sequence[Sequence[float]], plane: bool, R: tuple[Matrix, Matrix], p: Vector
+) -> dict[str, _Pull]:
+    """Rows of an axis of each body."""
+    u, v, a = (apply(R[0], axis) for axis in across(axes[0], plane))
+    b = apply(R[1], _unit(axes[1]))
+    return {
+        "u": _Pull(dot(p, u), force=u),
+        "v": _Pull(dot(p, v), force=v),
+        "ru": _at_right_angles(scaled(v, S.NegativeOne), b),
+        "rv": _at_right_angles(u, b),
+        "cross": _at_right_angles(a, b),
+    }
+
+
+def _of_frames(first: Matrix, second: Matrix) -> Iterator[tuple[str, _Pull]]:
+    """Rows of frames that stand alike."""
+    x, y, z = transposed(first)
+    for kind, a, k in (("rx", z, 1), ("ry", x, 2), ("rz", y, 0)):
+        yield kind, _at_right_angles(a, transposed(second)[k])
+
+
+def _at_right_angles(a: Vector, b: Vector) -> _Pull:
+    """a.b of an axis of the first body and one of the second."""
+    return _Pull(dot(a, b), moment=cross(b, a))
+
+
+def _branches(kinds: Mapping[str, str], first: Matrix, second: Matrix) -> Iterator[Expr]:
+    """Cosines that are 1 where frames stand as they are meant, and elsewhere -1 or 0."""
+    cosines = [dot(a, b) for a, b in zip(transposed(first), transposed(second), strict=True)]
+    if "rx" in kinds:
+        yield from cosines
+    elif "rz" in kinds:
+        yield cosines[0]
+
+
+def _unit(axis: Sequence[float]) -> Vector:
+    x, y, z = exact.unit(axis)
+    return x, y, z
+
+
+def across(axis: Sequence[float], plane: bool) -> tuple[Vector, Vector, Vector]:
+    """Two directions across an axis, and it, right-handed; in the plane the first is in it."""
+    along = _unit(axis)
+    if plane:
+        return (-along[1], along[0], S.Zero), (S.Zero, S.Zero, S.One), along
+    k, aligned = exact.aligned_with(axis)
+    columns = transposed(aligned)
+    return columns[(k + 1) % 3], columns[(k + 2) % 3], along
+
+
+def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
+    """The row of a gear: the second coordinate less ratio times the first, less the offset."""
+    first, second = (symbol(name) for name in loop.coordinates)
+    row = second - ratio * first - offset
+    return Closed([Constraint(loop.name, row, True, "", loop.note, loop.name)])
+
+
+def closed_otherwise(system: System) -> Iterator[str]:
+    """The loops whose rows hold at the start as they do after some other turn than is meant."""
+    values: dict[Expr, Expr] = {c.q: Float(c.start) for c in system.coordinates}
+    values |= {p.symbol: Float(p.value) for p in system.parameters}
+    values[t] = S.Zero
+    asked = [b for r in system.reactions for b in r.branches]
+    for name, e in needed(system.definitions, asked):
+        values[name] = e.xreplace(values).evalf()
+    for r in system.reactions:
+        if any(float(b.xreplace(values)) < 0.5 for b in r.branches):
+            yield r.name
+
+
+def settled(
+    made: Closed, value: Callable[[Expr], float | None]
+) -> tuple[Closed, list[tuple[Constraint, float]]]:
+    """Without the rows that no motion changes, whose multipliers are zero; and these.
+
+    value: of an expression without anything that moves, else None.
+    """
+    rows, still = [], []
+    for row in made.rows:
+        fixed = value(row.formula)
+        if fixed is None:
+            rows.append(row)
+        else:
+            still.append((row, fixed))
+    zero = {row.multiplier: S.Zero for row, _ in still}
+    reactions = [
+        replace(r, values=tuple(S(e).xreplace(zero) for e in r.values)) for r in made.reactions
+    ]
+    return Closed(rows, reactions), still

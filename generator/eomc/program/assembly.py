@@ -1,0 +1,240 @@
+"""The assembled start of a system with constraints, and the rows that are solved for.
+
+What a scene gives is held; the rest moves least from its guess, in the metric of D, until the rows
+are zero. Newton's method goes there by small ways, so that a guess is closed on its own branch
+where it has one, and ends in forty digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from eomc.base.errors import Problem, SceneError
+from eomc.base.texts import listed
+from eomc.model import loops
+from eomc.model.closure import Closure, Move
+from eomc.model.system import System
+from eomc.program import contradictions
+from eomc.program.manifold import ROUNDED, Flags, Manifold, Place, Vector
+from eomc.program.ranks import Ranks, ranks
+
+NOTHING = 1e-25  # of all values together, as lengths: what forty digits leave of a zero
+SHOWN = 1e-9  # of a value: a coordinate has moved
+
+
+@dataclass(frozen=True)
+class Start:
+    """An assembled start: where it is, in doubles and forty digits, and its rates."""
+
+    place: Place
+    q: Sequence[Any]
+    qd: Vector
+    strayed: bool  # small ways led to no position, and longer ones were taken
+
+
+def assembled(system: System) -> System:
+    """The system with its start assembled, rows that others imply marked, and its `closure`.
+
+    A system without constraints, or that has been assembled, is returned as it is. Raises
+    SceneError where held values contradict rows, or rows each other.
+    """
+    if not system.constraints:
+        return system
+    if system.closure is not None and system.closure.made_for == _made_for(system):
+        return system
+    manifold = Manifold(system)
+    _refuse_idle(manifold)
+    start = _start(manifold)
+    found = ranks(manifold, start.place)
+    if found.rank == 0:
+        why = (
+            "have no slope where they hold, and so no force: write each thing that is zero by "
+            "itself, x and y for x**2 + y**2"
+        )
+        raise SceneError([system.problem("constraints", why)])
+    constraints = tuple(
+        replace(c, redundant=k in found.left_out) for k, c in enumerate(system.constraints)
+    )
+    coordinates = tuple(
+        replace(c, start=q, rate=qd)
+        for c, q, qd in zip(
+            system.coordinates, start.place.q.tolist(), start.qd.tolist(), strict=True
+        )
+    )
+    closure = _closure(manifold, start, found)
+    made = replace(system, coordinates=coordinates, constraints=constraints)
+    return replace(
+        made,
+        closure=replace(closure, made_for=_made_for(made)),
+        warnings=(
+            *system.warnings,
+            *_warnings(manifold, start, found, closure),
+            *_otherwise(made),
+        ),
+    )
+
+
+def _made_for(system: System) -> tuple[Any, ...]:
+    """What the assembled start and the ranks depend on."""
+    return (
+        system.coordinates,
+        system.constraints,
+        system.parameters,
+        system.definitions,
+        system.kinetic,
+        system.tree,
+    )
+
+
+def _refuse_idle(manifold: Manifold) -> None:
+    """Raise SceneError for rows that no coordinate moves."""
+    system = manifold.system
+    idle = [
+        system.problem(contradictions.key(c), "depends on no coordinate: it can hold nothing")
+        for k, c in enumerate(system.constraints)
+        if not np.any(manifold.reads[k])
+    ]
+    if idle:
+        raise SceneError(idle)
+
+
+def _start(manifold: Manifold) -> Start:
+    """The assembled start. Raises SceneError where there is none."""
+    system = manifold.system
+    free = np.array([not c.held for c in system.coordinates])
+    guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
+    place, strayed = manifold.place(guess), False
+    if place is None:
+        why = "have no value at the start: guess it elsewhere"
+        raise SceneError([system.problem("constraints", why)])
+    q: Sequence[Any] = guess.tolist()
+    if _off(manifold, guess, free):
+        found, held = manifold.descend(guess, free)
+        if not held:
+            strayed = True
+            found, held = manifold.descend(guess, free, strict=False)
+        if not held or found is None:
+            raise SceneError(list(contradictions.of_positions(manifold, free, found or place)))
+        found = manifold.nearest(found, guess, free)
+        q, _ = manifold.polished(found, free)
+        rounded = np.where(free, _rounded(found, q), guess)
+        place = manifold.place(rounded) or found
+    return Start(place, q, _rates(manifold, place, q, rates), strayed)
+
+
+def _off(manifold: Manifold, q: Vector, free: Flags) -> bool:
+    """Whether some row is further from zero than doubles can tell: a rounding where it can move."""
+    exact = manifold.exactly("constraints", q.tolist(), [0.0] * len(q), 0.0)
+    off = np.abs([float(x) for x in exact])[manifold.holonomic]
+    rounding = manifold.rounding(q, 0 * q, 0.0)[manifold.holonomic]
+    moves = np.any(manifold.reads[:, free], axis=1)[manifold.holonomic]
+    return bool(np.any(off > np.where(moves, 1, ROUNDED) * rounding))
+
+
+def _rates(manifold: Manifold, place: Place, q: Sequence[Any], rates: Vector) -> Vector:
+    """The assembled rates. Raises SceneError where held ones contradict rows."""
+    free = np.array([not c.held_rate for c in manifold.system.coordinates])
+    off = manifold.value("constraint_rates", place.q, rates, 0.0)
+    limit = ROUNDED * manifold.rounding(place.q, rates, 0.0, "constraint_rates")
+    if np.all(np.abs(off) <= limit):
+        return rates
+    found, held = manifold.rates(place, list(q), rates, free)
+    rounded = np.where(free, _rounded(place, found), rates)
+    if not held:
+        off = np.abs(manifold.value("constraint_rates", place.q, rounded, 0.0))
+        limit = ROUNDED * manifold.rounding(place.q, rounded, 0.0, "constraint_rates")
+        if np.any(off > limit):
+            problems = contradictions.of_rates(manifold, free, place, list(q), rounded)
+            raise SceneError(list(problems))
+    return rounded
+
+
+def _rounded(place: Place, exact: Sequence[Any]) -> Vector:
+    """Numbers of forty digits as doubles; 0 of what is nothing beside the others."""
+    found = np.array([float(x) for x in exact])
+    sizes = np.sqrt(np.diag(place.metric)) * np.abs(found)
+    return np.where(sizes > NOTHING * np.linalg.norm(sizes), found, 0.0)
+
+
+def _moves(names: Sequence[tuple[str, str]], before: Vector, after: Vector) -> Iterator[Move]:
+    for (name, unit), one, other in zip(names, before.tolist(), after.tolist(), strict=True):
+        if abs(other - one) > SHOWN * max(abs(one), abs(other)):
+            yield Move(name, one, other, unit)
+
+
+def _closure(manifold: Manifold, start: Start, found: Ranks) -> Closure:
+    system = manifold.system
+    names = [c.name for c in system.constraints]
+    guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
+    units = [(c.name, c.unit) for c in system.coordinates]
+    speeds = [(f"{c.name}_dot", f"{c.unit}/s" if c.unit else "") for c in system.coordinates]
+    return Closure(
+        rows=tuple(names),
+        coordinates=len(system.q),
+        rank=found.rank,
+        redundant=tuple(names[k] for k in found.left_out),
+        shared=tuple(names[k] for k in found.shared),
+        start_sigma=found.sigma[0],
+        least_sigma=found.sigma[1],
+        positions=found.positions,
+        moves=tuple(_moves(units, guess, start.place.q)),
+        rate_moves=tuple(_moves(speeds, rates, start.qd)),
+        remarks=tuple(_remarks(manifold, start, found)),
+    )
+
+
+def _remarks(manifold: Manifold, start: Start, found: Ranks) -> Iterator[str]:
+    """What is unusual, in words."""
+    rows = len(manifold.rows)
+    if start.strayed:
+        yield (
+            "small ways from the guess lead to no position that the rows leave; longer ones led to "
+            "this start, which may lie on another branch than was meant: look at it"
+        )
+    if found.rank == len(manifold.system.q):
+        yield (
+            "no freedom is left: the rows alone decide the motion in time"
+            if manifold.timed
+            else "no freedom is left, and nothing moves: a structure under its load"
+        )
+    if not found.good:
+        yield (
+            f"rank {found.rank} of {rows}, but no {found.rank} rows are far from singular at every "
+            "position: all are kept, and where a row depends on the others it is dropped"
+        )
+    if found.sigma[0] == 0:
+        yield (
+            "the start is a singular position: rows depend on each other there, and the motion may "
+            "go on in more ways than one"
+        )
+
+
+def _otherwise(system: System) -> Iterator[Problem]:
+    """Loops that are closed by another turn than is meant."""
+    for name in loops.closed_otherwise(system):
+        why = (
+            "is closed at the start as its rows allow, but turned: axes that are to be alike are "
+            "not. Guess a start that is nearer, or change axis or rotation"
+        )
+        yield system.problem(f"loop.{name}", why, severity="warning")
+
+
+def _warnings(
+    manifold: Manifold, start: Start, found: Ranks, closure: Closure
+) -> Iterator[Problem]:
+    """What a build says of it."""
+    system = manifold.system
+    if closure.redundant:
+        yield system.problem("constraints", closure.ranks, severity="warning")
+    for remark in closure.remarks:
+        timely = manifold.timed and found.rank == len(system.q)
+        severity = "note" if timely and remark.startswith("no freedom") else "warning"
+        yield system.problem("constraints", remark, severity=severity)
+    moves = [*closure.moves, *closure.rate_moves]
+    if moves:
+        text = f"the start is assembled: {listed([str(m) for m in moves])}"
+        yield system.problem("coordinates", text, severity="note")

@@ -1,0 +1,77 @@
+"""What scenes with constraints compute besides: the rows, multipliers, reactions, corrections."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from sympy import S
+
+from eomc.base.errors import Problem
+from eomc.derive import kkt, outputs
+from eomc.derive.equations import Equations
+from eomc.derive.lagrange import Derivation
+from eomc.model.symbols import Output
+from eomc.model.system import System
+from eomc.program.admissible import Candidate
+from eomc.program.ir import Function
+from eomc.program.lower import lower
+
+
+def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
+    """Those of a system with constraints. taken: its accelerations."""
+    system = derived.system
+    if not system.constraints:
+        return
+    yield from of_rows(derived)
+    names = [f"lambda_{c.name}" for c in system.constraints]
+    yield lower("multipliers", taken.tape, taken.multipliers, (), names, system.names)
+    e = _equations(derived)
+    assert e.rows is not None
+    values, pivots = kkt.correction(e.tape, e.D, e.rows, system.q)
+    yield lower("correction", e.tape, values, pivots, (), system.names)
+    if system.reactions:
+        yield _reactions(system)
+    if system.run.linearize:
+        slopes = [x for r in e.rows.rates for x in e.tape.gradient([(r, S.One)], system.q)]
+        yield lower("constraint_slopes", e.tape, slopes, (), (), system.names)
+
+
+def of_rows(derived: Derivation) -> Iterator[Function]:
+    """The rows, their Jacobian and their rates: what assembling a start needs, besides D."""
+    system, e = derived.system, _equations(derived)
+    assert e.rows is not None
+    names = [c.name for c in system.constraints]
+    yield lower("constraints", e.tape, e.rows.values, (), names, system.names)
+    jacobian = [x for row in e.rows.jacobian for x in row]
+    yield lower("constraint_jacobian", e.tape, jacobian, (), (), system.names)
+    labels = [f"{name}_rate" for name in names]
+    yield lower("constraint_rates", e.tape, e.rows.rates, (), labels, system.names)
+
+
+def _equations(derived: Derivation) -> Equations:
+    """The equations that the rows stand beside: the shorter ones, where there are two."""
+    both = [e for e in (derived.lagrange, derived.newton_euler) if e is not None]
+    return min(both, key=lambda e: len(e.tape.live([x for row in e.D for x in row])))
+
+
+def _reactions(system: System) -> Function:
+    """Forces and moments in the loops, over the multipliers."""
+    values = [x for r in system.reactions for x in r.values]
+    named = tuple(Output(f"reaction_{k}", x) for k, x in enumerate(values))
+    multipliers = [c.multiplier for c in system.constraints]
+    made = outputs.outputs(replace(system, outputs=named), sloped=False, more=multipliers)
+    return lower("reactions", made.tape, made.values, (), (), system.names)
+
+
+def unsuited(system: System) -> Iterator[Problem]:
+    """What [run] asks for and a system with constraints can't have."""
+    if not system.constraints:
+        return
+    asked = {
+        "discretize": system.run.discretize,
+        "inverse_dynamics": system.run.inverse_dynamics,
+    }
+    for key in (key for key, there in asked.items() if there):
+        message = f"'{key}' is not for scenes with constraints: leave it out"
+        yield system.problem(f"run.{key}", message)

@@ -1,0 +1,323 @@
+"""The positions at which constraints hold, in numbers: values, steps onto them, forty digits.
+
+Lengths are in the metric of D; a row is in units of sqrt(A D^-1 A^T), its own inverse inertia.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eomc.derive import lagrange
+from eomc.model.system import System, t
+from eomc.program import constrained
+from eomc.program.interpret import context, evaluator, exact_evaluator
+from eomc.program.lower import lower
+
+Vector = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+FADED = 1e-7  # singular values below are zero, where rows hold to rounding
+LINEAR = 0.25  # of a step: what rows may differ by from their tangent at its end
+LEAP = 0.5  # of a coordinate or rad: a step, at most
+SHORTEST = 2.0**-13  # part of a step
+ROUNDED = 64  # roundings: what a row of held values may be
+SWEEPS = 400  # of Newton's method, damped
+LEAST = 1e-14  # of the inverse inertia of a row: by so much it is always damped
+EPS = 2.0**-52
+EXACT = 12  # sweeps in forty digits; each gains ten or more
+DEEP = 1e-32  # of the terms of a row: it holds in forty digits
+
+
+def _most(x: Vector) -> float:
+    return float(np.max(np.abs(x), initial=0))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Rows at q (nq,) and t: phi (m,), 0 for rows of rates; A (m, nq); D (nq, nq)."""
+
+    q: Vector
+    t: float
+    phi: Vector
+    A: Vector
+    D: Vector
+
+    @cached_property
+    def metric(self) -> Vector:
+        """D, with the rows' own weight where some coordinate has no inertia."""
+        D, A = (self.D + self.D.T) / 2, self.A
+        diagonal = np.diag(D)
+        known = diagonal > 0
+        if np.all(known):
+            scale = 1 / np.sqrt(diagonal)
+            with suppress(np.linalg.LinAlgError):
+                factor = np.linalg.cholesky(scale[:, None] * D * scale)
+                if np.min(np.diag(factor)) > 1e-6:
+                    return D
+        mass = float(np.mean(diagonal[known])) if np.any(known) else 1.0
+        size = np.sum(A**2, axis=1)
+        D = D + (A.T * (mass / np.where(size > 0, size, 1))) @ A
+        values, vectors = np.linalg.eigh(D)
+        least = 1e-12 * max(float(values[-1]), 1e-300)
+        return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
+
+    @cached_property
+    def sizes(self) -> Vector:
+        """(m,): sqrt(A D^-1 A^T) of each row, 1 where that is 0."""
+        B = np.linalg.solve(np.linalg.cholesky(self.metric), self.A.T)
+        sizes = np.sqrt(np.sum(B**2, axis=0))
+        return np.where(sizes > 0, sizes, 1.0)
+
+    @cached_property
+    def levels(self) -> Vector:
+        """(m,): how much a row changes where all coordinates change by themselves."""
+        scale = np.sqrt(np.diag(self.metric))
+        return self.sizes * float(np.linalg.norm(scale * self.q) + 1e-3 * np.max(scale))
+
+    @property
+    def off(self) -> float:
+        """How far the rows are from zero, as a length."""
+        return float(np.linalg.norm(self.phi / self.sizes))
+
+
+class Frame:
+    """Directions at a place, of the coordinates `free`, along and across the rows `rows`."""
+
+    def __init__(self, place: Place, free: Flags, rows: Sequence[int]) -> None:
+        self.place, self.free, self.rows = place, np.flatnonzero(free), list(rows)
+        self.L = np.linalg.cholesky(place.metric[self.free][:, self.free])
+        A = place.A[self.rows][:, self.free] / place.sizes[self.rows, None]
+        self.B = np.linalg.solve(self.L, A.T).T
+
+    @cached_property
+    def parts(self) -> tuple[Vector, Vector, Vector]:
+        """U, s and V^T of B = U diag(s) V^T."""
+        U, s, V = np.linalg.svd(self.B, full_matrices=False)
+        return np.asarray(U), np.asarray(s), np.asarray(V)
+
+    def _inverse(self, values: Vector, damping: float) -> Vector:
+        """(B B^T + damping)^-1 values; the little that is always damped leaves rows as they are."""
+        whole = self.B @ self.B.T + max(damping, LEAST) * np.eye(len(self.rows))
+        return np.asarray(np.linalg.solve(whole, values))
+
+    def back(self, y: Vector) -> Vector:
+        """(nq,): the direction of which y is the coordinates' part in the metric."""
+        whole = np.zeros(len(self.place.q))
+        whole[self.free] = np.linalg.solve(self.L.T, y)
+        return whole
+
+    def onto(self, values: Vector, damping: float = 0.0) -> Vector:
+        """(nq,): the least direction along which the rows change by -values, nearly, damped."""
+        aim = values[self.rows] / self.place.sizes[self.rows]
+        return -self.back(self.B.T @ self._inverse(aim, damping))
+
+    def exactly_onto(self, values: Vector) -> Vector:
+        """The same as far as they can, rows that depend on others left to these."""
+        U, s, V = self.parts
+        aim = values[self.rows] / self.place.sizes[self.rows]
+        return -self.back(V.T @ (U.T @ aim / np.where(s > FADED, s, np.inf)))
+
+    def along(self, direction: Vector) -> Vector:
+        """(nq,): what of a direction leaves the rows as they are."""
+        y = self.L.T @ direction[self.free]
+        for _ in range(2):
+            y = y - self.B.T @ self._inverse(self.B @ y, 0.0)
+        return self.back(y)
+
+    def length(self, direction: Vector) -> float:
+        """Of a direction of free coordinates."""
+        return float(np.linalg.norm(self.L.T @ direction[self.free]))
+
+
+class Manifold:
+    """The constraints of a system, at its parameters' defaults."""
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        derived = lagrange.derive(system)
+        made = {f.name: f for f in constrained.of_rows(derived)}
+        e = derived.lagrange or derived.newton_euler
+        assert e is not None
+        D = lower("D", e.tape, [x for row in e.D for x in row], (), (), system.names)
+        self.functions = {**made, "D": D}
+        self.parameters = {p.name: p.value for p in system.parameters}
+        self.holonomic = [k for k, c in enumerate(system.constraints) if c.holonomic]
+        self.rows = range(len(system.constraints))
+        self.timed = any(t.name in made[name].uses for name in ("constraints", "constraint_rates"))
+        self._plain: dict[str, Callable[..., Any]] = {}
+        self._exact: dict[str, Callable[..., Any]] = {}
+
+    @cached_property
+    def reads(self) -> Flags:
+        """(m, nq): which coordinates, or rates, a row depends on."""
+        outputs = self.functions["constraint_jacobian"].outputs
+        return np.array([o.coefficient != 0 for o in outputs]).reshape(len(self.rows), -1)
+
+    def _values(self, q: Sequence[Any], qd: Sequence[Any], time: Any) -> dict[str, Any]:
+        names = (*(x.name for x in self.system.q), *(x.name for x in self.system.qd))
+        return {
+            **self.parameters,
+            **dict.fromkeys((u.name for u in self.system.u), 0.0),
+            t.name: time,
+            **dict(zip(names, (*q, *qd), strict=True)),
+        }
+
+    def value(self, name: str, q: Vector, qd: Vector, time: float, **changed: float) -> Vector:
+        """What a function gives, in doubles; nan where it has no value."""
+        if name not in self._plain:
+            self._plain[name] = evaluator(self.functions[name])
+        values = self._values(q.tolist(), qd.tolist(), time) | changed
+        try:
+            return np.array(self._plain[name](values)[0])
+        except (ArithmeticError, ValueError):
+            return np.full(len(self.functions[name].outputs), np.nan)
+
+    def exactly(self, name: str, q: Sequence[Any], qd: Sequence[Any], time: float) -> list[Any]:
+        """The same in forty digits."""
+        if name not in self._exact:
+            self._exact[name] = exact_evaluator(self.functions[name])
+        found: list[Any] = self._exact[name](self._values(q, qd, time))
+        return found
+
+    def place(self, q: Vector, time: float = 0.0) -> Place | None:
+        """The rows there; None where something has no value."""
+        n, rest = len(q), np.zeros(len(q))
+        phi = self.value("constraints", q, rest, time)
+        phi[len(self.holonomic) :] = 0
+        A = self.value("constraint_jacobian", q, rest, time).reshape(-1, n)
+        D = self.value("D", q, rest, time).reshape(n, n)
+        if not all(np.all(np.isfinite(x)) for x in (phi, A, D)):
+            return None
+        return Place(q, time, phi, A, D)
+
+    def rounding(self, q: Vector, qd: Vector, time: float, name: str = "constraints") -> Vector:
+        """(m,): what one rounding of each coordinate, rate and parameter does to a row."""
+        total = np.zeros(len(self.rows))
+        value, step = self.value(name, q, qd, time), 2.0**-20
+        for k in range(len(q)):
+            for x in (q, qd) if name != "constraints" else (q,):
+                nudged = x.copy()
+                nudged[k] *= 1 + step
+                moved = self.value(name, *((nudged, qd) if x is q else (q, nudged)), time)
+                total += np.nan_to_num(np.abs(moved - value)) / step
+        for name_of, p in self.parameters.items():
+            moved = self.value(name, q, qd, time, **{name_of: p * (1 + step)})
+            total += np.nan_to_num(np.abs(moved - value)) / step
+        return EPS * (total + np.abs(value))
+
+    def descend(
+        self, q: Vector, free: Flags, time: float = 0.0, strict: bool = True
+    ) -> tuple[Place | None, bool]:
+        """Where small ways from q lead, free coordinates moving least, and whether rows hold there.
+
+        Newton's method, damped so that rows go to zero together as nearly as LINEAR (strict), or
+        so that they get less.
+        """
+        place = self.place(q, time)
+        if place is None:
+            return None, False
+        for _ in range(SWEEPS):
+            if place.off == 0:
+                return place, True
+            frame = Frame(place, free, self.holonomic)
+            unit = float(np.sqrt(np.trace(frame.L @ frame.L.T) / max(1, len(frame.free))))
+            step = frame.onto(place.phi, 1e-2 * min(1.0, place.off / unit if unit else 0.0))
+            change = float(np.linalg.norm(place.A @ step / place.sizes))
+            tiny = np.max(np.abs(step) / (np.abs(place.q) + 1e-3 + np.max(np.abs(place.q))))
+            if change < 1e-4 * place.off:
+                return place, self._rounded(place)
+            found = self._shortened(place, step, strict, LEAP * (1 + _most(q)))
+            if found is None:
+                return place, self._rounded(place)
+            if tiny < 1e-13 and found.off > place.off / 4:
+                return (found if found.off < place.off else place), True
+            place = found
+        return place, False
+
+    def _rounded(self, place: Place) -> bool:
+        """Whether rows are as near to zero as doubles can tell."""
+        limit = np.maximum(self.rounding(place.q, 0 * place.q, place.t), EPS * place.levels)
+        return bool(np.all(np.abs(place.phi) <= ROUNDED * limit))
+
+    def _shortened(self, place: Place, step: Vector, strict: bool, longest: float) -> Place | None:
+        # rows of sines hold again and again: a step across turns leads anywhere
+        part = min(1.0, longest / max(longest, _most(step)))
+        while part > SHORTEST:
+            there = self.place(place.q + part * step, place.t)
+            if there is not None:
+                aim = place.phi + part * (place.A @ step)
+                aim[len(self.holonomic) :] = 0
+                bent = float(np.linalg.norm((there.phi - aim) / place.sizes))
+                less = float(np.linalg.norm(there.phi / place.sizes))
+                if less < (1 - part / 8) * place.off and (
+                    not strict or bent <= LINEAR * part * place.off
+                ):
+                    return there
+            part /= 2
+        return None
+
+    def nearest(self, place: Place, guess: Vector, free: Flags) -> Place:
+        """The place at which the free coordinates have moved least from a guess, close by.
+
+        Along the rows towards the guess and back onto them, until that leads no nearer.
+        """
+        for _ in range(100):
+            frame = Frame(place, free, self.holonomic)
+            way = frame.along(guess - place.q)
+            far = frame.length(guess - place.q)
+            if frame.length(way) <= 1e-9 * far or far == 0:
+                return place
+            part = 1.0
+            while part > SHORTEST:
+                there, held = self.descend(place.q + part * way, free, place.t)
+                if held and there is not None and frame.length(guess - there.q) < far:
+                    break
+                part /= 2
+            else:
+                return place
+            assert there is not None
+            place = there
+        return place
+
+    def polished(self, place: Place, free: Flags) -> tuple[list[Any], bool]:
+        """q in forty digits, and whether all rows hold there. From a place good to rounding."""
+        mp, rest = context(), [0] * len(place.q)
+        frame = Frame(place, free, self.holonomic)
+        level = place.levels
+        q, best, last = [mp.mpf(x) for x in place.q.tolist()], None, np.inf
+        for _ in range(EXACT):
+            phi = self.exactly("constraints", q, rest, place.t)
+            off = np.array([float(x) for x in phi])
+            off[len(self.holonomic) :] = 0
+            size = float(np.max(np.abs(off) / level, initial=0))
+            if not size < last:
+                break
+            best, last = q, size
+            if size < DEEP:
+                break
+            q = [x + mp.mpf(d) for x, d in zip(q, frame.exactly_onto(off).tolist(), strict=True)]
+        return best or q, last < DEEP
+
+    def rates(self, place: Place, q: list[Any], qd: Vector, free: Flags) -> tuple[list[Any], bool]:
+        """qd in forty digits with the free rates moved least, and whether all rows hold there."""
+        mp = context()
+        frame = Frame(place, free, self.rows)
+        level = replace(place, q=qd).levels
+        v, best, last = [mp.mpf(x) for x in qd.tolist()], None, np.inf
+        for _ in range(EXACT):
+            off = np.array([float(x) for x in self.exactly("constraint_rates", q, v, place.t)])
+            size = float(np.max(np.abs(off) / level, initial=0))
+            if not size < last:
+                break
+            best, last = v, size
+            if size < DEEP:
+                break
+            v = [x + mp.mpf(d) for x, d in zip(v, frame.exactly_onto(off).tolist(), strict=True)]
+        return best or v, last < DEEP

@@ -1,0 +1,181 @@
+"""The rank of constraints on the positions that they leave, and the rows that are solved for.
+
+A rank at the start says little: a flat or symmetric one looks redundant. Nor does one where rows do
+not hold: there they are hardly ever redundant. So ranks are taken along a walk on the positions
+that the rows leave, at places that hold them in forty digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+from typing import Any
+
+import numpy as np
+
+from eomc.program.interpret import context
+from eomc.program.manifold import FADED, Flags, Frame, Manifold, Place, Vector
+
+POSITIONS = 12  # beside the start
+MANY, FEWER = 24, 3  # rows of a large system; positions of one whose rank is full at the start
+STEPS = 6  # from one to the next
+FIRST, LONGEST = 0.1, 0.3  # of a step, in coordinates' own units
+BENT = 0.1  # of a step: the correction back onto the rows, at most
+SAME = 1e-20  # of a row: it is a sum of others in forty digits
+GOOD = 1e-2  # of the singular value of all rows: what that of the kept ones is at least
+BETTER = 1.02  # times another set's: a set is better
+MOST_SETS = 4000  # that are tried; beyond, rows are left out one by one
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """rank: of all rows, almost everywhere. left_out: rows that others imply. shared: rows without
+    a force of their own. good: whether some set of rows will do everywhere that was looked at.
+    sigma: smallest over largest singular value that counts, at the start and at the worst place.
+    """
+
+    rank: int
+    left_out: tuple[int, ...]
+    shared: tuple[int, ...]
+    good: bool
+    sigma: tuple[float, float]
+    positions: int
+
+
+def ranks(manifold: Manifold, start: Place) -> Ranks:
+    """Of the rows around an assembled start."""
+    free = np.ones(len(start.q), dtype=bool)
+    first = Frame(start, free, manifold.rows)
+    sure = len(first.parts[1]) == len(manifold.rows) and first.parts[1][-1] > FADED
+    positions = FEWER if sure and len(manifold.rows) > MANY else POSITIONS
+    rest = [Frame(place, free, manifold.rows) for place in walk(manifold, start, positions)]
+    frames, places = [first, *rest], [start, *(f.place for f in rest)]
+    counts = [int(np.sum(f.parts[1] > FADED)) for f in frames]
+    rank, m = max(counts), len(manifold.rows)
+    regular = [f for f, n in zip(frames, counts, strict=True) if n == rank]
+    ratios = [float(f.parts[1][rank - 1] / f.parts[1][0]) if rank else 1.0 for f in frames]
+    ratios = [x if x > FADED else 0.0 for x in ratios]
+    sigma = (ratios[0], min(ratios))
+    if rank == m:
+        return Ranks(rank, (), (), True, sigma, len(places))
+    if rank == 0:
+        return Ranks(0, (), tuple(range(m)), False, (0.0, 0.0), len(places))
+    null = [np.linalg.svd(f.B)[0][:, rank:] for f in regular]
+    shared = np.flatnonzero(np.max([np.linalg.norm(u, axis=1) for u in null], axis=0) > 1e-6)
+    left_out, score = _chosen([f.B for f in regular], rank, shared.tolist())
+    good = score >= GOOD and all(_implied(manifold, f.place, left_out) for f in regular[:3])
+    return Ranks(rank, left_out if good else (), tuple(shared.tolist()), good, sigma, len(places))
+
+
+def walk(manifold: Manifold, start: Place, positions: int = POSITIONS) -> Iterator[Place]:
+    """Places that hold the rows, reached from the start by small steps in random directions."""
+    random = np.random.default_rng(17)
+    free = np.ones(len(start.q), dtype=bool)
+    span = manifold.system.run.duration if manifold.timed else 0.0
+    place, step = start, FIRST
+    for _ in range(positions):
+        heading = random.normal(size=len(start.q))
+        moved, steps = False, 0
+        for _ in range(8 * STEPS):
+            frame = Frame(place, free, manifold.holonomic)
+            unit = np.sqrt(np.diag(place.metric))
+            way = frame.along(heading / unit)
+            size = float(np.max(np.abs(way), initial=0))
+            drift = span / positions / STEPS * min(1.0, step / FIRST)
+            if size <= 1e-12 * float(np.max(1 / unit)) and not drift:
+                return  # no freedom
+            way = way * (step / size) if size > 0 else way
+            there = _moved(manifold, place, way, drift, free)
+            if there is None:
+                step /= 2
+                if step < 1e-9:
+                    break
+                continue
+            place, moved, steps, step = there, True, steps + 1, min(LONGEST, 1.5 * step)
+            if steps == STEPS:
+                break
+        if moved:
+            q, held = manifold.polished(place, free)
+            if held:
+                place = manifold.place(np.array([float(x) for x in q]), place.t) or place
+            yield place
+
+
+def _moved(
+    manifold: Manifold, place: Place, way: Vector, drift: float, free: Flags
+) -> Place | None:
+    """The place a step on; None where it is too long to be sure of it."""
+    aimed = manifold.place(place.q + way, place.t + drift)
+    if aimed is None:
+        return None
+    frame = Frame(aimed, free, manifold.holonomic)
+    length = frame.length(way) + 1e-9 * frame.length(np.ones(len(way)))
+    if not drift and frame.length(frame.onto(aimed.phi)) > BENT * length:
+        return None
+    found, held = manifold.descend(aimed.q, free, aimed.t)
+    if not held or found is None:
+        return None
+    return found if drift or frame.length(found.q - aimed.q) <= 2 * BENT * length else None
+
+
+def _chosen(
+    matrices: Sequence[Vector], rank: int, some: Sequence[int]
+) -> tuple[tuple[int, ...], float]:
+    """The rows of `some` to leave out, and how well the rest does at the worst of the matrices.
+
+    Each (m, nq), its rows of length 1. Well: their smallest singular value over that of all rows.
+    Of sets that are as good, the one that leaves the last rows out.
+    """
+    m = len(matrices[0])
+    every = range(m)
+    whole = [float(np.linalg.svd(B, compute_uv=False)[rank - 1]) for B in matrices]
+
+    def score(out: Sequence[int], relative: bool) -> float:
+        kept = [k for k in every if k not in out]
+        found = (float(np.linalg.svd(B[kept], compute_uv=False)[rank - 1]) for B in matrices)
+        return min(s / w if relative else s for s, w in zip(found, whole, strict=True))
+
+    def best(sets: Iterator[tuple[int, ...]]) -> tuple[int, ...]:
+        chosen, most = tuple[int, ...](), 0.0
+        for out in sets:
+            found = score(out, False)
+            if not chosen or found > BETTER * most:
+                chosen, most = out, found
+        return chosen
+
+    spare, backwards = m - rank, sorted(some, reverse=True)
+    if comb(len(backwards), spare) <= MOST_SETS:
+        chosen = best(combinations(backwards, spare))
+    else:
+        chosen = ()
+        for _ in range(spare):
+            chosen = best((*chosen, k) for k in backwards if k not in chosen)
+    return tuple(sorted(chosen)), score(chosen, True)
+
+
+def _implied(manifold: Manifold, place: Place, out: Sequence[int]) -> bool:
+    """Whether the gradients of rows `out` are sums of the others', in forty digits."""
+    mp, n = context(), len(place.q)
+    free = np.ones(n, dtype=bool)
+    q, held = manifold.polished(place, free)
+    if not held:
+        return False
+    flat = manifold.exactly("constraint_jacobian", q, [0] * n, place.t)
+    rows = [flat[k * n : (k + 1) * n] for k in manifold.rows]
+    kept = [k for k in manifold.rows if k not in out]
+    A = np.array([[float(x) for x in rows[k]] for k in kept])
+    size = np.linalg.norm(A, axis=1)
+    into = np.linalg.pinv((A / size[:, None]).T) / size[:, None]
+    for k in out:
+        left: list[Any] = [mp.mpf(x) for x in rows[k]]
+        for _ in range(6):
+            weights = (into @ np.array([float(x) for x in left])).tolist()
+            for w, row in zip(weights, (rows[i] for i in kept), strict=True):
+                if w:
+                    left = [x - mp.mpf(w) * y for x, y in zip(left, row, strict=True)]
+        whole = max(abs(x) for x in rows[k])
+        if max(abs(x) for x in left) > SAME * whole:
+            return False
+    return True

@@ -1,0 +1,215 @@
+"""Equality constraints of an MJCF file: bodies that are connected or welded, coupled joints.
+
+MuJoCo holds them softly, as springs whose stiffness solref and solimp say; here they hold exactly.
+Where the second body is met follows from the pose in which the file is written, as in MuJoCo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from eomc.base.spatial import apply, plus, scaled, transposed
+from eomc.robots import rotations
+from eomc.robots.mjcf.file import Given
+from eomc.robots.mjcf.joints import Found, fresh
+from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader, pose_of, rounded
+from eomc.robots.robot import Coupling, Motion, RobotBody, RobotLoop, moved
+from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times
+from eomc.robots.xml import Tag
+from eomc.scene.assembly import WORLD
+
+POLYNOMIAL = 5  # coefficients of a coupling
+KINDS = ("connect", "weld", "joint", "tendon")
+SOFT = "the softness of equality constraints (solref, solimp), which hold exactly here"
+
+
+Sides = tuple[tuple[float, Motion], ...]  # a sum of coordinates, each with its factor
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """The bodies in the pose of the file, and where the file has their frames in ours.
+
+    poses: of our frames in the world. anchors: of our frames in the file's.
+    """
+
+    poses: Mapping[str, Pose]
+    anchors: Mapping[str, Vector]
+
+    def of_file(self, body: str) -> Pose:
+        """The file's frame of a body, in the world."""
+        back = Pose(scaled(self.anchors.get(body, ORIGIN), -1.0), IDENTITY)
+        return self.poses[body].of(back)
+
+    def point(self, body: str, place: Vector) -> Vector:
+        """A place in the world, in our frame of a body."""
+        at, turn = self.poses[body]
+        x, y, z = apply(transposed(turn), plus(place, scaled(at, -1.0)))
+        return _plain(x), _plain(y), _plain(z)
+
+
+def _plain(x: float) -> float:
+    """A length that was computed, in m: without what rounding left in its last digit."""
+    return rounded(float(f"{x:.15g}"), 1.0)
+
+
+def constrained(
+    root: Tag,
+    bodies: Sequence[RobotBody],
+    joints: Sequence[Found],
+    anchors: Mapping[str, Vector],
+    reader: Reader,
+) -> tuple[tuple[RobotLoop, ...], tuple[Coupling, ...]]:
+    """The loops and couplings of a file; bodies and joints as they stand in it."""
+    poses = {WORLD: STILL}
+    for body in bodies:
+        offset, turn = moved(body, [m.start for m in body.motions])
+        poses[body.name] = poses[body.parent].of(Pose(offset, turn))
+    made = _Reading(root, _Ends(poses, anchors), joints, reader)
+    for section in root.each("equality"):
+        for tag in section.children:
+            made.read(tag)
+    return tuple(made.loops), tuple(made.couplings)
+
+
+class _Reading:
+    """The constraints read so far."""
+
+    def __init__(self, root: Tag, ends: _Ends, joints: Sequence[Found], reader: Reader) -> None:
+        self.ends = ends
+        self.reader = reader
+        self.joints = {joint.name: joint for joint in joints}
+        self.tendons = {
+            tag.get("name"): tag for section in root.each("tendon") for tag in section.children
+        }
+        self.taken: set[str] = set()
+        self.loops: list[RobotLoop] = []
+        self.couplings: list[Coupling] = []
+
+    def read(self, tag: Tag) -> None:
+        """One constraint; what is not read is reported."""
+        report = self.reader.report
+        a = self.reader.given(Placed(tag, "", STILL, ""), "equality")
+        ends = [a.get(f"{what}{k}") for k in "12" for what in ("body", "joint", "tendon", "site")]
+        name = a.get("name") or "_".join([tag.kind, *filter(None, ends)])
+        name = fresh(name, self.taken)
+        if tag.kind not in KINDS:
+            report.leave("equality constraints of other kinds", f"{tag.kind} {name}")
+        elif not a.is_true("active", True):
+            report.leave("equality constraints that are not active", name)
+        else:
+            self.taken.add(name)
+            if tag.kind in ("connect", "weld"):
+                self._loop(name, tag.kind, a)
+            else:
+                self._coupling(name, tag.kind, a)
+
+    # --- bodies
+
+    def _loop(self, name: str, kind: str, a: Given) -> None:
+        sites = [a.get("site1"), a.get("site2")]
+        found = [self._site(s, a) for s in sites] if any(sites) else self._anchored(kind, a)
+        places = [place for place in found if place]
+        if len(places) < 2:
+            return
+        one, other = places
+        if one[0] == other[0]:
+            a.fault(f'it holds body "{one[0]}" to itself; name two bodies')
+            return
+        turn = times(transposed(one[2]), other[2]) if kind == "weld" else IDENTITY
+        joint = "weld" if kind == "weld" else "spherical"
+        loop = RobotLoop(name, joint, (one[0], other[0]), (one[1], other[1]), turn)
+        self.loops.append(loop)
+        self.reader.report.leave(SOFT, name)
+
+    def _site(self, name: str, a: Given) -> tuple[str, Vector, Matrix] | None:
+        """A site: its body, its place in our frame of that, and the body's axes along its own."""
+        placed = self.reader.sites.get(name)
+        if placed is None:
+            what = f'there is no site "{name}"' if name else "it needs both site1 and site2"
+            a.fault(what)
+            return None
+        self.reader.report.read("sites", name)
+        site = placed.pose.of(pose_of(self.reader.given(placed, "site"), self.reader.settings))
+        world = self.ends.of_file(placed.body).of(site)
+        return placed.body, self.ends.point(placed.body, world.place), transposed(site.turn)
+
+    def _anchored(self, kind: str, a: Given) -> list[tuple[str, Vector, Matrix] | None]:
+        """Both bodies, where they meet, and the rotation of each in a frame that both share."""
+        names = [a.get("body1"), a.get("body2", WORLD)]
+        for name in names:
+            if name not in self.ends.poses:
+                a.fault(f'there is no body "{name}"' if name else "it needs body1")
+                return [None, None]
+        one, other = names
+        first, second = self.ends.of_file(one), self.ends.of_file(other)
+        anchor = a.vector("anchor")
+        if kind == "connect":
+            if anchor is None:
+                if "anchor" not in a:
+                    a.fault('it needs an anchor="x y z", where the bodies meet, in that of body1')
+                return [None, None]
+            place = first.of(Pose(anchor, IDENTITY)).place
+            return [(name, self.ends.point(name, place), IDENTITY) for name in names]
+        relative = a.numbers("relpose", 7)
+        if relative and any(relative[3:]):
+            x, y, z, *quaternion = relative
+            second = first.of(Pose((x, y, z), rotations.from_quaternion(*quaternion)))
+        at = plus(anchor or ORIGIN, scaled(self.ends.anchors.get(other, ORIGIN), -1.0))
+        place = second.of(Pose(anchor or ORIGIN, IDENTITY)).place
+        return [
+            (one, self.ends.point(one, place), IDENTITY),
+            (other, at, times(transposed(first.turn), second.turn)),
+        ]
+
+    # --- joints
+
+    def _coupling(self, name: str, kind: str, a: Given) -> None:
+        read = self._joint if kind == "joint" else self._tendon
+        first = read(a.get(f"{kind}1"), name, a)
+        second = read(a.get(f"{kind}2"), name, a) if a.get(f"{kind}2") else ()
+        if first is None or second is None:
+            return
+        given = a.numbers("polycoef", POLYNOMIAL, 1) or (0.0, 1.0)
+        polynomial = (*given, *(0.0,) * POLYNOMIAL)[:POLYNOMIAL]
+        if len(given) == 1:
+            polynomial = (given[0], 1.0, 0.0, 0.0, 0.0)
+        if not second:
+            polynomial = (polynomial[0], 0.0, 0.0, 0.0, 0.0)
+        unit = {m.unit for _, m in first}.pop() if first else ""
+        zeros = [sum((by * m.start for by, m in side), 0.0) for side in (first, second)]
+        sides = [tuple((by, m.name) for by, m in side) for side in (first, second)]
+        self.couplings.append(
+            Coupling(name, sides[0], sides[1], zeros[0], zeros[1], polynomial, unit)
+        )
+        self.reader.report.leave(SOFT, name)
+
+    def _joint(self, joint: str, name: str, a: Given) -> Sides | None:
+        """The coordinate of a joint, as a sum of one; None where there is none."""
+        if joint not in self.joints:
+            a.fault(f'there is no joint "{joint}"' if joint else "it needs joint1")
+            return None
+        found = self.joints[joint]
+        if len(found.motions) > 1:
+            self.reader.report.leave("couplings of free and ball joints", name)
+            return None
+        return ((1.0, found.motions[0]),)
+
+    def _tendon(self, tendon: str, name: str, a: Given) -> Sides | None:
+        """A tendon's length in coordinates; None where it is not a sum of these."""
+        tag = self.tendons.get(tendon)
+        if tag is None:
+            a.fault(f'there is no tendon "{tendon}"' if tendon else "it needs tendon1")
+            return None
+        if tag.kind != "fixed":
+            self.reader.report.leave("couplings of tendons through space", name)
+            return None
+        total = []
+        for each in tag.each("joint"):
+            of = self.reader.own(each)
+            part = self._joint(of.get("joint"), name, of)
+            if part is None:
+                return None
+            total.append((of.number("coef", 1.0), part[0][1]))
+        return tuple(total)

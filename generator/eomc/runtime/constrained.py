@@ -1,0 +1,197 @@
+"""Constraints of a compiled scene: what is zero, multipliers, reactions, states moved onto them.
+
+D qdd + C qd + g = tau + A^T lambda, with A = dphi/dq of holonomic rows phi(q, t) = 0 and dpsi/dqd
+of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in the scene's order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arguments import Array, Parameters, as_number, not_one_of
+from .frames import Frames
+from .trajectory import SAID, STATUS, MotionError, state_text
+
+
+class Rows(NamedTuple):
+    """Names of constraints, of loops with reactions, and what a start holds of q, then of qd.
+
+    holonomic: how many of the constraints are; they come first.
+    """
+
+    names: tuple[str, ...] = ()
+    loops: tuple[str, ...] = ()
+    held: tuple[bool, ...] = ()
+    holonomic: int = 0
+
+
+class Constrained(Frames):
+    """What scenes with [constraints] or [[loop]] have besides."""
+
+    _rows = Rows()
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """The constraints, in the order of results."""
+        return self._rows.names
+
+    @property
+    def loops(self) -> tuple[str, ...]:
+        """The loops that have reactions, in the order of results."""
+        return self._rows.loops
+
+    def constraints(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
+    ) -> Array:
+        """phi, and psi of rows that are not holonomic, (nc,): zero along every motion."""
+        return self._of_rows("constraints", q, qd, t, params)
+
+    def constraint_rates(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
+    ) -> Array:
+        """A qd + dphi/dt, psi of rows that are not holonomic, (nc,): zero along every motion."""
+        return self._of_rows("constraint_rates", q, qd, t, params)
+
+    def _of_rows(self, name: str, q: ArrayLike, qd: ArrayLike, t: float, params: Any) -> Array:
+        found: Array = self._evaluate(name, (len(self._rows.names),), q, qd, t, None, params, None)
+        return found
+
+    def constraint_jacobian(
+        self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None
+    ) -> Array:
+        """A, (nc, nq): dphi/dq of holonomic constraints, dpsi/dqd of others."""
+        shape = (len(self._rows.names), self.nq)
+        found: Array = self._evaluate("constraint_jacobian", shape, q, None, t, None, params, None)
+        return found
+
+    def tangent(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
+    ) -> Array:
+        """Changes of [q; qd] that keep the constraints, to the first order: (2 nq, k), orthonormal.
+
+        Near an equilibrium with A, B of `linearize`, dz/dt = T^T A T z + T^T B u has no more
+        states than the motion, x - x0 = T z. Raises ValueError where the scene was built without
+        derivatives.
+        """
+        if not hasattr(self._lib, "constraint_slopes"):
+            raise ValueError(
+                f"tangent: {self.name} was built without derivatives: a scene asks with [run] "
+                "linearize = true"
+            )
+        shape = (len(self._rows.names), self.nq)
+        A = self.constraint_jacobian(q, t=t, params=params)
+        slopes = self._evaluate("constraint_slopes", shape, q, qd, t, None, params, None)
+        of_q = A[: self._rows.holonomic]
+        whole = np.block([[of_q, np.zeros_like(of_q)], [slopes, A]])
+        whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-300)
+        _, sizes, rows = np.linalg.svd(whole)
+        rank = int((sizes > 1e-9 * sizes[0]).sum()) if sizes.size else 0
+        return np.asarray(rows[rank:].T)
+
+    def multipliers(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
+    ) -> Array:
+        """lambda, (nc,), one a constraint as it is written. u None: the scene's signals.
+
+        A constraint that says what others say has 0. Not finite where D is singular.
+        """
+        shape = (len(self._rows.names),)
+        found: Array = self._evaluate("multipliers", shape, q, qd, t, u, params, None)
+        return found
+
+    def reactions(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
+    ) -> dict[str, Array]:
+        """What each [[loop]] does to its second body, by name, along the world's axes.
+
+        Force and moment about the joint's point: (6,), in the plane (3,), the force (2) and the
+        moment; N and N m. Raises ValueError where the scene has no loops.
+        """
+        if not self._rows.loops:
+            raise ValueError(f"reactions: {self.name} has no [[loop]]")
+        found = self._reactions(q, qd, t, u, params)
+        return {name: found[..., k, :] for k, name in enumerate(self._rows.loops)}
+
+    def _reactions(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
+    ) -> Array:
+        """Of all loops, (loops, 6), in the plane (loops, 3)."""
+        multipliers = np.ascontiguousarray(self.multipliers(q, qd, t, u, params))
+        shape = (len(self._rows.loops), 3 if self._plane else 6)
+        args = ("reactions", shape, q, qd, t, None, params, None, multipliers)
+        found: Array = self._evaluate(*args)
+        return found
+
+    def project(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
+        held: Sequence[str] | None = None,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """(q, qd) moved onto the constraints, by the least change in the metric of D.
+
+        held: names of coordinates and velocities that stay as they are; None: nothing is held.
+        Raises MotionError, status "locked", where no such state is found.
+        """
+        if isinstance(held, str):
+            held = (held,)
+        for name in held or ():
+            if name not in self._states:
+                raise ValueError(not_one_of("held", name, self._states))
+        flags = tuple(name in held for name in self._states) if held else ()
+        return self._projected(q, qd, t, params, flags)
+
+    def _projected(
+        self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, held: Sequence[bool]
+    ) -> tuple[Array, Array]:
+        """The same; held: whether each of q and qd is, or empty."""
+        at, moving = (np.array(x, self.dtype, order="C") for x in self._state(q, qd))
+        flags = self._ffi.new("int[]", [int(x) for x in held]) if held else self._c[2]
+        found = self._lib.project(
+            at.size // self.nq, self._pointer(at), self._pointer(moving), as_number(t, "t"), flags,
+            self._given(None, params)[1],
+        )  # fmt: skip
+        if found & 7:
+            k, said = found >> 3, STATUS[found & 7]
+            where = state_text(at.reshape(-1, self.nq)[k], moving.reshape(-1, self.nq)[k])
+            kept = [n for n, h in zip(self._states, held, strict=False) if h]
+            what = SAID[said] if said != "locked" else (
+                "no state near that obeys the constraints"
+                + (f" with {', '.join(kept)} as given: leave one free" if kept else "")
+            )  # fmt: skip
+            raise MotionError(f"from {where}: {what}", said)
+        return at, moving
+
+    @property
+    def _states(self) -> tuple[str, ...]:
+        return (*self.coordinates, *(f"{name}_dot" for name in self.coordinates))
+
+    def _assembled_rows(self, q: Array, qd: Array, table: Array, t0: float) -> tuple[Array, Array]:
+        """The starts of many, (n, nq); table: their parameters, a row each or one for all."""
+        if not self._rows.names:
+            return q, qd
+        held = self._rows.held
+        if len(table) == 1:
+            return self._projected(q, qd, t0, table[0], held)
+        both = [
+            self._projected(*row[:2], t0, row[2], held) for row in zip(q, qd, table, strict=True)
+        ]
+        return np.array([x for x, _ in both]), np.array([x for _, x in both])
+
+    def _tell(self, run: Any, method: str, work: Any) -> None:
+        """A run what its steps met, as their work in C has it."""
+        if not self._rows.names:
+            return
+        run.singular_steps = getattr(self._lib, f"{method}_singular")(work)
+        if run.singular_steps:
+            run.first_singular = run.t0 + getattr(self._lib, f"{method}_first")(work)
+
+    def _assembled(self, q0: Any, qd0: Any, t0: float, params: Any) -> tuple[Any, Any]:
+        """A start on the constraints: what the scene holds stays as it is given, the rest moves."""
+        if not self._rows.names or (q0 is None and qd0 is None and params is None and t0 == 0):
+            return q0, qd0
+        q, qd = self._start
+        q, qd = q if q0 is None else q0, qd if qd0 is None else qd0
+        return self._projected(q, qd, t0, params, self._rows.held)

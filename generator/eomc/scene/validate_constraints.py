@@ -1,0 +1,74 @@
+"""Constraints as they are written: names, and formulas that are zero along every motion."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from eomc.base import names
+from eomc.scene.scene import Constraint
+from eomc.scene.schema import Document
+from eomc.scene.scope import INPUT, Checker
+
+
+def constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
+    """The rows of [constraints]; faults are reported."""
+    for name, entry in doc.constraints.items():
+        if why := fault_of_row(check, doc, name):
+            end = "" if names.fault(name) else ": give the constraint a name of its own"
+            check.say(("constraints", name), why + end)
+        path = ("constraints", name, "formula")
+        if isinstance(entry.formula, str) and (why := _equation(entry.formula)):
+            check.say(path, why, text=entry.formula)
+            continue
+        formula = check.formula(path, entry.formula)
+        if formula is None or path in check.mended:  # which is reported
+            continue
+        if INPUT in check.kinds_of(formula.tree):
+            check.say(
+                path,
+                "a constraint can't depend on inputs, whose rates nobody knows: let them act "
+                "through [forces], or write the motion wanted as a function of t",
+                check.where(formula, INPUT),
+                formula.text,
+            )
+        check.smooth(path, formula)
+        yield Constraint(name, entry.unit, formula, entry.note)
+
+
+def _equation(text: str) -> str:
+    """What to write in place of an equation, or the empty string."""
+    sides = [side.strip() for side in text.replace("==", "=").split("=")]
+    if len(sides) != 2 or not all(sides):
+        return ""
+    left, right = sides
+    if right == "0":
+        return f"a constraint is what is zero, without '= 0': write {left}"
+    right = right if re.fullmatch(r"[\w.*/()]+", right) else f"({right})"
+    return f"a constraint is what is zero: write {left} - {right}"
+
+
+def fault_of_row(check: Checker, doc: Document, name: str) -> str:
+    """Why a row can't have a name; the empty string where it can."""
+    taken = {n: f"stands in [{table}]" for n, table in check.tables.items()}
+    taken |= dict.fromkeys(doc.outputs, "stands in [outputs]")
+    taken |= {f"{c}_dot": f"is the velocity of '{c}'" for c in doc.coordinates}
+    taken |= {f"{c}_ddot": f"is the acceleration of '{c}'" for c in doc.coordinates}
+    taken |= dict.fromkeys(check.centers - {*check.tables}, "is where a body or point is")
+    taken |= {"energy": "is K + P"}
+    if why := names.fault(name):
+        return why
+    return f"'{name}' {taken[name]} already" if name in taken else ""
+
+
+def guesses(check: Checker, doc: Document) -> None:
+    """A warning of each `guess` where nothing is assembled."""
+    if not (doc.constraints or doc.loop):
+        for name, entry in doc.coordinates.items():
+            if entry.guess:
+                check.say(
+                    ("coordinates", name, "guess"),
+                    "changes nothing: a guess is what [constraints] or a [[loop]] may move, and "
+                    "there are none",
+                    severity="warning",
+                )

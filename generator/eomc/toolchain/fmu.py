@@ -1,0 +1,131 @@
+"""Units of FMI: compiled, and put into one file."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eomc.base.errors import EomcError, NoCompilerError
+from eomc.toolchain.compiler import Compiler, compiler_for, flags, standard
+
+if TYPE_CHECKING:
+    from eomc.emit.fmu.files import Unit
+
+_DATE = (1980, 1, 1, 0, 0, 0)  # of all that is inside: same scene, same bytes
+_SUFFIX = {"win32": ".dll", "cygwin": ".dll", "darwin": ".dylib"}
+_MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A unit on disk. binary: the folder inside that holds one, "" where there is none, and why."""
+
+    file: Path
+    binary: str
+    why: str = ""
+
+
+def export(made: Unit, file: Path, binary: bool = True) -> Exported:
+    """Write a unit to `file`, over what is there, with a binary for this machine where wanted.
+
+    Without a compiler the unit has its sources alone. Raises EomcError where the compiler fails,
+    with its own words, or the file can't be written.
+    """
+    if file.is_dir():
+        raise EomcError(f"{file}: is a folder: name a file, --out {made.name}.fmu")
+    held: dict[str, bytes] = {}
+    folder = why = ""
+    if binary:
+        try:
+            held, folder = _compiled(made, compiler_for(made.operations))
+        except NoCompilerError as fault:
+            why = str(fault)
+    texts = {name: text.encode(errors="backslashreplace") for name, text in made.files.items()}
+    _write(file, texts | held)
+    return Exported(file, folder, why)
+
+
+def place(version: int) -> str:
+    """The folder of binaries for this system and processor, as FMI calls it."""
+    system = {"win32": "windows", "cygwin": "windows"}.get(sys.platform, sys.platform)
+    machine = _MACHINES.get(platform.machine().lower(), platform.machine().lower())
+    if version == 2 and machine == "x86_64":
+        return {"windows": "win64", "darwin": "darwin64"}.get(system, "linux64")
+    return f"{machine}-{system}"
+
+
+def _compiled(made: Unit, compiler: Compiler) -> tuple[dict[str, bytes], str]:
+    library = made.name + _SUFFIX.get(sys.platform, ".so")
+    folder = place(made.version)
+    with tempfile.TemporaryDirectory(prefix="eomc-fmu-") as at:
+        sources = Path(at, "sources")
+        for name, text in made.files.items():
+            if name.endswith((".c", ".h")):
+                to = Path(at, name)
+                to.parent.mkdir(parents=True, exist_ok=True)
+                to.write_text(text, encoding="utf-8", errors="backslashreplace")
+        command = [
+            *compiler.command, standard("plain"), *flags("plain"), "-fPIC", "-fvisibility=hidden",
+            "-shared", *made.sources, "-lm", "-o", library,
+        ]  # fmt: skip
+        _run(made.name, command, sources)
+        load = f"import ctypes; ctypes.CDLL({str(sources / library)!r}).fmi{made.version}GetVersion"
+        done = subprocess.run(
+            [sys.executable, "-I", "-S", "-c", load], stdin=subprocess.DEVNULL, capture_output=True,
+            text=True, errors="backslashreplace",
+        )  # fmt: skip
+        if done.returncode:
+            said = [*done.stderr.strip().splitlines(), f"status {done.returncode}"][-2:][0]
+            raise EomcError(
+                f"{made.name}: the C compiler {shlex.join(compiler.command)} returned 0, but what "
+                f"it made can't be loaded: correct CC and EOMC_CFLAGS, or take --sources\n  {said}"
+            )
+        return {f"binaries/{folder}/{library}": (sources / library).read_bytes()}, folder
+
+
+def _run(name: str, command: list[str], folder: Path) -> None:
+    try:
+        done = subprocess.run(
+            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="backslashreplace",
+        )  # fmt: skip
+    except OSError as fault:
+        raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
+    if done.returncode:
+        raise EomcError(
+            f"{name}: the C compiler failed (status {done.returncode}):\n"
+            f"  {shlex.join(command)}\n{done.stdout.rstrip()}"
+        )
+
+
+def _write(file: Path, held: dict[str, bytes]) -> None:
+    """An archive of these, moved into place when it is whole."""
+    new = None
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        number, new = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
+        with os.fdopen(number, "wb") as out, zipfile.ZipFile(out, "w") as archive:
+            for name in sorted(held):
+                entry = zipfile.ZipInfo(name, _DATE)
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                entry.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
+                entry.create_system = 3
+                archive.writestr(entry, held[name])
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(new, 0o666 & ~umask)
+        os.replace(new, file)
+        new = None
+    except OSError as fault:
+        raise EomcError(f"{file}: can't be written ({fault.strerror})") from None
+    finally:
+        if new is not None:
+            Path(new).unlink(missing_ok=True)

@@ -1,0 +1,128 @@
+"""Accelerations under constraints, and states put back onto them, by one dense matrix in NumPy.
+
+    [D  -A^T] [  qdd   ]   [tau - bias]
+    [A    0 ] [ lambda ] = [ - gamma  ]
+
+Rows of A are those of the constraints that are not redundant; gamma is what the second rate of a
+position row, or the rate of a rate row, has without qdd. The matrix is scaled, and solved as it
+stands. Where rows depend on others in some position, the least scaled lambda of the least residual
+is taken: its singular values are about 1, and the square of those of A for rows that fade out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+FADED = 1e-9  # of the largest singular value: a row that is none here
+MOST = 60  # sweeps of Newton's method
+HELD = 1e-10  # of the terms of a row: what it may still be
+SETTLED = 16 * 2.0**-52  # of the state: what a correction may still be when it is rounding
+
+
+def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
+    """x and lambda with D x - A^T lambda = force and A x = level.
+
+    D: (..., n, n); A: (..., m, n); force: (..., n); level: (..., m). nan where something is not
+    finite.
+    """
+    n, m = D.shape[-1], A.shape[-2]
+    shape = np.broadcast_shapes(D.shape[:-2], A.shape[:-2], force.shape[:-1], level.shape[:-1])
+    x, multipliers = np.full((*shape, n), np.nan), np.full((*shape, m), np.nan)
+    parts = (
+        np.broadcast_to(D, (*shape, n, n)), np.broadcast_to(A, (*shape, m, n)),
+        np.broadcast_to(force, (*shape, n)), np.broadcast_to(level, (*shape, m)),
+    )  # fmt: skip
+    for k in np.ndindex(shape):
+        here = [part[k] for part in parts]
+        if all(np.all(np.isfinite(part)) for part in here):
+            x[k], multipliers[k] = _solve(*here)
+    return x, multipliers
+
+
+def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
+    """At one state."""
+    n, m = len(D), len(A)
+    scale = scales(D, A)
+    matrix = scale[:, None] * np.block([[D, -A.T], [A, np.zeros((m, m))]]) * scale
+    right = scale * np.concatenate([force, level])
+    sizes = np.linalg.svd(matrix, compute_uv=False)
+    if sizes[-1] > FADED * sizes[0]:
+        found = np.linalg.solve(matrix, right)
+        found += np.linalg.solve(matrix, right - matrix @ found)
+    else:
+        found = np.linalg.lstsq(matrix, right, rcond=FADED)[0]
+    found *= scale
+    return found[:n], found[n:]
+
+
+def inverse(D: Vector, A: Vector) -> Vector:
+    """(n + m, n + m): of the matrix, the sizes of its entries: how it spreads what is rounded."""
+    m, scale = len(A), scales(D, A)
+    matrix = scale[:, None] * np.block([[D, -A.T], [A, np.zeros((m, m))]]) * scale
+    return np.asarray(np.abs(scale[:, None] * np.linalg.inv(matrix) * scale))
+
+
+def regular(D: Vector, A: Vector, least: float) -> bool:
+    """Whether the scaled matrix is far from singular: its singular values above `least`.
+
+    Those of rows are squares of A's.
+    """
+    m, scale = len(A), scales(D, A)
+    matrix = scale[:, None] * np.block([[D, -A.T], [A, np.zeros((m, m))]]) * scale
+    if not np.all(np.isfinite(matrix)):
+        return False
+    sizes = np.linalg.svd(matrix, compute_uv=False)
+    return bool(sizes[-1] > least * sizes[0])
+
+
+def scales(D: Vector, A: Vector) -> Vector:
+    """(n + m,): of the rows and columns of the matrix, so that coordinates and rows alike are 1.
+
+    A coordinate without inertia has that of the rows that it is in.
+    """
+    inertia = np.abs(np.diag(D))
+    known = inertia > 0
+    mass = float(np.mean(inertia[known])) if np.any(known) else 1.0
+    size = np.sqrt(np.sum(A**2, axis=1))
+    part = np.max(np.abs(A) / np.where(size > 0, size, 1)[:, None], axis=0, initial=0)
+    inertia = np.where(known, inertia, mass * np.where(part > 0, part, 1) ** 2)
+    coordinates = 1 / np.sqrt(inertia)
+    rows = np.sqrt(np.sum((A * coordinates) ** 2, axis=1))
+    return np.concatenate([coordinates, 1 / np.where(rows > 0, rows, 1)])
+
+
+def onto(
+    q: Vector, rows: Callable[[Vector], tuple[Vector, Vector, Vector]]
+) -> tuple[Vector, float]:
+    """The nearest q by Newton's method in the metric of D, and its last correction, in sizes of q.
+
+    rows: D, A and what is to be zero, at q. Long corrections are halved until what is to be zero
+    gets less. The last correction is more than rounding where none is found, inf where the nearest
+    is not on the rows.
+    """
+    D, A, off = rows(q)
+    last = np.inf
+    for _ in range(MOST):
+        by, _ = solve(D, A, np.zeros(len(q)), -off)
+        size = float(np.max(np.abs(by) / (np.abs(q) + np.max(np.abs(q)) + 1), initial=0))
+        if not np.isfinite(size):
+            return q, np.inf
+        if size <= SETTLED or (size < 1e-12 and size > last / 2):
+            level = np.abs(A) @ (np.abs(q) + np.max(np.abs(q)) + 1)
+            return q + by, size if np.all(np.abs(off) <= HELD * level) else np.inf
+        last, part = size, 1.0
+        weight = scales(D, A)[len(q) :]
+        before = np.linalg.norm(weight * off)
+        while part > 1e-3 and size >= 1e-6:
+            after = np.linalg.norm(weight * rows(q + part * by)[2])
+            if after <= (1 - part / 4) * before:
+                break
+            part /= 2
+        q = q + part * by
+        D, A, off = rows(q)
+    return q, last

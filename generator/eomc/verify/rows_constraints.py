@@ -1,0 +1,258 @@
+"""Rows of `check` about constraints: what is zero, A, multipliers, projection, reactions.
+
+At states that the reference has put onto the rows, along a run, and of both forms of C. Multipliers
+and accelerations are compared with those of a dense KKT matrix in NumPy (`kkt`), a corrected step
+in `comparison` with a step that is put back by Newton's method. The module alone is asked whether
+multipliers work where no row moves by itself, whether A is the slope of the rows, and whether
+reactions do what multipliers do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.model.symbols import t as time
+from eomc.scene.assembly import Loop
+from eomc.verify.finding import Finding, largest
+from eomc.verify.oracle import Vector
+from eomc.verify.report import LIMIT
+from eomc.verify.rows_bodies import Line
+from eomc.verify.sampling import Expected, State, ask
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+
+VALUES = ("constraints", "constraint_rates", "constraint_jacobian", "multipliers")
+WORK = 1e-9  # of what multipliers do: velocities of bodies are good to 1e-12
+STATES = 4
+WIDTHS = (0.1, 0.01, 1e-3)  # of the lines along which bodies move, s at one `spread` a second
+STEPS = 200  # of a run that is to stay on the rows
+SHARE = 0.02  # of how far things go, in a step of it
+HELD = 450.0  # units: what rows may be along it, 1e-13 of their terms
+SLOPE = 1e-7  # of A: differences of order 8, in 16 digits; a wrong sign makes 1
+STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+AWAY = (1e-6, 1e-3, 1e-2)  # of how far things go: from a state to where it is projected from
+UNITS = "units of rounding"
+
+
+def report(of: Comparison, plain: Any) -> None:
+    """Add the rows of a scene with constraints. plain: the module of the plain form, or None."""
+    rows = Rows(of, of.module)
+    for name in VALUES:
+        of.row(name, LIMIT, UNITS, partial(of.value, name))
+    if of.dtype == np.float64:  # single precision leaves differences too few digits
+        of.row("A beside differences", SLOPE, "of A", rows.slopes)
+    of.row("power of multipliers", LIMIT, UNITS, rows.power)
+    if of.system.reactions:
+        of.row("reactions: virtual work", WORK, "of its size", rows.reactions)
+    for module, form in ((of.module, ""), (plain, "plain C: ")):
+        if module is None:
+            continue
+        own = Rows(of, module)
+        if form:
+            find = partial(_values, of, module)
+            of.row("plain C: constraints", LIMIT, UNITS, find)
+        of.row(f"{form}project", LIMIT, UNITS, own.projected)
+        for method in of.methods:
+            kept = partial(own.kept, method)
+            of.row(f"{form}{method} on the constraints", HELD, UNITS, kept)
+
+
+def _values(of: Comparison, module: Any) -> float:
+    """All values of another form at all states."""
+
+    def error(e: Expected) -> float:
+        found = ((ask(module, n, e.state), e.value[n], e.size[n]) for n in VALUES)
+        return float(np.max([of.units(*each) for each in found]))
+
+    return of.largest(error)
+
+
+class Rows:
+    """What is measured of one form's module."""
+
+    def __init__(self, of: Comparison, module: Any) -> None:
+        self.of, self.module, self.system = of, module, of.system
+        self.holonomic = np.array([c.holonomic for c in of.system.constraints])
+
+    def slopes(self) -> float:
+        """A of the module beside differences of its rows: along q, of rows of rates along qd.
+
+        The best of some widths counts: no width makes a wrong A right.
+        """
+        of, spread = self.of, self.of.sampler.spread
+
+        def error(e: Expected) -> float:
+            s = e.state
+            A = ask(self.module, "constraint_jacobian", s)
+            size = (
+                np.abs(A) + np.max(np.abs(A), axis=1, keepdims=True) + e.size["constraint_jacobian"]
+            )
+
+            def off(width: float) -> float:
+                found = np.zeros_like(A)
+                for i in range(len(s.q)):
+                    step = width * spread[i]
+                    for field, rows in (("q", self.holonomic), ("qd", ~self.holonomic)):
+                        if np.any(rows):
+                            found[rows, i] = self._slope(s, field, i, step)[rows]
+                return float(np.max(np.abs(found - A) / size))
+
+            return min(off(width) for width in (0.1, 0.03, 0.01, 0.003, 1e-3))
+
+        return of.largest(error)
+
+    def _slope(self, s: State, field: str, i: int, step: float) -> Vector:
+        total = np.zeros(len(self.system.constraints))
+        for n, weight in STENCIL:
+            for k in (n, -n):
+                x = getattr(s, field).copy()
+                x[i] += k * step
+                at = replace(s, **{field: x})
+                total += (weight if k > 0 else -weight) * ask(self.module, "constraints", at) / step
+        return total
+
+    def power(self) -> float | Finding:
+        """lambda . A qd of the rows in which t does not stand: they do no work."""
+        timeless = np.array([not self._timed(k) for k in range(len(self.system.constraints))])
+        if not np.any(timeless):
+            return Finding(math.inf, "every row moves by itself in time")
+
+        def error(e: Expected) -> float:
+            multipliers, A = (
+                ask(self.module, n, e.state) for n in ("multipliers", "constraint_jacobian")
+            )
+            work = (multipliers * (A @ e.state.qd))[timeless]
+            size = np.abs(multipliers) * e.size["constraint_rates"]
+            size = size + e.size["multipliers"] * (np.abs(A) @ np.abs(e.state.qd))
+            return self.of.units(work, np.zeros_like(work), size[timeless])
+
+        return self.of.largest(error)
+
+    def _timed(self, k: int) -> bool:
+        """Whether t stands in a row, or in what it is made of."""
+        known, found = dict(self.system.definitions), [self.system.constraints[k].formula]
+        while found:
+            symbols = found.pop().free_symbols
+            if time in symbols:
+                return True
+            found += [known[x] for x in symbols if x in known]
+        return False
+
+    def reactions(self) -> float:
+        """Virtual work: what reactions do as one coordinate moves, beside lambda . A of the loop.
+
+        The force acts at the second body's point, on it and against the first one; so does the
+        moment. Velocities are those of rows_bodies.py, from the scene's own tables.
+        """
+        return float(np.max([self._work(e) for e in self.of.few(STATES)]))
+
+    def _work(self, e: Expected) -> float:
+        s, scene = e.state, self.system.scene
+        assert scene is not None and scene.assembly is not None
+        found = self.module.reactions(s.q, s.qd, t=s.t, u=s.u, params=s.params)
+        multipliers, A = (ask(self.module, n, s) for n in ("multipliers", "constraint_jacobian"))
+        loops = {loop.name: loop for loop in scene.assembly.loops}
+        worst = 0.0
+        for name in (r.name for r in self.system.reactions):
+            rows = [k for k, c in enumerate(self.system.constraints) if c.loop == name]
+            force = np.asarray(found[name], float)
+            expected = multipliers[rows] @ A[rows]
+            size = np.abs(multipliers[rows]) @ np.abs(A[rows])
+            least = float(np.max(size, initial=0)) or 1.0
+            for j in range(len(s.q)):
+                off = min(
+                    abs(self._along(loops[name], s, j, width, force) - expected[j])
+                    for width in WIDTHS
+                )
+                worst = max(worst, off / least)
+        return worst
+
+    def _along(self, loop: Loop, s: State, j: int, width: float, force: Vector) -> float:
+        """The power of a reaction at a velocity 1 of coordinate j, less that at rest."""
+        total, spread, scene = 0.0, self.of.sampler.spread[j], self.system.scene
+        assert scene is not None
+        for sign, rate in ((1, spread), (-1, 0.0)):
+            qd = np.zeros(len(s.q))
+            qd[j] = rate
+            with np.errstate(all="ignore"):
+                line = Line(scene, replace(s, qd=qd), width)
+                m, second = line.middle, line.frames[loop.bodies[1]]
+                point = line.vector(loop.points[1]) if loop.points else np.zeros(3)
+                at = second.point(point)[m]
+                v, w = (x[m] for x in line.motion(second, point))
+                first = line.frames[loop.bodies[0]]
+                v0, w0 = (x[m] for x in line.motion(first, np.zeros(3)))
+            v, w = v - (v0 + np.cross(w0, at - first.at[m])), w - w0
+            twist = [*v[:2], w[2]] if self.system.plane else [*v, *w]
+            total += sign * float(force @ np.array(twist))
+        return float(total / spread)
+
+    def kept(self, method: str) -> float | Finding:
+        """What rows and their rates are along a run, in units of their terms there."""
+        of = self.of
+        errors: list[float | None] = []
+        for e in of.few(3):
+            s = replace(e.state, u=None)
+            with np.errstate(divide="ignore"):  # no longer than a stepper follows
+                longest = SHARE * float(np.min(of.sampler.spread / np.abs(s.qd)))
+            run = _quiet(self.module, s, method, min(of.system.run.h, longest))
+            for q, qd, t in zip(run.q[1:], run.qd[1:], run.t[1:], strict=True):
+                at = replace(s, q=np.array(q, float), qd=np.array(qd, float), t=float(t))
+                errors += [self._off(at, "constraints"), self._off(at, "constraint_rates")]
+        return largest(errors, "no step is taken")
+
+    def _off(self, s: State, name: str) -> float | None:
+        A = np.abs(ask(self.module, "constraint_jacobian", s))
+        off = np.abs(ask(self.module, name, s))
+        if name == "constraints":
+            off, A = off[self.holonomic], A[self.holonomic]
+            scale = np.abs(s.q) + self.of.sampler.spread
+        else:
+            scale = np.abs(s.qd) + self.of.sampler.speed
+        if not len(off):
+            return None
+        return self.of.units(off, 0 * off, A @ scale)
+
+    def projected(self) -> float | Finding:
+        """A state moved away is put back where the reference puts it, and held ones stay."""
+        of = self.of
+        scale = np.array([of.sampler.spread, of.sampler.speed])
+        random = np.random.default_rng(11)
+
+        def error(e: Expected, part: float) -> float | None:
+            by = part * scale * random.uniform(-1, 1, scale.shape)
+            s = replace(e.state, q=e.state.q + by[0], qd=e.state.qd + by[1])
+            with np.errstate(all="ignore"):
+                near = of.sampler.onto(s)
+            if not np.all(np.isfinite(near.q)) or not of.sampler.regular(near):
+                return None
+            expected = of.sampler.expected(near)
+            if expected is None:
+                return None
+            found = self.module.project(s.q, s.qd, t=s.t, params=s.params)
+            size = np.abs([near.q, near.qd]) + scale + expected.size["place"]
+            moved = np.abs(np.array([near.q - s.q, near.qd - s.qd]))
+            if np.any(moved > 10 * part * scale):  # far away there may be several
+                return None
+            return of.units(found, np.array([near.q, near.qd]), size)
+
+        errors = [error(e, part) for e in of.few(6) for part in AWAY]
+        return largest(errors, "no state that is moved away has a place nearby")
+
+
+def _quiet(module: Any, s: State, method: str, h: float) -> Any:
+    """A run; where it stops early its rows up to there count."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return module.simulate(
+            q0=s.q, qd0=s.qd, params=s.params, t0=s.t, method=method, h=h, steps=STEPS,
+            every=STEPS // 40,
+        )  # fmt: skip

@@ -1,0 +1,181 @@
+"""The plain C under every standard and level, sanitizers, valgrind and MISRA; what its object has.
+
+No heap, nothing writable, no recursion, a bounded stack: read from what the compiler made.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from itertools import product
+from pathlib import Path
+
+import pytest
+from c.test_plain import NAMES, WISHES, generated, kit, made
+from compilers import STRICT, clang, compiled, run
+from conftest import ROOT, needs, tiers
+
+from eomc.base.errors import EomcError
+from eomc.toolchain import compiler, sizes
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+LEVELS = ("-O0", "-O1", "-O2", "-O3", "-Os")
+C, CPP = ("c99", "c11", "c17"), ("c++11", "c++14", "c++17", "c++20")
+MOST = ["cartpole", "everything", "steppers", "driven", "single", "verlet", "chain", "rod"]
+MATHEMATICS = set(
+    """sin cos sincos tan asin acos atan atan2 sinh cosh tanh exp log sqrt pow fabs fmin
+    fmax""".split()
+)
+MATHEMATICS |= {f"{name}f" for name in MATHEMATICS}  # single precision
+
+
+@pytest.mark.parametrize(
+    ("which", "name"),
+    [
+        pytest.param(c, n, marks=() if (c, n) == ("gcc", "cartpole") else pytest.mark.slow)
+        for c, n in product(("gcc", "g++", "clang", "clang++"), MOST)
+    ],
+)
+def test_no_compiler_has_anything_to_say(which: str, name: str, tmp_path: Path) -> None:
+    title = kit(name, tmp_path)
+    cpp = which.endswith("++")
+    call = clang(cpp) if which.startswith("clang") else [needs(which)]
+    files = [f"{title}.c"] if cpp else [f"{title}.c", "main.c", "selftest.c"]
+    language = ["-x", "c++"] if cpp else []
+    for standard, level in product(CPP if cpp else C, LEVELS):
+        how = [f"-std={standard}", *STRICT[1:], level, "-I.", "-c", *language]
+        for file in files:
+            compiled(*call, *how, file, cwd=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [
+        pytest.param(f, n, marks=() if (f, n) == ("plain", "cartpole") else pytest.mark.slow)
+        for f, n in (*product(["plain"], MOST), *product(["fast"], ["cartpole", "verlet", "chain"]))
+    ],
+)
+def test_sanitizers_find_nothing(form: str, name: str, tmp_path: Path) -> None:
+    title = kit(name, tmp_path)
+    at = "." if form == "plain" else "fast"
+    how = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    how += ["-std=c99" if form == "plain" else "-std=gnu99", f"-I{at}"]
+    for program in ("selftest", "main"):
+        files = [f"{program}.c", f"{at}/{title}.c", "-lm", "-o", program]
+        done = run(needs("gcc"), *how, *files, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        done = run(f"./{program}", cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+STEPS = """
+#include <NAME.h>
+int main(void)
+{
+    double q[2] = { 0.1, 0.2 }, qd[2] = { 0, 0 };
+    int k, status = 0;
+
+    for (k = 0; k < 100; k++)
+        status += (int)NAME_rk4_step(q, qd, 0.001, &NAME_defaults);
+    return status;
+}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["plain", "fast"])
+def test_valgrind_sees_no_heap_and_no_fault(form: str, tmp_path: Path) -> None:
+    valgrind, title = needs("valgrind"), kit("cartpole", tmp_path)
+    at = "." if form == "plain" else "fast"
+    (tmp_path / "steps.c").write_text(STEPS.replace("NAME", title), encoding="utf-8")
+    for program, blocks in (("steps", "0 allocs"), ("selftest", "1 allocs")):  # stdio's one
+        files = [f"{program}.c", f"{at}/{title}.c", "-lm", "-o", program]
+        compiled("cc", "-std=gnu99", "-g", "-O2", f"-I{at}", *files, cwd=tmp_path)
+        done = run(valgrind, "--error-exitcode=9", f"./{program}", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert f"total heap usage: {blocks}" in done.stderr
+
+
+# --- the object -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", tiers(["-Os", "-O0", "-O2", "-O3"], "-Os"))
+@pytest.mark.parametrize("name", tiers([*NAMES, *WISHES], "cartpole"))
+def test_the_object_is_bounded(name: str, level: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing writable, no function calls itself, every stack known; only <math.h> is called."""
+    monkeypatch.setenv("EOMC_CFLAGS", level)
+    gcc = compiler.Compiler((needs("gcc"),), "")
+    title = made(name).name
+    found = sizes.measure(generated(name), title, gcc)
+    assert (found.faults, found.writable) == ((), 0)
+    names = {f.name for f in found.functions}
+    public = [f for f in found.functions if "." not in f.name]
+    assert {f"{title}_acceleration", f"{title}_{made(name).run.methods[0]}_run"} <= names
+    assert all(f.code > 0 and f.stack is not None and f.deepest is not None for f in public)
+    called = {x for f in found.functions for x in f.calls} - names
+    assert called <= MATHEMATICS | {"memcpy", "memset", "memmove"}, called - MATHEMATICS
+    run_of, step_of = (
+        next(f for f in public if f.name == f"{title}_{made(name).run.methods[0]}_{what}")
+        for what in ("run", "step")
+    )
+    assert run_of.deepest is not None and step_of.deepest is not None
+    if level == "-O0":  # where nothing is inlined
+        assert run_of.deepest > step_of.deepest > (step_of.stack or 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("int x_f(int n) { return n > 1 ? n*x_f(n - 1) + x_f(n - 2) : 1; }", "x_f: calls itself"),
+        ("int x_g(int); int x_f(int n) { return x_g(n) + 1; }\n"
+         "int x_g(int n) { return n > 9 ? 1 : x_f(n + 1) + x_f(n + 2); }", "calls itself"),
+        ("double use(double *);\ndouble x_f(int n) { double a[n]; return use(a); }",
+         "x_f: its stack has no bound"),
+    ],
+)  # fmt: skip
+def test_what_is_unbounded_is_told(text: str, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0")
+    gcc = compiler.Compiler((needs("gcc"),), "")
+    found = sizes.measure({"x.h": "", "x.c": text}, "x", gcc)
+    assert fault in "\n".join(found.faults)
+    assert next(f for f in found.functions if f.name == "x_f").deepest is None
+
+
+def test_writable_data_and_constants_are_counted() -> None:
+    text = (
+        "int x_a; int x_b = 3; const double x_c[4] = { 1, 2, 3, 4 };\nint x_f(void) { return 7; }"
+    )
+    found = sizes.measure({"x.h": "", "x.c": text}, "x", compiler.find_compiler())
+    assert (found.writable, found.constants) == (8, 32)
+    assert found.code > 0 and [f.name for f in found.functions] == ["x_f"]
+
+
+def test_sizes_need_a_compiler_that_makes_objects(tmp_path: Path) -> None:
+    (tmp_path / "cc").write_text("#!/bin/sh\necho no object > x.o\n", encoding="utf-8")
+    os.chmod(tmp_path / "cc", 0o755)
+    for command, said in ((str(tmp_path / "cc"), "no ELF object"), ("false", "failed"),
+                          ("true", "no ELF object"), ("/nowhere", "can't be run")):  # fmt: skip
+        with pytest.raises(EomcError, match=said):
+            sizes.measure({"x.h": "", "x.c": ""}, "x", compiler.Compiler((command,), ""))
+
+
+# --- MISRA ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_misra_rules_are_kept_but_for_those_that_are_told(tmp_path: Path) -> None:
+    """By cppcheck's addon, over all scenes; docs/c.md has those that are not, and why."""
+    cppcheck, text = needs("cppcheck"), (ROOT / "docs" / "c.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([\d., ]+) \| (?:required|advisory) \|", text, re.MULTILINE)
+    told = {rule for row in rows for rule in row.split(", ")}
+    found = set()
+    for name in [*NAMES, *WISHES]:
+        title = made(name).name
+        for end in "hc":
+            file = f"{title}.{end}"
+            (tmp_path / file).write_text(generated(name)[file], encoding="utf-8")
+        words = ["--addon=misra", "--enable=style", "--std=c99", "--suppress=misra-config"]
+        done = run(cppcheck, *words, f"{title}.c", cwd=tmp_path)
+        assert done.returncode == 0 and "error" not in done.stderr, done.stderr
+        found |= set(re.findall(r"\[misra-c2012-([\d.]+)\]", done.stderr))
+    assert found == told

@@ -1,0 +1,83 @@
+"""Random closed chains of bars in the plane, some with a bar more that says nothing new."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.scene.read import parse
+
+ROUGH = 0.2  # of a value, a guess may be off
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A chain of bars from one fixed pin to another; q: angles at which it is closed.
+
+    held: which of them a start holds; extra: rows that others imply.
+    """
+
+    system: System
+    q: np.ndarray
+    held: np.ndarray
+    extra: int
+
+
+def chain(seed: int, rough: float = ROUGH) -> Chain:
+    """A chain of 4 to 12 bars, the fixed one among them, with random lengths, masses and points.
+
+    Absolute angles; the last bar's end is at a random point of the bar. Every third has a bar more
+    between two bars that a parallelogram holds parallel, which is redundant.
+    """
+    random = np.random.default_rng(seed)
+    bars = int(random.integers(4, 13))
+    n = bars - 1
+    length, mass = random.uniform(0.3, 1.5, n), random.uniform(0.2, 3.0, n)
+    q = random.uniform(-np.pi, np.pi, n)
+    ends = length.copy()
+    ends[-1] *= random.uniform(0.4, 1.0)  # where the last bar is pinned
+    pin = np.array([ends @ np.cos(q), ends @ np.sin(q)])
+    held = np.zeros(n, dtype=bool)
+    held[random.permutation(n)[: n - 2]] = True
+    off = np.where(held, 0, random.uniform(-rough, rough, n))
+    guess = q * (1 + off)
+    x = " + ".join(f"{ends[k]!r}*cos(q{k})" for k in range(n))
+    y = " + ".join(f"{ends[k]!r}*sin(q{k})" for k in range(n))
+    rows = [f'x = "{x} - ({pin[0]!r})"', f'y = "{y} - ({pin[1]!r})"']
+    extra = 0
+    if seed % 3 == 0:  # what is pinned already is pinned once more, from elsewhere
+        factors = random.uniform(-2, 2, 2)
+        rows.append(f'again = "{factors[0]!r}*({x} - ({pin[0]!r})) + sin({y} - ({pin[1]!r}))"')
+        extra = 1
+    kinetic, potential = [], []
+    for k in range(n):
+        cx = " + ".join(
+            [*(f"{length[j]!r}*cos(q{j})" for j in range(k)), f"{length[k] / 2!r}*cos(q{k})"]
+        )
+        cy = cx.replace("cos", "sin")
+        kinetic.append(
+            f"{mass[k]!r}*(dot({cx})**2 + dot({cy})**2)/2"
+            f" + {mass[k] * length[k] ** 2 / 12!r}*q{k}_dot**2/2"
+        )
+        potential.append(f"{mass[k] * 9.81!r}*({cy})")
+    starts = "\n".join(
+        f"q{k} = {{ start = {float(guess[k])!r}, guess = {str(not held[k]).lower()} }}"
+        for k in range(n)
+    )
+    text = f"""
+eomc = 1
+name = "chain_{seed}"
+[coordinates]
+{starts}
+[constraints]
+{chr(10).join(rows)}
+[energy]
+kinetic = "{" + ".join(kinetic)}"
+potential = "{" + ".join(potential)}"
+[run]
+duration = 1.0
+"""
+    return Chain(from_scene(parse(text.replace("np.float64", ""), "chain.toml")), q, held, extra)

@@ -1,0 +1,95 @@
+"""Accelerations and multipliers under constraints against a dense solve of the KKT system."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from eomc.derive.lagrange import derive
+from eomc.model.symbols import symbol
+from eomc.model.system import Constraint, System
+from eomc.program.interpret import evaluator
+from eomc.program.program import Program, build, matrix
+
+
+def constrained(system: System, **rows: str) -> System:
+    """The system with holonomic rows over its own names."""
+    made = System.make(
+        system.name, [c.name for c in system.coordinates], system.kinetic, outputs=rows,
+        parameters={p.name: p.value for p in system.parameters},
+    )  # fmt: skip
+    return replace(system, constraints=tuple(Constraint(o.name, o.formula) for o in made.outputs))
+
+
+DOUBLE = System.make(
+    "two_links",
+    {"x1": 0.6, "y1": -0.8, "x2": 0.96, "y2": -1.28},
+    "m1*(x1_dot**2 + y1_dot**2)/2 + m2*(x2_dot**2 + y2_dot**2)/2 + x1_dot*x2_dot/9",
+    "9.81*(m1*y1 + m2*y2) + x1*x2",
+    parameters={"m1": 1.0, "m2": 0.7, "l": 1.0},
+)
+LINKS = {"first": "x1**2 + y1**2 - l**2", "second": "(x2 - x1)**2 + (y2 - y1)**2 - 0.36"}
+STATE = {
+    "x1": 0.6, "y1": -0.8, "x2": 0.96, "y2": -1.28, "x1_dot": 0.3, "y1_dot": 0.2, "x2_dot": -0.4,
+    "y2_dot": 0.7, "m1": 1.1, "m2": 0.7, "l": 1.0, "t": 0.0,
+}  # fmt: skip
+
+
+def values(program: Program, name: str) -> np.ndarray:
+    """The results of a function at the state."""
+    return np.array(evaluator(program[name], exact=True)(STATE)[0])
+
+
+@pytest.mark.parametrize("massless", [False, True])
+def test_accelerations_and_multipliers_solve_the_dense_system(massless: bool) -> None:
+    system = constrained(DOUBLE, **LINKS)
+    if massless:  # x2 is moved by nothing but its row
+        kinetic = system.kinetic.subs(symbol("x2_dot"), 0)
+        system = replace(system, kinetic=kinetic)
+    program = build(derive(system))
+    a, multipliers = values(program, "acceleration"), values(program, "multipliers")
+    A = values(program, "constraint_jacobian").reshape(2, 4)
+    D = np.array(matrix(program, "D", STATE))
+    bias = values(program, "bias")
+    np.testing.assert_allclose(D @ a + bias, A.T @ multipliers, atol=1e-13)
+    qd = np.array([STATE[f"{c.name}_dot"] for c in system.coordinates])
+    # d(A qd)/dt by differences of the rates along qd
+    rates = evaluator(program["constraint_rates"], exact=True)
+    by = 1e-6
+    moved = [
+        np.array(rates(STATE | {c.name: STATE[c.name] + s * by * v for c, v in
+                                zip(system.coordinates, qd, strict=True)})[0])
+        for s in (-1, 1)
+    ]  # fmt: skip
+    np.testing.assert_allclose(A @ a, -(moved[1] - moved[0]) / (2 * by), rtol=1e-9)
+
+
+def test_a_row_that_depends_on_others_here_is_dropped_and_told() -> None:
+    twice = constrained(DOUBLE, **LINKS, again="2*x1**2 + 2*y1**2 - 2*l**2")
+    program = build(derive(twice))
+    *_, inverses = np.split(values(program, "correction"), [8])
+    assert sum(inverses == 0) == 1
+    alone = values(build(derive(constrained(DOUBLE, **LINKS))), "acceleration")
+    np.testing.assert_allclose(values(program, "acceleration"), alone, rtol=1e-13)
+    first, _, again = values(program, "multipliers")
+    assert 0 in (first, again)
+
+
+def test_a_correction_moves_onto_the_rows_with_the_least_change_in_the_metric_of_D() -> None:
+    program = build(derive(constrained(DOUBLE, **LINKS)))
+    off = STATE | {"x1": 0.6003, "y2": -1.2797}
+    names = [c.name for c in DOUBLE.coordinates]
+    d = np.array(evaluator(program["correction"], exact=True)(off)[0])
+    A = np.array(evaluator(program["constraint_jacobian"], exact=True)(off)[0]).reshape(2, 4)
+    phi = np.array(evaluator(program["constraints"], exact=True)(off)[0])
+    D = np.array(matrix(program, "D", off))
+    np.testing.assert_allclose(A @ d[:4], -phi, atol=1e-15)
+    null = np.linalg.svd(A)[2][2:]  # D dq is of A's rows alone
+    np.testing.assert_allclose(null @ D @ d[:4], 0, atol=1e-16)
+    after = {n: off[n] + x for n, x in zip(names, d[:4], strict=True)}
+    after |= {f"{n}_dot": off[f"{n}_dot"] + x for n, x in zip(names, d[4:8], strict=True)}
+    left = np.array(evaluator(program["constraint_rates"], exact=True)(off | after)[0])
+    before = np.array(evaluator(program["constraint_rates"], exact=True)(off)[0])
+    assert np.abs(left).max() < 1e-3 * np.abs(before).max()

@@ -1,0 +1,212 @@
+"""Units of FMI as text: units, dependencies, C, bytes. No importer needed."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from compilers import compiled, run
+from conftest import EVERYTHING, needs
+from fmus import BALL, FLOAT
+from payloads import RAW, derived, payloads, tokens, with_texts
+
+import eomc
+from eomc import pipeline
+from eomc.base import resources, texts
+from eomc.emit import render
+from eomc.emit.fmu import units
+from eomc.emit.fmu.files import Unit
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+
+ODD = """
+eomc = 1
+name = "odd_names"
+title = "Quotes \\" ' and ]]> & <b> --> here"
+[coordinates]
+theta = { unit = "<rad & \\"more\\">", note = "ends a comment: */ --> ' & é" }
+near = { start = 1.0 }
+[parameters]
+MAX_FORCE = { value = 2.0, unit = "kg m^2/s^2" }
+energy = 1.0
+t_1 = 1.0
+[energy]
+kinetic = "(theta_dot**2 + near_dot**2)/2"
+potential = "MAX_FORCE*cos(theta) + energy*near**2 + t_1*near"
+"""
+
+
+def made(text: str, version: int) -> Unit:
+    return pipeline.unit(from_scene(parse(text, "test.toml")), version)
+
+
+def described(unit: Unit) -> ET.Element:
+    return ET.fromstring(unit.files["modelDescription.xml"])
+
+
+@pytest.mark.parametrize(
+    "text, attributes",
+    [
+        ("m", {"m": "1"}),
+        ("N", {"kg": "1", "m": "1", "s": "-2"}),
+        ("m/s^2", {"m": "1", "s": "-2"}),
+        ("m/s2", {"m": "1", "s": "-2"}),
+        ("m s**-2", {"m": "1", "s": "-2"}),
+        ("m·s⁻²", {"m": "1", "s": "-2"}),
+        ("N.m", {"kg": "1", "m": "2", "s": "-2"}),
+        ("N m/rad", {"kg": "1", "m": "2", "s": "-2", "rad": "-1"}),
+        ("N/(m/s)", {"kg": "1", "s": "-1"}),
+        ("(N m)/s", {"kg": "1", "m": "2", "s": "-3"}),
+        ("1/s", {"s": "-1"}),
+        ("kN", {"kg": "1", "m": "1", "s": "-2", "factor": "1000.0"}),
+        ("mm", {"m": "1", "factor": "0.001"}),
+        ("g", {"kg": "1", "factor": "0.001"}),
+        ("kg", {"kg": "1"}),
+        ("min", {"s": "1", "factor": "60.0"}),
+        ("deg", {"rad": "1", "factor": "0.017453292519943295"}),
+        ("1", {}),
+    ],
+)
+def test_units_mean_what_they_say(text: str, attributes: dict[str, str]) -> None:
+    meaning = units.parsed(text)
+    assert meaning is not None and dict(meaning.attributes) == attributes
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", " ", "furlong", "m/", "/m", "(m", "m)", "m^", "m^x", "m^99", "2 m", "m**2**2", "<b>", "°C",
+     "m" + "/s" * 30, "((((", "^", "kkg", "k", "m^1.5"],
+)  # fmt: skip
+def test_other_texts_mean_nothing(text: str) -> None:
+    assert units.parsed(text) is None
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_same_scene_same_text(version: int) -> None:
+    first, second = made(BALL, version), made(BALL, version)
+    assert first == second
+    other = made(BALL.replace("g = { value = 9.81", "g = { value = 9.82"), version)
+    key = {2: "guid", 3: "instantiationToken"}[version]
+    assert described(first).get(key) != described(other).get(key)
+    assert f'"{described(first).get(key)}"' in first.files["sources/fmi/scene.h"]
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_texts_of_people_are_escaped_and_names_are_the_authors(version: int) -> None:
+    unit = made(ODD, version)
+    root = described(unit)
+    assert root.get("description") == "Quotes \" ' and ]]> & <b> --> here"
+    found = {v.get("name"): v for v in root.iter() if v.get("valueReference") and v.get("name")}
+    assert found["theta"].get("description") == "ends a comment: */ --> ' & é"
+    assert {"near", "near_dot", "der(near)", "MAX_FORCE", "energy", "energy.total"} <= {*found}
+    # that unit means nothing to FMI, and so it is left out
+    whole = unit.files["modelDescription.xml"]
+    assert "more" not in whole and 'name="kg m^2/s^2"' in whole
+
+
+def test_what_depends_on_what() -> None:
+    root = described(made(BALL, 3))
+    name = {v.get("valueReference"): v.get("name") for v in root.find("ModelVariables") or ()}
+    structure = root.find("ModelStructure")
+    assert structure is not None
+    found = {
+        (e.tag, name[e.get("valueReference")]): {
+            name[r] for r in str(e.get("dependencies")).split()
+        }
+        for e in structure
+    }
+    assert found["Output", "height"] == {"x", "y"}
+    # the wind may follow its signal, which reads the time
+    assert found["Output", "ax"] == {"x_dot", "wind", "t"}
+    assert found["ContinuousStateDerivative", "der(y)"] == {"y_dot"}
+    assert found["ContinuousStateDerivative", "der(y_dot)"] == set()
+    assert found["InitialUnknown", "der(y_dot)"] == {"g"}
+    assert found["InitialUnknown", "ax"] == {
+        "x_dot", "wind", "t", "m", "inputs.follow_signals"
+    }  # fmt: skip
+    assert found["EventIndicator", "indicator.wall"] == {"x", "wind", "t"}
+
+
+@pytest.mark.parametrize(
+    "text", [BALL, FLOAT, ODD, EVERYTHING], ids=["ball", "float", "odd", "all"]
+)
+@pytest.mark.parametrize("version", [2, 3])
+def test_its_c_is_strict_and_has_nothing_that_changes(
+    text: str, version: int, tmp_path: Path
+) -> None:
+    unit = made(text, version)
+    for file, content in unit.files.items():
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    # the standard's own headers declare functions without prototypes
+    flags = """-std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wdouble-promotion -Wshadow -Werror
+    -O2 -fno-pic""".split()
+    compiled(
+        needs("gcc"), *flags, "-c", f"fmi/fmi{version}.c", "-o", "unit.o", cwd=tmp_path / "sources"
+    )
+    listed = run(needs("nm"), "unit.o", cwd=tmp_path / "sources").stdout.splitlines()
+    kinds = {line.split()[-2] for line in listed}
+    assert not kinds & set("BbCDd"), "globals that change"
+    ours = [line.split()[-1] for line in listed if line.split()[-2] == "T"]
+    assert ours and all(name.startswith(f"fmi{version}") for name in ours)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_units_that_are_linked_statically_have_a_prefix(version: int, tmp_path: Path) -> None:
+    unit = made(BALL, version)
+    for file, content in unit.files.items():
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    command = [needs("gcc"), f"-DFMI{version}_FUNCTION_PREFIX=ball_", "-c", f"fmi/fmi{version}.c",
+               "-o", "unit.o"]  # fmt: skip
+    compiled(*command, cwd=tmp_path / "sources")
+    listed = run(needs("nm"), "unit.o", cwd=tmp_path / "sources").stdout
+    assert f" T ball_fmi{version}DoStep" in listed and f" T fmi{version}DoStep" not in listed
+
+
+def test_the_standard_brings_its_licence() -> None:
+    text = resources.text("csrc", "fmi/LICENSE.txt")
+    assert "2-Clause BSD" in text and "Modelica Association" in text
+    for version in (2, 3):
+        assert made(FLOAT, version).files["documentation/licenses/fmi-headers.txt"] == text
+
+
+def test_constraints_are_refused_where_they_stand() -> None:
+    text = FLOAT.replace("[run]", '[constraints]\nnone = "phi - phi**2"\n[run]')
+    with pytest.raises(eomc.SceneError, match=r"constraints.*have no unit of FMI yet"):
+        made(text, 2)
+
+
+def test_other_versions_are_refused() -> None:
+    with pytest.raises(Exception, match="FMI 2 or 3, here 1"):
+        made(BALL, 1)
+
+
+@payloads
+@pytest.mark.parametrize("version", [2, 3])
+def test_free_texts_stay_texts(given: str, version: int, tmp_path: Path) -> None:
+    """Whatever they hold: descriptions read back are they, and a C compiler sees none of them."""
+    whole = derived()
+    found = [
+        render.unit(replace(whole, system=with_texts(whole.system, text)), version)
+        for text in ("plain", given)
+    ]
+    for unit in found:
+        for name, text in unit.files.items():
+            assert not RAW.search(text.replace("\t", "")), name
+    root = described(found[1])
+    words = {e.get("description") for e in root.iter() if e.get("description")}
+    assert {texts.line(given), root.get("description")} <= {*words, *map(texts.line, words)}
+    seen = []
+    for k, unit in enumerate(found):
+        inside = {
+            name.removeprefix("sources/"): re.sub(r"[0-9a-f-]{36}", "", text)
+            for name, text in unit.files.items()
+            if name.startswith("sources/")
+        }
+        (tmp_path / str(k)).mkdir()
+        seen.append(tokens(inside, tmp_path / str(k)))
+    assert re.sub(r"0x\w+u", "", seen[0]) == re.sub(r"0x\w+u", "", seen[1])

@@ -1,0 +1,211 @@
+"""Units of FMI for tests: scenes exported once, an importer over FMPy, alike for both versions."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cases import SCENES
+
+from eomc import pipeline
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+
+VERSIONS = (2, 3)
+FOLDER = Path(tempfile.mkdtemp(prefix="eomc-fmus-"))  # of this process
+
+# a ball that is thrown against a wall: jumps, a stop, an input with limits and a signal, an output
+BALL = """
+eomc = 1
+name = "ball"
+[coordinates]
+y = { unit = "m", start = 1.0 }
+x = { unit = "m", rate = 0.5 }
+[parameters]
+m = { value = 1.0, unit = "kg" }
+g = { value = 9.81, unit = "m/s^2" }
+e = 0.8
+wall = { value = 0.9, unit = "m" }
+[inputs]
+wind = { unit = "N", signal = "0.1*sin(t)", limits = [-5, 5] }
+[energy]
+kinetic = "m*(x_dot**2 + y_dot**2)/2"
+potential = "m*g*y"
+[forces]
+x = "wind - 0.1*x_dot"
+[outputs]
+ax = { formula = "x_ddot", unit = "m/s^2" }
+height = { formula = "y + 0.1*x", unit = "m" }
+[[event]]
+name = "impact"
+when = "y"
+direction = "falling"
+action = "jump"
+y_dot = "-e*y_dot"
+[[event]]
+name = "wall"
+when = "x - wall - 0.01*wind"
+action = "stop"
+[[event]]
+name = "top"
+when = "y_dot"
+direction = "falling"
+[run]
+h = 0.01
+duration = 3
+linearize = true
+"""
+
+# in single precision, with the method that is implicit, and an input that answers the state
+FLOAT = """
+eomc = 1
+name = "soft"
+[coordinates]
+phi = { unit = "rad", start = 0.5 }
+[parameters]
+k = { value = 3.0, unit = "N m/rad" }
+[inputs]
+push = { unit = "N m", signal = "-0.3*phi_dot" }
+[energy]
+kinetic = "phi_dot**2/2"
+potential = "k*phi**2/2"
+[forces]
+phi = "push"
+[run]
+h = 0.01
+real = "float"
+"""
+
+
+@cache
+def exported(scene: str, version: int) -> Path:
+    """The file of a unit: of a scene in scenes/ by its name, or of a scene as text."""
+    if "\n" not in scene:
+        return pipeline.export_fmu(
+            SCENES / f"{scene}.toml", FOLDER / f"{scene}{version}.fmu", version
+        ).file
+    system = from_scene(parse(scene, "test.toml"))
+    return pipeline.export_fmu(system, FOLDER / f"{system.digest[:12]}-{version}.fmu", version).file
+
+
+@cache
+def extracted(file: Path) -> str:
+    """The folder of what is inside."""
+    from fmpy import extract
+
+    return str(extract(str(file), str(FOLDER / f"{file.stem}-inside")))
+
+
+class Host:
+    """An instance. kind: "CoSimulation" or "ModelExchange"; said: what it has logged."""
+
+    def __init__(
+        self, file: Path, kind: str = "CoSimulation", logging: bool = False, folder: str = ""
+    ) -> None:
+        from fmpy import read_model_description
+        from fmpy.simulation import instantiate_fmu
+
+        folder = folder or extracted(file)
+        described = read_model_description(folder)
+        self.said: list[tuple[str, str]] = []
+        self.three = described.fmiVersion != "2.0"
+        logger = self._logged3 if self.three else self._logged2
+        self.unit: Any = instantiate_fmu(
+            folder, described, kind, logger=logger, debug_logging=logging
+        )
+        self.of = {v.name: v.valueReference for v in described.modelVariables}
+        self.t = 0.0
+
+    def _logged2(self, _: Any, name: bytes, status: int, category: bytes, message: bytes) -> None:
+        self.said.append((category.decode(), message.decode()))
+
+    def _logged3(self, _: Any, status: int, category: bytes, message: bytes) -> None:
+        self.said.append((category.decode(), message.decode()))
+
+    def references(self, names: Sequence[str]) -> list[int]:
+        return [self.of[n] for n in names]
+
+    def get(self, *names: str) -> list[float]:
+        read = self.unit.getFloat64 if self.three else self.unit.getReal
+        return list(read(self.references(names)))
+
+    def set(self, **values: float) -> None:
+        self.set_all(values)
+
+    def set_all(self, values: Mapping[str, float]) -> None:
+        write = self.unit.setFloat64 if self.three else self.unit.setReal
+        write(self.references([*values]), [*values.values()])
+
+    def follow_signals(self, on: bool = True) -> None:
+        self.unit.setBoolean([self.of["inputs.follow_signals"]], [on])
+
+    def start(self, t: float = 0.0, tolerance: float | None = None) -> None:
+        self.t = t
+        if self.three:
+            self.unit.enterInitializationMode(tolerance=tolerance, startTime=t)
+        else:
+            self.unit.setupExperiment(tolerance=tolerance, startTime=t)
+            self.unit.enterInitializationMode()
+        self.unit.exitInitializationMode()
+
+    def step(self, size: float) -> bool:
+        """A communication step; whether the unit wants to end."""
+        told = None
+        if self.three:
+            told = self.unit.doStep(self.t, size)
+        else:
+            from fmpy.fmi1 import FMICallException
+
+            try:
+                self.unit.doStep(self.t, size)
+            except FMICallException:
+                if not self.unit.getBooleanStatus(3):  # fmi2Terminated
+                    raise
+                self.t = self.unit.getRealStatus(2)  # fmi2LastSuccessfulTime
+                return True
+        self.t = told[3] if told else self.t + size
+        return bool(told and told[1])
+
+    def kept(self) -> Any:
+        return self.unit.getFMUState()
+
+    def restore(self, state: Any) -> None:
+        self.unit.setFMUState(state)
+
+    def slope(
+        self, unknown: Sequence[str], known: Sequence[str], seeds: Sequence[float]
+    ) -> list[float]:
+        return list(
+            self.unit.getDirectionalDerivative(
+                self.references(unknown), self.references(known), seeds
+            )
+        )
+
+    def free(self) -> None:
+        self.unit.terminate()
+        self.unit.freeInstance()
+
+
+def needs_fmpy() -> None:
+    """Skip where FMPy is not installed, by name."""
+    pytest.importorskip("fmpy", reason="FMPy is not installed: pip install 'eomc[fmu]'")
+
+
+def state_names(module: Any) -> list[str]:
+    """Coordinates and velocities."""
+    names = list(module.COORDINATES) if hasattr(module, "COORDINATES") else []
+    return [*names, *(f"{n}_dot" for n in names)]
+
+
+def rows(host: Host, names: Sequence[str], size: float, count: int) -> np.ndarray:
+    """The values at the start and after each of so many steps."""
+    found = [host.get(*names)]
+    for _ in range(count):
+        host.step(size)
+        found.append(host.get(*names))
+    return np.array(found)

@@ -1,0 +1,170 @@
+"""Constraints as a System has them: what is of positions, what of rates, what is held."""
+
+import pytest
+import sympy
+from sympy.physics.mechanics import dynamicsymbols
+
+from eomc.base.errors import EomcError
+from eomc.model.constraints import Dependence
+from eomc.model.from_scene import from_scene
+from eomc.model.symbols import Coordinate, dot, symbol, t
+from eomc.model.system import System
+from eomc.scene.read import parse
+
+SCENE = """
+eomc = 1
+name = "rows"
+
+[constants]
+n = 2
+
+[coordinates]
+a    = { start = 0.1, rate = 0.2 }
+b    = { start = 0.1, rate = 0.2, guess = true }
+c    = { unit = "m" }
+d    = { start = "l/2" }
+"e[i]" = { repeat = "i = 1..n", start = "0.1*i", guess = true }
+
+[parameters]
+l = 1.0
+
+[definitions]
+y = "l*sin(a)"
+w = "dot(y)*cos(b) - c_dot"
+
+[energy]
+kinetic = "(a_dot**2 + b_dot**2 + c_dot**2 + d_dot**2 + e1_dot**2 + e2_dot**2)/2"
+"""
+ROWS = """
+[constraints]
+first  = "y - c*t"
+blade  = { formula = "w*b - l", unit = "m/s", note = "no slip" }
+second = { formula = "a - b", unit = "rad" }
+"third[i]" = { repeat = "i = 1..n", formula = "e[i] - i*a" }
+"""
+
+
+def test_holonomic_rows_stand_first_in_their_order():
+    system = from_scene(parse(SCENE + ROWS))
+    assert [(c.name, c.holonomic) for c in system.constraints] == [
+        ("first", True), ("second", True), ("third1", True), ("third2", True), ("blade", False),
+    ]  # fmt: skip
+    blade = system.constraints[-1]
+    assert (blade.unit, blade.note, blade.loop) == ("m/s", "no slip", "")
+    assert blade.formula == symbol("w") * symbol("b") - symbol("l")
+    assert system.constraints[3].formula == symbol("e2") - 2 * symbol("a")
+    assert not system.warnings
+
+
+def test_what_is_given_is_held_and_guesses_are_not():
+    held = {c.name: (c.held, c.held_rate) for c in from_scene(parse(SCENE + ROWS)).coordinates}
+    assert held == {
+        "a": (True, True), "b": (False, False), "c": (False, False), "d": (True, False),
+        "e1": (False, False), "e2": (False, False),
+    }  # fmt: skip
+
+
+def test_without_constraints_everything_is_held():
+    assert all(c.held and c.held_rate for c in from_scene(parse(SCENE)).coordinates)
+
+
+def test_dependence_follows_definitions():
+    x, y = Coordinate("x"), Coordinate("y")
+    p, v = symbol("p"), symbol("v")
+    of = Dependence([x, y], [(p, x.q * 2), (v, dot(p) * sympy.cos(y.q))]).of
+
+    def found(e):
+        rates = of(e)
+        return rates.degree, rates.moves, rates.exact
+
+    m = symbol("m")
+    assert found(m * t) == (0, 1, False)
+    assert found(p**2) == (0, 2, False)
+    assert found(v) == (1, 2, False)
+    assert found(v * m - x.qd) == (1, 2, False)
+    assert found(m * dot(p) + sympy.sin(t) - y.qd / 3) == (1, 2, True)
+    assert found(m * dot(p) + p) == (1, 2, False)
+    assert found(t * x.qd) == (1, 2, False)
+    for e in (v**2, v * x.qd, sympy.sin(x.qd), 1 / x.qd, sympy.Abs(v), 2**v, sympy.sqrt(v)):
+        assert of(e).degree == 2
+
+
+def make(**more):
+    x, y, u = sympy.symbols("x y u")
+    given = {
+        "coordinates": {x: 0.6, y: (-0.8, 1.0)},
+        "kinetic": "(x_dot**2 + y_dot**2)/2",
+        "parameters": {"l": 1.0},
+        "inputs": [u],
+        "definitions": {"s": "x + u", "r": "x**2 + y**2"},
+        "constraints": {"rod": "r - l**2"},
+    }
+    return System.make("pendulum", **{**given, **more})
+
+
+def test_constraints_in_python():
+    system = make(units={"rod": "m^2"})
+    (rod,) = system.constraints
+    assert rod.formula == symbol("r") - symbol("l") ** 2
+    assert (rod.name, rod.unit, rod.holonomic) == ("rod", "m^2", True)
+    assert [(c.held, c.held_rate) for c in system.coordinates] == [(True, False), (True, True)]
+
+
+def test_guesses_in_python():
+    x, y = sympy.symbols("x y")
+    system = make(coordinates={x: None, y: -0.8}, guess=[y])
+    assert [(c.start, c.held) for c in system.coordinates] == [(0.0, False), (-0.8, False)]
+    system = make(coordinates={x: (None, 2.0), y: -0.8}, guess=["x"])
+    assert [(c.rate, c.held_rate) for c in system.coordinates] == [(2.0, False), (0.0, False)]
+    free = make(coordinates=[x, y], constraints=None)
+    assert all(c.held and c.held_rate for c in free.coordinates)
+    assert not free.constraints
+
+
+def test_dynamicsymbols_in_rows():
+    x, psi = dynamicsymbols("x psi")
+    length, time = sympy.Symbol("l"), dynamicsymbols._t
+    system = System.make(
+        "blade", {x: 0.0, psi: 0.1}, x.diff() ** 2 + psi.diff() ** 2, parameters={length: 1.0},
+        constraints={"skate": x.diff() * sympy.sin(psi), "rail": x - length * sympy.cos(time)},
+    )  # fmt: skip
+    rail, skate = system.constraints
+    assert rail.formula == symbol("x") - symbol("l") * sympy.cos(t)
+    assert skate.formula == symbol("x_dot") * sympy.sin(symbol("psi"))
+    assert not system.warnings
+
+
+def test_a_rate_of_a_position_is_doubted_in_python():
+    (warning,) = make(constraints={"roll": "x_dot - l*y_dot"}).warnings
+    assert warning.severity == "warning"
+    assert "write the position itself, -l*y + x, less its value at the start" in warning.message
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"constraints": ["x"]}, "constraints: give a dict"),
+        ({"constraints": {3: "x"}}, "3 is not a name"),
+        ({"constraints": {"lambda": "x"}}, "'lambda' is a Python keyword"),
+        ({"constraints": {"l": "x"}}, "the name 'l' is taken already"),
+        ({"constraints": {"s": "x"}}, "the name 's' is taken already"),
+        ({"constraints": {"rod": "z"}}, "z not declared"),
+        ({"constraints": {"rod": "x_ddot"}}, "x_ddot not declared"),
+        ({"constraints": {"rod": "s - y"}}, "constraint rod: u is an input, whose rate nobody"),
+        ({"constraints": {"rod": "u - y"}}, "constraint rod: u is an input, whose rate nobody"),
+        ({"constraints": {"rod": "l - t"}}, "has no coordinates or rates"),
+        ({"constraints": {"rod": "x_dot**2 - l"}}, "is not linear in the rates"),
+        ({"constraints": {"rod": "sign(x) - l"}}, "constraint rod: sign(...) jumps, and it is"),
+        ({"constraints": {"x_dot": "x - y"}}, "constraint x_dot: the name 'x_dot' is taken"),
+        ({"constraints": {"energy": "x - y"}}, "constraint energy: the name 'energy' is taken"),
+        ({"outputs": {"rod": "x"}}, "outputs: 'rod' is a constraint already"),
+        ({"guess": "x"}, "guess: give a list of coordinates"),
+        ({"guess": ["z"]}, "guess: z not among the coordinates"),
+        ({"guess": ["x"], "constraints": {}}, "guess: constraints move a guess"),
+        ({"coordinates": {"x": (1, 2, 3), "y": 0}}, "give a start, or a pair"),
+    ],
+)  # fmt: skip
+def test_faults_in_python(more, said):
+    with pytest.raises(EomcError) as fault:
+        make(**more)
+    assert said in str(fault.value)

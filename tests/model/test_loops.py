@@ -1,0 +1,312 @@
+"""Loops: rows, and reactions by virtual work, against differences of the rows themselves."""
+
+import numpy as np
+import pytest
+import sympy
+
+from eomc.model.from_scene import from_scene
+from eomc.model.kinematics import Kinematics
+from eomc.model.loops import across
+from eomc.model.symbols import needed
+from eomc.scene.joints import CLOSINGS
+from eomc.scene.read import parse
+
+STEP = 1e-5
+HEAD = 'eomc = 1\nname = "two"\ngravity = {gravity}\n\n[coordinates]\n'
+BODY = """
+[[body]]
+name        = "{name}"
+joint       = "{joint}"
+coordinates = {coordinates}
+mass        = 1.0
+inertia     = {inertia}
+offset      = {offset}
+"""
+LOOP = """
+[[loop]]
+name   = "pin"
+bodies = {bodies}
+joint  = "{joint}"
+"""
+AXES = {
+    "revolute": "[[0.3, -1, 0.4], [1, 2, -0.5]]",
+    "prismatic": "[0.3, -1, 0.4]",
+    "cylindrical": "[[0, 0, -1], [0.1, 2, -0.5]]",
+    "universal": "[[0.3, -1, 0.4], [1, 2, -0.5]]",
+    "point-on-line": "[1, 0, 0.4]",
+}
+CASES = [
+    (kind, plane, world)
+    for kind, closing in CLOSINGS.items()
+    for plane in (True, False)
+    for world in ("", "first", "second")
+    if closing.rows(plane) and kind != "gear"
+]
+
+
+def text(kind, plane, world):
+    """Two free bodies, or one and the world, and a loop between them."""
+    names = ["one", "other"]
+    letters = ("x", "y", "a") if plane else ("x", "y", "z", "a", "b", "c")
+    known = [f"{name}_q{letter}" for name in names for letter in letters]
+    out = HEAD.format(gravity=[0, 0] if plane else [0, 0, 0])
+    out += "".join(f'{name} = {{ unit = "rad" }}\n' for name in known)
+    for k, name in enumerate(names):
+        out += BODY.format(
+            name=name, joint="planar" if plane else "free",
+            coordinates=known[: len(letters)] if not k else known[len(letters) :],
+            inertia=0.5 if plane else [0.5, 0.6, 0.7],
+            offset=[0.1, 0.2] if plane else [0.1, 0.2, 0.3],
+        )  # fmt: skip
+    bodies = {"": names, "first": ["world", "other"], "second": ["one", "world"]}[world]
+    out += LOOP.format(bodies=bodies, joint=kind)
+    points = [[0.3, -0.2, 0.5], [-0.1, 0.4, 0.2]]
+    out += f"points = {[p[:2] for p in points] if plane else points}\n"
+    if kind in AXES and not plane:
+        out += f"axis = {AXES[kind]}\n"
+    elif kind in ("prismatic", "point-on-line"):
+        out += "axis = [0.6, -0.8]\n"
+    if kind in ("weld", "prismatic"):
+        out += f"rotation = {0.7 if plane else [['z', 0.4], ['x', -0.3]]}\n"
+    if kind == "distance":
+        out += "length = 0.8\n"
+    return out, bodies, points
+
+
+class Two:
+    """The scene's rows, reaction and branches in numbers."""
+
+    def __init__(self, kind, plane, world):
+        written, self.bodies, self.points = text(kind, plane, world)
+        self.scene = parse(written)
+        self.system = system = from_scene(self.scene)
+        self.plane = plane
+        (self.reaction,) = system.reactions
+        self.multipliers = [row.multiplier for row in system.constraints]
+        self.rows = self.numeric([row.formula for row in system.constraints])
+        self.branches = self.numeric(self.reaction.branches)
+        self.values = self.numeric(self.reaction.values, self.multipliers)
+        self.kinematics = Kinematics(self.scene, self.scene.assembly)
+        if plane:
+            self.points = [[x, y, 0.0] for x, y, _ in self.points]
+
+    def numeric(self, expressions, more=()):
+        """A function of the coordinates."""
+        expressions = list(expressions)
+        for name, e in reversed(needed(self.system.definitions, expressions)):
+            expressions = [sympy.sympify(x).xreplace({name: e}) for x in expressions]
+        return sympy.lambdify([*self.system.q, *more], expressions)
+
+    def place(self, end, q):
+        """The joint's point on a body, and the body's rotation."""
+        at, R = (np.zeros(3), np.eye(3))
+        if self.bodies[end] != "world":
+            at, R = self.kinematics.poses(q)[self.bodies[end]]
+        return at + R @ self.points[end], R
+
+    def jacobian(self, q):
+        """Of the rows, by central differences."""
+        columns = []
+        for k in range(len(q)):
+            step = STEP * np.eye(len(q))[k]
+            columns.append((np.array(self.rows(*(q + step))) - self.rows(*(q - step))) / 2 / STEP)
+        return np.array(columns).T
+
+    def twist(self, end, at, q):
+        """Of the place that is `at` on a body, over the coordinates: velocities, turning rates."""
+        point, R = self.place(end, q)
+        inside = R.T @ (at - point)
+        v, omega = np.zeros((2, 3, len(q)))
+        for k in range(len(q)):
+            step = STEP * np.eye(len(q))[k]
+            (p1, R1), (p0, R0) = self.place(end, q + step), self.place(end, q - step)
+            v[:, k] = (p1 + R1 @ inside - p0 - R0 @ inside) / 2 / STEP
+            skew = (R1 @ R0.T - R0 @ R1.T) / 4 / STEP
+            omega[:, k] = skew[2, 1], skew[0, 2], skew[1, 0]
+        return v, omega
+
+    def loads(self, q, multipliers):
+        """The reaction: a force and a moment, three entries each."""
+        values = np.array(self.values(*q, *multipliers), float)
+        if self.plane:
+            return np.array([values[0], values[1], 0]), np.array([0, 0, values[2]])
+        return values[:3], values[3:]
+
+    def closed(self, seed):
+        """A position where the loop is closed on its branch, by Gauss and Newton's method."""
+        for start in np.random.default_rng(seed).uniform(-1.5, 1.5, (50, len(self.system.q))):
+            q = start
+            for _ in range(30):
+                q = q - np.linalg.lstsq(self.jacobian(q), np.array(self.rows(*q)), rcond=None)[0]
+            if np.abs(self.rows(*q)).max() < 1e-13 and min(self.branches(*q), default=1) > 0.5:
+                return q
+        raise AssertionError("not closed")
+
+
+@pytest.mark.parametrize(("kind", "plane", "world"), CASES)
+def test_reactions_do_the_work_of_the_rows(kind, plane, world):
+    two = Two(kind, plane, world)
+    random = np.random.default_rng(1)
+    multipliers = random.normal(size=len(two.multipliers))
+    for q, ends in ((random.uniform(-1, 1, len(two.system.q)), (1,)), (two.closed(2), (0, 1))):
+        force, moment = two.loads(q, multipliers)
+        work = multipliers @ two.jacobian(q)
+        at = two.place(1, q)[0]
+        for end in ends:
+            v, omega = two.twist(end, at, q)
+            moved = np.abs(v).max(axis=0) + np.abs(omega).max(axis=0) > 1e-6
+            sign = 1 if end else -1
+            np.testing.assert_allclose(
+                sign * (force @ v + moment @ omega)[moved], work[moved], atol=1e-8
+            )
+            assert moved.any() == (two.bodies[end] != "world")
+
+
+@pytest.mark.parametrize(("kind", "plane", "world"), CASES)
+def test_rows_are_regular_where_the_loop_is_closed(kind, plane, world):
+    two = Two(kind, plane, world)
+    q = two.closed(3)
+    values = np.linalg.svd(two.jacobian(q), compute_uv=False)
+    assert len(values) == len(CLOSINGS[kind].rows(plane))
+    assert values[-1] > 1e-4 * values[0]  # a slide may be far from its points
+    assert [b for b in two.branches(*q) if abs(b - 1) > 1e-12] == []
+
+
+@pytest.mark.parametrize("kind", ["weld", "prismatic", "revolute", "cylindrical"])
+def test_rows_of_axes_are_small_rotations_about_the_named_axes(kind):
+    two = Two(kind, False, "first")
+    q = two.closed(4)
+    _, omega = two.twist(1, two.place(1, q)[0], q)
+    names = [row.name.removeprefix("pin_") for row in two.system.constraints]
+    slopes = dict(zip(names, two.jacobian(q), strict=True))
+    if kind in ("weld", "prismatic"):
+        R = two.place(1, q)[1]  # the first frame, rotated, is the second
+        axes = {f"r{letter}": R[:, k] for k, letter in enumerate("xyz")}
+    else:
+        loop = two.scene.assembly.loops[0]
+        u, v, _ = (np.array(e, float) for e in across(loop.axes[0], False))
+        axes = {"ru": u, "rv": v}
+    for name, axis in axes.items():
+        np.testing.assert_allclose(slopes[name], axis @ omega, atol=1e-8)
+
+
+def test_a_wrong_sign_would_be_seen():
+    """The test of work itself: a reaction with its moment turned round fails it."""
+    two = Two("weld", True, "")
+    q = two.closed(5)
+    force, moment = two.loads(q, [0.3, 0.4, 0.5])
+    v, omega = two.twist(1, two.place(1, q)[0], q)
+    work = np.array([0.3, 0.4, 0.5]) @ two.jacobian(q)
+    moved = np.abs(omega).max(axis=0) > 1e-6
+    assert np.abs((force @ v - moment @ omega - work)[moved]).max() > 0.1
+
+
+def test_a_gear():
+    scene = parse(
+        """
+eomc = 1
+name = "gears"
+
+[coordinates]
+phi = { unit = "rad", start = 0.5 }
+psi = { unit = "rad" }
+
+[parameters]
+n = -3.0
+c = 0.2
+
+[energy]
+kinetic = "phi_dot**2 + psi_dot**2"
+
+[[loop]]
+name = "mesh"
+joint = "gear"
+coordinates = ["phi", "psi"]
+ratio = "n"
+offset = "c"
+"""
+    )
+    system = from_scene(scene)
+    (row,) = system.constraints
+    assert str(row.formula) == "-c - n*phi + psi"
+    assert (row.name, row.loop, row.holonomic) == ("mesh", "mesh", True)
+    assert [c.held for c in system.coordinates] == [True, False]
+    assert not system.reactions
+
+
+SLIDER = """
+eomc = 1
+name = "slider"
+gravity = {gravity}
+
+[coordinates]
+a = {{ unit = "rad", start = 0.5 }}
+b = {{ unit = "rad" }}
+
+[parameters]
+l = 1.0
+h = 0.0
+
+[[body]]
+name = "crank"
+joint = "revolute"
+coordinates = "a"
+mass = 1.0
+inertia = {inertia}
+
+[[body]]
+name = "rod"
+parent = "crank"
+joint = "revolute"
+coordinates = "b"
+offset = ["l"{zeros}]
+mass = 1.0
+inertia = {inertia}
+
+[[point]]
+name = "end"
+body = "rod"
+place = [2.0{zeros}]
+
+[[point]]
+name = "rail"
+body = "world"
+place = [0.0, "h"{zero}]
+
+[[loop]]
+name = "pin"
+bodies = ["rail", "end"]
+{joint}
+"""
+
+
+def slider(joint, space):
+    return SLIDER.format(
+        gravity=[0, 0, -9.81] if space else [0, -9.81],
+        inertia=[0.1, 0.1, 0.1] if space else 0.1,
+        zeros=", 0, 0" if space else ", 0",
+        zero=", 0" if space else "",
+        joint=joint,
+    )
+
+
+def test_points_close_a_loop_without_points_of_its_own():
+    system = from_scene(parse(slider('joint = "point-on-line"\naxis = [1, 0]', False)))
+    (row,) = system.constraints
+    assert row.name == "pin"
+    assert str(row.formula) == "end_joint_y - h"
+
+
+def test_a_row_that_no_motion_changes_is_left_out_and_told():
+    system = from_scene(parse(slider('joint = "spherical"', True)))
+    assert [row.name for row in system.constraints] == ["pin_x", "pin_y"]
+    (warning,) = system.warnings
+    assert "has a row that is zero wherever its bodies move, left out: pin_z" in warning.message
+    (reaction,) = system.reactions
+    assert str(reaction.values) == "(pin_x_lambda_, pin_y_lambda_, 0, 0, 0, 0)"
+
+
+def test_hinges_in_a_plane_mechanism_of_space_keep_two_rows():
+    system = from_scene(parse(slider('joint = "revolute"', True)))
+    assert [row.name for row in system.constraints] == ["pin_x", "pin_y"]
+    assert "left out: pin_z, pin_ru, pin_rv; what they would carry" in system.warnings[0].message

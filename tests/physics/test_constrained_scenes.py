@@ -1,0 +1,59 @@
+"""Shipped scenes with constraints, beside trusted states of the same systems."""
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from cases import SCENES
+from conftest import MODULES, tiers
+
+import eomc
+
+CASES = {
+    case["name"]: case
+    for case in json.loads((SCENES.parent / "tests/data/constrained.json").read_text())["cases"]
+}
+
+
+def crank(q: np.ndarray) -> np.ndarray:
+    """The case's three angles and three places, of the scene's two angles and one way."""
+    phi, psi, s = q
+    return np.array([phi, phi + psi, s])
+
+
+# scene, case, what of the case the scene has, and h; errors are those of the case's own RK4
+SHIPPED: list[tuple[str, str, Callable, list[int], float]] = [
+    ("pendulum_xy", "pendulum_over_the_top", np.asarray, [0, 1], 0.005),
+    ("slider_crank", "slider_crank_bodies", crank, [2, 5, 6], 0.005),
+    ("andrews_squeezer", "andrews_squeezer_forces", np.asarray, [*range(7)], 5e-5),
+    ("bricard", "bricard_cube", np.asarray, [*range(5)], 0.01),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "case", "of", "which", "h"), tiers(SHIPPED, "pendulum_xy", "slider_crank")
+)
+def test_runs_end_where_they_should(name, case, of, which, h):
+    module = eomc.load(SCENES / f"{name}.toml", MODULES)
+    known = CASES[case]
+    start = np.array([float(x) for x in known["q0"]])[which]
+    assert np.allclose(of(np.array(module.start[0])), start, atol=1e-12)
+    run = module.simulate(h=h, duration=float(known["t_end"]))
+    end = np.array([float(x) for x in known["q_ref"]])[which]
+    (measured,) = [m["projected"] for m in known["rk4_measured"] if m["h"] == h]
+    error = np.abs(of(run.q[-1]) - end).max() / max(1.0, np.abs(end).max())
+    others = of is crank  # coordinates, so that steps err otherwise
+    assert error <= (2 if others else 1.5) * measured["err_q"]
+
+
+def test_the_reaction_of_a_pin_in_the_plane_is_its_multipliers():
+    module = eomc.load(SCENES / "slider_crank.toml", MODULES)
+    run = module.simulate(duration=0.5)
+    assert run.reactions["pin"].shape == (len(run.t), 3)
+    rows = np.array([run.multipliers["pin_x"], run.multipliers["pin_y"]]).T
+    assert np.allclose(run.reactions["pin"][:, :2], rows, rtol=1e-14)
+    assert not run.reactions["pin"][:, 2].any()
+    # what the pin does to the slider is its mass times its acceleration, along the slide
+    a = np.array([module.acceleration(q, v) for q, v in zip(run.q, run.qd, strict=True)])
+    assert np.allclose(run.reactions["pin"][:, 0], 2.0 * a[:, 2], rtol=1e-9, atol=1e-9)

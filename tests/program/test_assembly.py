@@ -1,0 +1,276 @@
+"""Starts are assembled: held values stay, the rest moves least, what contradicts is named."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import constrained
+import numpy as np
+import pytest
+import sympy
+from conftest import tiers
+
+from eomc.base.errors import SceneError
+from eomc.model.from_scene import from_scene
+from eomc.model.system import Constraint, System, symbol, t
+from eomc.program import ranks
+from eomc.program.assembly import assembled
+from eomc.program.manifold import Manifold
+from eomc.scene.read import parse
+
+NAMES = list(constrained.cases())
+SMALL = [name for name in NAMES if name != "iftomm_A02_four_bar_N40"]
+
+
+def start_of(system: System) -> tuple[np.ndarray, np.ndarray]:
+    q, qd = np.array([(c.start, c.rate) for c in system.coordinates]).T
+    return q, qd
+
+
+def refusal(system: System) -> str:
+    with pytest.raises(SceneError) as fault:
+        assembled(system)
+    return str(fault.value)
+
+
+def scene(coordinates: str, constraints: str, more: str = "") -> System:
+    names = [line.split("=")[0].strip() for line in coordinates.splitlines() if line.strip()]
+    kinetic = " + ".join(f"{name}_dot**2/2" for name in names)
+    return from_scene(
+        parse(
+            f'eomc = 1\nname = "made"\n[coordinates]\n{coordinates}\n{more}\n'
+            f'[constraints]\n{constraints}\n[energy]\nkinetic = "{kinetic}"\n',
+            "made.toml",
+        )
+    )
+
+
+@pytest.mark.parametrize("name", tiers(NAMES, *SMALL))
+def test_trusted_starts_are_found_from_their_guesses(name: str) -> None:
+    given = constrained.system(name, "guess", redundant=False)
+    made = assembled(given)
+    q0, qd0 = constrained.ends(name, "q0", "qd0")
+    q, qd = start_of(made)
+    np.testing.assert_allclose(q, q0, rtol=0, atol=2.3e-16 * max(1, np.max(np.abs(q0))))
+    np.testing.assert_allclose(qd, qd0, rtol=0, atol=4.5e-16 * max(1, np.max(np.abs(qd0))))
+    for before, after in zip(given.coordinates, made.coordinates, strict=True):
+        assert not before.held or before.start == after.start
+        assert not before.held_rate or before.rate == after.rate
+
+
+@pytest.mark.parametrize("name", tiers(NAMES, *SMALL))
+def test_ranks_and_freedoms_are_those_of_the_case(name: str) -> None:
+    case, closure = (
+        constrained.cases()[name],
+        assembled(constrained.system(name, "guess", redundant=False)).closure,
+    )
+    assert closure is not None
+    rows = len(case["constraints"]) + len(case["velocity_constraints"])
+    assert closure.rank == (case["redundant"] or {"rank": rows})["rank"]
+    assert closure.freedoms == case["dof"]
+    assert len(closure.redundant) == rows - closure.rank
+
+
+def test_of_bricard_s_rows_the_one_is_left_out_that_leaves_the_best_four() -> None:
+    made = assembled(constrained.system("bricard_cube", "guess", redundant=False))
+    assert [c.redundant for c in made.constraints] == [False] * 4 + [True]
+    assert made.closure is not None
+    assert made.closure.ranks == (
+        "rank 4 of 5: row row_4 is redundant; the forces in row_0, row_1, row_2, row_3, row_4 are "
+        "not unique"
+    )
+    assert any(made.closure.ranks in str(w) for w in made.warnings)
+
+
+@pytest.mark.parametrize(
+    "name", tiers(SMALL, "four_bar_crank_rocker", "parallelogram_redundant_bar")
+)
+def test_a_start_is_assembled_once(name: str) -> None:
+    made = assembled(constrained.system(name, "guess", redundant=False))
+    assert assembled(made) is made
+    again = assembled(replace(made, closure=None))
+    for one, other in zip(start_of(made), start_of(again), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert again.constraints == made.constraints
+    changed = assembled(made.at({made.parameters[0].name: made.parameters[0].value * 1.001}))
+    assert changed.closure is not made.closure
+
+
+def test_a_system_without_constraints_is_left_alone() -> None:
+    made = System.make("free", {"x": 1.0}, "x_dot**2/2")
+    assert assembled(made) is made
+
+
+@pytest.mark.slow
+def test_eighty_two_coordinates_take_seconds() -> None:
+    began = time.process_time()
+    assembled(constrained.system("iftomm_A02_four_bar_N40", "guess", redundant=False))
+    assert time.process_time() - began < 60
+
+
+def test_what_is_not_held_moves_least_in_the_metric_of_the_masses() -> None:
+    """Two masses on a line, 1 kg and 3 kg: the heavier moves a third as far."""
+    made = scene(
+        "a = { start = 0.0, guess = true }\nb = { start = 4.0, guess = true }", 'rod = "b - a - 2"'
+    )
+    made = replace(made, kinetic=made.kinetic + symbol("b_dot") ** 2)
+    np.testing.assert_allclose(start_of(assembled(made))[0], [1.5, 3.5], rtol=1e-15)
+
+
+def test_a_far_guess_ends_at_the_nearest_place_of_a_bent_row() -> None:
+    made = scene(
+        "x = { start = 3.0, guess = true }\ny = { start = 4.0, guess = true }",
+        'rod = "x**2 + y**2/4 - 1"',
+    )
+    (x, y), _ = start_of(assembled(made))
+    assert x**2 + y**2 / 4 == pytest.approx(1, rel=1e-15)
+    along = np.array([y / 4, -x])  # of the ellipse
+    assert along @ [3.0 - x, 4.0 - y] == pytest.approx(0, abs=1e-7)
+
+
+def test_rates_follow_and_held_ones_stay() -> None:
+    made = scene(
+        "x = { start = 0.6, rate = 1.0 }\ny = { start = 0.8, guess = true, rate = 5.0 }",
+        'rod = "x**2 + y**2 - 1"',
+    )
+    _, qd = start_of(assembled(made))
+    np.testing.assert_allclose(qd, [1.0, -0.75], rtol=1e-15)
+
+
+def test_rows_of_time_and_of_rates_set_rates() -> None:
+    made = scene(
+        "x = { guess = true }\npsi = { start = 0.3 }\ny = { start = 0.0 }",
+        'drive = "x - sin(2*t) - 1"\nskate = "x_dot*sin(psi) - y_dot*cos(psi)"',
+    )
+    made = assembled(made)
+    (x, _, _), (x_dot, _, y_dot) = start_of(made)
+    assert (x, x_dot) == (1.0, 2.0)
+    assert y_dot == pytest.approx(2 * np.tan(0.3), rel=1e-15)
+    assert made.closure is not None and made.closure.freedoms == 1
+
+
+def test_values_that_are_near_to_rounding_are_left_as_they_are() -> None:
+    made = scene(f"x = {{ start = {0.1 + 0.2!r} }}\ny = {{ start = 0.0 }}", 'a = "x - 0.3"')
+    assert start_of(assembled(made))[0][0] == 0.1 + 0.2
+
+
+def test_held_values_that_contradict_a_row_are_named_with_how_far_they_are_off() -> None:
+    made = scene("x = { start = 0.7 }\ny = { start = 0.8 }", 'rod = "x**2 + y**2 - 1"')
+    text = refusal(made)
+    assert text.startswith(
+        "made.toml:8:1: error: constraints.rod: can't be zero with x = 0.7, y = 0.8 held: "
+    )
+    assert "y would have to be 0.7141 (-0.086), or x would have to be 0.6 (-0.1)" in text
+    assert "guess = true" in text
+
+
+def test_held_values_that_are_off_together_are_named() -> None:
+    made = scene("x = { start = 3.0 }\ny = { start = 4.0 }", 'rod = "x**2 + y**2 - 1"')
+    assert "nor with one of them let go: together x would have to be 0.6 (-2.4), y" in refusal(made)
+
+
+def test_held_rates_that_contradict_a_row_are_named() -> None:
+    made = scene(
+        "x = { start = 0.6, rate = 1.0 }\ny = { start = 0.8, rate = 1.0 }",
+        'rod = "x**2 + y**2 - 1"',
+    )
+    text = refusal(made)
+    assert "constraints.rod: changes at the start, with x_dot = 1, y_dot = 1 held" in text
+    assert "y_dot would have to be -0.75 (-1.8), or x_dot would have to be -1.333 (-2.3)" in text
+
+
+def test_rows_that_contradict_each_other_are_named() -> None:
+    made = scene("x = { guess = true }\ny = {}", 'one = "x - 1"\ntwo = "x - 2"')
+    text = refusal(made)
+    assert "constraints.one: can't be zero together with two near the start" in text
+    assert "one is 0.5, two is -0.5" in text
+
+
+def test_a_loop_that_can_not_close_is_refused() -> None:
+    """Two rods of 1 m between points 3 m apart."""
+    made = scene(
+        "x = { start = 1.4, guess = true }\ny = { start = 0.1, guess = true }",
+        'one = "x**2 + y**2 - 1"\ntwo = "(x - 3)**2 + y**2 - 1"',
+    )
+    assert "constraints.one: can't be zero together with two near the start" in refusal(made)
+
+
+def test_a_start_without_a_value_is_refused() -> None:
+    made = scene("x = { start = -1.0, guess = true }\ny = {}", 'root = "sqrt(x) - y"')
+    assert "constraints: have no value at the start: guess it elsewhere" in refusal(made)
+
+
+def test_a_row_that_no_coordinate_moves_is_refused() -> None:
+    x = symbol("x")
+    made = System.make("idle", {x: 1.0}, symbol("x_dot") ** 2)
+    made = replace(made, constraints=(Constraint("late", t - 1),))
+    assert "constraints.late: depends on no coordinate: it can hold nothing" in refusal(made)
+
+
+def test_no_freedom_is_told_but_allowed() -> None:
+    made = assembled(scene("x = { guess = true }", 'wall = "x - 1"'))
+    assert made.closure is not None and made.closure.freedoms == 0
+    assert "nothing moves: a structure" in str(made.warnings[0])
+    driven = assembled(scene("x = { guess = true }", 'drive = "x - sin(t)"'))
+    assert [w.severity for w in driven.warnings] == ["note", "note"]
+    assert "the rows alone decide the motion in time" in str(driven.warnings[0])
+
+
+def test_what_has_moved_is_told() -> None:
+    made = assembled(constrained.system("four_bar_crank_rocker", "guess", redundant=False))
+    (note,) = made.warnings
+    assert note.severity == "note"
+    assert "q2 = 0.59085 (guess 0.7), q3 = 1.21122 (guess 1.6)" in str(note)
+
+
+def test_a_row_that_is_said_twice_is_redundant() -> None:
+    made = assembled(
+        scene(
+            "x = { start = 0.6 }\ny = { guess = true, start = 0.7 }\nz = {}",
+            'rod = "x**2 + y**2 - 1"\nagain = "3*y**2 + 3*x**2 - 3"\nground = "z"',
+        )
+    )
+    assert [c.redundant for c in made.constraints] == [False, True, False]
+    assert made.closure is not None
+    assert made.closure.shared == ("rod", "again")
+    assert made.closure.freedoms == 1
+
+
+def test_rows_that_fade_out_at_the_start_alone_are_not_redundant() -> None:
+    """A parallelogram that lies flat: two rows of rank one, there."""
+    made = assembled(
+        scene(
+            "a = { start = 0.0 }\nb = { start = 0.0 }\nc = { start = 0.0 }",
+            'x = "cos(a) + 2*cos(b) - cos(c) - 2"\ny = "sin(a) + 2*sin(b) - sin(c)"',
+        )
+    )
+    assert made.closure is not None
+    assert (made.closure.rank, made.closure.redundant) == (2, ())
+    assert made.closure.start_sigma == 0
+    assert "the start is a singular position" in "".join(map(str, made.warnings))
+
+
+def test_a_coordinate_without_inertia_is_assembled() -> None:
+    x, s = symbol("x"), symbol("s")
+    made = System.make("massless", {x: 0.3, s: 5.0}, symbol("x_dot") ** 2, 9.81 * x)
+    made = replace(
+        made,
+        constraints=(Constraint("drive", s - x - sympy.cos(t)),),
+        coordinates=(made.coordinates[0], replace(made.coordinates[1], held=False)),
+    )
+    assert start_of(assembled(made))[0][1] == 1.3
+
+
+@pytest.mark.parametrize("name", tiers(SMALL, "four_bar_crank_rocker", "pendulum_on_a_winch"))
+def test_a_walk_stays_on_the_rows(name: str) -> None:
+    made = assembled(constrained.system(name, "guess", redundant=False))
+    manifold = Manifold(made)
+    place = manifold.place(start_of(made)[0])
+    assert place is not None
+    found = list(ranks.walk(manifold, place))
+    assert len(found) == (ranks.POSITIONS if made.closure and made.closure.freedoms else 0)
+    for there in found:
+        assert np.max(np.abs(there.phi)) < 1e-14 * (1 + np.max(np.abs(there.q)))
+    far = np.ptp([p.q for p in found], axis=0)
+    assert np.max(far) > 0.1

@@ -1,0 +1,186 @@
+"""Equality constraints of MJCF: rows of the scene, beside MuJoCo's own at random positions."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+from mjcf_text import model, refused, reported
+
+from eomc.model.from_scene import from_scene
+from eomc.model.symbols import needed
+from eomc.robots.edit import cut, lock
+from eomc.robots.scene_text import scene_text
+from eomc.scene.read import parse
+
+INSIDE = """
+<body name="crank" pos="0 0 0.2" euler="10 20 0">
+  <joint name="q1" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0.4 0 0.3" size="0.02"/>
+  <body name="coupler" pos="0.4 0 0.3" euler="0 0 30">
+    <joint name="q2" axis="0 1 1" pos="0.1 0 0.2" ref="20"/>
+    <geom type="capsule" fromto="0 0 0 1 0 0.2" size="0.02"/>
+    <frame pos="0.1 0 0" euler="0 30 0"><site name="end" pos="0.9 0 0.2" euler="40 0 0"/></frame>
+  </body>
+</body>
+<body name="rocker" pos="0.9 0 0">
+  <joint name="q3" axis="0 1 0" pos="0.1 0 -0.1"/>
+  <joint name="slip" axis="0 1 0" type="slide" ref="0.3"/>
+  <geom type="capsule" fromto="0 0 0 0.5 0 0.5" size="0.02"/>
+  <site name="top" pos="0.5 0.1 0.5" euler="0 0 50"/>
+</body>
+<body name="wheel" pos="0 1 0"><joint name="g" axis="0 0 1" ref="15"/><joint name="h" axis="1 0 0"/>
+  <joint name="k" axis="0 1 0" pos="0 0.1 0"/><geom size="0.1"/>
+  <site name="hub" pos="0.1 0 0.1" euler="0 0 50"/></body>
+"""
+TENDONS = """
+<tendon>
+  <fixed name="belt"><joint joint="q1" coef="2"/><joint joint="g" coef="-1"/></fixed>
+  <fixed name="chain"><joint joint="slip" coef="3"/></fixed>
+  <spatial name="cable"><site site="end"/><site site="top"/></spatial>
+</tendon>
+"""
+HARD = [
+    '<connect name="pin" body1="coupler" body2="rocker" anchor="1 0 0.2"/>',
+    '<connect body1="rocker" anchor="0.2 0.1 0"/>',
+    '<connect site1="end" site2="top"/>',
+    '<weld name="seam" body1="coupler" body2="wheel"/>',
+    '<weld name="seam" body1="wheel" body2="coupler" anchor="0.1 0.2 0.3"/>',
+    '<weld name="seam" body1="crank" body2="wheel" relpose="0.1 0.2 0.3 0.9 0.1 -0.2 0.4"/>',
+    '<weld name="seam" site1="end" site2="hub"/>',
+    '<joint joint1="g" joint2="q1" polycoef="0.1 2"/>',
+    '<joint name="cubic" joint1="slip" joint2="q3" polycoef="0.01 0.1 0.5 -2 0.7"/>',
+    '<joint joint1="slip"/>',
+    '<joint joint1="g" polycoef="0.2"/>',
+    '<tendon tendon1="belt"/>',
+    '<tendon name="both" tendon1="belt" tendon2="chain" polycoef="0 1.5 0.5"/>',
+]
+
+
+def scene_of(robot):
+    """The scene as it is written, read."""
+    return from_scene(parse(scene_text(robot)))
+
+
+def rows(system):
+    """A function of the coordinates, the rows in the order of the file."""
+    return numeric(system, [c.formula for c in system.constraints])
+
+
+def numeric(system, expressions):
+    """A function of the coordinates."""
+    for name, e in reversed(needed(system.definitions, expressions)):
+        expressions = [x.xreplace({name: e}) for x in expressions]
+    return sympy.lambdify([system.q], expressions)
+
+
+def equality(*entries):
+    return f"{TENDONS}<equality>{''.join(entries)}</equality>"
+
+
+@pytest.mark.slow  # in the tier that installs MuJoCo
+@pytest.mark.parametrize("entry", HARD)
+def test_rows_are_those_of_mujoco(entry: str, tmp_path: Path) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    system = scene_of(model(tmp_path, INSIDE, after=equality(entry)))
+    theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    data = mujoco.MjData(theirs)
+    values = rows(system)
+    assert [c.name for c in system.coordinates] == ["q1", "q2", "q3", "slip", "g", "h", "k"]
+    for q in np.random.default_rng(0).uniform(-1, 1, (5, 7)):
+        data.qpos[:] = q
+        mujoco.mj_forward(theirs, data)
+        equal = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        wanted, found = data.efc_pos[equal], np.array(values(q))
+        assert len(found) == len(wanted)
+        np.testing.assert_allclose(np.abs(found[:3]), np.abs(wanted[:3]), atol=1e-12)
+    if "weld" in entry:  # rows of rotation are others: they are zero together
+        (reaction,) = system.reactions
+        q = _closed(values, numeric(system, reaction.branches), len(system.q))
+        data.qpos[:] = q
+        mujoco.mj_forward(theirs, data)
+        np.testing.assert_allclose(data.efc_pos[3:6], 0, atol=1e-10)
+
+
+def _closed(values, branches, n):
+    """Where the rows of rotation are zero, by Gauss and Newton's method."""
+    rows_of = slice(3, 6)
+    for start in np.random.default_rng(1).uniform(-1, 1, (100, n)):
+        q = start
+        for _ in range(50):
+            slopes = [
+                (np.array(values(q + 1e-6 * e)) - values(q - 1e-6 * e))[rows_of] / 2e-6
+                for e in np.eye(n)
+            ]
+            q = q - np.linalg.lstsq(np.array(slopes).T, np.array(values(q))[rows_of], rcond=None)[0]
+        if np.abs(np.array(values(q))[rows_of]).max() < 1e-13 and min(branches(q)) > 0.5:
+            return q
+    raise AssertionError("not closed")
+
+
+def test_rows_hold_in_the_pose_of_the_file(tmp_path: Path) -> None:
+    hard = [e for e in HARD if "site" not in e and "relpose" not in e and "0.1 2" not in e]
+    hard = [e for e in hard if 'polycoef="0.2"' not in e and "0.01" not in e]
+    system = scene_of(model(tmp_path, INSIDE, after=equality(*hard)))
+    assert np.abs(rows(system)([c.start for c in system.coordinates])).max() < 1e-14
+    assert not any(c.held for c in system.coordinates)
+
+
+def test_a_linear_coupling_of_two_joints_is_a_gear(tmp_path: Path) -> None:
+    text = scene_text(model(tmp_path, INSIDE, after=equality(HARD[7])))
+    assert 'joint       = "gear"\ncoordinates = ["q1", "g"]\nratio       = 2\n' in text
+
+
+def test_what_is_not_held_is_told(tmp_path: Path) -> None:
+    robot = model(
+        tmp_path, INSIDE, "<default><equality active='false'/></default>",
+        equality(
+            '<connect name="off" body1="rocker" anchor="0 0 0"/>',
+            '<tendon name="on_cable" tendon1="cable" active="true"/>',
+            '<connect name="soft" body1="rocker" anchor="0 0 0" solref="0.1 1" active="true"/>',
+            '<flex name="cloth" flex="x"/>',
+        ),
+    )  # fmt: skip
+    assert [loop.name for loop in robot.loops] == ["soft"]
+    assert reported(robot, "not active", "off")
+    assert reported(robot, "tendons through space", "on_cable")
+    assert reported(robot, "solref, solimp", "soft")
+    assert reported(robot, "of other kinds", "cloth")
+
+
+def test_sites_that_are_used_are_not_left_out(tmp_path: Path) -> None:
+    robot = model(tmp_path, INSIDE, after=equality(HARD[2]))
+    assert [line for line in robot.left_out if line.startswith("site")] == ["sites: hub"]
+
+
+def test_constraints_of_what_is_cut_off_or_locked_are_told(tmp_path: Path) -> None:
+    robot = model(tmp_path, INSIDE, after=equality(HARD[0], HARD[7], HARD[8]))
+    without = lock(robot, {"q1": 0.1})
+    assert [c.name for c in without.couplings] == ["cubic"]
+    assert without.left_out[0] == "constraints of what is cut off or locked: joint_g_q1"
+    without = cut(robot, root="crank")
+    assert not without.loops
+    assert "cubic, joint_g_q1, pin" in without.left_out[0]
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ('<connect body1="rocker"/>', 'it needs an anchor="x y z"'),
+        ('<connect body1="rocker" anchor="1 2"/>', "takes 3"),
+        ('<connect anchor="1 2 3"/>', "it needs body1"),
+        ('<connect body1="x" anchor="1 2 3"/>', 'there is no body "x"'),
+        ('<connect body1="crank" body2="crank" anchor="1 2 3"/>', 'holds body "crank" to itself'),
+        ('<connect site1="end"/>', "it needs both site1 and site2"),
+        ('<weld site1="end" site2="tip"/>', 'there is no site "tip"'),
+        ('<weld body1="rocker" relpose="1 2 3"/>', "takes 7"),
+        ("<joint/>", "it needs joint1"),
+        ('<joint joint1="x"/>', 'there is no joint "x"'),
+        ('<joint joint1="g" joint2="x"/>', 'there is no joint "x"'),
+        ('<tendon tendon1="x"/>', 'there is no tendon "x"'),
+        ('<joint joint1="g" polycoef="1 2 3 4 5 6"/>', "it takes 1 to 5"),
+        ('<joint joint1="g" active="maybe"/>', "is not one of false, true"),
+    ],
+)  # fmt: skip
+def test_faults(entry: str, said: str, tmp_path: Path) -> None:
+    assert said in refused(tmp_path, INSIDE, after=equality(entry))

@@ -1,0 +1,206 @@
+"""Scenes with constraints as they run: on the rows, with multipliers, locked, singular."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import eomc
+from eomc.model.system import Constraint, Reaction, System
+
+EPS = 2.0**-52
+
+
+def system(name: str, starts: Any, K: str, P: str, rows: dict[str, str], **given: Any) -> System:
+    """A system with holonomic rows over its own names; its first coordinate is held."""
+    made = System.make(name, starts, K, P, outputs=rows, **given)
+    constraints = tuple(Constraint(o.name, o.formula) for o in made.outputs)
+    first, *rest = made.coordinates
+    free = (first, *(replace(c, held=False, held_rate=False) for c in rest))
+    return replace(made, outputs=(), constraints=constraints, coordinates=free)
+
+
+@pytest.fixture(scope="module")
+def rod(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
+    """A pendulum in x and y, by RK4 and dp8, and many at once."""
+    made = system(
+        "rod_xy", {"x": (0.6, 0.4), "y": (-0.8, 0.3)}, "m*(x_dot**2 + y_dot**2)/2", "9.81*m*y",
+        {"rod": "x**2 + y**2 - l**2"}, parameters={"m": 2.0, "l": 1.0}, methods=("rk4", "dp8"),
+        batch=True, h=0.005, duration=3.0,
+    )  # fmt: skip
+    return eomc.load(made, tmp_path_factory.mktemp("rod"))
+
+
+@pytest.mark.parametrize("method", ["rk4", "dp8"])
+def test_steps_end_on_the_constraints(rod: ModuleType, method: str) -> None:
+    run = rod.simulate(method=method)
+    assert np.abs(run.constraints["rod"]).max() <= 8 * EPS
+    rates = rod.constraint_rates(run.q, run.qd)
+    assert np.abs(rates).max() <= 64 * EPS
+    assert np.ptp(run.energy) < (1e-6 if method == "rk4" else 1e-12)
+    assert run.singular_steps == 0 and np.isnan(run.first_singular)
+
+
+def test_the_multiplier_is_the_force_in_the_rod(rod: ModuleType) -> None:
+    run = rod.simulate()
+    x, y = run.q.T
+    # A^T lambda along the rod: m (v^2 + g.r)/l^2, twice lambda r
+    speed2 = (run.qd**2).sum(axis=1)
+    tension = 2.0 * (speed2 - 9.81 * y)
+    np.testing.assert_allclose(-2 * run.multipliers["rod"], tension, rtol=1e-12, atol=1e-9)
+    a = np.array([rod.acceleration(q, qd) for q, qd in zip(run.q, run.qd, strict=True)])
+    A = rod.constraint_jacobian(run.q)[:, 0]
+    force = np.stack([np.zeros_like(x), np.full_like(x, -9.81 * 2.0)], axis=1)
+    np.testing.assert_allclose(
+        2.0 * a, force + run.multipliers["rod"][:, None] * A, rtol=1e-12, atol=1e-10
+    )
+
+
+def test_a_batch_ends_on_the_constraints_too(rod: ModuleType) -> None:
+    angles = np.linspace(0.1, 3.0, 21)
+    q0 = np.stack([np.sin(angles), -np.cos(angles)], axis=1)
+    many = rod.simulate_batch(q0, np.zeros_like(q0), every=10)
+    assert (many.status == "ok").all()
+    assert np.abs((many.q**2).sum(axis=-1) - 1).max() <= 8 * EPS
+    one = rod.simulate(q0[7], np.zeros(2), every=10)
+    np.testing.assert_allclose(many.q[7], one.q, atol=1e-11)
+
+
+def test_a_start_is_assembled_and_held_values_stay(rod: ModuleType) -> None:
+    q, qd = rod.project([0.5, -0.9], [1.0, 0.0], held=["x", "x_dot"])
+    assert q[0] == 0.5 and qd[0] == 1.0
+    np.testing.assert_allclose(q[1], -np.sqrt(0.75), rtol=1e-15)
+    np.testing.assert_allclose(qd[1], 0.5 / np.sqrt(0.75), rtol=1e-14)
+    near, _ = rod.project([0.5, -0.9], [0.0, 0.0])  # the least change: along the rod
+    np.testing.assert_allclose(near, np.array([0.5, -0.9]) / np.hypot(0.5, 0.9), rtol=1e-14)
+    with pytest.raises(rod.MotionError, match="with x as given: leave one free") as caught:
+        rod.project([1.5, -0.9], [0.0, 0.0], held="x")
+    assert caught.value.status == "locked"
+    longer = rod.simulate([0.0, -1.9], [0.0, 0.0], params={"l": 2.0}, steps=1)
+    assert longer.q[0].tolist() == [0.0, -2.0]
+
+
+def test_a_run_that_can_not_stay_on_its_rows_is_locked(tmp_path: Path) -> None:
+    """A slider that is driven away from a wall at which its rod is stretched."""
+    made = system(
+        "stretched", {"x": (0.5, 1.0), "y": (0.8660254037844386, 0.0)},
+        "(x_dot**2 + y_dot**2)/2", "0", {"rod": "x**2 + y**2 - 1", "drive": "x - 0.5 - t"},
+        h=0.01, duration=1.0,
+    )  # fmt: skip
+    module = eomc.load(made, tmp_path)
+    with pytest.warns(RuntimeWarning, match="obeys the constraints|finite"):
+        run = module.simulate()
+    assert run.status in ("locked", "not finite") and 0.4 < run.t[-1] <= 0.51
+
+
+def test_steps_behind_which_rows_depend_on_each_other_are_told(tmp_path: Path) -> None:
+    """A parallelogram whose third step ends where it lies flat, and which goes on as one."""
+    made = system(
+        "flat", {"a": (-3 / 64, 1.0), "b": (-3 / 64, 1.0), "c": (0.0, 0.0)},
+        "(a_dot**2 + b_dot**2 + c_dot**2)/2", "0",
+        {"along": "cos(a) + cos(c) - cos(b) - 1", "across": "sin(a) + sin(c) - sin(b)"},
+        h=1 / 64, duration=6 / 64,
+    )  # fmt: skip
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        run = eomc.load(made, tmp_path).simulate()
+    assert run.status == "ok" and run.singular_steps == 1 and run.first_singular == 3 / 64
+    np.testing.assert_allclose(run.q[-1], [3 / 64, 3 / 64, 0.0], atol=1e-14)
+    assert "a step ends where a constraint depends on others" in str(said[0].message)
+
+
+def test_the_linearization_along_the_constraints_is_that_of_minimal_coordinates(
+    tmp_path: Path,
+) -> None:
+    """A pendulum in x and y with a torque's like, a force along x, hanging: w^2 = g/l."""
+    made = system(
+        "hanging", {"x": (0.0, 0.0), "y": (-0.5, 0.0)}, "m*(x_dot**2 + y_dot**2)/2", "9.81*m*y",
+        {"rod": "x**2 + y**2 - 1/4"}, parameters={"m": 2.0}, inputs=["f"], forces={"x": "f"},
+        linearize=True,
+    )  # fmt: skip
+    module = eomc.load(made, tmp_path)
+    x0 = np.array([0.0, -0.5]), np.zeros(2)
+    A, B = module.linearize(*x0, u=[0.0])
+    T = module.tangent(*x0)
+    assert T.shape == (4, 2)
+    np.testing.assert_allclose(T.T @ T, np.eye(2), atol=1e-15)
+    slow = T.T @ A @ T
+    assert sorted(np.linalg.eigvals(slow).imag) == pytest.approx([-np.sqrt(19.62), np.sqrt(19.62)])
+    np.testing.assert_allclose(A @ T, T @ slow, atol=1e-13)  # it leads nowhere else
+    assert np.abs(T.T @ B).max() == pytest.approx(0.5)
+    moving = module.project([0.3, -0.4], [1.0, 0.0])
+    along = module.tangent(*moving)
+    by = 1e-6
+    for z in along.T:  # changes along it keep the rows, to the first order
+        q, qd = moving[0] + by * z[:2], moving[1] + by * z[2:]
+        assert np.abs(module.constraints(q, qd)).max() < 4 * by**2
+        assert np.abs(module.constraint_rates(q, qd)).max() < 4 * by**2
+
+
+@pytest.mark.parametrize("asked", [{"discretize": True}])
+def test_what_there_is_not_under_constraints_is_refused(asked: dict[str, Any]) -> None:
+    made = system(
+        "refused", {"x": 0.6, "y": -0.8}, "(x_dot**2 + y_dot**2)/2", "y",
+        {"rod": "x**2 + y**2 - 1"}, **asked,
+    )  # fmt: skip
+    with pytest.raises(eomc.SceneError, match="is not for scenes with constraints"):
+        eomc.pipeline.sources(made)
+
+
+def test_reactions_along_a_run_are_those_of_their_times(tmp_path: Path) -> None:
+    """A mass between a driven wall and the ground: the force follows the wall."""
+    made = system(
+        "driven", {"x": (0.0, 1.0)}, "x_dot**2/2", "0", {"wall": "x - sin(t)"}, h=0.01,
+        duration=1.0,
+    )  # fmt: skip
+    wall = made.constraints[0]
+    made = replace(
+        made,
+        plane=True,
+        reactions=(Reaction("hold", (wall.multiplier, 0 * wall.multiplier, 0 * wall.multiplier)),),
+    )
+    module = eomc.load(made, tmp_path)
+    run = module.simulate(every=10)
+    np.testing.assert_allclose(run.reactions["hold"][:, 0], -np.sin(run.t), atol=1e-12)
+    alone = [
+        module.reactions(q, qd, t)["hold"] for q, qd, t in zip(run.q, run.qd, run.t, strict=True)
+    ]
+    np.testing.assert_array_equal(run.reactions["hold"], alone)
+
+
+def test_a_start_where_rows_depend_on_each_other_is_left_as_it_is(tmp_path: Path) -> None:
+    """A four-bar that lies flat, its rows zero to rounding."""
+    made = system(
+        "lies_flat", {"a": (0.0, 0.0), "b": (0.0, 0.0), "c": (0.0, 0.0)},
+        "(a_dot**2 + b_dot**2 + c_dot**2)/2", "0",
+        {"along": "0.3*cos(a) + 0.9*cos(b) - 0.5*cos(c) - 0.7",
+         "across": "0.3*sin(a) + 0.9*sin(b) - 0.5*sin(c)"},
+        h=0.01, duration=0.1,
+    )  # fmt: skip
+    module = eomc.load(made, tmp_path)
+    q, qd = module.project(np.zeros(3), np.zeros(3), held=["a"])
+    assert not q.any() and not qd.any()
+
+
+def test_a_projection_does_not_leap_across_turns(tmp_path: Path) -> None:
+    """From where the rows' slopes nearly vanish, Newton's whole step would be some 1e9 rad."""
+    made = system(
+        "folded", {"a": (1.0, 0.0), "b": (np.pi - 1, 0.0), "c": (0.0, 0.0)},
+        "(a_dot**2 + b_dot**2 + c_dot**2)/2", "0",
+        {"along": "0.5*cos(a) + cos(b) - 0.5*cos(c) - 1",
+         "across": "0.5*sin(a) + sin(b) - 0.5*sin(c)"},
+        h=0.01, duration=0.1,
+    )  # fmt: skip
+    module = eomc.load(
+        replace(made, coordinates=tuple(replace(c, held=False) for c in made.coordinates)), tmp_path
+    )
+    for off in (0.0, 1e-9):
+        q, _ = module.project([1.0, -1.0 + off, 1e-9], np.zeros(3))
+        assert np.abs(q).max() < 20
+        assert np.abs(module.constraints(q, np.zeros(3))).max() < 1e-14

@@ -1,0 +1,69 @@
+"""docs/embedding.md as it is written: each section's files and commands, in an empty folder."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import ROOT, needs
+
+pytestmark = pytest.mark.slow
+PAGE = (ROOT / "docs" / "embedding.md").read_text(encoding="utf-8")
+EXAMPLES = ROOT / "docs" / "examples"
+SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
+# a file, commands, or what they print
+BLOCK = re.compile(r"(?:^`([\w./]+)`:\n\n)?^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+TOOLS = {
+    "In a C program": ["cc"],
+    "In a CMake project": ["cmake", "g++", "pkg-config"],
+    "On a small core": ["arm-none-eabi-gcc", "qemu-system-arm"],
+    "A control loop": ["cc"],
+    "A model's wheel": ["cc"],
+}
+
+
+def played(section: str, folder: Path) -> str:
+    """What the section's commands print; each is compared with what the page says."""
+    said = whole = ""
+    here = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for file, language, text in BLOCK.findall(SECTIONS[section]):
+        if file:
+            (folder / file).write_text(text, encoding="utf-8")
+        elif language == "sh":
+            done = subprocess.run(
+                ["sh", "-e", "-c", text], cwd=folder, capture_output=True, text=True,
+                env={**os.environ, "PATH": here}, stdin=subprocess.DEVNULL, timeout=500,
+            )  # fmt: skip
+            assert done.returncode == 0, done.stdout + done.stderr
+            said = done.stdout
+            whole += said
+        elif language == "text":
+            assert said.replace("\r", "").endswith(text), said
+    return whole
+
+
+def test_every_section_is_run() -> None:
+    assert set(SECTIONS) == set(TOOLS)
+
+
+@pytest.mark.parametrize("section", TOOLS)
+def test_a_section_as_it_is_written(section: str, tmp_path: Path) -> None:
+    for tool in TOOLS[section]:
+        needs(tool)
+    if section == "On a small core":
+        shutil.copytree(EXAMPLES / "cortex_m", tmp_path / "cortex_m")
+    if section == "A control loop":
+        pytest.importorskip("scipy")
+        for file in (*(EXAMPLES / "control_loop").iterdir(), EXAMPLES / "balance.toml"):
+            shutil.copy(file, tmp_path)
+    said = played(section, tmp_path)
+    if section == "A control loop":
+        found = re.search(r"angle within (\S+) rad, its rate known to (\S+) rad/s", said)
+        assert found and float(found[1]) < 2e-3 and float(found[2]) < 2e-3, said
+        usual, _, worst = map(float, re.findall(r"(\S+) us", said))
+        assert 0 < usual < 1000 and usual <= worst, "within a period of 1 ms"

@@ -1,0 +1,113 @@
+"""docs/interfaces.md is followed as it is written, as far as the tools are here."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from cases import SCENES
+from conftest import ROOT, needs
+
+import eomc
+
+TEXT = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
+SAID = r"x = (\S+) m, theta = (\S+) rad"
+STRICT = "-std=c99 -Wall -Wextra -Werror -Ic -I.".split()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.S)
+
+
+def ran(*command: str, at: Path) -> str:
+    done = subprocess.run(command, cwd=at, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@cache
+def module() -> ModuleType:
+    return eomc.load(SCENES / "cartpole.toml", ROOT / "build" / "tests" / "fmu", form="plain")
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which the page's commands have been typed."""
+    here = tmp_path_factory.mktemp("interfaces")
+    (commands,) = blocks("sh")
+    for command in commands.splitlines():
+        ran(sys.executable, "-m", *command.split(), at=here)
+    return here
+
+
+def end() -> tuple[float, float]:
+    run = module().simulate(q0=[0.0, 0.1], qd0=[0.0, 0.0], h=0.001, steps=1000)
+    return float(run.q[-1, 0]), float(run.q[-1, 1])
+
+
+def ends_there(text: str) -> bool:
+    found = re.search(SAID, text)
+    return found is not None and [float(x) for x in found.groups()] == pytest.approx(
+        end(), rel=1e-10
+    )
+
+
+def test_the_page_says_what_is_so() -> None:
+    assert ends_there(TEXT)
+
+
+def test_rust(page: Path) -> None:
+    cargo = needs("cargo")
+    build, program = blocks("rust")
+    crate = page / "crate"
+    shutil.copytree(page / "c", crate / "c")
+    (crate / "src").mkdir()
+    (crate / "build.rs").write_text(build, encoding="utf-8")
+    (crate / "src" / "main.rs").write_text(program, encoding="utf-8")
+    (crate / "Cargo.toml").write_text(
+        '[package]\nname = "pole"\nversion = "0.1.0"\nedition = "2021"\n', encoding="utf-8"
+    )
+    assert ends_there(ran(cargo, "run", "--offline", "--quiet", at=crate))
+
+
+def test_julia(page: Path) -> None:
+    julia = needs("julia")
+    (program,) = blocks("julia")
+    (page / "pole.jl").write_text(program, encoding="utf-8")
+    assert ends_there(ran(julia, "pole.jl", at=page))
+
+
+def test_casadi(page: Path) -> None:
+    pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'eomc[fmu]'")
+    (program,) = blocks("python")
+    said = ran(sys.executable, "-c", program, at=page)
+    numbers = [float(x) for x in re.findall(r"[-\d.]+(?:e[-+]\d+)?", said)]
+    expected = module().acceleration([0.0, 0.1], [0.0, 0.0])
+    assert numbers[:4] == pytest.approx([0, 0, *expected], rel=1e-5)
+    # the Jacobian of [qd; qdd] along [q; qd]
+    assert numbers[4:12] == [0, 0, 1, 0, 0, 0, 0, 1]
+    A, B = [module().acceleration([0.0, 0.1 + d], [0.0, 0.0]) for d in (1e-6, -1e-6)]
+    assert [numbers[13], numbers[17]] == pytest.approx((A - B) / 2e-6, rel=1e-5)
+
+
+def test_the_c_of_simulinks_block(page: Path) -> None:
+    (header,) = blocks("c")
+    (page / "cartpole_block.h").write_text(header, encoding="utf-8")
+    (specification,) = blocks("matlab")
+    assert "void cartpole_block(" in specification and "void cartpole_block(" in header
+    (page / "block.c").write_text(
+        '#include "cartpole_block.h"\n#include <stdio.h>\nint main(void)\n{\n'
+        "    double a[2], q[2] = { 0, 0.1 }, qd[2] = { 0.3, 0.2 }, p[4] = { 2, 2, 2, 9.8 };\n\n"
+        '    cartpole_block(a, q, qd, p);\n    printf("%.17g %.17g\\n", a[0], a[1]);\n}\n',
+        encoding="utf-8",
+    )
+    ran(needs("cc"), *STRICT, "block.c", "c/cartpole.c", "-lm", "-o", "block", at=page)
+    expected = module().acceleration([0.0, 0.1], [0.3, 0.2])
+    found = [float(x) for x in ran("./block", at=page).split()]
+    assert found == pytest.approx(list(expected), rel=1e-14)

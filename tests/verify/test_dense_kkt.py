@@ -1,0 +1,163 @@
+"""The reference of systems with constraints is compared with trusted answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import constrained
+import numpy as np
+import pytest
+import sympy
+from conftest import tiers
+
+from eomc.base.errors import EomcError
+from eomc.model.system import Constraint, System, symbol, t
+from eomc.verify import kkt, symbolic
+from eomc.verify.oracle import Answer
+from eomc.verify.taylor import Jets
+
+NAMES = list(constrained.cases())
+SMALL = [n for n in NAMES if n != "iftomm_A02_four_bar_N40"]
+PLANE = [n for n in SMALL if n != "bricard_cube"]
+QUICK = (
+    "pendulum_over_the_top",
+    "pendulum_on_a_winch",
+    "chaplygin_sleigh",
+)
+RUNS = [n for n in SMALL if constrained.cases()[n]["rk4_measured"]]
+
+
+def answers(name: str) -> list[Answer]:
+    system = constrained.system(name)
+    return [Jets(system), *([symbolic.derive(system)] if name in SMALL else [])]
+
+
+@pytest.mark.parametrize("name", tiers(NAMES, *PLANE))
+def test_accelerations_and_multipliers_at_trusted_states(name: str) -> None:
+    q, qd, a, multipliers = constrained.ends(name, "q_ref", "qd_ref", "qdd_ref", "lambda_ref")
+    t_end = float(constrained.cases()[name]["t_end"])
+    for answer in answers(name):
+        np.testing.assert_allclose(
+            answer.acceleration(q, qd, t_end), a, rtol=0, atol=2e-11 * np.max(np.abs(a))
+        )
+        np.testing.assert_allclose(
+            answer.multipliers(q, qd, t_end), multipliers, rtol=0,
+            atol=2e-11 * np.max(np.abs(multipliers)),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", tiers(SMALL, *PLANE))
+def test_two_ways_to_the_rows_agree(name: str) -> None:
+    """Written out, and by Taylor arithmetic; and all states at once as one by one."""
+    taylor, plain = answers(name)
+    q0, qd0 = constrained.ends(name, "q0", "qd0")
+    random = np.random.default_rng(3)
+    q, qd = q0 + random.normal(size=(5, len(q0))) / 5, qd0 + random.normal(size=(5, len(q0)))
+    times = random.uniform(0, 3, 5)
+    for what in ("constraints", "constraint_jacobian", "constraint_rates", "gamma"):
+        found = taylor.evaluate(what, q, qd, times)
+        expected = plain.evaluate(what, q, qd, times)
+        size = np.max(np.abs(expected)) + 1
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * size)
+        one = plain.evaluate(what, q[2], qd[2], times[2])
+        np.testing.assert_array_equal(expected[2], one)
+
+
+@pytest.mark.parametrize("name", tiers(SMALL, *PLANE))
+def test_rows_are_each_other_s_derivatives(name: str) -> None:
+    """A, rates and gamma beside differences along a line in time."""
+    answer = Jets(constrained.system(name))
+    q, qd = constrained.ends(name, "q0", "qd0")
+    q = q + 0.1 * np.cos(np.arange(len(q)))
+    qd = qd + np.sin(np.arange(len(q)))
+    qdd, h = np.cos(3.0 * np.arange(len(q))), 1e-4
+
+    def along(what: str, s: float) -> np.ndarray:
+        return answer.evaluate(what, q + s * qd + s**2 * qdd / 2, qd + s * qdd, 0.7 + s)
+
+    n = len(constrained.cases()[name]["constraints"])
+    A, rates, gamma = (
+        answer.evaluate(x, q, qd, 0.7) for x in ("constraint_jacobian", "constraint_rates", "gamma")
+    )
+    size = np.max(np.abs(A)) * (np.max(np.abs(qd)) + np.max(np.abs(qdd)))
+    slope = (along("constraints", h) - along("constraints", -h))[:n] / (2 * h)
+    np.testing.assert_allclose(rates[:n], slope, atol=1e-6 * size)
+    bend = (along("constraint_rates", h) - along("constraint_rates", -h)) / (2 * h)
+    np.testing.assert_allclose(A @ qdd + gamma, bend, atol=1e-6 * size)
+
+
+@pytest.mark.parametrize("name", tiers(RUNS, *QUICK))
+def test_projected_rk4_makes_the_errors_that_an_independent_one_made(name: str) -> None:
+    measured = constrained.cases()[name]["rk4_measured"][0]
+    answer = symbolic.of(constrained.system(name))
+    steps = measured["steps"]
+    _, q, qd = answer.simulate(h=measured["h"], steps=steps, every=50)
+    expected = measured["projected"]["err_q"]
+    assert constrained.error_of(name, q[-1]) == pytest.approx(expected, rel=0.05)
+    times = measured["h"] * np.minimum(50 * np.arange(len(q)), steps)
+    n = len(constrained.cases()[name]["constraints"])
+    assert np.max(np.abs(answer.evaluate("constraints", q, qd, times)[:, :n]), initial=0) < 1e-13
+    rates = answer.evaluate("constraint_rates", q, qd, times)
+    assert np.max(np.abs(rates)) < 1e-12 * (1 + np.max(np.abs(qd)))
+
+
+def double_pendulum() -> System:
+    """On a table; its second row says what its first says."""
+    x, y, m = (symbol(name) for name in ("x", "y", "m"))
+    rates = symbol("x_dot") ** 2 + symbol("y_dot") ** 2
+    made = System.make("twice", {x: 1.0, y: 0.0}, m * rates / 2, parameters={m: 2.0})
+    rod = x**2 + y**2 - 1
+    return replace(made, constraints=(Constraint("rod", rod), Constraint("again", 3 * rod)))
+
+
+def test_a_row_that_says_what_another_says_shares_its_force() -> None:
+    """The least multipliers, each row scaled; the accelerations are those of one row."""
+    answer = symbolic.derive(double_pendulum())
+    q, qd = [0.6, 0.8], [-1.6, 1.2]
+    np.testing.assert_allclose(answer.acceleration(q, qd), [-2.4, -3.2], rtol=1e-14)
+    first, again = answer.multipliers(q, qd)
+    assert first == pytest.approx(3 * again)
+    assert first + 3 * again == pytest.approx(-4)
+
+
+def test_a_row_without_inertia_beside_it_is_solved_for() -> None:
+    x, s = symbol("x"), symbol("s")
+    made = System.make("massless", {x: 0.0, s: 0.0}, symbol("x_dot") ** 2, 9.81 * x)
+    held = replace(made, constraints=(Constraint("drive", s - x - sympy.sin(t)),))
+    answer = symbolic.derive(held)
+    found = answer.acceleration([0.2, 0.2 + np.sin(0.5)], [0.0, np.cos(0.5)], 0.5)
+    np.testing.assert_allclose(found, [-9.81 / 2, -9.81 / 2 - np.sin(0.5)], rtol=1e-14)
+    assert answer.multipliers([0.2, 0.2], [0.0, 0.0])[0] == pytest.approx(0, abs=1e-12)
+
+
+def test_project_finds_the_nearest_state_of_many() -> None:
+    answer = symbolic.derive(double_pendulum())
+    q, qd = answer.project([[1.2, 0.0], [0.3, -0.4]], [[0.1, 2.0], [1.0, 1.0]])
+    np.testing.assert_allclose(q, [[1, 0], [0.6, -0.8]], atol=1e-15)
+    np.testing.assert_allclose(qd, [[0, 2], [1.12, 0.84]], atol=1e-15)
+
+
+def test_what_can_not_be_put_onto_its_rows_is_nan() -> None:
+    made = double_pendulum()
+    x = symbol("x")
+    torn = replace(made, constraints=(Constraint("one", x - 1), Constraint("two", x - 2)))
+    q, _ = symbolic.derive(torn).project([0.0, 0.0], [0.0, 0.0])
+    assert np.all(np.isnan(q))
+
+
+def test_rows_of_rates_are_linear_in_them() -> None:
+    made = double_pendulum()
+    bad = (Constraint("speed", symbol("x_dot") ** 2 - 1, holonomic=False),)
+    for answer in (symbolic.derive, Jets):
+        with pytest.raises(EomcError, match="speed is not linear in the rates"):
+            answer(replace(made, constraints=bad))
+
+
+def test_scales_make_rows_and_coordinates_alike() -> None:
+    D, A = np.diag([1e-6, 1e6]), np.array([[1e-3, 1e3], [2.0, 0.0]])
+    s = kkt.scales(D, A)
+    B = s[2:, None] * A * s[:2]
+    np.testing.assert_allclose(np.sum(B**2, axis=1), 1)
+    x, multipliers = kkt.solve(D, A, np.array([1.0, 2.0]), np.array([0.0, 4.0]))
+    np.testing.assert_allclose(x, [2.0, -2e-6], rtol=1e-12)
+    np.testing.assert_allclose(D @ x - A.T @ multipliers, [1.0, 2.0], rtol=1e-9)

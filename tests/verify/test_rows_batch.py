@@ -1,0 +1,94 @@
+"""Rows about batches compare as far as there are digits, and no less."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+from eomc.verify.comparison import Comparison
+from eomc.verify.rows_batch import STEPS, Batches
+from eomc.verify.rows_runs import Runs, drive
+
+# forces that answer where a slide is; with a cosine of it they have no digit at 1e304
+SLIDE = """eomc = 1
+name = "slide"
+[coordinates]
+x = { start = 0.1, rate = 0.2 }
+[parameters]
+k = 60.0
+[energy]
+kinetic = "x_dot**2/3"
+potential = "k*x**2/2"
+dissipation = "x_dot**2/6"
+[forces]
+x = "FORCE"
+[run]
+h = 0.02
+batch = true
+"""
+ALL_BUT_LOST = 5e305
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
+def batches(modules: Modules, force: str, text: str = SLIDE) -> Batches:
+    text = text.replace("FORCE", force)
+    made = from_scene(parse(text, "slide.toml"))
+    comparison = Comparison(made, modules.unoptimised(text), np.random.default_rng(0), 4)
+    return Batches(Runs(comparison), [])
+
+
+@pytest.mark.parametrize(("force", "digits"), [("-x/7", True), ("-40*cos(x)*x", False)])
+def test_rows_without_digits_are_compared_by_their_own_rounding(
+    modules: Modules, force: str, digits: bool
+) -> None:
+    b = batches(modules, force)
+    s = replace(b.instances[0], q=np.zeros(1), qd=np.array([ALL_BUT_LOST]))
+    alone, beside = (
+        drive(b.model, "rk4", replace(s, qd=s.qd * by), b.h, STEPS) for by in (1, 1 + 1e-13)
+    )
+    kept = alone.rows[:, :6]
+    assert not b.parts("rk4", s, kept, alone)
+    assert not b.parts("rk4", s, beside.rows[:, :6], alone)
+    assert b.parts("rk4", s, kept * 1.01, alone) == digits
+
+
+def test_own_and_shared_parameters_are_compared_by_what_rounding_does(modules: Modules) -> None:
+    b = batches(modules, "-x/7")
+    alike = [replace(s, params=b.instances[0].params) for s in b.instances]
+    one, other = (b.simulate("rk4", alike, None, own=own) for own in (False, True))
+    by = [b.simulate("rk4", b.rounded(alike), None)]
+    assert b.near(one, other, by) and b.near(by[0], other, by)
+    one.q[3, 5] *= 1 + 1e-10
+    assert not b.near(one, other, by)
+
+
+COUPLED = """eomc = 1
+name = "coupled"
+[coordinates]
+x = { start = 0.5 }
+y = { start = 0.5 }
+[parameters]
+k = 1e9
+[energy]
+kinetic = "x_dot**2/2 + y_dot**2/2"
+potential = "k*(x - y)**2/2"
+[run]
+h = 0.02
+batch = true
+"""
+
+
+def test_what_one_coordinate_alone_would_throw_counts(modules: Modules) -> None:
+    """Both moved by as much leave the spring between them as it is; roundings do not."""
+    b = batches(modules, "", COUPLED)
+    s = replace(b.instances[0], q=np.array([0.5, 0.5]), qd=np.array([0.1, 0.1]), params=None)
+    beside = drive(b.model, "rk4", replace(s, q=np.array([0.5 + 1e-16, 0.5])), b.h, 1)
+    assert np.abs(beside.rows[:, 1] - drive(b.model, "rk4", s, b.h, 1).rows[:, 1]).max() > 1e-8
+    off = b.step_off("rk4", s, beside.rows[:, 1])
+    assert off is not None and off < 10
