@@ -13,7 +13,6 @@ import argparse
 import math
 import os
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,8 +23,8 @@ from typing import Any
 
 import numpy as np
 from machine import CORES, machine
-from searching import fewest, quick
-from taylor import Array, Options, Taylor
+from searching import Array, adaptive_in_c, fewest, quick, timed
+from taylor import Options, Taylor
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -119,25 +118,6 @@ class Case:
                 bound = min(bound, 2 * quick(call))
         return min(found, key=lambda way: quick(way.run)) if found else None
 
-    def alone(self, tol: float) -> Callable[[], object]:
-        """Our loop in C, called with nothing around it."""
-        model = self.module._model
-        (address, real, null), work = model._c, model._ffi.new("adaptive_work *")
-        start, nothing = np.concatenate(model.start), bytes(model._ffi.sizeof(work[0]))
-        x, t = start.copy(), np.zeros(1)
-        at_x, at_t, at_p = address(real, x), address(real, t), model._at[2]
-        memory, many = model._ffi.buffer(work), 2**40
-
-        def run() -> None:
-            x[:] = start
-            t[0] = 0.0
-            memory[:] = nothing
-            model._lib.adaptive(
-                at_x, at_t, self.end, tol, 0.0, null, many, null, 0, null, null, null, at_p, work
-            )
-
-        return run
-
     def taylor(self, k: int, wanted: float) -> tuple[Way, Options]:
         """heyoka at a tolerance in its quickest form."""
         tol, found = 10.0 ** (-k / 2), list[tuple[float, Way, Options]]()
@@ -189,22 +169,6 @@ class Line:
         )
 
 
-def timed(ways: list[Callable[[], object] | None], rounds: int) -> Array:
-    """The least us of each, all in turns for some tenths of ms; what is slow in fewer rounds."""
-    first = [math.nan if way is None else quick(way) for way in ways]
-    counts = [1 if math.isnan(s) else max(1, round(4e-4 / s)) for s in first]
-    rounds = max(3, min(rounds, round(20 / float(np.nansum(first)))))
-    times = np.full((rounds, len(ways)), np.nan)
-    for k in range(rounds):
-        for i, way in enumerate(ways):
-            if way is not None:
-                begun = time.perf_counter()
-                for _ in range(counts[i]):
-                    way()
-                times[k, i] = (time.perf_counter() - begun) / counts[i] * 1e6
-    return np.array([np.min(column) for column in times.T])
-
-
 def lines(name: str, rounds: int, most: float) -> Iterator[Line | str]:
     """A line for each target; a sentence where there is none."""
     case = Case(name)
@@ -250,7 +214,12 @@ def line(case: Case, wanted: float, said: str, k: int, other: int | None, rounds
         order, steps = case.theirs.steps(10.0 ** (-other / 2), options)
         how = f"{order} x {steps}, {options}"
     fixed = case.fixed(wanted, quick(call))
-    ways = [call, case.alone(tol), fixed and fixed.run, theirs and theirs.run]
+    ways = [
+        call,
+        adaptive_in_c(case.module, case.end, tol),
+        fixed and fixed.run,
+        theirs and theirs.run,
+    ]
     times = timed(ways, rounds)
     ours = f"{run.steps}+{run.rejected}, {run.evaluations}"
     return Line(case.name, wanted, said, ours, own, fixed, theirs, how, times)

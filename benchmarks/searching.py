@@ -1,10 +1,16 @@
-"""How long calls take, and the fewest steps that do: for digits.py and adaptive.py."""
+"""How long calls take, and the fewest steps that do, for several benchmarks."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
 def quick(run: Callable[[], object]) -> float:
@@ -30,3 +36,54 @@ def fewest(
         middle = (low + high) // 2
         low, high = (low, middle) if error(middle) <= wanted else (middle, high)
     return high
+
+
+def timed(ways: Sequence[Callable[[], object] | None], rounds: int) -> Array:
+    """The least us of each, all in turns for some tenths of ms; what is slow in fewer rounds."""
+    first = [math.nan if way is None else quick(way) for way in ways]
+    counts = [1 if math.isnan(s) else max(1, round(4e-4 / s)) for s in first]
+    rounds = max(3, min(rounds, round(20 / float(np.nansum(first)))))
+    times = np.full((rounds, len(ways)), np.nan)
+    for k in range(rounds):
+        for i, way in enumerate(ways):
+            if way is not None:
+                begun = time.perf_counter()
+                for _ in range(counts[i]):
+                    way()
+                times[k, i] = (time.perf_counter() - begun) / counts[i] * 1e6
+    return np.array([np.min(column) for column in times.T])
+
+
+def adaptive_in_c(module: ModuleType, end: float, tol: float) -> Callable[[], object]:
+    """A run in steps that fit the tolerance: the loop in C, called with nothing around it."""
+    model = module._model
+    (address, real, null), work = model._c, model._ffi.new("adaptive_work *")
+    start, nothing = np.concatenate(model.start), bytes(model._ffi.sizeof(work[0]))
+    x, t = start.copy(), np.zeros(1)
+    at_x, at_t, at_p = address(real, x), address(real, t), model._at[2]
+    memory, many = model._ffi.buffer(work), 2**40
+
+    def run() -> None:
+        x[:] = start
+        t[0] = 0.0
+        memory[:] = nothing
+        model._lib.adaptive(
+            at_x, at_t, end, tol, 0.0, null, many, null, 0, null, null, null, at_p, work
+        )
+
+    return run
+
+
+def fixed_in_c(module: ModuleType, method: str, h: float, steps: int) -> Callable[[], object]:
+    """A run in fixed steps, likewise; it keeps the start and the end."""
+    model = module._model
+    (address, real, null), loop = model._c, model._loops[method][1]
+    q0, qd0, p = model._at
+    rows = np.empty((2, 2, model.nq))
+    to = address(real, rows)
+
+    def run() -> Array:
+        loop(to, null, q0, qd0, 0.0, h, steps, null, 0, steps, p, null)
+        return rows
+
+    return run
