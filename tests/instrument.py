@@ -127,14 +127,13 @@ def _told(child: int, reading: int, seconds: float) -> tuple[str, object]:
 # --- lines ----------------------------------------------------------------------------------------
 
 CHECK = """
-import sys, tomllib
+import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
+import eomc
 from eomc.verify import check
-from eomc.scene.read import parse
-from eomc.model.from_scene import from_scene
 from instrument import Shipped
-made = from_scene(parse(Path({scene!r}).read_text(), "scene.toml"))
+made = eomc.read({scene!r})
 shipped = Shipped(made, Path({folder!r}))
 said = shipped.compile({flags!r})
 assert said is None, said
