@@ -26,7 +26,8 @@ class Constraints:
     the rate of `rates`. moved (m,): what A qd is where `rates` are 0, by what time alone moves.
     holonomic: how many are; solved: those that accelerations are solved for,
     which leaves redundant ones out. drop: a pivot that is this part of what it was, or less, tells
-    a row that depends on others in this position: nothing is solved for it there.
+    a row that depends on others in this position: nothing is solved for it there. weights: where D
+    alone is singular, of each row solved for, the part of A^T A that makes it regular; else none.
     """
 
     values: Vector
@@ -37,6 +38,7 @@ class Constraints:
     holonomic: int
     solved: tuple[int, ...]
     drop: Expr
+    weights: Vector = ()
 
 
 def constraints(system: System, e: Energies) -> Constraints | None:
@@ -53,10 +55,11 @@ def constraints(system: System, e: Energies) -> Constraints | None:
     still = dict.fromkeys(qd, S.Zero)
     moved = [*tape.forward(phi, {t: S.One}), *tape.substitute(psi, still)]
     solved = tuple(k for k, c in enumerate(system.constraints) if not c.redundant)
+    weights = system.closure.weights if system.closure else ()
     return Constraints(
         tuple(e.rows), tuple(map(tuple, by)), tuple(rates), tuple(tape.forward(rates, along)),
         tuple(tape.scaled(S.NegativeOne, x) for x in moved), count, solved,
-        DROPPED[system.run.real],
+        DROPPED[system.run.real], tuple(sympy.Rational(weights[k]) for k in solved if weights),
     )  # fmt: skip
 
 

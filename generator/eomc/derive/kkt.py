@@ -78,7 +78,9 @@ def factors(
         left.remove(k)
         below = {i: M[i, k] for i in sorted(left) if (i, k) in M}
         if k < n:
-            pivots.append((M[k, k], tape.define(D[k][k])))
+            pair = (M[k, k], tape.define(D[k][k]))
+            if not all(x.is_Number for x in pair) or pair[0] <= 1e-12 * pair[1]:
+                pivots.append(pair)
             inverse = tape.define(1 / M[k, k])
         else:
             pivot = tape.define(-M.get((k, k), S.Zero))
@@ -133,7 +135,7 @@ def accelerations(
     """qdd and the multipliers of all rows, 0 of redundant ones."""
     A = tuple(chosen(rows.jacobian, rows))
     c = [tape.scaled(S.NegativeOne, x) for x in chosen(rows.rest, rows)]
-    D, b = with_mass(tape, D, b, A, c)
+    D, b = with_mass(tape, D, b, A, c, rows.weights)
     made = factors(tape, D, A, rows.drop, short)
     a, some = made.solve(b, c, short)
     multipliers = [S.Zero] * len(rows.values)
@@ -144,18 +146,21 @@ def accelerations(
 
 
 def with_mass(
-    tape: Tape, D: Rows, b: Sequence[Expr], A: Rows, c: Sequence[Expr]
+    tape: Tape, D: Rows, b: Sequence[Expr], A: Rows, c: Sequence[Expr], weights: Vector = ()
 ) -> tuple[Rows, Sequence[Expr]]:
-    """D + A^T A and b + A^T c where a coordinate has no inertia of its own, as D and b elsewhere.
+    """D + A^T W A and b + A^T W c where D is singular by itself, as D and b elsewhere.
 
-    The accelerations and multipliers are the same, exactly: A a = c.
+    The accelerations and multipliers are the same, exactly: A a = c. W: the weights of the rows, 1
+    where none are given and a coordinate has no inertia at all.
     """
     n = range(len(D))
-    if all(D[i][i] != 0 for i in n):
+    if not weights and all(D[i][i] != 0 for i in n):
         return D, b
+    weights = weights or (S.One,) * len(A)
+    heavy = [[tape.scaled(w, x) for x in row] for w, row in zip(weights, A, strict=True)]
 
     def added(first: Expr, i: int, other: Sequence[Expr]) -> Expr:
-        parts = [tape.times(row[i], x) for row, x in zip(A, other, strict=True)]
+        parts = [tape.times(row[i], x) for row, x in zip(heavy, other, strict=True)]
         return tape.total([first, *parts])
 
     more = tuple(tuple(added(D[i][j], i, [row[j] for row in A]) for j in n) for i in n)
@@ -171,7 +176,7 @@ def correction(
     rates that are taken at q + dq, to the first order. Second: the pivots, as `Solution` has them.
     """
     n, A = len(D), tuple(chosen(rows.jacobian, rows))
-    D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A))
+    D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)
     made = factors(tape, D, A, rows.drop)
     positions = [S.Zero if k >= rows.holonomic else -rows.values[k] for k in rows.solved]
     zero, same = [S.Zero] * n, lambda atom: atom

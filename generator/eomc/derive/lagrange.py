@@ -26,6 +26,7 @@ from sympy import Expr, S, Symbol
 from eomc.base.errors import SceneError
 from eomc.derive import link_multipliers
 from eomc.derive.articulated_body import MasslessError, accelerations
+from eomc.derive.constraints import Constraints
 from eomc.derive.energies import Energies, directions, on_tape
 from eomc.derive.equations import Equations, Motion, equations, no_inertia
 from eomc.derive.ldl import Rows, Solution, Vector, Way, solve, work
@@ -90,7 +91,9 @@ def _by_lagrange(system: System) -> tuple[Equations, Way, Way]:
     e = on_tape(system, system.kinetic, system.potential)
     motion = _lagrange(system, e)
     if system.constraints:
-        return equations(system, e, motion), None, None
+        made = equations(system, e, motion)
+        _refuse_massless(system, motion.D, made.rows)
+        return made, None, None
     _refuse_massless(system, motion.D)
     multipliers, operations = _by_multipliers(system), work(motion.D)
     ldl: Way = f"{operations} flops for elimination alone"
@@ -140,7 +143,10 @@ def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, Way, Way]:
         composite = solve(tape, D, motion.balance)
     e.kinetic = tape.total([e.kinetic, recursion.kinetic_energy()])
     e.potential = tape.total([e.potential, recursion.potential_energy()])
-    return equations(system, e, replace(motion, D=D)), articulated, composite
+    made = equations(system, e, replace(motion, D=D))
+    if constrained:
+        _refuse_massless(system, D, made.rows)
+    return made, articulated, composite
 
 
 def _by_articulated_bodies(system: System, recursion: Recursion, rest: Motion) -> Way:
@@ -171,9 +177,11 @@ def _length(solution: Solution) -> int:
     return len(solution.tape.live(solution.acceleration))
 
 
-def _refuse_massless(system: System, D: Rows) -> None:
-    for c, row in zip(system.coordinates, D, strict=True):
-        if all(entry == 0 for entry in row):
+def _refuse_massless(system: System, D: Rows, rows: Constraints | None = None) -> None:
+    """Raise SceneError where a coordinate is neither in D nor in a row."""
+    for k, (c, row) in enumerate(zip(system.coordinates, D, strict=True)):
+        held = rows is not None and any(row[k] != 0 for row in rows.jacobian)
+        if all(entry == 0 for entry in row) and not held:
             no_inertia(system, c.name)
 
 

@@ -61,11 +61,15 @@ def project(functions: Functions) -> Project:
         public.evaluation(name)
         for name in ("D", "constraint_jacobian", "constraints", "constraint_rates")
     )
+    closure = target.system.closure
+    weights = closure.weights if closure else ()
+    rows = target.system.constraints
     return Project(
         **functions.names,
         fabs=f"fabs{end}",
         sqrt=f"sqrt{end}",
-        holonomic=sum(c.holonomic for c in target.system.constraints),
+        count=len(rows),
+        holonomic=sum(row.holonomic for row in rows),
         function=public.project,
         call_D=D.call(q="at"),
         call_A=A.call(q="at"),
@@ -76,6 +80,7 @@ def project(functions: Functions) -> Project:
         enough=target.literal((4096 * eps) ** 2),
         loose=target.literal(4096 * eps),
         rounded=target.literal(4 * eps),
-        redundant=tuple(k for k, c in enumerate(target.system.constraints) if c.redundant),
+        weights="{ " + ", ".join(map(target.literal, weights)) + " }" if weights else "",
+        redundant=tuple(k for k, row in enumerate(rows) if row.redundant),
         tiny=target.literal(1e-30),
     )

@@ -31,8 +31,9 @@ class Closure:
     whose multipliers are not unique, since others could bear them. start_sigma, least_sigma: the
     smallest singular value that counts over the largest one, at the start and at the worst of
     `positions` positions; rows in units of their own inverse inertia, coordinates in the metric of
-    D: 0 at a singular position. moves, rate_moves: what assembling changed. remarks: in words.
-    made_for: what of the system all that depends on.
+    D: 0 at a singular position. weights: where D alone is singular, of each row r what makes
+    D + sum of weights[r] A_r^T A_r regular; else none. moves, rate_moves: what assembling changed.
+    remarks: in words. made_for: what of the system all that depends on.
     """
 
     rows: tuple[str, ...]
@@ -43,6 +44,7 @@ class Closure:
     start_sigma: float = 1.0
     least_sigma: float = 1.0
     positions: int = 1
+    weights: tuple[float, ...] = ()
     moves: tuple[Move, ...] = ()
     rate_moves: tuple[Move, ...] = ()
     remarks: tuple[str, ...] = ()

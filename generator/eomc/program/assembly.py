@@ -181,6 +181,7 @@ def _closure(manifold: Manifold, start: Start, found: Ranks) -> Closure:
         start_sigma=found.sigma[0],
         least_sigma=found.sigma[1],
         positions=found.positions,
+        weights=found.weights,
         moves=tuple(_moves(units, guess, start.place.q)),
         rate_moves=tuple(_moves(speeds, rates, start.qd)),
         remarks=tuple(_remarks(manifold, start, found)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 from sympy import S
@@ -14,6 +14,7 @@ from eomc.derive.lagrange import Derivation
 from eomc.model.symbols import Output
 from eomc.model.system import System
 from eomc.program.admissible import Candidate
+from eomc.program.interpret import evaluator
 from eomc.program.ir import Function
 from eomc.program.lower import lower
 
@@ -62,6 +63,22 @@ def _reactions(system: System) -> Function:
     multipliers = [c.multiplier for c in system.constraints]
     made = outputs.outputs(replace(system, outputs=named), sloped=False, more=multipliers)
     return lower("reactions", made.tape, made.values, (), (), system.names)
+
+
+def weighted(
+    functions: Mapping[str, Function], system: System, values: Mapping[str, float]
+) -> list[tuple[float, list[float]]]:
+    """Weights and entries of the rows beside a singular D. Raises as `evaluate`."""
+    closure = system.closure
+    if closure is None or not closure.weights:
+        return []
+    flat, _ = evaluator(functions["constraint_jacobian"])(values)
+    n = len(system.q)
+    return [
+        (w, list(flat[n * k : n * k + n]))
+        for k, (w, row) in enumerate(zip(closure.weights, system.constraints, strict=True))
+        if not row.redundant
+    ]
 
 
 def unsuited(system: System) -> Iterator[Problem]:

@@ -50,20 +50,31 @@ class Place:
     D: Vector
 
     @cached_property
+    def singular(self) -> bool:
+        """Whether D is not positive definite by itself."""
+        diagonal = np.diag(self.D)
+        if np.all(diagonal > 0):
+            scale = 1 / np.sqrt(diagonal)
+            with suppress(np.linalg.LinAlgError):
+                factor = np.linalg.cholesky(scale[:, None] * (self.D + self.D.T) / 2 * scale)
+                return not np.min(np.diag(factor)) > 1e-6
+        return True
+
+    @property
+    def weights(self) -> Vector:
+        """(m,): of the rows in `metric`, where D is singular; powers of two."""
+        diagonal, size = np.diag(self.D), np.sum(self.A**2, axis=1)
+        known = diagonal > 0
+        mass = float(np.mean(diagonal[known])) if np.any(known) else 1.0
+        return np.asarray(2.0 ** np.round(np.log2(mass / np.where(size > 0, size, mass))))
+
+    @cached_property
     def metric(self) -> Vector:
         """D, with the rows' own weight where some coordinate has no inertia."""
         D, A = (self.D + self.D.T) / 2, self.A
-        diagonal = np.diag(D)
-        known = diagonal > 0
-        if np.all(known):
-            scale = 1 / np.sqrt(diagonal)
-            with suppress(np.linalg.LinAlgError):
-                factor = np.linalg.cholesky(scale[:, None] * D * scale)
-                if np.min(np.diag(factor)) > 1e-6:
-                    return D
-        mass = float(np.mean(diagonal[known])) if np.any(known) else 1.0
-        size = np.sum(A**2, axis=1)
-        D = D + (A.T * (mass / np.where(size > 0, size, 1))) @ A
+        if not self.singular:
+            return D
+        D = D + (A.T * self.weights) @ A
         values, vectors = np.linalg.eigh(D)
         least = 1e-12 * max(float(values[-1]), 1e-300)
         return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)

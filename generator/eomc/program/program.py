@@ -305,10 +305,17 @@ def _without_inertia(program: Program, k: int) -> str | None:
     """The coordinate without a positive pivot in D at the k-th state; None where D is regular."""
     names = [c.name for c in program.system.coordinates]
     n = len(names)
+    values = nearby(program.system, k)
     try:
-        D = matrix(program, "D", nearby(program.system, k))
+        D = matrix(program, "D", values)
+        rows = constrained.weighted(program.functions, program.system, values)
     except (ArithmeticError, ValueError):
         return names[0]
+    for w, row in rows:
+        D = [
+            [x + w * a * b for x, b in zip(of, row, strict=True)]
+            for of, a in zip(D, row, strict=True)
+        ]
     A = [list(row) for row in D]
     for i in range(n):
         if not A[i][i] > 8 * n * 2.0**-52 * D[i][i]:

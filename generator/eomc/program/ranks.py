@@ -8,7 +8,7 @@ that the rows leave, at places that hold them in forty digits.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 from typing import Any
@@ -34,6 +34,7 @@ class Ranks:
     """rank: of all rows, almost everywhere. left_out: rows that others imply. shared: rows without
     a force of their own. good: whether some set of rows will do everywhere that was looked at.
     sigma: smallest over largest singular value that counts, at the start and at the worst place.
+    weights: of the rows, that make D regular with them; none where it is so by itself.
     """
 
     rank: int
@@ -42,10 +43,18 @@ class Ranks:
     good: bool
     sigma: tuple[float, float]
     positions: int
+    weights: tuple[float, ...] = ()
 
 
 def ranks(manifold: Manifold, start: Place) -> Ranks:
     """Of the rows around an assembled start."""
+    found, places = _ranks(manifold, start)
+    singular = any(place.singular for place in places)
+    return replace(found, weights=tuple(start.weights.tolist()) if singular else ())
+
+
+def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
+    """Without weights, and the places that were looked at."""
     free = np.ones(len(start.q), dtype=bool)
     first = Frame(start, free, manifold.rows)
     sure = len(first.parts[1]) == len(manifold.rows) and first.parts[1][-1] > FADED
@@ -59,14 +68,15 @@ def ranks(manifold: Manifold, start: Place) -> Ranks:
     ratios = [x if x > FADED else 0.0 for x in ratios]
     sigma = (ratios[0], min(ratios))
     if rank == m:
-        return Ranks(rank, (), (), True, sigma, len(places))
+        return Ranks(rank, (), (), True, sigma, len(places)), places
     if rank == 0:
-        return Ranks(0, (), tuple(range(m)), False, (0.0, 0.0), len(places))
+        return Ranks(0, (), tuple(range(m)), False, (0.0, 0.0), len(places)), places
     null = [np.linalg.svd(f.B)[0][:, rank:] for f in regular]
     shared = np.flatnonzero(np.max([np.linalg.norm(u, axis=1) for u in null], axis=0) > 1e-6)
     left_out, score = _chosen([f.B for f in regular], rank, shared.tolist())
     good = score >= GOOD and all(_implied(manifold, f.place, left_out) for f in regular[:3])
-    return Ranks(rank, left_out if good else (), tuple(shared.tolist()), good, sigma, len(places))
+    out = left_out if good else ()
+    return Ranks(rank, out, tuple(shared.tolist()), good, sigma, len(places)), places
 
 
 def walk(manifold: Manifold, start: Place, positions: int = POSITIONS) -> Iterator[Place]:

@@ -23,6 +23,7 @@ from eomc.verify import (
     rows_newton,
     rows_outputs,
     rows_plain,
+    rows_projection,
     rows_signals,
     rows_sines,
 )
@@ -116,5 +117,7 @@ def compiled_rows(made: Comparison) -> None:
     rows_sines.report(made)
     rows_newton.report(made)
     refusals.report()
+    if made.system.constraints:
+        rows_projection.of_inertia(made, refusals)
     if hasattr(made.module, "simulate_batch"):
         Batches(runs, refusals.singular).report()

@@ -60,6 +60,15 @@ def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, 
     return found[:n], found[n:]
 
 
+def kept(D: Vector, A: Vector, held: tuple[int, ...]) -> tuple[Vector, Vector]:
+    """D and A with which the coordinates `held` do not change."""
+    D, A = D.copy(), A.copy()
+    for i in held:
+        D[i] = D[:, i] = A[:, i] = 0
+        D[i, i] = 1
+    return D, A
+
+
 def inverse(D: Vector, A: Vector) -> Vector:
     """(n + m, n + m): of the matrix, the sizes of its entries: how it spreads what is rounded."""
     m, scale = len(A), scales(D, A)

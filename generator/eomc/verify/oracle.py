@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -114,13 +114,16 @@ class Answer(ABC):
         qd: ArrayLike,
         t: ArrayLike = 0.0,
         params: Mapping[str, Any] | None = None,
+        held: tuple[int, ...] = (),
     ) -> tuple[Vector, Vector]:
         """q and qd put onto the constraints, by Newton's method in the metric of D, to rounding.
 
-        Each correction is the least. nan where none is found.
+        Each correction is the least. held: coordinates that stay, with their rates. nan where none
+        is found.
         """
         q, qd = np.asarray(q, float), np.asarray(qd, float)
-        return self._each(self._onto, q, qd, np.asarray(t, float), self._values(params))
+        onto = partial(self._onto, held=held)
+        return self._each(onto, q, qd, np.asarray(t, float), self._values(params))
 
     def corrected(
         self, q: Vector, qd: Vector, t: ArrayLike, params: Mapping[str, Any] | None = None
@@ -241,12 +244,14 @@ class Answer(ABC):
         found = np.asarray(self._value(name, q, qd, t, u, values))
         return found if name == "D" else found[self.solved]
 
-    def _onto(self, q: Vector, qd: Vector, t: Any, values: Values) -> tuple[Vector, Vector]:
+    def _onto(
+        self, q: Vector, qd: Vector, t: Any, values: Values, held: tuple[int, ...] = ()
+    ) -> tuple[Vector, Vector]:
         """`project` of one state."""
 
         def rows(x: Vector) -> tuple[Vector, Vector, Vector]:
             D, A, off = (self._row(name, x, qd, t, values) for name in ROWS)
-            return D, A, self._holonomic * off
+            return *kkt.kept(D, A, held), self._holonomic * off
 
         q, left = kkt.onto(q, rows)
         if not left < 1e-10:

@@ -18,6 +18,7 @@ import numpy as np
 
 from eomc.model.symbols import t as time
 from eomc.scene.assembly import Loop
+from eomc.verify import rows_projection
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
@@ -36,7 +37,6 @@ SHARE = 0.02  # of how far things go, in a step of it
 HELD = 450.0  # units: what rows may be along it, 1e-13 of their terms
 SLOPE = 1e-7  # of A: differences of order 8, in 16 digits; a wrong sign makes 1
 STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
-AWAY = (1e-6, 1e-3, 1e-2)  # of how far things go: from a state to where it is projected from
 UNITS = "units of rounding"
 
 
@@ -57,7 +57,7 @@ def report(of: Comparison, plain: Any) -> None:
         if form:
             find = partial(_values, of, module)
             of.row("plain C: constraints", LIMIT, UNITS, find)
-        of.row(f"{form}project", LIMIT, UNITS, own.projected)
+        rows_projection.report(of, module, form)
         for method in of.methods:
             kept = partial(own.kept, method)
             of.row(f"{form}{method} on the constraints", HELD, UNITS, kept)
@@ -218,32 +218,6 @@ class Rows:
         if not len(off):
             return None
         return self.of.units(off, 0 * off, A @ scale)
-
-    def projected(self) -> float | Finding:
-        """A state moved away is put back where the reference puts it, and held ones stay."""
-        of = self.of
-        scale = np.array([of.sampler.spread, of.sampler.speed])
-        random = np.random.default_rng(11)
-
-        def error(e: Expected, part: float) -> float | None:
-            by = part * scale * random.uniform(-1, 1, scale.shape)
-            s = replace(e.state, q=e.state.q + by[0], qd=e.state.qd + by[1])
-            with np.errstate(all="ignore"):
-                near = of.sampler.onto(s)
-            if not np.all(np.isfinite(near.q)) or not of.sampler.regular(near):
-                return None
-            expected = of.sampler.expected(near)
-            if expected is None:
-                return None
-            found = self.module.project(s.q, s.qd, t=s.t, params=s.params)
-            size = np.abs([near.q, near.qd]) + scale + expected.size["place"]
-            moved = np.abs(np.array([near.q - s.q, near.qd - s.qd]))
-            if np.any(moved > 10 * part * scale):  # far away there may be several
-                return None
-            return of.units(found, np.array([near.q, near.qd]), size)
-
-        errors = [error(e, part) for e in of.few(6) for part in AWAY]
-        return largest(errors, "no state that is moved away has a place nearby")
 
 
 def _quiet(module: Any, s: State, method: str, h: float) -> Any:

@@ -285,6 +285,9 @@ class Sampler:
         if not all(np.all(np.isfinite(x)) for x in value.values()):
             return None
         diagonal = np.sqrt(np.diag(reach["D"]))
+        if self.system.constraints:  # a coordinate without inertia has that of its rows
+            scale = kkt.scales(D, self.rows("constraint_jacobian", s))[: len(qd)]
+            diagonal = np.where(diagonal > 0, diagonal, 1 / scale)
         inertia = np.outer(diagonal, diagonal) + reach["D"]
         rate = np.max(qd / self.spread)  # of change of D, in 1/s
         force = reach["bias"] + reach["g"] + reach["tau"] + rate * inertia @ qd

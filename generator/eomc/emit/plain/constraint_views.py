@@ -40,12 +40,13 @@ class Project(Named):
     dependent: the part of a row's square below which it depends on others; small: of the square of
     q, where a change is rounding; enough: where what rows lack is; loose: of the terms of a rate;
     rounded: the same of rows and rates, where a state is left as it is; redundant: rows that the
-    others imply.
+    others imply; weights: of rows, an initializer, where D alone is singular.
     """
 
     TEMPLATE: ClassVar[str] = "c/project.c"
     fabs: str
     sqrt: str
+    count: int
     holonomic: int
     function: CFunction
     call_D: str
@@ -58,4 +59,5 @@ class Project(Named):
     loose: str
     rounded: str
     redundant: tuple[int, ...]
+    weights: str
     tiny: str
