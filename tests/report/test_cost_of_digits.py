@@ -23,8 +23,8 @@ from eomc.base.errors import EomcError
 from eomc.cli.main import main
 from eomc.emit.render import Sources
 from eomc.integrators.tableaux import METHODS
-from eomc.model.system import System
-from eomc.report import cost_of_digits, page
+from eomc.model.system import Event, System
+from eomc.report import cost_of_digits, linearised, page
 from eomc.report.cost_of_digits import Report
 
 REPORTS = ROOT / "build" / "tests" / "reports"
@@ -119,6 +119,30 @@ def test_a_difference_of_an_oscillator_does_not_grow() -> None:
     assert g.amplification[-1] == pytest.approx(math.sqrt(2), rel=0.02)
 
 
+@pytest.mark.usefixtures("quickly_compiled")
+def test_adaptive_steps_stand_beside_fixed_ones(tmp_path: Path) -> None:
+    """By tolerance; events, which the reference passes over, are left out."""
+    x = sympy.Symbol("x")
+    system = replace(oscillator(), events=(Event("middle", x, action="stop"),))
+    r = cost_of_digits.measure(system, tmp_path, longest=0.005, methods=("rk4", "adaptive"))
+    rk4, line = r.lines
+    assert not any(p.adaptive for p in rk4.points) and all(p.adaptive for p in line.points)
+    assert [p.tol for p in line.points] == list(cost_of_digits.TOLERANCES)
+    for p in line.points:
+        assert p.status == "ok" and p.along < 20 * p.tol + 2e-15
+        assert p.h == pytest.approx(4 / p.steps)
+    assert line.order == 16 and math.isnan(line.usable_h)
+    found = r.best(12)
+    assert found is not None and found.adaptive
+    words = page.recommendation(r, 12)
+    assert words.startswith(f"for 12 digits up to t = 4 s: adaptive steps with tol = {found.tol:g}")
+    assert page.rows(r)[1][-3] == f"tol {min(line.points, key=lambda p: p.along).tol:g}"
+    assert "Error against tolerance" in page.page(r)
+    assert json.loads(json.dumps(page.as_dict(r), allow_nan=False))["lines"][0]["points"][0][
+        "tol"
+    ] is None  # fmt: skip
+
+
 @pytest.mark.slow
 def test_condition_and_jumps_are_reported(tmp_path: Path) -> None:
     """D = [[1, c], [c, 1]], c = 1 - 1e-9 cos x: condition (1 + c)/(1 - c) = 2e9 at x = 0."""
@@ -139,16 +163,12 @@ def test_condition_and_jumps_are_reported(tmp_path: Path) -> None:
 
 
 def test_stable_steps_of_known_eigenvalues() -> None:
-    assert cost_of_digits.stable_step(np.array([100j, -100j]), (2.83, 2.79)) == pytest.approx(
-        0.0283
-    )
-    assert cost_of_digits.stable_step(np.array([-1000 + 0j, 1j]), (2.83, 2.79)) == pytest.approx(
+    assert linearised.stable_step(np.array([100j, -100j]), (2.83, 2.79)) == pytest.approx(0.0283)
+    assert linearised.stable_step(np.array([-1000 + 0j, 1j]), (2.83, 2.79)) == pytest.approx(
         2.79e-3
     )
-    assert (
-        cost_of_digits.stable_step(np.array([5 + 0j]), (2.83, 2.79)) == math.inf
-    )  # grows by itself
-    assert cost_of_digits.stable_step(np.array([-1000 + 0j]), (math.inf, math.inf)) == math.inf
+    assert linearised.stable_step(np.array([5 + 0j]), (2.83, 2.79)) == math.inf  # grows by itself
+    assert linearised.stable_step(np.array([-1000 + 0j]), (math.inf, math.inf)) == math.inf
 
 
 class _Page(HTMLParser):

@@ -1,10 +1,9 @@
 """What every digit of a scene costs: speed against error, and where each stepper breaks.
 
-Every stepper that a scene can use runs at steps h = T/2^k and is compared with the scene's
-reference solution. Errors are those of the worst of x = [q; qd], relative to its largest value
-along the motion; energy errors are jacobi's, relative to what K and P change by. Also measured is
-the linearised motion: eigenvalues of d[qd; qdd]/dx along the reference solution, compared with each
-stepper's stability limits, and the growth of a small difference.
+Every stepper that a scene can use runs at steps h = T/2^k, adaptive steps by tolerances, and is
+compared with the scene's reference solution. Errors are those of the worst of x = [q; qd], relative
+to its largest value along the motion; energy errors are jacobi's, relative to what K and P change
+by. Steppers' stability limits are compared with the eigenvalues of the linearised motion.
 """
 
 from __future__ import annotations
@@ -14,43 +13,49 @@ import math
 import os
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from eomc import pipeline
 from eomc.base.errors import EomcError, SceneError
-from eomc.integrators.tableaux import METHODS
+from eomc.integrators.tableaux import GAUSS16, METHODS
 from eomc.model.system import System
 from eomc.report import reference_solution
+from eomc.report.linearised import (
+    Complex,
+    Growth,
+    at_rows,
+    growth,
+    simulate,
+    spectrum,
+    stable_step,
+)
 from eomc.report.reference_solution import Reference
 from eomc.verify.oracle import Vector
 
-Complex = NDArray[np.complex128]
-
 ROWS = 256  # at which runs are compared with the reference
-SEGMENTS = 64  # over which the growth of differences is put together
 DIGITS = range(3, 16)
+ADAPTIVE = "adaptive"  # among methods: steps that a tolerance chooses
+TOLERANCES = tuple(10.0**-k for k in range(3, 16))
 LONGEST = 0.5  # s of computing of one run: no finer step after it
 REPEATS = 5
-NUDGE = 1e-6  # of each scale, for differences
 LOST = 1.0  # an error as large as the motion
 ROUNDED = 0.7  # halving h leaves more of the error: rounding or the reference's digits decide
 CONDITION = 1e8  # of D with its diagonal scaled to 1: as many digits are lost
-WILD = 30.0  # growth over the second half of the motion; regular motions grow by 2 to 4
-EPSILON = 2.0**-53
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """One run: N steps of h. Errors are relative; inf where it did not get to the end.
+    """One run: N steps of h, or by a tolerance tol, h on the average; tol is nan of fixed steps.
+
+    Errors are relative; inf where it did not get to the end.
 
     q, qd, end: of the last state, positions and velocities apart and together; along: the largest
     at any row; energy: likewise, energies: over time. evaluations: of accelerations.
@@ -68,11 +73,19 @@ class Point:
     energies: Vector
     seconds: float
     evaluations: int
+    tol: float = math.nan
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether its steps are chosen by a tolerance."""
+        return not math.isnan(self.tol)
 
 
 @dataclass(frozen=True)
 class Line:
     """One stepper: its runs from coarse to fine, and what follows from them.
+
+    Of adaptive steps order is the method's, the rest nan.
 
     observed: the order, nan where too few errors are clear of rounding. usable_h: the largest h
     measured that kept its error below 1 and so did all finer ones; stable_to: the one that
@@ -89,21 +102,6 @@ class Line:
     usable_h: float
     stable_to: float
     rounding: float
-
-
-@dataclass(frozen=True)
-class Growth:
-    """By what a difference at the start has grown, amplification (n,) at t (n,).
-
-    rate: of its growth over the second half, 1/s; wild: whether that is exponential. horizon: when
-    a rounding of the start has become a tenth of the motion, inf where it does not.
-    """
-
-    t: Vector
-    amplification: Vector
-    rate: float
-    wild: bool
-    horizon: float
 
 
 @dataclass(frozen=True)
@@ -150,24 +148,27 @@ def measure(
 ) -> Report:
     """The measurement of one scene, from its start to its duration.
 
-    methods: all steppers where None. longest: s of computing of a run, after which no finer one is
-    made. progress: called with (done, total). Raises EomcError as `reference_solution.of` does.
+    methods: all steppers where None, "adaptive" among them. longest: s of computing of a run,
+    after which no finer one is made. progress: called with (done, total). Raises EomcError as
+    `reference_solution.of` does.
     """
     system = scene if isinstance(scene, System) else pipeline.read(scene)
     reference = reference_solution.of(system, rows=ROWS, root=root)
-    wanted = tuple(METHODS) if methods is None else tuple(methods)
+    wanted = (*METHODS, ADAPTIVE) if methods is None else tuple(methods)
     module, skipped = variant(system, wanted, Path(root) / system.name / "report")
-    values, at, place = _spectrum(module, reference)
+    values, at, place = spectrum(module, reference)
     against = _Against(
-        reference, _at_rows(module.jacobi, reference), _energy_scale(module, reference)
+        reference, at_rows(module.jacobi, reference), _energy_scale(module, reference)
     )
     lines = []
     for k, name in enumerate(module.methods):
         progress(k, len(module.methods))
         lines.append(_line(module, against, name, values, system.run.duration, longest))
+    if module._model.tolerance:
+        lines.append(_adaptive(module, against, system.run.duration, longest))
     progress(len(module.methods), len(module.methods))
     points = [p for line in lines for p in line.points]
-    finest = min(points, key=lambda p: p.along)
+    finest = min((p for p in points if not p.adaptive), key=lambda p: p.along)
     fastest = max(values, key=abs, default=0j)
     return Report(
         scene=system.name,
@@ -175,7 +176,7 @@ def measure(
         duration=system.run.duration,
         digits=float(reference.digits[-1]),
         lines=tuple(lines),
-        growth=_growth(module, reference, finest),
+        growth=growth(module, reference, finest.method, finest.steps),
         eigenvalue=complex(fastest),
         condition=(at, *place),
         corners=reference_solution.corners(system),
@@ -187,16 +188,21 @@ def measure(
 
 
 def variant(system: System, wanted: Sequence[str], root: Path) -> tuple[ModuleType, dict[str, str]]:
-    """The scene with all steppers that it can use, and why it can't use the others."""
+    """The scene with all steppers that it can use, and why it can't use the others.
 
-    def made(methods: tuple[str, ...]) -> System:
+    Without its events, which fixed steps and the reference pass over.
+    """
+
+    def made(methods: Sequence[str]) -> System:
         # another digest, since it is another module than the scene's own
         digest = hashlib.sha256(f"{system.digest} report {methods}".encode()).hexdigest()
-        run = replace(system.run, methods=methods, batch=False)
-        return replace(system, run=run, digest=digest)
+        fixed = tuple(name for name in methods if name != ADAPTIVE) or ("rk4",)
+        tolerance = TOLERANCES[-1] if ADAPTIVE in methods else None
+        run = replace(system.run, methods=fixed, batch=False, tolerance=tolerance)
+        return replace(system, run=run, digest=digest, events=())
 
     try:
-        return pipeline.load(made(tuple(wanted)), root), {}
+        return pipeline.load(made(wanted), root), {}
     except EomcError:
         pass
     usable, skipped = [], {}
@@ -208,9 +214,9 @@ def variant(system: System, wanted: Sequence[str], root: Path) -> tuple[ModuleTy
             skipped[name] = "; ".join(p.message for p in fault.problems)
         except EomcError as fault:
             skipped[name] = str(fault)
-    if not usable:
+    if not set(usable) - {ADAPTIVE}:
         raise EomcError(f"{system.name}: no stepper can be used: {next(iter(skipped.values()))}")
-    return pipeline.load(made(tuple(usable)), root), skipped
+    return pipeline.load(made(usable), root), skipped
 
 
 # --- runs ---------------------------------------------------------------------------------------
@@ -272,22 +278,45 @@ def _line(
     )
 
 
-def _simulate(module: ModuleType, method: str, **how: Any) -> Any:
-    with warnings.catch_warnings():  # failures and advice are what is measured here
-        warnings.simplefilter("ignore", RuntimeWarning)
-        with np.errstate(all="ignore"):
-            return module.simulate(method=method, **how)
+def _adaptive(module: ModuleType, against: _Against, duration: float, longest: float) -> Line:
+    """All runs by tolerances, from loose to tight."""
+    points: list[Point] = []
+    for tol in TOLERANCES:
+        points.append(_point_of_tolerance(module, against, duration, tol))
+        if points[-1].seconds > longest:
+            break
+    order = 2 * len(GAUSS16.c)  # whose sweeps go to the end
+    return Line(ADAPTIVE, order, tuple(points), math.nan, math.nan, math.nan, math.nan)
 
 
 def _point(module: ModuleType, against: _Against, name: str, duration: float, steps: int) -> Point:
-    """A run compared with the reference, and its time: the median of some without rows."""
-    reference = against.reference
-    h, rows = duration / steps, len(reference.t) - 1
+    """A run by fixed steps."""
+    h, rows = duration / steps, len(against.reference.t) - 1
     every = max(1, steps // rows)
-    run = _simulate(module, name, h=h, steps=steps, every=every)
+    run = simulate(module, method=name, h=h, steps=steps, every=every)
+    again = partial(simulate, module, method=name, h=h, steps=steps, every=steps)
+    return replace(_judged(module, against, run, again, max(1, rows // steps)), h=h, steps=steps)
+
+
+def _point_of_tolerance(
+    module: ModuleType, against: _Against, duration: float, tol: float
+) -> Point:
+    """A run by a tolerance."""
+    run = simulate(module, tol=tol, times=against.reference.t)
+    again = partial(simulate, module, tol=tol, times=[duration])
+    return replace(_judged(module, against, run, again, 1), method=ADAPTIVE, tol=tol)
+
+
+def _judged(
+    module: ModuleType, against: _Against, run: Any, again: Callable[[], Any], stride: int
+) -> Point:
+    """A run compared with every so many rows of the reference, and its time.
+
+    That is the median of some runs `again` without rows.
+    """
+    reference = against.reference
     n, energies = len(module.coordinates), np.full(0, math.inf)
     q = qd = along = energy = math.inf
-    stride = max(1, rows // steps)
     if run.status == "ok":
         with np.errstate(all="ignore"):
             off = np.abs(reference.off(run.q, run.qd, slice(None, None, stride))) / reference.scale
@@ -300,7 +329,7 @@ def _point(module: ModuleType, against: _Against, name: str, duration: float, st
     spent = []
     for _ in range(REPEATS):
         begun = time.perf_counter()
-        timed = _simulate(module, name, h=h, steps=steps, every=steps)
+        timed = again()
         spent.append(time.perf_counter() - begun)
         if sum(spent) > 0.5:
             break
@@ -309,103 +338,14 @@ def _point(module: ModuleType, against: _Against, name: str, duration: float, st
         return x if math.isfinite(x) else math.inf
 
     return Point(
-        method=name, h=h, steps=steps, status=run.status, q=known(q), qd=known(qd),
+        method=run.method, h=run.h, steps=run.steps, status=run.status, q=known(q), qd=known(qd),
         end=known(max(q, qd)), along=known(along), energy=known(energy), energies=energies,
         seconds=statistics.median(spent), evaluations=timed.evaluations,
     )  # fmt: skip
 
 
-def _at_rows(function: Any, reference: Reference, *, velocities: bool = True) -> Vector:
-    """A function of the module at the reference's states, each at its time."""
-    n = reference.q.shape[1]
-    x = reference.halves[0]
-    given = (
-        ((row[:n], row[n:]) if velocities else (row[:n],), t)
-        for row, t in zip(x, reference.t, strict=True)
-    )
-    return np.array([function(*state, t=float(t)) for state, t in given])
-
-
 def _energy_scale(module: ModuleType, reference: Reference) -> float:
     """What K and P change by along the motion, J; 1 where nothing moves."""
-    K = _at_rows(module.kinetic_energy, reference)
-    P = _at_rows(module.potential_energy, reference, velocities=False)
+    K = at_rows(module.kinetic_energy, reference)
+    P = at_rows(module.potential_energy, reference, velocities=False)
     return float(np.max(np.abs(K)) + np.ptp(P)) or 1.0
-
-
-# --- the linearised motion ----------------------------------------------------------------------
-
-
-def stable_step(values: Complex, limits: tuple[float, float]) -> float:
-    """The largest stable h for eigenvalues l: (h Im l/limit_1)^2 + (h Re l/limit_2)^2 <= 1.
-
-    limits: of h omega, undamped, and h lambda, decaying; the ellipse through both lies close to
-    most methods' regions. What grows by itself does not count. inf: any h.
-    """
-    turn = np.abs(values.imag) / limits[0]
-    decay = np.maximum(-values.real, 0.0) / limits[1]
-    most = float(np.max(np.hypot(turn, decay), initial=0.0))
-    return 1 / most if most > 0 else math.inf
-
-
-def _spectrum(
-    module: ModuleType, reference: Reference
-) -> tuple[Complex, float, tuple[float, Vector]]:
-    """Eigenvalues of d[qd; qdd]/d[q; qd] along the reference; the largest condition of D, t, q."""
-    n, scale = reference.q.shape[1], reference.scale
-    worst, place = 0.0, (0.0, reference.halves[0][0, :n])
-    values: list[Complex] = []
-    for x, t in zip(reference.halves[0], reference.t, strict=True):
-        D = np.asarray(module.D(x[:n], t=float(t)))
-        size = np.sqrt(np.abs(np.diag(D)))
-        condition = (
-            float(np.linalg.cond(D / np.outer(size, size))) if np.all(size > 0) else math.inf
-        )
-        if condition > worst:
-            worst, place = condition, (float(t), x[:n].copy())
-        by = np.diag(scale * NUDGE)
-        states = np.vstack([x + by, x - by])
-        try:
-            a = module.acceleration(states[:, :n], states[:, n:], t=float(t))
-        except ArithmeticError:  # MotionError: no linearisation where there is no motion
-            continue
-        A = np.zeros((2 * n, 2 * n))
-        A[:n, n:] = np.eye(n)
-        A[n:] = ((a[: 2 * n] - a[2 * n :]) / (2 * NUDGE * scale[:, None])).T
-        if np.all(np.isfinite(A)):
-            values.append(np.asarray(np.linalg.eigvals(A), complex))
-    return np.concatenate(values) if values else np.zeros(0, complex), worst, place
-
-
-def _growth(module: ModuleType, reference: Reference, finest: Point) -> Growth:
-    """The norm of the product of transition matrices from row to row of the reference."""
-    n, scale = reference.q.shape[1], reference.scale
-    stride = (len(reference.t) - 1) // SEGMENTS
-    steps = max(1, min(finest.steps, 2**16) // SEGMENTS)
-    product = np.eye(2 * n)
-    largest = [1.0]
-    duration = reference.t[-1]
-    for k in range(SEGMENTS):
-        x, t0 = reference.halves[0][k * stride], float(reference.t[k * stride])
-        ends = []
-        for by in (np.zeros(2 * n), *np.diag(scale * NUDGE)):
-            y = x + by
-            run = _simulate(
-                module, finest.method, q0=y[:n], qd0=y[n:], h=duration / SEGMENTS / steps,
-                steps=steps, every=steps, t0=t0,
-            )  # fmt: skip
-            ends.append(np.hstack([run.q[-1], run.qd[-1]]) / scale)
-        with np.errstate(all="ignore"):
-            product = ((np.array(ends[1:]) - ends[0]).T / NUDGE) @ product
-            now = float(np.max(np.sum(np.abs(product), axis=1)))
-        largest.append(max(largest[-1], now if math.isfinite(now) else math.inf))
-    t, grown = reference.t[::stride], np.array(largest)
-    half = math.log(grown[-1] / grown[SEGMENTS // 2]) if math.isfinite(grown[-1]) else math.inf
-    rate, wild = half / (duration / 2), half > math.log(WILD)
-    lost = np.flatnonzero(grown * EPSILON > 0.1)
-    horizon = math.inf
-    if len(lost):
-        horizon = float(t[lost[0]])
-    elif wild and rate > 0:
-        horizon = float(duration + math.log(0.1 / EPSILON / grown[-1]) / rate)
-    return Growth(t=t, amplification=grown, rate=rate, wild=wild, horizon=horizon)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -34,13 +34,25 @@ def recommendation(report: Report, digits: float, to: float | None = None) -> st
             return f"{what}: no stepper follows this motion to its end"
         return (
             f"{what}: out of reach here; the most is {-math.log10(p.along):.1f} digits, by "
-            f"{p.method} with h = {_time(p.h)}, {_time(p.seconds)} of computing"
+            f"{_by(p)}, {_time(p.seconds)} of computing"
         )
+    parts = "" if found.adaptive else f" ({report.duration:g} s/{found.steps})"
     return (
-        f"{what}: {found.method} with h = {_time(found.h)} "
-        f"({report.duration:g} s/{found.steps}), {_time(found.seconds)} of computing, "
+        f"{what}: {_by(found)}{parts}, {_time(found.seconds)} of computing, "
         f"{found.evaluations} evaluations"
     )
+
+
+def _by(p: Point) -> str:
+    """dp8 with h = 40 ms; adaptive steps with tol = 1e-09, 52 steps."""
+    if p.adaptive:
+        return f"adaptive steps with tol = {p.tol:g}, {p.steps} steps"
+    return f"{p.method} with h = {_time(p.h)}"
+
+
+def _step(p: Point) -> str:
+    """A step size, or the tolerance that chooses it."""
+    return f"tol {p.tol:g}" if p.adaptive else _time(p.h)
 
 
 def recommendations(report: Report) -> list[str]:
@@ -62,7 +74,7 @@ def digit_rows(report: Report) -> list[tuple[str, ...]]:
         if p is None:
             made.append((str(digits), "out of reach", "-", "-", "-", "-"))
         else:
-            times = (_time(p.h), str(p.steps), str(p.evaluations), _time(p.seconds))
+            times = (_step(p), str(p.steps), str(p.evaluations), _time(p.seconds))
             made.append((str(digits), p.method, *times))
     return made
 
@@ -97,8 +109,8 @@ def remarks(report: Report) -> list[str]:
         said.append(f"D is regular: its condition number is at most {condition:.2g}, {place}.")
     if report.events:
         said.append(
-            f"The scene has events ({report.events}); fixed steps, and so all figures here, pass "
-            "over them."
+            f"The scene has events ({report.events}); all figures here are of runs that "
+            "pass over them."
         )
     if report.corners:
         said.append(
@@ -122,7 +134,7 @@ def table(report: Report) -> str:
     for row in rows(report):
         table.add_row(*row)
     text = io.StringIO()
-    Console(file=text, width=110).print(table)
+    Console(file=text, width=116).print(table)
     lines = [line.rstrip() for line in text.getvalue().splitlines()]
     words = [EXPLAINED, "", *recommendations(report), "", *remarks(report)]
     return "\n".join([*lines, *words]).strip("\n")
@@ -135,7 +147,7 @@ def rows(report: Report) -> list[tuple[str, ...]]:
         p = min(line.points, key=lambda p: p.along)
         stable_to = "any" if math.isinf(line.stable_to) else _time(line.stable_to)
         found = (line.method, str(line.order), _figure(line.observed, "{:.1f}"))
-        times = (_time(p.h), _time(p.seconds), _time(line.rounding))
+        times = (_step(p), _time(p.seconds), _time(line.rounding))
         made.append((*found, _time(line.usable_h), stable_to, _figure(p.along, "{:.1e}"), *times))
     return made
 
@@ -170,13 +182,15 @@ def page(report: Report, about: Presented | None = None) -> str:
     shown = report.best(6) or report.finest
     runs = [
         (
-            p.method, _time(p.h), str(p.steps), p.status, _figure(p.q, "{:.1e}"),
+            p.method, _step(p), str(p.steps), p.status, _figure(p.q, "{:.1e}"),
             _figure(p.qd, "{:.1e}"), _figure(p.along, "{:.1e}"), _figure(p.energy, "{:.1e}"),
             str(p.evaluations), _time(p.seconds),
             _time(p.seconds / report.duration),
         )
         for p in report.points
     ]  # fmt: skip
+    asked = [p for p in report.points if p.adaptive and p.along < LOST]
+    tolerances = _svg(lambda axes: _tolerances(axes, asked), (8.6, 3.6)) if asked else ""
     template = environment().get_template("report/report.html.jinja")
     return template.render(
         report=report,
@@ -190,6 +204,7 @@ def page(report: Report, about: Presented | None = None) -> str:
         runs=runs,
         work=_svg(lambda axes: _work(axes, report), (8.6, 5.0)),
         energy=_svg(lambda axes: _energy(axes, report, shown), (8.6, 3.6)),
+        tolerances=tolerances,
         growth=_svg(lambda axes: _grown(axes, report), (8.6, 3.0)),
         shown=_time(shown.seconds),
         digits=f"{report.digits:.0f}",
@@ -262,14 +277,29 @@ def _energy(axes: Any, report: Report, shown: Point) -> None:
         if not good:
             continue
         p = min(good, key=lambda p: abs(math.log(p.seconds / shown.seconds)))
-        t = report.t[:: max(1, (len(report.t) - 1) // p.steps)]
+        t = report.t[:: max(1, (len(report.t) - 1) // (len(p.energies) - 1))]
         axes.semilogy(
             t, np.maximum(p.energies, 1e-17), color=styles[line.method][0], linewidth=1.0,
-            label=f"{line.method}, h = {_time(p.h)}",
+            label=f"{line.method}, {_step(p) if p.adaptive else f'h = {_time(p.h)}'}",
         )  # fmt: skip
     axes.set_xlabel("t, s")
     axes.set_ylabel("relative energy error")
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _tolerances(axes: Any, points: Sequence[Point]) -> None:
+    """The error of each run beside the tolerance that it was asked for."""
+    tol = [p.tol for p in points]
+    axes.loglog(tol, tol, color="#999999", linewidth=1.0, linestyle="--", label="as asked")
+    for name, errors, mark in (
+        ("at the end", [p.end for p in points], "s"),
+        ("largest along the run", [p.along for p in points], "o"),
+    ):
+        axes.loglog(tol, errors, marker=mark, markersize=4, linewidth=1.2, label=name)
+    axes.invert_xaxis()
+    axes.set_xlabel("tolerance")
+    axes.set_ylabel("relative error")
+    axes.legend(frameon=False)
 
 
 def _grown(axes: Any, report: Report) -> None:

@@ -1,0 +1,137 @@
+"""The linearised motion along a reference solution: eigenvalues, and how differences grow.
+
+Eigenvalues are those of d[qd; qdd]/dx, x = [q; qd], by central differences of the module.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eomc.report.reference_solution import Reference
+from eomc.verify.oracle import Vector
+
+Complex = NDArray[np.complex128]
+
+SEGMENTS = 64  # over which the growth of differences is put together
+NUDGE = 1e-6  # of each scale, for differences
+WILD = 30.0  # growth over the second half of the motion; regular motions grow by 2 to 4
+EPSILON = 2.0**-53
+
+
+@dataclass(frozen=True)
+class Growth:
+    """By what a difference at the start has grown, amplification (n,) at t (n,).
+
+    rate: of its growth over the second half, 1/s; wild: whether that is exponential. horizon: when
+    a rounding of the start has become a tenth of the motion, inf where it does not.
+    """
+
+    t: Vector
+    amplification: Vector
+    rate: float
+    wild: bool
+    horizon: float
+
+
+def simulate(module: ModuleType, **how: Any) -> Any:
+    """A run of the module, whatever its end, without a word."""
+    with warnings.catch_warnings():  # failures and advice are what is measured here
+        warnings.simplefilter("ignore", RuntimeWarning)
+        with np.errstate(all="ignore"):
+            return module.simulate(**how)
+
+
+def at_rows(function: Any, reference: Reference, *, velocities: bool = True) -> Vector:
+    """A function of the module at the reference's states, each at its time."""
+    n = reference.q.shape[1]
+    x = reference.halves[0]
+    given = (
+        ((row[:n], row[n:]) if velocities else (row[:n],), t)
+        for row, t in zip(x, reference.t, strict=True)
+    )
+    return np.array([function(*state, t=float(t)) for state, t in given])
+
+
+def stable_step(values: Complex, limits: tuple[float, float]) -> float:
+    """The largest stable h for eigenvalues l: (h Im l/limit_1)^2 + (h Re l/limit_2)^2 <= 1.
+
+    limits: of h omega, undamped, and h lambda, decaying; the ellipse through both lies close to
+    most methods' regions. What grows by itself does not count. inf: any h.
+    """
+    turn = np.abs(values.imag) / limits[0]
+    decay = np.maximum(-values.real, 0.0) / limits[1]
+    most = float(np.max(np.hypot(turn, decay), initial=0.0))
+    return 1 / most if most > 0 else math.inf
+
+
+def spectrum(
+    module: ModuleType, reference: Reference
+) -> tuple[Complex, float, tuple[float, Vector]]:
+    """Eigenvalues of d[qd; qdd]/d[q; qd] along the reference; the largest condition of D, t, q."""
+    n, scale = reference.q.shape[1], reference.scale
+    worst, place = 0.0, (0.0, reference.halves[0][0, :n])
+    values: list[Complex] = []
+    for x, t in zip(reference.halves[0], reference.t, strict=True):
+        D = np.asarray(module.D(x[:n], t=float(t)))
+        size = np.sqrt(np.abs(np.diag(D)))
+        condition = (
+            float(np.linalg.cond(D / np.outer(size, size))) if np.all(size > 0) else math.inf
+        )
+        if condition > worst:
+            worst, place = condition, (float(t), x[:n].copy())
+        by = np.diag(scale * NUDGE)
+        states = np.vstack([x + by, x - by])
+        try:
+            a = module.acceleration(states[:, :n], states[:, n:], t=float(t))
+        except ArithmeticError:  # MotionError: no linearisation where there is no motion
+            continue
+        A = np.zeros((2 * n, 2 * n))
+        A[:n, n:] = np.eye(n)
+        A[n:] = ((a[: 2 * n] - a[2 * n :]) / (2 * NUDGE * scale[:, None])).T
+        if np.all(np.isfinite(A)):
+            values.append(np.asarray(np.linalg.eigvals(A), complex))
+    return np.concatenate(values) if values else np.zeros(0, complex), worst, place
+
+
+def growth(module: ModuleType, reference: Reference, method: str, steps: int) -> Growth:
+    """The norm of the product of transition matrices from row to row of the reference.
+
+    By runs of a method, of so many steps in all.
+    """
+    n, scale = reference.q.shape[1], reference.scale
+    stride = (len(reference.t) - 1) // SEGMENTS
+    steps = max(1, min(steps, 2**16) // SEGMENTS)
+    product = np.eye(2 * n)
+    largest = [1.0]
+    duration = reference.t[-1]
+    for k in range(SEGMENTS):
+        x, t0 = reference.halves[0][k * stride], float(reference.t[k * stride])
+        ends = []
+        for by in (np.zeros(2 * n), *np.diag(scale * NUDGE)):
+            y = x + by
+            run = simulate(
+                module, method=method, q0=y[:n], qd0=y[n:], h=duration / SEGMENTS / steps,
+                steps=steps, every=steps, t0=t0,
+            )  # fmt: skip
+            ends.append(np.hstack([run.q[-1], run.qd[-1]]) / scale)
+        with np.errstate(all="ignore"):
+            product = ((np.array(ends[1:]) - ends[0]).T / NUDGE) @ product
+            now = float(np.max(np.sum(np.abs(product), axis=1)))
+        largest.append(max(largest[-1], now if math.isfinite(now) else math.inf))
+    t, grown = reference.t[::stride], np.array(largest)
+    half = math.log(grown[-1] / grown[SEGMENTS // 2]) if math.isfinite(grown[-1]) else math.inf
+    rate, wild = half / (duration / 2), half > math.log(WILD)
+    lost = np.flatnonzero(grown * EPSILON > 0.1)
+    horizon = math.inf
+    if len(lost):
+        horizon = float(t[lost[0]])
+    elif wild and rate > 0:
+        horizon = float(duration + math.log(0.1 / EPSILON / grown[-1]) / rate)
+    return Growth(t=t, amplification=grown, rate=rate, wild=wild, horizon=horizon)
