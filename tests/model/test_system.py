@@ -122,6 +122,22 @@ x, x_dot, u = sympy.symbols("x x_dot u")
         (("a", [x], x_dot**2), {"real": "quad"}, "real: known are double, float"),
         (("a", [x], x_dot**2), {"batch": "yes"}, "batch: must be True or False"),
         (("a", [x], x_dot**2), {"linearize": "all"}, "linearize: must be True"),
+        (("a", [x], x_dot**2), {"tolerance": 0.1}, "tolerance: lies between 1e-15 and 0.01"),
+        (("a", [x], x_dot**2), {"tolerance": 1e-9, "real": "float"}, "between 5e-07 and 0.01"),
+        (("a", [x], x_dot**2), {"events": [x]}, 'events: give a dict, such as {"impact": y}'),
+        (("a", [x], x_dot**2), {"events": {"at": 3}}, "event at: 3 never crosses zero"),
+        (("a", [x], x_dot**2), {"events": {"at": {"action": "stop"}}}, "event at: None is not an"),
+        (
+            ("a", [x], x_dot**2),
+            {"events": {"at": {"when": x, "direction": "up"}}},
+            "direction is one of both, rising, falling, here 'up'",
+        ),
+        (("a", [x], x_dot**2), {"events": {"at": {"when": x, "y": 1}}}, "y is no coordinate or"),
+        (
+            ("a", [x], x_dot**2),
+            {"events": {"at": {"when": x, "action": "jump"}}},
+            'add "action": "jump" where something is set, and only there',
+        ),
     ],
 )
 def test_what_is_wrong_is_said(

@@ -13,6 +13,7 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
+import sympy.physics.vector
 from compilers import STRICT, compiled
 
 import eomc
@@ -431,3 +432,28 @@ def test_two_jumps_a_rounding_apart_do_not_accumulate(tmp_path: Path) -> None:
     assert run.status == "ok"
     np.testing.assert_allclose(run.q[-1], [0.0, 5.25], atol=1e-12)
     np.testing.assert_allclose(run.qd[-1], [-0.5, 2.0], atol=1e-12)
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+def test_events_and_tolerance_of_a_system_made_in_python() -> None:
+    """As in a scene; what a jump sets is named by symbols, dynamicsymbols or texts."""
+    x, y = sympy.physics.vector.dynamicsymbols("x y")
+    made = eomc.System.make(
+        "thrown", {x: (0, 1), y: 1.0}, (x.diff() ** 2 + y.diff() ** 2) / 2, G * y,
+        parameters={"e": 0.8}, duration=1.5,
+        events={
+            "impact": {
+                "when": y, "direction": "falling", "action": "jump",
+                y.diff(): "-e*y_dot", "x": "x + 1",
+            },
+            "top": {"when": "y_dot", "direction": "falling"},
+            "middle": x - 0.25,
+        },
+    )  # fmt: skip
+    assert made.run.tolerance == 1e-9
+    run = eomc.load(made, BUILDS / "made").simulate(tol=1e-13)
+    fall = math.sqrt(2 / G)
+    np.testing.assert_allclose(run.events["impact"].t[0], fall, rtol=1e-13)
+    np.testing.assert_allclose(run.events["top"].t[0], fall * 1.8, rtol=1e-12)
+    np.testing.assert_allclose(run.events["middle"].t, [0.25], rtol=1e-13)
+    assert run.q[-1, 0] == pytest.approx(1.5 + len(run.events["impact"]))

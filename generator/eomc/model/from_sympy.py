@@ -19,6 +19,7 @@ from eomc.model.rewrite import JumpError, rewritten
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
+    Event,
     Input,
     Output,
     Parameter,
@@ -28,6 +29,7 @@ from eomc.model.symbols import (
     t,
 )
 from eomc.scene.scene import Run
+from eomc.scene.schema import ACTIONS, DIRECTIONS
 
 if TYPE_CHECKING:
     from eomc.model.system import System
@@ -111,7 +113,7 @@ class Maker:
         parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
         definitions: Mapping[Any, Any], outputs: Mapping[str, Any],
         rows: Mapping[str, Any], guess: Sequence[Any], units: Mapping[Any, str],
-        title: str, run: Run, limits: Mapping[Any, Any],
+        title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
     ) -> System:  # fmt: skip
         """The system, of the class `of`."""
         starts = given.symbols(coordinates, "coordinates", None)
@@ -156,6 +158,7 @@ class Maker:
             "inputs": tuple(self._inputs(pending, given_inputs, units, ends)),
             "definitions": tuple(ordered),
             **self._constraints(rows, made, ordered, given_inputs.values(), units),
+            "events": tuple(self._events(events, starts)),
             "outputs": tuple(self._outputs(outputs, starts, made, units, [*map(str, rows)])),
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
@@ -281,6 +284,43 @@ class Maker:
                 raise given.fault(role, f"{least}, the least value, is not below {most}")
             found[name] = (least, most)
         return found
+
+    def _events(self, events: Any, starts: Iterable[Any]) -> Iterator[Event]:
+        """The events, each a formula or a dict as [[event]] has it."""
+        if not isinstance(events, Mapping):
+            raise given.fault("events", f'give a dict, such as {{"impact": y}}, here {events!r}')
+        state: dict[
+            str, str
+        ] = {}  # names, by what a user may call them
+        for one in starts:
+            name = self.map[one].name
+            rate = one.diff() if isinstance(one, AppliedUndef) else f"{one}_dot"
+            state |= {str(one): name, given.name_of(one): name}
+            state |= {str(rate): f"{name}_dot", f"{given.name_of(one)}_dot": f"{name}_dot"}
+        for name, entry in events.items():
+            role = f"event {name}"
+            if not isinstance(name, (str, Symbol)):
+                raise given.fault("events", f"{name!r} is not a name")
+            if why := names.fault(str(name)):
+                raise EomcError(f"System.make: events: {why}")
+            table = {str(k): x for k, x in entry.items()} if isinstance(entry, Mapping) else {}
+            when = self._expression(table.pop("when", None) if table else entry, role)
+            if not when.free_symbols:
+                raise given.fault(role, f"{when} never crosses zero: it has no names")
+            direction, action = table.pop("direction", "both"), table.pop("action", "record")
+            for key, word, known in (
+                ("direction", direction, DIRECTIONS), ("action", action, ACTIONS),
+            ):  # fmt: skip
+                if word not in known:
+                    raise given.fault(role, f"{key} is one of {', '.join(known)}, here {word!r}")
+            if strange := [key for key in table if key not in state]:
+                why = f"{strange[0]} is no coordinate or velocity, which a jump sets"
+                raise given.fault(role, why)
+            if (action == "jump") != bool(table):
+                remedy = 'add "action": "jump" where something is set, and only there'
+                raise given.fault(role, remedy)
+            jump = ((state[key], self._expression(x, f"{role}: {key}")) for key, x in table.items())
+            yield Event(str(name), when, direction, action, tuple(jump))
 
     def _outputs(
         self, outputs: Any, starts: Iterable[Any], made: Sequence[Coordinate],

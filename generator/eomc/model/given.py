@@ -17,7 +17,7 @@ from eomc.model.symbols import dot, symbol
 from eomc.scene import formulas
 from eomc.scene.formulas import FormulaError
 from eomc.scene.scene import Run
-from eomc.scene.schema import REALS
+from eomc.scene.schema import LEAST_OF_FLOAT, LEAST_TOLERANCE, LOOSEST, OF_EVENTS, REALS
 
 _FUNCTIONS = (
     *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
@@ -181,8 +181,9 @@ def symbol_of(given: Any, role: str) -> Any:
 
 
 def run(
-    h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any, discretize: Any
-) -> Run:
+    h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any, discretize: Any,
+    tolerance: Any, events: bool,
+) -> Run:  # fmt: skip
     """How the system is run. Raises EomcError where that is not possible."""
     for name, value in (("h", h), ("duration", duration)):
         if number(value, name) <= 0:
@@ -198,4 +199,12 @@ def run(
             raise fault(name, f"must be True or False, here {value!r}")
     if not isinstance(linearize, bool) and linearize != "parameters":
         raise fault("linearize", f'must be True, False or "parameters", here {linearize!r}')
-    return Run(float(h), float(duration), methods, real, batch, linearize, discretize)
+    if tolerance is not None:
+        least = LEAST_OF_FLOAT if real == "float" else LEAST_TOLERANCE
+        if not least <= number(tolerance, "tolerance") <= LOOSEST:
+            raise fault("tolerance", f"lies between {least:g} and {LOOSEST:g}, here {tolerance!r}")
+        tolerance = float(tolerance)
+    elif events:
+        tolerance = OF_EVENTS[real]
+    plain = (float(h), float(duration), methods, real, batch, linearize, discretize)
+    return Run(*plain, tolerance=tolerance)

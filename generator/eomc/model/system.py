@@ -167,6 +167,8 @@ class System:
         linearize: bool | str = False,
         discretize: bool = False,
         limits: Mapping[Any, Sequence[Any]] | None = None,
+        events: Mapping[str, Any] | None = None,
+        tolerance: float | None = None,
     ) -> System:
         r"""A system from SymPy expressions.
 
@@ -178,9 +180,11 @@ class System:
         dynamicsymbol, is an acceleration there. constraints: mapping from names to what is zero,
         over coordinates and t, or linear in the velocities; assembling the start moves coordinates
         without a start (None, or a list of coordinates alone) and those in `guess`. limits: mapping
-        from inputs to pairs, the least and largest value that acts, None for no such. Names that C
-        can't bear (`\theta`, `lambda`) are replaced, and `renamed` says how. Raises EomcError where
-        something is undeclared.
+        from inputs to pairs, the least and largest value that acts, None for no such. events:
+        mapping from names to what crosses zero, or to a dict as [[event]] has it, {"when": y,
+        "direction": "falling", "action": "jump", y_dot: -e*y_dot}. tolerance: of adaptive steps;
+        events have 1e-9 where none is given. Names that C can't bear (`\theta`, `lambda`) are
+        replaced, and `renamed` says how. Raises EomcError where something is undeclared.
 
         >>> from sympy.physics.mechanics import dynamicsymbols
         >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
@@ -188,12 +192,14 @@ class System:
         ...             -m*g*l*sympy.cos(theta), parameters={m: 1, l: 1, g: 9.81}).qd
         (theta_dot,)
         """
-        run = given.run(h, duration, methods, real, batch, linearize, discretize)
+        run = given.run(
+            h, duration, methods, real, batch, linearize, discretize, tolerance, bool(events)
+        )
         system = from_sympy.Maker(name).make(
             cls, coordinates, kinetic, potential, given.or_none(parameters), dissipation,
             given.or_none(forces), inputs, given.or_none(definitions), given.or_none(outputs),
             given.or_none(constraints), guess, given.or_none(units), title, run,
-            given.or_none(limits),
+            given.or_none(limits), given.or_none(events),
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)

@@ -42,8 +42,6 @@ from eomc.scene.toml_text import MAX_BYTES
 
 _NOT_SI = "mm cm km g gram ms min rpm inch ft lb lbs".split()
 
-LEAST_OF_FLOAT = 5e-7  # a tolerance, of single precision
-
 
 def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = None) -> Scene:
     """Read and check a scene file, with other values in place of those of its parameters.
@@ -152,9 +150,10 @@ class _Check(Checker):
         asked = self.doc.run.model_dump()
         single = asked["real"] == "float"
         if self.doc.event and asked["tolerance"] is None:
-            asked["tolerance"] = 1e-5 if single else 1e-9
-        if single and (asked["tolerance"] or 1) < LEAST_OF_FLOAT:
-            why = f'a float can keep {LEAST_OF_FLOAT:g} at best: take that, or real = "double"'
+            asked["tolerance"] = schema.OF_EVENTS[asked["real"]]
+        if single and (asked["tolerance"] or 1) < schema.LEAST_OF_FLOAT:
+            least = schema.LEAST_OF_FLOAT
+            why = f'a float can keep {least:g} at best: take that, or real = "double"'
             self.say(("run", "tolerance"), why)
         return Run(**asked)
 

@@ -16,6 +16,9 @@ from eomc.scene.formulas import nearest
 
 REALS = ("double", "float")
 DIRECTIONS, ACTIONS = ("both", "rising", "falling"), ("record", "stop", "jump")
+LEAST_TOLERANCE, LOOSEST = 1e-15, 1e-2
+LEAST_OF_FLOAT = 5e-7  # a tolerance, of single precision
+OF_EVENTS = {"double": 1e-9, "float": 1e-5}  # the tolerance of a scene that gives none
 _NAMES = tuple(METHODS)
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
@@ -26,7 +29,9 @@ _Note = Annotated[pydantic.StrictStr, pydantic.AfterValidator(texts.checked_line
 _Positive = Annotated[float, pydantic.Field(strict=True, gt=0, allow_inf_nan=False)]
 
 
-_Tolerance = Annotated[float, pydantic.Field(strict=True, ge=1e-15, le=1e-2, allow_inf_nan=False)]
+_Tolerance = Annotated[
+    float, pydantic.Field(strict=True, ge=LEAST_TOLERANCE, le=LOOSEST, allow_inf_nan=False)
+]
 
 
 class _Table(pydantic.BaseModel):
