@@ -204,3 +204,35 @@ def test_a_projection_does_not_leap_across_turns(tmp_path: Path) -> None:
         q, _ = module.project([1.0, -1.0 + off, 1e-9], np.zeros(3))
         assert np.abs(q).max() < 20
         assert np.abs(module.constraints(q, np.zeros(3))).max() < 1e-14
+
+
+def test_equilibrium_is_where_forces_and_multipliers_balance(rod: ModuleType) -> None:
+    """The rod hangs, or stands where the guess is near that; a bad guess is no matter."""
+    q, u = rod.equilibrium()
+    np.testing.assert_allclose(q, [0, -1], atol=1e-14)
+    assert u is None
+    q, _ = rod.equilibrium([0.1, 2.0], params={"l": 1.5})
+    np.testing.assert_allclose(q, [0, 1.5], atol=1e-14)
+    with pytest.raises(ArithmeticError, match="a force of"):
+        rod.equilibrium([0.6, -0.8], free=["y"])
+
+
+def test_equilibrium_of_a_linkage_with_a_spring(tmp_path: Path) -> None:
+    """A four-bar whose crank a torsion spring holds: no acceleration, and rows hold."""
+    made = system(
+        "sprung", {"a": (0.7, 0.0), "b": 0.3, "c": 1.2},
+        "(a_dot**2 + 3*b_dot**2 + 2*c_dot**2)/2",
+        "4*(a - 0.9)**2 + 9.81*(sin(a) + 3*sin(b)/2 + sin(a))",
+        {"px": "cos(a) + 3*cos(b) - 2*cos(c) - 2.5", "py": "sin(a) + 3*sin(b) - 2*sin(c)"},
+    )  # fmt: skip
+    m = eomc.load(made, tmp_path)
+    q, _ = m.equilibrium()
+    assert np.abs(m.constraints(q, 0 * q)).max() < 1e-14
+    assert np.abs(m.acceleration(q, 0 * q)).max() < 1e-12
+    assert np.abs(q - m.simulate(steps=0).q[0]).max() > 1e-3
+
+
+def test_equilibrium_of_a_structure_that_can_not_move(rod: ModuleType) -> None:
+    """Nothing is free, and the rod bears what is along it alone."""
+    q, _ = rod.equilibrium([0.0, -1.0], free=["y"])
+    np.testing.assert_array_equal(q, [0, -1])

@@ -289,9 +289,7 @@ class Maker:
         """The events, each a formula or a dict as [[event]] has it."""
         if not isinstance(events, Mapping):
             raise given.fault("events", f'give a dict, such as {{"impact": y}}, here {events!r}')
-        state: dict[
-            str, str
-        ] = {}  # names, by what a user may call them
+        state: dict[str, str] = {}  # names, by what a user may call them
         for one in starts:
             name = self.map[one].name
             rate = one.diff() if isinstance(one, AppliedUndef) else f"{one}_dot"
