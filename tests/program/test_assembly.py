@@ -183,8 +183,46 @@ def test_held_rates_that_contradict_a_row_are_named() -> None:
 def test_rows_that_contradict_each_other_are_named() -> None:
     made = scene("x = { guess = true }\ny = {}", 'one = "x - 1"\ntwo = "x - 2"')
     text = refusal(made)
-    assert "constraints.one: can't be zero together with two near the start" in text
-    assert "one is 0.5, two is -0.5" in text
+    assert "constraints.one: contradicts two: where they are least, one is 0.5, two is -0.5" in text
+    assert "None changes alone: leave one out, or correct a formula" in text
+
+
+@pytest.mark.parametrize("held", ["x = { start = 0.6 }", "x = { guess = true, start = 0.6 }"])
+def test_two_lengths_of_one_rod_contradict(held: str) -> None:
+    rods = 'rod = "x**2 + y**2 - 1"\nrod2 = "x**2 + y**2 - 1.44"\nground = "z"'
+    text = refusal(scene(f"{held}\ny = {{ guess = true, start = -0.8 }}\nz = {{}}", rods))
+    assert "constraints.rod: contradicts rod2: where they are least, rod is 0.2" in text
+    assert "leave one out" in text and "ground" not in text and "x = 0.6" not in text
+
+
+def test_of_rows_that_are_apart_those_that_contradict_are_named() -> None:
+    rows = 'low = "z"\na = "x - 0.6"\nb = "y - 0.1"\nhigh = "z - y"\nc = "y - z + 1"'
+    text = refusal(scene("x = {}\ny = {}\nz = {}", rows))
+    assert "constraints.low: contradicts b, high: where they are least" in text
+    assert "None changes alone: leave one out" in text
+
+
+def test_rows_that_contradict_as_time_passes_are_named() -> None:
+    two = refusal(scene("x = {}\ny = {}", 'one = "x - t"\ntwo = "x - 2*t"\nground = "y"'))
+    assert (
+        "constraints.one: contradicts two: no rates keep them zero. None changes alone: leave one"
+        in two
+    )
+    rows = 'rod = "x**2 + y**2 - 1"\na = "x - 0.6"\nb = "y + 0.8 - 0.1*t"\nground = "z"'
+    three = refusal(scene("x = { start = 0.6 }\ny = { start = -0.8 }\nz = {}", rows))
+    assert (
+        "constraints.rod: contradicts a, b: no rates keep them zero. None changes alone: leave one"
+        in three
+    )
+    held = refusal(scene("x = { rate = 3.0 }", 'one = "x - t"\ntwo = "x - 2*t"'))
+    assert "constraints.one: contradicts two: no rates keep them zero" in held
+
+
+def test_rates_that_a_singular_position_alone_forbids_are_told_so() -> None:
+    rows = 'rod = "x**2 + y**2 - 1"\nlift = "y - 1 + 0.1*t"'
+    text = refusal(scene("x = { start = 0.0 }\ny = { start = 1.0 }", rows))
+    assert "constraints.rod: changes at the start together with lift, and no rates mend it" in text
+    assert "the start is a singular position. Start beside it, or correct a formula" in text
 
 
 def test_a_loop_that_can_not_close_is_refused() -> None:
@@ -198,7 +236,19 @@ def test_a_loop_that_can_not_close_is_refused() -> None:
 
 def test_a_start_without_a_value_is_refused() -> None:
     made = scene("x = { start = -1.0, guess = true }\ny = {}", 'root = "sqrt(x) - y"')
-    assert "constraints: have no value at the start: guess it elsewhere" in refusal(made)
+    text = refusal(made)
+    assert "constraints.root: has no value at x = -1, y = 0: start where it has one" in text
+
+
+def test_a_start_without_a_slope_is_refused() -> None:
+    made = scene("x = {}\ny = {}\nz = {}", 'root = "sqrt(x) - y"\nground = "z"')
+    assert "constraints.root: has no slope at x = 0, y = 0: start where" in refusal(made)
+
+
+def test_a_start_at_which_the_energy_has_no_value_is_refused() -> None:
+    made = scene("x = { start = -1.0 }\ny = {}", 'ground = "y"')
+    made = replace(made, kinetic=made.kinetic + sympy.sqrt(symbol("x")) * symbol("x_dot") ** 2)
+    assert "energy.kinetic: has no value at the start, x = -1, y = 0" in refusal(made)
 
 
 def test_a_row_that_no_coordinate_moves_is_refused() -> None:

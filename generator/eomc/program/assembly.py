@@ -109,8 +109,7 @@ def _start(manifold: Manifold) -> Start:
     guess, rates = np.array([(c.start, c.rate) for c in system.coordinates], float).T
     place, strayed = manifold.place(guess), False
     if place is None:
-        why = "have no value at the start: guess it elsewhere"
-        raise SceneError([system.problem("constraints", why)])
+        raise SceneError(list(contradictions.of_values(manifold, guess)))
     q: Sequence[Any] = guess.tolist()
     if _off(manifold, guess, free):
         found, held = manifold.descend(guess, free)

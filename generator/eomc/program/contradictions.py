@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,15 @@ import numpy as np
 from eomc.base.errors import Problem
 from eomc.base.texts import listed
 from eomc.model.symbols import Constraint
-from eomc.program.manifold import Flags, Frame, Manifold, Place, Vector
+from eomc.program.manifold import FADED, Flags, Frame, Manifold, Place, Vector
 
 PART = 0.01  # of the row that is furthest from zero: a row contradicts
 MOST = 12  # held values that are let go one by one
 FAR = 3  # values that a message proposes
+FEW, SMALL = 8, 24  # rows that are left out one by one, and coordinates of a system where they are
+PLACES = 6  # beside one, at which rows are compared
+ALONE = "None changes alone: leave one out, or correct a formula or a parameter"
+NEAR = 0.1  # of the coordinates' size: how far beside
 
 
 def key(row: Constraint) -> str:
@@ -57,15 +62,8 @@ def of_positions(manifold: Manifold, free: Flags, stuck: Place) -> Iterator[Prob
                 f"{', '.join(moved)}. Correct them, or let them move: guess = true"
             )
         else:
-            left = ", ".join(
-                f"{system.constraints[k].name} is {stuck.phi[k]:.2g}" for k in rows[:FAR]
-            )
-            message = (
-                f"can't be zero{others} near the start: where they are least, {left}. "
-                "Correct a formula or a parameter"
-                + (f", {held} that are held," if involved else "")
-                + " or give a guess closer to a position that closes"
-            )
+            yield _apart(manifold, rows, stuck)
+            return
     yield system.problem(key(row), message)
 
 
@@ -74,6 +72,9 @@ def of_rates(
 ) -> Iterator[Problem]:
     """What is wrong with the rates of a start. rates: those that leave the rows least off."""
     system = manifold.system
+    if clash := _clash(manifold, place):
+        yield _apart_in_time(manifold, clash, place)
+        return
     off = np.abs(manifold.value("constraint_rates", place.q, rates, 0.0) / place.sizes)
     rows = [k for k in manifold.rows if off[k] > PART * np.max(off)]
     involved = [k for k in np.flatnonzero(free == 0) if np.any(place.A[rows, k] != 0)]
@@ -86,16 +87,11 @@ def of_rates(
             ways.append((abs(float(found[k]) - rate), f"{name} {_to(rate, float(found[k]))}"))
     row, others = system.constraints[rows[0]], _beside(system.constraints, rows)
     given = listed([f"{system.coordinates[k].name}_dot = {rates[k]:.6g}" for k in involved])
-    frame = Frame(place, np.ones(len(free), dtype=bool), manifold.rows)
     if ways:
         told = ", or ".join(text for _, text in sorted(ways)[:FAR])
         message = (
             f"changes at the start{others}, with {given} held: {told}. Correct a rate, or leave "
             "it out, and it follows"
-        )
-    elif frame.parts[1][-1] < 1e-6:
-        message = (
-            f"changes at the start{others}, and no rates mend it: the start is a singular position"
         )
     else:
         message = (
@@ -103,6 +99,111 @@ def of_rates(
             "leave them out, and they follow"
         )
     yield system.problem(key(row), message)
+
+
+def _apart(manifold: Manifold, rows: Sequence[int], stuck: Place) -> Problem:
+    """Rows that no positions near make zero together, whatever is held."""
+    constraints = manifold.system.constraints
+    rows = _needed(manifold, rows, stuck)
+    left = ", ".join(f"{constraints[k].name} is {stuck.phi[k]:.2g}" for k in rows[:FAR])
+    row, others = constraints[rows[0]], _beside(constraints, rows)
+    if len(rows) > 1 and _alike(manifold, rows, stuck):
+        why = f"contradicts {_names(constraints, rows[1:])}: where they are least, {left}. {ALONE}"
+    else:
+        they, leave = ("they are", ", leave one out,") if others else ("it is", "")
+        why = (
+            f"can't be zero{others} near the start: where {they} least, {left}. Correct a formula "
+            f"or a parameter{leave} or start closer to a position that closes"
+        )
+    return manifold.system.problem(key(row), why)
+
+
+def _apart_in_time(manifold: Manifold, rows: Sequence[int], place: Place) -> Problem:
+    """Rows that no rates keep at zero, whatever is held."""
+    constraints = manifold.system.constraints
+    row, others = constraints[rows[0]], _beside(constraints, rows)
+    if len(rows) > 1 and _alike(manifold, rows, place):
+        why = f"contradicts {_names(constraints, rows[1:])}: no rates keep them zero. {ALONE}"
+    else:
+        why = (
+            f"changes at the start{others}, and no rates mend it: the start is a singular "
+            "position. Start beside it, or correct a formula"
+        )
+    return manifold.system.problem(key(row), why)
+
+
+def _needed(manifold: Manifold, rows: Sequence[int], stuck: Place) -> list[int]:
+    """Rows that contradict, without those that nothing depends on."""
+    system, free = manifold.system, np.ones(len(stuck.q), dtype=bool)
+    if not 2 < len(rows) <= FEW or len(free) > SMALL:
+        return list(rows)
+
+    def closes(some: Sequence[int]) -> bool:
+        alone = Manifold(replace(system, constraints=tuple(system.constraints[k] for k in some)))
+        return _closed(alone, free, stuck) is not None
+
+    kept = list(rows)
+    for k in reversed(rows):
+        fewer = [i for i in kept if i != k]
+        if fewer and not closes(fewer):
+            kept = fewer
+    return kept
+
+
+def _clash(manifold: Manifold, place: Place) -> list[int]:
+    """Rows that no rates keep at zero, none of them without need; none where some rates do."""
+    A = Frame(place, np.ones(len(place.q), dtype=bool), manifold.rows).B
+    aim = manifold.value("constraint_rates", place.q, 0 * place.q, place.t) / place.sizes
+
+    def kept(rows: Sequence[int]) -> bool:
+        U, s, _ = np.linalg.svd(A[rows], full_matrices=False)
+        within = U[:, s > FADED]
+        left = aim[rows] - within @ (within.T @ aim[rows])
+        return bool(np.linalg.norm(left) <= FADED * np.linalg.norm(aim))
+
+    rows = list(manifold.rows)
+    if kept(rows):
+        return []
+    for k in reversed(manifold.rows):
+        fewer = [i for i in rows if i != k]
+        if fewer and not kept(fewer):
+            rows = fewer
+    return rows
+
+
+def _alike(manifold: Manifold, rows: Sequence[int], place: Place) -> bool:
+    """Whether the rows depend on each other beside a place too."""
+    free, random = np.ones(len(place.q), dtype=bool), np.random.default_rng(5)
+    reach = NEAR * (float(np.max(np.abs(place.q))) or 1.0)
+    for _ in range(PLACES):
+        beside = manifold.place(place.q + reach * random.normal(size=len(free)), place.t)
+        if beside is not None and len(rows) <= len(free):
+            if Frame(beside, free, rows).parts[1][-1] > FADED:
+                return False
+    return True
+
+
+def of_values(manifold: Manifold, q: Vector) -> Iterator[Problem]:
+    """What has no value, or no slope, at a start."""
+    system, n = manifold.system, 0
+    for k, c in enumerate(system.constraints):
+        alone = Manifold(replace(system, constraints=(c,)))
+        what = ("constraints", "value"), ("constraint_jacobian", "slope")
+        for name, called in what:
+            if not np.all(np.isfinite(alone.value(name, q, 0 * q, 0.0))):
+                at = _written(manifold, np.flatnonzero(manifold.reads[k]), q)
+                why = f"has no {called} at {at}: start where it has one, or guess closer to it"
+                yield system.problem(key(c), why)
+                n += 1
+                break
+    if not n:
+        at = _written(manifold, range(len(q)), q)
+        yield system.problem("energy.kinetic", f"has no value at the start, {at}: start elsewhere")
+
+
+def _written(manifold: Manifold, some: Iterable[int], q: Vector) -> str:
+    names = [(manifold.system.coordinates[k].name, q[k]) for k in some]
+    return listed([f"{name} = {value:.6g}" for name, value in names])
 
 
 def _closed(manifold: Manifold, free: Flags, stuck: Place) -> Place | None:
@@ -115,8 +216,11 @@ def _closed(manifold: Manifold, free: Flags, stuck: Place) -> Place | None:
 
 
 def _beside(constraints: Sequence[Constraint], rows: Sequence[int]) -> str:
-    others = [constraints[k].name for k in rows[1:]]
-    return f" together with {listed(others)}" if others else ""
+    return f" together with {_names(constraints, rows[1:])}" if len(rows) > 1 else ""
+
+
+def _names(constraints: Sequence[Constraint], rows: Sequence[int]) -> str:
+    return listed([constraints[k].name for k in rows])
 
 
 def _to(before: float, after: float) -> str:
