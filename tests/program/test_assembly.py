@@ -258,6 +258,14 @@ def test_a_row_that_no_coordinate_moves_is_refused() -> None:
     assert "constraints.late: depends on no coordinate: it can hold nothing" in refusal(made)
 
 
+@pytest.mark.parametrize("formula", ["abs(x) + y", "y - max(x, 0)**2", "dot(min(x, y))"])
+def test_a_row_with_a_corner_is_refused_by_its_name(formula: str) -> None:
+    made = scene("x = {}\ny = {}\nz = {}", f'ground = "z"\nbent = "{formula}"')
+    text = refusal(made)
+    assert "constraints.bent: abs, min and max have corners, and constraints are diff" in text
+    assert "ground" not in text and "energy" not in text
+
+
 def test_no_freedom_is_told_but_allowed() -> None:
     made = assembled(scene("x = { guess = true }", 'wall = "x - 1"'))
     assert made.closure is not None and made.closure.freedoms == 0

@@ -23,10 +23,10 @@ from itertools import product
 import sympy
 from sympy import Expr, S, Symbol
 
-from eomc.base.errors import SceneError
+from eomc.base.errors import Problem, SceneError
 from eomc.derive import link_multipliers
 from eomc.derive.articulated_body import MasslessError, accelerations
-from eomc.derive.constraints import Constraints
+from eomc.derive.constraints import Constraints, constraints
 from eomc.derive.energies import Energies, directions, on_tape
 from eomc.derive.equations import Equations, Motion, equations, no_inertia
 from eomc.derive.ldl import Rows, Solution, Vector, Way, solve, work
@@ -77,13 +77,32 @@ def derive(system: System) -> Derivation:
             newton_euler, articulated, composite = _by_newton_euler(system, system.tree)
         if lagrange is None and not system.constraints:
             multipliers = _by_multipliers(system)
-    except RoughError:  # P and R are differentiated once, K twice
+    except RoughError:  # P and R are differentiated once, K and constraints twice
+        if rough := _rough_rows(system):
+            raise SceneError(rough) from None
         message = (
             "a second derivative of the kinetic energy jumps: it must be quadratic in the "
             "velocities and smooth; abs, sign, min, max and roots of velocities are not"
         )
         raise SceneError([system.problem("energy.kinetic", message)]) from None
     return Derivation(system, lagrange, newton_euler, ldl, composite, articulated, multipliers)
+
+
+def _rough_rows(system: System) -> list[Problem]:
+    """What is to be said of constraints with corners."""
+    problems, still = [], replace(system, kinetic=S.Zero, potential=S.Zero, tree=None)
+    for row in system.constraints:
+        alone = replace(still, constraints=(row,))
+        try:
+            constraints(alone, on_tape(alone, S.Zero, S.Zero))
+        except RoughError:
+            key = f"loop.{row.loop}" if row.loop else f"constraints.{row.name}"
+            message = (
+                "abs, min and max have corners, and constraints are differentiated twice: write "
+                "the side that is meant, such as x for abs(x)"
+            )
+            problems.append(system.problem(key, message))
+    return problems
 
 
 def _by_lagrange(system: System) -> tuple[Equations, Way, Way]:
