@@ -266,6 +266,35 @@ def test_a_row_with_a_corner_is_refused_by_its_name(formula: str) -> None:
     assert "ground" not in text and "energy" not in text
 
 
+@pytest.mark.parametrize("start", ["guess = true, start = 0.6", "start = 0.0"])
+@pytest.mark.parametrize(
+    ("formula", "instead"),
+    [
+        ("(x - y)**2", "write x - y for (x - y)**2"),
+        ("(x**2 - y)**3", "write x**2 - y for (x**2 - y)**3"),
+        ("x**2 - 2*x*y + y**2", "write each thing that is zero by itself"),
+    ],
+)
+def test_a_row_without_a_slope_where_it_holds_is_refused(
+    start: str, formula: str, instead: str, recwarn: pytest.WarningsRecorder
+) -> None:
+    rows = f'ground = "z"\nflat = "{formula}"'
+    text = refusal(scene(f"x = {{ {start} }}\ny = {{ guess = true }}\nz = {{}}", rows))
+    assert f"constraints.flat: has no slope where it holds, and so no force: {instead}" in text
+    assert "ground" not in text and not recwarn
+
+
+def test_rows_that_fade_out_at_a_start_and_nowhere_else_are_allowed(
+    recwarn: pytest.WarningsRecorder,
+) -> None:
+    for rows in ('a = "x*y"', 'a = "x**2*y + sin(x) - x"', 'a = "y**2 - x**3"'):
+        made = assembled(scene("x = {}\ny = {}\nz = {}", rows))
+        assert "singular position" in str(made.warnings[0])
+    small = 'a = "x**2 + y**2 - 1e-14"'
+    made = assembled(scene("x = { start = 1e-7 }\ny = {}", small))
+    assert made.closure is not None and made.closure.freedoms == 1 and not recwarn
+
+
 def test_no_freedom_is_told_but_allowed() -> None:
     made = assembled(scene("x = { guess = true }", 'wall = "x - 1"'))
     assert made.closure is not None and made.closure.freedoms == 0

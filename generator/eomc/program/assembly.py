@@ -51,11 +51,7 @@ def assembled(system: System) -> System:
     start = _start(manifold)
     found = ranks(manifold, start.place)
     if found.rank == 0:
-        why = (
-            "have no slope where they hold, and so no force: write each thing that is zero by "
-            "itself, x and y for x**2 + y**2"
-        )
-        raise SceneError([system.problem("constraints", why)])
+        raise SceneError(list(contradictions.of_slopes(system, found.flat)))
     constraints = tuple(
         replace(c, redundant=k in found.left_out) for k, c in enumerate(system.constraints)
     )

@@ -11,6 +11,7 @@ import numpy as np
 from eomc.base.errors import Problem
 from eomc.base.texts import listed
 from eomc.model.symbols import Constraint
+from eomc.model.system import System
 from eomc.program.manifold import FADED, Flags, Frame, Manifold, Place, Vector
 
 PART = 0.01  # of the row that is furthest from zero: a row contradicts
@@ -19,6 +20,8 @@ FAR = 3  # values that a message proposes
 FEW, SMALL = 8, 24  # rows that are left out one by one, and coordinates of a system where they are
 PLACES = 6  # beside one, at which rows are compared
 ALONE = "None changes alone: leave one out, or correct a formula or a parameter"
+BY_ITSELF = "each thing that is zero by itself, x and y for x**2 + y**2"
+LONGEST = 60  # characters of a formula that a message writes out
 NEAR = 0.1  # of the coordinates' size: how far beside
 
 
@@ -181,6 +184,19 @@ def _alike(manifold: Manifold, rows: Sequence[int], place: Place) -> bool:
             if Frame(beside, free, rows).parts[1][-1] > FADED:
                 return False
     return True
+
+
+def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
+    """What is wrong with rows that have no slope where they hold: with all, where none is told."""
+    for row in [system.constraints[k] for k in flat]:
+        base, power = row.formula.as_base_exp()
+        simple = power.is_number and power != 1 and not base.is_Number and len(str(base)) < LONGEST
+        instead = f"{base} for {row.formula}" if simple else BY_ITSELF
+        why = f"has no slope where it holds, and so no force: write {instead}"
+        yield system.problem(key(row), why)
+    if not flat:
+        why = f"have no slope where they hold, and so no force: write {BY_ITSELF}"
+        yield system.problem("constraints", why)
 
 
 def of_values(manifold: Manifold, q: Vector) -> Iterator[Problem]:

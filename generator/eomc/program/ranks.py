@@ -26,6 +26,8 @@ BENT = 0.1  # of a step: the correction back onto the rows, at most
 SAME = 1e-20  # of a row: it is a sum of others in forty digits
 GOOD = 1e-2  # of the singular value of all rows: what that of the kept ones is at least
 BETTER = 1.02  # times another set's: a set is better
+BESIDE, REACH = 3, 0.1  # places beside the start, and how far, of the coordinates' size
+FLAT = 1e-6  # of the slope beside: a row has none
 MOST_SETS = 4000  # that are tried; beyond, rows are left out one by one
 
 
@@ -35,6 +37,7 @@ class Ranks:
     a force of their own. good: whether some set of rows will do everywhere that was looked at.
     sigma: smallest over largest singular value that counts, at the start and at the worst place.
     weights: of the rows, that make D regular with them; none where it is so by itself.
+    flat: rows without a slope wherever they hold.
     """
 
     rank: int
@@ -44,6 +47,7 @@ class Ranks:
     sigma: tuple[float, float]
     positions: int
     weights: tuple[float, ...] = ()
+    flat: tuple[int, ...] = ()
 
 
 def ranks(manifold: Manifold, start: Place) -> Ranks:
@@ -61,10 +65,13 @@ def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
     positions = FEWER if sure and len(manifold.rows) > MANY else POSITIONS
     rest = [Frame(place, free, manifold.rows) for place in walk(manifold, start, positions)]
     frames, places = [first, *rest], [start, *(f.place for f in rest)]
+    if flat := _flat(manifold, places):
+        return Ranks(0, (), (), False, (0.0, 0.0), len(places), flat=flat), places
     counts = [int(np.sum(f.parts[1] > FADED)) for f in frames]
     rank, m = max(counts), len(manifold.rows)
     regular = [f for f, n in zip(frames, counts, strict=True) if n == rank]
-    ratios = [float(f.parts[1][rank - 1] / f.parts[1][0]) if rank else 1.0 for f in frames]
+    ends = [(float(f.parts[1][rank - 1]), float(f.parts[1][0])) if rank else (1, 1) for f in frames]
+    ratios = [least / most if most else 0.0 for least, most in ends]
     ratios = [x if x > FADED else 0.0 for x in ratios]
     sigma = (ratios[0], min(ratios))
     if rank == m:
@@ -77,6 +84,31 @@ def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
     good = score >= GOOD and all(_implied(manifold, f.place, left_out) for f in regular[:3])
     out = left_out if good else ()
     return Ranks(rank, out, tuple(shared.tolist()), good, sigma, len(places)), places
+
+
+def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
+    """Rows of positions whose slope is nothing where they hold, beside that next to it.
+
+    They are squares, or other powers. Where one has no slope at the start alone, that is singular.
+    """
+    start, random = places[0], np.random.default_rng(29)
+    sizes = [*start.q, *(c.start for c in manifold.system.coordinates)]
+    flat = list(manifold.holonomic) if len(places) > 1 else []
+    for place in places:
+        if flat:
+            # a walk from a singular position ends near it, where slopes grow with the way gone
+            span = sizes if place is start else place.q - start.q
+            reach = REACH * (float(np.max(np.abs(span))) or 1.0)
+            q = [place.q + reach * random.normal(size=len(place.q)) for _ in range(BESIDE)]
+            found = [p for p in (manifold.place(x, place.t) for x in q) if p is not None]
+            beside = np.max([_slopes(p) for p in found], axis=0, initial=0.0)
+            flat = [k for k in flat if _slopes(place)[k] < FLAT * beside[k]]
+    return tuple(flat)
+
+
+def _slopes(place: Place) -> Vector:
+    """(m,): of each row, sqrt(A D^-1 A^T)."""
+    return np.where(np.any(place.A != 0, axis=1), place.sizes, 0.0)
 
 
 def walk(manifold: Manifold, start: Place, positions: int = POSITIONS) -> Iterator[Place]:
