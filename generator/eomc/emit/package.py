@@ -35,7 +35,7 @@ FUNCTIONS = (
     "linearize load_run output potential_energy power rhs sensitivity signal simulate "
     "simulate_batch step step_batch tau"
 ).split()
-CONSTRAINED = "constraint_jacobian constraint_rates constraints multipliers project".split()
+CONSTRAINED = "constraint_jacobian constraint_rates constraints multipliers project tangent".split()
 ASKED = {  # what only scenes have that ask for it in [run]
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
     "inverse_dynamics": ("inverse_dynamics",),
@@ -186,7 +186,6 @@ def _functions(target: Target) -> tuple[str, ...]:
     functions = [n for n in FUNCTIONS if run.batch or not n.endswith("_batch")]
     functions += CONSTRAINED if s.constraints else ()
     functions += ["reactions"] if s.reactions else ()
-    functions += ["tangent"] if s.constraints and run.linearize else ()
     functions += [n for key, names in ASKED.items() if getattr(run, key) for n in names]
     return tuple(sorted(functions))
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 from .arguments import Array, not_one_of
 
@@ -20,6 +20,20 @@ if TYPE_CHECKING:
     from .model import Model
 
 File = str | os.PathLike[str]
+
+
+class ByName(dict[str, Array]):
+    """What each constraint or loop has, by name."""
+
+    def __init__(self, what: str, names: Sequence[str], values: Iterable[Array]) -> None:
+        super().__init__(zip(names, values, strict=True))
+        self.what = what
+
+    def __missing__(self, name: object) -> NoReturn:
+        raise KeyError(not_one_of(self.what, str(name), tuple(self)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (dict(self),)
 
 
 class Columns:

@@ -6,13 +6,14 @@ of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, as_number, not_one_of
+from .columns import ByName
 from .frames import Frames
 from .trajectory import SAID, STATUS, MotionError, state_text
 
@@ -73,6 +74,8 @@ class Constrained(Frames):
     ) -> Array:
         """Changes of [q; qd] that keep the constraints, to the first order: (2 nq, k), orthonormal.
 
+        Of many states, (n, nq), they have a leading n; these have to leave equally many freedoms.
+
         Near an equilibrium with A, B of `linearize`, dz/dt = T^T A T z + T^T B u has no more
         states than the motion, x - x0 = T z. Raises ValueError where the scene was built without
         derivatives.
@@ -85,6 +88,21 @@ class Constrained(Frames):
         shape = (len(self._rows.names), self.nq)
         A = self.constraint_jacobian(q, t=t, params=params)
         slopes = self._evaluate("constraint_slopes", shape, q, qd, t, None, params, None)
+        if A.ndim == 2:
+            return self._kernel(A, slopes)
+        found = [self._kernel(*pair) for pair in zip(A, slopes, strict=True)]
+        if len({x.shape for x in found}) > 1:
+            few, many = (
+                pick(range(len(found)), key=lambda k: found[k].size) for pick in (min, max)
+            )
+            raise ValueError(
+                f"tangent: {found[few].shape[1]} changes keep the constraints at state {few}, "
+                f"{found[many].shape[1]} at state {many}: ask for each by itself"
+            )
+        return np.array(found) if found else np.empty((0, 2 * self.nq, 0))
+
+    def _kernel(self, A: Array, slopes: Array) -> Array:
+        """The tangent of one state."""
         of_q = A[: self._rows.holonomic]
         whole = np.block([[of_q, np.zeros_like(of_q)], [slopes, A]])
         whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-300)
@@ -114,7 +132,7 @@ class Constrained(Frames):
         if not self._rows.loops:
             raise ValueError(f"reactions: {self.name} has no [[loop]]")
         found = self._reactions(q, qd, t, u, params)
-        return {name: found[..., k, :] for k, name in enumerate(self._rows.loops)}
+        return ByName("reactions", self._rows.loops, np.moveaxis(found, -2, 0))
 
     def _reactions(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
@@ -137,6 +155,9 @@ class Constrained(Frames):
         """
         if isinstance(held, str):
             held = (held,)
+        if not (held is None or isinstance(held, Iterable)):
+            raise ValueError(f"held: {held!r} is no list of names: {', '.join(self._states)}")
+        held = held and tuple(held)
         for name in held or ():
             if name not in self._states:
                 raise ValueError(not_one_of("held", name, self._states))

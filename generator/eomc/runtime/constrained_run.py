@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
+from .columns import ByName
 
 
 class ConstrainedRun:
@@ -27,16 +28,14 @@ class ConstrainedRun:
     def constraints(self) -> Mapping[str, Array]:
         """What each constraint lacks along the run, (n,), by name: rounding."""
         names = self._model.constraint_names
-        return dict(zip(names, self._values("constraints").T, strict=True)) if names else {}
+        return ByName("constraints", names, self._values("constraints").T if names else ())
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
         """The multiplier of each constraint along the run, (n,), by name."""
         names = self._model.constraint_names
-        if not names:
-            return {}
-        found = self._driven("multipliers", self._model.multipliers)
-        return dict(zip(names, np.ascontiguousarray(found.T), strict=True))
+        found = self._driven("multipliers", self._model.multipliers).T if names else ()
+        return ByName("multipliers", names, np.ascontiguousarray(found))
 
     @property
     def reactions(self) -> Mapping[str, Array]:
@@ -46,11 +45,11 @@ class ConstrainedRun:
         """
         loops = self._model.loops
         if not loops:
-            return {}
+            return ByName("reactions", (), ())
         # their multipliers may depend on the time, by signals or rows, where they do not themselves
         timed = self._model._timed & {"multipliers", "reactions"}
         found = self._driven(min(timed, default="reactions"), self._model._reactions)
-        return {name: found[:, k] for k, name in enumerate(loops)}
+        return ByName("reactions", loops, np.moveaxis(found, -2, 0))
 
     @property
     def _singular(self) -> str:

@@ -42,8 +42,24 @@ def meant(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else ""
 
 
+CONSTRAINED = (
+    "constraint_jacobian constraint_names constraint_rates constraints loops multipliers project "
+    "reactions tangent"
+).split()
+
+
 class Package(ModuleType):
     """The class of a built package."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Raises AttributeError: of what only scenes with constraints have, with the reason."""
+        model = self.__dict__.get("_model")
+        if model is not None and name in CONSTRAINED:
+            what = "[[loop]]" if hasattr(model, name) and model.constraint_names else (
+                "constraints: a scene has them by [constraints] or [[loop]]"
+            )  # fmt: skip
+            raise AttributeError(f"{name}: {model.name} has no {what}")
+        return self.__dict__["__getattr__"](name)
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not name.startswith("_") and (why := self._why_not(name, value)):
