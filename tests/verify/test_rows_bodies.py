@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from stand_in import StandIn
 from trees import SHAPES, trees
 
+from eomc.model import limits
 from eomc.model import multibody as building
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse, read
@@ -177,6 +178,52 @@ def test_a_fault_in_what_is_made_of_bodies_is_noticed(
 def test_a_damper_left_out_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(building.Builder, "_damper", lambda *line: None)
     assert compared(single())["power"] > 1e3 * rows_bodies.LIMIT
+
+
+LIMITED = """
+eomc = 1
+name = "limited"
+gravity = [0, -9.81]
+[coordinates]
+a = { start = 0.3, rate = 0.5 }
+b = { start = -0.4 }
+[parameters]
+most = 1.5
+[inputs]
+u = { signal = "5*sin(t)", limits = [-1, "most"] }
+v = { signal = "3 + t - slow", limits = [2.0, inf] }
+[[body]]
+name = "arm"
+joint = "revolute"
+coordinates = "a"
+actuator = "u"
+mass = 1
+center = [0.2, 0]
+inertia = 0.02
+[[body]]
+name = "slide"
+parent = "arm"
+joint = "prismatic"
+axis = [1, 0]
+coordinates = "b"
+mass = 1
+inertia = 0.02
+[definitions]
+push = "2*v"
+slow = "3*a"
+[forces]
+b = "push"
+"""
+
+
+def test_of_inputs_beyond_their_limits_the_limits_act() -> None:
+    off = compared(LIMITED, 12)
+    assert max(off.values()) < rows_bodies.LIMIT, off
+
+
+def test_limits_left_out_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "within", lambda system: system)
+    assert compared(LIMITED, 12)["power"] > 1e3 * rows_bodies.LIMIT
 
 
 def test_quaternions_are_scipys() -> None:

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cases import SCENES
 from conftest import Modules
 
 import eomc
+from eomc import pipeline
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify import rows_plain
@@ -106,3 +108,32 @@ def test_few_sweeps_are_compared_in_steps_so_short_that_they_do(modules: Modules
     wrong = Plain(plain, 25, 1e-9)
     off = rows_plain._least_off(made, wrong, "gauss16", made.expected[0])
     assert off is not None and off > LIMIT
+
+
+class Linear:
+    """A module of which one entry of A is off by a part of it."""
+
+    def __init__(self, module: ModuleType, off: float) -> None:
+        self.module, self.off = module, off
+
+    def linearize(self, *state: Any, **how: Any) -> tuple[Any, ...]:
+        A, *rest = self.module.linearize(*state, **how)
+        A = A.copy()
+        k = np.unravel_index(np.argmax(np.abs(A)), A.shape)
+        A[k] *= 1 + self.off
+        return A, *rest
+
+    def sensitivity(self, *state: Any, **how: Any) -> Any:
+        return self.module.sensitivity(*state, **how)
+
+
+def test_derivatives_that_cancel_to_nothing_are_compared_in_units_of_their_terms() -> None:
+    """Of a rolling disk no angle's acceleration depends on where it points."""
+    text = (SCENES / "rolling_disk.toml").read_text().replace("[run]", "[run]\nlinearize = true")
+    system = from_scene(parse(text, "disk.toml"))
+    plain = eomc.load(system, Path("build/tests/plain_disk"), form="plain")
+    fast = eomc.load(system, Path("build/tests/fast_disk"), form="fast")
+    made = Comparison(pipeline._assembled(system), fast, np.random.default_rng(0), 8)
+    assert rows_plain._linearization(made, plain) < LIMIT
+    for off in (1e-8, 1e-11):
+        assert rows_plain._linearization(made, Linear(plain, off)) > LIMIT

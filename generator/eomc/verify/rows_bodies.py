@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -145,12 +145,9 @@ class Line:
                 self.hang(body)
         for k, i in enumerate(self.scene.inputs):
             if s.u is not None:
-                known[i.name] = s.u[k] + zero
-        for name, formula in self.scene.definitions:
-            known[name] = self.of(formula)
-        for i in self.scene.inputs:
-            if s.u is None:
-                known[i.name] = self.of(i.signal)
+                known[i.name] = self.limited(i.name, s.u[k] + zero)
+        for name in self.formulas:
+            self.named(name)
         for body in self.assembly.bodies:
             if not body.joint:
                 assert body.position is not None
@@ -166,7 +163,25 @@ class Line:
 
     def of(self, formula: Formula) -> Any:
         """The value of a formula along the line."""
-        return formulas.evaluate(formula, self.algebra, self.known.__getitem__)
+        return formulas.evaluate(formula, self.algebra, self.named)
+
+    @cached_property
+    def formulas(self) -> Mapping[str, Formula]:
+        """Those of definitions and signals, each of which may hold the other."""
+        return dict(self.scene.definitions) | {i.name: i.signal for i in self.scene.inputs}
+
+    def named(self, name: str) -> Any:
+        """The value of a name along the line."""
+        if name not in self.known:
+            self.known[name] = self.limited(name, self.of(self.formulas[name]))
+        return self.known[name]
+
+    def limited(self, name: str, value: Any) -> Any:
+        """What acts of an input; all else as it is."""
+        for ends in (i.limits for i in self.scene.inputs if i.name == name):
+            for end, within in zip(ends, (np.maximum, np.minimum), strict=True):
+                value = value if end is None else within(value, self.of(end))
+        return value
 
     def vector(self, of: Sequence[Formula]) -> Vector:
         """Three numbers that do not change."""

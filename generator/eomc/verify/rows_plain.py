@@ -82,9 +82,19 @@ def _linearization(of: Comparison, plain: Any) -> float:
         assert one is not None and other is not None
         near = [_slopes(of.module, s) for s in nudged(e.state, of.sampler.defaults)[:64]]
         size = np.abs(one) + sum(np.abs(x - one) / NUDGE for x in near if x is not None)
+        if of.system.constraints:  # entries that are 0 everywhere are sums of what cancels
+            scale = _inputs(of, e.state)[: one.shape[1]]
+            size = np.maximum(size, e.size["acceleration"][:, None] / scale)
         return of.units(other, one, np.maximum(size, 1e-6 * np.max(size)))
 
     return float(np.max([error(e) for e in of.few(of.effort.few)]))
+
+
+def _inputs(of: Comparison, s: State) -> Vector:
+    """How far coordinates, rates, inputs and parameters go, in the order of `_slopes`."""
+    params = list((s.params or of.sampler.defaults).values())
+    given = np.abs([*(np.zeros(len(of.system.inputs)) if s.u is None else s.u), *params])
+    return np.array([*of.sampler.spread, *of.sampler.speed, *np.where(given > 0, given, 1.0)])
 
 
 def _runs(of: Comparison, plain: Any, method: str) -> float | Finding:
