@@ -25,40 +25,12 @@ static void said(const Instance *a, fmi2Status status, const char *category, con
         a->callbacks.logger(a->callbacks.componentEnvironment, a->name, status, category, text);
 }
 
-static fmi2Status outcome(Instance *a, UnitResult result)
-{
-    if (result == unitOk)
-        return fmi2OK;
-    if (result == unitImpossible) {
-        said(a, fmi2Discard, "logStatusDiscard", a->unit.said);
-        return fmi2Discard;
-    }
-    said(a, fmi2Error, "logStatusError", a->unit.said);
-    return fmi2Error;
-}
-
-static fmi2Status refused(Instance *a, const char *text)
-{
-    return outcome(a, unitSay(&a->unit, unitRefused, text));
-}
-
-static void happened(void *instance, const char *text)
-{
-    const Instance *const a = instance;
-
-    said(a, fmi2OK, "logEvents", text);
-}
-
-static fmi2Status enter(Instance *a, UnitMode from, UnitMode to, const char *call)
-{
-    if (a->unit.x.mode != from) {
-        snprintf(
-            a->unit.said, sizeof a->unit.said, "%s is not for the mode that the unit is in", call);
-        return outcome(a, unitRefused);
-    }
-    a->unit.x.mode = to;
-    return fmi2OK;
-}
+#define FMI(name) fmi2##name
+#define FMI_TEXT(name) "fmi2" #name
+#define FMI_STATE(before, behind) fmi2##before##FMUstate##behind
+#define FMI_DESERIALIZE fmi2DeSerializeFMUstate
+#define FMI_INSTANCE fmi2Component
+#include "both.h"
 
 /* --- instances ---------------------------------------------------------------------------------- */
 
@@ -70,27 +42,6 @@ const char *fmi2GetTypesPlatform(void)
 const char *fmi2GetVersion(void)
 {
     return fmi2Version;
-}
-
-fmi2Status fmi2SetDebugLogging(
-    fmi2Component c, fmi2Boolean loggingOn, size_t nCategories, const fmi2String categories[])
-{
-    Instance *const a = c;
-
-    if (nCategories == 0)
-        a->errors = a->events = loggingOn;
-    for (size_t i = 0; i < nCategories; i++) {
-        if (!strcmp(categories[i], "logEvents"))
-            a->events = loggingOn;
-        else if (!strcmp(categories[i], "logStatusError") ||
-            !strcmp(categories[i], "logStatusDiscard"))
-            a->errors = loggingOn;
-        else
-            return refused(a,
-                "there is no such category of messages: logEvents, logStatusDiscard, "
-                "logStatusError");
-    }
-    return fmi2OK;
 }
 
 fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2String fmuGUID,
@@ -160,55 +111,17 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c)
     return enter(c, unitNew, unitStarting, "fmi2EnterInitializationMode");
 }
 
-fmi2Status fmi2ExitInitializationMode(fmi2Component c)
-{
-    Instance *const a = c;
-    const fmi2Status status = enter(a, unitStarting,
-        a->unit.x.exchange ? unitAtEvent : unitStepping, "fmi2ExitInitializationMode");
-
-    if (status == fmi2OK)
-        (void)unitCrossed(&a->unit.x);
-    return status;
-}
-
-fmi2Status fmi2Terminate(fmi2Component c)
-{
-    Instance *const a = c;
-
-    a->unit.x.mode = unitEnded;
-    return fmi2OK;
-}
-
-fmi2Status fmi2Reset(fmi2Component c)
-{
-    Instance *const a = c;
-
-    unitReset(&a->unit.x, a->unit.x.exchange);
-    return fmi2OK;
-}
-
 /* --- variables ---------------------------------------------------------------------------------- */
 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, fmi2Real value[])
 {
-    Instance *const a = c;
-    UnitValues v = { 0 };
-    UnitResult result = unitOk;
-
-    for (size_t i = 0; i < nvr && result == unitOk; i++)
-        result = unitGet(&a->unit, vr[i], &v, &value[i]);
-    return outcome(a, result);
+    return get(c, vr, nvr, value);
 }
 
 fmi2Status fmi2SetReal(
     fmi2Component c, const fmi2ValueReference vr[], size_t nvr, const fmi2Real value[])
 {
-    Instance *const a = c;
-    UnitResult result = unitOk;
-
-    for (size_t i = 0; i < nvr && result == unitOk; i++)
-        result = unitSet(&a->unit, vr[i], value[i]);
-    return outcome(a, result);
+    return set(c, vr, nvr, value);
 }
 
 fmi2Status fmi2GetBoolean(
@@ -250,76 +163,6 @@ NONE(GetString, fmi2String unused[])
 NONE(SetInteger, const fmi2Integer unused[])
 NONE(SetString, const fmi2String unused[])
 
-/* --- states ------------------------------------------------------------------------------------- */
-
-fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *FMUstate)
-{
-    Instance *const a = c;
-
-    if (!*FMUstate)
-        *FMUstate = malloc(sizeof a->unit.x);
-    if (!*FMUstate)
-        return refused(a, "there is no memory for a state");
-    memcpy(*FMUstate, &a->unit.x, sizeof a->unit.x);
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate FMUstate)
-{
-    Instance *const a = c;
-
-    if (!FMUstate)
-        return refused(a, "fmi2SetFMUstate: there is no state");
-    memcpy(&a->unit.x, FMUstate, sizeof a->unit.x);
-    return fmi2OK;
-}
-
-fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *FMUstate)
-{
-    (void)c;
-    if (FMUstate) {
-        free(*FMUstate);
-        *FMUstate = NULL;
-    }
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate FMUstate, size_t *size)
-{
-    (void)c, (void)FMUstate;
-    *size = (size_t)unitBytes;
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializeFMUstate(
-    fmi2Component c, fmi2FMUstate FMUstate, fmi2Byte serializedState[], size_t size)
-{
-    if (!FMUstate || size < (size_t)unitBytes)
-        return refused(c,
-            "fmi2SerializeFMUstate: there is no state, or not as much room as "
-            "fmi2SerializedFMUstateSize tells");
-    unitPack(FMUstate, (unsigned char *)serializedState);
-    return fmi2OK;
-}
-
-fmi2Status fmi2DeSerializeFMUstate(
-    fmi2Component c, const fmi2Byte serializedState[], size_t size, fmi2FMUstate *FMUstate)
-{
-    Instance *const a = c;
-    Unit x;
-    const UnitResult result =
-        unitUnpack(&a->unit, (const unsigned char *)serializedState, size, &x);
-
-    if (result)
-        return outcome(a, result);
-    if (!*FMUstate)
-        *FMUstate = malloc(sizeof x);
-    if (!*FMUstate)
-        return refused(a, "there is no memory for a state");
-    memcpy(*FMUstate, &x, sizeof x);
-    return fmi2OK;
-}
-
 /* --- derivatives -------------------------------------------------------------------------------- */
 
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference vUnknown_ref[],
@@ -334,16 +177,6 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
 
 /* --- model exchange ----------------------------------------------------------------------------- */
 
-fmi2Status fmi2EnterEventMode(fmi2Component c)
-{
-    return enter(c, unitContinuous, unitAtEvent, "fmi2EnterEventMode");
-}
-
-fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c)
-{
-    return enter(c, unitAtEvent, unitContinuous, "fmi2EnterContinuousTimeMode");
-}
-
 fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *fmi2eventInfo)
 {
     Instance *const a = c;
@@ -356,72 +189,9 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *fmi2eventInfo)
     return outcome(a, result);
 }
 
-fmi2Status fmi2CompletedIntegratorStep(fmi2Component c,
-    fmi2Boolean noSetFMUStatePriorToCurrentPoint, fmi2Boolean *enterEventMode,
-    fmi2Boolean *terminateSimulation)
+fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real values[], size_t nx)
 {
-    Instance *const a = c;
-
-    (void)noSetFMUStatePriorToCurrentPoint;
-    *enterEventMode = unitCrossed(&a->unit.x);
-    *terminateSimulation = fmi2False;
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time)
-{
-    Instance *const a = c;
-
-    a->unit.x.t = time;
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t nx)
-{
-    Instance *const a = c;
-
-    if (nx != (size_t)unitNX)
-        return refused(
-            a, "fmi2SetContinuousStates: coordinates and velocities, no more and no less");
-    unitPut(&a->unit.x, x);
-    return fmi2OK;
-}
-
-fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t nx)
-{
-    Instance *const a = c;
-
-    if (nx != (size_t)unitNX)
-        return refused(
-            a, "fmi2GetContinuousStates: coordinates and velocities, no more and no less");
-    unitTake(&a->unit.x, x);
-    return fmi2OK;
-}
-
-fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t nx)
-{
-    Instance *const a = c;
-
-    if (nx != (size_t)unitNX)
-        return refused(a, "fmi2GetDerivatives: of coordinates and velocities, no more and no less");
-    return outcome(a, unitDerivatives(&a->unit, derivatives));
-}
-
-fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real eventIndicators[], size_t ni)
-{
-    Instance *const a = c;
-
-    if (ni != (size_t)unitNE)
-        return refused(a, "fmi2GetEventIndicators: one for each event");
-    return outcome(a, unitIndicators(&a->unit, eventIndicators));
-}
-
-fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal[], size_t nx)
-{
-    (void)c;
-    for (size_t i = 0; i < nx; i++)
-        x_nominal[i] = 1;
-    return fmi2OK;
+    return derivatives(c, values, nx);
 }
 
 /* --- co-simulation ------------------------------------------------------------------------------ */

@@ -16,67 +16,18 @@ static void said(const Instance *a, fmi3Status status, const char *category, con
         a->log(a->environment, status, category, text);
 }
 
-static fmi3Status outcome(Instance *a, UnitResult result)
-{
-    if (result == unitOk)
-        return fmi3OK;
-    if (result == unitImpossible) {
-        said(a, fmi3Discard, "logStatusDiscard", a->unit.said);
-        return fmi3Discard;
-    }
-    said(a, fmi3Error, "logStatusError", a->unit.said);
-    return fmi3Error;
-}
-
-static fmi3Status refused(Instance *a, const char *text)
-{
-    return outcome(a, unitSay(&a->unit, unitRefused, text));
-}
-
-static void happened(void *instance, const char *text)
-{
-    const Instance *const a = instance;
-
-    said(a, fmi3OK, "logEvents", text);
-}
-
-static fmi3Status enter(Instance *a, UnitMode from, UnitMode to, const char *call)
-{
-    if (a->unit.x.mode != from) {
-        snprintf(
-            a->unit.said, sizeof a->unit.said, "%s is not for the mode that the unit is in", call);
-        return outcome(a, unitRefused);
-    }
-    a->unit.x.mode = to;
-    return fmi3OK;
-}
+#define FMI(name) fmi3##name
+#define FMI_TEXT(name) "fmi3" #name
+#define FMI_STATE(before, behind) fmi3##before##FMUState##behind
+#define FMI_DESERIALIZE fmi3DeserializeFMUState
+#define FMI_INSTANCE fmi3Instance
+#include "both.h"
 
 /* --- instances ---------------------------------------------------------------------------------- */
 
 const char *fmi3GetVersion(void)
 {
     return fmi3Version;
-}
-
-fmi3Status fmi3SetDebugLogging(
-    fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories, const fmi3String categories[])
-{
-    Instance *const a = instance;
-
-    if (nCategories == 0)
-        a->errors = a->events = loggingOn;
-    for (size_t i = 0; i < nCategories; i++) {
-        if (!strcmp(categories[i], "logEvents"))
-            a->events = loggingOn;
-        else if (!strcmp(categories[i], "logStatusError") ||
-            !strcmp(categories[i], "logStatusDiscard"))
-            a->errors = loggingOn;
-        else
-            return refused(a,
-                "there is no such category of messages: logEvents, logStatusDiscard, "
-                "logStatusError");
-    }
-    return fmi3OK;
 }
 
 static fmi3Instance made(fmi3String token, fmi3Boolean loggingOn,
@@ -166,60 +117,22 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
     return status;
 }
 
-fmi3Status fmi3ExitInitializationMode(fmi3Instance instance)
-{
-    Instance *const a = instance;
-    const fmi3Status status = enter(a, unitStarting,
-        a->unit.x.exchange ? unitAtEvent : unitStepping, "fmi3ExitInitializationMode");
-
-    if (status == fmi3OK)
-        (void)unitCrossed(&a->unit.x);
-    return status;
-}
-
-fmi3Status fmi3Terminate(fmi3Instance instance)
-{
-    Instance *const a = instance;
-
-    a->unit.x.mode = unitEnded;
-    return fmi3OK;
-}
-
-fmi3Status fmi3Reset(fmi3Instance instance)
-{
-    Instance *const a = instance;
-
-    unitReset(&a->unit.x, a->unit.x.exchange);
-    return fmi3OK;
-}
-
 /* --- variables ---------------------------------------------------------------------------------- */
 
 fmi3Status fmi3GetFloat64(fmi3Instance instance, const fmi3ValueReference valueReferences[],
     size_t nValueReferences, fmi3Float64 values[], size_t nValues)
 {
-    Instance *const a = instance;
-    UnitValues v = { 0 };
-    UnitResult result = unitOk;
-
     if (nValues != nValueReferences)
-        return refused(a, "fmi3GetFloat64: as many values as value references");
-    for (size_t i = 0; i < nValues && result == unitOk; i++)
-        result = unitGet(&a->unit, valueReferences[i], &v, &values[i]);
-    return outcome(a, result);
+        return refused(instance, "fmi3GetFloat64: as many values as value references");
+    return get(instance, valueReferences, nValues, values);
 }
 
 fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference valueReferences[],
     size_t nValueReferences, const fmi3Float64 values[], size_t nValues)
 {
-    Instance *const a = instance;
-    UnitResult result = unitOk;
-
     if (nValues != nValueReferences)
-        return refused(a, "fmi3SetFloat64: as many values as value references");
-    for (size_t i = 0; i < nValues && result == unitOk; i++)
-        result = unitSet(&a->unit, valueReferences[i], values[i]);
-    return outcome(a, result);
+        return refused(instance, "fmi3SetFloat64: as many values as value references");
+    return set(instance, valueReferences, nValues, values);
 }
 
 fmi3Status fmi3GetBoolean(fmi3Instance instance, const fmi3ValueReference valueReferences[],
@@ -330,75 +243,6 @@ fmi3Status fmi3GetVariableDependencies(fmi3Instance instance, fmi3ValueReference
     return refused(instance, "dependencies are those of modelDescription.xml");
 }
 
-/* --- states ------------------------------------------------------------------------------------- */
-
-fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *FMUState)
-{
-    Instance *const a = instance;
-
-    if (!*FMUState)
-        *FMUState = malloc(sizeof a->unit.x);
-    if (!*FMUState)
-        return refused(a, "there is no memory for a state");
-    memcpy(*FMUState, &a->unit.x, sizeof a->unit.x);
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState FMUState)
-{
-    Instance *const a = instance;
-
-    if (!FMUState)
-        return refused(a, "fmi3SetFMUState: there is no state");
-    memcpy(&a->unit.x, FMUState, sizeof a->unit.x);
-    return fmi3OK;
-}
-
-fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *FMUState)
-{
-    (void)instance;
-    if (FMUState) {
-        free(*FMUState);
-        *FMUState = NULL;
-    }
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState FMUState, size_t *size)
-{
-    (void)instance, (void)FMUState;
-    *size = (size_t)unitBytes;
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializeFMUState(
-    fmi3Instance instance, fmi3FMUState FMUState, fmi3Byte serializedState[], size_t size)
-{
-    if (!FMUState || size < (size_t)unitBytes)
-        return refused(instance,
-            "fmi3SerializeFMUState: there is no state, or not as much room as "
-            "fmi3SerializedFMUStateSize tells");
-    unitPack(FMUState, serializedState);
-    return fmi3OK;
-}
-
-fmi3Status fmi3DeserializeFMUState(
-    fmi3Instance instance, const fmi3Byte serializedState[], size_t size, fmi3FMUState *FMUState)
-{
-    Instance *const a = instance;
-    Unit x;
-    const UnitResult result = unitUnpack(&a->unit, serializedState, size, &x);
-
-    if (result)
-        return outcome(a, result);
-    if (!*FMUState)
-        *FMUState = malloc(sizeof x);
-    if (!*FMUState)
-        return refused(a, "there is no memory for a state");
-    memcpy(*FMUState, &x, sizeof x);
-    return fmi3OK;
-}
-
 /* --- derivatives -------------------------------------------------------------------------------- */
 
 fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[],
@@ -432,16 +276,6 @@ fmi3Status fmi3EnterConfigurationMode(fmi3Instance instance)
 fmi3Status fmi3ExitConfigurationMode(fmi3Instance instance)
 {
     return refused(instance, "there are no structural parameters");
-}
-
-fmi3Status fmi3EnterEventMode(fmi3Instance instance)
-{
-    return enter(instance, unitContinuous, unitAtEvent, "fmi3EnterEventMode");
-}
-
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance)
-{
-    return enter(instance, unitAtEvent, unitContinuous, "fmi3EnterContinuousTimeMode");
 }
 
 fmi3Status fmi3EnterStepMode(fmi3Instance instance)
@@ -514,79 +348,10 @@ fmi3Status fmi3ActivateModelPartition(
 
 /* --- model exchange ----------------------------------------------------------------------------- */
 
-fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance,
-    fmi3Boolean noSetFMUStatePriorToCurrentPoint, fmi3Boolean *enterEventMode,
-    fmi3Boolean *terminateSimulation)
-{
-    Instance *const a = instance;
-
-    (void)noSetFMUStatePriorToCurrentPoint;
-    *enterEventMode = unitCrossed(&a->unit.x) != 0;
-    *terminateSimulation = false;
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time)
-{
-    Instance *const a = instance;
-
-    a->unit.x.t = time;
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetContinuousStates(
-    fmi3Instance instance, const fmi3Float64 continuousStates[], size_t nContinuousStates)
-{
-    Instance *const a = instance;
-
-    if (nContinuousStates != (size_t)unitNX)
-        return refused(
-            a, "fmi3SetContinuousStates: coordinates and velocities, no more and no less");
-    unitPut(&a->unit.x, continuousStates);
-    return fmi3OK;
-}
-
-fmi3Status fmi3GetContinuousStates(
-    fmi3Instance instance, fmi3Float64 continuousStates[], size_t nContinuousStates)
-{
-    Instance *const a = instance;
-
-    if (nContinuousStates != (size_t)unitNX)
-        return refused(
-            a, "fmi3GetContinuousStates: coordinates and velocities, no more and no less");
-    unitTake(&a->unit.x, continuousStates);
-    return fmi3OK;
-}
-
 fmi3Status fmi3GetContinuousStateDerivatives(
-    fmi3Instance instance, fmi3Float64 derivatives[], size_t nContinuousStates)
+    fmi3Instance instance, fmi3Float64 values[], size_t nContinuousStates)
 {
-    Instance *const a = instance;
-
-    if (nContinuousStates != (size_t)unitNX)
-        return refused(a,
-            "fmi3GetContinuousStateDerivatives: of coordinates and velocities, no more and no "
-            "less");
-    return outcome(a, unitDerivatives(&a->unit, derivatives));
-}
-
-fmi3Status fmi3GetEventIndicators(
-    fmi3Instance instance, fmi3Float64 eventIndicators[], size_t nEventIndicators)
-{
-    Instance *const a = instance;
-
-    if (nEventIndicators != (size_t)unitNE)
-        return refused(a, "fmi3GetEventIndicators: one for each event");
-    return outcome(a, unitIndicators(&a->unit, eventIndicators));
-}
-
-fmi3Status fmi3GetNominalsOfContinuousStates(
-    fmi3Instance instance, fmi3Float64 nominals[], size_t nContinuousStates)
-{
-    (void)instance;
-    for (size_t i = 0; i < nContinuousStates; i++)
-        nominals[i] = 1;
-    return fmi3OK;
+    return derivatives(instance, values, nContinuousStates);
 }
 
 fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *nEventIndicators)

@@ -64,7 +64,7 @@ def unit(
     texts = {f"sources/{file}": text for file, text in steppers.files(safe, plain).items()}
     texts |= {
         f"sources/fmi/{file}": resources.text("csrc", f"fmi/{file}")
-        for file in (*_HEADERS[version], f"fmi{version}.c", "unit.h")
+        for file in (*_HEADERS[version], f"fmi{version}.c", "both.h", "unit.h")
     }
     texts["documentation/licenses/fmi-headers.txt"] = resources.text("csrc", "fmi/LICENSE.txt")
     whole = "\0".join(f"{file}\0{text}" for file, text in sorted(made("").items()))
