@@ -32,10 +32,11 @@ from eomc.cli.terminal import say, shown
 @click.option(
     "--mend-inertias", is_flag=True, help="Take the nearest inertia for one that no body can have."
 )
+@click.option("--stops", is_flag=True, help="Let limits of joints push back, as stops do.")
 @click.option("--include", is_flag=True, help="Open what <include> names, in the file's folder.")
 def command(
     file: Path, out: Path | None, name: str | None, locks: Sequence[str], root: str, tip: str,
-    base: str | None, no_drives: bool, mend_inertias: bool, include: bool,
+    base: str | None, no_drives: bool, mend_inertias: bool, stops: bool, include: bool,
 ) -> None:  # fmt: skip
     """Write the scene of a robot file, URDF or MJCF, and say what it leaves out.
 
@@ -65,6 +66,8 @@ def command(
         robot = replace(robot, drives=())
     if mend_inertias:
         robot = edit.mended(robot)
+    if stops:
+        robot = edit.stopped(robot)
     if name is not None:
         if why := names.module_fault(name):
             raise EomcError(f"--name: {why}")

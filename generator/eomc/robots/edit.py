@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -20,8 +21,12 @@ from eomc.robots.robot import (
     without_dust,
 )
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_pitch_roll
+from eomc.robots.stops import stops
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
+
+# what readers say of them
+_OF_LIMITS = re.compile(r"limits of (\d+ joints: their values|joints, kept as notes)")
 
 
 def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
@@ -61,6 +66,15 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
             body = replace(body, motions=(replace(motion, start=start),))
         bodies.append(body)
     return settled(replace(robot, bodies=tuple(bodies)))
+
+
+def stopped(robot: Robot) -> Robot:
+    """The robot with stops where its joints have limits. Raises EomcError where none has."""
+    if not stops(robot):
+        raise EomcError("--stops: no joint of this robot has limits")
+    left_out = tuple(words for words in robot.left_out if not _OF_LIMITS.match(words))
+    told = "limits of speed and of effort; those of positions are stops, [forces] pushes back there"
+    return replace(robot, stopped=True, left_out=(told, *left_out))
 
 
 def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:

@@ -6,6 +6,7 @@ asks, scene_text.py makes it fit for a scene and writes that.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -36,7 +37,8 @@ class Motion:
     """A coordinate of a joint, in `unit` "rad" or "m"; where it `mimics` another, it is none.
 
     damping: N m s/rad or N s/m; friction: N m or N; armature: kg m^2 or kg; stiffness (N m/rad or
-    N/m) and rest: of the joint's own spring. note: its limits.
+    N/m) and rest: of the joint's own spring. note: its limits, in words. limits: where it ends.
+    effort: the most that drives it, N m or N; 0 where nobody says.
     """
 
     name: str
@@ -49,6 +51,8 @@ class Motion:
     stiffness: float = 0.0
     rest: float = 0.0
     mimics: Mimic | None = None
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    effort: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -118,7 +122,10 @@ class Coupling:
 
 @dataclass(frozen=True)
 class Robot:
-    """A tree of bodies, parents first; gravity in m/s^2; what the file has besides, in words."""
+    """A tree of bodies, parents first; gravity in m/s^2; what the file has besides, in words.
+
+    stopped: whether limits of joints are stops.
+    """
 
     name: str
     title: str
@@ -127,6 +134,7 @@ class Robot:
     drives: tuple[Drive, ...] = ()
     loops: tuple[RobotLoop, ...] = ()
     couplings: tuple[Coupling, ...] = ()
+    stopped: bool = False
     left_out: tuple[str, ...] = ()
 
     @property

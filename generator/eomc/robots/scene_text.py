@@ -24,6 +24,7 @@ from eomc.robots.robot import (
     without_dust,
 )
 from eomc.robots.rotations import SNAP, Vector, turns_of
+from eomc.robots.stops import DAMPING, DEPTHS, Stop, stops
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import CLOSINGS, JOINTS
 
@@ -90,7 +91,7 @@ def _named(robot: Robot) -> Robot:
 
     A coordinate takes its velocity's name too, a body those of its centre of mass.
     """
-    taken: set[str] = set()
+    taken = {name for unit in DEPTHS for name in _stop_names(unit)} if robot.stopped else set()
 
     def fit(name: str, *ends: str) -> str:
         plain = names.plain(name)[:_NAME].rstrip("_")
@@ -210,6 +211,15 @@ def scene_text(robot: Robot) -> str:
     ]
     if robot.drives:
         parts.append(_table("[inputs]", {d.name: _input(d, units) for d in robot.drives}))
+    if found := stops(robot) if robot.stopped else []:
+        kinds = [unit for unit in DEPTHS if any(s.unit == unit for s in found)]
+        numbers = {}
+        for unit in kinds:
+            deep, soft = _stop_names(unit)
+            numbers[deep] = _depth(unit)
+            numbers[soft] = f'{{ value = {number(DAMPING[unit])}, unit = "s/{unit}" }}'
+        parts.append(_table("[parameters]", numbers))
+        parts.append(_table("[forces]", {s.coordinate: _stop(s) for s in found}))
     bodies = sorted(robot.bodies, key=lambda body: body.point)
     parts += [_table(f"[[{'point' if b.point else 'body'}]]", _entry(b, robot)) for b in bodies]
     for motion in robot.motions:
@@ -255,6 +265,26 @@ def _shortest(x: float) -> str:
 
 def _length(x: float, of: str) -> str:
     return angle(x) if of == "rad" else number(x)
+
+
+def _stop_names(unit: str) -> tuple[str, str]:
+    """Parameters of stops of this unit: depth and damping."""
+    kind = "slide" if unit == "m" else "turn"
+    return f"stop_depth_{kind}", f"stop_damping_{kind}"
+
+
+def _depth(unit: str) -> str:
+    note = "how deep a joint's effort pushes it into its stop"
+    return f"{{ value = {number(DEPTHS[unit])}, unit = {toml(unit)}, note = {toml(note)} }}"
+
+
+def _stop(s: Stop) -> str:
+    """The force of a stop, as `stops` has it."""
+    deep, soft = _stop_names(s.unit)
+    q, (low, high) = s.coordinate, (_length(x, s.unit).strip('"') for x in s.limits)
+    before = f"max(0, {low} - {q})*(1 - {soft}*{q}_dot)"
+    beyond = f"max(0, {q} - {high})*(1 + {soft}*{q}_dot)".replace("- -", "+ ")
+    return toml(f"{number(s.effort)}/{deep}*({before} - {beyond})")
 
 
 def _loop(loop: RobotLoop) -> dict[str, str]:

@@ -235,13 +235,15 @@ class _Reader:
             slide = Motion(f"x_{name}", "m", damping=damping, friction=friction)
             return slide, replace(slide, name=f"y_{name}"), Motion(f"turn_{name}", "rad")
         start, note = 0.0, "turns without end" if kind == "continuous" else ""
+        ends, effort = Motion.limits, 0.0
         limit = joint.first("limit")
         if limit is not None and kind != "continuous":
             lower, upper = (self._number(limit, end, key) for end in ("lower", "upper"))
+            effort = self._number(limit, "effort", key)
             if lower or upper:
-                note = f"{lower:g} to {upper:g}"
+                note, ends = f"{lower:g} to {upper:g}", (lower, upper)
                 start = min(max(0.0, lower), upper) if lower <= upper else 0.0
-        return (Motion(name, of, start, note, damping, friction),)
+        return (Motion(name, of, start, note, damping, friction, limits=ends, effort=effort),)
 
     def _coupled(self, joints: list[_Joint], elements: Mapping[str, Tag]) -> list[_Joint]:
         """The joints, those with <mimic> moved by the coordinate that it leads to."""

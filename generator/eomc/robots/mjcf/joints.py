@@ -71,7 +71,7 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
         own |= {"stiffness": 0.0, "damping": 0.0}
     if a.number("springyield"):
         report.leave("yield of the springs of joints", name)
-    note = _limits(a, kind, settings, name)
+    note, ends, effort = _limits(a, kind, settings, name)
     anchor = plus(placed.pose.place, apply(placed.pose.turn, a.vector("pos") or ORIGIN))
     if kind == "free":
         align = a.get("align", "auto")
@@ -98,6 +98,8 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
         rest=value("springref") if own["stiffness"] else 0.0,
         note=note,
         mimics=None,
+        limits=ends,
+        effort=effort,
         **own,
     )
     if turns:
@@ -135,9 +137,11 @@ def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
     return joint._replace(motions=motions, armature=own["armature"])
 
 
-def _limits(a: Given, kind: str, settings: Settings, name: str) -> str:
-    """The limits of a joint in words, for its note; reported as left out."""
-    notes = []
+def _limits(
+    a: Given, kind: str, settings: Settings, name: str
+) -> tuple[str, tuple[float, float], float]:
+    """The limits of a joint in words, for its note, its ends and effort; reported as left out."""
+    notes, ends, effort = [], Motion.limits, 0.0
     limits = a.numbers("range", 2)
     if limits and kind != "free" and limited(a, "limited", settings):
         a.report.leave("limits of joints, kept as notes", name)
@@ -147,12 +151,14 @@ def _limits(a: Given, kind: str, settings: Settings, name: str) -> str:
             notes.append(f"turns by {high:.6g} rad at most")
         else:
             notes.append(f"from {low:.6g} to {high:.6g} {of}")
+            ends = (low, high)
     force = a.numbers("actuatorfrcrange", 2)
     if force and kind in {"hinge", "slide"} and limited(a, "actuatorfrclimited", settings):
         a.report.leave("limits of the actuators' force on joints, kept as notes", name)
         newton = "N m" if kind == "hinge" else "N"
         notes.append(f"driven with {force[0]:.6g} to {force[1]:.6g} {newton}")
-    return joined(*notes)
+        effort = max(map(abs, force))
+    return joined(*notes), ends, effort
 
 
 def limited(a: Given, key: str, settings: Settings) -> bool:

@@ -1,0 +1,50 @@
+"""Limits of joints as stops: springs that push back beyond them, and give less than they took.
+
+The force beyond a limit is that of Hunt and Crossley (1975), k x (1 + d v): x is how far the joint
+is beyond it, v how fast it goes on. k is the joint's effort over `depth`, so that a joint driven as
+hard as it may be rests that far in its stop. Where the file tells no effort, what holds all that
+the joint carries, stretched out against gravity, stands for it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from eomc.robots.robot import Robot
+
+DEPTHS = {"rad": 0.01, "m": 0.001}  # by a coordinate's unit
+DAMPING = {"rad": 1.0, "m": 10.0}  # s/rad, s/m
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The stop of a coordinate: its limits, and the force `effort` that pushes it in by depth."""
+
+    coordinate: str
+    unit: str
+    limits: tuple[float, float]
+    effort: float
+
+
+def stops(robot: Robot) -> list[Stop]:
+    """Of all coordinates that have limits."""
+    carried: dict[str, tuple[float, float]] = {}  # by a body: mass, and moment at most
+    held: dict[str, float] = {}  # by a coordinate: what holds that against gravity
+    g = math.hypot(*robot.gravity)
+    for body in reversed(robot.bodies):  # children come before parents
+        mass, moment = carried.get(body.name, (0.0, 0.0))
+        mass, moment = mass + body.mass, moment + body.mass * math.hypot(*body.center)
+        held |= {m.name: g * (moment if m.unit == "rad" else mass) for m in body.motions}
+        more = mass, moment + mass * math.hypot(*body.offset)
+        one, other = carried.get(body.parent, (0.0, 0.0)), more
+        carried[body.parent] = one[0] + other[0], one[1] + other[1]
+    return [
+        Stop(m.name, m.unit, m.limits, _effort(m.effort, held[m.name]))
+        for m in robot.motions
+        if m.limits[0] < m.limits[1] and all(map(math.isfinite, m.limits))
+    ]
+
+
+def _effort(told: float, held: float) -> float:
+    return told if 0 < told < math.inf else float(f"{held:.3g}") or 1.0

@@ -1,0 +1,78 @@
+"""Limits of joints in robot files as stops: their force, and what they give back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import eomc
+from eomc.cli.main import main
+
+# a slide that reaches from -0.4 to 0.5 m, driven with 80 N at most, and a hinge without limits
+URDF = """<robot name="pusher"><link name="rail"/>
+<link name="cart"><inertial><mass value="2"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="arm"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/><axis xyz="1 0 0"/>
+<limit lower="-0.4" upper="0.5" effort="80" velocity="1"/></joint>
+<joint name="turn" type="continuous"><parent link="cart"/><child link="arm"/><axis xyz="1 0 0"/>
+</joint></robot>"""
+MJCF = """<mujoco model="swing"><compiler angle="radian"/><option gravity="0 0 -10"/><worldbody>
+<body name="bob"><joint name="q" axis="0 1 0" range="-0.5 0.7" limited="true"/>
+<geom size="0.1" pos="0 0 -1" mass="3"/></body></worldbody></mujoco>"""
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
+def imported(folder: Path, text: str, *words: str) -> tuple[str, str]:
+    """What the command says, and the scene."""
+    file, scene = folder / "robot.xml", folder / "robot.toml"
+    file.write_text(text, encoding="utf-8")
+    done = CliRunner().invoke(main, ["import", str(file), "--out", str(scene), *words])
+    assert done.exit_code == (0 if scene.exists() else 2), done.output
+    return done.output, scene.read_text(encoding="utf-8") if scene.exists() else ""
+
+
+def test_a_joint_rests_in_its_stop_by_its_depth_where_it_is_driven_whole(tmp_path: Path) -> None:
+    said, scene = imported(tmp_path, URDF, "--stops")
+    assert "those of positions are stops" in said and "values are in the notes" not in said
+    assert "turn " not in scene.split("\n[forces]\n")[1].split("[[body]]")[0]
+    m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
+    depth = m.defaults["stop_depth_slide"]
+    for at, force in ((0.5 + depth, 80.0), (-0.4 - depth, -80.0), (0.2, 0.0)):
+        a = m.acceleration([at, 0.0], [0.0, 0.0], u={"slide_force": force, "turn_torque": 0})
+        np.testing.assert_allclose(a, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_stop_gives_back_less_the_harder_it_is_hit(side: int, tmp_path: Path) -> None:
+    """Hunt and Crossley: 1 - 2/3 d v of the speed v, to the first order, whatever mass and k."""
+    imported(tmp_path, URDF, "--stops")
+    m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
+    for v, d in ((0.1, 0.1), (0.1, 0.3), (0.02, 1.0)):
+        run = m.simulate(
+            q0=[0, 0], qd0=[side * v, 0], params={"stop_damping_slide": d}, h=1e-4,
+            duration=0.6 / v,
+        )  # fmt: skip
+        back = -side * run.qd[-1, 0] / v
+        assert back == pytest.approx(1 - 2 / 3 * d * v, abs=(d * v) ** 2)
+
+
+def test_without_an_effort_the_weight_stands_for_it(tmp_path: Path) -> None:
+    """Of 3 kg at 10 m/s^2, stretched out by 1 m: a bob at v goes in by v sqrt(I/k)."""
+    _, scene = imported(tmp_path, MJCF, "--stops")
+    assert 'q = "30/stop_depth_turn*(max(0, -0.5 - q)' in scene and "max(0, q - 0.7)" in scene
+    m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
+    run = m.simulate(q0=[0.6], qd0=[3.0], h=1e-4, duration=3.0)
+    assert run.status == "ok" and run.q.min() < -0.5
+    inertia = float(np.squeeze(m.D([0.0])))
+    assert 0.7 < run.q.max() < 0.7 + 3 * np.sqrt(inertia * 0.01 / 30)
+
+
+def test_stops_need_limits(tmp_path: Path) -> None:
+    said, scene = imported(tmp_path, MJCF.replace('limited="true"', 'limited="false"'), "--stops")
+    assert "no joint of this robot has limits" in said and not scene
