@@ -31,7 +31,7 @@ NEAR = 1e-6  # of how far things go: the start beside the equilibrium, linear fo
 LINEAR = 0.01  # the same: as far as a run may go from there
 SEARCH = 40  # for an equilibrium
 PLAIN = 1 / 7  # by which plain sweeps contract: they get there in fewer than twenty
-MOST = 12  # sweeps of a step by the reference: more say that the motion is not linear
+MOST = 8  # sweeps of a step by the reference: more say that the motion is not linear
 EXTRA = 8.0  # sweeps a step: what the module may need more, to see that plain ones do not contract
 OFF = 1e4  # roundings of the end, magnified as the fastest mode does
 
