@@ -391,5 +391,6 @@ class Runs:
             )
             if not (one.status or other.status):
                 size = np.abs([s.q, s.qd]) + np.array([T * (np.abs(s.qd) + gain), gain])
+                size = size + e.size.get("place", 0.0)  # onto which each step is put
                 found.append(self.check.units(one.rows[:, -1], other.rows[:, -1], size))
         return float(median(found)) if found else 0.0

@@ -320,6 +320,8 @@ class Sampler:
             """Of each row what x makes, were its largest part along that row."""
             return np.asarray(A @ np.abs(x) + np.max(np.abs(x) / scale[:n]) / scale[n:])
 
+        # an entry may be a sum that cancels, of terms that others of its row have whole
+        size["constraint_jacobian"] = A + np.outer(1 / scale[n:], 1 / scale[:n])
         size["constraints"] = size["constraints"] + whole(s.q)
         size["constraint_rates"] = size["constraint_rates"] + whole(s.qd)
         motion = size["motion"] + np.abs(value["multipliers"]) @ A
