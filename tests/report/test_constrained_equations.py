@@ -8,6 +8,7 @@ import pytest
 import sympy
 
 import eomc
+from eomc import pipeline
 from eomc.model.symbols import symbol
 from eomc.report import equations, reference_solution
 
@@ -48,6 +49,23 @@ def test_equations_have_the_force_of_the_constraint_and_the_constraint(winch: Pa
     exec(equations.written(found.system, "python"), namespace)  # our own text
     assert namespace["scalar"][0] == found.scalar[0]  # type: ignore[index]
     assert r"\lambda_{\mathrm{rod}} x" in equations.written(found.system, "latex")
+
+
+def test_multipliers_are_shown_by_their_rows_names(winch: Path) -> None:
+    """Letters such as y have no subscript, others have: neither is made one."""
+    text = winch.read_text(encoding="utf-8").replace("rod =", "pin_x =")
+    text = text.replace("start = 0.3", "guess = true, start = 0.3")
+    winch.write_text(text + 'pin_y = "y - x/2"\n', encoding="utf-8")
+    found = str(eomc.equations(winch))
+    assert "λ_pin_x⋅x" in found and "λ_pin_y" in found and "λₚ" not in found
+
+
+def test_what_is_generated_says_that_constraints_have_forces(winch: Path) -> None:
+    files = pipeline.sources(eomc.read(winch)).files
+    made = [t for t in files.values() if "D(q) qdd + C(q, qd) qd + g(q) = tau" in t]
+    assert len(made) > 2
+    assert all("g(q) = tau + A^T lambda" in text for text in made)
+    assert "qdd from D qdd + C qd + g = tau + A^T lambda." in files["winch.h"]
 
 
 @pytest.mark.slow

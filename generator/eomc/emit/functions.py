@@ -330,7 +330,10 @@ class Functions:
     def acceleration(self) -> Computed:
         """qdd, with a status."""
         function = self.target.program["acceleration"]
-        doc = ["qdd from D qdd + C qd + g = tau. Where the status is not OK, qdd is untouched."]
+        force = "tau + A^T lambda" if self.target.system.constraints else "tau"
+        doc = [
+            f"qdd from D qdd + C qd + g = {force}. Where the status is not OK, qdd is untouched."
+        ]
         if self.target.system.inputs:
             doc.append("u: the inputs; NULL for the scene's signals.")
         values, parts = "", tuple[CFunction, ...]()

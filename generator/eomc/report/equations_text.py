@@ -242,8 +242,9 @@ def python(found: Equations) -> str:
     ]
     names = ", ".join(s.name for s in symbols)
     title = texts.docstring(_title(system))
+    force = "tau + A^T lambda" if system.constraints else "tau"
     lines = [
-        f'"""{title}: D qdd + C qd + g = tau, as SymPy matrices."""',
+        f'"""{title}: D qdd + C qd + g = {force}, as SymPy matrices."""',
         "",
         "from sympy import *",
         "",

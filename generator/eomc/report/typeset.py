@@ -19,7 +19,7 @@ from sympy.printing.pretty.pretty_symbology import pretty_symbol, pretty_use_uni
 from sympy.printing.pretty.stringpict import prettyForm, stringPict
 from sympy.printing.str import StrPrinter
 
-from eomc.model.system import System, t
+from eomc.model.system import System, symbol, t
 from eomc.runtime.labels import tex
 
 WIDE = 96  # columns of text, and of what LaTeX sets in a line
@@ -39,9 +39,12 @@ class Typesetter:
         for group, symbols in enumerate((parameters, [], [], system.q, system.qd, system.qdd)):
             self._rank |= {s: (group, i) for i, s in enumerate(symbols)}
         self._rates = (*system.qdd, *system.qd)
-        self._text = _Text({s: Symbol(_dotted(name, n)) for s, (name, n) in dotted.items()})
+        # rows keep their names: some letters have subscripts, others none
+        names = {symbol(f"lambda_{c.name}"): f"λ_{c.name}" for c in system.constraints}
+        shown = {s: Symbol(_dotted(name, n)) for s, (name, n) in dotted.items()}
+        self._text = _Text(shown, names)
         self._blocks: dict[Expr, prettyForm] = {}
-        self._line = _Line({s: Symbol(_dotted(name, n)) for s, (name, n) in dotted.items()})
+        self._line = _Line(shown, names)
         every = (*(c.name for c in system.coordinates), *map(str, (*system.u, *parameters)))
         words = any(tex(name).startswith(r"\mathrm") for name in every)
         self._latex = _Latex({s: tex(name, n) for s, (name, n) in dotted.items()}, words)
@@ -212,11 +215,13 @@ def _dotted(name: str, dots: int) -> str:
 class _Text(PrettyPrinter):  # type: ignore[misc]
     """Blocks of Unicode."""
 
-    def __init__(self, names: dict[Symbol, Symbol]) -> None:
+    def __init__(self, names: dict[Symbol, Symbol], plain: dict[Symbol, str]) -> None:
         super().__init__({"use_unicode": True, "wrap_line": False, "order": "none"})
-        self._names = names
+        self._names, self._plain = names, plain
 
     def _print_Symbol(self, e: Symbol, bold_name: bool = False) -> prettyForm:
+        if e in self._plain:
+            return prettyForm(self._plain[e])
         return super()._print_Symbol(self._names.get(e, e))
 
     def _print_dot(self, e: Expr) -> prettyForm:
@@ -227,12 +232,12 @@ class _Text(PrettyPrinter):  # type: ignore[misc]
 class _Line(StrPrinter):  # type: ignore[misc]
     """One line of text: √(x + y), x^2."""
 
-    def __init__(self, names: dict[Symbol, Symbol]) -> None:
+    def __init__(self, names: dict[Symbol, Symbol], plain: dict[Symbol, str]) -> None:
         super().__init__({"order": "none"})
-        self._names = names
+        self._names, self._plain = names, plain
 
     def _print_Symbol(self, e: Symbol) -> str:
-        return str(pretty_symbol(self._names.get(e, e).name))
+        return self._plain.get(e) or str(pretty_symbol(self._names.get(e, e).name))
 
     def _print_dot(self, e: Expr) -> str:
         return f"d/dt ({self._print(e.args[0])})"
