@@ -17,6 +17,7 @@ from conftest import ROOT, needs, tiers
 import eomc
 from eomc.base.errors import EomcError
 from eomc.emit import c_expression
+from eomc.model.corners import corners
 from eomc.model.system import System
 from eomc.report import reference_solution
 
@@ -157,7 +158,7 @@ def test_a_jump_costs_digits(tmp_path: Path) -> None:
     rubbed = System.make("rubbed", {x: (1.0, 0.0)}, v**2 / 2, 9 * x**2 / 2,
                          forces={x: -sympy.sign(v) / 2}, duration=2.0)  # fmt: skip
     made = reference_solution.of(rubbed, rows=8, root=tmp_path)
-    assert reference_solution.corners(rubbed) == "sign"
+    assert corners(rubbed) == "sign"
     assert made.digits[-1] < 20
     # half a swing about x = 1/18 until pi/3, then about -1/18
     turned = -1 + 2 / 18

@@ -37,6 +37,7 @@ from eomc.emit.functions import Functions
 from eomc.emit.plain import steppers as plain
 from eomc.emit.render import show
 from eomc.emit.views import Quad
+from eomc.model.corners import corners
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
@@ -304,19 +305,6 @@ def _plainly(system: System, rows: Text, spacing: float) -> tuple[float, float, 
             for i in range(2 * n):
                 motion = min(motion, _digits(x[i] - found[k][i], sizes[i]))
         return digits, motion if until else 0.0, until
-
-
-def corners(system: System) -> str:
-    """The functions in the scene that jump or bend, by name; "" where all is smooth."""
-    exprs = (
-        *(system.kinetic, system.potential, system.dissipation, *system.forces),
-        *(force for _, force in system.applied),
-        *(e for _, e in system.definitions),
-        *(i.signal for i in system.inputs),
-    )
-    kinds = (sympy.sign, sympy.Heaviside, sympy.Abs, sympy.Min, sympy.Max)
-    found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
-    return ", ".join(sorted(found))
 
 
 def _digits(off: Any, size: float) -> float:

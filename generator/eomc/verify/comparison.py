@@ -10,9 +10,9 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-import sympy
 
 from eomc.integrators.tableaux import METHODS
+from eomc.model.corners import corners
 from eomc.model.system import System
 from eomc.verify import one_step
 from eomc.verify.advice import PARTS, Advice
@@ -155,15 +155,7 @@ class Comparison:
     @cached_property
     def corners(self) -> str:
         """The functions in the scene that jump or bend."""
-        s = self.system
-        exprs = (
-            *(s.kinetic, s.potential, s.dissipation, *s.forces, *(e for x in s.applied for e in x)),
-            *(e for _, e in s.definitions),
-            *(i.signal for i in s.inputs),
-        )
-        kinds = (sympy.sign, sympy.Heaviside, sympy.Abs, sympy.Min, sympy.Max)
-        found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
-        return ", ".join(sorted(found))
+        return corners(self.system)
 
     def largest(self, of: Callable[[Expected], float]) -> float:
         """The largest error over all states; nan wins."""
