@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 
 from eomc.emit import c_function as c
@@ -14,12 +15,15 @@ from eomc.emit.plain.adaptive_views import (
     Adaptive,
     AdaptiveRun,
 )
-from eomc.integrators.tableaux import GAUSS16
+from eomc.integrators.tableaux import GAUSS16, Row
+from eomc.model.corners import corners
+from eomc.model.system import System
 
 METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
 LOOSEST = 1e-2  # tolerance
+SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 BUSY = 32  # events in one step, from which on it ends there
 
 
@@ -28,9 +32,11 @@ def memory(functions: Functions) -> str:
     return f"{functions.prefix}_{METHOD.name}_adaptive_memory"
 
 
-def kept(coordinates: int, width: int, events: int) -> int:
+def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
-    return 6 * width + METHOD.stages * coordinates + 16 + 2 * events
+    vectors, few = (8, 20) if corners(system) else (6, 16)
+    stages = METHOD.stages * len(system.coordinates)
+    return vectors * width + stages + few + 2 * len(system.events)
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,13 @@ class Stepping:
         return CFunction(f"{self.method}_settled", "int", (out, *given, *told), qualifier="static")
 
     @cached_property
+    def forces(self) -> CFunction:
+        """The accelerations at a state, where forces have corners."""
+        out = c.filled(self.functions.real, "f")
+        given = (a for a in self.form.around if a.name != "h")
+        return CFunction(f"{self.method}_forces", "int", (out, *given), qualifier="static")
+
+    @cached_property
     def step(self) -> CFunction:
         """The next step."""
         given = (self.number("t_end"), self.number("tol"), *self.rest)
@@ -152,6 +165,13 @@ def steps(made: Stepping) -> Adaptive:
         start=form.start,
         settled=made.settle.call(most=f"{target.literal(2 * 0.8**-8)}*aim", **known),
         within=made.within,
+        corners=bool(corners(target.system)),
+        close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
+        share=target.literal(SHARE),
+        top=c.in_braces(numbers(m.legendre(n), real) for n in range(m.stages - 4, m.stages)),
+        ends=c.in_braces(numbers(row, real) for row in _ends()),
+        forces=made.forces,
+        forces_there=made.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
         settled_within=made.settle.call(most=target.literal(1e30), **known),
     )
 
@@ -193,6 +213,14 @@ def run(made: Stepping, happen: str = "", restart: str = "") -> AdaptiveRun:
         project_row=projected(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]"),
         project_restart=projected(q="x.q", qd="x.qd", t="x.t"),
     )
+
+
+def _ends() -> tuple[Row, Row]:
+    """To the values at both ends of a step of the polynomial through those at its stages."""
+    parts = [METHOD.legendre(n) for n in range(METHOD.stages)]
+    columns = list(zip(*parts, strict=True))
+    start = tuple(sum(column[::2], Fraction(0)) - sum(column[1::2]) for column in columns)
+    return start, tuple(sum(column, Fraction(0)) for column in columns)
 
 
 def _total(terms: list[str]) -> str:

@@ -42,7 +42,7 @@ def steppers(target: Target) -> Steppers:
 def rooms(made: Steppers) -> list[int]:
     """The numbers that each method's memory keeps, and behind that of adaptive steps."""
     system = made.one.target.system
-    room = adaptive.kept(len(system.coordinates), made.one.width, len(system.events))
+    room = adaptive.kept(system, made.one.width)
     return [*(runs.kept(made, m) for m in made.methods), room]
 
 

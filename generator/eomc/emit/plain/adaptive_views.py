@@ -17,6 +17,9 @@ class Adaptive:
     before: from accelerations at the stages, one a row, to their polynomial's powers, and to its
     parts in the last two of Legendre's. most: sweeps of a step. lanes: before loops over stages.
     project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
+    corners: whether forces jump or bend; share: of the tolerance, for a step in which they do;
+    top, ends: from accelerations at the stages to the parts in the last four of Legendre's, and to
+    the ends of the polynomial through them; forces: the accelerations at a state.
     """
 
     TEMPLATE: ClassVar[str] = "c/adaptive.c"
@@ -52,6 +55,13 @@ class Adaptive:
     settled: str
     within: CFunction
     settled_within: str
+    corners: bool
+    close: str
+    share: str
+    top: tuple[str, ...]
+    ends: tuple[str, ...]
+    forces: CFunction
+    forces_there: str
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ def header(
         ),
         adaptive=AdaptiveDeclared(
             adaptive.TITLE, adaptive.memory(plain),
-            rooms[-1] or adaptive.kept(len(s.coordinates), len(s.coordinates), len(s.events)),
+            rooms[-1] or adaptive.kept(s, len(s.coordinates)),
             plain.public.adaptive(adaptive.METHOD.name),
         ) if s.run.tolerance else None,
         busy=adaptive.BUSY,

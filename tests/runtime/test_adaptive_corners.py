@@ -1,0 +1,103 @@
+"""Adaptive steps where forces jump or bend: the end errs by about the tolerance there too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from compilers import STRICT, compiled
+from conftest import Modules, needs, tiers
+from corner_cases import BOUNCING, CASES, PENDULUM, RUBBED, rubbed
+
+import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+
+TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
+STUCK = RUBBED.replace("0.3*sign(x_dot)", "3*sign(x_dot)").replace("rubbed", "stuck")
+SLIDING = RUBBED.replace("0.3*sign(x_dot)", "30*sign(x_dot + x)").replace("rubbed", "sliding")
+
+
+@pytest.fixture(scope="module")
+def bouncing(modules: Modules) -> ModuleType:
+    """A body on a stiff spring that pushes only."""
+    text = BOUNCING.replace("bouncing_spring", "many_springs")
+    return modules.unoptimised(text.replace("[run]", "[run]\nbatch = true"))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_end_errs_by_about_the_tolerance(name: str, modules: Modules) -> None:
+    case = CASES[name]
+    module = modules.unoptimised(case.text)
+    q0, _ = module.start
+    for start in np.random.default_rng(5).uniform(*case.starts, 12):
+        end = case.end(start)
+        for tol in TOLERANCES:
+            run = module.simulate(q0=[start, *q0[1:]], tol=tol)
+            assert run.status == "ok" and abs(run.q[-1, 0] - end) < 10 * tol, (start, tol)
+
+
+def test_small_jumps_count_too(modules: Modules) -> None:
+    """The smooth force is up to 32."""
+    text = RUBBED.replace("[energy]", "[parameters]\nmu = 0.3\n[energy]").replace("0.3*", "mu*")
+    module = modules.unoptimised(text.replace("rubbed", "hardly_rubbed"))
+    for start in np.random.default_rng(3).uniform(0.5, 2.0, 12):
+        for mu in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+            for tol in TOLERANCES:
+                run = module.simulate(q0=[start], tol=tol, params={"mu": mu})
+                assert abs(run.q[-1, 0] - rubbed(start, mu)) < 10 * tol, (start, mu, tol)
+
+
+@pytest.mark.parametrize("name", tiers(CASES, "limits"))
+def test_the_plain_form_does_the_same(name: str, tmp_path: Path) -> None:
+    case = CASES[name]
+    module = eomc.load(from_scene(parse(case.text, "x.toml")), tmp_path, form="plain")
+    for tol in TOLERANCES:
+        run = module.simulate(tol=tol)
+        assert abs(run.q[-1, 0] - case.end(module.start[0][0])) < 10 * tol, tol
+
+
+def test_each_of_many_is_as_it_is_alone(bouncing: ModuleType) -> None:
+    q0 = np.linspace(0.2, 1.0, 9)[:, None]
+    times = [0.0, 1.3, 5.0]
+    run = bouncing.simulate_batch(q0, np.zeros((9, 1)), tol=1e-9, times=times)
+    for k in range(9):
+        alone = bouncing.simulate(q0[k], tol=1e-9, times=times)
+        assert np.array_equal(run.q[k], alone.q) and run.steps[k] == alone.steps
+
+
+def test_a_run_is_the_same_in_pieces(bouncing: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = bouncing.simulate()
+    module = __import__(f"{bouncing.__name__}.adaptive", fromlist=["adaptive"])
+    monkeypatch.setattr(module, "_ROOM", 1)
+    monkeypatch.setattr(module, "_MOST", 3)
+    assert bouncing.simulate() == run
+
+
+def test_single_precision(modules: Modules) -> None:
+    text = PENDULUM.replace("limited", "single").replace("1e-9", '1e-5\nreal = "float"')
+    module, end = modules.unoptimised(text), CASES["limits"].end(1.0)
+    for tol in (1e-3, 1e-4, 1e-5):
+        assert abs(module.simulate(tol=tol).q[-1, 0] - end) < 10 * tol
+
+
+@pytest.mark.parametrize("text", [STUCK, SLIDING], ids=["sticks", "slides"])
+def test_forces_that_keep_jumping_end_the_run_soon(text: str, modules: Modules) -> None:
+    module = modules.unoptimised(text)
+    for tol in (1e-6, 1e-12):
+        with pytest.warns(RuntimeWarning, match="stopped at t = "):
+            run = module.simulate(tol=tol)
+        assert run.status == "no convergence" and run.steps + run.rejected < 50_000
+
+
+def test_it_is_compiled_for_corners_alone(tmp_path: Path) -> None:
+    smooth = PENDULUM.replace("limits", "note").replace("[-1.5, 1.5]", '"free"')
+    for text, there in ((PENDULUM, True), (smooth, False)):
+        files = eomc.sources(from_scene(parse(text, "x.toml")), "_x").files
+        for name in ("limited_pendulum.c", "fast/limited_pendulum.c"):
+            assert ("gauss16_bent" in files[name]) == there
+        for name in ("limited_pendulum.h", "limited_pendulum.c"):
+            (tmp_path / name).write_text(files[name], encoding="utf-8")
+        compiled(needs("gcc"), *STRICT, "-O1", "-c", "limited_pendulum.c", cwd=tmp_path)
