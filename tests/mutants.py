@@ -30,6 +30,7 @@ from instrument import Shipped, in_a_fork
 
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
+from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify import check as checking
 from eomc.verify import comparison
@@ -97,10 +98,11 @@ class Mutant:
 
 
 def variant(name: str) -> System:
-    """A scene, or one of VARIANTS, as a system."""
+    """A scene, or one of VARIANTS, as a system, its start assembled."""
     base, more = VARIANTS.get(name, (name, ""))
     text = (SCENES / f"{base}.toml").read_text(encoding="utf-8")
-    return from_scene(parse(text.replace("[run]\n", "[run]\n" + more), f"{name}.toml"))
+    made = from_scene(parse(text.replace("[run]\n", "[run]\n" + more), f"{name}.toml"))
+    return assembled(made)
 
 
 def mutants(source: str) -> list[Mutant]:

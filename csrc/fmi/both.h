@@ -67,8 +67,14 @@ FMI(Status) FMI(ExitInitializationMode)(FMI_INSTANCE instance)
     const FMI(Status) status = enter(a, unitStarting,
         a->unit.x.exchange ? unitAtEvent : unitStepping, FMI_TEXT(ExitInitializationMode));
 
-    if (status == FMI(OK))
-        (void)unitCrossed(&a->unit.x);
+    if (status == FMI(OK)) {
+        Unit *const x = &a->unit.x;
+        const int found = unitAssemble(x->q, x->qd, (unitReal)x->t, &x->p);
+
+        if (found)
+            return outcome(a, unitFailed(&a->unit, found));
+        (void)unitCrossed(x);
+    }
     return status;
 }
 

@@ -64,6 +64,12 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
                 "different builds");
         return NULL;
     }
+    if (unitConstrained && fmuType == fmi2ModelExchange) {
+        if (functions->logger)
+            functions->logger(functions->componentEnvironment, instanceName, fmi2Error,
+                "logStatusError", "there is no model exchange: constraints hold in co-simulation");
+        return NULL;
+    }
     length = strlen(instanceName) + 1;
     a = calloc(1, sizeof *a);
     if (a)

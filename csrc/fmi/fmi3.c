@@ -42,6 +42,12 @@ static fmi3Instance made(fmi3String token, fmi3Boolean loggingOn,
                 "are of different builds");
         return NULL;
     }
+    if (unitConstrained && exchange) {
+        if (log)
+            log(environment, fmi3Error, "logStatusError",
+                "there is no model exchange: constraints hold in co-simulation");
+        return NULL;
+    }
     a = calloc(1, sizeof *a);
     if (!a) {
         if (log)

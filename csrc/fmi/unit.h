@@ -93,10 +93,12 @@ static UnitResult unitFailed(UnitInstance *a, int status)
         ("the state would no longer be finite: the step may be too long, or the motion runs into "
          "a singularity"),
         "the iteration for the step does not converge: take a smaller step or a looser tolerance",
-        "jumps follow one another ever sooner, without end in finite time"
+        "jumps follow one another ever sooner, without end in finite time",
+        ("no state near obeys the constraints: they contradict one another there, or the step is "
+         "far too long")
     };
 
-    return unitSay(a, unitImpossible, words[status < 1 || status > 4 ? 1 : status - 1]);
+    return unitSay(a, unitImpossible, words[status < 1 || status > 5 ? 1 : status - 1]);
 }
 
 /* The inputs as the scene's functions take them: NULL for its signals. */

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
-from eomc.base.errors import EomcError, SceneError
+from eomc.base.errors import EomcError
 
 if TYPE_CHECKING:
     from eomc.base.errors import Problem
@@ -107,8 +107,6 @@ def unit(
 
     if version not in (2, 3):
         raise EomcError(f"version: FMI 2 or 3, here {version!r}")
-    if system.constraints:  # an importer that integrates would leave them
-        raise SceneError([system.problem("constraints", "have no unit of FMI yet")])
     return render.unit(_program(system, warn), version)
 
 

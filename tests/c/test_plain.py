@@ -23,6 +23,7 @@ from eomc.emit.c_function import CArgument, CFunction
 from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.program import outline
+from eomc.program.assembly import assembled
 from eomc.scene import read as scene
 from eomc.verify import rows_plain
 from eomc.verify.comparison import Comparison
@@ -74,14 +75,14 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 @cache
 def made(name: str) -> System:
-    """A scene of scenes/, or one of WISHES."""
+    """A scene of scenes/, or one of WISHES, its start assembled."""
     source, run = WISHES.get(name, (name, ""))
     own = {"": EVERYTHING, "rod": ROD}
     text = own.get(source) or (SCENES / f"{source}.toml").read_text(encoding="utf-8")
     text = text.replace("[run]\n", "[run]\n" + run)
     if name in WISHES:
         text = re.sub(r"^name *= .*", f'name = "plain_{name}"', text, count=1, flags=re.MULTILINE)
-    return system.from_scene(scene.parse(text, f"{name}.toml"))
+    return assembled(system.from_scene(scene.parse(text, f"{name}.toml")))
 
 
 @cache

@@ -13,7 +13,6 @@ from conftest import EVERYTHING, needs
 from fmus import BALL, FLOAT
 from payloads import RAW, derived, payloads, tokens, with_texts
 
-import eomc
 from eomc import pipeline
 from eomc.base import resources, texts
 from eomc.emit import render
@@ -174,10 +173,13 @@ def test_the_standard_brings_its_licence() -> None:
         assert made(FLOAT, version).files["documentation/licenses/fmi-headers.txt"] == text
 
 
-def test_constraints_are_refused_where_they_stand() -> None:
-    text = FLOAT.replace("[run]", '[constraints]\nnone = "phi - phi**2"\n[run]')
-    with pytest.raises(eomc.SceneError, match=r"constraints.*have no unit of FMI yet"):
-        made(text, 2)
+def test_constraints_are_for_co_simulation_alone() -> None:
+    """An importer that integrates would leave them."""
+    text = FLOAT.replace("[run]", '[constraints]\ndrive = "phi - phi**2/4 - t"\n[run]')
+    text = text.replace("start = 0.5", "start = 0.5, guess = true")
+    for version in (2, 3):
+        described = made(text, version).files["modelDescription.xml"]
+        assert "<ModelExchange" not in described and "<CoSimulation" in described
 
 
 def test_other_versions_are_refused() -> None:

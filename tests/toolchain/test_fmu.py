@@ -81,7 +81,7 @@ def hosts() -> Iterator[list[Host]]:
 
 
 SCENES_TESTED = [
-    "cartpole", "cartpole_driven", "kapitza_pendulum", "cartpole_bodies", BALL, FLOAT,
+    "four_bar", "cartpole", "cartpole_driven", "kapitza_pendulum", "cartpole_bodies", BALL, FLOAT,
 ]  # fmt: skip
 IDS = [s if "\n" not in s else s.split('"')[1] for s in SCENES_TESTED]
 
@@ -93,7 +93,7 @@ def test_it_is_valid(scene: str, version: int) -> None:
     assert validate_fmu(str(exported(scene, version))) == []
 
 
-@pytest.mark.parametrize("scene", ["cartpole", "kapitza_pendulum", "cartpole_bodies"])
+@pytest.mark.parametrize("scene", ["cartpole", "kapitza_pendulum", "cartpole_bodies", "four_bar"])
 def test_whole_steps_have_the_bits_of_the_module(
     scene: str, version: int, hosts: list[Host]
 ) -> None:
@@ -105,6 +105,34 @@ def test_whole_steps_have_the_bits_of_the_module(
     assert np.array_equal(rows(host, names, 3 * run.h, 20), moved(run)[::3])
     (total,) = host.get("energy.total")
     assert total == pytest.approx(run.energy[-1], rel=1e-14, abs=1e-14)
+
+
+def test_a_start_on_constraints_is_assembled(version: int, hosts: list[Host]) -> None:
+    """What the scene holds stays as it is set; guesses move as in a run of the module."""
+    run = plain("four_bar").simulate(q0=[0.9, 0.4, 1.2], qd0=[3.0, 0, 0], steps=30)
+    names = states("four_bar")
+    host = Host(exported("four_bar", version))
+    hosts.append(host)
+    host.set_all(dict(zip(names, (0.9, 0.4, 1.2, 3.0, 0.0, 0.0), strict=True)))
+    host.start()
+    assert np.array_equal(rows(host, names, 3 * run.h, 10), moved(run)[::3])
+
+
+def test_a_start_that_no_linkage_has_is_told(version: int, hosts: list[Host]) -> None:
+    host = Host(exported("four_bar", version))
+    hosts.append(host)
+    host.set(c=0.01)
+    with pytest.raises(Exception, match="ExitInitializationMode"):
+        host.start()
+    assert any("no state near obeys the constraints" in text for _, text in host.said)
+
+
+def test_there_is_no_model_exchange_under_constraints(version: int) -> None:
+    """An importer that integrates would leave them; it isn't offered, and refused in words."""
+    from fmpy import read_model_description
+
+    described = read_model_description(str(exported("four_bar", version)))
+    assert described.modelExchange is None and described.coSimulation is not None
 
 
 def test_other_communication_steps_end_in_a_shorter_one(version: int, hosts: list[Host]) -> None:

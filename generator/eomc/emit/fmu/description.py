@@ -37,6 +37,7 @@ def view(
         "token": token,
         "tool": f"eomc {__version__}",
         "about": _free(about),
+        "exchange": not s.constraints,
         "derivatives": "true" if s.run.sloped else "false",
         "experiment": _free(experiment),
         "units": _units(known),

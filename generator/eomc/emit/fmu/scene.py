@@ -19,7 +19,7 @@ def view(target: Target, token: str) -> SceneCalls:
     """The view of a scene. token: what modelDescription.xml says too."""
     s, public = target.system, Public(target)
     by_tolerance = s.run.tolerance is not None
-    method = s.run.methods[0]
+    method, rows = s.run.methods[0], s.coordinates if s.constraints else ()
     asked = {name: _called(target, name) for name in (*ENERGIES, "outputs", "events", "jumps")}
     kept = adaptive.METHOD.name + "_adaptive" if by_tolerance else method
     return SceneCalls(
@@ -46,6 +46,8 @@ def view(target: Target, token: str) -> SceneCalls:
         energies=tuple(asked[name] for name in ENERGIES),
         values=asked["events"],
         jumps=asked["jumps"],
+        project=public.project.call() if s.constraints else "",
+        held=tuple(int(x) for x in (*(c.held for c in rows), *(c.held_rate for c in rows))),
         run="" if by_tolerance else public.run(method).call(
             h="(unitReal)unitStep", u_stride="0", every="0", q_rows="NULL", qd_rows="NULL",
             status="&status",

@@ -23,8 +23,9 @@ class SceneEvent:
 class SceneCalls:
     """fmu/scene.h.jinja. inputs: their starts; from acceleration on calls, "" for none.
 
-    run, step: of steps of fixed size; adaptive: of those that fit a tolerance, one or the other.
-    solved: whether outputs read accelerations. feedback: whether signals answer the state.
+    project: onto constraints; held: whether each of q and qd stays there as it is. run, step: of
+    steps of fixed size; adaptive: of those that fit a tolerance, one or the other. solved: whether
+    outputs read accelerations. feedback: whether signals answer the state.
     """
 
     TEMPLATE: ClassVar[str] = "fmu/scene.h"
@@ -49,6 +50,8 @@ class SceneCalls:
     energies: tuple[str, ...]
     values: str
     jumps: str
+    project: str
+    held: tuple[int, ...]
     run: str
     step: str
     adaptive: str
@@ -78,12 +81,16 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Description:
-    """What both versions' descriptions of a model ask for, but for the events."""
+    """What both versions' descriptions of a model ask for, but for the events.
+
+    exchange: whether importers may integrate it.
+    """
 
     prefix: str
     token: str
     tool: str
     about: Attributes
+    exchange: bool
     derivatives: str
     experiment: Attributes
     units: tuple[Described, ...]
