@@ -11,6 +11,7 @@ from report.pictures import OWN, SCENES, chain, humanoid, motion, scene, system
 from eomc.model.from_scene import from_scene
 from eomc.model.kinematics import Kinematics
 from eomc.model.system import System, symbol
+from eomc.program.assembly import assembled
 from eomc.report.drawing import drawing
 from eomc.scene.read import parse
 
@@ -78,6 +79,32 @@ def test_a_body_without_more_has_no_rod():
     (arm,) = marks(found, "arm")
     assert np.allclose(np.linalg.norm(arm[:, 0] - arm[:, 1], axis=1), 1.0)  # l/2
     assert not marks(found, "rod")
+
+
+def closed(joint):
+    """The drawing of the assembled four-bar without its picture, closed by another joint."""
+    text = (SCENES / "four_bar.toml").read_text()
+    text = text[: text.index("[picture]")] + text[text.index("[run]") :]
+    made = assembled(from_scene(parse(text.replace('joint  = "revolute"', joint))))
+    return drawing(made, np.zeros(1), np.array([[c.start for c in made.coordinates]]))
+
+
+def test_a_loop_is_drawn_as_a_joint_that_its_bodies_reach():
+    found = closed('joint  = "revolute"')
+    pins, rods = marks(found, "joint"), marks(found, "rod")
+    assert len(pins) == 4 and len(rods) == 3  # the crank to the coupler, two to the pin
+    ends = [rod[:, 1] for rod in rods[1:]]
+    assert np.allclose(ends[0], ends[1], atol=1e-12) and len(marks(found, "ground")) == 2
+    assert any(np.array_equal(pin[:, 0], ends[0]) for pin in pins)
+
+
+def test_loops_that_slide_have_rails_and_distances_rods():
+    found = closed('joint = "point-on-line"\naxis = [1, 0]')
+    (slide,) = marks(found, "slide")
+    assert any(np.allclose(rod[:, 1], slide[:, 0]) for rod in marks(found, "rod"))
+    rods = marks(closed('joint = "distance"\nlength = 0.2'), "rod")
+    lengths = [np.linalg.norm(rod[:, 1] - rod[:, 0], axis=1) for rod in rods]
+    assert len(rods) == 4 and any(np.allclose(x, 0.2, atol=1e-9) for x in lengths)
 
 
 def test_a_rail_is_as_long_as_the_travel():

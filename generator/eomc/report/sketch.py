@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from eomc.base import spatial
 from eomc.report.marks import Drawing, Marks
 from eomc.scene import formulas
-from eomc.scene.assembly import WORLD, Assembly, Between, Body, Turn
+from eomc.scene.assembly import WORLD, Assembly, Between, Body, Loop, Turn
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
 from eomc.scene.picture import Picture, Shape
@@ -152,6 +152,9 @@ class _Sketch:
                 self._join(body)
         for body in assembly.bodies:
             self._mass(body, assembly.plane)
+        for loop in assembly.loops:
+            if loop.bodies:
+                self._close(loop)
         laid: list[tuple[int, ...]] = []
         for kind, some in (("spring", assembly.springs), ("damper", assembly.dampers)):
             for end in some:
@@ -179,6 +182,25 @@ class _Sketch:
             marks.add("joint", at)
         if body.point:
             marks.add("point", marks.point(self.poses[body.name][0]))
+
+    def _close(self, loop: Loop) -> None:
+        """The joint of a loop, and what holds it to the frames of its bodies."""
+        marks, ends = self.marks, list[Array]()
+        for k, name in enumerate(loop.bodies):
+            at, R = self.poses[name]
+            ends.append(at + _turned(R, self._vector(loop.points[k])) if loop.points else at)
+            marks.add("ground" if name == WORLD else "rod", *self._hold(name, marks.point(ends[k])))
+        first, second = map(marks.point, ends)
+        if loop.joint == "distance":
+            marks.add("rod", first, second)
+        if loop.joint in ("prismatic", "cylindrical", "point-on-line"):
+            unit = _turned(self.poses[loop.bodies[0]][1], np.tile(loop.axes[0], (self.n, 1)))
+            way = np.sum((ends[1] - ends[0]) * unit, axis=1)
+            marks.add("rail", *(marks.point(ends[0] + x * unit) for x in (way.min(), way.max())))
+            marks.add("slide", second)
+        elif loop.joint != "weld":
+            for end in (first, second) if loop.joint == "distance" else (first,):
+                marks.add("joint", end)
 
     def _mass(self, body: Body, plane: bool) -> None:
         """The centre of mass, and how the body is turned where no line of it shows that."""
