@@ -311,6 +311,17 @@ def test_what_has_moved_is_told() -> None:
     assert "q2 = 0.59085 (guess 0.7), q3 = 1.21122 (guess 1.6)" in str(note)
 
 
+def test_what_has_moved_by_a_rounding_is_not_told() -> None:
+    """At a right angle, which no double is, the second rate is 6e-17 times the first."""
+    rows = 'guide = "y - sin(x)"\ngear = "z - 2*x"'
+    x = f"x = {{ start = {np.pi / 2!r}, rate = 3.0 }}"
+    made = assembled(scene(f"{x}\ny = {{ start = 1.0 }}\nz = {{ start = {np.pi!r} }}", rows))
+    assert 0 < made.coordinates[1].rate < 1e-15
+    assert made.closure is not None and [m.name for m in made.closure.rate_moves] == ["z_dot"]
+    small = assembled(scene("x = { rate = 3e-9 }\ny = {}", 'guide = "y - 1e-3*x"'))
+    assert [str(w).count("y_dot = 3e-12") for w in small.warnings] == [1]
+
+
 def test_a_row_that_is_said_twice_is_redundant() -> None:
     made = assembled(
         scene(

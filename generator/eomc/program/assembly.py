@@ -24,6 +24,7 @@ from eomc.program.ranks import Ranks, ranks
 
 NOTHING = 1e-25  # of all values together, as lengths: what forty digits leave of a zero
 SHOWN = 1e-9  # of a value: a coordinate has moved
+ROUNDING = 1e-13  # of all values together: what a coordinate that is 0 may move by
 
 
 @dataclass(frozen=True)
@@ -155,9 +156,18 @@ def _rounded(place: Place, exact: Sequence[Any]) -> Vector:
     return np.where(sizes > NOTHING * np.linalg.norm(sizes), found, 0.0)
 
 
-def _moves(names: Sequence[tuple[str, str]], before: Vector, after: Vector) -> Iterator[Move]:
-    for (name, unit), one, other in zip(names, before.tolist(), after.tolist(), strict=True):
-        if abs(other - one) > SHOWN * max(abs(one), abs(other)):
+def _moves(
+    names: Sequence[tuple[str, str]], before: Vector, after: Vector, place: Place
+) -> Iterator[Move]:
+    """What has moved, as far as that is something beside all values together, as lengths."""
+    sizes = np.sqrt(np.diag(place.metric))
+    least = ROUNDING * np.linalg.norm(sizes * after) / sizes
+    far = np.maximum(SHOWN * np.maximum(np.abs(before), np.abs(after)), least)
+    told = (np.abs(after - before) > far).tolist()
+    for (name, unit), one, other, moved in zip(
+        names, before.tolist(), after.tolist(), told, strict=True
+    ):
+        if moved:
             yield Move(name, one, other, unit)
 
 
@@ -177,8 +187,8 @@ def _closure(manifold: Manifold, start: Start, found: Ranks) -> Closure:
         least_sigma=found.sigma[1],
         positions=found.positions,
         weights=found.weights,
-        moves=tuple(_moves(units, guess, start.place.q)),
-        rate_moves=tuple(_moves(speeds, rates, start.qd)),
+        moves=tuple(_moves(units, guess, start.place.q, start.place)),
+        rate_moves=tuple(_moves(speeds, rates, start.qd, start.place)),
         remarks=tuple(_remarks(manifold, start, found)),
     )
 
