@@ -184,7 +184,7 @@ def test_the_commands_print_no_text_raw(here: Path) -> None:
     )
     assert out.startswith(every)
     assert json.loads(said("run", file, "--json"))["scene"] == "fields"
-    assert Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,u,energy"  # names only
+    assert Path("x.csv").read_text().splitlines()[0] == "t,x,x_dot,u,y,energy"  # names only
     ElementTree.parse("x.svg")
     page = Path("x.html").read_text(encoding="utf-8")
     assert str(texts.html(every)) in page and every not in page

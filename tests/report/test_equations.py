@@ -91,10 +91,14 @@ def test_scalar_equations_are_those_of_the_reference(file: Path) -> None:
         for symbols_, x in ((system.q, q), (system.qd, qd), (system.qdd, qdd), (system.u, u)):
             named |= dict(zip(symbols_, x, strict=True))
         named[symbolic.t] = 0.7
+        multipliers = rng.uniform(0.2, 1.0, len(system.constraints))
+        named |= dict(zip(found.multipliers, multipliers, strict=True))
         made = [float((e.lhs - e.rhs).subs(named).evalf()) for e in found.scalar]
         state = {"q": q, "qd": qd, "t": 0.7, "u": u}
         D, bias, tau = (reference.evaluate(name, **state) for name in ("D", "bias", "tau"))
         wanted = D @ qdd + bias - tau
+        if system.constraints:
+            wanted -= multipliers @ reference.evaluate("constraint_jacobian", **state)
         assert np.allclose(made, wanted, rtol=1e-9, atol=1e-9 * abs(wanted).max())
 
 

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import eomc
+from eomc.cli.main import main
 from eomc.model.system import Constraint, Reaction, System
 
 EPS = 2.0**-52
@@ -236,3 +238,37 @@ def test_equilibrium_of_a_structure_that_can_not_move(rod: ModuleType) -> None:
     """Nothing is free, and the rod bears what is along it alone."""
     q, _ = rod.equilibrium([0.0, -1.0], free=["y"])
     np.testing.assert_array_equal(q, [0, -1])
+
+
+LATER = """eomc = 1
+name = "later"
+[coordinates]
+x = { start = 0.6 }
+y = { start = -0.8 }
+[energy]
+kinetic = "x_dot**2 + y_dot**2"
+potential = "9.81*y"
+[constraints]
+rod = "x**2 + y**2 - 1"
+a = "x - 0.6"
+b = "y + 0.8 - 0.1*t**2"
+[run]
+h = 0.01
+duration = 2
+"""
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+def test_rows_that_contradict_one_another_later_are_told(tmp_path: Path) -> None:
+    """The start and its rates obey them all; the motion can't."""
+    (tmp_path / "later.toml").write_text(LATER, encoding="utf-8")
+    made = eomc.read(tmp_path / "later.toml")
+    said = " ".join(map(str, made.warnings))
+    assert "no position obeys the rows a little later" in said
+    module = eomc.load(made, tmp_path / "build")
+    with pytest.warns(RuntimeWarning, match=r"b is 0\.4 at the end, not 0: constraints contradict"):
+        run = module.simulate()
+    assert run.constraints["b"][-1] == pytest.approx(-0.4)
+    words = ["run", str(tmp_path / "later.toml"), "--build", str(tmp_path / "build")]
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 1 and "constraints contradict one another" in done.output

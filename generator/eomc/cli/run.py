@@ -116,7 +116,7 @@ def command(
         say(json.dumps(summary, indent=1))
     elif not quiet:
         _print_summary(module, done, balance, summary)
-    whole = done.status in ("ok", "accumulated")
+    whole = done.status in ("ok", "accumulated") and not done._broken
     if done.status != "ok":
         say(f"eomc: {done.message}", err=True)
     if stopped or not whole:
@@ -218,6 +218,7 @@ def _summary(
         "error_estimate": _error(done),
         "beyond_stability": unstable,
         "beyond_duration": ends,
+        "remark": done._remark if done.status == "ok" else "",
         "seconds": seconds,
         "steps_per_second": done.steps / seconds if seconds else None,
         "files": [str(path) for path in files.values() if path],
@@ -250,7 +251,7 @@ def _print_summary(
         say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
     if module._model.events and summary["tolerance"] is None:
         say("  fixed steps pass over the scene's events: leave out --h and --method")
-    for words in (summary["beyond_stability"], summary["beyond_duration"]):
+    for words in (summary["beyond_stability"], summary["beyond_duration"], summary["remark"]):
         if words:
             say(f"  {words}")
     if done.error is not None:

@@ -23,6 +23,7 @@ from eomc.program.manifold import ROUNDED, Flags, Manifold, Place, Vector
 from eomc.program.ranks import Ranks, ranks
 
 NOTHING = 1e-25  # of all values together, as lengths: what forty digits leave of a zero
+BEGUN = 1e-3  # of a run: rows that hold no longer do not hold
 SHOWN = 1e-9  # of a value: a coordinate has moved
 ROUNDING = 1e-13  # of all values together: what a coordinate that is 0 may move by
 
@@ -207,7 +208,12 @@ def _remarks(manifold: Manifold, start: Start, found: Ranks) -> Iterator[str]:
             if manifold.timed
             else "no freedom is left, and nothing moves: a structure under its load"
         )
-    if not found.good:
+    if manifold.timed and found.latest <= BEGUN * manifold.system.run.duration:
+        yield (
+            "no position obeys the rows a little later: they contradict one another as time goes "
+            "on, or the start is where the motion ends"
+        )
+    elif not found.good:
         yield (
             f"rank {found.rank} of {rows}, but no {found.rank} rows are far from singular at every "
             "position: all are kept, and where a row depends on the others it is dropped"

@@ -36,7 +36,8 @@ class Ranks:
     """rank: of all rows, almost everywhere. left_out: rows that others imply. shared: rows without
     a force of their own. good: whether some set of rows will do everywhere that was looked at.
     sigma: smallest over largest singular value that counts, at the start and at the worst place.
-    weights: of the rows, that make D regular with them; none where it is so by itself.
+    weights: of the rows, that make D regular with them; none where it is so by itself. latest: the
+    time of the last position, s.
     flat: rows without a slope wherever they hold.
     """
 
@@ -47,6 +48,7 @@ class Ranks:
     sigma: tuple[float, float]
     positions: int
     weights: tuple[float, ...] = ()
+    latest: float = 0.0
     flat: tuple[int, ...] = ()
 
 
@@ -54,7 +56,8 @@ def ranks(manifold: Manifold, start: Place) -> Ranks:
     """Of the rows around an assembled start."""
     found, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)
-    return replace(found, weights=tuple(start.weights.tolist()) if singular else ())
+    weights = tuple(start.weights.tolist()) if singular else ()
+    return replace(found, weights=weights, latest=max(place.t for place in places))
 
 
 def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:

@@ -10,6 +10,9 @@ import numpy as np
 from .arguments import Array
 from .columns import ByName
 
+_HOLDS = 2.0**26  # roundings of its terms: more is no rounding
+_LEAST = 1e-9  # of these terms
+
 
 class ConstrainedRun:
     """A part of `trajectory.Run`. singular_steps: behind so many a constraint depends on others.
@@ -21,6 +24,11 @@ class ConstrainedRun:
     _model: Any
     _values: Callable[..., Array]
     _driven: Callable[..., Array]
+    _params: Array
+    q: Any
+    qd: Any
+    t: Any
+    status: str
     singular_steps: int = 0
     first_singular: float = float("nan")
 
@@ -52,8 +60,30 @@ class ConstrainedRun:
         return ByName("reactions", loops, np.moveaxis(found, -2, 0))
 
     @property
+    def _broken(self) -> str:
+        """Which row does not hold at the end, in words, or "": one that was left out for others."""
+        model, names = self._model, self._model.constraint_names
+        if not names or not len(self.q) or self.status != "ok":
+            return ""
+        q, qd, t, p = self.q[-1], self.qd[-1], float(self.t[-1]), self._params
+        sizes = np.abs(model.constraint_jacobian(q, t=t, params=p)).astype(float)
+        for what, x in (("constraints", q), ("constraint_rates", qd)):
+            off = np.abs(getattr(model, what)(q, qd, t, p)).astype(float)
+            share = off / np.maximum(sizes @ (np.abs(x) + np.max(np.abs(x))), _LEAST)
+            worst = int(np.argmax(share))
+            if share[worst] > _HOLDS * float(np.finfo(model.dtype).eps):
+                rate = "the rate of " if what != "constraints" else ""
+                return (
+                    f"{rate}{names[worst]} is {off[worst]:.3g} at the end, not 0: constraints "
+                    "contradict one another, and this motion does not obey them all"
+                )
+        return ""
+
+    @property
     def _singular(self) -> str:
-        """What is to be said of steps behind which a constraint depends on others, or ""."""
+        """What is to be said of rows that don't hold, or depend on others behind steps, or ""."""
+        if broken := self._broken:
+            return broken
         if not self.singular_steps:
             return ""
         many = "a step ends" if self.singular_steps == 1 else f"{self.singular_steps} steps end"
