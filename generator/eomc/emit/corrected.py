@@ -5,14 +5,11 @@ from __future__ import annotations
 from eomc.emit.c_function import CFunction
 from eomc.emit.c_names import Target
 from eomc.emit.functions import Functions
-from eomc.emit.plain.constraint_views import (
-    Corrected,
-    Project,
-)
-from eomc.emit.plain.parts import (
-    Computed,
-)
+from eomc.emit.plain.constraint_views import Corrected, Project
+from eomc.emit.plain.parts import Computed
 
+# beside singular positions: squares of what corrections may change; how much more rounding is
+SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
 APART = 1e-12  # of the squares of all coordinates together: a coordinate that is less is 0
 
 
@@ -27,6 +24,8 @@ def view(
 ) -> Corrected:  # fmt: skip
     """The view for one form and lane."""
     target = functions.target
+    little, noise = SINGULAR[target.system.run.real]
+    near = 8 * target.real.epsilon
     return Corrected(
         PREFIX=functions.PREFIX,
         real=functions.real,
@@ -39,8 +38,11 @@ def view(
         correction=correction,
         function=function,
         call=call,
-        near=target.literal(8 * target.real.epsilon),
+        near=target.literal(near),
         apart=target.literal(APART),
+        little=target.literal(little),
+        slight=target.literal(1e4 * little),
+        rounded=target.literal(near**2 * noise),
     )
 
 

@@ -8,9 +8,7 @@ from eomc.emit import c_function as c
 from eomc.emit.c_function import CFunction
 from eomc.emit.coefficients import tableau
 from eomc.emit.functions import Functions
-from eomc.emit.plain.views import (
-    Derivative,
-)
+from eomc.emit.plain.views import Derivative
 from eomc.integrators.tableaux import METHODS
 
 TURNS = 50  # of Newton's method for the stages

@@ -16,9 +16,7 @@ from eomc.emit.c_expression import REALS, Block, Body, Real, several
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, sentence, unclashed
 from eomc.emit.evaluations import KINDS, doc, source
-from eomc.emit.plain.parts import (
-    Computed,
-)
+from eomc.emit.plain.parts import Computed
 from eomc.emit.plain.views import (
     Indexed,
     Parameter,

@@ -16,9 +16,7 @@ from eomc.emit.fast import views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, NOINLINE, Lane
 from eomc.emit.functions import Functions
-from eomc.emit.plain.views import (
-    Slopes,
-)
+from eomc.emit.plain.views import Slopes
 from eomc.integrators.tableaux import METHODS, RK4, Method, Row
 from eomc.program import two_point
 

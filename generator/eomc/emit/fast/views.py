@@ -12,9 +12,7 @@ from eomc.emit.plain.parts import (
     Named,
     Prefixed,
 )
-from eomc.emit.plain.views import (
-    Parameter,
-)
+from eomc.emit.plain.views import Parameter
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ class Corrected:
 
     L, lane, mask: of the lane, L "" for one number. increments: whether r, v are what a step adds.
     near, apart: squares of parts of a coordinate, and of all, beyond which a correction is large.
+    little, slight: squares of parts of all coordinates and of all velocities, which corrections
+    near a singular position are below; rounded: of coordinates, where one may be rounding there.
     """
 
     TEMPLATE: ClassVar[str] = "c/corrected.c"
@@ -31,6 +33,9 @@ class Corrected:
     call: str
     near: str
     apart: str
+    little: str
+    slight: str
+    rounded: str
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,7 @@ from eomc.emit.coefficients import tableau
 from eomc.emit.derivatives import derivatives
 from eomc.emit.evaluations import source
 from eomc.emit.functions import Functions, handshake, indexed, of, parameters
-from eomc.emit.plain.parts import (
-    Computed,
-)
+from eomc.emit.plain.parts import Computed
 from eomc.emit.plain.views import (
     AdaptiveDeclared,
     Declared,
