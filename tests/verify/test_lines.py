@@ -84,7 +84,7 @@ def behind_steps(name: str, source: str) -> set[int]:
     within = False
     for number, line in enumerate(source.splitlines(), start=1):
         within = (within or bool(re.match(rf".*\b{name}_projected\(.*[^;]$", line))) and line != "}"
-        refuses = within and "return" in line and "OK" not in line
+        refuses = within and re.search("return|break", line) and "OK" not in line
         if refuses or re.match(r"\s+x\.first = \(\w+\)\(first \+ n\)\*h;", line):
             found.add(number)
     return found
