@@ -113,10 +113,10 @@ def _apart(manifold: Manifold, rows: Sequence[int], stuck: Place) -> Problem:
     if len(rows) > 1 and _alike(manifold, rows, stuck):
         why = f"contradicts {_names(constraints, rows[1:])}: where they are least, {left}. {ALONE}"
     else:
-        they, leave = ("they are", ", leave one out,") if others else ("it is", "")
+        leave = ", leave one out," if others else ""
         why = (
-            f"can't be zero{others} near the start: where {they} least, {left}. Correct a formula "
-            f"or a parameter{leave} or start closer to a position that closes"
+            f"can't be zero{others} near the start: the search for a position ends where {left}. "
+            f"Correct a formula or a parameter{leave} or start closer to a position that closes"
         )
     return manifold.system.problem(key(row), why)
 
