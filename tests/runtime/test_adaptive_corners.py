@@ -50,6 +50,19 @@ def test_small_jumps_count_too(modules: Modules) -> None:
                 assert abs(run.q[-1, 0] - rubbed(start, mu)) < 10 * tol, (start, mu, tol)
 
 
+@pytest.mark.parametrize("width", [1e-2, 1e-3])
+def test_smoothed_friction_is_a_corner_to_long_steps(width: float, modules: Modules) -> None:
+    """Beside steps that are short against its width; 0.01 is that of a joint's friction."""
+    text = RUBBED.replace("[energy]", "[parameters]\nw = 0.01\n[energy]")
+    text = text.replace("sign(x_dot)", "tanh(x_dot/w)").replace("rubbed", "softly_rubbed")
+    module = modules.unoptimised(text)
+    for start in (0.7, 1.0, 1.6):
+        way = {"q0": [start], "params": {"w": width}}
+        end = module.simulate(tol=1e-14, h_most=1e-3, **way).q[-1, 0]
+        for tol in TOLERANCES:
+            assert abs(module.simulate(tol=tol, **way).q[-1, 0] - end) < 10 * tol, (start, tol)
+
+
 @pytest.mark.parametrize("name", tiers(CASES, "limits"))
 def test_the_plain_form_does_the_same(name: str, tmp_path: Path) -> None:
     case = CASES[name]

@@ -16,7 +16,7 @@ from eomc.emit.plain.adaptive_views import (
     AdaptiveRun,
 )
 from eomc.integrators.tableaux import GAUSS16, Row
-from eomc.model.corners import corners
+from eomc.model.corners import STEEP, corners
 from eomc.model.system import System
 
 METHOD = GAUSS16
@@ -34,7 +34,7 @@ def memory(functions: Functions) -> str:
 
 def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
-    vectors, few = (8, 20) if corners(system) else (6, 16)
+    vectors, few = (8, 20) if corners(system, STEEP) else (6, 16)
     stages = METHOD.stages * len(system.coordinates)
     return vectors * width + stages + few + 2 * len(system.events)
 
@@ -165,7 +165,7 @@ def steps(made: Stepping) -> Adaptive:
         start=form.start,
         settled=made.settle.call(most=f"{target.literal(2 * 0.8**-8)}*aim", **known),
         within=made.within,
-        corners=bool(corners(target.system)),
+        corners=bool(corners(target.system, STEEP)),
         close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
         share=target.literal(SHARE),
         top=c.in_braces(numbers(m.legendre(n), real) for n in range(m.stages - 4, m.stages)),

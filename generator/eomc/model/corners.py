@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import sympy
 
 from eomc.model.system import System
 
 KINDS = (sympy.sign, sympy.Heaviside, sympy.Abs, sympy.Min, sympy.Max)
+STEEP = (*KINDS, sympy.tanh)  # which is a corner to steps that are longer than it is wide
 
 
-def corners(system: System) -> str:
+def corners(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
     """The functions in the scene that jump or bend, by name; "" where all is smooth."""
     s = system
     exprs = (
@@ -19,5 +22,5 @@ def corners(system: System) -> str:
         *(i.signal for i in s.inputs),
         *(c.formula for c in s.constraints),
     )
-    found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*KINDS)}
+    found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
     return ", ".join(sorted(found))
