@@ -44,6 +44,7 @@ def numbers(text: str, pattern: str) -> list[float]:
 
 
 @needs_scipy
+@pytest.mark.slow
 def test_the_pole_is_balanced_within_the_limits() -> None:
     text = said("lqr.py")
     low, high = numbers(text, r"force between (\S+) and (\S+) N")
@@ -104,6 +105,7 @@ def test_the_environment_is_what_gymnasium_expects(monkeypatch: pytest.MonkeyPat
     assert info["episode"]["l"][over].min() > 5
 
 
+@pytest.mark.slow
 def test_the_path_of_the_tip_is_in_the_file() -> None:
     text = said("tip_path.py")
     table = np.genfromtxt(FOLDER / "path.csv", delimiter=",", names=True)
@@ -123,6 +125,7 @@ def test_the_path_of_the_tip_is_in_the_file() -> None:
     not all(map(importlib.util.find_spec, ("fmpy", "pythonfmu3"))),
     reason="FMPy and PythonFMU3 are not installed: pip install 'eomc[fmu]'",
 )
+@pytest.mark.slow
 def test_a_controller_that_is_another_unit_holds_the_arm() -> None:
     text = said("fmu_pid.py")
     angle, highest = numbers(text, r"at (\S+) rad, at most (\S+);")

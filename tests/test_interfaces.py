@@ -83,6 +83,7 @@ def test_julia(page: Path) -> None:
     assert ends_there(ran(julia, "pole.jl", at=page))
 
 
+@pytest.mark.slow
 def test_casadi(page: Path) -> None:
     pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'eomc[fmu]'")
     (program,) = blocks("python")

@@ -115,6 +115,7 @@ def test_what_does_nothing_imports_nothing_slow(there: Path) -> None:
     assert "is up to date" in done.stdout
 
 
+@pytest.mark.slow
 def test_where_the_energy_went_is_told(there: Path) -> None:
     assert "J, changed by at most" in eomc("run", "cartpole.toml").output
     built(there, "kapitza_pendulum")

@@ -35,7 +35,7 @@ def export(here: Path, *words: str, **variables: str) -> subprocess.CompletedPro
 @pytest.mark.parametrize(
     "version, binary",
     [
-        ("2", "binaries/linux64/"),
+        pytest.param("2", "binaries/linux64/", marks=pytest.mark.slow),
         pytest.param("3", "binaries/x86_64-linux/", marks=pytest.mark.slow),
     ],
 )
@@ -107,6 +107,7 @@ def test_a_folder_that_can_not_be_written(here: Path) -> None:
     assert done.returncode == 2 and "/proc/x.fmu: can't be written" in done.stderr
 
 
+@pytest.mark.slow
 def test_the_page_is_followed_as_written(tmp_path: Path) -> None:
     needs_fmpy()
     commands = [c for b in re.findall(r"```sh\n(.*?)```", DOCUMENT, re.S) for c in b.splitlines()]

@@ -117,7 +117,7 @@ def test_steps_that_end_where_a_four_bar_lies_flat() -> None:
     print("told", told)
 
 
-@pytest.mark.parametrize("h", [0.05, 0.04, 0.02, 0.01])
+@pytest.mark.parametrize("h", tiers([0.05, 0.04, 0.02, 0.01], 0.02))
 def test_bricard_s_cube_turns_for_ten_seconds(h: float) -> None:
     """Its fifth row depends on the others on the manifold, and on none off it."""
     run = simulate("bricard_cube", h=h, duration=10.0)

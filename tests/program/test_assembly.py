@@ -271,7 +271,7 @@ def test_a_row_with_a_corner_is_refused_by_its_name(formula: str) -> None:
     ("formula", "instead"),
     [
         ("(x - y)**2", "write x - y for (x - y)**2"),
-        ("(x**2 - y)**3", "write x**2 - y for (x**2 - y)**3"),
+        pytest.param("(x**2 - y)**3", "write x**2 - y for (x**2 - y)**3", marks=pytest.mark.slow),
         ("x**2 - 2*x*y + y**2", "write each thing that is zero by itself"),
     ],
 )
@@ -284,6 +284,7 @@ def test_a_row_without_a_slope_where_it_holds_is_refused(
     assert "ground" not in text and not recwarn
 
 
+@pytest.mark.slow
 def test_rows_that_fade_out_at_a_start_and_nowhere_else_are_allowed(
     recwarn: pytest.WarningsRecorder,
 ) -> None:

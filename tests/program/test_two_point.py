@@ -192,6 +192,7 @@ def written(module: ModuleType, end: str) -> str:
     return file.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_few_angles_and_light_configurations_stay_whole(modules: Modules) -> None:
     for name in ("cartpole", "double_pendulum", "tumbling_box", "suspension"):
         assert "_configuration;" not in written(modules.unoptimised(scene_system(name)), "c")
@@ -305,6 +306,7 @@ def test_sums_are_compensated_in_the_two_point_form(modules: Modules) -> None:
     assert np.abs(short.x[-1] - few.x[-1]).max() < 60 * 2.0**-53
 
 
+@pytest.mark.slow
 def test_weights_add_up_to_one_in_the_two_point_form(modules: Modules) -> None:
     """An oscillator beside five angles: a step of it is a linear map, its power the answer.
 

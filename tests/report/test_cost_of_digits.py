@@ -120,6 +120,7 @@ def test_a_difference_of_an_oscillator_does_not_grow() -> None:
 
 
 @pytest.mark.usefixtures("quickly_compiled")
+@pytest.mark.slow
 def test_adaptive_steps_stand_beside_fixed_ones(tmp_path: Path) -> None:
     """By tolerance; events, which the reference passes over, are left out."""
     x = sympy.Symbol("x")

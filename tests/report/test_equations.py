@@ -183,6 +183,7 @@ def test_text_is_mathematics_of_at_most_100_columns(file: Path) -> None:
     assert max(stringPict(line).width() for line in text.splitlines()) <= 100
 
 
+@pytest.mark.slow
 def test_what_is_too_large_says_what_it_comes_from_and_what_it_costs() -> None:
     system = pipeline.read(SCENES / "chain.toml")
     text = written(system)

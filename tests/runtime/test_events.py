@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import sympy.physics.vector
 from compilers import STRICT, compiled
+from conftest import tiers
 
 import eomc
 from eomc.base.errors import SceneError
@@ -344,7 +345,7 @@ def test_single_precision_has_a_tolerance_that_it_can_keep() -> None:
         parse(text.replace("[run]", "[run]\ntolerance = 1e-9"), "float.toml")
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
 def test_the_c_compiles_without_a_word_and_does_as_python(real: str, tmp_path: Path) -> None:
     text = BALL.replace("bouncing", f"ball_{real}").replace("[run]", f'[run]\nreal = "{real}"')
     made = eomc.sources(from_scene(parse(text, "c.toml")))

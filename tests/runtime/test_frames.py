@@ -196,6 +196,7 @@ def test_many_more_rows_than_one_call_takes(space: ModuleType) -> None:
     assert np.array_equal(found[4321], space.inverse_dynamics(*[q[4321]] * 3))
 
 
+@pytest.mark.slow
 def test_accelerations_are_second_derivatives(modules: Modules) -> None:
     """In eighty digits: of a point's place, and so of all rates in them, dJ/dt qd at qdd = 0."""
     places = [f"tip_{x}" for x in "xyz"] + [f"arm_{x}" for x in "xyz"]

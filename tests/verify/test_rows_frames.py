@@ -73,6 +73,7 @@ def test_wrong_ones_fail(comparison: Comparison, name: str) -> None:
     assert failed == ({ROWS[name], *also} if name else set()), comparison.rows
 
 
+@pytest.mark.slow
 def test_joints_that_move_together(modules: Modules) -> None:
     """By formulas of coordinates: rates and accelerations have slopes and drift."""
     text = SPACE.replace(

@@ -70,6 +70,7 @@ def test_a_form_that_ends_where_the_step_can_be_made_fails(modules: Modules) -> 
         compared(modules, "0.1", 5)
 
 
+@pytest.mark.slow
 def test_no_form_has_to_find_stages_that_nothing_finds_soon(modules: Modules) -> None:
     """Where the motion turns many times within a step, and is not linear in it."""
     assert compared(modules, "30.0", 5) < 1
@@ -127,6 +128,7 @@ class Linear:
         return self.module.sensitivity(*state, **how)
 
 
+@pytest.mark.slow
 def test_derivatives_that_cancel_to_nothing_are_compared_in_units_of_their_terms() -> None:
     """Of a rolling disk no angle's acceleration depends on where it points."""
     text = (SCENES / "rolling_disk.toml").read_text().replace("[run]", "[run]\nlinearize = true")

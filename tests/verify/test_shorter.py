@@ -28,6 +28,7 @@ def test_textbook_forms(given: sympy.Expr, short: sympy.Expr) -> None:
     assert shorter(given, (v, w)) == short
 
 
+@pytest.mark.slow
 def test_forms_are_equal_and_no_longer() -> None:
     pick = random.Random(1)
     parts = [
