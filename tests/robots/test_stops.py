@@ -39,10 +39,12 @@ def imported(folder: Path, text: str, *words: str) -> tuple[str, str]:
 
 def test_a_joint_rests_in_its_stop_by_its_depth_where_it_is_driven_whole(tmp_path: Path) -> None:
     said, scene = imported(tmp_path, URDF, "--stops")
-    assert "those of positions are stops" in said and "values are in the notes" not in said
+    assert "at limits of positions [forces] pushes back" in said
     assert "turn " not in scene.split("\n[forces]\n")[1].split("[[body]]")[0]
     m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
     depth = m.defaults["stop_depth_slide"]
+    pulled = m.acceleration([0.5 + depth, 0.0], [-5.0, 0.0], u={"slide_force": 0, "turn_torque": 0})
+    np.testing.assert_array_equal(pulled, 0)  # out of its stop, faster than that pushes
     for at, force in ((0.5 + depth, 80.0), (-0.4 - depth, -80.0), (0.2, 0.0)):
         a = m.acceleration([at, 0.0], [0.0, 0.0], u={"slide_force": force, "turn_torque": 0})
         np.testing.assert_allclose(a, 0, atol=1e-9)

@@ -18,11 +18,11 @@ from eomc.emit.plain.adaptive_views import (
 from eomc.integrators.tableaux import GAUSS16, Row
 from eomc.model.corners import STEEP, corners
 from eomc.model.system import System
+from eomc.scene.schema import LOOSEST
 
 METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
-LOOSEST = 1e-2  # tolerance
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 BUSY = 32  # events in one step, from which on it ends there
 

@@ -17,10 +17,10 @@ from eomc.emit.plain.adaptive_views import (
     Events,
 )
 from eomc.integrators.tableaux import Row
+from eomc.scene.schema import ACTIONS
 
 SAMPLES = 9  # values in a step
 APART = 1e-6  # parts of a step between values that make a slope
-ACTIONS = ("record", "stop", "jump")
 DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
 
 

@@ -228,6 +228,7 @@ def face(target: Target, extension: str) -> Face:
         constraints=tuple(c.name for c in s.constraints),
         held=(*(c.held for c in s.coordinates), *(c.held_rate for c in s.coordinates)),
         holonomic=sum(c.holonomic for c in s.constraints),
+        redundant=any(c.redundant for c in s.constraints),
         reactions=tuple(r.name for r in s.reactions),
         timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,

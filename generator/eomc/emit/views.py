@@ -222,6 +222,7 @@ class Face:
     constraints: tuple[str, ...]
     held: tuple[bool, ...]
     holonomic: int
+    redundant: bool
     reactions: tuple[str, ...]
     timed: tuple[str, ...]
     batch: bool

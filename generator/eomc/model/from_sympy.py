@@ -306,6 +306,8 @@ class Maker:
             if not when.free_symbols:
                 raise given.fault(role, f"{when} never crosses zero: it has no names")
             direction, action = table.pop("direction", "both"), table.pop("action", "record")
+            if not isinstance(note := table.pop("note", ""), str):
+                raise given.fault(role, f"note is a text, not {note!r}")
             for key, word, known in (
                 ("direction", direction, DIRECTIONS), ("action", action, ACTIONS),
             ):  # fmt: skip
@@ -318,7 +320,7 @@ class Maker:
                 remedy = 'add "action": "jump" where something is set, and only there'
                 raise given.fault(role, remedy)
             jump = ((state[key], self._expression(x, f"{role}: {key}")) for key, x in table.items())
-            yield Event(str(name), when, direction, action, tuple(jump))
+            yield Event(str(name), when, direction, action, tuple(jump), note=note)
 
     def _outputs(
         self, outputs: Any, starts: Iterable[Any], made: Sequence[Coordinate],

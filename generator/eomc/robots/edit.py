@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -24,9 +23,6 @@ from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_p
 from eomc.robots.stops import stops
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
-
-# what readers say of them
-_OF_LIMITS = re.compile(r"limits of (\d+ joints: their values|joints, kept as notes)")
 
 
 def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
@@ -72,9 +68,8 @@ def stopped(robot: Robot) -> Robot:
     """The robot with stops where its joints have limits. Raises EomcError where none has."""
     if not stops(robot):
         raise EomcError("--stops: no joint of this robot has limits")
-    left_out = tuple(words for words in robot.left_out if not _OF_LIMITS.match(words))
-    told = "limits of speed and of effort; those of positions are stops, [forces] pushes back there"
-    return replace(robot, stopped=True, left_out=(told, *left_out))
+    told = "stops: at limits of positions [forces] pushes back; those of speed and effort are notes"
+    return replace(robot, stopped=True, left_out=(told, *robot.left_out))
 
 
 def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:

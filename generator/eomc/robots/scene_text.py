@@ -282,8 +282,8 @@ def _stop(s: Stop) -> str:
     """The force of a stop, as `stops` has it."""
     deep, soft = _stop_names(s.unit)
     q, (low, high) = s.coordinate, (_length(x, s.unit).strip('"') for x in s.limits)
-    before = f"max(0, {low} - {q})*(1 - {soft}*{q}_dot)"
-    beyond = f"max(0, {q} - {high})*(1 + {soft}*{q}_dot)".replace("- -", "+ ")
+    before = f"max(0, {low} - {q})*max(0, 1 - {soft}*{q}_dot)"
+    beyond = f"max(0, {q} - {high})*max(0, 1 + {soft}*{q}_dot)".replace("- -", "+ ")
     return toml(f"{number(s.effort)}/{deep}*({before} - {beyond})")
 
 

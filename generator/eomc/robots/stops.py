@@ -1,9 +1,9 @@
 """Limits of joints as stops: springs that push back beyond them, and give less than they took.
 
-The force beyond a limit is that of Hunt and Crossley (1975), k x (1 + d v): x is how far the joint
-is beyond it, v how fast it goes on. k is the joint's effort over `depth`, so that a joint driven as
-hard as it may be rests that far in its stop. Where the file tells no effort, what holds all that
-the joint carries, stretched out against gravity, stands for it.
+The force beyond a limit is that of Hunt and Crossley (1975), k x (1 + d v), which never pulls: x is
+how far the joint is beyond it, v how fast it goes on. k is the joint's effort over `depth`, so that
+a joint driven as hard as it may be rests that far in its stop. Where the file tells no effort, what
+holds all that the joint carries, stretched out against gravity, stands for it.
 """
 
 from __future__ import annotations

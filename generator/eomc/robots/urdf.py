@@ -199,8 +199,7 @@ class _Reader:
         drive = None
         if len(motions) == 1:
             word, newton = ("torque", "N m") if motions[0].unit == "rad" else ("force", "N")
-            limit = joint.first("limit")
-            effort = 0.0 if limit is None else self._number(limit, "effort", key)
+            effort = motions[0].effort
             note = f"along {name}" + (f", at most {effort:g} {newton}" if effort > 0 else "")
             drive = Drive(f"{name}_{word}", name, note=note)
         return _Joint(name, kind, ends[0], ends[1], offset, rotation, axis, motions, drive)
@@ -235,11 +234,10 @@ class _Reader:
             slide = Motion(f"x_{name}", "m", damping=damping, friction=friction)
             return slide, replace(slide, name=f"y_{name}"), Motion(f"turn_{name}", "rad")
         start, note = 0.0, "turns without end" if kind == "continuous" else ""
-        ends, effort = Motion.limits, 0.0
-        limit = joint.first("limit")
+        ends, limit = Motion.limits, joint.first("limit")
+        effort = 0.0 if limit is None else self._number(limit, "effort", key)
         if limit is not None and kind != "continuous":
             lower, upper = (self._number(limit, end, key) for end in ("lower", "upper"))
-            effort = self._number(limit, "effort", key)
             if lower or upper:
                 note, ends = f"{lower:g} to {upper:g}", (lower, upper)
                 start = min(max(0.0, lower), upper) if lower <= upper else 0.0

@@ -21,13 +21,15 @@ from .trajectory import SAID, STATUS, MotionError, state_text
 class Rows(NamedTuple):
     """Names of constraints, of loops with reactions, and what a start holds of q, then of qd.
 
-    holonomic: how many of the constraints are; they come first.
+    holonomic: how many of the constraints are; they come first. redundant: whether some were left
+    out, which the others imply.
     """
 
     names: tuple[str, ...] = ()
     loops: tuple[str, ...] = ()
     held: tuple[bool, ...] = ()
     holonomic: int = 0
+    redundant: bool = False
 
 
 class Constrained(Frames):

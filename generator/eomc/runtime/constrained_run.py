@@ -63,7 +63,8 @@ class ConstrainedRun:
     def _broken(self) -> str:
         """Which row does not hold at the end, in words, or "": one that was left out for others."""
         model, names = self._model, self._model.constraint_names
-        if not names or not len(self.q) or self.status != "ok":
+        left_out = self.singular_steps or model._rows.redundant  # all else a step ends on
+        if not left_out or not len(self.q) or self.status != "ok":
             return ""
         q, qd, t, p = self.q[-1], self.qd[-1], float(self.t[-1]), self._params
         sizes = np.abs(model.constraint_jacobian(q, t=t, params=p)).astype(float)

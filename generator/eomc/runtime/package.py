@@ -59,7 +59,8 @@ class Package(ModuleType):
                 "constraints: a scene has them by [constraints] or [[loop]]"
             )  # fmt: skip
             raise AttributeError(f"{name}: {model.name} has no {what}")
-        return self.__dict__["__getattr__"](name)
+        own = self.__dict__.get("__getattr__", super().__getattribute__)
+        return own(name)
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not name.startswith("_") and (why := self._why_not(name, value)):

@@ -6,10 +6,11 @@ from eomc.base.texts import FreeText
 from eomc.emit import adaptive, heading
 from eomc.emit.c_names import Target
 from eomc.emit.evaluations import source, takes_qdd
-from eomc.emit.events import ACTIONS, DIRECTIONS
+from eomc.emit.events import DIRECTIONS
 from eomc.emit.fmu.variables import input_starts
 from eomc.emit.fmu.views import SceneCalls, SceneEvent
 from eomc.emit.public import Public
+from eomc.scene.schema import ACTIONS
 
 ENERGIES = ("kinetic_energy", "potential_energy", "energy")
 STEPS = 10_000  # of one call of adaptive steps
