@@ -153,6 +153,11 @@ class Comparison:
         )
 
     @cached_property
+    def elsewhere(self) -> list[Expected]:
+        """States that a run hardly comes to, where values have to be right too."""
+        return self.sampler.elsewhere(1 if self.large else 2)
+
+    @cached_property
     def corners(self) -> str:
         """The functions in the scene that jump or bend."""
         return corners(self.system)
@@ -187,7 +192,7 @@ class Comparison:
             size = np.maximum(e.size[name], usual)
             return self.units(ask(self.module, name, e.state), e.value[name], size)
 
-        return self.largest(error)
+        return float(np.max([error(e) for e in (*self.expected, *self.elsewhere)]))
 
     def steps(self) -> float | Finding:
         """One step of the scene's h from a few states."""

@@ -31,6 +31,7 @@ MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 HALVINGS, RESOLVED = 5, 0.1  # of steps ahead, until how far things go changes by so little
 FARTHER = 8.0  # times as far from the start, where a term that is small near it counts
+SLOWER = (2.0**-6, 2.0**-10)  # times as fast
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 
 
@@ -202,6 +203,23 @@ class Sampler:
             else:
                 found.append(expected)
                 nearness = 1.0
+        return found
+
+    def elsewhere(self, slow: int) -> list[Expected]:
+        """States that a run hardly comes to: a unit away, and `slow` that are almost at rest, where
+        what smooths friction acts. Fewer, where some are none.
+        """
+        usual = [self.draw(1.0, True, False) for _ in range(1 + slow)]
+        way = np.array([usual[0].q - self.start.q, usual[0].qd - self.start.qd])
+        reach = np.array([self.spread, self.speed])
+        q, qd = [self.start.q, self.start.qd] + way * np.maximum(1, 1 / reach)
+        states = [replace(usual[0], q=q, qd=qd)]
+        states += [replace(s, qd=p * s.qd) for s, p in zip(usual[1:], SLOWER, strict=False)]
+        found = []
+        for state in map(self.onto, states):
+            with np.errstate(all="ignore"):
+                expected = self.expected(state) if self.regular(state) else None
+            found += [] if expected is None else [expected]
         return found
 
     def farther(self) -> list[Expected]:
