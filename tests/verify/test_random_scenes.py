@@ -424,9 +424,9 @@ def test_random_scenes_pass(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(23))
+@pytest.mark.parametrize("seed", [*range(23), 2710186, 2710244])
 def test_random_scenes_with_a_term_negated_fail(tmp_path: Path, seed: int) -> None:
     """Unless what was negated changes no value, or is refused at once."""
     found = outcome(seed, True, tmp_path)
     assert found.outcome in ("caught", "unchanged", "refused"), (found, scene_text(seed))
-    assert found.outcome == "caught" or seed != 14
+    assert found.outcome == "caught" or seed not in (14, 2710186, 2710244)
