@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import shutil
 import signal
 import sys
@@ -30,6 +31,7 @@ pytest_plugins = ["builds"]
 gc.set_threshold(20_000, 20, 100)  # SymPy makes many values and few cycles
 
 ROOT = Path(__file__).parent.parent
+os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", str(ROOT / "build" / ".hypothesis"))
 # kept from one run of the tests to the next
 MODULES = ROOT / "build" / "tests" / "modules"
 UNOPTIMISED = ROOT / "build" / "tests" / "unoptimised"

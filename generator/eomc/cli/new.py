@@ -54,10 +54,10 @@ def _copied(source: str, name: str) -> str:
     """A scene that comes with eomc, under this name. Raises EomcError where there is none."""
     known = resources.scenes()
     if source not in known:
-        import difflib
+        from eomc.scene.formulas import nearest
 
-        near = difflib.get_close_matches(source, known, n=1)
-        meant = f"did you mean '{near[0]}'? " if near else ""
+        near = nearest(source, known)
+        meant = f"did you mean '{near}'? " if near else ""
         raise EomcError(
             f"--from {shown(source)}: is no scene that comes with eomc; {meant}they are "
             + ", ".join(known)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError
 from eomc.toolchain.compiler import STANDARD, Compiler, binding_flags, flags, standard
+from eomc.toolchain.running import finish, run, start
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
@@ -53,9 +54,9 @@ def build(
     running = []
     try:
         for job in jobs:
-            running.append((job, _start(job, folder)))  # Ctrl-C may come between them
+            running.append((job, start(job, folder)))  # Ctrl-C may come between them
         for job, process in running:
-            _finish(name, job, process)
+            finish(name, job, process)
     finally:
         for _, process in running:  # none goes on where another failed
             process.kill()
@@ -64,7 +65,7 @@ def build(
     if sys.platform == "darwin":
         link.insert(1, "-undefined")
         link.insert(2, "dynamic_lookup")
-    _finish(name, link, _start(link, folder))
+    run(name, link, folder)
     _try(name, extension, folder / library, compiler)
 
 
@@ -96,23 +97,4 @@ def _try(name: str, extension: str, library: Path, compiler: Compiler) -> None:
         raise EomcError(
             f"{name}: the C compiler {shlex.join(compiler.command)} returned 0, but what it made "
             f"can't be loaded: correct CC and EOMC_CFLAGS; the last build stays\n  {said}"
-        )
-
-
-def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
-    try:
-        return subprocess.Popen(
-            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="backslashreplace",
-        )  # fmt: skip
-    except OSError as fault:
-        raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
-
-
-def _finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) -> None:
-    words, _ = process.communicate()
-    if process.returncode:
-        raise EomcError(
-            f"{name}: the C compiler failed (status {process.returncode}):\n"
-            f"  {shlex.join(command)}\n{words.rstrip()}"
         )

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shlex
 import subprocess
 import sys
 import tempfile
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError, NoCompilerError
+from eomc.toolchain import archive
 from eomc.toolchain.compiler import Compiler, compiler_for, flags, standard
+from eomc.toolchain.running import run
 
 if TYPE_CHECKING:
     from eomc.emit.fmu.files import Unit
 
-_DATE = (1980, 1, 1, 0, 0, 0)  # of all that is inside: same scene, same bytes
 _SUFFIX = {"win32": ".dll", "cygwin": ".dll", "darwin": ".dylib"}
 _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 
@@ -49,7 +48,7 @@ def export(made: Unit, file: Path, binary: bool = True) -> Exported:
         except NoCompilerError as fault:
             why = str(fault)
     texts = {name: text.encode(errors="backslashreplace") for name, text in made.files.items()}
-    _write(file, texts | held)
+    archive.write(file, dict(sorted((texts | held).items())), "binaries")
     return Exported(file, folder, why)
 
 
@@ -76,7 +75,7 @@ def _compiled(made: Unit, compiler: Compiler) -> tuple[dict[str, bytes], str]:
             *compiler.command, standard("plain"), *flags("plain"), "-fPIC", "-fvisibility=hidden",
             "-shared", *made.sources, "-lm", "-o", library,
         ]  # fmt: skip
-        _run(made.name, command, sources)
+        run(made.name, command, sources)
         load = f"import ctypes; ctypes.CDLL({str(sources / library)!r}).fmi{made.version}GetVersion"
         done = subprocess.run(
             [sys.executable, "-I", "-S", "-c", load], stdin=subprocess.DEVNULL, capture_output=True,
@@ -89,43 +88,3 @@ def _compiled(made: Unit, compiler: Compiler) -> tuple[dict[str, bytes], str]:
                 f"it made can't be loaded: correct CC and EOMC_CFLAGS, or take --sources\n  {said}"
             )
         return {f"binaries/{folder}/{library}": (sources / library).read_bytes()}, folder
-
-
-def _run(name: str, command: list[str], folder: Path) -> None:
-    try:
-        done = subprocess.run(
-            command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="backslashreplace",
-        )  # fmt: skip
-    except OSError as fault:
-        raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
-    if done.returncode:
-        raise EomcError(
-            f"{name}: the C compiler failed (status {done.returncode}):\n"
-            f"  {shlex.join(command)}\n{done.stdout.rstrip()}"
-        )
-
-
-def _write(file: Path, held: dict[str, bytes]) -> None:
-    """An archive of these, moved into place when it is whole."""
-    new = None
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        number, new = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
-        with os.fdopen(number, "wb") as out, zipfile.ZipFile(out, "w") as archive:
-            for name in sorted(held):
-                entry = zipfile.ZipInfo(name, _DATE)
-                entry.compress_type = zipfile.ZIP_DEFLATED
-                entry.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
-                entry.create_system = 3
-                archive.writestr(entry, held[name])
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(new, 0o666 & ~umask)
-        os.replace(new, file)
-        new = None
-    except OSError as fault:
-        raise EomcError(f"{file}: can't be written ({fault.strerror})") from None
-    finally:
-        if new is not None:
-            Path(new).unlink(missing_ok=True)

@@ -6,9 +6,9 @@ alone (-fstack-usage). Sizes of functions and sections stand in the object, whic
 
 from __future__ import annotations
 
+import contextlib
 import re
 import struct
-import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,6 +16,7 @@ from pathlib import Path
 
 from eomc.base.errors import EomcError
 from eomc.toolchain.compiler import PLAIN_STANDARD, Compiler, given_flags
+from eomc.toolchain.running import run
 
 SMALL = ("-Os",)  # where EOMC_CFLAGS says nothing
 # tables by which debuggers unwind are in no small machine
@@ -76,27 +77,17 @@ def measure(files: Mapping[str, str], name: str, compiler: Compiler) -> Object:
         folder = Path(place)
         for end in "hc":
             (folder / f"{name}.{end}").write_text(files[f"{name}.{end}"], encoding="utf-8")
-        command = (*compiler.command, *flags, "-o", f"{name}.o")
-        for more in _STACKS:
-            done = _ran([*command, *(word.format(name=name) for word in more)], folder)
-            if not done.returncode:
-                break
-        else:
-            raise EomcError(
-                f"{name}: the C compiler failed (status {done.returncode}):\n"
-                f"  {' '.join(command)}\n{(done.stdout + done.stderr).rstrip()}"
-            )
+        _compile(name, (*compiler.command, *flags, "-o", f"{name}.o"), folder)
         return _object(name, (*compiler.command, *flags[:-2]), folder)
 
 
-def _ran(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    try:
-        return subprocess.run(
-            command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-            errors="backslashreplace",
-        )  # fmt: skip
-    except OSError as fault:
-        raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
+def _compile(name: str, command: tuple[str, ...], folder: Path) -> None:
+    """By the first way of asking for stacks that the compiler takes."""
+    *others, last = ([*command, *(word.format(name=name) for word in more)] for more in _STACKS)
+    for asked in others:
+        with contextlib.suppress(EomcError):
+            return run(name, asked, folder)
+    run(name, last, folder)
 
 
 def _object(name: str, command: tuple[str, ...], folder: Path) -> Object:

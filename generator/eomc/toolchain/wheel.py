@@ -7,30 +7,25 @@ generations of processors; the package loads the widest that the machine has.
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
-import os
 import platform
 import re
 import sys
 import sysconfig
 import tempfile
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from eomc.base import texts
-from eomc.base.errors import EomcError
 from eomc.base.version import __version__
 from eomc.emit.render import Sources, show
 from eomc.emit.views import Compiled, Form
-from eomc.toolchain import extension
+from eomc.toolchain import archive, extension
 from eomc.toolchain.compiler import FLAGS, compiler_for, given_flags
 
 COMPILED = "compiled"  # the module that chooses an extension
 OLDEST = 17  # glibc 2.17, below which installers know no wheels
-_EARLIEST = (1980, 1, 1, 0, 0, 0)  # of a zip: same scene, same bytes
 
 
 @dataclass(frozen=True)
@@ -99,7 +94,9 @@ def build(made: Sources, scene: bytes, digest: str, title: str, folder: Path) ->
     whole[f"{info}/WHEEL"] = (
         f"Wheel-Version: 1.0\nGenerator: eomc {__version__}\nRoot-Is-Purelib: false\nTag: {tag}\n"
     ).encode()
-    return _written(folder, f"{name}-{version}-{tag}.whl", whole, f"{info}/RECORD")
+    wheel = folder / f"{name}-{version}-{tag}.whl"
+    archive.write(wheel, _recorded(whole, f"{info}/RECORD"))
+    return wheel
 
 
 def _interface() -> tuple[str, str, str]:
@@ -136,31 +133,10 @@ def _metadata(name: str, version: str, title: str) -> str:
     )
 
 
-def _written(folder: Path, called: str, files: Mapping[str, bytes], record: str) -> Path:
-    """A zip of the files, and a record of their digests, in place at once."""
+def _recorded(files: Mapping[str, bytes], record: str) -> dict[str, bytes]:
+    """The files, and behind them the record of their digests."""
     rows = []
-    new = folder / f".{called}.{os.getpid()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, data in files.items():
-                hashed = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=")
-                rows.append(f"{name},sha256={hashed.decode()},{len(data)}\n")
-                archive.writestr(_entry(name), data)
-            archive.writestr(_entry(record), "".join((*rows, f"{record},,\n")))
-        os.replace(new, folder / called)
-    except OSError as fault:
-        raise EomcError(
-            f"{fault.filename or folder}: can't be written ({fault.strerror})"
-        ) from None
-    finally:
-        with contextlib.suppress(OSError):
-            new.unlink()
-    return folder / called
-
-
-def _entry(name: str) -> zipfile.ZipInfo:
-    entry = zipfile.ZipInfo(name, _EARLIEST)
-    entry.compress_type = zipfile.ZIP_DEFLATED
-    entry.external_attr = 0o644 << 16
-    return entry
+    for name, data in files.items():
+        digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=").decode()
+        rows.append(f"{name},sha256={digest},{len(data)}\n")
+    return {**files, record: "".join((*rows, f"{record},,\n")).encode()}
