@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -24,6 +25,7 @@ METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
+ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
 BUSY = 32  # events in one step, from which on it ends there
 
 
@@ -34,7 +36,7 @@ def memory(functions: Functions) -> str:
 
 def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
-    vectors, few = (8, 20) if corners(system, STEEP) else (6, 16)
+    vectors, few = (8, 24) if corners(system, STEEP) else (6, 20)
     stages = METHOD.stages * len(system.coordinates)
     return vectors * width + stages + few + 2 * len(system.events)
 
@@ -97,15 +99,23 @@ class Stepping:
         real = self.functions.real
         out = c.filled(f"{self.method}_stages", "a")
         told = (c.filled(real, "rough"), c.filled("int", "sweeps"))
-        given = (*self.form.around, self.number("tol"), self.number("most"))
+        by = c.given(f"{self.method}_newton", "m")
+        given = (*self.form.around, self.number("tol"), self.number("most"), by)
         return CFunction(f"{self.method}_settled", "int", (out, *given, *told), qualifier="static")
 
     @cached_property
     def forces(self) -> CFunction:
-        """The accelerations at a state, where forces have corners."""
-        out = c.filled(self.functions.real, "f")
+        """The accelerations at a state."""
+        return self._at_a_state("forces", c.filled(self.functions.real, "f"))
+
+    @cached_property
+    def slopes(self) -> CFunction:
+        """Their derivatives."""
+        return self._at_a_state("slopes", c.filled(f"{self.method}_newton", "m"))
+
+    def _at_a_state(self, name: str, out: CArgument) -> CFunction:
         given = (a for a in self.form.around if a.name != "h")
-        return CFunction(f"{self.method}_forces", "int", (out, *given), qualifier="static")
+        return CFunction(f"{self.method}_{name}", "int", (out, *given), qualifier="static")
 
     @cached_property
     def step(self) -> CFunction:
@@ -132,7 +142,8 @@ def steps(made: Stepping) -> Adaptive:
     functions, m, form = made.functions, METHOD, made.form
     target, real = functions.target, functions.target.real
     end = real.function_suffix
-    known = {"a": "&a", "rough": "&rough", "sweeps": "&sweeps"}
+    known = {"a": "&a", "rough": "&rough", "sweeps": "&sweeps", "m": "newton ? &m : 0"}
+    eigenvalues, to_parts, from_parts = m.eigen
     return Adaptive(
         prefix=functions.prefix,
         PREFIX=functions.PREFIX,
@@ -171,6 +182,15 @@ def steps(made: Stepping) -> Adaptive:
         top=c.in_braces(numbers(m.legendre(n), real) for n in range(m.stages - 4, m.stages)),
         ends=c.in_braces(numbers(row, real) for row in _ends()),
         forces=made.forces,
+        forces_here=made.forces.call(f="here", q="at_q", qd="at_qd"),
+        forces_near=made.forces.call(f="near", q="at_q", qd="at_qd"),
+        slopes=made.slopes,
+        slopes_now=made.slopes.call(m="&m"),
+        nudge=target.literal(math.sqrt(real.epsilon)),
+        eigenvalues=c.in_braces(numbers(row, real) for row in eigenvalues),
+        to_parts=c.in_braces(numbers(row, real) for row in to_parts),
+        from_parts=c.in_braces(numbers(row, real) for row in from_parts),
+        anew=ANEW,
         forces_there=made.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
         settled_within=made.settle.call(most=target.literal(1e30), **known),
     )
@@ -203,6 +223,7 @@ def run(made: Stepping, happen: str = "", restart: str = "") -> AdaptiveRun:
         tightest=target.literal(1e-15 if target.real.epsilon < 1e-10 else 5e-7),
         events=bool(happen),
         busy=BUSY,
+        anew=ANEW,
         run=functions.public.adaptive(METHOD.name),
         advance=made.step.call(x="&x"),
         happen=happen,

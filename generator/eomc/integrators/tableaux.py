@@ -11,12 +11,13 @@ b A are put by others, it is a method of Nystrom: Euler's and Verlet's are writt
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
 from fractions import Fraction
 from functools import cached_property
 from math import comb, inf, lcm
+from typing import Any
 
 Row = tuple[Fraction, ...]
 
@@ -86,6 +87,34 @@ class Method:
         """To its part in Legendre's polynomial P_n(2 c - 1), n below the stages, at Gauss nodes."""
         p = _legendre(n)
         return tuple((2 * n + 1) * b * _value(p, x) for b, x in zip(self.b, self.c, strict=True))
+
+    @cached_property
+    def eigen(self) -> tuple[tuple[Row, ...], tuple[Row, ...], tuple[Row, ...]]:
+        """Of A, of an even number of stages and without real eigenvalues: those of each pair whose
+        imaginary part is positive, (real, imaginary); the rows to their parts, of each the real
+        and the imaginary one; and those from there, as many.
+        """
+        from mpmath import matrix, mp, mpf
+
+        with mp.workdps(_DIGITS + 10):
+            a = matrix([[mpf(x.numerator) / x.denominator for x in row] for row in self.a])
+            values, right = mp.eig(a)
+            left = right**-1
+            pairs = sorted(
+                (k for k, mu in enumerate(values) if mu.imag > 0), key=lambda k: values[k].imag
+            )
+
+            def fractions(numbers: Iterable[Any]) -> Row:
+                return tuple(Fraction(mp.nstr(x, _DIGITS)) for x in numbers)
+
+            there, back = [], []
+            for k in pairs:
+                v = [right[i, k] / right[0, k] for i in range(self.stages)]
+                w = [left[k, i] * right[0, k] for i in range(self.stages)]
+                there += [fractions(x.real for x in w), fractions(x.imag for x in w)]
+                back += [fractions(2 * x.real for x in v), fractions(-2 * x.imag for x in v)]
+            mu = [fractions((values[k].real, values[k].imag)) for k in pairs]
+        return tuple(mu), tuple(there), tuple(back)
 
     @cached_property
     def a_ahead(self) -> tuple[Row, ...]:

@@ -33,7 +33,6 @@ LOOSEST = 1e-2
 _EVENTS = 1024  # of one call
 _ROOM = 256  # steps of the first call
 _MOST = 2**20  # of one call
-_STIFF = 50  # steps that sweeps have held back, from which a run says so
 _DRAWN = 1_000  # rows of a curve, at least
 _EVEN = 8  # rows a step, as equally spaced ones need them
 
@@ -54,18 +53,19 @@ class Happened:
 class AdaptiveRun(Run):
     """A run whose steps fit `tol`: rows after each step, or at the times that were asked for.
 
-    h is the mean step, `rejected` how many steps were tried in vain, `held_back` how many would
-    have been longer if the motion were not stiff. events: by name where and when each happened, t,
-    q, qd; stopped: the one that ended the run, or "". A run whose jumps follow one another ever
-    sooner ends with the status "accumulated", and `limit`, the time that it can't pass, s.
-    Everything else as in a Run.
+    h is the mean step, `rejected` how many steps were tried in vain, `stiff_steps` how many were
+    found by Newton's method, since the motion is stiff there. events: by name where and when each
+    happened, t, q, qd; stopped: the one that ended the run, or "". A run whose jumps follow one
+    another ever sooner ends with the status "accumulated", and `limit`, the time that it can't
+    pass, s. Everything else as in a Run.
     """
 
     tol: float = field(kw_only=True)
     rejected: int = field(kw_only=True)
-    held_back: int = field(kw_only=True)
+    stiff_steps: int = field(kw_only=True)
     _times: Array = field(kw_only=True)
     _h_most: float = field(kw_only=True)
+    _stiff: bool = field(kw_only=True)
     _begin: Array = field(kw_only=True)  # q and qd at t0, (2, nq)
     _t_end: float = field(kw_only=True)
     _happened: tuple[Array, Array] = field(kw_only=True)  # which, rows of t, q, qd
@@ -110,7 +110,7 @@ class AdaptiveRun(Run):
         if len(asked) > first:
             made = run(
                 self._model, q, qd, self.t0, self._t_end, self.tol, asked[first:], self._u,
-                self._params, self._h_most, None,
+                self._params, self._h_most, None, self._stiff,
             )  # fmt: skip
             rows[:, first:] = made._rows
         both = rows[:, place.ravel()].reshape(2, *times.shape, len(q))
@@ -129,16 +129,12 @@ class AdaptiveRun(Run):
     @property
     def told(self) -> str:
         """How its steps were chosen, in words."""
-        return f"{self.rejected} rejected, tolerance {self.tol:g}"
+        stiff = f", {self.stiff_steps} by Newton's method" if self.stiff_steps else ""
+        return f"{self.rejected} rejected{stiff}, tolerance {self.tol:g}"
 
     @property
     def _remark(self) -> str:
-        if self.held_back < max(_STIFF, self.steps // 8):
-            return self._singular
-        return (
-            f"{self.held_back} of {self.steps} steps were held back by a stiff motion: fixed steps "
-            "of gauss8 may be quicker"
-        )
+        return self._singular
 
     def __repr__(self) -> str:
         how = "" if self.status == "ok" else f"{self.status} after "
@@ -206,9 +202,9 @@ class AdaptiveRun(Run):
 
     def _kept(self) -> dict[str, Any]:
         own = {
-            "tol": self.tol, "rejected": self.rejected, "held_back": self.held_back,
-            "times": self.t, "h_most": self._h_most, "begin": self._begin, "t_end": self._t_end,
-            "which": self._happened[0],
+            "tol": self.tol, "rejected": self.rejected, "stiff_steps": self.stiff_steps,
+            "times": self.t, "h_most": self._h_most, "stiff": self._stiff, "begin": self._begin,
+            "t_end": self._t_end, "which": self._happened[0],
             "event_rows": self._happened[1], "stopped": self.stopped, "limit": self.limit,
         }  # fmt: skip
         return super()._kept() | own
@@ -218,9 +214,9 @@ class AdaptiveRun(Run):
         return cls(
             model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
             kept["params"], 1, kept.get("held"), kept["method"], kept["evaluations"],
-            tol=kept["tol"], rejected=kept["rejected"], held_back=kept["held_back"],
-            _times=kept["times"], _h_most=kept["h_most"], _begin=kept["begin"],
-            _t_end=kept["t_end"],
+            tol=kept["tol"], rejected=kept["rejected"], stiff_steps=kept.get("stiff_steps", 0),
+            _times=kept["times"], _h_most=kept["h_most"], _stiff=bool(kept.get("stiff", False)),
+            _begin=kept["begin"], _t_end=kept["t_end"],
             _happened=(kept["which"], kept["event_rows"]), stopped=kept["stopped"],
             limit=kept["limit"],
         )  # fmt: skip
@@ -240,7 +236,7 @@ class AdaptiveRun(Run):
 def simulate(
     model: Model, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
     params: Any, t0: float, progress: Callable[[int, int], None] | None, tol: float | None,
-    times: ArrayLike | None, h_most: float | None, **fixed: Any,
+    times: ArrayLike | None, h_most: float | None, stiff: bool, **fixed: Any,
 ) -> AdaptiveRun:  # fmt: skip
     """`Model.simulate` with a tolerance; fixed: what belongs to fixed steps, and was given."""
     tol, most = as_limits(model, tol, h_most, fixed)
@@ -256,14 +252,14 @@ def simulate(
     p = model._p0 if params is None else model._parameters(params).copy()
     if times is None:
         end = as_end(model, t0, duration)
-        found = run(model, q, qd, t0, end, tol, None, held, p, most, progress)
+        found = run(model, q, qd, t0, end, tol, None, held, p, most, progress, stiff)
     else:
         if duration is not None:
             raise ValueError(BOTH)
         rows = as_times(times, t0, model.dtype)
         first = int(rows[0] == t0)
         end = float(rows[-1])
-        found = run(model, q, qd, t0, end, tol, rows[first:], held, p, most, progress)
+        found = run(model, q, qd, t0, end, tol, rows[first:], held, p, most, progress, stiff)
         if first:
             both = np.concatenate([np.array([[q], [qd]]), found._rows], axis=1)
             found._rows, found._times = both, rows[: both.shape[1]]
@@ -273,10 +269,12 @@ def simulate(
 def run(
     model: Model, q: Array, qd: Array, t0: float, t_end: float, tol: float, times: Array | None,
     u: Array | None, p: Array, h_most: float, progress: Callable[[int, int], None] | None,
+    stiff: bool = False,
 ) -> AdaptiveRun:  # fmt: skip
     """A run from checked arguments, whatever its status; times (n,) later than t0."""
     address, real, null = model._c
     nq, dtype, work = model.nq, model.dtype, model._ffi.new("adaptive_work *")
+    work.stiff = bool(stiff)
     x, at, start = np.concatenate([q, qd]), np.array([t0], dtype), np.empty((2, nq), dtype)
     start[0], start[1] = q, qd
     at_x, at_t, at_u = address(real, x), address(real, at), model._pointer(u)
@@ -335,8 +333,8 @@ def run(
     held = None if u is None else u.copy()
     made = AdaptiveRun(
         model, t0, both, mean, work.steps, said, p, 1, held, "gauss16",
-        work.evaluations, tol=tol, rejected=work.rejected, held_back=work.held_back,
-        _times=stamps, _h_most=h_most, _begin=start, _t_end=t_end,
+        work.evaluations, tol=tol, rejected=work.rejected, stiff_steps=work.stiff_steps,
+        _times=stamps, _h_most=h_most, _stiff=bool(stiff), _begin=start, _t_end=t_end,
         _happened=found_events.all(),
         stopped=model.events[work.stopped - 1] if model.events and work.stopped else "",
         limit=work.limit if said == "accumulated" else float("nan"),

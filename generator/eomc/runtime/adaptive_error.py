@@ -42,7 +42,7 @@ def error_of(
         if len(kept):
             made = run(
                 model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], own._u,
-                own._params, own._h_most, progress,
+                own._params, own._h_most, progress, own._stiff,
             )  # fmt: skip
             if made.status == "interrupted":
                 raise KeyboardInterrupt

@@ -207,32 +207,32 @@ class Model(Constrained):
         control_period: float | None = None, out: tuple[Array, Array] | None = None,
         progress: Callable[[int, int], None] | None = None, estimate: bool = False,
         tol: float | None = None, times: ArrayLike | None = None, h_most: float | None = None,
+        stiff: bool = False,
     ) -> Run:  # fmt: skip
         """A trajectory by fixed steps of size h, or by steps that fit a tolerance; the loop in C.
 
-        q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration.
-        every: a row is kept of every so many steps, and the first and last state always.
-        method: one of `methods`, the first of them where None.
+        q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration. method:
+        one of `methods`, the first where None. every: a row is kept of every so many steps, and the
+        first and last state always.
         u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; a
         dict of all inputs by name, numbers or (steps,); or a function u(t, q, qd) called before
-        each step, which is some hundred times slower.
-        control_period: in s, a whole number of steps: the function is called, a row taken, or the
-        signals are read, once in it, and held until the next.
-        out: (q, qd) arrays to write the rows to. progress: called with (done, steps).
-        estimate: whether to find the run's own error, `run.error`, by doing it again in shorter
-        steps, which takes some nine times as long.
-        tol: of adaptive steps, each of which errs by about tol of how far it moves; built where
-        the scene says [run] tolerance, which is taken where h, steps and method are not given.
+        each step, some hundred times slower. control_period: in s, a whole number of steps: the
+        function is called, a row taken, or the signals are read, once in it, and held to the next.
+        out: (q, qd) arrays to write the rows to. progress: called with (done, steps). estimate:
+        whether to find the run's own error, `run.error`, by shorter steps, nine times as long.
+        tol: of adaptive steps, each of which errs by about tol of how far it moves; built where the
+        scene says [run] tolerance, which is taken where h, steps and method are not given.
         times: (n,) ascending, instead of duration: the rows, at no extra steps. h_most: the longest
-        adaptive step, in s, so that none leaps over a short pulse.
-        A run that can't go on keeps what it has, warns, and says in `status` and `message` where
-        and why. Ctrl-C raises Interrupted, which holds the run so far.
+        adaptive step, in s, so that none leaps over a short pulse. stiff: whether they begin by
+        Newton's method, which they else take up where the motion turns out to be stiff.
+        A run that can't go on keeps what it has, warns, and says in `status` and `message` why;
+        Ctrl-C raises Interrupted, which holds it.
         """
         q0, qd0 = self._assembled(q0, qd0, t0, params)
-        given = tol is not None or times is not None or h_most is not None
+        given = tol is not None or times is not None or h_most is not None or stiff
         if given or self._fits(h, steps, method):
             fitted = adaptive.simulate(
-                self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, h=h,
+                self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff, h=h,
                 steps=steps, method=method, every=every, control_period=control_period, out=out,
             )  # fmt: skip
             return self._finished(fitted, estimate)

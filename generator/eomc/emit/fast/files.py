@@ -253,12 +253,12 @@ def _two_points(made: Steppers) -> views.TwoPoints:
 def _steppers(made: Steppers, show: Show) -> Iterator[str]:
     """The methods: their state, one step, run and batch."""
     real = made.one.real
-    batch = made.accelerations.target.system.run.batch
-    if any(m.newton for m in made.methods):
+    run = made.accelerations.target.system.run
+    if run.tolerance is not None or any(m.newton for m in made.methods):
         fabs = f"fabs{real.function_suffix}"
         yield show(views.Factors(made.one.prefix, made.one.real.name, fabs, real.suffix))
     for m in made.methods:
-        lanes = [made.one, *([made.wide] if batch else [])]
+        lanes = [made.one, *([made.wide] if run.batch else [])]
         if m is RK4:
             yield from (show(made.rk4(lane)) for lane in lanes)
         elif not m.implicit:
@@ -273,9 +273,9 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
         elif m.implicit:
             yield show(made.gauss(m))
         yield show(runs.loop(made, m))
-        if batch:
+        if run.batch:
             yield show(runs.batch(made, m))
-    if made.accelerations.target.system.run.tolerance is not None:
+    if run.tolerance is not None:
         if adaptive.METHOD not in made.methods:
             yield show(made.stages(adaptive.METHOD))
         yield from map(show, events.views(made.functions, _adaptive(made)))

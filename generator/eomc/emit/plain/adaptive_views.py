@@ -19,7 +19,9 @@ class Adaptive:
     project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
     corners: whether forces jump or bend; share: of the tolerance, for a step in which they do;
     top, ends: from accelerations at the stages to the parts in the last four of Legendre's, and to
-    the ends of the polynomial through them; forces: the accelerations at a state.
+    the ends of the polynomial through them; forces: the accelerations at a state; slopes: their
+    derivatives, by differences over `nudge`. eigenvalues, to_parts, from_parts: of A, as
+    Method.eigen has them; anew: steps by Newton's method, before sweeps alone are tried again.
     """
 
     TEMPLATE: ClassVar[str] = "c/adaptive.c"
@@ -62,6 +64,15 @@ class Adaptive:
     ends: tuple[str, ...]
     forces: CFunction
     forces_there: str
+    forces_here: str
+    forces_near: str
+    slopes: CFunction
+    slopes_now: str
+    nudge: str
+    eigenvalues: tuple[str, ...]
+    to_parts: tuple[str, ...]
+    from_parts: tuple[str, ...]
+    anew: int
 
 
 @dataclass(frozen=True)
@@ -126,6 +137,7 @@ class AdaptiveRun(Named):
     tightest: str
     events: bool
     busy: int
+    anew: int
     run: CFunction
     advance: str
     happen: str

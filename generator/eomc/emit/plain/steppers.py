@@ -50,7 +50,8 @@ def files(
     name = plain.prefix
     methods = [METHODS[m] for m in plain.target.system.run.methods]
     loops = [loop(plain, m) for m in methods]
-    views: list[View] = [implicit(plain, methods)] if any(m.implicit for m in methods) else []
+    swept = plain.target.system.run.tolerance is not None or any(m.implicit for m in methods)
+    views: list[View] = [implicit(plain, methods)] if swept else []
     views += [
         view for m, run in zip(methods, loops, strict=True) for view in (stepper(plain, m), run)
     ]
@@ -250,13 +251,16 @@ def _advance(plain: Functions, m: Method) -> tuple[CFunction, str]:
 def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
     """What the implicit methods share."""
     real, accelerate = plain.target.real, plain.acceleration.function.call
+    newton = any(m.newton for m in methods)
     return Implicit(
         **plain.names,
         fabs=f"fabs{real.function_suffix}",
         fmax=f"fmax{real.function_suffix}",
         tiny=plain.target.literal(1e-30),
         nudge=plain.target.literal(sqrt(real.epsilon)),
-        newton=any(m.newton for m in methods),
+        corrections=any(m.implicit for m in methods),
+        factors=newton or plain.target.system.run.tolerance is not None,
+        newton=newton,
         slopes=CFunction(
             f"{plain.prefix}_differences",
             plain.status,

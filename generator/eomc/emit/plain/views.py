@@ -199,13 +199,18 @@ class Explicit(Named):
 
 @dataclass(frozen=True)
 class Implicit(Named):
-    """c/plain/implicit.c.jinja: what implicit methods share. here, near: calls of accelerations."""
+    """c/plain/implicit.c.jinja: what implicit methods share, and what adaptive steps take of it.
+
+    here, near: calls of accelerations.
+    """
 
     TEMPLATE: ClassVar[str] = "c/plain/implicit.c"
     fabs: str
     fmax: str
     tiny: str
     nudge: str
+    corrections: bool
+    factors: bool
     newton: bool
     slopes: CFunction
     here: str

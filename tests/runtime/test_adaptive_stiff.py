@@ -1,0 +1,202 @@
+"""Adaptive steps in stiff motion, found by Newton's method: beside closed forms, and each other."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import cases
+import mpmath
+import numpy as np
+import pytest
+
+import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+
+BUILDS = Path(__file__).parents[2] / "build" / "tests" / "adaptive"
+TRAIN = """eomc = 1
+name = "stiff_train"
+[coordinates]
+x = { unit = "m", start = 0.1, rate = 1 }
+y = { unit = "m", start = 0.3 }
+[parameters]
+k = 1e8
+c = 1e4
+[energy]
+kinetic = "(x_dot**2 + 2*y_dot**2)/2"
+potential = "x**2/2 + k*(y - x)**2/2"
+[forces]
+x = "c*(y_dot - x_dot)"
+y = "c*(x_dot - y_dot)"
+[[event]]
+name = "back"
+when = "x + 2*y"
+[run]
+tolerance = 1e-9
+batch = true
+"""
+START = (0.1, 0.3, 1.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def train() -> ModuleType:
+    """Two masses, one on a soft spring, coupled so that they move as one after 1e-3 s."""
+    return eomc.load(from_scene(parse(TRAIN, "stiff_train.toml")), BUILDS)
+
+
+@cache
+def exact(t: float) -> np.ndarray:
+    """Its state at t, (4,), in fifty digits."""
+    k, c = 10**8, 10**4
+    with mpmath.workdps(50):
+        rates = mpmath.matrix(
+            [
+                [0, 0, 1, 0],
+                [0, 0, 0, 1],
+                [-1 - k, k, -c, c],
+                [mpmath.mpf(k) / 2, -k / 2, c / 2, -c / 2],
+            ]
+        )
+        values, vectors = mpmath.eig(rates)
+        parts = mpmath.lu_solve(vectors, mpmath.matrix([mpmath.mpf(str(x)) for x in START]))
+        ends = [parts[i] * mpmath.exp(values[i] * mpmath.mpf(t)) for i in range(4)]
+        return np.array([float(mpmath.re(x)) for x in vectors * mpmath.matrix(ends)])
+
+
+@pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-9, 1e-12])
+def test_the_end_is_the_closed_form(train: ModuleType, tol: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run = train.simulate(tol=tol, duration=20.0)
+    assert run.status == "ok" and run.stiff_steps > run.steps / 3 and run.steps < 120
+    assert np.abs(run.x[-1] - exact(20.0)).max() < 10 * tol
+    assert "by Newton's method" in run.message
+
+
+def test_rows_within_stiff_steps_are_exact_too(train: ModuleType) -> None:
+    times = np.array([1e-4, 1e-3, 0.5, 3.0, 3.01, 17.7, 20.0])
+    run = train.simulate(tol=1e-11, times=times)
+    assert run.steps < 300
+    for t, x in zip(times, run.x, strict=True):
+        assert np.abs(x - exact(t)).max() < 1e-9, t
+    again = train.simulate(tol=1e-11, duration=20.0)
+    assert np.array_equal(np.concatenate(again(3.01)), run.x[4])
+
+
+def test_events_in_stiff_steps_are_found(train: ModuleType) -> None:
+    found = train.simulate(tol=1e-12, duration=20.0).events["back"].t
+    assert len(found) == 3 and np.diff(found) == pytest.approx(np.pi * np.sqrt(3), rel=1e-7)
+    for t in found:
+        x = exact(float(t))
+        assert abs(x[0] + 2 * x[1]) < 1e-10
+
+
+def test_a_run_may_begin_by_newtons_method(train: ModuleType, tmp_path: Path) -> None:
+    run = train.simulate(tol=1e-9, duration=20.0, stiff=True)
+    own = train.simulate(tol=1e-9, duration=20.0)
+    assert run.evaluations != own.evaluations
+    assert np.abs(run.x[-1] - exact(20.0)).max() < 1e-8
+    assert np.array_equal(run(3.3)[0], train.simulate(tol=1e-9, times=[3.3, 20], stiff=True).q[0])
+    run.save(tmp_path / "run.npz")
+    kept = train.load_run(tmp_path / "run.npz")
+    assert kept.stiff_steps == run.stiff_steps and np.array_equal(kept(3.3)[0], run(3.3)[0])
+    assert max(run.estimate().end.values()) < 1e-8
+
+
+def test_many_take_the_steps_that_each_takes_alone(train: ModuleType) -> None:
+    q0 = np.column_stack([np.linspace(0, 1, 9), np.linspace(0.3, 0.31, 9)])
+    c = np.geomspace(1, 1e6, 9)
+    runs = train.simulate_batch(q0, params={"c": c}, tol=1e-8, times=[0.0, 2.0, 5.0])
+    for k in (0, 5, 8):
+        alone = train.simulate(q0[k], params={"c": c[k]}, tol=1e-8, times=[0.0, 2.0, 5.0])
+        assert np.array_equal(runs.q[k], alone.q) and runs.steps[k] == alone.steps
+
+
+def test_calm_motion_goes_back_to_sweeps(train: ModuleType) -> None:
+    calm = train.simulate(params={"k": 1, "c": 0}, tol=1e-9, duration=200.0, stiff=True)
+    assert calm.stiff_steps == 32 and calm.steps > 64
+    assert train.simulate(params={"k": 1, "c": 0}, tol=1e-9, duration=200.0).stiff_steps == 0
+
+
+def test_single_precision() -> None:
+    text = TRAIN.replace("stiff_train", "stiff_single").replace("1e4", "1e3").replace("1e8", "1e5")
+    text = text.replace("batch = true\n", 'method = "gauss8"\nreal = "float"\n')
+    text = text.replace("1e-9", "1e-5")
+    module = eomc.load(from_scene(parse(text, "stiff_single.toml")), BUILDS)
+    run, fine = module.simulate(duration=20.0), module.simulate(duration=20.0, h=0.05)
+    assert run.stiff_steps > 40 and run.steps < 400  # 4300 where sweeps converge
+    assert np.abs(run.x[-1] - fine.x[-1]).max() < 1e-4
+
+
+def test_constraints_hold_in_stiff_steps() -> None:
+    text = """eomc = 1
+name = "stiff_rod"
+[coordinates]
+x = { start = 0.6 }
+y = { start = -0.8 }
+z = { start = 0.1 }
+[parameters]
+k = 1e7
+c = 1e4
+[energy]
+kinetic = "(x_dot**2 + y_dot**2 + z_dot**2/10)/2"
+potential = "9.81*y + k*(z - x)**2/2"
+[forces]
+x = "c*(z_dot - x_dot)"
+z = "c*(x_dot - z_dot)"
+[constraints]
+rod = "x**2 + y**2 - 1"
+[run]
+tolerance = 1e-10
+method = "gauss8"
+"""
+    module = eomc.load(from_scene(parse(text, "stiff_rod.toml")), BUILDS)
+    run = module.simulate(duration=3.0)
+    assert run.status == "ok" and run.stiff_steps > run.steps / 2
+    assert np.abs(run.constraints["rod"]).max() < 1e-13
+    fine = module.simulate(duration=3.0, h=5e-5)
+    assert np.abs(run.q[-1] - fine.q[-1]).max() < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
+def test_the_governor_settles(tol: float) -> None:
+    text = cases.scene_text("iftomm_A05_governor").replace("[run]", "[run]\ntolerance = 1e-9")
+    module = eomc.load(from_scene(parse(text, "stiff.toml")), BUILDS)
+    run = module.simulate(tol=tol)
+    assert cases.error_of("iftomm_A05_governor", run.q[-1]) < 10 * tol
+    assert run.stiff_steps > run.steps / 2 and run.steps < 400
+
+
+def test_a_relaxation_oscillator() -> None:
+    """Van der Pol's, mu = 1000, by the asymptotic period of Dorodnicyn."""
+    text = """eomc = 1
+name = "relaxation"
+[coordinates]
+x = { start = 2.0 }
+[parameters]
+mu = 1000.0
+[energy]
+kinetic = "x_dot**2/2"
+potential = "x**2/2"
+[forces]
+x = "mu*(1 - x**2)*x_dot"
+[[event]]
+name = "up"
+when = "x"
+direction = "rising"
+[run]
+duration = 8000
+tolerance = 1e-9
+"""
+    module = eomc.load(from_scene(parse(text, "relaxation.toml")), BUILDS)
+    run = module.simulate()
+    assert run.status == "ok" and run.steps < 2000 and run.stiff_steps > 400
+    period = np.diff(run.events["up"].t)
+    # 1.6137056 mu + 7.01432 mu^(-1/3) - (22/9) ln(mu)/mu + 0.0087/mu
+    expected = (3 - 2 * np.log(2)) * 1000 + 7.01432 * 0.1 - 22 / 9 * np.log(1000) / 1000
+    assert len(period) >= 3 and period == pytest.approx(expected, rel=1e-5)
+    assert np.ptp(period) < 1e-5
