@@ -17,12 +17,14 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from eomc.integrators.tableaux import METHODS
+from eomc.integrators.tableaux import METHODS, RK4
+from eomc.verify import one_step
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
 from eomc.verify.sampling import started
@@ -44,6 +46,12 @@ BESIDE = (1 - 1e-3, 1 + 1e-3)  # times a state: hardly changes what is smooth, b
 CLOSED = 1e3  # roundings of the energy: a balance is closed
 RESOLVED = 1e-3  # of the motion: two methods are compared where halving h changes no more
 DRAWS = 2  # of starts moved by a rounding
+
+
+class _End(Protocol):
+    """The scaled end of a run from a state, (2, nq); None where it does not get there."""
+
+    def __call__(self, s: State, *, span: float, steps: int) -> Vector | None: ...
 
 
 @dataclass(frozen=True)
@@ -126,17 +134,17 @@ class Convergence:
             return None
         return np.array([run.q[-1], run.qd[-1]]) / self.scale
 
-    def noise(self, at: Place, method: str, span: float, steps: int, end: Vector) -> float:
+    def noise(self, at: Place, end: _End, span: float, steps: int, there: Vector) -> float:
         """What rounding does to the end: that of the sums on the way, and of the start, grown."""
         s = at.state
-        size = np.abs(np.array([s.q, s.qd])) + np.abs(end) * self.scale
+        size = np.abs(np.array([s.q, s.qd])) + np.abs(there) * self.scale
         least = EPS * float(np.max(size / self.scale))
         random = np.random.default_rng(steps)
         for _ in range(DRAWS):
             by = random.choice([-EPS, EPS], size.shape) * size
-            near = self.end(replace(s, q=s.q + by[0], qd=s.qd + by[1]), method, span, steps)
+            near = end(replace(s, q=s.q + by[0], qd=s.qd + by[1]), span=span, steps=steps)
             if near is not None:
-                least = max(least, float(np.max(np.abs(near - end))))
+                least = max(least, float(np.max(np.abs(near - there))))
         return least
 
     # --- orders -----------------------------------------------------------------------------------
@@ -161,10 +169,11 @@ class Convergence:
         order 1 with any method, where steps leap over a bend of the forces.
         """
         ladders: dict[int, _Ladder | None] = {}
+        end = partial(self.end, method=method)
 
         def ladder(power: int) -> _Ladder | None:
             if power not in ladders:
-                ladders[power] = self._ladder(at, method, 48 * self.h * 2.0**power)
+                ladders[power] = self._ladder(at, end, 48 * self.h * 2.0**power)
             return ladders[power]
 
         for power in FIRST:
@@ -187,21 +196,41 @@ class Convergence:
         return math.nan if moved else math.inf
 
     def _bends(self, at: Place, method: str, span: float) -> bool:
-        """Whether another method is of low orders over a span too: steps leap over a bend."""
-        for other in self.methods:
-            least = min(METHODS[other].order, SEEN) - ORDER_MARGIN
-            one = self._ladder(at, other, span) if other != method else None
+        """Whether another method is of low orders over a span too: steps leap over a bend.
+
+        RK4 on the module's accelerations is one, beside those that the module has.
+        """
+        others: list[tuple[str, _End]] = [
+            (m, partial(self.end, method=m)) for m in self.methods if m != method
+        ]
+        if not getattr(self.module, "constraint_names", ()):
+            others.append((RK4.name, self._end_by_hand))
+        for name, end in others:
+            least = min(METHODS[name].order, SEEN) - ORDER_MARGIN
+            one = self._ladder(at, end, span)
             if one and math.isnan(one.best(least)) and sum(clear for _, clear in one.orders) > 1:
                 return True
         return False
 
-    def _ladder(self, at: Place, method: str, span: float) -> _Ladder | None:
-        ends = [self.end(at.state, method, span, n) for n in COUNTS]
+    def _end_by_hand(self, s: State, span: float, steps: int) -> Vector | None:
+        """As `end`, by RK4 in Python."""
+
+        def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
+            return self.ask("acceleration", replace(s, q=q, qd=qd, t=t))
+
+        x, h = np.array([s.q, s.qd]), span / steps
+        with np.errstate(all="ignore"):
+            for k in range(steps):
+                x = one_step.step(RK4, acceleration, x[0], x[1], s.t + k * h, h)
+        return x / self.scale if np.isfinite(x).all() else None
+
+    def _ladder(self, at: Place, end: _End, span: float) -> _Ladder | None:
+        ends = [end(at.state, span=span, steps=n) for n in COUNTS]
         known = [end for end in ends if end is not None]
         if ends[2] is None or any(e is None for e in ends[-len(known) :]):
             return None
         off = tuple(float(np.max(np.abs(b - a))) for a, b in pairwise(known))
-        return _Ladder(span, off, self.noise(at, method, span, COUNTS[2], ends[2]))
+        return _Ladder(span, off, self.noise(at, end, span, COUNTS[2], ends[2]))
 
     # --- two methods ------------------------------------------------------------------------------
 
@@ -232,7 +261,7 @@ class Convergence:
             change = np.abs(two - one) + np.abs(other - far)
             if float(np.max(change)) > RESOLVED:
                 continue
-            noise = self.noise(at, method, span, 48, other)
+            noise = self.noise(at, partial(self.end, method=method), span, 48, other)
             ratios.append(float(np.max(np.abs(two - other)) / (np.max(change) + 2 * CLEAR * noise)))
             if len(ratios) == 2 or ratios[-1] <= 1:
                 break
