@@ -227,7 +227,7 @@ def test_check_compares_both_forms_with_the_reference(scene: str, real: str) -> 
         plain = eomc.load(system, BUILDS, form="plain")
         report = check(system, eomc.load(system, BUILDS), plain=plain, states=4)
     rows = [row for row in report.rows if "adaptive" in row.name]
-    assert len(rows) == 6 and all(row.passed for row in rows), rows
+    assert len(rows) == 8 and all(row.passed for row in rows), rows
 
 
 def test_the_plain_form_has_the_method_by_fixed_steps_beside(tmp_path: Path) -> None:

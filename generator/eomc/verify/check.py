@@ -15,6 +15,7 @@ import numpy as np
 from eomc.model.system import System
 from eomc.verify import (
     rows_adaptive,
+    rows_adaptive_refusals,
     rows_constraints,
     rows_derivatives,
     rows_discretize,
@@ -117,6 +118,7 @@ def compiled_rows(made: Comparison) -> None:
     rows_sines.report(made)
     rows_newton.report(made)
     refusals.report()
+    rows_adaptive_refusals.report(made, refusals)
     if made.system.constraints:
         rows_projection.of_inertia(made, refusals)
     if hasattr(made.module, "simulate_batch"):

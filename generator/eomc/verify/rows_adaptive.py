@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 LIMIT, UNIT = 0.1, "tolerances a step, times growth"
 STEPS = (12, 6, 3)  # of a run that is compared, the first in which a difference grows little
 LEAST = {"float64": 1e-15, "float32": 5e-7}  # tolerance
+TICKS = 4  # roundings of a time
 ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 
@@ -65,11 +67,14 @@ def _error(of: Comparison, module: Any, tol: float, stiff: bool, s: State) -> fl
         return None
     ends = [first.events[e.name].t for e in of.system.events if e.action != "record"]
     first_end = min((float(t[0]) for t in ends if len(t)), default=math.inf)
+    moved = x + NUDGE * spread
+    beside = of.sampler.onto(replace(s, q=moved[: len(s.q)], qd=moved[len(s.q) :]))
+    nudged = np.concatenate([beside.q, beside.qd])
     for steps in STEPS:
         T = min(float(first.t[min(steps, len(first) - 1)]), first_end) - s.t
         T *= 1 if s.t + T < first_end else 0.9  # the reference knows of no events
         run = _adaptive(module, s, x, T, tol, stiff=stiff)
-        near = _adaptive(module, s, x + NUDGE * spread, T, tol, stiff=stiff)
+        near = _adaptive(module, s, nudged, T, tol, stiff=stiff)
         if run.status != "ok" or near.status != "ok":
             continue
         growth = float(np.max(np.abs(near.x[-1] - run.x[-1]) / spread)) / NUDGE
@@ -78,20 +83,23 @@ def _error(of: Comparison, module: Any, tol: float, stiff: bool, s: State) -> fl
         times = s.t + T * np.array([0.31, 0.77, 1.0])
         rows = _adaptive(module, s, x, T, tol, times=times, stiff=stiff)
         finer = _adaptive(module, s, x, T, max(tol / 1000, LEAST[of.dtype.name]))
-        expected = _reference(of, s, x, times, finer.t)
+        expected, rates = _reference(of, s, x, times, finer.t)
         if not np.isfinite(expected).all():
             continue
-        found = np.vstack([rows.x, run.x[-1:]]).astype(float)
-        size = np.abs(expected).max(axis=0) + max(growth, 1.0) * spread
-        off = np.abs(found - np.vstack([expected, expected[-1:]])) / size
+        late = TICKS * of.eps * (abs(s.t) + T) * np.abs(rates)  # by what rounding of t makes of it
+        off = np.abs(np.vstack([rows.x - expected, run.x[-1:] - expected[-1:]]).astype(float))
+        off = np.maximum(0.0, off - np.vstack([late, late[-1:]]))
+        off /= np.abs(expected).max(axis=0) + max(growth, 1.0) * spread
         allowed = (tol + ROUNDING * of.eps) * (run.steps + 1)
         return float(np.nan_to_num(off.max(), nan=math.inf) / allowed)
     return None
 
 
-def _reference(of: Comparison, s: State, x: Vector, times: Vector, grid: Vector) -> Vector:
-    """The states at some times, (n, 2 nq), by two fixed steps from each time of a grid on."""
-    n, rows = len(s.q), []
+def _reference(
+    of: Comparison, s: State, x: Vector, times: Vector, grid: Vector
+) -> tuple[Vector, Vector]:
+    """The states at some times, and their rates, (n, 2 nq); two fixed steps from each of a grid."""
+    n, rows, rates = len(s.q), [], []
     held = None if s.u is None else s.u[None]
 
     def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
@@ -110,4 +118,5 @@ def _reference(of: Comparison, s: State, x: Vector, times: Vector, grid: Vector)
             t = float(end)
             if end in times:
                 rows.append(np.concatenate([q[0], qd[0]]))
-    return np.array(rows)
+                rates.append(np.concatenate([qd[0], acceleration(q, qd, t)[0]]))
+    return np.array(rows), np.array(rates)

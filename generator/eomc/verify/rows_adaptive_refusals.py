@@ -1,0 +1,126 @@
+"""Rows of `check` about what adaptive steps refuse, their longest step, and runs in pieces.
+
+A run that can't go on says so, and leaves the last good state in place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from eomc.verify.oracle import Vector
+from eomc.verify.rows_refusals import NO_CONVERGENCE, NOT_FINITE, OK, SINGULAR, Refusals
+from eomc.verify.rows_runs import parameters
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import State
+
+FEW, ROOM = 8, 40  # states; steps of a run
+PARTS = 7  # steps of a span in which one would do
+LOOSE = 1e-3  # tolerance
+TURNS = 1e7  # rad: sines of several angles at once come to their limit before
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """What a run of the C function left: rows (n, 2 nq), their times (n,), its place (2 nq,)."""
+
+    status: int
+    rows: Vector
+    times: Vector
+    x: Vector
+
+    @property
+    def stays(self) -> bool:
+        """Whether it refuses, and leaves only finite states."""
+        return self.status != OK and not len(self.rows)
+
+
+def report(of: Comparison, refusals: Refusals) -> None:
+    """Add the rows of a scene that asks for a tolerance."""
+    if of.system.run.tolerance is None:
+        return
+    made = _Adaptive(of, refusals)
+    of.row("adaptive steps: refusals", 0, "runs that end otherwise", made.refused)
+    of.row("adaptive steps: longest", 0, "runs that end otherwise", made.longest)
+
+
+class _Adaptive:
+    def __init__(self, check: Comparison, refusals: Refusals) -> None:
+        self.check, self.model, self.refusals = check, check.module._model, refusals
+        self.state = check.few(2)[-1].state
+
+    def drive(
+        self, s: State, span: float, tol: float, h_most: float = 0.0, stiff: bool = False,
+        each: int = ROOM,
+    ) -> _Driven:  # fmt: skip
+        """A run of at most ROOM steps, `each` of them in a call."""
+        model, many = self.model, 2 * ROOM
+        x, t = np.array([s.q, s.qd], model.dtype).ravel(), np.array([s.t], model.dtype)
+        rows, times = np.full((2, many, model.nq), np.nan, model.dtype), np.zeros(many, model.dtype)
+        u = None if s.u is None else np.array(s.u, model.dtype)
+        work, null, p = model._ffi.new("adaptive_work *"), model._c[2], parameters(model, s)
+        work.stiff = stiff
+        events = (0, model._ffi.NULL, null) if model.events else ()
+        n, status, end = 0, OK, s.t + span
+        for _ in range(0, ROOM, each):
+            if status != OK or t[0] >= end or (model.events and work.stopped):
+                break
+            status = model._lib.adaptive(
+                model._pointer(x), model._pointer(t), end, tol, h_most, model._pointer(u), each,
+                null, many - n, model._pointer(times[n:]), model._pointer(rows[0, n:]),
+                model._pointer(rows[1, n:]), *events, model._pointer(p), work,
+            )  # fmt: skip
+            n += work.rows
+        return _Driven(status, np.hstack([rows[0, :n], rows[1, :n]]), times[:n], x)
+
+    def refused(self) -> float:
+        """From where D is singular, or numbers are none, or too large for a step."""
+        h, tol = self.check.system.run.h, LOOSE
+        wrong = 0
+        for s in self.refusals.singular[:: max(1, len(self.refusals.singular) // FEW)]:
+            for stiff in (False, True):
+                run = self.drive(s, 10 * h, tol, stiff=stiff)
+                wrong += not (run.stays and run.status == SINGULAR)
+                wrong += not np.array_equal(run.x, np.asarray([s.q, s.qd], run.x.dtype).ravel())
+        for field in ("q", "qd"):
+            for i in range(len(self.state.q)):
+                for what in (math.nan, math.inf):
+                    x = getattr(self.state, field).copy()
+                    x[i] = what
+                    run = self.drive(replace(self.state, **{field: x}), 10 * h, tol)
+                    wrong += not run.stays or run.status not in (
+                        SINGULAR, NOT_FINITE, NO_CONVERGENCE,
+                    )  # fmt: skip
+        return float(wrong + self.overflown())
+
+    def overflown(self) -> int:
+        """How many runs keep states that are not finite, of those that start almost there."""
+        wrong, huge = 0, float(np.finfo(self.model.dtype).max) / 2
+        for unit in np.eye(len(self.state.q)):
+            for size in (TURNS, huge):
+                for stiff in (False, True):
+                    far = replace(self.state, q=size * unit, qd=1.01 * size * unit)
+                    run = self.drive(far, 1.0, LOOSE, stiff=stiff)
+                    wrong += not (np.all(np.isfinite(run.rows)) and np.all(np.isfinite(run.x)))
+        return wrong
+
+    def longest(self) -> float:
+        """No step is longer than asked for, the last ends at the end, and calls leave no trace."""
+        first = self.drive(self.state, self.check.system.run.duration, LOOSE)
+        if not len(first.times):
+            return 0.0
+        span = float(first.times[0]) - self.state.t
+        run, cut = (
+            self.drive(self.state, span, LOOSE, h_most=span / PARTS, each=n) for n in (ROOM, 1)
+        )
+        sizes = np.diff(np.concatenate([[self.state.t], run.times]))
+        rounding = 4 * self.check.eps * (abs(self.state.t) + span)
+        late = bool(np.any(sizes > span / PARTS + rounding)) or len(run.times) < PARTS
+        end = np.asarray(self.state.t + span, run.times.dtype)
+        there = run.status == OK and run.times[-1] == end
+        return float(late) + float(not there) + float(not np.array_equal(run.rows, cut.rows))
