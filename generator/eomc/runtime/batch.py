@@ -26,6 +26,7 @@ from .arguments import (
     unmasked,
 )
 from .batch_plot import Fans
+from .batch_values import Values
 from .batch_work import WORTH, Work
 from .columns import Columns, File
 from .model import LARGE, RARELY, SOME, Model
@@ -37,7 +38,7 @@ _KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as th
 
 
 @dataclass(eq=False, repr=False)
-class BatchRun(Fans, Columns):
+class BatchRun(Values, Fans, Columns):
     """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
 
     status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the
@@ -72,16 +73,6 @@ class BatchRun(Fans, Columns):
         return np.asarray(_NAMES[self._codes])
 
     @property
-    def energy(self) -> Array:
-        """K + P, (batch, n), J. What is conserved may be `jacobi` instead."""
-        return self._values("energy", ())
-
-    @property
-    def jacobi(self) -> Array:
-        """qd.dK/dqd - K + P, (batch, n), J: the energy, where K is purely quadratic."""
-        return self._values("jacobi", ())
-
-    @property
     def u(self) -> Array:
         """The inputs as they acted at each row, (batch, n, nu), so within their limits.
 
@@ -111,46 +102,9 @@ class BatchRun(Fans, Columns):
     def _given(self) -> Array:
         """The inputs at each row, (batch, n, nu), whatever their limits."""
         if self._held is None:
-            return self._values("signal", (self._model.nu,))
+            return self._values("signal", self._model.signal, (self._model.nu,))
         found = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
         found[np.isnan(self.q[..., 0])] = np.nan
-        return found
-
-    @cached_property
-    def outputs(self) -> dict[str, Array]:
-        """The scene's outputs by their names, (batch, n) each, nan where rows are.
-
-        nan also where one needs accelerations and D is singular.
-        """
-        names = self._model.outputs
-        if not names:
-            return {}
-        if self._held is None:
-            found = self._values("outputs", (len(names),))
-        else:  # one state at a time, as each has its own inputs
-            found = np.full((*self.q.shape[:2], len(names)), np.nan, self._model.dtype)
-            u, alike = self.u, len(self._params) == 1
-            for k, j in np.argwhere(np.isfinite(self.q).all(axis=-1)).tolist():
-                params = self._params[0 if alike else k]
-                row = self.q[k, j], self.qd[k, j], float(self.t[j]), u[k, j], params
-                found[k, j] = self._model.output(*row)
-        return dict(zip(names, np.ascontiguousarray(np.moveaxis(found, 2, 0)), strict=True))
-
-    def _values(self, name: str, shape: tuple[int, ...]) -> Array:
-        """A function at all rows, (batch, n, ...), nan where these are."""
-        model = self._model
-        function = model.output if name == "outputs" else getattr(model, name)
-        found = np.full((*self.q.shape[:2], *shape), np.nan, model.dtype)
-        good: Any = np.isfinite(self.q).all(axis=-1) & np.isfinite(self.qd).all(axis=-1)
-        one_time = name != "signal" and name not in model._timed
-        times = [slice(None)] if one_time else [slice(j, j + 1) for j in range(len(self.t))]
-        alike = len(self._params) == 1
-        for k in [slice(None)] if alike else [slice(k, k + 1) for k in range(len(self))]:
-            params = self._params[0 if alike else k.start]
-            for j in times:
-                here = good[k, j]
-                q, qd, t = self.q[k, j][here], self.qd[k, j][here], float(self.t[j][0])
-                found[k, j][here] = function(q, qd, t=t, params=params)
         return found
 
     def _kept(self) -> dict[str, Any]:
