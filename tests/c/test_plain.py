@@ -67,7 +67,7 @@ WISHES = {
     "single": ("suspension", 'real = "float"\ndiscretize = true\nmethod = ["rk4", "gauss4"]\n'),
     "slopes": ("cartpole", "linearize = true\n"),
     "everything": ("", 'method = ["rk4", "dp8", "euler"]\n'),
-    "rod": ("rod", 'method = ["rk4", "gauss4"]\n'),
+    "rod": ("rod", 'discretize = true\nmethod = ["rk4", "gauss4"]\n'),
 }
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")

@@ -145,16 +145,6 @@ def test_the_linearization_along_the_constraints_is_that_of_minimal_coordinates(
         assert np.abs(module.constraint_rates(q, qd)).max() < 4 * by**2
 
 
-@pytest.mark.parametrize("asked", [{"discretize": True}])
-def test_what_there_is_not_under_constraints_is_refused(asked: dict[str, Any]) -> None:
-    made = system(
-        "refused", {"x": 0.6, "y": -0.8}, "(x_dot**2 + y_dot**2)/2", "y",
-        {"rod": "x**2 + y**2 - 1"}, **asked,
-    )  # fmt: skip
-    with pytest.raises(eomc.SceneError, match="is not for scenes with constraints"):
-        eomc.pipeline.sources(made)
-
-
 def test_reactions_along_a_run_are_those_of_their_times(tmp_path: Path) -> None:
     """A mass between a driven wall and the ground: the force follows the wall."""
     made = system(

@@ -27,6 +27,11 @@ def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> 
     return tuple(zip(*columns, strict=True))
 
 
+def along(system: System, tape: Tape, values: Sequence[Expr]) -> Vector:
+    """The derivatives of values of the state along a direction, `directions`. Raises likewise."""
+    return _slopes(system, tape, values, [directions(system)])[0]
+
+
 def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
     """da/dp at held inputs, (nq, np), of accelerations a on the tape. Raises as linearization."""
     entries = [{p.symbol: S.One} for p in system.parameters]

@@ -13,6 +13,11 @@ SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
 APART = 1e-12  # of the squares of all coordinates together: a coordinate that is less is 0
 
 
+def near(target: Target) -> float:
+    """The square of the part of a coordinate beyond which a correction is large."""
+    return 8 * target.real.epsilon
+
+
 def width(target: Target) -> int:
     """Numbers of a correction: of q, of qd, of the rows' pivots."""
     return len(target.program["correction"].outputs)
@@ -25,7 +30,7 @@ def view(
     """The view for one form and lane."""
     target = functions.target
     little, noise = SINGULAR[target.system.run.real]
-    near = 8 * target.real.epsilon
+    large = near(target)
     return Corrected(
         PREFIX=functions.PREFIX,
         real=functions.real,
@@ -38,11 +43,11 @@ def view(
         correction=correction,
         function=function,
         call=call,
-        near=target.literal(near),
+        near=target.literal(large),
         apart=target.literal(APART),
         little=target.literal(little),
         slight=target.literal(1e4 * little),
-        rounded=target.literal(near**2 * noise),
+        rounded=target.literal(large**2 * noise),
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from eomc.emit import c_function as c
 from eomc.emit.c_function import CFunction
 from eomc.emit.coefficients import tableau
+from eomc.emit.corrected import APART, near
 from eomc.emit.functions import Functions
 from eomc.emit.plain.views import Derivative
 from eomc.integrators.tableaux import METHODS
@@ -30,6 +31,8 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
     if "signal_slopes" in target.program:
         feedback = plain.public.evaluation("signal_slopes").call(slopes="K")
     accelerate = plain.acceleration.function.call
+    correction = plain.correction_along
+    moved = _moved(plain) if correction else None
     methods = [METHODS[name] for name in run.methods]
     first_implicit = next((m for m in methods if m.implicit), None)
     for m in methods:
@@ -41,6 +44,12 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
             linearization=plain.public.linearization.call(),
             feedback=feedback,
             eliminate=m is first_implicit,
+            correction=correction if m is methods[0] else None,
+            moved=moved,
+            correction_call=correction.function.call(q="r", qd="v") if correction else "",
+            move=moved.call(X="ends", t="t + h") if moved else "",
+            near=target.literal(near(target)),
+            apart=target.literal(APART),
             function=plain.public.derivative(m.name),
             implicit=m.implicit,
             stages=m.stages,
@@ -57,3 +66,13 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
             other=target.literal(real.epsilon**0.25),
             most=TURNS,
         )
+
+
+def _moved(plain: Functions) -> CFunction:
+    """A step's end and its derivatives, moved onto the constraints."""
+    state = (c.filled(plain.real, "X"), *(c.filled(plain.real, n) for n in "rv"))
+    read = plain.read(plain.target.program["correction_along"])
+    more = (plain.argument("q"), *plain.usual(*(n for n in ("t", "p") if n in read)))
+    return CFunction(
+        f"{plain.prefix}_derivative_projected", plain.status, (*state, *more), qualifier="static"
+    )

@@ -314,6 +314,15 @@ class Functions:
         return self.static(function, "projection", "d", sentence(function), fails=True)
 
     @cached_property
+    def correction_along(self) -> Computed | None:
+        """The same, and its derivatives along a direction, where steps have them; static."""
+        function = self.target.program.functions.get("correction_along")
+        if function is None:
+            return None
+        doc = f"The same, and its derivatives along `along`. {sentence(function)}"
+        return self.static(function, "projection_along", "column", doc, fails=True)
+
+    @cached_property
     def corrected(self) -> CFunction:
         """A state behind a step, moved onto the constraints; of the plain form."""
         state = (*(c.filled(self.real, n) for n in "rv"), self.argument("q"))

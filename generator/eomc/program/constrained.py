@@ -11,6 +11,7 @@ from eomc.base.errors import Problem
 from eomc.derive import kkt, outputs
 from eomc.derive.equations import Equations
 from eomc.derive.lagrange import Derivation
+from eomc.derive.linearize import along
 from eomc.model.symbols import Output
 from eomc.model.system import System
 from eomc.program.admissible import Candidate
@@ -31,9 +32,13 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
     assert e.rows is not None
     values, pivots = kkt.correction(e.tape, e.D, e.rows, system.q)
     yield lower("correction", e.tape, values, pivots, (), system.names)
+    if system.run.discretize:
+        moves = values[: 2 * len(system.q)]
+        both = [*moves, *along(system, e.tape, moves)]
+        yield lower("correction_along", e.tape, both, pivots, (), system.names)
     if system.reactions:
         yield _reactions(system)
-    if system.run.linearize:
+    if system.run.sloped:
         slopes = [x for r in e.rows.rates for x in e.tape.gradient([(r, S.One)], system.q)]
         yield lower("constraint_slopes", e.tape, slopes, (), (), system.names)
 
@@ -85,10 +90,6 @@ def unsuited(system: System) -> Iterator[Problem]:
     """What [run] asks for and a system with constraints can't have."""
     if not system.constraints:
         return
-    asked = {
-        "discretize": system.run.discretize,
-        "inverse_dynamics": system.run.inverse_dynamics,
-    }
-    for key in (key for key, there in asked.items() if there):
-        message = f"'{key}' is not for scenes with constraints: leave it out"
-        yield system.problem(f"run.{key}", message)
+    if system.run.inverse_dynamics:
+        message = "'inverse_dynamics' is not for scenes with constraints: leave it out"
+        yield system.problem("run.inverse_dynamics", message)

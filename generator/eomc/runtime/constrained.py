@@ -85,7 +85,7 @@ class Constrained(Frames):
         if not hasattr(self._lib, "constraint_slopes"):
             raise ValueError(
                 f"tangent: {self.name} was built without derivatives: a scene asks with [run] "
-                "linearize = true"
+                "linearize = true, or discretize"
             )
         shape = (len(self._rows.names), self.nq)
         A = self.constraint_jacobian(q, t=t, params=params)

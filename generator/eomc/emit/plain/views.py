@@ -123,8 +123,10 @@ class Derivative(Named):
     """c/derivative.c.jinja: of a step by a tableau. rates, eliminate: what methods share.
 
     width: of a row along q, qd and u. feedback: the call of the signals' derivatives, if there are.
-    start, stage: calls of accelerations. settled, loose: corrections of stages, of a velocity;
-    other: how far apart ends are of stages that are not the step's.
+    correction, moved: under constraints how rows move a state, shared too, and what moves a step's
+    end by that; near, apart: as of Corrected. start, stage: calls of accelerations. settled, loose:
+    corrections of stages, of a velocity; other: how far apart ends are of stages that are not the
+    step's.
     """
 
     TEMPLATE: ClassVar[str] = "c/derivative.c"
@@ -134,6 +136,12 @@ class Derivative(Named):
     linearization: str
     feedback: str
     eliminate: bool
+    correction: Computed | None
+    moved: CFunction | None
+    correction_call: str
+    move: str
+    near: str
+    apart: str
     function: CFunction
     implicit: bool
     stages: int

@@ -1,0 +1,191 @@
+"""The derivatives of steps that end on constraints: by differences, and of fewer coordinates."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Modules, tiers
+
+import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+from eomc.verify import rows_discretize
+from eomc.verify.comparison import Comparison
+
+WINCH = """eomc = 1
+name = "winch_stepped"
+[coordinates]
+x = { unit = "m", start = 0.6, rate = 0.5 }
+y = { unit = "m", start = -0.8, guess = true }
+[parameters]
+m = 1.3
+k = 0.2
+[inputs]
+push = { unit = "N", signal = "3*sin(4*t) - x_dot - 2*x*y" }
+[constraints]
+rope = "x**2 + y**2 - (1 + k*sin(3*t))**2"
+[energy]
+kinetic = "m*(x_dot**2 + y_dot**2)/2"
+potential = "9.81*m*y"
+[forces]
+x = "push"
+y = "-y_dot*x"
+[run]
+h = 0.02
+discretize = true
+method = ["rk4", "dp8", "gauss4", "gauss16"]
+"""
+SLEIGH = """eomc = 1
+name = "sleigh_stepped"
+[coordinates]
+x = { start = 0.2, rate = 0.3 }
+y = { start = 0.1, guess = true }
+psi = { start = 0.4, rate = 2.0 }
+[inputs]
+turn = {}
+[constraints]
+blade = "x_dot*sin(psi) - y_dot*cos(psi) - 0.3*psi_dot*(1 + sin(x)/5)"
+[energy]
+kinetic = "x_dot**2 + y_dot**2 + psi_dot**2/5 + x_dot*psi_dot*sin(psi)/4"
+potential = "sin(x) + y**2"
+[forces]
+psi = "turn"
+[run]
+h = 0.02
+discretize = true
+"""
+ROPE = """eomc = 1
+name = "rope_stepped"
+[coordinates]
+x = { start = 1.1, rate = 0.3 }
+s = { start = 0.4, guess = true }
+r = { start = 0.5, guess = true }
+[constraints]
+rope = "x + s + r**2/2 - 2"
+pulley = "x*r - s"
+[energy]
+kinetic = "x_dot**2 + (x_dot + s_dot)**2/3"
+potential = "9.81*x + s**2"
+[run]
+h = 0.02
+discretize = true
+"""
+METHODS = [(WINCH, m) for m in ("rk4", "dp8", "gauss4", "gauss16")]
+CASES = [*METHODS, (SLEIGH, "rk4"), (ROPE, "rk4")]
+STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+INPUTS: dict[str, Any] = {"signals": None, "held": [0.7]}
+
+
+def apart(step: Any, x: Any, width: float = 2e-3) -> Any:
+    """The derivatives of step by differences of order 8."""
+    return np.array(
+        [
+            sum(w * (step(x + k * by) - step(x - k * by)) for k, w in STENCIL) / width
+            for by in width * np.eye(len(x))
+        ]
+    ).T
+
+
+@pytest.mark.parametrize("given", INPUTS)
+@pytest.mark.parametrize(
+    ("text", "method"), tiers(CASES, CASES[0], *CASES[-2:]), ids=lambda x: x[-9:].strip()
+)
+def test_against_differences_of_steps(modules: Modules, text: str, method: str, given: str) -> None:
+    """Also where the state before a step is off the rows: steps put any on them."""
+    m, t, h = modules.unoptimised(text), 0.4, 0.02
+    u = INPUTS[given] if m.inputs else None
+    q, qd = m.project(*m.start, t=t)
+    for off in (0.0, 0.01):
+        x = np.hstack([q, qd]) + off * np.arange(2 * m._model.nq)
+
+        def end(x: Any) -> Any:
+            return np.hstack(m.step(*np.split(x, 2), h, t, u, method=method))
+
+        Phi, Gamma = m.discretize(*np.split(x, 2), h, t, u, method=method)
+        np.testing.assert_allclose(Phi, apart(end, x), rtol=0, atol=2e-11)
+        if u is not None:
+            near = apart(lambda u: np.hstack(m.step(q, qd, h, t, u, method=method)), np.array(u))
+            _, Gamma = m.discretize(q, qd, h, t, u, method=method)
+            np.testing.assert_allclose(Gamma, near, rtol=0, atol=2e-12)
+            assert np.abs(Gamma).max() > 1e-3
+
+
+@pytest.mark.parametrize("text", [WINCH, SLEIGH, ROPE], ids=["winch", "sleigh", "rope"])
+def test_it_leads_along_the_rows(modules: Modules, text: str) -> None:
+    """Whatever changes before a step, behind it changes keep the rows, to rounding."""
+    m, t, h = modules.unoptimised(text), 0.4, 0.02
+    q, qd = m.project(*m.start, t=t)
+    Phi, Gamma = m.discretize(q, qd, h, t)
+    T = m.tangent(*m.step(q, qd, h, t), t + h)
+    across = np.eye(2 * len(q)) - T @ T.T
+    assert np.abs(across @ Phi).max() < 1e-14 * np.abs(Phi).max()
+    assert not Gamma.size or np.abs(across @ Gamma).max() < 1e-15
+    assert np.linalg.matrix_rank(Phi, 1e-9) == T.shape[1]
+
+
+def hanging(modules: Modules, form: str) -> ModuleType:
+    """A pendulum with a push, in x and y or by its angle."""
+    if form == "angle":
+        text = '[coordinates]\na = {}\n[energy]\nkinetic = "m*(l*a_dot)**2/2"\n'
+        text += 'potential = "-9.81*m*l*cos(a)"\n[forces]\na = "push*l*cos(a) - a_dot/5"\n'
+    else:
+        text = '[coordinates]\nx = {}\ny = { start = "-l" }\n[energy]\n'
+        text += 'kinetic = "m*(x_dot**2 + y_dot**2)/2"\npotential = "9.81*m*y"\n'
+        text += '[forces]\nx = "push - x_dot/5/l**2"\n[constraints]\nrod = "x**2 + y**2 - l**2"\n'
+    head = f'eomc = 1\nname = "hanging_{form}"\n[parameters]\nm = 1.3\nl = 0.5\n'
+    run = '[run]\nh = 0.01\ndiscretize = true\nmethod = "dp8"\n'
+    return modules.unoptimised(head + "[inputs]\npush = {}\n" + text + run)
+
+
+def test_a_regulator_of_it_is_that_of_minimal_coordinates(modules: Modules) -> None:
+    """About the equilibrium T^T Phi T is the step of the angle, in steps and control periods."""
+    xy, angle = (hanging(modules, form) for form in ("xy", "angle"))
+    q, u = xy.equilibrium(u=[0.0])
+    T = xy.tangent(q, 0 * q)
+    for period in (None, 0.05):
+        Phi, Gamma = xy.discretize(q, 0 * q, u=u, control_period=period)
+        right, right_u = angle.discretize([0.0], [0.0], u=[0.0], control_period=period)
+        # T is of unit vectors: arcs, up to order and sign
+        S = T.T @ np.array([[0.5, 0], [0, 0], [0, 0.5], [0, 0]])
+        np.testing.assert_allclose(T.T @ Phi @ T @ S, S @ right, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(T.T @ Gamma, S @ right_u, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("text", tiers([WINCH, SLEIGH], SLEIGH), ids=lambda t: t[16:22])
+@pytest.mark.usefixtures("quickly_compiled")
+def test_plain_c_has_the_same(modules: Modules, text: str, tmp_path: Any) -> None:
+    fast: Any = modules.unoptimised(text)
+    plain = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form="plain")
+    q, qd = fast.project(*fast.start, t=0.4)
+    for method in fast.methods:
+        both = [m.discretize(q, qd, t=0.4, method=method) for m in (fast, plain)]
+        for a, b in zip(*both, strict=True):
+            assert a == pytest.approx(b, rel=1e-12, abs=1e-13)
+
+
+def test_a_step_that_can_not_be_made_has_none(modules: Modules) -> None:
+    m = modules.unoptimised(WINCH)
+    with pytest.raises(m.MotionError, match="no derivative of a step") as caught:
+        m.discretize([0.6, -0.8], [1e3, 1e3], h=1.0, u=[0.0], params={"k": 1.0})
+    assert caught.value.status in ("locked", "singular", "not finite")
+
+
+def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
+    class Wrong:
+        """Derivatives that are a little off."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(m, name)
+
+        def discretize(self, *state: Any, **how: Any) -> Any:
+            Phi, Gamma = m.discretize(*state, **how)
+            return Phi + 1e-5 * np.abs(Phi).max(), Gamma
+
+    m, made = modules.unoptimised(SLEIGH), from_scene(parse(SLEIGH, "test.toml"))
+    for module, passed in ((m, True), (Wrong(), False)):
+        of = Comparison(made, module, np.random.default_rng(0), 4)
+        rows_discretize.report(of, None)
+        assert [row.passed for row in of.rows] == [passed], of.rows
