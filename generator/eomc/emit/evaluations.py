@@ -165,7 +165,10 @@ _SPACE = {
 
 def doc(target: Target, name: str) -> str:
     """What a function gives, in the words of the plane or of space."""
-    return KINDS[name].doc.format(**(_PLANE if target.system.plane else _SPACE))
+    found = KINDS[name].doc.format(**(_PLANE if target.system.plane else _SPACE))
+    if name == "inverse_dynamics" and target.system.constraints:
+        found = found.replace("tau =", "tau + A^T lambda =")
+    return found
 
 
 def extent(target: Target, shape: str) -> str:

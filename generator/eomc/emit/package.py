@@ -38,7 +38,7 @@ FUNCTIONS = (
 CONSTRAINED = "constraint_jacobian constraint_rates constraints multipliers project tangent".split()
 ASKED = {  # what only scenes have that ask for it in [run]
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
-    "inverse_dynamics": ("inverse_dynamics",),
+    "inverse_dynamics": ("inverse_dynamics", "drive_forces"),
     "momentum": ("momentum",),
 }
 
@@ -228,7 +228,7 @@ def face(target: Target, extension: str) -> Face:
         constraints=tuple(c.name for c in s.constraints),
         held=(*(c.held for c in s.coordinates), *(c.held_rate for c in s.coordinates)),
         holonomic=sum(c.holonomic for c in s.constraints),
-        redundant=any(c.redundant for c in s.constraints),
+        redundant=tuple(k for k, c in enumerate(s.constraints) if c.redundant),
         reactions=tuple(r.name for r in s.reactions),
         timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,

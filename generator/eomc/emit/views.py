@@ -222,7 +222,7 @@ class Face:
     constraints: tuple[str, ...]
     held: tuple[bool, ...]
     holonomic: int
-    redundant: bool
+    redundant: tuple[int, ...]
     reactions: tuple[str, ...]
     timed: tuple[str, ...]
     batch: bool

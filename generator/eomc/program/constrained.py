@@ -7,7 +7,6 @@ from dataclasses import replace
 
 from sympy import S
 
-from eomc.base.errors import Problem
 from eomc.derive import kkt, outputs
 from eomc.derive.equations import Equations
 from eomc.derive.lagrange import Derivation
@@ -84,12 +83,3 @@ def weighted(
         for k, (w, row) in enumerate(zip(closure.weights, system.constraints, strict=True))
         if not row.redundant
     ]
-
-
-def unsuited(system: System) -> Iterator[Problem]:
-    """What [run] asks for and a system with constraints can't have."""
-    if not system.constraints:
-        return
-    if system.run.inverse_dynamics:
-        message = "'inverse_dynamics' is not for scenes with constraints: leave it out"
-        yield system.problem("run.inverse_dynamics", message)

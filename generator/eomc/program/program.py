@@ -221,7 +221,6 @@ def _unsuited(program: Program) -> list[Problem]:
                 "an explicit method, or one with fewer stages"
             )
             out.append(s.problem("run.method", message))
-    out += constrained.unsuited(s)
     swept = [name for name in implicit if METHODS[name].sweeps]
     if swept and (jumps := _jumps(program)):
         message = (

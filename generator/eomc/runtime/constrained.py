@@ -6,7 +6,7 @@ of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,22 +14,24 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, as_number, not_one_of
 from .columns import ByName
+from .drives import drive_forces, driven
 from .frames import Frames
+from .functions import row_times
 from .trajectory import SAID, STATUS, MotionError, state_text
 
 
 class Rows(NamedTuple):
     """Names of constraints, of loops with reactions, and what a start holds of q, then of qd.
 
-    holonomic: how many of the constraints are; they come first. redundant: whether some were left
-    out, which the others imply.
+    holonomic: how many of the constraints are; they come first. redundant: which of them were left
+    out, as the others imply them.
     """
 
     names: tuple[str, ...] = ()
     loops: tuple[str, ...] = ()
     held: tuple[bool, ...] = ()
     holonomic: int = 0
-    redundant: bool = False
+    redundant: tuple[int, ...] = ()
 
 
 class Constrained(Frames):
@@ -145,6 +147,32 @@ class Constrained(Frames):
         args = ("reactions", shape, q, qd, t, None, params, None, multipliers)
         found: Array = self._evaluate(*args)
         return found
+
+    def drive_forces(
+        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, drives: Sequence[str] | None = None,
+        f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, *, t: float = 0.0,
+        params: Parameters = None,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """(tau, lambda): what drives give in a motion, (nq,), and the multipliers, (nc,).
+
+        tau + A^T lambda is `inverse_dynamics` less friction and the scene's other forces at
+        inputs of 0. drives: the coordinates along which they act, all where None; tau is 0 along
+        the others. As many drives as freedoms have one answer; of more the least is taken,
+        tau^T D^-1 tau. Raises ValueError where the drives can't give this motion, or constraints
+        don't allow qdd.
+        """
+        which = driven(self, drives)
+        force = self.inverse_dynamics(q, qd, qdd, f_ext, t=t, params=params)
+        force = force - self.tau(q, qd, t, np.zeros(self.nu) if self.nu else None, params)
+        at, moving = self._state(q, qd)
+        each = self._like(qdd, "qdd", (self.nq,), at)
+        tau, found = np.empty_like(at), np.empty((*at.shape[:-1], len(self._rows.names)), at.dtype)
+        times = row_times(t, at.shape[:-1])
+        for k in np.ndindex(at.shape[:-1]):
+            now = as_number(t if times is None else times[k], "t")
+            state = at[k], moving[k], each[k].astype(float)
+            tau[k], found[k] = drive_forces(self, which, state, force[k].astype(float), now, params)
+        return tau, found
 
     def project(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,

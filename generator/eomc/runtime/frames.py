@@ -104,6 +104,7 @@ class Frames(Functions):
 
         f_ext: wrenches from outside, as in `frame_forces`. tau is all that acts along the
         coordinates, N or N m: what drives have to give is that less `tau` at u = 0, friction.
+        Under constraints it is tau + A^T lambda; `drive_forces` parts them.
         """
         if f_ext is not None and not self.frames:
             raise ValueError("f_ext acts at frames: a scene has them by [run] frames = true")

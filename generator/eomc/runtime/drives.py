@@ -1,0 +1,95 @@
+"""The forces of drives that a motion takes, parted from those of constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .arguments import Array, Parameters, not_one_of
+from .trajectory import state_text
+
+if TYPE_CHECKING:
+    from .constrained import Constrained
+
+_DEPENDENT = {"float64": 1e-9, "float32": 1e-4}  # of the largest singular value
+_LEFT = {"float64": 1e-6, "float32": 1e-3}  # of the terms: what drives or rows may leave
+
+
+def driven(model: Constrained, drives: Sequence[str] | None) -> list[int]:
+    """Which coordinates have drives, all where None. Raises ValueError for unknown names."""
+    if drives is None:
+        return [*range(model.nq)]
+    names = (drives,) if isinstance(drives, str) else tuple(drives)
+    for name in names:
+        if name not in model.coordinates:
+            raise ValueError(not_one_of("drives", str(name), model.coordinates))
+    return sorted({model.coordinates.index(name) for name in names})
+
+
+def drive_forces(
+    model: Constrained, which: list[int], state: tuple[Array, Array, Array], force: Array, t: float,
+    params: Parameters,
+) -> tuple[Array, Array]:  # fmt: skip
+    """(tau, lambda) of one state (q, qd, qdd), with tau + A^T lambda = force.
+
+    tau is along the coordinates `which`. Where several are right, it is that of the least
+    tau^T D^-1 tau, which has no units to choose. Raises ValueError where none is.
+    """
+    kind = str(model.dtype)
+    rows, least = model._rows, _DEPENDENT[kind]
+    solved = [k for k in range(len(rows.names)) if k not in rows.redundant]
+    A = np.zeros((0, model.nq))
+    if solved:
+        A = np.asarray(model.constraint_jacobian(state[0], t=t, params=params)[solved], float)
+        _rows_keep(model, A, [rows.names[k] for k in solved], state, t, params)
+    along = _along(A, least)
+    B, right = along.T[:, which], along.T @ force
+    D = np.asarray(model.D(state[0], t=t, params=params), float)
+    L = np.linalg.cholesky(np.linalg.inv(_regular(D, A))[np.ix_(which, which)])
+    found = np.linalg.lstsq(np.linalg.solve(L, B.T).T, right, rcond=least)[0]
+    tau = np.zeros(model.nq)
+    tau[which] = np.linalg.solve(L.T, found)
+    if np.any(np.abs(B @ tau[which] - right) > _LEFT[kind] * np.max(np.abs(force), initial=0)):
+        names = ", ".join(model.coordinates[k] for k in which) or "nothing"
+        raise ValueError(
+            f"drives: forces along {names} can't give this motion at {state_text(*state[:2])}: "
+            f"name others, or more; there are {len(right)} freedoms"
+        )
+    multipliers = np.zeros(len(rows.names))
+    multipliers[solved] = np.linalg.lstsq(A.T, force - tau, rcond=least)[0]
+    return tau, multipliers
+
+
+def _rows_keep(
+    model: Constrained, A: Array, names: list[str], state: tuple[Array, Array, Array], t: float,
+    params: Parameters,
+) -> None:  # fmt: skip
+    """Raise ValueError where rows don't allow the accelerations."""
+    q, qd, qdd = state
+    free = np.asarray(model.acceleration(q, qd, t, params=params), float)
+    given, wanted = A @ qdd, A @ free
+    off = np.abs(given - wanted)
+    limit = np.abs(A) @ (np.abs(qdd) + np.abs(free))
+    worst = int(np.argmax(off / np.maximum(limit, 1e-300)))
+    if off[worst] > _LEFT[str(model.dtype)] * limit[worst]:
+        raise ValueError(
+            f"qdd: leaves the constraint {names[worst]}: its row of A qdd, of "
+            f"constraint_jacobian(q), is {given[worst]:.6g} and has to be {wanted[worst]:.6g}"
+        )
+
+
+def _along(A: Array, least: float) -> Array:
+    """(nq, k): the directions in which no row changes, orthonormal."""
+    if not len(A):
+        return np.eye(A.shape[1])
+    _, sizes, directions = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=1)[:, None], 1e-300))
+    return np.asarray(directions[int((sizes > least * sizes[0]).sum()) :].T)
+
+
+def _regular(D: Array, A: Array) -> Array:
+    """D, with the rows' weight where it has no inverse by itself."""
+    if np.linalg.cond(D) < 1e12:
+        return D
+    return np.asarray(D + A.T @ A * (np.trace(D) / np.sum(A**2)))

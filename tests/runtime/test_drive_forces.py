@@ -1,0 +1,131 @@
+"""What drives give in a motion, parted from what constraints give."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from cases import SCENES
+from conftest import Modules
+from test_constrained_discretize import ROPE, SLEIGH
+
+ASK = "[run]\ninverse_dynamics = true\nframes = true\n"
+
+
+@pytest.fixture(scope="module")
+def linkage(modules: Modules) -> ModuleType:
+    """A four-bar with motors at the crank and the rocker, and friction in both and between."""
+    text = (SCENES / "four_bar.toml").read_text(encoding="utf-8")
+    text = text.split("[picture]")[0].replace('"four_bar"', '"driven_bars"')
+    return modules.unoptimised(
+        text + '[inputs]\nat_crank = { signal = "t" }\nat_rocker = {}\n'
+        '[forces]\nq1 = "at_crank - q1_dot/7"\nq2 = "-q2_dot/9"\nq3 = "at_rocker"\n' + ASK
+    )
+
+
+def motion(m: ModuleType, u: Any) -> tuple[Any, Any, Any]:
+    """(q, qd, qdd) along some of a run under constant inputs."""
+    run = m.simulate(h=0.01, steps=20, every=5, u=u)
+    return run.q, run.qd, m.acceleration(run.q, run.qd, u=u)
+
+
+def test_of_one_drive_it_is_what_has_acted(linkage: ModuleType) -> None:
+    for u, drive in (([1.3, 0.0], "q1"), ([0.0, -0.7], "q3")):
+        q, qd, qdd = motion(linkage, u)
+        tau, multipliers = linkage.drive_forces(q, qd, qdd, [drive])
+        right = np.zeros_like(q)
+        right[:, linkage.coordinates.index(drive)] = sum(u)
+        np.testing.assert_allclose(tau, right, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(multipliers, linkage.multipliers(q, qd, u=u), rtol=0, atol=1e-10)
+        one = linkage.drive_forces(q[2], qd[2], qdd[2], drive)
+        assert np.array_equal(one[0], tau[2]) and np.array_equal(one[1], multipliers[2])
+
+
+@pytest.mark.parametrize("drives", [None, ["q1", "q3"], ["q2", "q3"]])
+def test_of_more_drives_than_freedoms_the_least_is_taken(linkage: ModuleType, drives: Any) -> None:
+    q, qd, qdd = (x[3] for x in motion(linkage, [1.3, -0.2]))
+    tau, multipliers = linkage.drive_forces(q, qd, qdd, drives)
+    A, D = linkage.constraint_jacobian(q), linkage.D(q)
+    whole = linkage.inverse_dynamics(q, qd, qdd)
+    np.testing.assert_allclose(whole, D @ qdd + linkage.bias(q, qd), rtol=1e-12, atol=1e-12)
+    friction = linkage.tau(q, qd, u=[0.0, 0.0])
+    np.testing.assert_allclose(tau + friction + A.T @ multipliers, whole, rtol=0, atol=1e-11)
+    which = [linkage.coordinates.index(name) for name in drives or linkage.coordinates]
+    assert not np.delete(tau, which).any()
+    # any other is more: none of what drives and rows alone can hold is in it
+    held = np.linalg.svd(np.hstack([np.eye(3)[:, which], -A.T]))[2][3:]
+    for way in held:
+        other = np.zeros(3)
+        other[which] = way[: len(which)]
+        assert abs(other @ np.linalg.solve(D, tau)) < 1e-10 * np.abs(tau).max()
+        assert np.abs(other).max() > 0.1
+
+
+def test_forces_from_outside_are_borne_too(linkage: ModuleType) -> None:
+    q, qd, qdd = (x[1] for x in motion(linkage, [0.4, 0.0]))
+    push = {"coupler": [3.0, -1.0, 0.5]}
+    tau, _ = linkage.drive_forces(q, qd, qdd, ["q1"], push)
+    alone, _ = linkage.drive_forces(q, qd, qdd, ["q1"])
+    way = np.linalg.svd(linkage.constraint_jacobian(q))[2][-1]
+    work = way @ linkage.frame_forces(q, push)
+    assert (tau - alone)[0] * way[0] == pytest.approx(-work, rel=1e-12)
+    assert abs(work) > 0.1
+
+
+def test_wheels_and_massless_ropes_have_them_too(modules: Modules) -> None:
+    sleigh: Any = modules.unoptimised(SLEIGH + "inverse_dynamics = true\n")
+    q, qd = sleigh.start
+    qdd = sleigh.acceleration(q, qd, u=[0.6])
+    tau, blade = sleigh.drive_forces(q, qd, qdd, ["x", "psi"])
+    np.testing.assert_allclose(tau, [0, 0, 0.6], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(blade, sleigh.multipliers(q, qd, u=[0.6]), rtol=1e-11)
+    rope: Any = modules.unoptimised(ROPE + "inverse_dynamics = true\n")
+    q, qd = rope.start
+    qdd = rope.acceleration(q, qd)
+    tau, held = rope.drive_forces(q, qd, qdd, ["x"])
+    np.testing.assert_allclose(tau, 0, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(held, rope.multipliers(q, qd), rtol=1e-10)
+
+
+def test_without_constraints_a_motion_tells_its_drives(modules: Modules) -> None:
+    text = 'eomc = 1\nname = "cart_drives"\n[coordinates]\nx = {}\na = { start = 0.4 }\n[energy]\n'
+    text += 'kinetic = "x_dot**2 + x_dot*a_dot*cos(a) + a_dot**2"\npotential = "9*cos(a)"\n'
+    m: Any = modules.unoptimised(text + "[run]\ninverse_dynamics = true\n")
+    q, qd = np.array([0.0, 0.4]), np.array([0.1, 0.2])
+    tau, none = m.drive_forces(q, qd, [1.0, 2.0])
+    assert none.shape == (0,)
+    np.testing.assert_allclose(tau, m.inverse_dynamics(q, qd, [1.0, 2.0]), rtol=1e-13)
+    with pytest.raises(ValueError, match=r"forces along x can't give .*: name others.* 2 freedoms"):
+        m.drive_forces(q, qd, [1.0, 2.0], ["x"])
+
+
+def test_what_it_refuses(linkage: ModuleType) -> None:
+    q, qd, qdd = (x[1] for x in motion(linkage, [0.4, 0.0]))
+    with pytest.raises(ValueError, match="drives: 'crank' is not one of q1, q2, q3"):
+        linkage.drive_forces(q, qd, qdd, ["crank"])
+    with pytest.raises(ValueError, match="forces along nothing can't give this motion"):
+        linkage.drive_forces(q, qd, qdd, [])
+    off = qdd + np.array([0.0, 0.0, 0.5])
+    row = linkage.constraint_jacobian(q)
+    worst = r"qdd: leaves the constraint pin_[xy]: its row of A qdd, .* is .* and has to be"
+    with pytest.raises(ValueError, match=worst) as told:
+        linkage.drive_forces(q, qd, off, ["q1"])
+    k = ["pin_x" in str(told.value), "pin_y" in str(told.value)].index(True)
+    assert f"{(row @ off)[k]:.6g} and has to be {(row @ qdd)[k]:.6g}" in str(told.value)
+    along = np.linalg.svd(row)[2][-1]
+    linkage.drive_forces(q, qd, qdd + 3 * along, ["q1"])  # what rows allow is not
+
+
+def test_redundant_rows_give_nothing(modules: Modules) -> None:
+    text = (SCENES / "bricard.toml").read_text(encoding="utf-8").split("[picture]")[0]
+    text = text.replace('name    = "bricard"', 'name = "bricard_drives"')
+    m: Any = modules.unoptimised(text.replace("[run]", ASK) if "[run]" in text else text + ASK)
+    q, qd = m.start
+    qdd = m.acceleration(q, qd)
+    tau, multipliers = m.drive_forces(q, qd, qdd, [m.coordinates[0]])
+    np.testing.assert_allclose(tau, 0, rtol=0, atol=1e-10)
+    right = m.multipliers(q, qd)
+    assert (right == 0).any()
+    np.testing.assert_allclose(multipliers, right, rtol=1e-9, atol=1e-10)
