@@ -60,6 +60,7 @@ bench: build/bench/done
 	build/bench/bin/python benchmarks/digits.py
 	build/bench/bin/python benchmarks/adaptive.py
 	build/bench/bin/python benchmarks/constrained.py
+	build/bench/bin/python benchmarks/iftomm.py
 
 # what the LaTeX of equations is compiled with, where npm is there; else that test is skipped
 build/katex/done:
