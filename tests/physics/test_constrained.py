@@ -117,6 +117,20 @@ def test_steps_that_end_where_a_four_bar_lies_flat() -> None:
     print("told", told)
 
 
+@pytest.mark.parametrize(
+    ("method", "counts", "most"),
+    [("dp8", [529, *range(660, 671), 515], 1e-6), ("rk4", [1036, 1109, 1113, 1125], 2e-5)],
+)
+def test_stages_near_a_flat_position_do_no_harm(
+    method: str, counts: list[int], most: float
+) -> None:
+    """Step sizes of which some lost the run where rows were left out too far from where it is."""
+    name = "iftomm_A02_four_bar_N2"
+    for steps in counts:
+        run = simulate(name, h=10 / steps, steps=steps, every=steps, method=method)
+        assert run.status == "ok" and constrained.error_of(name, run.q[-1]) < most, steps
+
+
 @pytest.mark.parametrize("h", tiers([0.05, 0.04, 0.02, 0.01], 0.02))
 def test_bricard_s_cube_turns_for_ten_seconds(h: float) -> None:
     """Its fifth row depends on the others on the manifold, and on none off it."""

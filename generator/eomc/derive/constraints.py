@@ -15,7 +15,11 @@ from eomc.derive.energies import Energies
 from eomc.derive.ldl import Rows, Vector
 from eomc.model.system import System, t
 
-DROPPED = {"double": sympy.Float("1e-9"), "float": sympy.Float("1e-5")}
+# parts of pivots: rows of accelerations, and of corrections, which lead far where pivots are small
+DROPPED = {
+    "double": (sympy.Float("1e-12"), sympy.Float("1e-9")),
+    "float": (sympy.Float("1e-5"), sympy.Float("1e-5")),
+}
 
 
 @dataclass(frozen=True)
@@ -26,8 +30,9 @@ class Constraints:
     the rate of `rates`. moved (m,): what A qd is where `rates` are 0, by what time alone moves.
     holonomic: how many are; solved: those that accelerations are solved for,
     which leaves redundant ones out. drop: a pivot that is this part of what it was, or less, tells
-    a row that depends on others in this position: nothing is solved for it there. weights: where D
-    alone is singular, of each row solved for, the part of A^T A that makes it regular; else none.
+    a row that depends on others in this position: nothing is solved for it there; in accelerations,
+    and in corrections. weights: where D alone is singular, of each row solved for, the part of
+    A^T A that makes it regular; else none.
     """
 
     values: Vector
@@ -37,7 +42,7 @@ class Constraints:
     moved: Vector
     holonomic: int
     solved: tuple[int, ...]
-    drop: Expr
+    drop: tuple[Expr, Expr]
     weights: Vector = ()
 
 

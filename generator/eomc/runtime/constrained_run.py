@@ -17,7 +17,8 @@ _LEAST = 1e-9  # of these terms
 class ConstrainedRun:
     """A part of `trajectory.Run`. singular_steps: behind so many a constraint depends on others.
 
-    Its multiplier is 0 there, and the forces in the joints are not unique; the motion is right.
+    Its multiplier is large there, or 0, and the forces in the joints are not unique; the motion is
+    right.
     first_singular: when the first of them ended, s; nan where there is none.
     """
 
