@@ -5,20 +5,23 @@ import json
 import re
 from types import SimpleNamespace
 
+import batches
 import numpy as np
 import pytest
-from report.pictures import chain, humanoid, motion, scene, system
+from report.pictures import SCENES, chain, humanoid, motion, scene, system
 
 from eomc.base.errors import EomcError
 from eomc.report import animation
+from eomc.report.drawing import drawing
 from eomc.report.labels import html_name
 from eomc.report.origin import system_of
+from eomc.report.reel import Reel, part, which
 
 EVIL = "</script><img src=x onerror=alert(1)>"
 
 
 def page(made, title="", **how):
-    return animation.page([system(made, title)], [motion(made, **how)])
+    return animation.page([Reel(system(made, title), motion(made, **how))])
 
 
 def data(text):
@@ -38,7 +41,7 @@ def test_nothing_is_asked_of_a_network():
 
 
 def test_titles_are_text():
-    text = animation.page([system(scene("cartpole"), EVIL)] * 2, [motion(scene("cartpole"))] * 2)
+    text = animation.page([Reel(system(scene("cartpole"), EVIL), motion(scene("cartpole")))] * 2)
     assert "<img" not in text and text.count("</script>") == 2
     assert "&lt;img" in text
     assert "<img" not in page(scene("cartpole"), title=EVIL)
@@ -48,15 +51,15 @@ def test_names_in_the_data_are_text():
     run = motion(scene("cartpole"))
     odd = system(scene("cartpole"))
     odd.coordinates = [SimpleNamespace(name="x", unit=EVIL), SimpleNamespace(name="y", unit="a<b")]
-    text = animation.page([odd], [run])
+    text = animation.page([Reel(odd, run)])
     assert "<img" not in text and data(text)
 
 
 def test_positions_are_those_of_the_run_to_the_stated_resolution():
     made = scene("cartpole")
     run = motion(made)
-    given = data(animation.page([system(made)], [run]))["runs"][0]
-    shown = animation.drawing(system(made), run.t, run.q)
+    given = data(animation.page([Reel(system(made), run)]))["runs"][0]
+    shown = drawing(system(made), run.t, run.q)
     d = given["drawing"]
     moving = values(d["moving"], (len(run.t), d["count"], 2))
     (box,) = [m for m in d["marks"] if m[0] == "box"]
@@ -107,7 +110,7 @@ def test_a_run_of_one_row_and_what_is_not_finite():
 def test_without_a_drawing_there_are_the_curves():
     made = system(scene("cartpole"))
     made.scene, made.definitions = None, ()
-    text = animation.page([made], [motion(scene("cartpole"))])
+    text = animation.page([Reel(made, motion(scene("cartpole")))])
     assert 'class="stage"' not in text and text.count('class="panel"') == 3
 
 
@@ -168,13 +171,111 @@ def test_other_suffixes_and_folders_are_reported(tmp_path):
         animation.Animation("").save(tmp_path / "nowhere" / "a.html")
 
 
+# --- of a batch -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """Ten poles of different lengths; one of them stops half way."""
+    runs = batches.module("cartpole").simulate_batch(
+        steps=400, params={"l": np.linspace(1.0, 3.0, 10)}
+    )
+    runs.q[9, 200:], runs.qd[9, 200:], runs._codes[9] = np.nan, np.nan, 1
+    return runs
+
+
+def rows_of(batch, text):
+    """The rows of a batch that a page shows."""
+    times = values(data(text)["runs"][0]["rows"])
+    return np.rint(np.interp(times, batch.t, np.arange(len(batch.t)))).astype(int)
+
+
+def test_instances_of_a_batch_are_over_each_other(batch, tmp_path):
+    made = batch.animate(tmp_path / "b.html", instances=[0, 4, 9])
+    text = (tmp_path / "b.html").read_text()
+    assert text == made.page and text.count('class="stage"') == 1
+    assert "0: l = 1 m" in text and "9: l = 3 m, singular" in text
+    d = data(text)["runs"][0]["drawing"]
+    assert {*d["whose"]} == {0, 1, 2} and len(d["whose"]) == len(d["marks"])
+    assert [(name, of) for name, _, of in d["paths"]] == [("0", 0), ("4", 1), ("9", 2)]
+    moving, rows = values(d["moving"], (-1, d["count"], 2)), rows_of(batch, text)
+    fifth = system_of(batch).at({"l": batch._params[4, 2]})
+    alone = drawing(fifth, batch.t[rows], batch.q[4, rows])
+    (own,) = [k for name, k, _ in d["paths"] if name == "4"]
+    path = alone.points[:, alone.paths[0].point]
+    assert np.abs(moving[:, own] - path).max() <= d["moving"]["scale"]
+
+
+def test_an_instance_that_stopped_stands_where_it_did_and_its_curve_ends(batch):
+    given = data(batch.animate(instances=[9], names=["theta"]).page)["runs"][0]
+    d = given["drawing"]
+    moving = values(d["moving"], (-1, d["count"], 2))
+    half = len(moving) // 2 + 1
+    assert np.ptp(moving[half:], axis=0).max() == 0 < np.ptp(moving[: half - 1], axis=0).max()
+    ((curve,),) = given["panels"]
+    levels = np.frombuffer(base64.b64decode(curve["data"]), dtype="<i2")
+    assert (levels[half:] == -32768).all() and (levels[: half - 1] != -32768).all()
+
+
+def test_curves_of_a_batch_are_those_of_its_instances(batch):
+    text = batch.animate(names=["theta", "theta_dot"]).page
+    theta, rate = data(text)["runs"][0]["panels"]
+    shown = [0, 1, 3, 5, 7, 9]  # six, spread evenly
+    for packed, k in zip(rate, shown, strict=True):
+        own = batch.qd[k, rows_of(batch, text), 1]
+        known = np.isfinite(own)
+        assert np.abs(values(packed) - own)[known].max() <= packed["scale"]
+    assert len(theta) == 6
+
+
+@pytest.mark.parametrize("wrong", [0, -1, True, 1.5, "all", [], [[1]], [0, 10], [-1]])
+def test_instances_that_are_not_there_are_named(batch, wrong):
+    with pytest.raises(EomcError, match="instances: give how many, or a list of some from 0 to 9"):
+        batch.animate(instances=wrong)
+
+
+def test_too_many_instances_and_unknown_curves_are_refused():
+    with pytest.raises(EomcError, match="at most 24 can be told apart, here 25"):
+        which(100, 25)
+    assert which(3, 24) == [0, 1, 2] and which(3, np.array([2, 2])) == [2]
+
+
+def test_unknown_curves_of_a_batch_are_refused(batch):
+    with pytest.raises(KeyError, match="'thete' is not one of t, x, theta"):
+        batch.animate(names=["thete"])
+
+
+@pytest.mark.slow
+def test_a_batch_by_tolerance_moves_at_its_times(modules):
+    text = (SCENES / "cartpole.toml").read_text().replace('"cartpole"', '"fitted_poles"')
+    many = modules.of_text(text.replace("[run]\n", "[run]\nbatch = true\ntolerance = 1e-6\n"))
+    times, lengths = np.arange(61) / 60, np.linspace(1.0, 2.0, 3)
+    runs = many.simulate_batch(params={"l": lengths}, times=times, tol=1e-6)
+    given = data(runs.animate(instances=[2, 0]).page)["runs"][0]
+    assert np.abs(values(given["rows"]) - runs.t).max() <= given["rows"]["scale"]
+    (first, _) = given["panels"][1]
+    assert np.abs(values(first) - runs.q[2, :, 1]).max() <= first["scale"]
+
+
+def test_a_batch_as_a_film(batch, tmp_path):
+    pytest.importorskip("matplotlib")
+    image = pytest.importorskip("PIL.Image")
+    short = part(batch, [0, 5])
+    short.q, short.qd = short.q[:, :11], short.qd[:, :11]
+    short.animate(tmp_path / "b.gif")
+    with image.open(tmp_path / "b.gif") as made:
+        colours = {c for _, c in made.convert("RGB").getcolors(1 << 20)}
+    assert any(r < 40 and b > 150 for r, _, b in colours)  # the first in blue
+    assert any(r > 180 and b < 60 for r, _, b in colours)  # the second in orange
+
+
 # --- films ------------------------------------------------------------------------------------
 
 
 def film(made, file, **how):
     from eomc.report import film
 
-    film.write([system(made)], [motion(made, **how)], file, None)
+    film.write([Reel(system(made), motion(made, **how))], file, None)
 
 
 def test_a_gif_has_a_picture_for_each_instant(tmp_path):
@@ -197,7 +298,7 @@ def test_films_that_can_not_be_made_say_why(tmp_path, monkeypatch):
     from eomc.report.film import write
 
     with pytest.raises(EomcError, match="says nothing about its shape"):
-        write([bare], [motion(scene("cartpole"))], tmp_path / "a.gif", None)
+        write([Reel(bare, motion(scene("cartpole")))], tmp_path / "a.gif", None)
 
 
 def test_without_matplotlib_a_film_says_what_to_do(tmp_path, monkeypatch):

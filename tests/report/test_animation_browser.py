@@ -4,12 +4,15 @@ import io
 import time
 from itertools import pairwise
 
+import batches
 import browser
 import numpy as np
 import pytest
 from report.pictures import chain, humanoid, motion, scene, system
 
 from eomc.report import animation
+from eomc.report.origin import system_of
+from eomc.report.reel import Instances, Reel
 
 pytestmark = [
     pytest.mark.slow,
@@ -30,9 +33,9 @@ def opened(window, tmp_path):
     """Opens a page of scenes, and sees afterwards that nothing was logged or asked for."""
     file = tmp_path / "motion.html"
 
-    def open_(*scenes, width=1000, seconds=2.0, rows=1201, title=None):
-        runs = [motion(made, seconds, rows) for made in scenes]
-        file.write_text(animation.page([*map(system, scenes)], runs, title), encoding="utf-8")
+    def open_(*scenes, width=1000, seconds=2.0, rows=1201, title=None, reels=()):
+        reels = reels or [Reel(system(made), motion(made, seconds, rows)) for made in scenes]
+        file.write_text(animation.page(reels, title), encoding="utf-8")
         window.open(file, width)
         window.wait("return document.documentElement.dataset.frames > 0")
         return window
@@ -171,6 +174,43 @@ def test_runs_stand_side_by_side_in_one_time(opened):
         ".map(c => c.getBoundingClientRect()).map(r => [r.left, r.right, r.top])"
     )
     assert boxes[0][1] <= boxes[1][0] and boxes[0][2] == boxes[1][2]
+
+
+def poles(count):
+    """A batch of cart-poles, as many as are shown, that swing from different heights."""
+    module = batches.module("cartpole")
+    q0 = np.column_stack([0.1 * np.arange(count), np.linspace(0.5, 3.0, count)])
+    runs = module.simulate_batch(q0, steps=400)
+    return [Instances(system_of(runs), runs, (), count)]
+
+
+def test_instances_of_a_batch_move_in_their_own_colours(opened):
+    page = opened(reels=poles(3))
+    stop(page, 0.0)
+    first = tip(page)
+    assert pixel(page, first) == (0, 0x72, 0xB2)
+    seen = page.run(
+        f"const c = {STAGE}, g = c.getContext('2d'), n = {{}};"
+        "const p = g.getImageData(0, 0, c.width, c.height).data;"
+        "for (let k = 0; k < p.length; k += 4) if (p[k + 3] > 250) {"
+        "const h = [p[k], p[k + 1], p[k + 2]].join(); n[h] = (n[h] || 0) + 1; } return n"
+    )
+    for colour in ("0,114,178", "184,74,0", "0,121,90"):  # --c0, --c1, --c2
+        assert seen.get(colour, 0) > 100, colour
+    seek(page, 0.5)
+    second = tip(page)
+    assert np.hypot(*np.subtract(first, second)) > 20
+    assert pixel(page, second) == (0, 0x72, 0xB2) and pixel(page, first) != (0, 0x72, 0xB2)
+    keys = page.run("return [...document.querySelectorAll('.key')].map(k => k.style.background)")
+    assert len({*keys}) == 3
+
+
+def test_two_dozen_instances_have_two_dozen_colours_and_sixty_frames(opened):
+    page = opened(reels=poles(24))
+    keys = page.run("return [...document.querySelectorAll('.key')].map(k => k.style.background)")
+    assert len({*keys}) == 24
+    page.wait("return document.documentElement.dataset.rate > 55", 10.0)
+    assert float(page.data("drawn")) < 1000 / 60
 
 
 @pytest.mark.parametrize("width", [400, 1000])

@@ -7,7 +7,7 @@ import html
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.emit.render import environment
-from eomc.report.drawing import drawing
 from eomc.report.labels import html_name
 from eomc.report.marks import Drawing
 from eomc.report.origin import Source, system_of
+from eomc.report.reel import Instances, Panel, Reel
 
 Array = NDArray[np.float64]
 
@@ -31,8 +31,6 @@ SMOOTH = 25  # rows a second from which positions between two rows are those bet
 BYTES = 650_000  # of positions and curves before they are written as text, at most
 LEVELS = 32_767  # of a quantity from its middle to its ends
 FILMS = (".gif", ".mp4")
-COLOURS = 4  # curves in one panel, at most; more where units are few
-PANELS = 6
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 25, 100, 500)
 SHORT, LONG = 1.0, 60.0  # s that the motion is played in, where not in real time
 
@@ -70,26 +68,55 @@ def animate(
     file: .html, .gif or .mp4; None: nothing is written. scene: of the first run, as in system_of.
     Returns the page, None of a film. Raises EomcError where it can't be drawn or written.
     """
+    _check(file)
+    reels = [Reel(system_of(run, scene if k == 0 else None), run) for k, run in enumerate(runs)]
+    return shown(reels, file, title)
+
+
+def instances(
+    batch: Any,
+    file: str | os.PathLike[str] | None = None,
+    *,
+    names: Sequence[str] = (),
+    chosen: int | Sequence[int] = 6,
+    scene: Source | None = None,
+    title: str | None = None,
+) -> Animation | None:
+    """The motion of instances of a batch, over each other.
+
+    names: of the curves. chosen: how many instances, or which. Else as `animate`; raises KeyError
+    for unknown names too.
+    """
+    _check(file)
+    return shown([Instances(system_of(batch, scene), batch, names, chosen)], file, title)
+
+
+def _check(file: str | os.PathLike[str] | None) -> None:
     if file is not None and Path(file).suffix.lower() not in (".html", *FILMS):
         raise EomcError(
             f"{texts.line(str(file))}: a motion is written as .html, .gif or .mp4: end its name so"
         )
-    systems = [system_of(run, scene if k == 0 else None) for k, run in enumerate(runs)]
+
+
+def shown(
+    reels: Sequence[Reel], file: str | os.PathLike[str] | None, title: str | None
+) -> Animation | None:
+    """The page of what is shown, None of a film; written where there is a file."""
     if file is not None and Path(file).suffix.lower() in FILMS:
         from eomc.report import film
 
-        film.write(systems, runs, Path(file), title)
+        film.write(reels, Path(file), title)
         return None
-    made = Animation(page(systems, runs, title))
+    made = Animation(page(reels, title))
     if file is not None:
         made.save(file)
     return made
 
 
-def page(systems: Sequence[Any], runs: Sequence[Any], title: str | None = None) -> str:
+def page(reels: Sequence[Reel], title: str | None = None) -> str:
     """The text of the page."""
-    shown = [_Shown(s, run, len(runs)) for s, run in zip(systems, runs, strict=True)]
-    named = title or " and ".join(dict.fromkeys(s.title or s.name for s in systems))
+    shown = [_Shown(reel, len(reels)) for reel in reels]
+    named = title or " and ".join(dict.fromkeys(reel.title for reel in reels))
     lasting = max(one.rows[-1] - one.rows[0] for one in shown)
     data = {"speed": _speed(lasting), "speeds": SPEEDS, "runs": [one.data() for one in shown]}
     text = json.dumps(data, separators=(",", ":"))
@@ -115,40 +142,22 @@ def _speed(seconds: float) -> float:
     return min(SPEEDS, key=lambda speed: abs(math.log(speed / wanted)))
 
 
-@dataclass(frozen=True)
-class Line:
-    """One curve: its name and its values at the rows that are shown."""
-
-    name: str
-    values: Array
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Curves that share axes, and their unit."""
-
-    unit: str
-    lines: tuple[Line, ...]
-
-
 class _Shown:
     """One run on the page."""
 
-    def __init__(self, system: Any, run: Any, count: int) -> None:
-        self.system, self.run = system, run
-        last = len(run.t) - 1
-        spacing = (run.t[last] - run.t[0]) / last if last else 1.0
+    def __init__(self, reel: Reel, count: int) -> None:
+        self.reel, t = reel, reel.t
+        last = len(t) - 1
+        spacing = (t[last] - t[0]) / last if last else 1.0
         step = max(round(1 / (FRAMES * spacing)), 1) if spacing > 0 else 1
-        made = drawing(system, run.t[:1], run.q[:1])
+        made = reel.drawing(np.zeros(1, dtype=int))
         width = made.points[0].size if made else 0
-        numbers = width + 2 * len(system.q) + 1
-        most = max(BYTES // (2 * numbers * count), 2)  # rows
+        most = max(BYTES // (2 * (width + reel.curves) * count), 2)  # rows
         step = max(step, -(-last // most))
         self.index = np.unique(np.append(np.arange(0, last + 1, step), last))
-        self.rows = np.asarray(run.t, dtype=float)[self.index]
-        q = np.asarray(run.q, dtype=float)
-        self.drawing = drawing(system, self.rows, q[self.index])
-        self.panels = list(_panels(system, run, self.index))
+        self.rows = t[self.index]
+        self.drawing = reel.drawing(self.index)
+        self.panels = list(reel.panels(self.index))
 
     @property
     def rate(self) -> float:
@@ -162,6 +171,7 @@ class _Shown:
             "rows": _packed(self.rows),
             "smooth": bool(self.rate >= SMOOTH),
             "drawing": _drawn(self.drawing) if self.drawing else None,
+            "many": len(self.reel.key),
             "panels": [[_packed(line.values) for line in p.lines] for p in self.panels],
         }
 
@@ -173,24 +183,30 @@ class _Shown:
         if made:
             resolution += f"; positions to {scale:.1g} {made.unit}".rstrip()
         kinds = dict.fromkeys(_KINDS[m.kind] for m in made.marks) if made else {}
+        many = len(self.reel.key)
         return {
-            "title": texts.html(self.system.title or self.system.name),
+            "title": texts.html(self.reel.title),
             "drawn": bool(made),
             "plane": bool(made and made.plane),
             "description": texts.html(
-                f"{self.system.title or self.system.name}, "
-                f"{'in the plane' if made and made.plane else 'in space'}: {', '.join(kinds)}"
+                f"{self.reel.title}, {'in the plane' if made and made.plane else 'in space'}: "
+                + ", ".join([*kinds, *([f"of {many} instances"] if many else [])])
             ),
+            "key": [texts.html(words) for words in self.reel.key],
             "resolution": resolution,
-            "panels": [
-                {
-                    "names": [Markup(html_name(line.name)) for line in panel.lines],
-                    "plain": ", ".join(line.name.replace("_", " ") for line in panel.lines),
-                    "unit": texts.html(panel.unit),
-                }
-                for panel in self.panels
-            ],
+            "panels": [*map(_caption, self.panels)],
         }
+
+
+def _caption(panel: Panel) -> dict[str, Any]:
+    """What stands above curves: the name of each, or that of the quantity that all are of."""
+    names = [panel.name] if panel.name else [line.name for line in panel.lines]
+    return {
+        "names": [Markup(html_name(n.removesuffix("_dot"), n.endswith("_dot"))) for n in names],
+        "keyed": not panel.name,
+        "plain": ", ".join(names).replace("_", " "),
+        "unit": texts.html(panel.unit),
+    }
 
 
 _KINDS = {
@@ -199,26 +215,6 @@ _KINDS = {
     "joint": "joints", "spiral": "springs that turn", "slide": "slides", "ground": "supports",
     "mass": "centres of mass", "point": "points", "dot": "points",
 }  # fmt: skip
-
-
-def _panels(system: Any, run: Any, index: NDArray[np.int64]) -> Iterator[Panel]:
-    """Coordinates by unit, their rates where there is room, outputs, inputs, energy."""
-    q = np.asarray(run.q, dtype=float)[index]
-    lines = [(c.unit, Line(c.name, q[:, k])) for k, c in enumerate(system.coordinates)]
-    lines += [
-        (o.unit, Line(o.name, np.asarray(run.outputs[o.name], dtype=float)[index]))
-        for o in system.outputs
-    ]
-    u = np.asarray(run.u, dtype=float)[index] if system.inputs else np.empty((len(index), 0))
-    lines += [(i.unit, Line(i.name, u[:, k])) for k, i in enumerate(system.inputs)]
-    units = dict.fromkeys(unit for unit, _ in lines)
-    apart = len(lines) <= PANELS - 1 and len(lines) <= COLOURS
-    for unit in units:
-        mine = tuple(line for of, line in lines if of == unit)
-        for group in [(line,) for line in mine] if apart else [mine]:
-            yield Panel(unit, group)
-    known = "J" if any(c.unit for c in system.coordinates) else ""
-    yield Panel(known, (Line("energy", np.asarray(run.energy, dtype=float)[index]),))
 
 
 def _packed(values: Array) -> dict[str, Any]:
@@ -253,5 +249,9 @@ def _drawn(made: Drawing) -> dict[str, Any]:
         "still": [[float(f"{x:.9g}") if math.isfinite(x) else 0.0 for x in p]
                   for p in points[0, ~moves]],
         "marks": [[mark.kind, *(int(place[k]) for k in mark.points)] for mark in made.marks],
-        "paths": [[p.name.replace("_", " "), int(place[p.point])] for p in made.paths],
+        "whose": [mark.whose for mark in made.marks if mark.whose is not None],
+        "paths": [
+            [p.name.replace("_", " "), int(place[p.point]), k if p.whose is None else p.whose]
+            for k, p in enumerate(made.paths)
+        ],
     }  # fmt: skip

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from eomc.model.system import System, dot
 from eomc.model.system import t as time
 from eomc.report import sketch
-from eomc.report.marks import Drawing, Marks
+from eomc.report.marks import Drawing, Marks, together
 
 Array = NDArray[np.float64]
 FLAT = 1e-9  # of the size of a drawing: what moves out of a plane by less stays in it
@@ -29,11 +29,26 @@ def drawing(system: System, t: Array, q: Array) -> Drawing | None:
 
     t: (n,), s; q: (n, nq).
     """
+    made = _made(system, t, q) if len(t) else None
+    return _flattened(made) if made else None
+
+
+def drawings(systems: Sequence[System], t: Array, q: Array, names: Sequence[str]) -> Drawing | None:
+    """What is drawn of instances of one scene, over each other, as `drawing` of one.
+
+    q: (batch, n, nq). names: of the instances.
+    """
     if not len(t):
         return None
+    each = [_made(system, t, own) for system, own in zip(systems, q, strict=True)]
+    made = together(each, names)
+    return _flattened(made) if made else None
+
+
+def _made(system: System, t: Array, q: Array) -> Drawing | None:
     values = {p.name: p.value for p in system.parameters}
     made = sketch.declared(system.scene, values, t, q) if system.scene else None
-    return _flattened(made) if made else _named(system, t, q)
+    return made or _named(system, t, q)
 
 
 def _flattened(made: Drawing) -> Drawing:

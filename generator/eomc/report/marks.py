@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 
 import numpy as np
@@ -39,6 +40,7 @@ class Mark:
 
     kind: str
     points: tuple[int, ...]
+    whose: int | None = None  # of which instance, where several are drawn over each other
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Path:
 
     name: str
     point: int
+    whose: int | None = None
 
 
 @dataclass(frozen=True)
@@ -144,3 +147,23 @@ class Marks:
         if len(axes) == 2:
             points = points[:, :, :2]
         return Drawing(points, marks, paths, axes, unit, names, up)
+
+
+def together(drawings: Sequence[Drawing | None], names: Sequence[str]) -> Drawing | None:
+    """Instances of one scene over each other, with a path of each under its name.
+
+    None where nothing is drawn of any.
+    """
+    points, marks, paths = list[Array](), list[Mark](), list[Path]()
+    made = [each for each in drawings if each]
+    for whose, (each, name) in enumerate(zip(drawings, names, strict=True)):
+        if each is None:
+            continue
+        at = sum(some.shape[1] for some in points)
+        marks += [Mark(m.kind, tuple(at + k for k in m.points), whose) for m in each.marks]
+        paths += [Path(name, at + p.point, whose) for p in each.paths[:1]]
+        points.append(each.points)
+    if not made:
+        return None
+    whole = np.concatenate(points, axis=1)
+    return replace(made[0], points=whole, marks=tuple(marks), paths=tuple(paths))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from typing import Any
 
+import numpy as np
+
 from eomc import pipeline
 from eomc.base import texts
 from eomc.base.errors import EomcError
@@ -14,7 +16,7 @@ Source = str | os.PathLike[str] | System
 
 
 def system_of(run: Any, scene: Source | None = None) -> System:
-    """The system of a run, with the parameters that the run was made with.
+    """The system of a run, with the parameters that the run, or a batch's first, was made with.
 
     scene: where it is not what eomc.load made the module from, the path of a scene or a System.
     Raises EomcError where there is none, or where the scene is another than the one that was built.
@@ -33,4 +35,5 @@ def system_of(run: Any, scene: Source | None = None) -> System:
             f"{where}: is not the scene that {model.name} was built from, or has changed since: "
             "load it again with eomc.load"
         )
-    return system.at(dict(zip(model.parameters, map(float, run._params), strict=True)))
+    values = np.atleast_2d(run._params)[0]
+    return system.at(dict(zip(model.parameters, map(float, values), strict=True)))

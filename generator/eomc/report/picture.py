@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -196,8 +196,13 @@ SYMBOLS = {"joint": ("o", 4.5, "white"), "slide": ("s", 6, "white"), "ground": (
 SKIPPED = frozenset(("rail", "arm", "inertia"))  # at earlier instants
 
 
-def still(axes: Axes, made: Drawing, flat: Array, shade: str = "") -> None:
-    """The marks at one instant; in a shade of grey, without symbols, where it is an earlier one."""
+def still(
+    axes: Axes, made: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
+) -> None:
+    """The marks at one instant; in a shade of grey, without symbols, where it is an earlier one.
+
+    hues: of instances, where several are drawn over each other.
+    """
     widest = np.linalg.norm(np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0))
     width = 0.02 * float(widest)
     pairs = [frozenset(m.points) for m in made.marks if m.kind in ("spring", "damper")]
@@ -205,25 +210,27 @@ def still(axes: Axes, made: Drawing, flat: Array, shade: str = "") -> None:
         points = flat[list(mark.points)]
         if not np.isfinite(points).all():
             continue
+        ink, rod = (INK, BODY) if mark.whose is None else (hues[mark.whose],) * 2
         if mark.kind in LINES:
             if shade and (mark.kind in SKIPPED and len(made.marks) > 3):
                 continue
             aside = width * 1.4 if pairs.count(frozenset(mark.points)) > 1 else 0.0
             for line in outline(mark, points, width, aside):
                 axes.plot(
-                    *line.T, color=shade or (BODY if mark.kind != "line" else INK),
+                    *line.T, color=shade or (rod if mark.kind != "line" else ink),
                     linewidth=LINES[mark.kind] * (0.7 if shade else 1.0), zorder=1 if shade else 3,
                     solid_capstyle="round", linestyle=(0, (4, 3)) if mark.kind == "rail" else "-",
                     solid_joinstyle="round",
                 )  # fmt: skip
         elif not shade:
             symbol, size, face = SYMBOLS[mark.kind]
-            axes.plot(*points[0], symbol, color=INK, markersize=size, markerfacecolor=face,
+            face = ink if face == INK else face
+            axes.plot(*points[0], symbol, color=ink, markersize=size, markerfacecolor=face,
                       markeredgewidth=0.9, zorder=4)  # fmt: skip
             if mark.kind == "mass" and len(points) == 2:  # how it is turned
                 way = points[1] - points[0]
                 tick = points[0] + way / np.linalg.norm(way) * 2 * width
-                axes.plot(*np.array([points[0], tick]).T, color=INK, linewidth=1.2, zorder=4)
+                axes.plot(*np.array([points[0], tick]).T, color=ink, linewidth=1.2, zorder=4)
 
 
 def outline(mark: Mark, points: Array, width: float, aside: float) -> Iterator[Array]:

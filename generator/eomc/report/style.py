@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from colorsys import hls_to_rgb
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -10,6 +11,15 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, distinct in every kind of colour vision; yellow left out on white
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK, FAINT = "#333333", "#DDDDDD"
+
+
+def colours(count: int) -> tuple[str, ...]:
+    """As many colours, from red to violet where COLOURS are too few."""
+    if count <= len(COLOURS):
+        return COLOURS[:count]
+    hues = (k / count * 5 / 6 for k in range(count))
+    shades = (tuple(round(255 * x) for x in hls_to_rgb(hue, 0.36, 0.75)) for hue in hues)
+    return tuple("#{:02X}{:02X}{:02X}".format(*shade) for shade in shades)
 
 
 def plain(axes: Axes, lines: bool = True) -> None:

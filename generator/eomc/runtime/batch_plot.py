@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, not_one_of
+from .columns import File
 from .labels import mathtext, with_unit
 from .plot import Curve, Source, against, given_axes, new_axes
+from .shown import by_eomc
 
 
 class Fans:
@@ -28,6 +30,19 @@ class Fans:
         the last value of each is drawn instead. Else as `Run.plot`.
         """
         return fan(self, names, quantiles, lines, over, wrap, ax, axes, style)
+
+    def animate(
+        self, file: File | None = None, *, names: Sequence[str] = (),
+        instances: int | Sequence[int] = 6, scene: Any = None, title: str | None = None,
+    ) -> Any:  # fmt: skip
+        """The motion of some instances, over each other and each in its colour, as `Run.animate`.
+
+        names: of the curves beside it, the coordinates and the energy where none is given.
+        instances: how many, spread evenly, or which, at most 24. One that has stopped stands where
+        it did. Raises KeyError for unknown names, EomcError for instances that there are not.
+        """
+        page = by_eomc("animation")
+        return page.instances(self, file, names=names, chosen=instances, scene=scene, title=title)
 
 
 def fan(
