@@ -1,6 +1,8 @@
 """Curves of runs: which panels there are, what is in them, whose axes they are drawn in."""
 
+import base64
 import dataclasses
+import io
 import subprocess
 import sys
 from pathlib import Path
@@ -217,6 +219,30 @@ def test_a_notebook_shows_the_end_the_verdict_and_a_picture(driven: ModuleType) 
     run.error = dataclasses.replace(error, verdict="steps < motion")
     assert "not resolved: steps &lt; motion" in html(run)
     assert not pyplot.get_fignums()
+
+
+def image(page: str) -> np.ndarray:
+    """The picture of a run in a notebook."""
+    data = page.split("data:image/png;base64,")[1].split('"')[0]
+    return np.asarray(pyplot.imread(io.BytesIO(base64.b64decode(data)), format="png"))
+
+
+def test_a_notebook_shows_the_mechanism_where_there_is_one(modules: Modules, monkeypatch) -> None:
+    run = modules("cartpole").simulate(duration=0.5)
+    page = run._repr_html_()
+    assert 'alt="over time: x, theta; and the mechanism"' in page
+    with_it = image(page)
+    right = with_it[:, with_it.shape[1] // 2 :, :3]
+    grey = np.abs(right - 0.3).max(axis=2) < 0.05  # the cart and the pole
+    assert grey.sum() > 100
+    monkeypatch.setattr(run._model, "source", None)
+    alone = run._repr_html_()
+    assert 'alt="over time: x, theta"' in alone and image(alone).shape[1] < with_it.shape[1]
+
+
+def test_a_notebook_shows_curves_alone_of_what_says_nothing_of_its_shape(modules: Modules) -> None:
+    page = modules.of_text(BATCH).simulate(duration=0.5)._repr_html_()
+    assert 'alt="over time: x"' in page
 
 
 def test_a_notebook_shows_free_text_escaped(modules: Modules, monkeypatch) -> None:

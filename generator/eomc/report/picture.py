@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eomc.base import texts
+from eomc.base.errors import EomcError
 from eomc.model.system import System
 from eomc.report.drawing import drawing
 from eomc.report.labels import label, mathtext, with_unit
 from eomc.report.marks import FAR, Drawing, Mark
+from eomc.report.origin import system_of
 from eomc.report.style import COLOURS, INK, plain
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ Array = NDArray[np.float64]
 
 INSTANTS = 16  # at which a small mechanism is shown; MANY: marks from which there are fewer
 MANY = 24
+ROWS = 5000  # of a run from which a small picture is made, about
 AZIMUTH, ELEVATION = -60.0, 20.0  # degrees, from where drawings in space are seen
 BODY, GHOST = "#4D4D4D", 0.80  # of rods; the lightest grey of an earlier instant
 
@@ -44,6 +47,17 @@ def picture(system: System, t: Array, q: Array, qd: Array) -> Mechanism | Curve 
         first, second = map(label, system.coordinates)
         return Curve(q, (first, second), "Configuration space")
     return None
+
+
+def of_run(run: Any) -> Mechanism | None:
+    """The mechanism of a run; None where its scene is not known or says nothing of its shape."""
+    try:
+        system = system_of(run)
+    except EomcError:
+        return None
+    t, q = (np.asarray(x, dtype=float)[:: max(len(run) // ROWS, 1)] for x in (run.t, run.q))
+    made = drawing(system, t, q)
+    return Mechanism(t, made) if made else None
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .labels import plain
+from .shown import by_eomc
 
 SHOWN = 12  # coordinates in the table, at most
 
@@ -38,7 +39,8 @@ def html(run: Any) -> str:
 
 
 def _picture(run: Any) -> str:
-    """The coordinates over time as an image, where matplotlib is there."""
+    """The mechanism, where eomc is there and the scene says what it looks like, beside the
+    coordinates over time, as an image; "" without matplotlib."""
     if not len(run) or find_spec("matplotlib") is None:
         return ""
     from matplotlib import rc_context
@@ -50,12 +52,28 @@ def _picture(run: Any) -> str:
     names = list(source.coordinates)
     panels = grouped([source.curve(name) for name in names])[:3]
     shown = [c.name for panel in panels for c in panel]
+    drawn = _mechanism(run)
     with rc_context({"text.usetex": False}):
-        figure = Figure(figsize=(6, 1.6 * len(panels) + 0.5), layout="constrained", dpi=80)
-        axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        height = max(1.6 * len(panels) + 0.5, 3.2 if drawn else 0)
+        figure = Figure(figsize=(9 if drawn else 6, height), layout="constrained", dpi=80)
+        grid = figure.add_gridspec(len(panels), 2 if drawn else 1)
+        axes = [figure.add_subplot(grid[0, 0])]
+        axes += [figure.add_subplot(grid[k, 0], sharex=axes[0]) for k in range(1, len(panels))]
         plot(run, shown, None, None, (), None, False, None, axes, {})
+        for above in axes[:-1]:
+            above.tick_params(labelbottom=False)
+        if drawn:
+            drawn.draw(figure.add_subplot(grid[:, 1]))
         file = io.BytesIO()
         figure.savefig(file, format="png")
     data = base64.b64encode(file.getvalue()).decode("ascii")
-    said = escape("over time: " + ", ".join(shown), quote=True)
-    return f'<img alt="{said}" src="data:image/png;base64,{data}">'
+    said = "over time: " + ", ".join(shown) + ("; and the mechanism" if drawn else "")
+    return f'<img alt="{escape(said, quote=True)}" src="data:image/png;base64,{data}">'
+
+
+def _mechanism(run: Any) -> Any:
+    """What draws the mechanism of a run; None where nothing says what it looks like."""
+    try:
+        return by_eomc("picture").of_run(run)
+    except ImportError:
+        return None
