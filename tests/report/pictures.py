@@ -23,8 +23,8 @@ def scene(name: str) -> Scene:
 def system(made: Scene, title: str = "") -> Any:
     """What pictures ask of a System."""
     return SimpleNamespace(
-        scene=made, name=made.name, title=title or made.title, coordinates=made.coordinates,
-        parameters=(*made.parameters,), outputs=(), inputs=(), q=made.coordinates,
+        scene=made, pictured=None, name=made.name, title=title or made.title, outputs=(),
+        coordinates=made.coordinates, parameters=(*made.parameters,), inputs=(), q=made.coordinates,
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError, Problem
 from eomc.model import constraints, given
 from eomc.model.algebra import UNDEFINED
+from eomc.model.pictured import pictured
 from eomc.model.rewrite import JumpError, rewritten
 from eomc.model.symbols import (
     Constraint,
@@ -114,6 +115,7 @@ class Maker:
         definitions: Mapping[Any, Any], outputs: Mapping[str, Any],
         rows: Mapping[str, Any], guess: Sequence[Any], units: Mapping[Any, str],
         title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
+        picture: Any,
     ) -> System:  # fmt: skip
         """The system, of the class `of`."""
         starts = given.symbols(coordinates, "coordinates", None)
@@ -143,6 +145,10 @@ class Maker:
         if unknown := [f for f in forces if f not in map(given.name_of, starts)]:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
         expression = self._expression
+        drawn, drawn_text = None, ""
+        if picture is not None:
+            names = given_inputs.values()
+            drawn, drawn_text = pictured(picture, expression, made, declared, names, ordered)
         given_energies = {"kinetic": kinetic, "potential": potential, "dissipation": dissipation}
         energies = {role: expression(energy, role) for role, energy in given_energies.items()}
         for role, energy in energies.items():
@@ -163,8 +169,9 @@ class Maker:
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
         }
-        digest = hashlib.sha256(sympy.srepr(sorted(made_of.items())).encode()).hexdigest()
-        return of(**made_of, digest=digest, renamed=tuple(self.renamed))
+        whole = sympy.srepr(sorted(made_of.items())) + drawn_text
+        digest = hashlib.sha256(whole.encode()).hexdigest()
+        return of(**made_of, digest=digest, renamed=tuple(self.renamed), pictured=drawn)
 
     def _coordinate(self, one: Any, units: Mapping[Any, str], start: Any) -> Coordinate:
         """A coordinate, whose symbols are known from here on; what is given of it is held."""

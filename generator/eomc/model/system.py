@@ -61,7 +61,8 @@ class System:
     that are held by joints, whose energies are part of K and P. `frames`: of bodies and points, in
     space or in the `plane`. `digest` names what the system was
     made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
-    was read from, where it was. `closure`: what its constraints leave, once its start is assembled.
+    was read from, where it was. `pictured`: where it was made in Python with a picture, a scene of
+    its names and that alone. `closure`: what its constraints leave, once its start is assembled.
     """
 
     name: str
@@ -90,6 +91,7 @@ class System:
     warnings: tuple[Problem, ...] = field(default=(), compare=False)
     place: Callable[..., Problem] | None = field(default=None, compare=False, repr=False)
     scene: Scene | None = field(default=None, compare=False, repr=False)
+    pictured: Scene | None = field(default=None, compare=False, repr=False)
     closure: Closure | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -169,6 +171,7 @@ class System:
         limits: Mapping[Any, Sequence[Any]] | None = None,
         events: Mapping[str, Any] | None = None,
         tolerance: float | None = None,
+        picture: Mapping[str, Any] | None = None,
     ) -> System:
         r"""A system from SymPy expressions.
 
@@ -183,8 +186,10 @@ class System:
         from inputs to pairs, the least and largest value that acts, None for no such. events:
         mapping from names to what crosses zero, or to a dict as [[event]] has it, {"when": y,
         "direction": "falling", "action": "jump", y_dot: -e*y_dot}. tolerance: of adaptive steps;
-        events have 1e-9 where none is given. Names that C can't bear (`\theta`, `lambda`) are
-        replaced, and `renamed` says how. Raises EomcError where something is undeclared.
+        events have 1e-9 where none is given. picture: what it looks like, a dict as [picture] of a
+        scene has it, with expressions or formulas: {"lines": [[[0, 0], [x, -l]]]}. Names that C
+        can't bear (`\theta`, `lambda`) are replaced, and `renamed` says how. Raises EomcError where
+        something is undeclared.
 
         >>> from sympy.physics.mechanics import dynamicsymbols
         >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
@@ -199,7 +204,7 @@ class System:
             cls, coordinates, kinetic, potential, given.or_none(parameters), dissipation,
             given.or_none(forces), inputs, given.or_none(definitions), given.or_none(outputs),
             given.or_none(constraints), guess, given.or_none(units), title, run,
-            given.or_none(limits), given.or_none(events),
+            given.or_none(limits), given.or_none(events), picture,
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)

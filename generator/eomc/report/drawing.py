@@ -47,7 +47,8 @@ def drawings(systems: Sequence[System], t: Array, q: Array, names: Sequence[str]
 
 def _made(system: System, t: Array, q: Array) -> Drawing | None:
     values = {p.name: p.value for p in system.parameters}
-    made = sketch.declared(system.scene, values, t, q) if system.scene else None
+    scene = system.scene or system.pictured
+    made = sketch.declared(scene, values, t, q) if scene else None
     return made or _named(system, t, q)
 
 

@@ -76,6 +76,11 @@ def parse(
     return check.scene(hashlib.sha256(data).hexdigest())
 
 
+def of_tree(tree: dict[str, Any], called: str) -> Scene:
+    """Check a scene that is given as a tree, as `parse` one of text; its faults have no lines."""
+    return _Check(tree, SourceMap("", called), {}).scene("")
+
+
 class _Check(Checker):
     """Everything that is checked in one scene, faults collected on the way."""
 

@@ -1,0 +1,113 @@
+"""The picture of a system that is made in Python: what [picture] is to a scene, checked as there.
+
+A scene of the system's names and its picture alone, in which expressions stand as formulas.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import sympy
+from sympy import Expr, Symbol
+from sympy.printing.str import StrPrinter
+
+from eomc.model import given
+from eomc.model.symbols import Coordinate, Parameter
+from eomc.scene import read
+from eomc.scene.scene import Scene
+
+_EXAMPLE = '{"points": {"tip": ["l*sin(theta)", "-l*cos(theta)"]}, "lines": [[[0, 0], "tip"]]}'
+_NAMES = {"Abs": "abs", "Max": "max", "Min": "min"}
+
+
+def pictured(
+    picture: Any, expression: Callable[[Any, str], Expr], coordinates: Iterable[Coordinate],
+    parameters: Iterable[Parameter], inputs: Iterable[str],
+    definitions: Sequence[tuple[Symbol, Expr]],
+) -> tuple[Scene, str]:  # fmt: skip
+    """The scene from which pictures are drawn, and its text, which the same picture has again.
+
+    expression: from a user's expression to ours. Raises EomcError as a scene with that [picture].
+    """
+    if not isinstance(picture, Mapping):
+        raise given.fault("picture", f"give a dict, such as {_EXAMPLE}, here {picture!r}")
+    table = _written(picture, expression)
+    coordinates = [*coordinates]
+    tree: dict[str, Any] = {
+        "eomc": 1,
+        "name": "pictured",
+        "coordinates": {c.name: _metres(c) for c in coordinates},
+        "parameters": {p.name: {"value": p.value, **_metres(p)} for p in parameters},
+        "inputs": {name: {} for name in inputs},
+        "definitions": _used(table, definitions),
+        "energy": {"kinetic": f"{coordinates[0].name}_dot**2"},  # which a scene has; not drawn
+        "picture": table,
+    }
+    return read.of_tree(tree, "System.make"), json.dumps(table, sort_keys=True, default=str)
+
+
+def _metres(one: Coordinate | Parameter) -> dict[str, str]:
+    """Its unit, of which pictures need to know whether it is a length."""
+    return {"unit": "m"} if one.unit == "m" else {}
+
+
+def _written(value: Any, expression: Callable[[Any, str], Expr]) -> Any:
+    """A value as scenes have it: expressions as formulas, whatever holds them as lists."""
+    if isinstance(value, Mapping):
+        return {str(key): _written(entry, expression) for key, entry in value.items()}
+    if isinstance(value, sympy.MatrixBase):
+        value = value.flat()
+    if isinstance(value, (list, tuple)):
+        return [_written(entry, expression) for entry in value]
+    if isinstance(value, Expr):
+        return text(expression(value, "picture"))
+    return value.item() if hasattr(value, "item") else value  # a number of NumPy
+
+
+def _used(table: Any, definitions: Sequence[tuple[Symbol, Expr]]) -> dict[str, str]:
+    """The definitions that a picture needs, in their order."""
+    wanted = {*re.findall(r"[A-Za-z_]\w*", json.dumps(table, default=str))}
+    found: dict[str, str] = {}
+    for name, expr in reversed(definitions):
+        if name.name in wanted:
+            wanted |= {s.name for s in expr.free_symbols if isinstance(s, Symbol)}
+            found[name.name] = text(expr)
+    return dict(reversed(found.items()))
+
+
+class _Formula(StrPrinter):  # type: ignore[misc]  # SymPy has no types
+    """SymPy in the words of formulas."""
+
+    def _print_Function(self, expr: Any) -> str:
+        name = type(expr).__name__
+        return f"{_NAMES.get(name, name)}({self.stringify(expr.args, ', ')})"
+
+    _print_Max = _print_Min = _print_Abs = _print_Function
+
+    def _print_Heaviside(self, expr: Any) -> str:
+        return f"heaviside({self._print(expr.args[0])})"
+
+    def _print_Float(self, expr: Any) -> str:
+        return repr(float(expr))
+
+    def _print_Exp1(self, expr: Any) -> str:
+        return "exp(1)"
+
+    def _print_NumberSymbol(self, expr: Any) -> str:
+        return repr(float(expr))
+
+    def _print_Pi(self, expr: Any) -> str:
+        return "pi"
+
+
+def text(expr: Expr) -> str:
+    """An expression as a formula.
+
+    >>> x = Symbol("x")
+    >>> text(sympy.Abs(x) ** 2 / 2 + sympy.exp(1) * sympy.Max(x, 0))
+    'exp(1)*max(0, x) + abs(x)**2/2'
+    """
+    return str(_Formula().doprint(expr))

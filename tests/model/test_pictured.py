@@ -1,0 +1,167 @@
+"""The picture of a system made in Python: drawn, checked and worded as [picture] of a scene."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy
+from conftest import Modules
+from sympy.physics.mechanics import dynamicsymbols
+
+import eomc
+from eomc.base.errors import EomcError, SceneError
+from eomc.model.from_scene import from_scene
+from eomc.model.pictured import text
+from eomc.report.drawing import drawing
+from eomc.scene import formulas
+from eomc.scene.read import parse
+
+SCENE = """
+eomc = 1
+name = "crane"
+[coordinates]
+x = { unit = "m" }
+theta = { unit = "rad" }
+[parameters]
+m = 2.0
+l = { value = 1.5, unit = "m" }
+[inputs]
+F = {}
+[definitions]
+x_p = "x - l*sin(theta)"
+y_p = "l*cos(theta)"
+[energy]
+kinetic = "m*x_dot**2/2 + m*(dot(x_p)**2 + dot(y_p)**2)/2"
+potential = "9.81*m*y_p"
+[forces]
+x = "F"
+"""
+PICTURE = """
+[picture]
+points = { cart = ["x", 0], load = ["x_p", "y_p"] }
+lines = [["cart", "load"], ["world", [0, -0.2]]]
+boxes = [{ at = "cart", size = [0.5, "l/8"], rotation = "theta/10" }]
+circles = [{ at = "load", radius = "0.1*l" }]
+springs = [[[-2, 0], "cart"]]
+dots = ["load"]
+paths = ["load"]
+axes = "xz"
+"""
+T = np.array([0.0, 0.5])
+Q = np.array([[0.1, 0.2], [-0.4, 1.3]])
+
+
+def made(picture: Any) -> eomc.System:
+    """The crane of the scene."""
+    return eomc.System.make(
+        "crane", ["x", "theta"], "m*x_dot**2/2 + m*(dot(x_p)**2 + dot(y_p)**2)/2", "9.81*m*y_p",
+        parameters={"m": 2.0, "l": 1.5}, definitions={"x_p": "x - l*sin(theta)",
+        "y_p": "l*cos(theta)"}, inputs=["F"], forces={"x": "F"}, units={"x": "m", "l": "m"},
+        picture=picture,
+    )  # fmt: skip
+
+
+def same(one: Any, other: Any) -> None:
+    assert (one.marks, one.paths, one.axes) == (other.marks, other.paths, other.axes)
+    assert one.unit == other.unit and np.allclose(one.points, other.points, atol=1e-15)
+
+
+def test_it_is_drawn_as_that_of_a_scene() -> None:
+    scene = from_scene(parse(SCENE + PICTURE))
+    system = made(tomllib.loads(PICTURE)["picture"])
+    same(drawing(system, T, Q), drawing(scene, T, Q))
+    longer = drawing(system.at({"l": 3.0}), T, Q)
+    same(longer, drawing(scene.at({"l": 3.0}), T, Q))
+
+
+def test_expressions_stand_as_formulas_do() -> None:
+    q, theta = dynamicsymbols("x theta")
+    m, l, g = sympy.symbols("m l g", positive=True)  # noqa: E741 - the scene's name
+    at = sympy.Matrix([q - l * sympy.sin(theta), l * sympy.cos(theta)])
+    t = dynamicsymbols._t
+    v = at.diff(t)
+    system = eomc.System.make(
+        "crane", [q, theta], m * q.diff(t) ** 2 / 2 + m * v.dot(v) / 2, g * m * at[1],
+        parameters={m: 2, l: 1.5, g: 9.81}, units={q: "m"},
+        picture={
+            "points": {"cart": (q, np.float64(0)), "load": at},
+            "lines": [("cart", "load"), ("world", (0, -0.2))],
+            "boxes": [{"at": "cart", "size": [0.5, l / 8], "rotation": theta / 10}],
+            "circles": [{"at": "load", "radius": l / 10}],
+            "springs": [[(-2, 0), "cart"]],
+            "dots": ["load"],
+            "paths": ["load"],
+            "axes": "xz",
+        },
+    )  # fmt: skip
+    same(drawing(system, T, Q), drawing(from_scene(parse(SCENE + PICTURE)), T, Q))
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        "",
+        'lines = [["cart", "tip"]]',
+        "line = []",
+        'dots = [["F", 0]]',
+        'dots = [["x_dot", 0]]',
+        'dots = [["dot(x_p)", 0]]',
+        'dots = [["xx", 0]]',
+        'dots = [["x^2", 0]]',
+        'paths = "tip"',
+        'boxes = [{ at = ["x", 0], size = ["x", 1] }]',
+        'circles = [{ at = ["x", 0], radius = -1 }]',
+        "dots = [[0, 0, 0], [0, 0]]",
+        "springs = [[[0, 0], [1, 0], [2, 0]]]",
+        'points = { world = ["x", 0] }',
+        'dots = [["x", 0]]\naxes = "zx"',
+    ],
+)
+def test_faults_are_told_as_those_of_a_scene(picture: str) -> None:
+    with pytest.raises(SceneError) as of_scene:
+        parse(SCENE + "[picture]\n" + picture)
+    with pytest.raises(SceneError, match=r"System\.make: error: picture") as of_python:
+        made(tomllib.loads(picture))
+    told = [(p.key, p.message) for p in of_scene.value.problems if p.severity == "error"]
+    assert told == [(p.key, p.message) for p in of_python.value.problems if p.severity == "error"]
+
+
+@pytest.mark.parametrize(
+    ("picture", "said"),
+    [
+        ([1], r"picture: give a dict, such as .*\[1\]"),
+        ({"dots": [[sympy.Symbol("zz"), 0]]}, "picture: zz not declared"),
+        ({"dots": [[sympy.erf(sympy.Symbol("x")), 0]]}, "picture: erf can't be used: write tanh"),
+        ({"dots": [[sympy.Symbol("x_dot"), 0]]}, "picture.dots: a picture can't depend on velo"),
+    ],
+)
+def test_faults_of_python_are_told(picture: Any, said: str) -> None:
+    with pytest.raises(EomcError, match=said):
+        made(picture)
+
+
+def test_a_module_is_built_anew_where_its_picture_changes() -> None:
+    bare, one, other = (made(p) for p in (None, {"dots": [["x", 0]]}, {"dots": [["x", 1]]}))
+    assert len({bare.digest, one.digest, other.digest}) == 3
+    assert made({"dots": [["x", 0]]}).digest == one.digest
+
+
+@pytest.mark.parametrize("name", sorted({*formulas.FUNCTIONS} - {"dot"}))
+def test_every_function_is_written_as_formulas_have_it(name: str) -> None:
+    fewest, _ = formulas.FUNCTIONS[name]
+    known = {"x": 0.3, "y": 0.7}
+    written = f"{name}(x, y)" if fewest == 2 else f"{name}(x)"
+    expr = sympy.sympify(written, {"min": sympy.Min, "max": sympy.Max, "abs": sympy.Abs,
+                                   "heaviside": sympy.Heaviside})  # fmt: skip
+    again = formulas.parse(text(expr + sympy.E - sympy.Rational(1, 7) + sympy.Float("0.1")))
+    value = formulas.evaluate(again, formulas.NUMERIC, known.__getitem__)
+    direct = formulas.evaluate(formulas.parse(written), formulas.NUMERIC, known.__getitem__)
+    assert np.isclose(value, direct + np.e - 1 / 7 + 0.1, rtol=1e-14)
+
+
+def test_its_runs_move_in_pages(modules: Modules) -> None:
+    drawn = modules.unoptimised(made({"lines": [[["x", 0], ["x_p", "y_p"]]], "paths": [["x", 0]]}))
+    assert 'class="stage"' in drawn.simulate(steps=20).animate().page
