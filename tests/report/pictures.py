@@ -2,22 +2,52 @@
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from eomc.robots import edit, scene_text, urdf
 from eomc.scene.read import parse, read
 from eomc.scene.scene import Scene
 
 SCENES = Path(__file__).parents[2] / "scenes"
 OWN = Path(__file__).parent / "pictured"
+ROBOTS = {
+    "allegro": "/allegro_right_hand.urdf", "anymal": "b_simple_description/robots/anymal.urdf",
+    "double_pendulum_urdf": "/double_pendulum.urdf", "finger": "/finger_edu.urdf",
+    "kinova": "/kinova.urdf", "panda": "/panda.urdf", "so101": "/so101.urdf",
+    "solo12": "/solo12.urdf", "talos_arm": "/talos_left_arm.urdf", "ur5": "/ur5_robot.urdf",
+}  # fmt: skip
+FREE = ("anymal", "solo12")  # on no ground
 
 
 def scene(name: str) -> Scene:
+    """A scene of ours, or of a robot file."""
+    if (file := OWN / f"{name}.urdf").exists():
+        return robot(file)
+    if name in ROBOTS:
+        return robot(robot_data(ROBOTS[name]), name in FREE)
     folder = OWN if (OWN / f"{name}.toml").exists() else SCENES
     return read(folder / f"{name}.toml")
+
+
+def robot(file: Path, free: bool = False) -> Scene:
+    """The scene of a URDF, as eomc import writes it."""
+    made = edit.mended(edit.based(urdf.read(file), free))
+    return parse(scene_text.scene_text(scene_text.finished(made)))
+
+
+def robot_data(name: str) -> Path:
+    """A URDF of example-robot-data; skips the test where that is not installed."""
+    try:
+        found = [f for f in files("example-robot-data") or () if str(f).endswith(name)]
+    except PackageNotFoundError:
+        pytest.skip('example-robot-data is not there: pip install ".[robots]"')
+    return Path(str(found[0].locate()))
 
 
 def system(made: Scene, title: str = "") -> Any:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sympy
-from report.pictures import OWN, SCENES, chain, humanoid, motion, scene, system
+from report.pictures import FREE, OWN, ROBOTS, SCENES, chain, humanoid, motion, scene, system
 
 from eomc.model.from_scene import from_scene
 from eomc.model.kinematics import Kinematics
@@ -18,7 +18,7 @@ from eomc.scene.read import parse
 GOLDEN = Path(__file__).parent / "drawings.json"
 DRAWN = [
     *sorted(p.stem for p in SCENES.glob("*.toml")),
-    *sorted(p.stem for p in OWN.glob("*.toml")),
+    *sorted(p.stem for p in OWN.iterdir()),
 ]
 
 
@@ -134,6 +134,75 @@ def test_a_free_body_is_the_box_of_its_inertia():
 def test_wheels_are_drawn_where_no_line_shows_how_they_turn():
     assert len(marks(drawn(scene("satellite")), "inertia")) == 3
     assert len(marks(drawn(scene("quadrotor")), "inertia")) == 1  # not the load on its rope
+
+
+TWINS = """
+eomc = 1
+name = "twins"
+gravity = [0, 0, -9.81]
+[coordinates]
+x = { unit = "m" }
+y = { unit = "m" }
+z = { unit = "m" }
+a = { unit = "rad" }
+b = { unit = "rad" }
+c = { unit = "rad" }
+[[body]]
+name = "dummy"
+joint = "free"
+coordinates = ["x", "y", "z", "a", "b", "c"]
+mass = 1e-6
+inertia = [1e-6, 1e-6, 1e-6]
+[[body]]
+name = "left"
+parent = "dummy"
+joint = "fixed"
+offset = [0, 0.3, 0]
+rotation = [["x", "pi/2"]]
+mass = 1.0
+inertia = [0.02, 0.03, 0.04]
+[[body]]
+name = "right"
+parent = "dummy"
+joint = "fixed"
+offset = [0, -0.3, 0]
+mass = 1.0
+inertia = [0.02, 0.03, 0.04]
+"""
+
+
+def test_bodies_that_are_fixed_together_have_one_box():
+    """A frame with hardly a mass, as robot files have it, has none that is metres wide."""
+    (box,) = marks(drawn(parse(TWINS)), "inertia")
+    halves = np.sort(np.linalg.norm(box[:, 1:] - box[:, :1], axis=2), axis=1)
+    # the left one's y is along the right one's z; Steiner's parts are of x and z
+    moments = np.array([0.04 + 2 * 0.3**2, 0.07, 0.07 + 2 * 0.3**2])
+    known = np.sort(np.sqrt(3 * (moments.sum() / 2 - moments) / 2))
+    assert np.allclose(halves, known, rtol=1e-4)
+    assert np.allclose(box[:, 0], motion(parse(TWINS)).q[:, :3], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["arm", *ROBOTS])
+def test_a_robot_has_its_joints_and_lines_to_all_of_it(name):
+    """The joints stand where another kinematics has them; what slides hangs on its rail."""
+    made = scene(name)
+    found, run = drawn(made), motion(made)
+    poses = Kinematics(made, made.assembly).poses(run.q[0])
+    turning = [poses[b.name][0] for b in made.assembly.bodies if b.joint == "revolute"]
+    shown = np.array([joint[0, 0] for joint in marks(found, "joint")])
+    apart = np.linalg.norm(np.array(turning)[:, None] - shown, axis=2)
+    assert apart.min(axis=0).max() < 1e-12 and apart.min(axis=1).max() < 1e-12
+    assert len(marks(found, "ground")) == (name not in FREE)
+    hung = {k: {k} for m in found.marks for k in m.points}
+    for mark in found.marks:
+        if mark.kind in ("rod", "arm"):
+            joined = set().union(*(hung[k] for k in mark.points))
+            hung |= dict.fromkeys(joined, joined)
+    sliding = sum(b.joint == "prismatic" for b in made.assembly.bodies)
+    ends = {
+        frozenset(hung[m.points[0]]) for m in found.marks if m.kind in ("joint", "mass", "point")
+    }
+    assert len(ends) == 1 + sliding
 
 
 def test_springs_and_dampers_are_where_they_are_declared():

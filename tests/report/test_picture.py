@@ -72,6 +72,23 @@ def test_every_mark_is_drawn(name):
     assert len(again.get_lines()) == lines + symbols + turned > 0
 
 
+def test_the_dot_of_a_path_is_where_the_mechanism_is():
+    shown, on, _ = drawn("cartpole")
+    (dot,) = [line.get_xydata()[0] for line in on.get_lines() if line.get_zorder() == 6]
+    rods = [line.get_xydata() for line in on.get_lines() if line.get_zorder() == 3]
+    assert any(np.allclose(rod[-1], dot) for rod in rods if len(rod) == 2)
+    assert not np.allclose(dot, picture.seen(shown.drawing)[-1, shown.drawing.paths[0].point])
+
+
+def test_a_planet_is_drawn_once():
+    """What is points alone is shown at the end of its path."""
+    shown, on, _ = drawn("kepler_orbit")
+    flat = picture.seen(shown.drawing)
+    dots = [line.get_xydata()[0] for line in on.get_lines() if len(line.get_xydata()) == 1]
+    at = {tuple(np.round(dot, 9)) for dot in dots}
+    assert at == {tuple(np.round(x, 9)) for x in flat[-1]}
+
+
 def test_a_spring_reaches_from_end_to_end():
     (line,) = picture.outline(
         picture.Mark("spring", (0, 1)), np.array([[0.0, 0], [3, 4]]), 0.1, 0.0

@@ -92,7 +92,8 @@ class Mechanism:
         made = self.drawing
         flat = self._near(seen(made))
         paths = [(p.name, flat[:, p.point]) for p in made.paths]
-        last = self._stretch(flat)
+        shapes = sum(mark.kind in LINES for mark in made.marks)
+        last = self._stretch(flat) if shapes else len(flat) - 1
         ghosts = self._ghosts(last)
         for k, i in enumerate(ghosts):
             shade = str(GHOST - 0.35 * k / max(len(ghosts) - 1, 1))
@@ -103,7 +104,7 @@ class Mechanism:
         if made.marks:
             still(axes, made, flat[last])
         for (_, path), colour in zip(paths, COLOURS, strict=False):
-            axes.plot(*path[-1], "o", color=colour, markersize=5, zorder=6)
+            axes.plot(*path[last], "o", color=colour, markersize=5, zorder=6)
         frame(axes, made, flat)
         end = f", t = 0 to {self.t[last]:.3g} s" if ghosts.size else ""
         where = "In the plane" if made.plane else "In space"

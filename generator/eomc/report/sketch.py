@@ -152,6 +152,8 @@ class _Sketch:
                 self._join(body)
         for body in assembly.bodies:
             self._mass(body, assembly.plane)
+        if not assembly.plane:
+            self._boxes(assembly)
         for loop in assembly.loops:
             if loop.bodies:
                 self._close(loop)
@@ -215,19 +217,46 @@ class _Sketch:
             radius = np.sqrt(max(float(self._number(body.inertia[2])), 0) / mass)  # of gyration
             marks.add("mass", at, *([marks.point(center + radius * R[:, :, 0])] if radius else []))
             return
-        lines = [m.points for m in marks.marks if m.kind in ("rod", "arm")]
-        held = body.joint not in ("", "free") and marks.point(origin) in [
-            first for first, _ in lines
-        ]
-        if not held:  # else its lines show how it is turned
-            self._inertia(body, mass, center, R)
         marks.add("mass", at)
 
-    def _inertia(self, body: Body, mass: float, center: Array, R: Array) -> None:
-        """The box of a body's mass and inertia: with edges 2a, 2b, 2c Ixx is m (b^2 + c^2)/3."""
-        xx, yy, zz, xy, xz, yz = (float(self._number(entry)) for entry in body.inertia)
-        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        halves = np.sqrt(np.maximum(3 * (moments.sum() / 2 - moments) / mass, 0))
+    def _boxes(self, assembly: Assembly) -> None:
+        """Of bodies in space that no line shows the turning of; what is fixed together is one."""
+        roots: dict[str, str] = {}
+        for body in assembly.bodies:
+            together = body.joint == "fixed" and body.parent != WORLD
+            roots[body.name] = roots[body.parent] if together else body.name
+        marks = self.marks
+        lines = {m.points[0] for m in marks.marks if m.kind in ("rod", "arm")}
+        for root in assembly.bodies:
+            group = [b for b in assembly.bodies if roots[b.name] == root.name]
+            held = any(marks.point(self.poses[b.name][0]) in lines for b in group)
+            if group and (root.joint in ("", "free") or not held):
+                self._inertia(group, self.poses[root.name][1])
+
+    def _inertia(self, group: Sequence[Body], R: Array) -> None:
+        """The box of the mass and inertia of bodies that are fixed together, R their rotation.
+
+        With edges 2a, 2b, 2c Ixx is m (b^2 + c^2)/3.
+        """
+        masses = np.array([float(self._number(body.mass)) for body in group])
+        if not masses.sum() > 0:
+            return
+        centers = np.stack([self.centers[body.name] for body in group])  # (bodies, n, 3)
+        center = centers[0]  # exactly, where it is alone
+        if len(group) > 1:
+            center = np.tensordot(masses, centers, 1) / masses.sum()
+        whole = np.zeros((3, 3))
+        for body, m, own in zip(group, masses, centers, strict=True):
+            d, turned = R[0].T @ (own[0] - center[0]), np.eye(3)
+            if body is not group[0]:
+                turned = R[0].T @ self.poses[body.name][1][0]
+            xx, yy, zz, xy, xz, yz = (float(self._number(entry)) for entry in body.inertia)
+            whole += turned @ [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]] @ turned.T
+            whole += m * (d @ d * np.eye(3) - np.outer(d, d))
+        if not np.isfinite(whole).all():
+            return
+        moments, axes = np.linalg.eigh(whole)
+        halves = np.sqrt(np.maximum(3 * (moments.sum() / 2 - moments) / masses.sum(), 0))
         halves[halves < 1e-6 * halves.max(initial=0.0)] = 0
         if halves.any():
             tips = (R @ axes * halves).transpose(2, 0, 1)
