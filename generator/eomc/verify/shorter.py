@@ -7,6 +7,7 @@ a few forms, and the shortest is taken.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -75,14 +76,26 @@ def _coefficient(e: Expr) -> Expr:
         forms += [sums, *_again(sums)]
         if len(angles) > 1:
             forms += [_sums(fewest, True)]
-    shortest = sorted(forms, key=_length)[:CANDIDATES]
-    return min(shortest + [sympy.factor_terms(form) for form in shortest], key=_length)
+    shortest = _ranked(forms)[:CANDIDATES]
+    return _ranked(shortest + [sympy.factor_terms(form) for form in shortest])[0]
 
 
-def _length(e: Expr) -> tuple[int, int, str]:
-    """Of forms as short as each other, that without double angles."""
+def _ranked(forms: Sequence[Expr]) -> list[Expr]:
+    """The shortest first, of forms as long as each other those without double angles.
+
+    By their texts, which take long to write, only where nothing else tells them apart.
+    """
+    lengths = {form: _length(form) for form in forms}
+    shared = Counter(lengths.values())
+    return sorted(
+        forms,
+        key=lambda form: (lengths[form], str(form) if shared[lengths[form]] > 1 else ""),
+    )
+
+
+def _length(e: Expr) -> tuple[int, int]:
     doubled = sum(f.args[0].is_Mul and f.args[0].args[0].is_Number for f in e.atoms(sin, cos))
-    return (int(e.count_ops()) + int(doubled), int(doubled), str(e))
+    return (int(e.count_ops()) + int(doubled), int(doubled))
 
 
 def _inside(e: Expr) -> Expr:
