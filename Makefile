@@ -36,10 +36,10 @@ wheel: .venv/bin/python
 test: .venv/dev
 	$(PYTEST) -m "not slow"
 
-test-all: .venv/robots build/katex/done
+test-all: .venv/robots build/katex/done build/axe/done
 	$(PYTEST)
 
-test-slow: .venv/robots build/katex/done
+test-slow: .venv/robots build/katex/done build/axe/done
 	$(PYTEST) -m slow
 
 lint: .venv/dev
@@ -66,6 +66,11 @@ bench: build/bench/done
 build/katex/done:
 	@mkdir -p build/katex
 	@if command -v npm >/dev/null; then npm install --silent --prefix build/katex katex@0.16.11; fi
+	@touch $@
+
+build/axe/done:
+	@mkdir -p build/axe
+	@if command -v npm >/dev/null; then npm install --silent --prefix build/axe axe-core@4.14.1; fi
 	@touch $@
 
 build/bench/done: pyproject.toml benchmarks/requirements.txt

@@ -3,6 +3,7 @@
 import io
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import batches
 import browser
@@ -18,6 +19,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(bool(browser.MISSING), reason=browser.MISSING),
 ]
+AXE = Path(__file__).parents[2] / "build/axe/node_modules/axe-core/axe.min.js"
 SLOWEST = 500  # ms from the navigation to the first picture
 STAGE = "document.querySelector('canvas.stage')"
 
@@ -252,6 +254,22 @@ def test_everything_has_a_name_for_those_who_listen(opened):
     assert page.run(f"return {STAGE}.getAttribute('aria-label')").startswith(
         "Cart-pole, in the plane"
     )
+
+
+@pytest.mark.skipif(not AXE.is_file(), reason="axe-core is not there: make build/axe/done")
+@pytest.mark.parametrize("width", [400, 1000])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("many", [0, 6, 24])
+def test_axe_finds_nothing(opened, window, width, scheme, many):
+    """Labels, contrast, order: what those need who read by ear, or on little glass."""
+    window.media(prefers_color_scheme=scheme)
+    given = {"reels": poles(many)} if many else {}
+    page = opened(scene("furuta_pendulum"), width=width, **given)
+    page.run(AXE.read_text(encoding="utf-8") + "; window.axe = axe;")
+    page.run("axe.run().then(r => { window.found = r; })")
+    page.wait("return window.found", 20.0)
+    assert page.run("return window.found.violations.map(v => v.id)") == []
+    assert page.run("return window.found.passes.length") > 20
 
 
 def test_titles_are_text(opened):

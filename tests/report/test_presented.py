@@ -92,7 +92,7 @@ def test_a_scene_too_large_to_write_out_says_how_it_is_computed() -> None:
     report = cost_of_digits.measure(chain, REPORTS, longest=0.002, methods=("rk4",))
     about = presented.of(chain, report, REPORTS)
     assert not about.equations and "link2 on link1: turns about z" in about.text
-    assert "<pre>Chain of links" in page.page(report, about)
+    assert '<pre tabindex="0">Chain of links' in page.page(report, about)
 
 
 @pytest.mark.parametrize("given", ["page", "latex", "escape", "attribute"])
