@@ -122,6 +122,8 @@ def test_many_coordinates_share_panels_by_unit():
 
 def test_names_are_set_as_in_print():
     assert html_name("theta_1", rate=True) == "θ\u0307<sub>1</sub>"
+    assert html_name("arm_1", rate=True) == "arm\u02d9<sub>1</sub>"
+    assert html_name("wrist_1_joint", rate=True) == "wrist 1 joint\u02d9"
     assert html_name("m_c") == "m<sub>c</sub>" and html_name("arm") == "arm"
     with pytest.raises(ValueError, match="plain name"):
         html_name("<b>")

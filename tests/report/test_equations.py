@@ -24,6 +24,7 @@ from eomc import pipeline
 from eomc.base.errors import EomcError
 from eomc.cli.main import main
 from eomc.model.from_scene import from_scene
+from eomc.model.symbols import symbol
 from eomc.report import equations_text
 from eomc.report.equations import of, written
 from eomc.report.typeset import Typesetter
@@ -75,6 +76,44 @@ def test_inputs_stand_on_the_right_and_friction_on_the_left() -> None:
     assert r"& m \ddot{x} + c \dot{x} + k x = F - k_{3} x^{3}" in equations_text.latex(of(made))
     text = unicodedata.normalize("NFC", str(of(made)))
     assert unicodedata.normalize("NFC", "m⋅ẍ + c⋅ẋ + k⋅x = F - k₃⋅x") in text
+
+
+def test_dots_stand_behind_words_not_in_their_middle() -> None:
+    text = unicodedata.normalize("NFC", str(eomc.equations(SCENES / "furuta_pendulum.toml")))
+    assert "⋅arm¨⋅cos(θ)" in text and "⋅arm˙⋅θ̇⋅" in unicodedata.normalize("NFD", text)
+    assert not re.search(r"ar[\u0307\u0308]|aṙ|r̈", unicodedata.normalize("NFD", text))
+
+
+def test_decimals_of_a_scene_stay_decimals() -> None:
+    """0.028, not 7/250; a third and an eighth stay fractions."""
+    potential = "0.0125*x**2/2 + 0.007*x*(1 + m) - m*sin(x)/400 + x**3/8"
+    made = eomc.System.make("a", ["x"], "m*x_dot**2/6", potential, parameters={"m": 1})
+    text, latex = (form(of(made)) for form in (str, equations_text.latex))
+    assert "- 0.0025⋅m⋅cos(x) = 0" in text and "0.007 + 0.007⋅m + 0.0125⋅x" in text
+    assert r"- 0.0025 m \cos {x} = 0" in latex and r"\frac{3 x^{2}}{8}" in latex
+    found = re.search(r"P &= (.*) \\\\\n  L &= (.*)", latex)
+    assert found and "- 0.0025 m \\sin {x}" in found[1] and "+ 0.0025 m \\sin {x}" in found[2]
+    assert "000" not in text + latex
+    assert not of(made).g.atoms(sympy.Float)  # shown only
+
+
+@pytest.mark.parametrize("file", scenes(SMALL))
+def test_terms_are_what_they_are_terms_of(file: Path) -> None:
+    """With their signs: a sum behind a minus would lose all but its first."""
+    found = of(pipeline.read(file))
+    write = Typesetter(found.system)
+    rng = np.random.default_rng(3)
+    names = sorted(found.system.names | {"t"})
+    at = {
+        symbol(n): float(x) for n, x in zip(names, rng.uniform(0.2, 1.0, len(names)), strict=True)
+    }
+    at |= dict.fromkeys(found.multipliers, 0.3)
+    values = [found.kinetic, found.potential, found.L, *found.g, *found.D, *found.C, *found.right]
+    for value in values:
+        terms = write.terms(value)
+        assert len(terms) == 1 or not any(term.is_Add for _, term in terms)
+        total = sum((-1 if minus else 1) * complex(term.subs(at).doit()) for minus, term in terms)
+        assert np.isclose(total, complex(value.subs(at)), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("file", scenes(SMALL))

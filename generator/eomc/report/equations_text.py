@@ -16,7 +16,7 @@ from eomc.model.system import Constraint, System, t
 from eomc.model.tree import Tree
 from eomc.program import program
 from eomc.program.routes import ROUTES
-from eomc.report.typeset import WIDE, Typesetter
+from eomc.report.typeset import WIDE, Typesetter, spread
 from eomc.runtime.labels import tex
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def _flat(terms: Terms) -> Iterator[tuple[Expr, Expr]]:
     """Sums that stand alone as terms of their own."""
     for monomial, c in terms:
         if monomial == 1:
-            yield from ((sympy.S.One, part) for part in sympy.Add.make_args(c))
+            yield from ((sympy.S.One, part) for part in sympy.Add.make_args(spread(c)))
         else:
             yield monomial, c
 

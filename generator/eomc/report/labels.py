@@ -23,13 +23,13 @@ def html_name(name: str, rate: bool = False) -> str:
     ('θ<sub>1</sub>', 'wrist 1 joint')
     """
     if re.search(r"[a-z]{2,}\d*_.*[a-z]{2,}", name) and not set(name.split("_")) & {*_LETTERS}:
-        return texts.name(name).replace("_", " ") + ("\N{COMBINING DOT ABOVE}" if rate else "")
+        return texts.name(name).replace("_", " ") + ("\N{DOT ABOVE}" if rate else "")
     head, *rest = texts.name(name).split("_")
     if digits := re.fullmatch(r"([A-Za-z]+?)(\d+)", head):
         head, rest = digits[1], [digits[2], *rest]
     symbol, *below = (_LETTERS.get(part, part) for part in (head, *rest))
-    if rate:
-        symbol += "\N{COMBINING DOT ABOVE}"
+    if rate:  # behind a word, not on a letter of it
+        symbol += "\N{DOT ABOVE}" if len(symbol) > 1 else "\N{COMBINING DOT ABOVE}"
     return f"{symbol}<sub>{','.join(below)}</sub>" if below else symbol
 
 

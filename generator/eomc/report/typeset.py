@@ -22,6 +22,8 @@ from sympy.printing.str import StrPrinter
 from eomc.model.system import System, symbol, t
 from eomc.runtime.labels import tex
 
+DECIMAL = 20  # below the line of a fraction, from which it is shown as a decimal
+DOTS = ("", "\N{DOT ABOVE}", "\N{DIAERESIS}")  # behind words, not on a letter in their middle
 WIDE = 96  # columns of text, and of what LaTeX sets in a line
 
 Term = tuple[bool, Expr]  # whether it is subtracted, and what
@@ -42,6 +44,11 @@ class Typesetter:
         # rows keep their names: some letters have subscripts, others none
         names = {symbol(f"lambda_{c.name}"): f"λ_{c.name}" for c in system.constraints}
         shown = {s: Symbol(_dotted(name, n)) for s, (name, n) in dotted.items()}
+        names |= {
+            s: pretty_symbol(name) + DOTS[n]
+            for s, (name, n) in dotted.items()
+            if n and tex(name).startswith(r"\mathrm")
+        }
         self._text = _Text(shown, names)
         self._blocks: dict[Expr, prettyForm] = {}
         self._line = _Line(shown, names)
@@ -57,27 +64,40 @@ class Typesetter:
     def _parted(self, part: Expr) -> list[Expr]:
         """A product that is too wide for a line, multiplied out by its longest sum."""
         sums = [f for f in part.args if f.is_Add] if part.is_Mul else []
+        if (apart := spread(part)) is not part:
+            return [*apart.args]
         if not sums or self._block(part).width() <= WIDE - 12:
             return [part]
         longest = max(sums, key=lambda f: (f.count_ops(), str(f)))
-        return [part / longest * x for x in longest.args]
+        made = [part / longest * x for x in longest.args]
+        return [y for x in made for y in sympy.Add.make_args(spread(x))]
 
     def term(self, *factors: Expr) -> Term:
         """A product in order; its sign by itself."""
         factors = tuple(x for f in factors for x in sympy.Mul.make_args(f) if x != 1)
-        number = sympy.Mul(*(f for f in factors if f.is_Number))
-        rest = sorted((f for f in factors if not f.is_Number), key=self._factor)
-        made = [self.ordered(f) for f in rest]
-        if abs(number) != 1 or not made:
-            made.insert(0, abs(number))
+        signed = sympy.Mul(*(f for f in factors if f.is_Number))
+        number = abs(signed)
+        others = [f for f in factors if not f.is_Number]
+        sums = [f for f in others if f.is_Add]
+        if _decimal(number) and not any(f.is_Pow and f.base.is_Add for f in others):
+            if len(sums) == 1 and len(others) > 1:  # each term with its own
+                others[others.index(sums[0])] = sympy.Add(*(number * x for x in sums[0].args))
+                number = sympy.S.One
+            else:
+                number = sympy.Float(number, 15)
+        made = [self.ordered(f) for f in sorted(others, key=self._factor)]
+        if number != 1 or not made:
+            made.insert(0, number)
         product = made[0] if len(made) == 1 else sympy.Mul(*made, evaluate=False)
-        return bool(number < 0), product
+        return bool(signed < 0), product
 
     def ordered(self, e: Expr) -> Expr:
         """A formula with its sums and products in order."""
         if e.is_Add:
             signed = [(-1 if minus else 1, term) for minus, term in self.terms(e)]
             return sympy.Add(*(_negative(x) if s < 0 else x for s, x in signed), evaluate=False)
+        if (apart := spread(e)) is not e:
+            return self.ordered(apart)
         if e.is_Mul:
             minus, made = self.term(e)
             return _negative(made) if minus else made
@@ -87,7 +107,7 @@ class Typesetter:
             return sympy.ImmutableDenseMatrix(e.applyfunc(self.ordered))
         if isinstance(e, sympy.Function) and len(e.args) == 1:
             return e.func(self.ordered(e.args[0]), evaluate=False)
-        return e
+        return sympy.Float(e, 15) if _decimal(e) else e
 
     def _factor(self, f: Expr) -> tuple[Any, ...]:
         base = f.base if f.is_Pow else f
@@ -189,6 +209,24 @@ class Typesetter:
         return made
 
 
+def _decimal(e: Expr) -> bool:
+    """Whether it reads better as a decimal, which it was in the scene: 0.028, not 7/250."""
+    if not e.is_Rational or e.q < DECIMAL:
+        return False
+    rest = e.q
+    for prime in (2, 5):
+        while rest % prime == 0:
+            rest //= prime
+    return bool(rest == 1)
+
+
+def spread(e: Expr) -> Expr:
+    """A decimal times a sum, as the sum of terms each with its own; anything else as it is."""
+    if e.is_Mul and len(e.args) == 2 and _decimal(e.args[0]) and e.args[1].is_Add:
+        return sympy.Add(*(e.args[0] * x for x in e.args[1].args))
+    return e
+
+
 def _negative(e: Expr) -> Expr:
     factors = sympy.Mul.make_args(e)
     if factors[0].is_Number:
@@ -216,7 +254,9 @@ class _Text(PrettyPrinter):  # type: ignore[misc]
     """Blocks of Unicode."""
 
     def __init__(self, names: dict[Symbol, Symbol], plain: dict[Symbol, str]) -> None:
-        super().__init__({"use_unicode": True, "wrap_line": False, "order": "none"})
+        super().__init__(
+            {"use_unicode": True, "wrap_line": False, "order": "none", "full_prec": False}
+        )
         self._names, self._plain = names, plain
 
     def _print_Symbol(self, e: Symbol, bold_name: bool = False) -> prettyForm:
@@ -233,7 +273,7 @@ class _Line(StrPrinter):  # type: ignore[misc]
     """One line of text: √(x + y), x^2."""
 
     def __init__(self, names: dict[Symbol, Symbol], plain: dict[Symbol, str]) -> None:
-        super().__init__({"order": "none"})
+        super().__init__({"order": "none", "full_prec": False})
         self._names, self._plain = names, plain
 
     def _print_Symbol(self, e: Symbol) -> str:
@@ -251,7 +291,7 @@ class _Latex(LatexPrinter):  # type: ignore[misc]
     """LaTeX with upright words, a thin space between factors where there are any; sin θ bare."""
 
     def __init__(self, names: dict[Symbol, str], words: bool) -> None:
-        settings = {"order": "none", "fold_func_brackets": True}
+        settings = {"order": "none", "fold_func_brackets": True, "full_prec": False}
         super().__init__(settings | ({"mul_symbol": r" \, "} if words else {}))
         self._names = names
 
