@@ -68,6 +68,7 @@ def write(reels: Sequence[Reel], file: Path, title: str | None) -> None:
                         still(axes, drawn, flat[k], hues=hues)
                         frame(axes, drawn, flat)
                     writer.grab_frame()
+                    figure.set_layout_engine("none")  # as in the first: nothing jumps
         except (OSError, CalledProcessError) as fault:
             words = getattr(fault, "strerror", None) or str(fault)
             raise EomcError(f"{shown}: can't be written ({words})") from None
