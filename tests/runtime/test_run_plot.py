@@ -36,6 +36,21 @@ def labels(axes) -> list[str]:
     return [a.get_ylabel() for a in np.ravel(axes)]
 
 
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("shoulder_pan_joint", r"$\mathrm{shoulder\ pan\ joint}$"),
+        ("wrist_1_joint", r"$\mathrm{wrist\ 1\ joint}$"),
+        ("tip_x", r"$\mathrm{tip}_{\mathrm{x}}$"),
+        ("m_pole", r"$m_{\mathrm{pole}}$"),
+        ("theta_rod", r"$\theta_{\mathrm{rod}}$"),
+        ("rod_prime", r"$\mathrm{rod}'$"),
+    ],
+)
+def test_names_of_words_are_words(name: str, shown: str) -> None:
+    assert mathtext(name) == shown
+
+
 def test_without_names_coordinates_inputs_and_energy_have_panels(run) -> None:
     axes = run.plot()
     wanted = ["$x$ (m)", r"$\theta$ (rad)", r"$\mathrm{force}$ (N)", "energy (J)"]

@@ -6,7 +6,7 @@ import re
 
 from eomc.base import names, texts
 from eomc.model.system import Coordinate, Output
-from eomc.runtime.labels import mathtext, rate_unit, with_unit
+from eomc.runtime.labels import mathtext, of_words, rate_unit, with_unit
 
 __all__ = ["html_name", "label", "mathtext", "rate_unit", "with_unit"]
 
@@ -22,7 +22,7 @@ def html_name(name: str, rate: bool = False) -> str:
     >>> html_name("theta_1"), html_name("wrist_1_joint")
     ('θ<sub>1</sub>', 'wrist 1 joint')
     """
-    if re.search(r"[a-z]{2,}\d*_.*[a-z]{2,}", name) and not set(name.split("_")) & {*_LETTERS}:
+    if of_words(name):
         return texts.name(name).replace("_", " ") + ("\N{DOT ABOVE}" if rate else "")
     head, *rest = texts.name(name).split("_")
     if digits := re.fullmatch(r"([A-Za-z]+?)(\d+)", head):

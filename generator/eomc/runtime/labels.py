@@ -32,6 +32,12 @@ def tex(name: str, dots: int = 0) -> str:
     return symbol + primes + (f"_{{{below}}}" if below else "")
 
 
+def of_words(name: str) -> bool:
+    """Whether a name is words, such as elbow_joint, and not a letter or word with subscripts."""
+    words = re.search(r"[a-z]{2,}\d*_.*[a-z]{2,}", name)
+    return bool(words) and not {*name.split("_")} & {*GREEK, "prime"}
+
+
 def _upright(word: str) -> str:
     if greek := GREEK.get(word):
         return greek
@@ -43,14 +49,19 @@ def _upright(word: str) -> str:
 def mathtext(name: str, rate: bool = False) -> str:
     r"""A name as figures print it.
 
-    The rate of a word is d/dt of it: matplotlib sets a dot on one of its letters.
+    The rate of a word is d/dt of it: matplotlib sets a dot on one of its letters. Several words
+    stand side by side, which in a product they could not.
 
     >>> mathtext("theta_1", rate=True), mathtext("arm", rate=True)
     ('$\\dot{\\theta}_{1}$', '$\\mathrm{d}\\,\\mathrm{arm}/\\mathrm{d}t$')
+    >>> mathtext("wrist_1_joint")
+    '$\\mathrm{wrist\\ 1\\ joint}$'
     """
-    if rate and tex(name).startswith(r"\mathrm"):
-        return rf"$\mathrm{{d}}\,{tex(name)}/\mathrm{{d}}t$"
-    return f"${tex(name, int(rate))}$"
+    words = name.replace("_", r"\ ")
+    still = rf"\mathrm{{{words}}}" if of_words(name) else tex(name)
+    if rate and still.startswith(r"\mathrm"):
+        return rf"$\mathrm{{d}}\,{still}/\mathrm{{d}}t$"
+    return f"${tex(name, 1) if rate else still}$"
 
 
 def rate_unit(unit: str, rate: bool) -> str:
