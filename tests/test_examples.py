@@ -57,6 +57,7 @@ def test_the_pole_is_balanced_within_the_limits() -> None:
     assert numbers(text, r"exact to (\S+)")[0] < 1e-9
 
 
+@pytest.mark.slow
 @needs_scipy
 def test_the_pole_is_swung_up() -> None:
     text = said("swing_up.py")

@@ -58,6 +58,7 @@ def ends_there(text: str) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_the_page_says_what_is_so() -> None:
     assert ends_there(TEXT)
 

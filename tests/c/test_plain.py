@@ -378,7 +378,8 @@ def test_what_is_refused_leaves_the_arguments_as_they_were(tmp_path: Path) -> No
 # --- large systems --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", tiers(["everything", "single", "driven", "slopes"], "single"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["everything", "single", "driven", "slopes"])
 def test_long_functions_are_cut(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Into static functions that hand values on in a struct; the self-test passes."""
     monkeypatch.setattr(outline, "LARGE", 5)

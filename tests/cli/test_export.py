@@ -100,6 +100,7 @@ def test_what_stands_in_the_way_is_named(here: Path) -> None:
     assert left == {scene, "folder.fmu", "file", "fails", "lies"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="there is no /proc")
 def test_a_folder_that_can_not_be_written(here: Path) -> None:
     """Not even by root."""

@@ -176,6 +176,7 @@ h = 0.01
 """
 
 
+@pytest.mark.slow
 def test_more_angles_than_coordinates(modules: Modules) -> None:
     """Every coordinate is an angle, and a sum of two is one more; other functions beside them."""
     module = modules.of_text(MORE)
@@ -199,7 +200,7 @@ def test_few_angles_and_light_configurations_stay_whole(modules: Modules) -> Non
     assert "} chain_configuration;" in written(modules.unoptimised(scene_system("chain")), "c")
 
 
-@pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.2, 0.45), 0.02, 0.45))
+@pytest.mark.parametrize("h", tiers((0.001, 0.02, 0.2, 0.45), 0.45))
 def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modules) -> None:
     """Turned by little, by nearly what is allowed, by more: then sines are computed anew."""
     module, trusted = modules.of_text(ODD), symbolic.derive(odd())
@@ -211,7 +212,8 @@ def test_steps_short_and_long_are_those_of_the_reference(h: float, modules: Modu
         np.testing.assert_allclose(run.qd, qd, rtol=1e-11, atol=1e-12 * scale)
 
 
-@pytest.mark.parametrize("links", tiers((5, 8), 5))
+@pytest.mark.slow
+@pytest.mark.parametrize("links", (5, 8))
 def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
     module = modules.of_text(chain(links))
     made = system.from_scene(scene.parse(chain(links), "links.toml"))

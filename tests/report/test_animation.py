@@ -280,6 +280,7 @@ def film(made, file, **how):
     film.write([Reel(system(made), motion(made, **how))], file, None)
 
 
+@pytest.mark.slow
 def test_a_gif_has_a_picture_for_each_instant(tmp_path):
     pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")

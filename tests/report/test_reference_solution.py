@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import sympy
 from cases import case_system, cases
-from conftest import ROOT, needs, tiers
+from conftest import ROOT, needs
 
 import eomc
 from eomc.base.errors import EomcError
@@ -56,9 +56,8 @@ def agrees(name: str) -> None:
     assert digits_right(name, made) > min(made.digits[-1], 29) - 0.5
 
 
-@pytest.mark.parametrize(
-    "name", tiers(["cartpole_drop_physicalP", "double_pendulum_regular"], "double_pendulum_regular")
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cartpole_drop_physicalP", "double_pendulum_regular"])
 def test_a_case_has_25_digits(name: str) -> None:
     agrees(name)
 

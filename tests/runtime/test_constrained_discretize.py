@@ -113,7 +113,14 @@ def test_against_differences_of_steps(modules: Modules, text: str, method: str, 
             assert np.abs(Gamma).max() > 1e-3
 
 
-@pytest.mark.parametrize("text", [WINCH, SLEIGH, ROPE], ids=["winch", "sleigh", "rope"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param(WINCH, id="winch"),
+        pytest.param(SLEIGH, id="sleigh", marks=pytest.mark.slow),
+        pytest.param(ROPE, id="rope", marks=pytest.mark.slow),
+    ],
+)
 def test_it_leads_along_the_rows(modules: Modules, text: str) -> None:
     """Whatever changes before a step, behind it changes keep the rows, to rounding."""
     m, t, h = modules.unoptimised(text), 0.4, 0.02
@@ -166,6 +173,7 @@ def test_plain_c_has_the_same(modules: Modules, text: str, tmp_path: Any) -> Non
             assert a == pytest.approx(b, rel=1e-12, abs=1e-13)
 
 
+@pytest.mark.slow
 def test_a_step_that_can_not_be_made_has_none(modules: Modules) -> None:
     m = modules.unoptimised(WINCH)
     with pytest.raises(m.MotionError, match="no derivative of a step") as caught:

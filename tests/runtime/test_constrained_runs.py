@@ -166,6 +166,8 @@ def test_reactions_along_a_run_are_those_of_their_times(tmp_path: Path) -> None:
     np.testing.assert_array_equal(run.reactions["hold"], alone)
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_a_start_where_rows_depend_on_each_other_is_left_as_it_is(tmp_path: Path) -> None:
     """A four-bar that lies flat, its rows zero to rounding."""
     made = system(
@@ -198,6 +200,7 @@ def test_a_projection_does_not_leap_across_turns(tmp_path: Path) -> None:
         assert np.abs(module.constraints(q, np.zeros(3))).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_equilibrium_is_where_forces_and_multipliers_balance(rod: ModuleType) -> None:
     """The rod hangs, or stands where the guess is near that; a bad guess is no matter."""
     q, u = rod.equilibrium()

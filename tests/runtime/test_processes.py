@@ -261,6 +261,9 @@ def test_a_run_of_another_version_of_the_scene_says_so(
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
     file.write_text(text, encoding="utf-8")
 
+    for name in [name for name in sys.modules if name.startswith("_eomc_cartpole_")]:
+        monkeypatch.delitem(sys.modules, name)  # another test's, from a folder that is gone
+
     def pickled() -> list[str]:
         m = eomc.load(file, tmp_path / "build")
         with pytest.raises(m.MotionError) as fault:
