@@ -31,10 +31,11 @@ if TYPE_CHECKING:
 
 LOOSEST = 1e-2
 _EVENTS = 1024  # of one call
-_ROOM = 256  # steps of the first call
+_ROOM = 48  # steps of the first call
 _MOST = 2**20  # of one call
 _DRAWN = 1_000  # rows of a curve, at least
 _EVEN = 8  # rows a step, as equally spaced ones need them
+_NONE = (np.empty(0, np.intc), np.empty((0, 1)))  # events
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class AdaptiveRun(Run):
     _stiff: bool = field(kw_only=True)
     _begin: Array = field(kw_only=True)  # q and qd at t0, (2, nq)
     _t_end: float = field(kw_only=True)
-    _happened: tuple[Array, Array] = field(kw_only=True)  # which, rows of t, q, qd
+    _happened: tuple[Array, Array] = field(default=_NONE, kw_only=True)  # which, rows of t, q, qd
     stopped: str = field(default="", kw_only=True)
     limit: float = field(default=float("nan"), kw_only=True)
 
@@ -273,76 +274,89 @@ def run(
 ) -> AdaptiveRun:  # fmt: skip
     """A run from checked arguments, whatever its status; times (n,) later than t0."""
     address, real, null = model._c
-    nq, dtype, work = model.nq, model.dtype, model._ffi.new("adaptive_work *")
+    nq, work = model.nq, model._ffi.new("adaptive_work *")
     work.stiff = bool(stiff)
-    x, at, start = np.concatenate([q, qd]), np.array([t0], dtype), np.empty((2, nq), dtype)
-    start[0], start[1] = q, qd
-    at_x, at_t, at_u = address(real, x), address(real, at), model._pointer(u)
+    place = np.empty(2 * nq + 1, model.dtype)  # q, qd and t, where the run is
+    place[:nq], place[nq:-1], place[-1] = q, qd, t0
+    at_x = address(real, place)
+    at_u = null if u is None else address(real, u)
     at_p = model._at[2] if p is model._p0 else address(real, p)
+    found_events = _Found(model) if model.events else None
     each = 2 if model.events else 1  # rows of a step, beside a jump
-    room, filled, spent = _ROOM, 0, 0.0  # steps of a call, rows of both that are, s of a call
-    pieces: list[tuple[Array, Array]] = []
-    stamps = (
-        np.empty(1 + each * room, dtype) if times is None else np.ascontiguousarray(times, dtype)
-    )
-    both = np.empty((2, len(stamps), nq), dtype)
-    if times is None:
-        stamps[0], both[:, 0], filled = t0, start, 1
-    to_t, to_q = address(real, stamps), address(real, both)
-    found_events = _Found(model)
-
-    def kept() -> None:
-        nonlocal filled
-        filled += work.rows
-        work.rows = 0
-        found_events.keep(work)
-
+    room, spent = _ROOM, 0.0  # steps of a call, s of a call
+    pieces = list[tuple[Array, Array, int]]()  # times, rows, how many of them there are
+    own = times is None
+    if own:
+        stamps, both, to = _rows(model, 1 + each * room)
+        stamps[0], both[0, 0], both[1, 0], filled = t0, q, qd, 1
+        to_t = to
+    else:
+        stamps = np.ascontiguousarray(times, model.dtype)
+        _, both, to = _rows(model, len(stamps))
+        to_t, filled = address(real, stamps), 0
     said = "ok"
     try:
-        while at[0] < t_end and said == "ok" and not (model.events and work.stopped):
+        while place[-1] < t_end and said == "ok" and not (model.events and work.stopped):
             if spent:
                 if progress is not None:
-                    progress(round(1000 * (float(at[0]) - t0) / (t_end - t0)), 1000)
+                    progress(round(1000 * (float(place[-1]) - t0) / (t_end - t0)), 1000)
                 room = min(longer(room, spent), _MOST)
             left = len(stamps) - filled
-            if times is None and left < each:
-                pieces.append((stamps[:filled], both[:, :filled]))
+            if own and left < each:
+                pieces.append((stamps, both, filled))
                 left, filled = each * room, 0
-                stamps, both = np.empty(left, dtype), np.empty((2, left, nq), dtype)
-                to_t, to_q = address(real, stamps), address(real, both)
+                stamps, both, to = _rows(model, left)
+                to_t = to
+            to_q = to + len(stamps) + nq * filled
             begun = perf_counter()
             found = model._lib.adaptive(
-                at_x, at_t, t_end, tol, h_most, at_u, left // each if times is None else room,
-                null if times is None else to_t + filled, 0 if times is None else left,
-                to_t + filled if times is None else null, to_q + nq * filled,
-                to_q + nq * (len(stamps) + filled), *found_events.room(), at_p, work,
+                at_x, at_x + 2 * nq, t_end, tol, h_most, at_u, left // each if own else room,
+                null if own else to_t + filled, 0 if own else left,
+                to_t + filled if own else null, to_q, to_q + nq * len(stamps),
+                *(found_events.room() if found_events else ()), at_p, work,
             )  # fmt: skip
             spent = perf_counter() - begun
-            kept()
+            filled += _kept(work, found_events)
             said = STATUS[found]
         if progress is not None and said == "ok":
             progress(1000, 1000)
     except KeyboardInterrupt:
-        kept()
+        filled += _kept(work, found_events)
         said = "interrupted"
     stamps, both = stamps[:filled], both[:, :filled]
     if pieces:
-        stamps = np.concatenate([*(t for t, _ in pieces), stamps])
-        both = np.concatenate([*(rows for _, rows in pieces), both], axis=1)
-    mean = (float(at[0]) - t0) / work.steps if work.steps else t_end - t0
-    held = None if u is None else u.copy()
+        stamps = np.concatenate([*(t[:n] for t, _, n in pieces), stamps])
+        both = np.concatenate([*(rows[:, :n] for _, rows, n in pieces), both], axis=1)
+    steps = work.steps
     made = AdaptiveRun(
-        model, t0, both, mean, work.steps, said, p, 1, held, "gauss16",
-        work.evaluations, tol=tol, rejected=work.rejected, stiff_steps=work.stiff_steps,
-        _times=stamps, _h_most=h_most, _stiff=bool(stiff), _begin=start, _t_end=t_end,
-        _happened=found_events.all(),
-        stopped=model.events[work.stopped - 1] if model.events and work.stopped else "",
-        limit=work.limit if said == "accumulated" else float("nan"),
+        model, t0, both, (float(place[-1]) - t0) / steps if steps else t_end - t0, steps, said, p,
+        1, None if u is None else u.copy(), "gauss16", work.evaluations, tol=tol,
+        rejected=work.rejected, stiff_steps=work.stiff_steps, _times=stamps, _h_most=h_most,
+        _stiff=bool(stiff), _begin=np.array([q, qd]), _t_end=t_end,
     )  # fmt: skip
+    if found_events:
+        made._happened = found_events.all()
+        made.stopped = model.events[work.stopped - 1] if work.stopped else ""
+        made.limit = work.limit if said == "accumulated" else made.limit
     if model.constraint_names:
         made.singular_steps = work.singular
         made.first_singular = work.first if work.singular else made.first_singular
     return made
+
+
+def _rows(model: Model, count: int) -> tuple[Array, Array, Any]:
+    """Room for so many times (n,) and rows (2, n, nq), and its address."""
+    whole = np.empty(count * (1 + 2 * model.nq), model.dtype)
+    address, real, _ = model._c
+    return whole[:count], whole[count:].reshape(2, count, model.nq), address(real, whole)
+
+
+def _kept(work: Any, events: _Found | None) -> int:
+    """The rows of the last call, whose events are kept."""
+    rows, work.rows = work.rows, 0
+    if events:
+        events.keep(work)
+    return int(rows)
 
 
 class _Found:
@@ -350,20 +364,18 @@ class _Found:
 
     def __init__(self, model: Model) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
-        self.which = np.empty(_EVENTS if model.events else 0, np.intc)
+        self.which = np.empty(_EVENTS, np.intc)
         self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)
 
     def room(self) -> tuple[Any, ...]:
-        """What C is told of it, where the scene has events."""
-        if not self.model.events:
-            return ()
+        """What C is told of it."""
         address, real, _ = self.model._c
         which = self.model._ffi.from_buffer("int[]", self.which)
         return len(self.which), which, address(real, self.rows)
 
     def keep(self, work: Any) -> None:
         """Copy what the last call has found."""
-        if self.model.events and work.events:
+        if work.events:
             n, work.events = work.events, 0
             self.pieces.append((self.which[:n].copy(), self.rows[:n].copy()))
 
