@@ -43,6 +43,19 @@ def spring(n=1):
     return made, t, q, np.gradient(q, t, axis=0), np.exp(-t)
 
 
+def test_angles_are_wrapped_where_asked_for():
+    made, t, q, *rest = cartpole()
+    q = np.column_stack([q[:, 0], q[:, 1] + 4 * t])
+    for wrap in (False, True):
+        cart, pole = (
+            axes.lines[0].get_ydata()
+            for axes in plot.figure(made, t, q, *rest, wrap=wrap).axes[:4:2]
+        )
+        assert np.array_equal(cart, q[:, 0])
+        assert (np.nanmax(np.abs(pole)) <= np.pi) == wrap
+        assert np.isnan(pole).any() == wrap  # no line where they jump
+
+
 @pytest.mark.slow  # the quick ones: SVG below, PNG by `eomc run --plot`
 @pytest.mark.parametrize(
     ("run", "suffix"),

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
 )
 @click.option("--plot", type=click.Path(path_type=Path), help="Draw them: FILE.png, .svg or .pdf.")
+@click.option("--wrap", is_flag=True, help="Angles from -pi to pi in --plot.")
 @click.option(
     "--animate",
     type=click.Path(path_type=Path),
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
 def command(
     scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str], h: float | None,
     duration: float | None, method: str | None, tol: float | None, every: int, out: Path | None,
-    plot: Path | None, animate: Path | None, quiet: bool, as_json: bool,
+    plot: Path | None, wrap: bool, animate: Path | None, quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Simulate a scene; print the end, the error and the speed.
 
@@ -105,8 +106,9 @@ def command(
         words = balance.words if balance else ""
         inputs = dict(zip(module.inputs, drawn.u.T, strict=True)) if module.inputs else {}
         plots.draw(
-            system, *rows, plot, jacobi=jacobi, outputs=drawn.outputs, words=words, inputs=inputs
-        )
+            system, *rows, plot, jacobi=jacobi, outputs=drawn.outputs, words=words, inputs=inputs,
+            wrap=wrap,
+        )  # fmt: skip
     if animate:
         with status_line(f"drawing {animate.name}", quiet or as_json):
             done.animate(animate)

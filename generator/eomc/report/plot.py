@@ -20,7 +20,7 @@ from eomc.model.system import Coordinate, System
 from eomc.report import picture as pictures
 from eomc.report.labels import mathtext, rate_unit, with_unit
 from eomc.report.style import COLOURS, INK, plain
-from eomc.runtime.plot import Curve, against, grouped
+from eomc.runtime.plot import Curve, against, grouped, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,18 +38,18 @@ SAMPLES = 20_000  # of a run that are drawn, at most
 def draw(
     system: System, t: Array, q: Array, qd: Array, energy: Array, path: str | Path, *,
     jacobi: Array | None = None, title: str | None = None, outputs: Outputs = _NONE,
-    words: str = "", inputs: Outputs = _NONE,
+    words: str = "", inputs: Outputs = _NONE, wrap: bool = False,
 ) -> None:  # fmt: skip
     """Write the figure of a run to `path`; its suffix says how: .png, .svg or .pdf.
 
     t: (n,), s; q, qd: (n, nq); energy: (n,); jacobi: (n,), where it is not the energy; outputs,
-    inputs: (n,) by name; words: what was put in and lost. Raises EomcError without matplotlib, with
-    another suffix, or where the file can't be written.
+    inputs: (n,) by name; words: what was put in and lost; wrap: angles from -pi to pi. Raises
+    EomcError without matplotlib, with another suffix, or where the file can't be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise EomcError(f"{path}: a picture is written as {', '.join(SUFFIXES)}: end its name so")
-    made = figure(system, t, q, qd, energy, title, jacobi, outputs, words, inputs)
+    made = figure(system, t, q, qd, energy, title, jacobi, outputs, words, inputs, wrap)
     import matplotlib
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
@@ -73,7 +73,7 @@ def svg(made: Figure) -> Markup:
 def figure(
     system: System, t: Array, q: Array, qd: Array, energy: Array, title: str | None = None,
     jacobi: Array | None = None, outputs: Outputs = _NONE, words: str = "",
-    inputs: Outputs = _NONE,
+    inputs: Outputs = _NONE, wrap: bool = False,
 ) -> Figure:  # fmt: skip
     """The figure of a run. t: (n,), s; q, qd: (n, nq); energy, jacobi, each other: (n,)."""
     try:
@@ -82,7 +82,7 @@ def figure(
         raise EomcError("drawing needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"text.usetex": False}):  # a title and units are no LaTeX
         name = title or system.title or system.name
-        return _figure(system, t, q, qd, energy, name, jacobi, outputs, words, inputs)
+        return _figure(system, t, q, qd, energy, name, jacobi, outputs, words, inputs, wrap)
 
 
 def _figure(
@@ -96,6 +96,7 @@ def _figure(
     outputs: Outputs,
     words: str,
     inputs: Outputs,
+    wrap: bool,
 ) -> Figure:
     from matplotlib.figure import Figure
 
@@ -105,7 +106,12 @@ def _figure(
         jacobi = np.asarray(jacobi, dtype=float)[::every]
 
     moving = [
-        (Curve(c.name, q[:, i], c.unit, "coordinates"), _rate(c, qd[:, i]))
+        (
+            Curve(c.name, wrapped(q[:, i]), c.unit, "angles")
+            if wrap and c.unit == "rad"
+            else Curve(c.name, q[:, i], c.unit, "coordinates"),
+            _rate(c, qd[:, i]),
+        )
         for i, c in enumerate(system.coordinates)
     ]
     rates = {c.name: rate for c, rate in moving}

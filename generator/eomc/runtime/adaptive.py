@@ -401,7 +401,10 @@ def as_limits(
         )
     for name, value in fixed.items():
         if value is not None and (name, value) != ("every", 1):
-            raise ValueError(f"{name}: belongs to fixed steps, tol to adaptive ones: give one")
+            raise ValueError(
+                f"{name}: belongs to fixed steps, tol, times and h_most to adaptive ones: give one "
+                "or the other; run(times) gives the states of a run by fixed steps"
+            )
     most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
     return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most
 
