@@ -189,7 +189,7 @@ def test_what_makes_no_sense_is_refused(kepler: ModuleType, how: dict, words: st
 
 
 def test_without_tolerance_nothing_is_built(cartpole: ModuleType) -> None:
-    with pytest.raises(ValueError, match=r"tol, times: not built; a scene asks for them"):
+    with pytest.raises(ValueError, match=r"tol, times, stiff: not built; a scene asks for them"):
         cartpole.simulate(tol=1e-9)
     assert not hasattr(cartpole._model._lib, "adaptive")
 

@@ -200,3 +200,75 @@ tolerance = 1e-9
     expected = (3 - 2 * np.log(2)) * 1000 + 7.01432 * 0.1 - 22 / 9 * np.log(1000) / 1000
     assert len(period) >= 3 and period == pytest.approx(expected, rel=1e-5)
     assert np.ptp(period) < 1e-5
+
+
+FAR = """eomc = 1
+name = "far_{name}"
+[coordinates]
+x = {{ unit = "m", start = {at} }}
+y = {{ unit = "m", start = {at} }}
+[parameters]
+k = 1e6
+c = 1e5
+L = {length}
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "k*L**2*exp((y - x)/L)"
+[forces]
+x = "c*(y_dot - x_dot)"
+y = "c*(x_dot - y_dot) + 10*{length}*1000*sin(t)"
+[run]
+tolerance = 1e-9
+duration = 5
+"""
+
+
+@pytest.mark.parametrize(
+    ("at", "length", "steps"), [(0.0, 1e-3, 200), (6.4e6, 1e-3, 200), (0.0, 1e-9, 200)]
+)
+def test_neither_units_nor_the_origin_matter(at: float, length: float, steps: int) -> None:
+    """A contact as steep as 1/L: derivatives over a metre would be those of another."""
+    text = FAR.format(
+        name=f"{at:.0e}_{length:.0e}".translate({43: 95, 45: 95}), at=at, length=length
+    )
+    module = eomc.load(from_scene(parse(text, "far.toml")), BUILDS)
+    moved = (29.79659887e-3, 29.79264387e-3)  # over 1000 L; Radau of SciPy to 1e-10
+    for how in ({}, {"stiff": True}):
+        run = module.simulate(**how)
+        assert run.status == "ok" and run.steps < steps and run.stiff_steps > run.steps / 3
+        far = (run.q[-1] - at) / (1000 * length)
+        assert far / 1000 == pytest.approx(moved, rel=1e-6 if at else 1e-8)
+
+
+def test_a_stiff_controller_with_limits_is_seen() -> None:
+    text = """eomc = 1
+name = "stiffly_held"
+[coordinates]
+theta = { unit = "rad", start = 0.5 }
+[inputs]
+torque = { signal = "-1e6*(theta - 0.3*sin(t)) - 1e5*theta_dot", limits = [-1e4, 1e4] }
+[energy]
+kinetic = "theta_dot**2/2"
+potential = "-cos(theta)"
+[forces]
+theta = "torque"
+[run]
+tolerance = 1e-6
+duration = 10
+"""
+    module = eomc.load(from_scene(parse(text, "stiffly_held.toml")), BUILDS)
+    run = module.simulate()
+    assert run.status == "ok" and run.steps < 200 and run.stiff_steps > 10
+    assert np.abs(run.x[-1] - module.simulate(tol=1e-9, stiff=True).x[-1]).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"stiff": "no"}, "stiff: 'no' is not True or False"),
+        ({"stiff": True, "h": 0.1}, "h_most and stiff to"),
+    ],
+)
+def test_what_stiff_is_not(train: ModuleType, how: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        train.simulate(**how)

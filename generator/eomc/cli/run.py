@@ -66,6 +66,8 @@ def command(
     _known_suffix(out, (".csv", ".npz"), "--out")
     _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
     _known_suffix(animate, (".html", ".gif", ".mp4"), "--animate")
+    if wrap and not plot:
+        raise EomcError("--wrap: says how --plot draws angles: give --plot FILE.png too")
     with status_line(f"building {scene.stem}", quiet or as_json):
         module = pipeline.load(scene, root, warn=warn)
     values, q0, qd0 = _overrides(scene, module, parameters, start)

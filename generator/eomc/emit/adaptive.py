@@ -106,16 +106,17 @@ class Stepping:
     @cached_property
     def forces(self) -> CFunction:
         """The accelerations at a state."""
-        return self._at_a_state("forces", c.filled(self.functions.real, "f"))
+        out = c.filled(self.functions.real, "f")
+        given = (a for a in self.form.around if a.name != "h")
+        return CFunction(f"{self.method}_forces", "int", (out, *given), qualifier="static")
 
     @cached_property
     def slopes(self) -> CFunction:
         """Their derivatives."""
-        return self._at_a_state("slopes", c.filled(f"{self.method}_newton", "m"))
-
-    def _at_a_state(self, name: str, out: CArgument) -> CFunction:
-        given = (a for a in self.form.around if a.name != "h")
-        return CFunction(f"{self.method}_{name}", "int", (out, *given), qualifier="static")
+        out = c.filled(f"{self.method}_newton", "m")
+        return CFunction(
+            f"{self.method}_slopes", "int", (out, *self.form.around), qualifier="static"
+        )
 
     @cached_property
     def step(self) -> CFunction:

@@ -60,11 +60,13 @@ def _written(value: Any, expression: Callable[[Any, str], Expr]) -> Any:
         return {str(key): _written(entry, expression) for key, entry in value.items()}
     if isinstance(value, sympy.MatrixBase):
         value = value.flat()
+    if hasattr(value, "tolist"):  # NumPy's
+        value = value.tolist()
     if isinstance(value, (list, tuple)):
         return [_written(entry, expression) for entry in value]
     if isinstance(value, Expr):
         return text(expression(value, "picture"))
-    return value.item() if hasattr(value, "item") else value  # a number of NumPy
+    return value
 
 
 def _used(table: Any, definitions: Sequence[tuple[Symbol, Expr]]) -> dict[str, str]:

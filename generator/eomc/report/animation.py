@@ -8,7 +8,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ SHORT, LONG = 1.0, 60.0  # s that the motion is played in, where not in real tim
 class Animation:
     """A page that plays a motion; notebooks show it, `save` writes it."""
 
-    page: str
+    page: str = field(repr=False)
 
     def save(self, file: str | os.PathLike[str]) -> None:
         """Write the page. Raises EomcError where it can't be written."""

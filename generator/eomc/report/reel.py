@@ -121,7 +121,7 @@ class Instances(Reel):
 def which(count: int, chosen: int | Sequence[int]) -> list[int]:
     """The numbers of the instances that are shown, of `count`. Raises EomcError."""
     wanted: Any = chosen
-    if isinstance(chosen, int) and not isinstance(chosen, bool) and chosen > 0:
+    if isinstance(chosen, (int, np.integer)) and not isinstance(chosen, bool) and chosen > 0:
         wanted = np.linspace(0, count - 1, min(chosen, count)).astype(int)
     try:
         array = np.asarray(wanted)

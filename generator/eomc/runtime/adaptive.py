@@ -241,6 +241,8 @@ def simulate(
 ) -> AdaptiveRun:  # fmt: skip
     """`Model.simulate` with a tolerance; fixed: what belongs to fixed steps, and was given."""
     tol, most = as_limits(model, tol, h_most, fixed)
+    if not isinstance(stiff, (bool, np.bool_)):
+        raise ValueError(f"stiff: {stiff!r} is not True or False")
     if u is not None and (callable(u) or np.ndim(u) > 1):
         raise ValueError(
             "u: adaptive steps take the scene's signals, or one value an input, held over the "
@@ -396,14 +398,14 @@ def as_limits(
     """(tolerance, longest step or 0); fixed: what belongs to fixed steps, and may be given."""
     if model.tolerance is None:
         raise ValueError(
-            "tol, times: not built; a scene asks for them with [run] tolerance = 1e-9 (of a run by "
-            "fixed steps run(times) gives the states at any times)"
+            "tol, times, stiff: not built; a scene asks for them with [run] tolerance = 1e-9 (of a "
+            "run by fixed steps run(times) gives the states at any times)"
         )
     for name, value in fixed.items():
         if value is not None and (name, value) != ("every", 1):
             raise ValueError(
-                f"{name}: belongs to fixed steps, tol, times and h_most to adaptive ones: give one "
-                "or the other; run(times) gives the states of a run by fixed steps"
+                f"{name}: belongs to fixed steps; tol, times, h_most and stiff to adaptive ones: "
+                "give one or the other; run(times) gives the states of a run by fixed steps"
             )
     most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
     return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most

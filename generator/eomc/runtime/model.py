@@ -229,7 +229,7 @@ class Model(Constrained):
         Ctrl-C raises Interrupted, which holds it.
         """
         q0, qd0 = self._assembled(q0, qd0, t0, params)
-        given = tol is not None or times is not None or h_most is not None or stiff
+        given = tol is not None or times is not None or h_most is not None or stiff is not False
         if given or self._fits(h, steps, method):
             fitted = adaptive.simulate(
                 self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff, h=h,

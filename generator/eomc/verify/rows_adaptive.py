@@ -63,8 +63,9 @@ def _error(of: Comparison, module: Any, tol: float, stiff: bool, s: State) -> fl
     x = np.concatenate([s.q, s.qd])
     spread = np.concatenate([of.sampler.spread, of.sampler.speed])
     first = _adaptive(module, s, x, of.system.run.duration, tol, stiff=stiff)
-    if len(first) < 2:
-        return None
+    if len(first) < 2:  # not a single step
+        begins = np.isfinite(of.reference.acceleration(s.q, s.qd, s.t, s.u, s.params)).all()
+        return math.inf if first.status == "not finite" and begins else None
     ends = [first.events[e.name].t for e in of.system.events if e.action != "record"]
     first_end = min((float(t[0]) for t in ends if len(t)), default=math.inf)
     moved = x + NUDGE * spread
