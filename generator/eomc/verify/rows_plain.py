@@ -82,9 +82,9 @@ def _linearization(of: Comparison, plain: Any) -> float:
         assert one is not None and other is not None
         near = [_slopes(of.module, s) for s in nudged(e.state, of.sampler.defaults)[:64]]
         size = np.abs(one) + sum(np.abs(x - one) / NUDGE for x in near if x is not None)
-        if of.system.constraints:  # entries that are 0 everywhere are sums of what cancels
-            scale = _inputs(of, e.state)[: one.shape[1]]
-            size = np.maximum(size, e.size["acceleration"][:, None] / scale)
+        # entries that are 0 everywhere are sums of what cancels
+        scale = _inputs(of, e.state)[: one.shape[1]]
+        size = np.maximum(size, e.size["acceleration"][:, None] / scale)
         return of.units(other, one, np.maximum(size, 1e-6 * np.max(size)))
 
     return float(np.max([error(e) for e in of.few(of.effort.few)]))
