@@ -2,6 +2,7 @@
 # make test    set up, run the quick tests
 # make bench   against others (an environment of 2.6 GB, a C++ compiler); writes benchmarks/*.md
 # make wheel   a wheel and an sdist into dist/
+# make fuzz    attacks the readers of text, without end; finds go to build/hostile/finds
 # make test-all, make test-slow, make lint, make golden, make clean
 
 PYTHON ?= python3
@@ -14,7 +15,7 @@ export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
 # some shells forbid bytecode: every command then takes four seconds to start, instead of 0.7
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo wheel test test-all test-slow lint golden bench clean
+.PHONY: demo wheel test test-all test-slow fuzz lint golden bench clean
 
 demo: .venv/demo
 	@$(BIN)/eomc build $(DEMO)
@@ -36,11 +37,17 @@ wheel: .venv/bin/python
 test: .venv/dev
 	$(PYTEST) -m "not slow"
 
-test-all: .venv/robots build/katex/done build/axe/done
+test-all: .venv/robots .venv/hostile build/katex/done build/axe/done
 	$(PYTEST)
 
-test-slow: .venv/robots build/katex/done build/axe/done
+test-slow: .venv/robots .venv/hostile build/katex/done build/axe/done
 	$(PYTEST) -m slow
+
+# ten minutes of each reader in turn, for ever
+fuzz: .venv/hostile
+	@while true; do for t in formula read scene urdf mjcf command; do \
+	$(BIN)/python tests/hostile/readers.py $$t --seconds 600 --seed 0 2>&1 | grep -v "^INFO\|^WARNING"; \
+	done; done
 
 lint: .venv/dev
 	$(BIN)/ruff check .
@@ -76,6 +83,11 @@ build/axe/done:
 build/bench/done: pyproject.toml benchmarks/requirements.txt
 	$(PYTHON) -m venv build/bench
 	build/bench/bin/python -m pip install --quiet --editable . -r benchmarks/requirements.txt
+	@touch $@
+
+# what fuzzes; there are wheels for Linux and some Pythons alone
+.venv/hostile: .venv/dev
+	-$(BIN)/python -m pip install --quiet --only-binary :all: --editable ".[hostile]"
 	@touch $@
 
 clean:

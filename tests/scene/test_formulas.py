@@ -160,6 +160,7 @@ def test_names_come_in_reading_order_without_functions_and_pi():
         ("1/(3 - 3)", 3, 5),
         ("a + 1e999", 4, 5),
         ("sqrt(2 - 3)", 0, 11),
+        ("1/dot(3)", 2, 6),  # a rate of numbers alone is zero
         ("a\n + #b", 5, 1),
     ],
 )

@@ -23,6 +23,11 @@ class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as th
     nargs = 1
     is_real = True
 
+    @classmethod
+    def eval(cls, inner: Any) -> Any:
+        """Zero of a number, which does not change."""
+        return sympy.S.Zero if inner.is_number else None
+
     def _latex(self, printer: Any, exp: str = "") -> str:
         rate = rf"\frac{{d}}{{dt}} \left({printer._print(self.args[0])}\right)"
         return rf"\left({rate}\right)^{{{exp}}}" if exp else rate

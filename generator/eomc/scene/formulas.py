@@ -347,7 +347,7 @@ def _number(formula: Formula, node: ast.expr) -> float | None:
     if any(name not in FUNCTIONS and name != "pi" for name in found):
         return None
     try:
-        value = _walk(formula, node, NUMERIC, NUMERIC.__getitem__)
+        value = _walk(formula, node, _OF_NUMBERS, _OF_NUMBERS.__getitem__)
         return float(value) if isinstance(value, (int, float)) else math.nan
     except (ArithmeticError, ValueError, TypeError):
         return math.nan
@@ -402,3 +402,4 @@ NUMERIC: Mapping[str, Any] = {
     "min": min,
     "max": max,
 }
+_OF_NUMBERS = {**NUMERIC, "dot": lambda _: 0.0}  # which do not change
