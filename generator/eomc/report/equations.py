@@ -12,15 +12,14 @@ from eomc import pipeline
 from eomc.base.errors import EomcError
 from eomc.model.system import System, symbol
 from eomc.pipeline import ScenePath
-from eomc.report import equations_text
+from eomc.report import abbreviations, equations_text, large_system
+from eomc.report.typeset import readable
 from eomc.verify import symbolic
 from eomc.verify.shorter import coefficients
 
 EXPANDED = 30_000  # as symbolic.is_small counts: seconds for K without definitions
-DERIVED = 4_000  # operations of D, C and bias as they are derived, up to which they are simplified
-WRITTEN_OUT = 1_000  # operations of the scalar equations, which then fill a page or two
-LONG = 10**12  # above or below the line of a fraction, which is then shown as a decimal
-TINY = 1e-25  # a factor below it is what rounding left of a zero
+DERIVED = 8_000  # operations of D, C and bias as they are derived, up to which they are simplified
+WRITTEN_OUT = 1_000  # operations of what is set out, which then fills a page or two
 
 Terms = list[tuple[Expr, Expr]]  # a product of accelerations or rates, and its coefficient
 
@@ -32,7 +31,8 @@ class Equations:
     With constraints, zero = 0 (m, 1), it is tau + A^T lambda, A (m, nq) and lambda (m,) symbols.
     D, C: (nq, nq); g, tau: (nq, 1), tau = forces - friction. kinetic, potential: K and P;
     jacobi, power: Jacobi's integral and its rate, None where they say nothing more. `str` prints
-    them, at most 100 columns wide; a notebook shows them typeset.
+    them, at most 100 columns wide; a notebook shows them typeset; long ones with names for what
+    they share, `named` in those that are `set_out`.
 
     >>> import eomc
     >>> eomc.equations("scenes/simple_pendulum.toml").scalar    # doctest: +SKIP
@@ -52,6 +52,7 @@ class Equations:
     jacobi: Expr | None
     power: Expr | None
     left: tuple[Terms, ...]  # of each scalar equation
+    named: tuple[tuple[sympy.Symbol, Expr], ...] = ()  # abbreviations, in their order
 
     @property
     def multipliers(self) -> tuple[sympy.Symbol, ...]:
@@ -82,6 +83,12 @@ class Equations:
             for terms, right in sides
         )
 
+    @cached_property
+    def set_out(self) -> Equations:
+        """The same as they are printed: long ones by abbreviations."""
+        long = not self.named and _operations(self) > WRITTEN_OUT
+        return abbreviations.of(self) if long else self
+
     def __str__(self) -> str:
         return equations_text.text(self)
 
@@ -110,30 +117,37 @@ def of(system: System) -> Equations:
         for name in ("D", "C", "g", "tau", "friction", "bias")
     )
     left = tuple(_left(system, D, bias[i], friction[i], i) for i in range(len(system.q)))
-    if sum(b.count_ops() + 2 for terms in left for _, b in terms) > WRITTEN_OUT:
-        raise too_long(system)
-    return Equations(
+    made = Equations(
         system, D, C, g, tau, (plain.tau + plain.friction).applyfunc(readable),
         plain.constraints.applyfunc(readable), plain.constraint_jacobian.applyfunc(readable),
         readable(_energy(plain.kinetic, system)), readable(_energy(plain.potential, system)),
         readable(found.jacobi) if found.jacobi != found.energy else None,
         readable(found.power) if found.power != 0 else None, left,
     )  # fmt: skip
+    if _operations(made.set_out) > WRITTEN_OUT:
+        raise too_long(system)
+    return made
+
+
+def _operations(found: Equations) -> int:
+    """Of the scalar equations, and of what is named in them."""
+    rows = sum(b.count_ops() + 2 for terms in found.left for _, b in terms)
+    return int(rows + sum(e.count_ops() for _, e in found.named))
 
 
 def written(system: System, form: str = "text") -> str:
     """L, the scalar equations, D, C, g and what else there is of D qdd + C qd + g = tau.
 
-    form: "text" (Unicode), "latex" or "python". The equations are the reference's, simplified:
-    written out, as a textbook has them. Those of a large system would be of no use to anyone: as
-    text what they come from is shown, and what computes them; other forms raise EomcError.
+    form: "text" (Unicode), "latex" or "python". The equations are the reference's, simplified, as
+    a textbook has them: written out, or by abbreviations. Those of a large system would be of no
+    use to anyone: what they come from is shown; "python" raises EomcError.
     """
     try:
         found = of(system)
     except EomcError:
-        if form != "text":
+        if form == "python":
             raise
-        return equations_text.large(system)
+        return large_system.latex(system) if form == "latex" else large_system.text(system)
     forms = {"text": equations_text.text, "latex": equations_text.latex}
     return forms.get(form, equations_text.python)(found)
 
@@ -142,7 +156,7 @@ def too_long(system: System) -> EomcError:
     """What to say of a system whose equations nobody would read."""
     return EomcError(
         f"{system.name}: written out, its equations would fill many pages: 'eomc show' without "
-        "--latex or --python says what they come from and how they are computed"
+        "--python says what they come from and how they are computed"
     )
 
 
@@ -160,25 +174,3 @@ def _left(system: System, D: ImmutableMatrix, bias: Expr, friction: Expr, i: int
         for rates, c in coefficients(part, system.qd) or [(sympy.S.One, part)]:
             (last if rates == 1 else terms).append((rates, c))
     return terms + [(rates, c) for rates, c in last if c != 0]
-
-
-def readable(value: Expr) -> Expr:
-    """With decimals for fractions that nobody reads, as those of 50 digits of slanted axes.
-
-    At 30 digits more of them fall together, and what rounding left of zeros is gone.
-    """
-    if not _long(value):
-        return value
-    short = _rounded(sympy.expand(value))
-    plain = _rounded(sympy.expand(short))  # each factor whole again
-    return plain.xreplace({x: sympy.Float(x, 15) for x in _long(plain)})
-
-
-def _rounded(e: Expr) -> Expr:
-    return e.xreplace(
-        {x: sympy.Rational(str(sympy.Float(x, 30))) if abs(x) > TINY else 0 for x in _long(e)}
-    )
-
-
-def _long(e: Expr) -> set[sympy.Rational]:
-    return {x for x in e.atoms(sympy.Rational) if max(abs(x.p), x.q) >= LONG}

@@ -13,7 +13,6 @@ from sympy.printing.str import StrPrinter
 from eomc.base import texts
 from eomc.derive import lagrange
 from eomc.model.system import Constraint, System, t
-from eomc.model.tree import Tree
 from eomc.program import program
 from eomc.program.routes import ROUTES
 from eomc.report.typeset import WIDE, Typesetter, spread
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
 
 LENGTH = 3_000  # characters of one environment, about: KaTeX takes no more than a page
 GOES_ON = r"  & \quad "  # how a line begins that goes on with the last
-DECLARED = 60  # definitions, at most, that are shown of a system too large to write out
 
 _MEANING = {
     "kinetic": "kinetic energy",
@@ -45,6 +43,8 @@ _LATEX = {**_SYMBOL, "tau": r"\tau", "power": r"\dot h"}
 def _values(found: Equations) -> dict[str, Expr | MatrixBase]:
     """What is shown, by its name."""
     values = {name: getattr(found, name) for name in _MEANING}
+    if found.named:
+        values["L"] = sympy.Symbol("K") - sympy.Symbol("P")
     if not found.system.constraints:
         del values["A"]
     if all(e == 0 for e in found.tau):
@@ -57,47 +57,57 @@ def _values(found: Equations) -> dict[str, Expr | MatrixBase]:
 
 def text(found: Equations) -> str:
     """For a terminal, WIDE columns and an indent."""
+    found = found.set_out
     system, write = found.system, Typesetter(found.system)
     values, made = _values(found), list[str]()
-    parts = [_wrapped(f"{_title(system)}: {_head('tau' in values, system)}")]
+    parts = [wrapped(f"{title_of(system)}: {form_of('tau' in values, system)}")]
     lines = []
     for left, force in zip(found.left, found.right, strict=True):
         lines += [
             *write.text_lines([write.term(a, b) for a, b in _flat(left)], _terms(write, force)),
             "",
         ]
-    parts.append(_part("equations of motion", lines[:-1]))
+    parts.append(section("equations of motion", lines[:-1]))
     if system.constraints:
         made = []
         for c, zero in zip(system.constraints, found.zero, strict=True):
-            made += [*write.text_lines(write.terms(zero), []), *_told(c)]
-        parts.append(_part("constraints", made))
+            made += [*write.text_lines(write.terms(zero), []), *told(c)]
+        parts.append(section("constraints", made))
+    if found.named:
+        made = [line for s, e in found.named for line in named_lines(write, s.name, e)]
+        parts.append(section("where, here and below", made))
     for name, value in values.items():
         head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}"
-        parts.append(_part(head, list(_value_lines(write, name, value))))
+        parts.append(section(head, list(_value_lines(write, name, value))))
     if system.outputs:
         made = []
         for name, formula in _outputs(system):
-            made += _named_lines(write, name, formula)
-        parts.append(_part("outputs", made))
+            made += named_lines(write, name, formula)
+        parts.append(section("outputs", made))
     return "\n\n".join(parts)
 
 
-def _part(head: str, lines: list[str]) -> str:
+def section(head: str, lines: list[str]) -> str:
+    """A heading and what stands under it."""
     return "\n".join([f"{head}:", *("    " + line if line else "" for line in lines)])
 
 
-def _title(system: System) -> str:
+def title_of(system: System) -> str:
+    """Of one line."""
     return texts.line(system.title or system.name)
 
 
-def _head(driven: bool, system: System) -> str:
+def form_of(driven: bool, system: System) -> str:
     """The form of the equations, and the order of q."""
-    right = [*(["τ"] * driven), *(["Aᵀλ"] * bool(system.constraints))]
-    return f"D q̈ + C q̇ + g = {' + '.join(right) or '0'}, q = ({_order(system)})"
+    return f"D q̈ + C q̇ + g = {right_of(driven, system)}, q = ({_order(system)})"
 
 
-def _told(c: Constraint) -> list[str]:
+def right_of(driven: bool, system: System) -> str:
+    """What stands on their right side."""
+    return " + ".join([*(["τ"] * driven), *(["Aᵀλ"] * bool(system.constraints))]) or "0"
+
+
+def told(c: Constraint) -> list[str]:
     """What is to be said of a constraint beside its formula."""
     said = [f"{c.name}: of {'positions' if c.holonomic else 'rates'}"]
     said += ["implied by others, its multiplier 0"] if c.redundant else []
@@ -108,7 +118,8 @@ def _order(system: System) -> str:
     return ", ".join(c.name for c in system.coordinates)
 
 
-def _wrapped(words: str) -> str:
+def wrapped(words: str) -> str:
+    """In lines of WIDE columns."""
     return "\n    ".join(textwrap.wrap(words, WIDE, break_on_hyphens=False))
 
 
@@ -135,14 +146,14 @@ def _value_lines(write: Typesetter, name: str, value: Expr | MatrixBase) -> Iter
         yield from (line.rstrip() for line in str(block).splitlines())
         return
     for (i, j), entry in _entries(name, value):
-        yield from _named_lines(write, f"{_SYMBOL.get(name, name)}_{i}{j}", entry)
+        yield from named_lines(write, f"{_SYMBOL.get(name, name)}_{i}{j}", entry)
 
 
 def _sum_lines(write: Typesetter, e: Expr) -> list[str]:
     return write.text_lines(write.terms(e))
 
 
-def _named_lines(write: Typesetter, name: str, e: Expr) -> list[str]:
+def named_lines(write: Typesetter, name: str, e: Expr) -> list[str]:
     """name = sum, its lines broken."""
     return write.text_lines([(False, sympy.Symbol(name))], write.terms(e))
 
@@ -186,6 +197,7 @@ def bodies(found: Equations) -> list[str]:
 
 def latex_lines(found: Equations) -> tuple[list[str], list[str]]:
     """The lines of the equations of motion; those of energies, matrices and outputs."""
+    found = found.set_out
     system, write = found.system, Typesetter(found.system)
     motion = []
     for left, force in zip(found.left, found.right, strict=True):
@@ -195,6 +207,8 @@ def latex_lines(found: Equations) -> tuple[list[str], list[str]]:
     for zero in found.zero:
         first, *more = write.latex_lines(write.terms(zero), [])
         motion += [f"  & {first}", *(GOES_ON + line for line in more)]
+    for name, value in found.named:
+        motion += latex_sum(write, tex(name.name), value)
     lines = []
     for name, value in _values(found).items():
         symbol = _LATEX.get(name, name)
@@ -203,15 +217,16 @@ def latex_lines(found: Equations) -> tuple[list[str], list[str]]:
                 lines.append(f"  {symbol} &= {write.latex(write.ordered(value))}")
                 continue
             for (i, j), entry in _entries(name, value):
-                lines += _latex_sum(write, f"{symbol}_{{{i}{j}}}", entry)
+                lines += latex_sum(write, f"{symbol}_{{{i}{j}}}", entry)
         else:
-            lines += _latex_sum(write, symbol, value)
+            lines += latex_sum(write, symbol, value)
     for name, formula in _outputs(system):
-        lines += _latex_sum(write, tex(name), formula)
+        lines += latex_sum(write, tex(name), formula)
     return motion, lines
 
 
-def _latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
+def latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
+    """The lines of symbol = sum."""
     first, *more = write.latex_lines(write.terms(value))
     return [f"  {symbol} &= {first}", *(GOES_ON + line for line in more)]
 
@@ -241,7 +256,7 @@ def python(found: Equations) -> str:
         t,
     ]
     names = ", ".join(s.name for s in symbols)
-    title = texts.docstring(_title(system))
+    title = texts.docstring(title_of(system))
     force = "tau + A^T lambda" if system.constraints else "tau"
     lines = [
         f'"""{title}: D qdd + C qd + g = {force}, as SymPy matrices."""',
@@ -263,56 +278,17 @@ def python(found: Equations) -> str:
     return "\n".join(lines)
 
 
-# --- what is too large, and costs -----------------------------------------------------------------
-
-
-def large(system: System) -> str:
-    """What the equations of a large system come from, and what it costs to compute them."""
-    write = Typesetter(system)
-    parts = [
-        _wrapped(f"{_title(system)}: {_head(True, system)}"),
-        "Written out, these equations would fill many pages. They are those of L = K - P,\n"
-        "d/dt ∂L/∂q̇ - ∂L/∂q = τ.",
-    ]
-    tree = system.tree
-    if tree is not None:
-        parts.append(_recursion(tree, write))
-    known = system.definitions
-    if tree is None and len(known) <= DECLARED:
-        energies = [("K", system.kinetic), ("P", system.potential)]
-        made: list[str] = []
-        for name, e in [*((str(s), e) for s, e in known), *energies]:
-            made += _named_lines(write, name, e)
-        parts.append(_part("energies, over definitions; a dot is d/dt", made))
-    return "\n\n".join([*parts, "What computes them:", _costs(system)])
-
-
-def _recursion(tree: Tree, write: Typesetter) -> str:
-    """The recursion of Newton and Euler (Featherstone, 2008, table 5.1)."""
-    lines = [
-        "outward from parent p; S is the joint's axis, v a twist, a its rate, f a wrench:",
-        "    v = X v_p + S q̇",
-        "    a = X a_p + S q̈ + v × S q̇",
-        "inward:",
-        "    f = I a + v ×* I v + the sum of Xᵀ f over its children",
-        "    τ = S · f",
-        "",
-    ]
-    for link in tree.links:
-        parent = "the world" if link.parent < 0 else tree.links[link.parent].name
-        how = f"{'turns about' if link.turns else 'slides along'} {'xyz'[link.axis]}"
-        by = str(write.text(write.ordered(link.q))).strip()
-        lines.append(f"{link.name} on {parent}: {how} by {by if len(by) <= 40 else '...'}")
-    return _part(f"Newton and Euler's recursion over {len(tree.links)} elementary joints", lines)
+# --- costs ----------------------------------------------------------------------------------------
 
 
 def cost(system: System) -> str:
     """The operations of each generated function, by each route, and why one was taken."""
-    head = f"{_title(system)}: operations of one call, those on parameters alone left out"
-    return f"{head}\n\n{_costs(system)}"
+    head = f"{title_of(system)}: operations of one call, those on parameters alone left out"
+    return f"{head}\n\n{costs(system)}"
 
 
-def _costs(system: System) -> str:
+def costs(system: System) -> str:
+    """The table of `cost`, without its heading."""
     made = program.build(lagrange.derive(system))
     lines = []
     wide = max(map(len, made.functions))

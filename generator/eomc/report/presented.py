@@ -12,7 +12,7 @@ from markupsafe import Markup
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import Coordinate, Input, Output, Parameter, System
-from eomc.report import equations, equations_text, mathml
+from eomc.report import equations, large_system, mathml
 from eomc.report.cost_of_digits import Report, variant
 from eomc.report.labels import html_name
 
@@ -45,7 +45,7 @@ def of(system: System, report: Report, root: Path) -> Presented:
         first, rest = mathml.lines(equations.of(system))
         text = ""
     except EomcError:
-        first, rest, text = [], [], equations_text.large(system)
+        first, rest, text = [], [], large_system.text(system)
     motion, said = _motion(system, report, root)
     return Presented(
         note=Markup(texts.html(texts.flat(system.note))),

@@ -8,6 +8,7 @@ would sort them by name.
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -24,6 +25,8 @@ from eomc.runtime.labels import tex
 
 DECIMAL = 20  # below the line of a fraction, from which it is shown as a decimal
 DOTS = ("", "\N{DOT ABOVE}", "\N{DIAERESIS}")  # behind words, not on a letter in their middle
+LONG = 10**12  # above or below the line of a fraction, which is then shown as a decimal
+TINY = 1e-25  # a factor below it is what rounding left of a zero
 WIDE = 96  # columns of text, and of what LaTeX sets in a line
 
 Term = tuple[bool, Expr]  # whether it is subtracted, and what
@@ -54,7 +57,8 @@ class Typesetter:
         self._line = _Line(shown, names)
         every = (*(c.name for c in system.coordinates), *map(str, (*system.u, *parameters)))
         words = any(tex(name).startswith(r"\mathrm") for name in every)
-        self._latex = _Latex({s: tex(name, n) for s, (name, n) in dotted.items()}, words)
+        in_latex = {s: tex(name, n) for s, (name, n) in dotted.items()}
+        self._latex = _Latex(_apart(system.definitions) | in_latex, words)
 
     def terms(self, e: Expr) -> list[Term]:
         """The terms of a sum, ordered, without their signs."""
@@ -209,6 +213,13 @@ class Typesetter:
         return made
 
 
+def _apart(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Symbol, str]:
+    """Names that LaTeX would set as others, whole: joint_y_, beside joint_y."""
+    many = Counter(tex(s.name) for s, _ in definitions)
+    whole = (s for s, _ in definitions if many[tex(s.name)] > 1 and "" in s.name.split("_"))
+    return {s: r"\mathrm{" + s.name.replace("_", r"\_") + "}" for s in whole}
+
+
 def _decimal(e: Expr) -> bool:
     """Whether it reads better as a decimal, which it was in the scene: 0.028, not 7/250."""
     if not e.is_Rational or e.q < DECIMAL:
@@ -225,6 +236,28 @@ def spread(e: Expr) -> Expr:
     if e.is_Mul and len(e.args) == 2 and _decimal(e.args[0]) and e.args[1].is_Add:
         return sympy.Add(*(e.args[0] * x for x in e.args[1].args))
     return e
+
+
+def readable(value: Expr) -> Expr:
+    """With decimals for fractions that nobody reads, as those of 50 digits of slanted axes.
+
+    At 30 digits more of them fall together, and what rounding left of zeros is gone.
+    """
+    if not _long(value):
+        return value
+    short = _rounded(sympy.expand(value))
+    plain = _rounded(sympy.expand(short))  # each factor whole again
+    return plain.xreplace({x: sympy.Float(x, 15) for x in _long(plain)})
+
+
+def _rounded(e: Expr) -> Expr:
+    return e.xreplace(
+        {x: sympy.Rational(str(sympy.Float(x, 30))) if abs(x) > TINY else 0 for x in _long(e)}
+    )
+
+
+def _long(e: Expr) -> set[sympy.Rational]:
+    return {x for x in e.atoms(sympy.Rational) if max(abs(x.p), x.q) >= LONG}
 
 
 def _negative(e: Expr) -> Expr:
@@ -250,6 +283,12 @@ def _dotted(name: str, dots: int) -> str:
     return f"{base}{'d' * (dots - 1)}dot{name[len(base) :]}"
 
 
+def _set_as_name(name: str) -> str:
+    """With its subscripts, as far as Unicode has them; else as it is."""
+    made = str(pretty_symbol(name))
+    return name if {" ", "_"} & {*made} else made
+
+
 class _Text(PrettyPrinter):  # type: ignore[misc]
     """Blocks of Unicode."""
 
@@ -260,9 +299,7 @@ class _Text(PrettyPrinter):  # type: ignore[misc]
         self._names, self._plain = names, plain
 
     def _print_Symbol(self, e: Symbol, bold_name: bool = False) -> prettyForm:
-        if e in self._plain:
-            return prettyForm(self._plain[e])
-        return super()._print_Symbol(self._names.get(e, e))
+        return prettyForm(self._plain.get(e) or _set_as_name(self._names.get(e, e).name))
 
     def _print_dot(self, e: Expr) -> prettyForm:
         inside = prettyForm(*self._print(e.args[0]).parens())
@@ -277,7 +314,7 @@ class _Line(StrPrinter):  # type: ignore[misc]
         self._names, self._plain = names, plain
 
     def _print_Symbol(self, e: Symbol) -> str:
-        return self._plain.get(e) or str(pretty_symbol(self._names.get(e, e).name))
+        return self._plain.get(e) or _set_as_name(self._names.get(e, e).name)
 
     def _print_dot(self, e: Expr) -> str:
         return f"d/dt ({self._print(e.args[0])})"

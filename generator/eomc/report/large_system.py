@@ -1,0 +1,273 @@
+"""What is shown of a system whose equations would fill many pages, as text and as LaTeX.
+
+The recursion over its joints, or its energies over their definitions, and what else acts.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import sympy
+from sympy import Expr
+
+from eomc.model.exact import Vector
+from eomc.model.system import System, t
+from eomc.model.tree import Link, Tree
+from eomc.report.equations_text import (
+    GOES_ON,
+    costs,
+    form_of,
+    latex_sum,
+    named_lines,
+    right_of,
+    section,
+    title_of,
+    told,
+    wrapped,
+)
+from eomc.report.typeset import Typesetter, readable
+from eomc.runtime.labels import tex
+
+DECLARED = 60  # definitions, at most, that are shown
+LINES = 40  # of joints in one environment, which fill a page
+T, DQ = r"^{\mathsf{T}}", r"\dot{q}"
+
+
+def text(system: System) -> str:
+    """What the equations of a large system come from, and what it costs to compute them."""
+    write = Typesetter(system)
+    parts = [
+        wrapped(f"{title_of(system)}: {form_of(_driven(system), system)}"),
+        "Written out, these equations would fill many pages. They are those of L = K - P,\n"
+        f"d/dt ∂L/∂q̇ - ∂L/∂q = {right_of(_driven(system), system)}.",
+    ]
+    if system.tree is not None:
+        parts.append(_recursion(system.tree, write))
+    known = _declared(system)
+    if known is not None and (known or _energies(system)):
+        made: list[str] = []
+        for name, e in [*((str(s), e) for s, e in known), *_energies(system)]:
+            made += named_lines(write, name, e)
+        parts.append(section("energies, over definitions; a dot is d/dt", made))
+    if system.constraints:
+        made = []
+        for c in system.constraints:
+            if known is not None:
+                made += write.text_lines(write.terms(c.formula), [])
+            made += told(c)
+        parts.append(section("constraints", made))
+    return "\n\n".join([*parts, "What computes them:", costs(system)])
+
+
+def _recursion(tree: Tree, write: Typesetter) -> str:
+    """The recursion of Newton and Euler (Featherstone, 2008, table 5.1)."""
+    lines = [
+        "outward from parent p; S is the joint's axis, v a twist, a its rate, f a wrench:",
+        "    v = X v_p + S q̇",
+        "    a = X a_p + S q̈ + v × S q̇",
+        "inward:",
+        "    f = I a + v ×* I v + the sum of Xᵀ f over its children",
+        "    τ = S · f",
+        "",
+    ]
+    for link in tree.links:
+        parent = "the world" if link.parent < 0 else tree.links[link.parent].name
+        how = f"{'turns about' if link.turns else 'slides along'} {'xyz'[link.axis]}"
+        by = str(write.text(write.ordered(link.q))).strip()
+        lines.append(f"{link.name} on {parent}: {how} by {by if len(by) <= 40 else '...'}")
+    return section(f"Newton and Euler's recursion over {len(tree.links)} elementary joints", lines)
+
+
+def _declared(system: System) -> list[tuple[sympy.Symbol, Expr]] | None:
+    """The definitions that what is shown depends on, None where they are too many to read."""
+    along = (e for pair in system.applied for e in pair)
+    shown = [*(c.formula for c in system.constraints), *along, system.dissipation, *system.forces]
+    shown += [e for _, e in _energies(system)]
+    wanted = {s for e in shown for s in e.free_symbols}
+    known: list[tuple[sympy.Symbol, Expr]] = []
+    for name, e in reversed(system.definitions):
+        if name in wanted:
+            wanted |= e.free_symbols
+            known.insert(0, (name, e))
+    return known if len(known) <= DECLARED else None
+
+
+def _energies(system: System) -> list[tuple[str, Expr]]:
+    """Those that no recursion accounts for."""
+    if system.tree is None:
+        return [("K", system.kinetic), ("P", system.potential)]
+    beside = (("K'", system.tree.beside_kinetic), ("P'", system.tree.beside_potential))
+    return [(name, e) for name, e in beside if e != 0]
+
+
+# --- LaTeX ----------------------------------------------------------------------------------------
+
+
+def latex(system: System) -> str:
+    """Environments of amsmath: the form of the equations, and what they come from."""
+    return "\n".join(r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in bodies(system))
+
+
+def bodies(system: System) -> list[str]:
+    """What stands in each environment."""
+    write, tree, known = Typesetter(system), system.tree, _declared(system)
+    parts = [_latex_form(system)]
+    if tree is not None:
+        parts[0] += _latex_recursion(tree, write)
+        links = [line for k in range(len(tree.links)) for line in _latex_link(k, tree, write)]
+        parts += [links[k : k + LINES] for k in range(0, len(links), LINES)]
+    if known is not None:
+        parts.append(_latex_rest(system, known, write))
+    return [" \\\\\n".join(lines) for lines in parts if lines]
+
+
+def _latex_form(system: System) -> list[str]:
+    """The equations, and D, C, g by what they are derivatives of."""
+    force = " + ".join(
+        [*([r"\tau"] * _driven(system)), *([rf"A{T} \lambda"] * bool(system.constraints))]
+    )
+    force = force or "0"
+    order = r", \; ".join(tex(c.name) for c in system.coordinates)
+    lines = [
+        rf"  & D \, \ddot{{q}} + C \, \dot{{q}} + g = {force}, \quad q = \left({order}\right){T}",
+        rf"  & \frac{{d}}{{dt}} {_slope('L', DQ)} - {_slope('L', 'q')} = {force}, \quad L = K - P",
+        rf"  D_{{ij}} &= \frac{{\partial^{{2}} K}}{{\partial {DQ}_{{i}} \, \partial {DQ}_{{j}}}}",
+    ]
+    if _quadratic(system):
+        slopes = (("D_{ij}", "q_{k}"), ("D_{ik}", "q_{j}"), ("D_{jk}", "q_{i}"))
+        ij, ik, jk = (_slope(e, q) for e, q in slopes)
+        lines += [
+            rf"  C_{{ij}} &= \frac{{1}}{{2}} \sum_{{k}} \left({ij} + {ik} - {jk}\right) {DQ}_{{k}}",
+            rf"  g &= {_slope('P', 'q')}",
+        ]
+    return lines
+
+
+def _driven(system: System) -> bool:
+    """Whether anything acts besides potentials and constraints."""
+    return bool(system.applied) or any(e != 0 for e in (system.dissipation, *system.forces))
+
+
+def _quadratic(system: System) -> bool:
+    """Whether K is surely of second degree in the rates alone, and C Christoffel's."""
+    tree = system.tree
+    timed = any(e.has(t) for _, e in system.definitions)
+    return tree is not None and not timed and tree.beside_kinetic == 0
+
+
+def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
+    """As in `_recursion`: twists (angular, linear) and wrenches (moment, force) of joint k."""
+    K, P = "K'", "P'"
+    wrench, energy = rf"S_{{k}}{T} f_{{k}}", rf"v_{{k}}{T} I_{{k}} \, v_{{k}}"
+    if any(link.armature != 0 for link in tree.links):
+        wrench = rf"\left({wrench} + \alpha_{{k}} \ddot{{s}}_{{k}}\right)"
+        energy = rf"\left({energy} + \alpha_{{k}} \dot{{s}}_{{k}}^{{2}}\right)"
+    beside = f" + {_slope(P, 'q')}" * (tree.beside_potential != 0)
+    if tree.beside_kinetic != 0:
+        beside += rf" + \frac{{d}}{{dt}} {_slope(K, DQ)} - {_slope(K, 'q')}"
+    turned, r, c = rf"R_{{k}}{T}", r"[r_{k}]_{\times}", r"[c_{k}]_{\times}"
+    X, body = [[turned, "0"], [f"-{turned} {r}", turned]], [["J_{k}", c], [f"-{c}", "m_{k}"]]
+    return [
+        r"  v_{k} &= X_{k} \, v_{p} + S_{k} \, \dot{s}_{k}, \quad v_{0} = 0",
+        r"  a_{k} &= X_{k} \, a_{p} + S_{k} \, \ddot{s}_{k} + v_{k} \times S_{k} \, \dot{s}_{k}, "
+        rf"\quad a_{{0}} = \left(0, -\gamma\right), \; \gamma = {_vector(tree.gravity, write)}",
+        r"  f_{k} &= I_{k} \, a_{k} + v_{k} \times^{*} I_{k} \, v_{k} + "
+        rf"\sum_{{p(c) = k}} X_{{c}}{T} f_{{c}}",
+        rf"  D \, \ddot{{q}} + C \, {DQ} + g &= \sum_{{k}} {_slope('s_{k}', 'q')} "
+        rf"{wrench}{beside}",
+        rf"  K &= \frac{{1}}{{2}} \sum_{{k}} {energy}"
+        + f" + {K}" * (tree.beside_kinetic != 0)
+        + r", \quad "
+        rf"P = -\gamma{T} \sum_{{k}} \left(m_{{k}} \, o_{{k}} + O_{{k}} \, c_{{k}}\right)"
+        + f" + {P}"
+        * (tree.beside_potential != 0),
+        r"  o_{k} &= o_{p} + O_{p} \, r_{k}, \quad O_{k} = O_{p} \, R_{k}, \quad O_{0} = 1",
+        rf"  X_{{k}} &= {_matrix(X)}, \quad I_{{k}} = {_matrix(body)}",
+    ]
+
+
+def _latex_link(k: int, tree: Tree, write: Typesetter) -> list[str]:
+    """Where joint k stands, how it moves, and the mass that moves with it."""
+    link = tree.links[k]
+    parent = "the world" if link.parent < 0 else tree.links[link.parent].name
+    n, axis = k + 1, "xyz"[link.axis]
+    r, R = _vector(link.offset, write), _rotation(link, write)
+    turn = rf"R_{{{axis}}}(s_{{{n}}})"
+    if link.turns:
+        R = f"{R} {turn}" if R else turn
+    else:
+        r += f" + {R or ''} e_{{{axis}}} s_{{{n}}}"
+    S = f"(e_{{{axis}}}, 0)" if link.turns else f"(0, e_{{{axis}}})"
+    lines = [
+        rf"  & \text{{{_escaped(f'{link.name} on {parent}')}}}, "
+        rf"\; k = {n}, \; p = {link.parent + 1}: \quad "
+        rf"s_{{{n}}} = {_formula(link.q, write)}, \; S_{{{n}}} = {S}, \; "
+        rf"R_{{{n}}} = {R or '1'}, \; r_{{{n}}} = {r}"
+    ]
+    if any(e != 0 for e in (link.mass, *link.moment, *link.inertia)):
+        xx, yy, zz, xy, xz, yz = (_formula(e, write) for e in link.inertia)
+        J = _matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if (xy, xz, yz) == ("0", "0", "0"):
+            J = rf"\operatorname{{diag}}\left({xx}, {yy}, {zz}\right)"
+        lines.append(
+            rf"{GOES_ON}m_{{{n}}} = {_formula(link.mass, write)}, \; c_{{{n}}} = "
+            rf"{_vector(link.moment, write)}, \; J_{{{n}}} = {J}"
+        )
+    if link.armature != 0:
+        lines.append(rf"{GOES_ON}\alpha_{{{n}}} = {_formula(link.armature, write)}")
+    return lines
+
+
+def _latex_rest(
+    system: System, known: list[tuple[sympy.Symbol, Expr]], write: Typesetter
+) -> list[str]:
+    """Energies, friction and forces over definitions, and the rows of constraints."""
+    lines = [line for s, e in known for line in latex_sum(write, write.latex(s), e)]
+    for name, e in _energies(system):
+        lines += latex_sum(write, name, e)
+    friction = f" - {_slope('R', DQ)}" * (system.dissipation != 0)
+    along = "".join(
+        f" + {_slope(f'y_{{{k}}}', 'q')} F_{{{k}}}" for k in range(1, len(system.applied) + 1)
+    )
+    if _driven(system):
+        lines.append(rf"  \tau &= Q{friction}{along}")
+    if friction:
+        lines += latex_sum(write, "R", system.dissipation)
+    for i, force in enumerate(system.forces, 1):
+        if force != 0:
+            lines += latex_sum(write, f"Q_{{{i}}}", force)
+    for k, (y, force) in enumerate(system.applied, 1):
+        lines += latex_sum(write, f"y_{{{k}}}", y) + latex_sum(write, f"F_{{{k}}}", force)
+    for c in system.constraints:
+        first, *more = write.latex_lines(write.terms(c.formula), [])
+        lines += [f"  & {first}", *(GOES_ON + line for line in more)]
+    return lines
+
+
+def _slope(of: str, along: str) -> str:
+    return rf"\frac{{\partial {of}}}{{\partial {along}}}"
+
+
+def _formula(e: Expr, write: Typesetter) -> str:
+    return write.latex(write.ordered(readable(sympy.sympify(e))))
+
+
+def _vector(v: Vector, write: Typesetter) -> str:
+    return rf"\left({', '.join(_formula(e, write) for e in v)}\right)"
+
+
+def _rotation(link: Link, write: Typesetter) -> str:
+    """That of the frame before its joint moves; nothing where it is none."""
+    if sympy.Matrix(link.rotation) == sympy.eye(3):
+        return ""
+    return _matrix([[_formula(e, write) for e in row] for row in link.rotation])
+
+
+def _matrix(rows: Sequence[Sequence[str]]) -> str:
+    body = r" \\ ".join(" & ".join(row) for row in rows)
+    return rf"\begin{{pmatrix}} {body} \end{{pmatrix}}"
+
+
+def _escaped(words: str) -> str:
+    return re.sub(r"([#$%&_{}])", r"\\\1", words)
