@@ -20,6 +20,7 @@ DROPPED = {
     "double": (sympy.Float("1e-12"), sympy.Float("1e-9")),
     "float": (sympy.Float("1e-5"), sympy.Float("1e-5")),
 }
+FADED = {"double": 1e-22, "float": 1e-12}  # of a row's usual pivot: it is rounding
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Constraints:
     which leaves redundant ones out. drop: a pivot that is this part of what it was, or less, tells
     a row that depends on others in this position: nothing is solved for it there; in accelerations,
     and in corrections. weights: where D alone is singular, of each row solved for, the part of
-    A^T A that makes it regular; else none.
+    A^T A that makes it regular; else none. faded: of each row solved for, the pivot that tells that
+    it has no slope at all in this position, where it may have none.
     """
 
     values: Vector
@@ -44,6 +46,7 @@ class Constraints:
     solved: tuple[int, ...]
     drop: tuple[Expr, Expr]
     weights: Vector = ()
+    faded: Vector = ()
 
 
 def constraints(system: System, e: Energies) -> Constraints | None:
@@ -61,11 +64,19 @@ def constraints(system: System, e: Energies) -> Constraints | None:
     moved = [*tape.forward(phi, {t: S.One}), *tape.substitute(psi, still)]
     solved = tuple(k for k, c in enumerate(system.constraints) if not c.redundant)
     weights = system.closure.weights if system.closure else ()
+    slopes = system.closure.slopes if system.closure else (0.0,) * len(system.constraints)
     return Constraints(
         tuple(e.rows), tuple(map(tuple, by)), tuple(rates), tuple(tape.forward(rates, along)),
         tuple(tape.scaled(S.NegativeOne, x) for x in moved), count, solved,
         DROPPED[system.run.real], tuple(sympy.Rational(weights[k]) for k in solved if weights),
+        tuple(_faded(by[k], slopes[k] * FADED[system.run.real]) for k in solved),
     )  # fmt: skip
+
+
+def _faded(row: Sequence[Expr], limit: float) -> Expr:
+    """The limit of a row's pivot; 0 where it is always one, an entry of the row being a number."""
+    bounded = any(entry.is_Number and entry != 0 for entry in row)
+    return S.Zero if bounded else sympy.Float(f"{limit:.0e}")
 
 
 def chosen(some: Sequence[Expr], rows: Constraints) -> list[Expr]:

@@ -64,9 +64,13 @@ def factors(
     D: Rows,
     A: Rows,
     drop: Expr,
+    faded: Sequence[Expr],
     short: Callable[[Expr], Expr] = lambda atom: atom,
 ) -> Factors:
-    """The KKT matrix of D and A, factored. drop: the part of itself below which a pivot is none."""
+    """The KKT matrix of D and A, factored.
+
+    drop, faded: the part of itself, and of each row the number, below which a pivot is none.
+    """
     n = len(D)
     M = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
     for r, row in enumerate(A):
@@ -88,6 +92,7 @@ def factors(
         else:
             pivot = tape.define(-M.get((k, k), S.Zero))
             limit = tape.define(drop * whole[k]) if pivot != whole.get(k, S.Zero) else S.Zero
+            limit = tape.total([limit, faded[k - n]])
             inverses[k] = tape.define(pivot_inverse(pivot, limit))
             inverse = tape.define(-inverses[k])
         found = {i: tape.define(a * inverse) for i, a in below.items()}
@@ -139,7 +144,7 @@ def accelerations(
     A = tuple(chosen(rows.jacobian, rows))
     c = [tape.scaled(S.NegativeOne, x) for x in chosen(rows.rest, rows)]
     D, b = with_mass(tape, D, b, A, c, rows.weights)
-    made = factors(tape, D, A, rows.drop[0], short)
+    made = factors(tape, D, A, rows.drop[0], rows.faded, short)
     a, some = made.solve(b, c, short)
     multipliers = [S.Zero] * len(rows.values)
     for k, x in zip(rows.solved, some, strict=True):
@@ -180,7 +185,7 @@ def correction(
     """
     n, A = len(D), tuple(chosen(rows.jacobian, rows))
     D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)
-    made = factors(tape, D, A, rows.drop[1])
+    made = factors(tape, D, A, rows.drop[1], rows.faded)
     positions = [S.Zero if k >= rows.holonomic else -rows.values[k] for k in rows.solved]
     zero, same = [S.Zero] * n, lambda atom: atom
     dq, _ = made.solve(zero, positions, same)

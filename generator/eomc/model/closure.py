@@ -32,7 +32,8 @@ class Closure:
     smallest singular value that counts over the largest one, at the start and at the worst of
     `positions` positions; rows in units of their own inverse inertia, coordinates in the metric of
     D: 0 at a singular position. weights: where D alone is singular, of each row r what makes
-    D + sum of weights[r] A_r^T A_r regular; else none. moves, rate_moves: what assembling changed.
+    D + sum of weights[r] A_r^T A_r regular; else none. slopes: of each row the largest
+    A D^-1 A^T of these positions. moves, rate_moves: what assembling changed.
     remarks: in words. made_for: what of the system all that depends on.
     """
 
@@ -45,6 +46,7 @@ class Closure:
     least_sigma: float = 1.0
     positions: int = 1
     weights: tuple[float, ...] = ()
+    slopes: tuple[float, ...] = ()
     moves: tuple[Move, ...] = ()
     rate_moves: tuple[Move, ...] = ()
     remarks: tuple[str, ...] = ()

@@ -188,6 +188,7 @@ def _closure(manifold: Manifold, start: Start, found: Ranks) -> Closure:
         least_sigma=found.sigma[1],
         positions=found.positions,
         weights=found.weights,
+        slopes=found.slopes,
         moves=tuple(_moves(units, guess, start.place.q, start.place)),
         rate_moves=tuple(_moves(speeds, rates, start.qd, start.place)),
         remarks=tuple(_remarks(manifold, start, found)),

@@ -36,8 +36,8 @@ class Ranks:
     """rank: of all rows, almost everywhere. left_out: rows that others imply. shared: rows without
     a force of their own. good: whether some set of rows will do everywhere that was looked at.
     sigma: smallest over largest singular value that counts, at the start and at the worst place.
-    weights: of the rows, that make D regular with them; none where it is so by itself. latest: the
-    time of the last position, s.
+    weights: of the rows, that make D regular with them; none where it is so by itself. slopes: of
+    each row the largest A D^-1 A^T. latest: the time of the last position, s.
     flat: rows without a slope wherever they hold.
     """
 
@@ -48,6 +48,7 @@ class Ranks:
     sigma: tuple[float, float]
     positions: int
     weights: tuple[float, ...] = ()
+    slopes: tuple[float, ...] = ()
     latest: float = 0.0
     flat: tuple[int, ...] = ()
 
@@ -57,11 +58,13 @@ def ranks(manifold: Manifold, start: Place) -> Ranks:
     found, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)
     weights = tuple(start.weights.tolist()) if singular else ()
-    return replace(found, weights=weights, latest=max(place.t for place in places))
+    slopes = tuple(np.max([_slopes(place) ** 2 for place in places], axis=0).tolist())
+    latest = max(place.t for place in places)
+    return replace(found, weights=weights, slopes=slopes, latest=latest)
 
 
 def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
-    """Without weights, and the places that were looked at."""
+    """Without weights and slopes, and the places that were looked at."""
     free = np.ones(len(start.q), dtype=bool)
     first = Frame(start, free, manifold.rows)
     sure = len(first.parts[1]) == len(manifold.rows) and first.parts[1][-1] > FADED
