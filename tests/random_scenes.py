@@ -2,6 +2,7 @@
 
 python tests/random_scenes.py --count 2000            right modules must pass
 python tests/random_scenes.py --count 300 --negate    with one term negated they must not
+python tests/random_scenes.py --wide --count 500      with outputs, events, loops and so on
 python tests/random_scenes.py --show 7                the scene of that number
 """
 
@@ -10,35 +11,38 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib.util
+import io
 import json
 import multiprocessing
 import os
-import re
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
 import warnings
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
 
+import cffi
 import negated
 from scene_author import scene_text
+from scene_author_wide import wide_text
 
 import eomc
 from eomc.base.errors import EomcError
 from eomc.emit.render import Sources
 from eomc.model.from_scene import from_scene
+from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.toolchain import compiler
 from eomc.verify.check import check
 
 ROOT = Path(__file__).parent.parent / "build" / "random"
 EXTENSION = "_extension"
-WORK = 2**15  # bytes, more than the working storage of a run of four coordinates
 JUDGES = ("order of", "h of", "power balance", "beside")  # rows that may say they can't judge
 
 
@@ -60,12 +64,13 @@ class Outcome:
     seconds: float = 0.0
 
 
-def outcome(seed: int, negate: bool, root: Path) -> Outcome:
+def outcome(seed: int, negate: bool, root: Path, wide: bool = False) -> Outcome:
     """The scene of that number derived, built under `root` and checked."""
     began = time.perf_counter()
     made, module, plain = None, None, None
     try:
-        made = from_scene(parse(scene_text(seed), f"{seed}.toml"))
+        text = (wide_text if wide else scene_text)(seed)
+        made = assembled(from_scene(parse(text, f"{seed}.toml")))
         sources = eomc.sources(made, EXTENSION)
         module = _built(sources, root / "right")
         if not negate:  # what is wrong is to be seen without a right one beside it
@@ -103,31 +108,28 @@ def _words(fault: Exception) -> str:
 
 
 def _built(sources: Sources, folder: Path, form: str = "fast") -> ModuleType:
-    """The module of a form of these sources, compiled and bound in half the time of a build.
-
-    The binding is a library that cffi opens, instead of an extension with Python's headers.
-    """
+    """The module of a form of these sources, as a build makes it, its binding not optimised."""
     folder.mkdir(parents=True)
     for file, text in sources.files.items():
         if file.startswith("fast/") == (form == "fast") or file.endswith(".py"):
             (folder / file.removeprefix("fast/")).write_text(text, encoding="utf-8")
-    binding = re.sub(r"^static (?=(int|long|void) )", "", sources.binding, flags=re.M)
-    (folder / "binding.c").write_text(
-        "#include <stddef.h>\n#include <stdint.h>\n" + binding, encoding="utf-8"
-    )
-    flags = [compiler.standard(form), "-fPIC", "-shared", "-Wl,-Bsymbolic", *compiler.flags()]
-    command = [*compiler.find_compiler().command, *flags, f"{sources.name}.c", "binding.c", "-lm"]
-    done = subprocess.run(
-        [*command, "-o", "library.so"], cwd=folder, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise EomcError(done.stderr)
-    cdef = sources.cdef.replace("long done; ...;", f"long done; char rest[{WORK}];")
-    (folder / f"{EXTENSION}.py").write_text(
-        f"import cffi\nffi = cffi.FFI()\nffi.cdef({cdef!r})\n"
-        f"lib = ffi.dlopen({str(folder / 'library.so')!r})\n",
-        encoding="utf-8",
-    )
+    ffi = cffi.FFI()
+    ffi.cdef(sources.cdef)
+    ffi.set_source(EXTENSION, sources.binding)
+    with redirect_stdout(io.StringIO()):  # it tells of itself
+        ffi.emit_c_code(str(folder / "binding.c"))
+    include = {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}
+    flags = [compiler.standard(form), *compiler.flags()]
+    library = f"{EXTENSION}{sysconfig.get_config_var('EXT_SUFFIX')}"
+    for words in (
+        ["-O0", *(f"-I{path}" for path in include), "-c", "binding.c"],
+        [*flags, "-c", f"{sources.name}.c"],
+        ["-shared", "binding.o", f"{sources.name}.o", "-lm", "-o", library],
+    ):
+        command = [*compiler.find_compiler().command, "-fPIC", *words]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise EomcError(done.stderr)
     name = f"_random_{hashlib.sha256(str(folder).encode()).hexdigest()}"
     spec = importlib.util.spec_from_file_location(
         name, folder / "__init__.py", submodule_search_locations=[str(folder)]
@@ -138,13 +140,14 @@ def _built(sources: Sources, folder: Path, form: str = "fast") -> ModuleType:
     return module
 
 
-def _one(task: tuple[int, bool]) -> Outcome:
+def _one(task: tuple[int, bool, bool]) -> Outcome:
     """For a process of a pool: nothing of the build is left."""
     os.environ.setdefault("EOMC_CFLAGS", "-O1")
     warnings.simplefilter("ignore")
     ROOT.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=ROOT) as root:
-        return outcome(*task, Path(root))
+        seed, negate, wide = task
+        return outcome(seed, negate, Path(root), wide)
 
 
 def main() -> int:
@@ -153,14 +156,15 @@ def main() -> int:
     asked.add_argument("--count", type=int, default=100)
     asked.add_argument("--seed", type=int, default=0, help="the number of the first scene")
     asked.add_argument("--negate", action="store_true", help="negate one term of each")
+    asked.add_argument("--wide", action="store_true", help="those of scene_author_wide")
     asked.add_argument("--jobs", type=int, default=1)
     asked.add_argument("--log", type=Path, help="a line of JSON for each scene")
     asked.add_argument("--show", type=int, metavar="N", help="print the scene of that number")
     given = asked.parse_args()
     if given.show is not None:
-        print(scene_text(given.show), end="")
+        print((wide_text if given.wide else scene_text)(given.show), end="")
         return 0
-    tasks = [(given.seed + k, given.negate) for k in range(given.count)]
+    tasks = [(given.seed + k, given.negate, given.wide) for k in range(given.count)]
     counts: Counter[str] = Counter()
     unjudged: Counter[str] = Counter()
     judged = 0

@@ -39,7 +39,7 @@ class _Tables:
     run: list[str] = field(default_factory=list)
 
 
-class _Author:
+class Author:
     """Writes one scene.
 
     static: D constant and forces of positions and time alone, so that every stepper can be used.
@@ -315,5 +315,5 @@ class _Author:
 
 def scene_text(seed: int) -> str:
     """The scene of that number as TOML: valid, always the same."""
-    author = _Author(seed)
+    author = Author(seed)
     return author.bodies() if author.chance(0.25) else author.energies()

@@ -170,14 +170,19 @@ def seeds(name: str) -> list[Path]:
     return found
 
 
+def everything(name: str) -> list[bytes]:
+    """All seeds."""
+    files = [file for folder in seeds(name) for file in sorted(folder.iterdir())]
+    return [file.read_bytes() for file in files if file.suffix not in (".py", ".txt")]
+
+
+def _fine(name: str, data: bytes) -> bool:
+    return name == "command" or TARGETS[name](data)
+
+
 def pool(name: str) -> tuple[list[str], list[str]]:
     """Tokens and lines of all seeds."""
-    texts = [
-        file.read_text(encoding="utf-8", errors="replace")
-        for folder in seeds(name)
-        for file in sorted(folder.iterdir())
-        if file.suffix not in (".py", ".txt")
-    ]
+    texts = [data.decode("utf-8", "replace") for data in everything(name)]
     lines = sorted({line for text in texts for line in text.split("\n") if line.strip()})
     tokens = {t for line in lines for t in TOKEN.findall(line) if t.strip()}
     return [*sorted(tokens), *HOSTILE * 3, *_options(name)], lines
@@ -202,15 +207,19 @@ def _options(name: str) -> list[str]:
 
 
 class Mutator:
-    """Half the time libFuzzer's bytes, else one to four changes of tokens, values and lines."""
+    """A few changes of tokens, values and lines, half the time of a valid seed; or of bytes."""
 
     def __init__(self, name: str) -> None:
         self.tokens, self.lines = pool(name)
+        self.valid = [data for data in everything(name) if _fine(name, data)]
 
     def __call__(self, data: bytes, most: int, seed: int) -> bytes:
         draw = random.Random(seed)
-        if draw.random() < 0.3:
+        part = draw.random()
+        if part < 0.2:
             return bytes(atheris.Mutate(data, most))
+        if part < 0.45:  # what has reached new lines is mostly faulty
+            data = draw.choice(self.valid)
         text = data.decode("utf-8", "replace")
         for _ in range(draw.choice([1, 1, 1, 2, 2, 4])):
             text = self._changed(text, draw)

@@ -426,7 +426,8 @@ def mend(tree: dict[str, Any], path: tuple[str, ...]) -> None:
     elif path[0] == "loop" and last == "joint":
         table[last] = ""
     elif len(path) == 3 and last == "body" and path[0] in ("force", "point"):
-        table[last] = next((b["name"] for b in tree.get("body", {}).values() if "name" in b), "")
+        bodies = table_at(tree, ("body",))  # where there are none, no table
+        table[last] = next((table_at(bodies, (b,)).get("name", b) for b in bodies), "world")
     elif len(path) == 2 and path[0] in ("definitions", "forces"):
         table[last] = "0"
     elif len(path) == 2 and path[0] in ("coordinates", "inputs"):
