@@ -133,7 +133,7 @@ class _Wide(Author):
         """A chain of bodies with points and forces, closed by a loop perhaps."""
         plane, count = self.chance(0.6), self.random.choice([1, 2, 3, 3])
         self.static = False
-        close = self.chance(0.4) and (not plane or count == 3)
+        close = self.chance(0.4) and count > (2 if plane else 1)
         out: list[str] = []
         for k in range(count):
             out += self.body(k, plane, close)
@@ -171,10 +171,10 @@ class _Wide(Author):
         return self.ended(out, f"gravity = [0, {gravity if plane else f'0, {gravity}'}]")
 
     def body(self, k: int, plane: bool, close: bool) -> list[str]:
-        # where a loop closes, all starts but the first may move
+        # where a loop closes, all starts may move
         x = self.name()
         start = self.number(0.2, 1.1)
-        guess = ", guess = true" if close and k else ""
+        guess = ", guess = true" if close else ""
         rate = "" if close else f", rate = {self.number(-1, 1)}"
         self.tables.coordinates.append(f'{x} = {{ unit = "rad", start = "{start}"{rate}{guess} }}')
         self.q.append(x)

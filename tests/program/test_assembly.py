@@ -150,6 +150,14 @@ def test_rows_of_time_and_of_rates_set_rates() -> None:
     assert made.closure is not None and made.closure.freedoms == 1
 
 
+@pytest.mark.parametrize("name", ["self", "qd", "q", "time", "name", "changed"])
+def test_parameters_have_any_name(name: str) -> None:
+    made = assembled(
+        scene("x = {}\ny = { start = 1 }", f'c = "x - {name}*y"', f"parameters.{name}=2")
+    )
+    assert start_of(made)[0].tolist() == [2, 1]
+
+
 def test_values_that_are_near_to_rounding_are_left_as_they_are() -> None:
     made = scene(f"x = {{ start = {0.1 + 0.2!r} }}\ny = {{ start = 0.0 }}", 'a = "x - 0.3"')
     assert start_of(assembled(made))[0][0] == 0.1 + 0.2

@@ -180,7 +180,7 @@ class Manifold:
             **dict(zip(names, (*q, *qd), strict=True)),
         }
 
-    def value(self, name: str, q: Vector, qd: Vector, time: float, **changed: float) -> Vector:
+    def value(self, name: str, q: Vector, qd: Vector, time: float, /, **changed: float) -> Vector:
         """What a function gives, in doubles; nan where it has no value."""
         if name not in self._plain:
             self._plain[name] = evaluator(self.functions[name])

@@ -30,7 +30,8 @@ class _Picture:
         assert doc.picture is not None
         self.check, self.known, self.table = check, known, doc.picture
         self.bodies = [e.name for table in (doc.body, doc.point) for e in table.values()]
-        self.wide = len(doc.gravity) if doc.body and doc.gravity else 0  # 0: the first vector says
+        wide = len(doc.gravity) if doc.body and doc.gravity else 0
+        self.wide = wide if wide in (2, 3) else 0  # 0: the first vector says
         self.points: dict[str, Vector] = {}
 
     def checked(self) -> Picture:
@@ -71,7 +72,7 @@ class _Picture:
                 place = self._place(path, at)
                 if kind == "box" and self.wide and len(size) != self.wide:
                     where = "in the plane" if self.wide == 2 else "in space"
-                    words = {2: "two edges", 3: "three edges"}[self.wide]
+                    words = "two edges" if self.wide == 2 else "three edges"
                     self.check.say(path, f"a box {where} has {words}, here {len(size)}")
                 large = tuple(self._size(path, entry) for entry in size)
                 yield Shape(kind, (place,), large, self._rotation(path, rotation))
@@ -90,8 +91,8 @@ class _Picture:
         return Place(written, ORIGIN)
 
     def _vector(self, path: Path, given: tuple[float | str, ...]) -> Vector:
-        self.wide = self.wide or len(given)
-        if len(given) != self.wide or self.wide not in (2, 3):
+        self.wide = self.wide or (len(given) if len(given) in (2, 3) else 0)
+        if len(given) != self.wide:
             words = {2: "two entries, as the others here", 3: "three entries, as the others here"}
             wanted = words.get(self.wide, "two entries in the plane and three in space")
             self.check.say(path, f"a point has {wanted}, not {len(given)}")
