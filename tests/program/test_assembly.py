@@ -152,9 +152,8 @@ def test_rows_of_time_and_of_rates_set_rates() -> None:
 
 @pytest.mark.parametrize("name", ["self", "qd", "q", "time", "name", "changed"])
 def test_parameters_have_any_name(name: str) -> None:
-    made = assembled(
-        scene("x = {}\ny = { start = 1 }", f'c = "x - {name}*y"', f"parameters.{name}=2")
-    )
+    rows = f'c = "x - {name}*y"'
+    made = assembled(scene("x = {}\ny = { start = 1 }", rows, f"[parameters]\n{name} = 2"))
     assert start_of(made)[0].tolist() == [2, 1]
 
 
