@@ -3,12 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from sympy import Expr
 
+from eomc.verify.shorter import shorter
 from eomc.verify.symbolic import Reference
+
+
+def simplified(reference: Reference) -> Reference:
+    """The same in shorter forms, which round differently."""
+
+    def short(e: Expr) -> Expr:
+        return shorter(e, reference.system.qd)
+
+    names = ("D", "C", "g", "bias", "tau", "friction")
+    made = {name: getattr(reference, name).applyfunc(short) for name in names}
+    K, P = short(reference.kinetic), short(reference.potential)
+    made |= {"kinetic": K, "potential": P, "energy": K + P}
+    made |= {name: short(getattr(reference, name)) for name in ("jacobi", "power")}
+    return replace(reference, **made)
 
 
 class StandIn:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -265,6 +266,26 @@ assert "sympy" not in sys.modules and "numpy" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "mass matrix" in done.stdout, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["suspension", "quad"])
+def test_four_coordinates_take_less_than_three_seconds_and_a_third_of_one_again(
+    name: str, tmp_path: Path
+) -> None:
+    """Of the processor, from an empty folder, SymPy's import with it."""
+    file = SCENES / f"{name}.toml"
+    if name == "quad":
+        file = tmp_path / "quad.toml"
+        file.write_text(QUAD, encoding="utf-8")
+    took = []
+    for _ in range(2):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        command = [sys.executable, "-m", "eomc", "show", str(file), "--build", str(tmp_path)]
+        subprocess.run(command, check=True, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        took.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    assert took[0] < 3.0 and took[1] < 0.3, took
 
 
 def test_nothing_is_kept_where_nothing_can_be_written(here: Path) -> None:

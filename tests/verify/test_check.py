@@ -13,7 +13,7 @@ import pytest
 import sympy
 from cases import scene_system
 from conftest import Modules, tiers
-from stand_in import StandIn, bent, deaf, flipped, late, set_
+from stand_in import StandIn, bent, deaf, flipped, late, set_, simplified
 
 from eomc.model.from_scene import from_scene as system_of
 from eomc.model.system import System, symbol
@@ -122,7 +122,7 @@ def right() -> Report:
 )
 def test_what_is_right_passes(name: str) -> None:
     """Also in other arithmetic: the simplified equations round differently."""
-    report = check(scene_system(name), StandIn(reference(name).simplified))
+    report = check(scene_system(name), StandIn(simplified(reference(name))))
     assert report.passed, report.table()
     values = [row for row in report.rows if row.unit == "units of rounding"]
     assert max(row.error for row in values) < 2
@@ -168,7 +168,7 @@ def as_if_large(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", tiers(("cartpole_driven", "foucault_pendulum"), "cartpole_driven"))
 def test_what_is_right_passes_as_if_large(name: str, as_if_large: None) -> None:
-    report = check(scene_system(name), StandIn(reference(name).simplified))
+    report = check(scene_system(name), StandIn(simplified(reference(name))))
     assert report.passed, report.table()
     assert report.states == LARGE.states
     assert report.reference == "Taylor arithmetic"
@@ -264,7 +264,7 @@ def test_cancelling_terms_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     angle, rate = a + b, symbol("a_dot") + symbol("b_dot")
     kinetic = sum((f(angle).diff(a) * rate) ** 2 for f in (sympy.sin, sympy.cos)) * 7 / 2
     system = System.make("ring", {a: 0.3, b: 0.1}, kinetic + symbol("a_dot") ** 2 / 3, 0)
-    report = check(system, StandIn(derive(system).simplified), states=8)
+    report = check(system, StandIn(simplified(derive(system))), states=8)
     assert report.passed, report.table()
 
 

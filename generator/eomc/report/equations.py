@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import sympy
 from sympy import Expr, ImmutableMatrix
@@ -15,7 +15,7 @@ from eomc.pipeline import ScenePath
 from eomc.report import abbreviations, equations_text, large_system
 from eomc.report.typeset import readable
 from eomc.verify import symbolic
-from eomc.verify.shorter import coefficients
+from eomc.verify.shorter import coefficients, shorter
 
 EXPANDED = 30_000  # as symbolic.is_small counts: seconds for K without definitions
 DERIVED = 8_000  # operations of D, C and bias as they are derived, up to which they are simplified
@@ -111,18 +111,22 @@ def of(system: System) -> Equations:
     plain = symbolic.derive(symbolic.written_out(system))
     if sum(e.count_ops() for name in ("D", "C", "bias") for e in getattr(plain, name)) > DERIVED:
         raise too_long(system)
-    found = plain.simplified
-    D, C, g, tau, friction, bias = (
-        getattr(found, name).applyfunc(readable)
-        for name in ("D", "C", "g", "tau", "friction", "bias")
+
+    @cache
+    def short(e: Expr) -> Expr:
+        return readable(shorter(e, system.qd))
+
+    D, C, g, tau, friction = (
+        getattr(plain, name).applyfunc(short) for name in ("D", "C", "g", "tau", "friction")
     )
-    left = tuple(_left(system, D, bias[i], friction[i], i) for i in range(len(system.q)))
+    conserved = sympy.expand(plain.jacobi - plain.energy) == 0
+    jacobi, power = None if conserved else short(plain.jacobi), short(plain.power)
+    left = tuple(_left(system, D, plain.bias[i], friction[i], i) for i in range(len(system.q)))
     made = Equations(
         system, D, C, g, tau, (plain.tau + plain.friction).applyfunc(readable),
         plain.constraints.applyfunc(readable), plain.constraint_jacobian.applyfunc(readable),
         readable(_energy(plain.kinetic, system)), readable(_energy(plain.potential, system)),
-        readable(found.jacobi) if found.jacobi != found.energy else None,
-        readable(found.power) if found.power != 0 else None, left,
+        jacobi, power if power != 0 else None, left,
     )  # fmt: skip
     if _operations(made.set_out) > WRITTEN_OUT:
         raise too_long(system)
@@ -172,5 +176,6 @@ def _left(system: System, D: ImmutableMatrix, bias: Expr, friction: Expr, i: int
     last: Terms = []
     for part in (bias, friction):
         for rates, c in coefficients(part, system.qd) or [(sympy.S.One, part)]:
+            c = readable(c)
             (last if rates == 1 else terms).append((rates, c))
     return terms + [(rates, c) for rates, c in last if c != 0]

@@ -35,7 +35,7 @@ def by_rates(e: Expr, rates: Sequence[Symbol]) -> Expr:
     terms = coefficients(e, rates)
     if terms is None:
         return _coefficient(e)
-    return sympy.factor_terms(sympy.Add(*(monomial * c for monomial, c in terms)))
+    return _factored(sympy.Add(*(monomial * c for monomial, c in terms)))
 
 
 def coefficients(e: Expr, rates: Sequence[Symbol]) -> list[tuple[Expr, Expr]] | None:
@@ -77,7 +77,7 @@ def _coefficient(e: Expr) -> Expr:
         if len(angles) > 1:
             forms += [_sums(fewest, True)]
     shortest = _ranked(forms)[:CANDIDATES]
-    return _ranked(shortest + [sympy.factor_terms(form) for form in shortest])[0]
+    return _ranked(shortest + [_factored(form) for form in shortest])[0]
 
 
 def _ranked(forms: Sequence[Expr]) -> list[Expr]:
@@ -93,6 +93,13 @@ def _ranked(forms: Sequence[Expr]) -> list[Expr]:
     )
 
 
+@lru_cache(maxsize=10_000)
+def _factored(e: Expr) -> Expr:
+    """Without common factors. The same forms come again and again: of energies, D and bias."""
+    return sympy.factor_terms(e)
+
+
+@lru_cache(maxsize=10_000)
 def _length(e: Expr) -> tuple[int, int]:
     doubled = sum(f.args[0].is_Mul and f.args[0].args[0].is_Number for f in e.atoms(sin, cos))
     return (int(e.count_ops()) + int(doubled), int(doubled))
@@ -141,7 +148,7 @@ def _grouped(polynomial: PolyElement) -> Expr:
         trig = sympy.Mul(*(x for x in parts if x.has(sin, cos)))
         rest = sympy.Mul(ring.domain.to_sympy(c), *(x for x in parts if not x.has(sin, cos)))
         found.setdefault(trig, []).append(rest)
-    return sympy.Add(*(sympy.factor_terms(sympy.Add(*cs)) * x for x, cs in found.items()))
+    return sympy.Add(*(_factored(sympy.Add(*cs)) * x for x, cs in found.items()))
 
 
 def _without_squares(polynomial: PolyElement, this: PolyElement, other: PolyElement) -> PolyElement:
@@ -179,9 +186,7 @@ def _sums(polynomial: PolyElement, crossed: bool) -> Expr:
             waves = _waves(trig)
         for wave, size in waves.items():
             total.setdefault(wave, []).extend(size * rest for rest in rests)
-    return sympy.Add(
-        *(sympy.Mul(wave, sympy.factor_terms(sympy.Add(*cs))) for wave, cs in total.items())
-    )
+    return sympy.Add(*(sympy.Mul(wave, _factored(sympy.Add(*cs))) for wave, cs in total.items()))
 
 
 def _waves(trig: list[Expr]) -> dict[Expr, Expr]:

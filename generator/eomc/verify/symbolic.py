@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -230,26 +230,6 @@ class Reference(Answer):
     def motion(self) -> ImmutableMatrix:
         """D by rows, bias and tau, which an acceleration needs together: (nq^2 + 2 nq, 1)."""
         return ImmutableMatrix([*self.D, *self.bias, *self.tau])
-
-    @cached_property
-    def simplified(self) -> Reference:
-        """The same in shorter forms, for people to read."""
-
-        @cache
-        def short(e: Expr) -> Expr:
-            return shorter(e, self.system.qd)
-
-        D, C, g, bias, tau, friction = (
-            getattr(self, name).applyfunc(short)
-            for name in ("D", "C", "g", "bias", "tau", "friction")
-        )
-        K, P, power = map(short, (self.kinetic, self.potential, self.power))
-        conserved = sympy.expand(self.jacobi - self.energy) == 0
-        jacobi = K + P if conserved else short(self.jacobi)
-        return replace(
-            self, D=D, C=C, g=g, bias=bias, tau=tau, friction=friction,
-            kinetic=K, potential=P, energy=K + P, jacobi=jacobi, power=power,
-        )  # fmt: skip
 
     @cached_property
     def magnitude(self) -> Expr:
