@@ -33,7 +33,7 @@ from scene_author import scene_text
 from scene_author_wide import wide_text
 
 import eomc
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, SceneError
 from eomc.emit.render import Sources
 from eomc.model.from_scene import from_scene
 from eomc.program.assembly import assembled
@@ -48,8 +48,8 @@ JUDGES = ("order of", "h of", "power balance", "beside")  # rows that may say th
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one scene: "passed", "false alarm", "not built", "check raised"; where a term is negated
-    "caught", "wrong pass", "unchanged" or, where the build itself refused, "refused".
+    """Of one scene: "passed", "false alarm", "not built", "no start", "check raised"; where a term
+    is negated "caught", "wrong pass", "unchanged" or, where the build itself refused, "refused".
 
     rows: those that failed, with what was found. unjudged: those that said they judge nothing.
     judged: how many rows about orders, steps and balances did.
@@ -70,7 +70,11 @@ def outcome(seed: int, negate: bool, root: Path, wide: bool = False) -> Outcome:
     made, module, plain = None, None, None
     try:
         text = (wide_text if wide else scene_text)(seed)
-        made = assembled(from_scene(parse(text, f"{seed}.toml")))
+        made = from_scene(parse(text, f"{seed}.toml"))
+        try:
+            made = assembled(made)
+        except SceneError as fault:  # a loop that can't close from there, rightly
+            return Outcome(seed, "no start", _words(fault))
         sources = eomc.sources(made, EXTENSION)
         module = _built(sources, root / "right")
         if not negate:  # what is wrong is to be seen without a right one beside it
@@ -183,7 +187,8 @@ def main() -> int:
     print(", ".join(f"{n} {what}" for what, n in counts.most_common()))
     print(f"of {judged} rows about orders, h and balances not judged: {unjudged.total()}")
     print(", ".join(f"{n} {row}" for row, n in unjudged.most_common()))
-    return int(bool(counts["false alarm"] + counts["wrong pass"] + counts["check raised"]))
+    bad = ("false alarm", "wrong pass", "check raised", "not built")
+    return int(any(counts[outcome] for outcome in bad))
 
 
 if __name__ == "__main__":

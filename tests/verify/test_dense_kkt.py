@@ -161,3 +161,14 @@ def test_scales_make_rows_and_coordinates_alike() -> None:
     x, multipliers = kkt.solve(D, A, np.array([1.0, 2.0]), np.array([0.0, 4.0]))
     np.testing.assert_allclose(x, [2.0, -2e-6], rtol=1e-12)
     np.testing.assert_allclose(D @ x - A.T @ multipliers, [1.0, 2.0], rtol=1e-9)
+
+
+def test_a_row_of_rates_moves_no_position() -> None:
+    """Where it points is not where it may be: a position is put onto rows of positions alone."""
+    xd, yd, zd = (symbol(f"{n}_dot") for n in "xyz")
+    rows = {"line": symbol("y") - 2 * symbol("x"), "blade": zd - symbol("y") * xd}
+    made = System.make("mixed", ["x", "y", "z"], (xd**2 + yd**2 + zd**2) / 2, constraints=rows)
+    for answer in (Jets(made), symbolic.derive(made)):
+        q, qd = answer.project(np.array([1.0, 1.0, 5.0]), np.array([1.0, 1.0, 0.0]))
+        np.testing.assert_allclose(q, [0.6, 1.2, 5.0], rtol=1e-15)
+        np.testing.assert_allclose([qd[1] - 2 * qd[0], qd[2] - 1.2 * qd[0]], 0, atol=1e-15)

@@ -1,6 +1,6 @@
 """Random valid scenes pass the check, and with one term negated they do not.
 
-Many more of both: python tests/random_scenes.py --count 2000 [--negate].
+Many more of both: python tests/random_scenes.py --count 2000 [--negate | --wide].
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import scene_author
 from conftest import Modules, tiers
 from random_scenes import JUDGES, outcome
 from scene_author import scene_text
+from scene_author_wide import wide_text
 
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
@@ -248,6 +249,28 @@ SEEDS = """400000 500399 500434 500578 500643 500672 700053 800095 800167 800199
 def test_right_modules_of_these_numbers_pass(seed: str, tmp_path: Path) -> None:
     found = outcome(int(seed), False, tmp_path)
     assert found.outcome == "passed", found
+
+
+WIDE_SEEDS = "120 124 143 150".split()  # the same of scene_author_wide
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [*map(str, range(12)), *WIDE_SEEDS])
+def test_wide_scenes_pass(seed: str, tmp_path: Path) -> None:
+    """With outputs, limits, events, tolerances, forces, points, frames, constraints and loops."""
+    found = outcome(int(seed), False, tmp_path, wide=True)
+    assert found.outcome == "passed", (found, wide_text(int(seed)))
+
+
+def test_wide_scenes_have_all_of_it() -> None:
+    texts = [wide_text(k) for k in range(200)]
+    words = ["[[event]]", '"jump"', '"stop"', "[outputs]", "limits", "[[loop]]", "[constraints]"]
+    words += ["tolerance", "discretize", "inverse_dynamics", "frames", "momentum", "[[force]]"]
+    words += ["[[point]]", '"gear"', '"distance"', 'joint = "revolute"\npoints', '"float"']
+    for word in words:
+        assert any(word in text for text in texts), word
+    for text in texts[:40]:
+        parse(text, "wide.toml")
 
 
 WOUND = """eomc = 1

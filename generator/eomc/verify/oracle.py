@@ -247,16 +247,19 @@ class Answer(ABC):
     def _onto(
         self, q: Vector, qd: Vector, t: Any, values: Values, held: tuple[int, ...] = ()
     ) -> tuple[Vector, Vector]:
-        """`project` of one state."""
+        """`project` of one state: rows of rates alone say nothing of where q may be."""
+        positions = self._holonomic > 0
 
         def rows(x: Vector) -> tuple[Vector, Vector, Vector]:
             D, A, off = (self._row(name, x, qd, t, values) for name in ROWS)
-            return *kkt.kept(D, A, held), self._holonomic * off
+            return *kkt.kept(D, A[positions], held), off[positions]
 
-        q, left = kkt.onto(q, rows)
-        if not left < 1e-10:
-            return np.full_like(q, np.nan), np.full_like(q, np.nan)
-        D, A, _ = rows(q)
+        if np.any(positions):
+            q, left = kkt.onto(q, rows)
+            if not left < 1e-10:
+                return np.full_like(q, np.nan), np.full_like(q, np.nan)
+        D, A = (self._row(name, q, qd, t, values) for name in ROWS[:2])
+        D, A = kkt.kept(D, A, held)
         for _ in range(2):  # linear in qd: the second takes what the first has rounded
             by, _ = kkt.solve(D, A, np.zeros(len(q)), -self._row(RATES, q, qd, t, values))
             qd = qd + by

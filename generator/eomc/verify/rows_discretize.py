@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 SLOPE_LIMIT = 1e-6  # of the largest derivative
 SMALL = 1e-4  # what inputs do to a coordinate in a step may be so little, and less is not seen
+WIDER = 10  # inputs act nearly in proportion, and the widest of WIDTHS is left out there
 SHORTER = (1.0, 0.1, 0.01)  # of the scene's h, until the stages of an implicit method are found
 
 Differences = Callable[[str, int, float], list[Vector]]  # of a method, state and step
@@ -43,6 +44,8 @@ def report(of: Comparison, plain: Any) -> None:
     def exact(method: str, k: int, h: float) -> list[Vector]:
         with np.errstate(all="ignore"):
             scales = _scales(of, few[k])
+            if of.system.constraints:
+                scales[2 * len(few[k].q) :] *= WIDER
             return [_differences(of, method, few[k], h, width * scales) for width in widths]
 
     for module, form in ((of.module, ""), (plain, "plain C: ")):
