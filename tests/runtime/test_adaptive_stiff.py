@@ -127,7 +127,7 @@ def test_single_precision() -> None:
     text = text.replace("1e-9", "1e-5").replace('[[event]]\nname = "back"\nwhen = "x + 2*y"\n', "")
     module = eomc.load(from_scene(parse(text, "stiff_single.toml")), BUILDS)
     run, fine = module.simulate(duration=20.0), module.simulate(duration=20.0, h=0.05)
-    assert run.stiff_steps > 40 and run.steps < 400  # 4300 where sweeps converge
+    assert run.stiff_steps > run.steps / 3 and run.steps < 100  # 4300 where sweeps converge
     assert np.abs(run.x[-1] - fine.x[-1]).max() < 1e-4
 
 
@@ -238,6 +238,44 @@ def test_neither_units_nor_the_origin_matter(at: float, length: float, steps: in
         assert run.status == "ok" and run.steps < steps and run.stiff_steps > run.steps / 3
         far = (run.q[-1] - at) / (1000 * length)
         assert far / 1000 == pytest.approx(moved, rel=1e-6 if at else 1e-8)
+
+
+RESTS = """eomc = 1
+name = "{name}"
+[coordinates]
+x = {{ unit = "m", start = 0.5 }}
+[energy]
+kinetic = "x_dot**2/2"
+potential = "{potential}"
+[forces]
+x = "{force}"
+[run]
+tolerance = 1e-9
+duration = 300
+"""
+
+
+@pytest.mark.parametrize("how", [{"tol": 1e-4}, {}, {"tol": 1e-12}, {"stiff": True}])
+@pytest.mark.parametrize(
+    ("name", "potential", "force", "end", "steps"),
+    [
+        ("sags", "9.81*x + 50*x**2", "-2*x_dot", -0.0981, 1500),
+        ("comes_to_rest", "-9.81*cos(x - 0.2)", "-x_dot/2", 0.2, 500),
+        ("lies", "9.81*x", "max(0, -1e6*x - 1e3*x_dot)", -9.81e-6, 500),
+        ("lands", "9.81*x + exp(-x/5e-4)/1000", "-10*x_dot*exp(-x/5e-4)", None, 500),
+    ],
+)
+def test_what_has_come_to_rest_takes_few_steps(
+    name: str, potential: str, force: str, end: float | None, steps: int, how: dict
+) -> None:
+    """There a velocity is rounding of the position: by parts of it, steps were 1e5 and more."""
+    text = RESTS.format(name=name, potential=potential, force=force)
+    module = eomc.load(from_scene(parse(text, f"{name}.toml")), BUILDS)
+    run = module.simulate(**how)
+    assert run.status == "ok" and run.steps + run.rejected < steps
+    if end is None:  # where exp(-x/L) = 9.81 1000 L
+        end = -5e-4 * np.log(9.81 * 0.5)
+    assert run.q[-1, 0] == pytest.approx(end, rel=1e-12)
 
 
 def test_a_stiff_controller_with_limits_is_seen() -> None:
