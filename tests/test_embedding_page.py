@@ -22,6 +22,7 @@ TOOLS = {
     "In a C program": ["cc"],
     "In a CMake project": ["cmake", "g++", "pkg-config"],
     "On a small core": ["arm-none-eabi-gcc", "qemu-system-arm"],
+    "On a bare RISC-V core": ["riscv64-unknown-elf-gcc", "qemu-system-riscv32"],
     "A control loop": ["cc"],
     "A model's wheel": ["cc"],
 }
