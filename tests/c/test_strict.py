@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from itertools import product
 from pathlib import Path
 
@@ -46,6 +47,23 @@ def test_no_compiler_has_anything_to_say(which: str, name: str, tmp_path: Path) 
         how = [f"-std={standard}", *STRICT[1:], level, "-I.", "-c", *language]
         for file in files:
             compiled(*call, *how, file, cwd=tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MOST)
+def test_clang_cl_has_nothing_to_say(name: str, tmp_path: Path) -> None:
+    """Clang as Visual C++, its command line and language, with ziglang's headers of Windows."""
+    ziglang = pytest.importorskip("ziglang", reason="ziglang is not installed")
+    title, library = kit(name, tmp_path), Path(ziglang.__file__).parent / "lib"
+    call = [sys.executable, "-m", "ziglang", "clang", "--driver-mode=cl"]
+    call += ["--target=x86_64-pc-windows-msvc", "/Zs", "/W4", "/WX", "/I."]
+    for place in (library / "include", library / "libc/include/any-windows-any"):
+        call += ["-imsvc", str(place)]
+    for file in (f"{title}.c", "main.c", "selftest.c"):
+        compiled(*call, "/TC", file, cwd=tmp_path)
+    compiled(*call, "/TP", f"{title}.c", cwd=tmp_path)
+    (tmp_path / "bad.c").write_text("int f(void) { int y = 1; return 0; }\n", encoding="utf-8")
+    assert "unused variable" in run(*call, "/TC", "bad.c", cwd=tmp_path).stderr
 
 
 @pytest.mark.parametrize(

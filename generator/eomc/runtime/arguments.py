@@ -378,9 +378,11 @@ def as_count(value: Any, name: str, least: int) -> int:
 
 def machine_memory() -> float:
     """The bytes of memory that the machine has; a larger array may be handed out all the same."""
+    if sys.platform == "win32":
+        return float("inf")
     try:
         return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):
+    except (OSError, ValueError):
         return float("inf")
 
 

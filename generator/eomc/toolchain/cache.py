@@ -7,19 +7,15 @@ was there before stays whole. A file lock keeps builds of one scene apart.
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import hashlib
 import importlib.util
 import json
 import os
 import shutil
-import stat
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -30,12 +26,12 @@ from eomc.base import resources
 from eomc.base.errors import EomcError, FolderError
 from eomc.base.version import __version__
 from eomc.toolchain.compiler import MANY, STANDARD, compiler_for, flags, processor, standard
+from eomc.toolchain.lock import locked
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
 
 MANIFEST = "build.json"
-_NO_LOCK = "{}: is no file, and builds of a scene lock one there: remove it"
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,7 @@ def build(
         return Built(name, folder, False)
     try:
         root.mkdir(parents=True, exist_ok=True)
-        with _locked(root / f".{folder.name}.lock"):
+        with locked(root / f".{folder.name}.lock"):
             if found(folder, wanted):  # by another process, meanwhile
                 return Built(name, folder, False)
             _free(folder)
@@ -124,28 +120,6 @@ def build(
 def place(name: str, root: Path, form: str = "fast") -> Path:
     """The folder of a scene's module; that of the plain form, for comparison, lies inside it."""
     return root / name if form == "fast" else root / name / ".plain"
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """A lock on a file that is made where it isn't there; nothing is written to it.
-
-    Raises EomcError where something else lies there: no link is followed, no pipe waited for.
-    """
-    try:
-        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        lock = os.open(path, flags, 0o666)
-    except OSError as fault:
-        if fault.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV):
-            raise
-        raise EomcError(_NO_LOCK.format(path)) from None
-    try:
-        if not stat.S_ISREG(os.fstat(lock).st_mode):
-            raise EomcError(_NO_LOCK.format(path))
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(lock)
 
 
 def _free(folder: Path) -> None:

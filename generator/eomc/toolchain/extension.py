@@ -65,8 +65,17 @@ def build(
     if sys.platform == "darwin":
         link.insert(1, "-undefined")
         link.insert(2, "dynamic_lookup")
+    if sys.platform == "win32":
+        link.insert(link.index("-lm"), python_library(library))
     run(name, link, folder)
     _try(name, extension, folder / library, compiler)
+
+
+def python_library(library: str) -> str:
+    """What extensions are linked with on Windows, of their own Python or, abi3, of any Python 3."""
+    version = f"{sys.version_info[0]}{sys.version_info[1]}"
+    name = f"python{version if version in library else 3}.lib"
+    return str(Path(sys.base_prefix, "libs", name))
 
 
 # imports an extension from a file, with nothing of Python's own start-up but cffi's backend
