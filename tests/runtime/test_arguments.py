@@ -75,6 +75,7 @@ BAD_VALUES = [
     ("rhs", (0, np.ma.array([*Q, *QD], mask=[0, 0, 0, 1])), {}, r"x: 1 of 4 numbers are masked"),
     ("rhs", (0, [1, 2]), {}, r"x: shape \(2,\), expected \(4,\): q, then qd"),
     ("rhs", (0, None), {}, r"x: "),
+    ("rhs", (0, 10**400), {}, r"x: 10+ is not an array of numbers"),
 ]
 
 
@@ -104,6 +105,7 @@ BAD_RUNS = [
     ({"h": 1e-300, "duration": 1e300}, r"duration: 1e\+300 s are more steps .*take a larger h"),
     ({"h": 1e-300, "duration": 1}, r"duration: 1 s are more steps"),
     ({"steps": 10**30}, r"steps: 1e\+30 are more than a run can count"),
+    ({"steps": 10**400}, r"steps: so many are more than a run can count"),
     ({"q0": [0.0, 10**400]}, r"q0: .*is not an array of numbers"),
     ({"params": [10**400, 1, 1, 1]}, r"params: expected"),
     ({"h": "a"}, r"h: "),
@@ -175,3 +177,11 @@ def test_velocities_left_out_are_refused_not_read_from_nowhere() -> None:
 def test_too_many_rows_are_reported_before_the_run(cartpole: ModuleType) -> None:
     with pytest.raises(MemoryError, match=r"rows of 4 numbers don't fit in memory.*every="):
         cartpole.simulate(steps=10**15)
+
+
+def test_masks_may_be_in_the_middle_of_their_import(
+    driven: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By another thread: NumPy imports them when they are first asked for."""
+    monkeypatch.setitem(sys.modules, "numpy.ma", ModuleType("numpy.ma"))
+    assert driven.D(np.array(Q)).shape == (2, 2)

@@ -91,14 +91,20 @@ def test_wheels_and_massless_ropes_have_them_too(modules: Modules) -> None:
 
 def test_without_constraints_a_motion_tells_its_drives(modules: Modules) -> None:
     text = 'eomc = 1\nname = "cart_drives"\n[coordinates]\nx = {}\na = { start = 0.4 }\n[energy]\n'
-    text += 'kinetic = "x_dot**2 + x_dot*a_dot*cos(a) + a_dot**2"\npotential = "9*cos(a)"\n'
-    m: Any = modules.unoptimised(text + "[run]\ninverse_dynamics = true\n")
+    text += (
+        'kinetic = "x_dot**2 + x_dot*a_dot*cos(a) + m*a_dot**2"\npotential = "9*cos(a) + x**3"\n'
+    )
+    m: Any = modules.unoptimised(text + "[parameters]\nm = 1\n[run]\ninverse_dynamics = true\n")
     q, qd = np.array([0.0, 0.4]), np.array([0.1, 0.2])
     tau, none = m.drive_forces(q, qd, [1.0, 2.0])
     assert none.shape == (0,)
     np.testing.assert_allclose(tau, m.inverse_dynamics(q, qd, [1.0, 2.0]), rtol=1e-13)
     with pytest.raises(ValueError, match=r"forces along x can't give .*: name others.* 2 freedoms"):
         m.drive_forces(q, qd, [1.0, 2.0], ["x"])
+    with pytest.raises(m.MotionError, match=r"at .*a force .* is not finite there"):
+        m.drive_forces([1e200, 0.4], qd, [1.0, 2.0])
+    with pytest.raises(m.MotionError, match="D is not positive definite there"):
+        m.drive_forces(q, qd, [1.0, 2.0], params={"m": -1.0})
 
 
 def test_what_it_refuses(linkage: ModuleType) -> None:

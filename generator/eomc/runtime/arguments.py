@@ -309,8 +309,9 @@ class Arguments:
 
 def unmasked(value: Any, name: str) -> Any:
     """The value; a ValueError where it is an array with masked numbers, for these have none."""
-    ma = sys.modules.get("numpy.ma")  # NumPy imports it when it is first asked for
-    if ma and isinstance(value, ma.MaskedArray) and ma.is_masked(value):
+    ma: Any = sys.modules.get("numpy.ma")  # NumPy imports it when it is first asked for
+    masked = getattr(ma, "MaskedArray", ())  # another thread may be at that just now
+    if isinstance(value, masked) and ma.is_masked(value):
         raise ValueError(
             f"{name}: {ma.count_masked(value)} of {value.size} numbers are masked: "
             "fill them in first, with .filled(...), or leave these rows out"

@@ -109,6 +109,8 @@ class Constrained(Frames):
         """The tangent of one state."""
         of_q = A[: self._rows.holonomic]
         whole = np.block([[of_q, np.zeros_like(of_q)], [slopes, A]])
+        if not np.isfinite(whole).all():
+            raise MotionError("tangent: a constraint's slope is not finite there", "not finite")
         whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-300)
         _, sizes, rows = np.linalg.svd(whole)
         rank = int((sizes > 1e-9 * sizes[0]).sum()) if sizes.size else 0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .arguments import Array, Parameters, not_one_of
-from .trajectory import state_text
+from .trajectory import MotionError, state_text
 
 if TYPE_CHECKING:
     from .constrained import Constrained
@@ -35,7 +35,8 @@ def drive_forces(
     """(tau, lambda) of one state (q, qd, qdd), with tau + A^T lambda = force.
 
     tau is along the coordinates `which`. Where several are right, it is that of the least
-    tau^T D^-1 tau, which has no units to choose. Raises ValueError where none is.
+    tau^T D^-1 tau, which has no units to choose. Raises ValueError where none is, MotionError where
+    D is not positive definite, or something not finite.
     """
     kind = str(model.dtype)
     rows, least = model._rows, _DEPENDENT[kind]
@@ -44,10 +45,17 @@ def drive_forces(
     if solved:
         A = np.asarray(model.constraint_jacobian(state[0], t=t, params=params)[solved], float)
         _rows_keep(model, A, [rows.names[k] for k in solved], state, t, params)
+    D = np.asarray(model.D(state[0], t=t, params=params), float)
+    if not all(np.isfinite(x).all() for x in (D, A, force)):
+        words = "D, a force or a constraint's slope is not finite there"
+        raise MotionError(f"at {state_text(*state[:2])}: {words}", "not finite")
     along = _along(A, least)
     B, right = along.T[:, which], along.T @ force
-    D = np.asarray(model.D(state[0], t=t, params=params), float)
-    L = np.linalg.cholesky(np.linalg.inv(_regular(D, A))[np.ix_(which, which)])
+    try:
+        L = np.linalg.cholesky(np.linalg.inv(_regular(D, A))[np.ix_(which, which)])
+    except np.linalg.LinAlgError:
+        words = "D is not positive definite there, so no force is the least"
+        raise MotionError(f"at {state_text(*state[:2])}: {words}", "singular") from None
     found = np.linalg.lstsq(np.linalg.solve(L, B.T).T, right, rcond=least)[0]
     tau = np.zeros(model.nq)
     tau[which] = np.linalg.solve(L.T, found)

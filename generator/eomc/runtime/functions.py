@@ -342,7 +342,10 @@ class Functions(Arguments):
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
-        n, state = self.nq, np.asarray(unmasked(x, "x"), self.dtype)
+        try:
+            n, state = self.nq, np.asarray(unmasked(x, "x"), self.dtype)
+        except OverflowError:
+            n, state = self.nq, self._numbers(x, "x")
         if state.shape != (2 * n,):
             raise ValueError(f"x: shape {state.shape}, expected ({2 * n},): q, then qd")
         out = empty(2 * n, self.dtype)

@@ -185,7 +185,8 @@ class Model(Constrained):
                 raise ValueError("steps: give steps or duration, not both")
             count = as_count(steps, "steps", 0)
             if count > _MOST:
-                raise ValueError(f"steps: {count:.3g} are more than a run can count, {_MOST:.3g}")
+                shown = f"{count:.3g}" if count < 10**300 else "so many"
+                raise ValueError(f"steps: {shown} are more than a run can count, {_MOST:.3g}")
             return count
         time = self.duration if duration is None else as_number(duration, "duration")
         if words := beyond_end(h, time):
