@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import venv
@@ -65,6 +66,36 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if done.returncode:
         pytest.skip(f"its dependencies can't be installed: {done.stderr.strip()[-200:]}")
     return found
+
+
+def interpreter(version: str) -> str:
+    """Another Python, of the system or of pyenv; the test is skipped where there is none."""
+    kept = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    for found in (shutil.which(f"python{version}"), *kept.glob(f"{version}.*/bin/python")):
+        code = "import sys; print('%d.%d' % sys.version_info[:2])"
+        done = subprocess.run([found or "false", "-c", code], capture_output=True, text=True)
+        if done.stdout.strip() == version:
+            return str(found)
+    pytest.skip(f"there is no Python {version}")
+
+
+@pytest.mark.parametrize("version", ["3.12", "3.13", "3.14"])
+def test_other_pythons_build_and_run(version: str, tmp_path: Path) -> None:
+    other = interpreter(version)
+    subprocess.run([other, "-m", "venv", str(tmp_path / "venv")], check=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    done = pip(python, str(made("wheel", ROOT, tmp_path, "")))
+    if done.returncode:
+        pytest.skip(f"its dependencies can't be installed: {done.stderr.strip()[-200:]}")
+    (tmp_path / "work").mkdir()
+    for words, said in COMMANDS:
+        if words.split()[0] in ("new", "build", "check", "show"):
+            done = subprocess.run(
+                [str(python.parent / "eomc"), *words.split()], capture_output=True, text=True,
+                cwd=tmp_path / "work", env=environment(), stdin=subprocess.DEVNULL,
+            )  # fmt: skip
+            assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
+            assert said in done.stdout, f"{words}: {done.stdout}"
 
 
 @pytest.mark.parametrize("kind", ["wheel", "sdist", "clone"])

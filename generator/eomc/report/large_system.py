@@ -169,6 +169,12 @@ def _latex_recursion(tree: Tree, write: Typesetter) -> list[str]:
     turned, r, c = rf"R_{{k}}{T}", r"[r_{k}]_{\times}", r"[c_{k}]_{\times}"
     X, body = [[turned, "0"], [f"-{turned} {r}", turned]], [["J_{k}", c], [f"-{c}", "m_{k}"]]
     return [
+        r"  & \text{Joint } k \text{ on } p \text{ moves by } s_{k} \text{ along } S_{k}; "
+        r"\; r_{k}, R_{k} \text{: its frame in that of } p;",
+        rf"{GOES_ON}v_{{k}}, a_{{k}} \text{{: its twist (angular, linear) and the rate; }} "
+        r"f_{k} \text{: its wrench;}",
+        rf"{GOES_ON}m_{{k}}, c_{{k}}, J_{{k}} \text{{: mass, mass times its centre, inertia about "
+        r"the frame's origin.}",
         r"  v_{k} &= X_{k} \, v_{p} + S_{k} \, \dot{s}_{k}, \quad v_{0} = 0",
         r"  a_{k} &= X_{k} \, a_{p} + S_{k} \, \ddot{s}_{k} + v_{k} \times S_{k} \, \dot{s}_{k}, "
         rf"\quad a_{{0}} = \left(0, -\gamma\right), \; \gamma = {_vector(tree.gravity, write)}",
