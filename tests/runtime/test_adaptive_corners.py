@@ -99,10 +99,10 @@ def test_single_precision(modules: Modules) -> None:
 @pytest.mark.parametrize("text", [STUCK, SLIDING], ids=["sticks", "slides"])
 def test_forces_that_keep_jumping_end_the_run_soon(text: str, modules: Modules) -> None:
     module = modules.unoptimised(text)
-    for tol in (1e-4, 1e-6, 1e-12):
+    for tol in (1e-3, 1e-6, 1e-12):
         with pytest.warns(RuntimeWarning, match="stopped at t = "):
             run = module.simulate(tol=tol)
-        assert run.status == "no convergence" and run.steps + run.rejected < 10_000
+        assert run.status == "no convergence" and run.steps + run.rejected < 20_000
 
 
 def test_it_is_compiled_for_corners_alone(tmp_path: Path) -> None:
