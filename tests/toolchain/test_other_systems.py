@@ -40,8 +40,8 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_LOCK=1))  # type: ignore[arg-type]
     monkeypatch.setitem(sys.modules, "fcntl", None)  # type: ignore[arg-type]
     monkeypatch.setattr(sys, "platform", "win32")
-    for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"):
-        monkeypatch.delattr(os, name)
+    there = ("open", "close", "fstat", "O_RDWR", "O_CREAT")
+    monkeypatch.setattr(lock, "os", SimpleNamespace(**{name: getattr(os, name) for name in there}))
     return taken
 
 

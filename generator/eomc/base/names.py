@@ -29,7 +29,7 @@ float_t double_t linux unix i386""".split()
 
 # scenes that would be files of a build next to theirs, and those whose functions would be macros
 _FILES = frozenset("main selftest binding".split())
-_MACROS = re.compile(r"U?INT(8|16|32|64|MAX)|Py_\w+|(?i:SIG|PYMACCONFIG|HAVE_\w+)")
+_MACROS = re.compile(r"U?INT(8|16|32|64|MAX)|Py_\w+|(?i:SIG|PY_?MACCONFIG|HAVE_\w+)")
 
 _FORMULA = "abs sign heaviside dot min max pi t".split()
 
