@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import mmap
 import os
 import random
@@ -349,6 +350,8 @@ def main(arguments: Sequence[str]) -> int:
         child = os.fork()
         if child == 0:
             status = 3
+            # where a call hangs, its place is told
+            faulthandler.dump_traceback_later(100 + given.count / 100, exit=True)
             try:
                 status = run(names, first, count, given.seed, given.threads, shared)
             except BaseException:

@@ -251,7 +251,7 @@ def test_right_modules_of_these_numbers_pass(seed: str, tmp_path: Path) -> None:
     assert found.outcome == "passed", found
 
 
-WIDE_SEEDS = "120 124 143 150".split()  # the same of scene_author_wide
+WIDE_SEEDS = "120 124 143 150 1088".split()  # the same of scene_author_wide
 
 
 @pytest.mark.slow

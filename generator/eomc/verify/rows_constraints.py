@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 VALUES = ("constraints", "constraint_rates", "constraint_jacobian", "multipliers")
 WORK = 1e-9  # of what multipliers do: velocities of bodies are good to 1e-12
+ROUNDED = 30  # roundings of multipliers and forces, where those are more: in single precision
 STATES = 4
 WIDTHS = (0.1, 0.01, 1e-3)  # of the lines along which bodies move, s at one `spread` a second
 STEPS = 200  # of a run that is to stay on the rows
@@ -49,7 +50,8 @@ def report(of: Comparison, plain: Any) -> None:
         of.row("A beside differences", SLOPE, "of A", rows.slopes)
     of.row("power of multipliers", LIMIT, UNITS, rows.power)
     if of.system.reactions:
-        of.row("reactions: virtual work", WORK, "of its size", rows.reactions)
+        limit = max(WORK, ROUNDED * of.eps)
+        of.row("reactions: virtual work", limit, "of its size", rows.reactions)
     for module, form in ((of.module, ""), (plain, "plain C: ")):
         if module is None:
             continue
