@@ -11,8 +11,11 @@ import venv
 from pathlib import Path
 
 import pytest
+from cases import SCENES
 from conftest import ROOT
 from toolchain.test_packaging import made
+
+from eomc import pipeline
 
 pytestmark = pytest.mark.slow
 ROBOT = """<robot name="arm">
@@ -80,7 +83,10 @@ def interpreter(version: str) -> str:
 
 
 @pytest.mark.parametrize("version", ["3.12", "3.13", "3.14"])
-def test_other_pythons_build_and_run(version: str, tmp_path: Path) -> None:
+def test_other_pythons_build_and_run(
+    version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Scenes, and the wheel of a model that this Python has made."""
     other = interpreter(version)
     subprocess.run([other, "-m", "venv", str(tmp_path / "venv")], check=True)
     python = tmp_path / "venv" / "bin" / "python"
@@ -96,6 +102,14 @@ def test_other_pythons_build_and_run(version: str, tmp_path: Path) -> None:
             )  # fmt: skip
             assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
             assert said in done.stdout, f"{words}: {done.stdout}"
+    monkeypatch.setenv("EOMC_CFLAGS", "-O1")
+    wheel = pipeline.write_wheel(SCENES / "furuta_pendulum.toml", tmp_path)
+    assert pip(python, "--no-deps", str(wheel)).returncode == 0
+    code = "import furuta_pendulum; print(furuta_pendulum.simulate(steps=100).status)"
+    done = subprocess.run(
+        [python, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment()
+    )
+    assert done.stdout == "ok\n", done.stderr
 
 
 @pytest.mark.parametrize("kind", ["wheel", "sdist", "clone"])
