@@ -85,3 +85,30 @@ def test_a_wheel_and_one_of_the_sdist(tmp_path: Path, backend: str) -> None:
     assert Path(place).is_relative_to(site) and status == "ok"
     script = (site / "bin" / "eomc").read_text(encoding="utf-8")
     assert "from eomc.cli.main import main" in script
+
+
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_the_same_sources_make_the_same_bytes(kind: str, tmp_path: Path, backend: str) -> None:
+    """In another folder, with other times and rights of its files: no date goes in."""
+    keep = "generator templates csrc scenes README.md LICENSE CHANGELOG.md pyproject.toml".split()
+    found = []
+    for place, mask, stamp in (
+        ("one", 0o022, 1_000_000_000),
+        ("other/deeper", 0o002, 1_500_000_000),
+    ):
+        source = tmp_path / place / "tree"
+        source.mkdir(parents=True)
+        for name in keep:
+            skip = shutil.ignore_patterns("__pycache__")
+            if (ROOT / name).is_dir():
+                shutil.copytree(ROOT / name, source / name, ignore=skip)
+            else:
+                shutil.copy(ROOT / name, source / name)
+        for file in source.rglob("*"):
+            os.utime(file, (stamp, stamp))
+            file.chmod(0o777 & ~mask if file.is_dir() else 0o666 & ~mask)
+        (tmp_path / place / "out").mkdir()
+        made(kind, source, tmp_path / place / "out", backend)
+        (file,) = (tmp_path / place / "out").iterdir()
+        found.append((file.name, file.read_bytes()))
+    assert found[0] == found[1]
