@@ -138,3 +138,14 @@ def test_a_row_too_few_is_told(balanced: ModuleType) -> None:
         balanced.simulate(u=np.zeros((9, 2)), steps=40, control_period=0.02)
     with pytest.raises(ValueError, match=r"expected \(2,\), \(batch, 2\) or \(batch, 10, 2\)"):
         balanced.simulate_batch(u=np.zeros((3, 9, 2)), steps=40, control_period=0.02)
+
+
+@pytest.mark.parametrize("period", [1e12, 1e300])
+def test_a_period_may_be_longer_than_the_run(balanced: ModuleType, period: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        run = balanced.simulate(steps=7, u=law, control_period=period)
+    assert np.all(run.u == run.u[0]) and run.u.shape == (8, 2)
+    assert balanced.simulate(steps=7, control_period=period).steps == 7
+    runs = balanced.simulate_batch(np.zeros((3, 2)), steps=7, u=[[1.0, 0.0]], control_period=period)
+    assert np.all(runs.steps == 7)

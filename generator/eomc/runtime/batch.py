@@ -212,7 +212,7 @@ class BatchModel(Model):
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
-        hold = as_period(control_period, h)
+        hold = min(as_period(control_period, h), max(steps, 2))
         if u is None and control_period is not None and self.nu:
             raise ValueError("control_period: a batch follows the signals: give u, a row a period")
         starts, table, held, count = self._instances(q0, qd0, params, u, -(-steps // hold), t0)

@@ -269,7 +269,7 @@ class Model(Constrained):
         t0 = as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
-        hold = as_period(control_period, h)
+        hold = min(as_period(control_period, h), max(steps, 2))  # a period may be beyond the run
         if u is None and control_period is not None and self.nu:
             u = Sampled(self, params)
         if steps >= SOME and (method, h) not in self._warned:

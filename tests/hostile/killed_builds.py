@@ -1,0 +1,138 @@
+"""Builds that are killed: at each change of a file, and at random moments.
+
+    python tests/hostile/killed_builds.py                  at every change, then at 100 moments
+    python tests/hostile/killed_builds.py --moments 1000
+
+A good module is there, and its scene has changed. After each kill the module that is there has to
+be the old one or the new one, whole, and the next build makes the new one and leaves nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from builds import CHANGED, TEXT, gravity, leftovers
+from instrument import in_a_fork
+
+import eomc
+
+RENAMES = {"os.rename"}
+CHANGES = RENAMES | {
+    "os.remove",
+    "os.mkdir",
+    "os.rmdir",
+    "os.link",
+    "os.symlink",
+    "os.chmod",
+    "open",
+}
+WRITES = os.O_WRONLY | os.O_RDWR
+OLD = 8.2548  # its g at 1 rad
+
+
+class Killed:
+    """A folder with a module, builds in forks that are killed, and what they leave."""
+
+    def __init__(self, folder: Path) -> None:
+        os.environ["EOMC_CFLAGS"] = "-O0"
+        self.scene, self.root = folder / "simple_pendulum.toml", folder / "build"
+        self.outcomes: Counter[str] = Counter()
+
+    def renew(self) -> None:
+        """The old module, whole, and a scene that has changed."""
+        self.scene.write_text(TEXT, encoding="utf-8")
+        eomc.build(self.scene, self.root)
+        assert leftovers(self.root) == []
+        self.scene.write_text(CHANGED, encoding="utf-8")
+
+    def at_change(self, n: int, kinds: set[str]) -> bool:
+        """Whether a build had an n-th change of a file; it was killed just before it."""
+        self.renew()
+
+        def build() -> None:
+            seen = 0
+
+            def audit(event: str, args: tuple[Any, ...]) -> None:
+                nonlocal seen
+                if event not in kinds or (event == "open" and not (args[2] or 0) & WRITES):
+                    return
+                seen += 1
+                if seen == n:
+                    os.kill(os.getpid(), signal.SIGKILL)
+
+            sys.addaudithook(audit)
+            eomc.build(self.scene, self.root)
+
+        how, _ = in_a_fork(build, 60)
+        if how == "done":
+            return False
+        assert how == "killed", how
+        self.judge(f"change {n}")
+        return True
+
+    def at_moment(self, seconds: float) -> None:
+        """Killed so long after it began, unless it was over."""
+        self.renew()
+        child = os.fork()
+        if child == 0:
+            os.setpgid(0, 0)
+            eomc.build(self.scene, self.root)
+            os._exit(0)
+        time.sleep(seconds)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        self.judge(f"{seconds:.3f} s")
+
+    def judge(self, when: str) -> None:
+        """Old or new, and mended by the next build."""
+        found = gravity(self.root)
+        kind = "old" if abs(found - OLD) < 1e-3 else "new" if abs(found - 2 * OLD) < 2e-3 else ""
+        assert kind, f"at {when} the module was neither: g = {found}"
+        self.outcomes[kind] += 1
+        eomc.build(self.scene, self.root)
+        assert abs(gravity(self.root) - 2 * OLD) < 2e-3, when
+        assert leftovers(self.root) == [], (when, leftovers(self.root))
+
+    def everything(self, kinds: set[str], moments: int, seed: int) -> str:
+        """What was done and found, in a line."""
+        changes = 0
+        while self.at_change(changes + 1, kinds):
+            changes += 1
+        began = time.perf_counter()
+        self.renew()
+        eomc.build(self.scene, self.root)
+        whole = (time.perf_counter() - began) / 2
+        draw = random.Random(seed)
+        for _ in range(moments):
+            self.at_moment(draw.uniform(0, 1.1 * whole))
+        told = ", ".join(f"{n} {what}" for what, n in self.outcomes.most_common())
+        return f"killed at {changes} changes of files and {moments} moments: {told}"
+
+
+def main(arguments: Sequence[str]) -> int:
+    """An AssertionError where something was lost."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--moments", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--renames", action="store_true", help="at renames alone, not each change")
+    given = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        kinds = RENAMES if given.renames else CHANGES
+        print(Killed(Path(folder)).everything(kinds, given.moments, given.seed))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
