@@ -67,5 +67,7 @@ def _outputs(system: System, sloped: bool, more: Sequence[Symbol]) -> Outputs:
     for defined, expr in needed(system.definitions, [o.formula for o in system.outputs]):
         known[defined] = tape.named(value(expr), defined.name)
     values = tuple(tape.named(value(o.formula), o.name) for o in system.outputs)
-    along = (*state, *system.u, *system.qdd) if sloped else ()
+    if not sloped:
+        return Outputs(tape, values, ((),) * len(values))
+    along = (*state, *system.u, *system.qdd)
     return Outputs(tape, values, tuple(tuple(tape.gradient([(y, S.One)], along)) for y in values))

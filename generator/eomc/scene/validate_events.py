@@ -10,6 +10,11 @@ from eomc.scene.scene import Event
 from eomc.scene.schema import Document, EventTable
 from eomc.scene.scope import Checker
 
+MODE = (
+    ", and does not change in a run: what events change is a coordinate of its own, with "
+    "{name}_dot**2/2 in the kinetic energy"
+)
+
 
 def events(check: Checker, doc: Document) -> Iterator[Event]:
     """The events of a document; faults are reported."""
@@ -42,6 +47,8 @@ def _jump(
         path = ("event", k, name)
         if name not in state:
             remedy = suggest(name, [*state, *EventTable.model_fields])
+            if name in {**doc.parameters, **doc.inputs, **doc.constants}:
+                remedy = MODE.format(name=name)
             remedy = remedy or f": a jump sets {', '.join(state[:9])}"
             check.say(path, f"'{name}' is no coordinate or velocity{remedy}")
         elif isinstance(value, bool) or not isinstance(value, (int, float, str)):
