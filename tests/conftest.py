@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from cases import SCENES
+from hypothesis import HealthCheck, settings
 
 import eomc
 from eomc.model.from_scene import from_scene
@@ -32,6 +33,9 @@ gc.set_threshold(20_000, 20, 100)  # SymPy makes many values and few cycles
 
 ROOT = Path(__file__).parent.parent
 os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", str(ROOT / "build" / ".hypothesis"))
+# how long a busy machine takes to think of inputs is no fault of what they are given to
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 # kept from one run of the tests to the next
 MODULES = ROOT / "build" / "tests" / "modules"
 UNOPTIMISED = ROOT / "build" / "tests" / "unoptimised"
