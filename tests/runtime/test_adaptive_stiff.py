@@ -113,6 +113,12 @@ def test_many_take_the_steps_that_each_takes_alone(train: ModuleType) -> None:
     for k in (0, 5, 8):
         alone = train.simulate(q0[k], params={"c": c[k]}, tol=1e-8, times=[0.0, 2.0, 5.0])
         assert np.array_equal(runs.q[k], alone.q) and runs.steps[k] == alone.steps
+        assert runs.stiff_steps[k] == alone.stiff_steps
+    assert (runs.stiff_steps > 0).any() and not (runs.stiff_steps > 0).all()
+    begun = train.simulate_batch(q0, tol=1e-8, times=[0.0, 0.1], stiff=True)
+    assert (begun.stiff_steps > 0).all() and set(begun.status) == {"ok"}
+    alone = train.simulate(q0[8], tol=1e-8, times=[0.0, 0.1], stiff=True)
+    assert np.array_equal(begun.q[8], alone.q) and begun.stiff_steps[8] == alone.stiff_steps
 
 
 def test_calm_motion_goes_back_to_sweeps(train: ModuleType) -> None:
@@ -308,5 +314,6 @@ duration = 10
     ],
 )
 def test_what_stiff_is_not(train: ModuleType, how: dict, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        train.simulate(**how)
+    for simulate in (train.simulate, train.simulate_batch):
+        with pytest.raises(ValueError, match=words):
+            simulate(**how)

@@ -240,9 +240,7 @@ def simulate(
     times: ArrayLike | None, h_most: float | None, stiff: bool, **fixed: Any,
 ) -> AdaptiveRun:  # fmt: skip
     """`Model.simulate` with a tolerance; fixed: what belongs to fixed steps, and was given."""
-    tol, most = as_limits(model, tol, h_most, fixed)
-    if not isinstance(stiff, (bool, np.bool_)):
-        raise ValueError(f"stiff: {stiff!r} is not True or False")
+    tol, most = as_limits(model, tol, h_most, stiff, fixed)
     if u is not None and (callable(u) or np.ndim(u) > 1):
         raise ValueError(
             "u: adaptive steps take the scene's signals, or one value an input, held over the "
@@ -393,9 +391,11 @@ BOTH = "times: say where the run ends; give times or duration, not both"
 
 
 def as_limits(
-    model: Model, tol: float | None, h_most: float | None, fixed: Mapping[str, Any]
+    model: Model, tol: float | None, h_most: float | None, stiff: Any, fixed: Mapping[str, Any]
 ) -> tuple[float, float]:
     """(tolerance, longest step or 0); fixed: what belongs to fixed steps, and may be given."""
+    if not isinstance(stiff, (bool, np.bool_)):
+        raise ValueError(f"stiff: {stiff!r} is not True or False")
     if model.tolerance is None:
         raise ValueError(
             "tol, times, stiff: not built; a scene asks for them with [run] tolerance = 1e-9 (of a "

@@ -182,7 +182,7 @@ class BatchModel(Model):
         params: Any = None, u: ArrayLike | None = None, threads: int | None = None,
         method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
         progress: Callable[[int, int], None] | None = None, tol: float | None = None,
-        times: ArrayLike | None = None, h_most: float | None = None,
+        times: ArrayLike | None = None, h_most: float | None = None, stiff: bool = False,
     ) -> BatchRun:  # fmt: skip
         """Trajectories of many instances; see `simulate` for what is not here.
 
@@ -195,13 +195,13 @@ class BatchModel(Model):
         tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
         at the start and the end where None.
         """
-        given = tol is not None or times is not None or h_most is not None
+        given = tol is not None or times is not None or h_most is not None or stiff is not False
         if given or self._fits(h, steps, method):
             from . import batch_adaptive  # which needs this file
 
             fitted, whole = batch_adaptive.simulate(
-                self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most, h=h,
-                steps=steps, method=method, every=every, control_period=control_period,
+                self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
+                stiff, h=h, steps=steps, method=method, every=every, control_period=control_period,
             )  # fmt: skip
             if not whole:
                 raise Interrupted(fitted)

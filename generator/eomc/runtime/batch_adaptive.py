@@ -24,21 +24,22 @@ if TYPE_CHECKING:
 
 _GROUP = 16  # instances that a thread takes at once
 _FEW = 64  # steps of an instance before the first look at Ctrl-C
-_NAMES = ("tol", "evaluations", "rejected", "reached", "_times")
+_NAMES = ("tol", "evaluations", "rejected", "stiff_steps", "reached", "_times")
 
 
 @dataclass(eq=False, repr=False)
 class AdaptiveBatchRun(BatchRun):
     """Trajectories by steps that fit `tol`, rows at the same times for all.
 
-    evaluations, rejected: of each instance, (batch,). reached: the time to which each has come,
-    (batch,), s; rows behind it are nan, as where an event stops an instance. Everything else as
-    in a BatchRun.
+    evaluations, rejected, stiff_steps: of each instance, (batch,). reached: the time to which each
+    has come, (batch,), s; rows behind it are nan, as where an event stops an instance. Everything
+    else as in a BatchRun.
     """
 
     tol: float = field(kw_only=True)
     evaluations: Array = field(kw_only=True)
     rejected: Array = field(kw_only=True)
+    stiff_steps: Array = field(kw_only=True)
     reached: Array = field(kw_only=True)
     _times: Array = field(kw_only=True)
 
@@ -82,10 +83,10 @@ def simulate(
     model: BatchModel, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
     params: Any, u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float | None, times: ArrayLike | None,
-    h_most: float | None, **fixed: Any,
+    h_most: float | None, stiff: bool, **fixed: Any,
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
     """`simulate_batch` by a tolerance, and whether it is whole, not cut off by Ctrl-C."""
-    tol, most = as_limits(model, tol, h_most, fixed)
+    tol, most = as_limits(model, tol, h_most, stiff, fixed)
     t0 = as_number(t0, "t0")
     if times is None:
         end = as_end(model, t0, duration)
@@ -96,17 +97,20 @@ def simulate(
     starts, table, held, _ = model._instances(q0, qd0, params, u, 1, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
     work = _Work(model, np.ascontiguousarray(np.hstack([q, qd])), t0, rows, tol, most, held, table)
+    for w in work.works:
+        w.stiff = bool(stiff)
     whole = work.run(threads, progress)
     kept = np.arange(len(rows)) < work.kept[:, None]
     for values in work.rows:
         values[~kept] = np.nan
-    counts = np.array([[w.steps, w.evaluations, w.rejected] for w in work.works])
+    counts = np.array([[w.steps, w.evaluations, w.rejected, w.stiff_steps] for w in work.works])
     codes = np.where((work.status == 0) & work.open, len(STATUS), work.status).astype("i")
     span = float(rows[-1]) - t0
     made = AdaptiveBatchRun(
         model, t0, work.rows[0], work.rows[1], span / max(1.0, float(counts[:, 0].mean())),
         counts[:, 0], codes, 1, 0, table.copy(), held, "gauss16", tol=tol,
-        evaluations=counts[:, 1], rejected=counts[:, 2], reached=work.t, _times=rows,
+        evaluations=counts[:, 1], rejected=counts[:, 2], stiff_steps=counts[:, 3],
+        reached=work.t, _times=rows,
     )  # fmt: skip
     return made, whole
 
