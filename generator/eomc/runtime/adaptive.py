@@ -91,7 +91,7 @@ class AdaptiveRun(Run):
                 f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
                 f"run ends, after {done}"
             )
-        said = SAID[self.status].replace("take a smaller h", "take a looser tolerance")
+        said = STOPPED if self.status == "no convergence" else SAID[self.status]
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
         return f"stopped at t = {end:.9g} after {done}, {where}: {said}"
@@ -387,6 +387,10 @@ class _Found:
         return np.concatenate(which), np.concatenate(rows)
 
 
+STOPPED = (
+    "no step is short enough to go on; where forces keep jumping, as friction by sign(x_dot) that "
+    "sticks, take tanh(x_dot/0.001), or let events switch them; else a looser tolerance"
+)
 BOTH = "times: say where the run ends; give times or duration, not both"
 
 
