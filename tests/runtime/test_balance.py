@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from conftest import Modules
+from scipy.integrate import trapezoid
 
 from eomc.runtime.balance import _work as work
 
@@ -64,7 +65,7 @@ def test_inputs_and_forces_are_told_apart(pushed: ModuleType) -> None:
     rows = pushed.simulate(**EXACT, params={"a": 0.7})
     assert still.inputs == 0
     assert still.forces == pytest.approx(
-        np.trapezoid(0.7 * np.cos(rows.t) * rows.qd[:, 0], rows.t), rel=1e-5
+        trapezoid(0.7 * np.cos(rows.t) * rows.qd[:, 0], rows.t), rel=1e-5
     )
     assert balance.inputs == pytest.approx(3 * (run.q[-1, 0] - run.q[0, 0]), rel=1e-6)
     change = run.energy[-1] - run.energy[0]
