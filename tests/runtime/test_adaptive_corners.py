@@ -105,6 +105,23 @@ def test_forces_that_keep_jumping_end_the_run_soon(text: str, modules: Modules) 
         assert run.status == "no convergence" and run.steps + run.rejected < 20_000
 
 
+STRIBECK = "-(1 + exp(-(x_dot/0.05)**2))*x_dot/(1 + 20*x_dot**2)/2"
+
+
+@pytest.mark.parametrize(
+    "friction", ["-atan(x_dot/0.02)/3", "-x_dot/sqrt(x_dot**2 + 4e-4)/2", STRIBECK]
+)
+def test_friction_smoothed_otherwise_is_seen(friction: str, modules: Modules) -> None:
+    """Steep in a velocity: the end erred by 1e-3 and more, whatever the tolerance."""
+    text = RUBBED.replace("-0.3*sign(x_dot)", friction).replace("rubbed", "smoothed")
+    text = text.replace("[run]", '[run]\nmethod = "dp8"')
+    module = modules.unoptimised(text)
+    end = module.simulate(h=2e-5, method="dp8").x[-1]
+    for tol in (1e-5, 1e-8, 1e-11):
+        run = module.simulate(tol=tol)
+        assert run.status == "ok" and np.abs(run.x[-1] - end).max() < 20 * tol
+
+
 def test_it_is_compiled_for_corners_alone(tmp_path: Path) -> None:
     smooth = PENDULUM.replace("limits", "note").replace("[-1.5, 1.5]", '"free"')
     for text, there in ((PENDULUM, True), (smooth, False)):

@@ -17,7 +17,7 @@ from eomc.emit.plain.adaptive_views import (
     AdaptiveRun,
 )
 from eomc.integrators.tableaux import GAUSS16, Row
-from eomc.model.corners import STEEP, corners
+from eomc.model.corners import steep
 from eomc.model.system import System
 from eomc.scene.schema import LOOSEST
 
@@ -36,7 +36,7 @@ def memory(functions: Functions) -> str:
 
 def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
-    vectors, few = (8, 24) if corners(system, STEEP) else (6, 20)
+    vectors, few = (8, 24) if steep(system) else (6, 20)
     stages = METHOD.stages * len(system.coordinates)
     return vectors * width + stages + few + 2 * len(system.events)
 
@@ -177,7 +177,7 @@ def steps(made: Stepping) -> Adaptive:
         start=form.start,
         settled=made.settle.call(most=f"{target.literal(2 * 0.8**-8)}*aim", **known),
         within=made.within,
-        corners=bool(corners(target.system, STEEP)),
+        corners=steep(target.system),
         close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
         share=target.literal(SHARE),
         top=c.in_braces(numbers(m.legendre(n), real) for n in range(m.stages - 4, m.stages)),

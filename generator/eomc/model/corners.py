@@ -1,4 +1,4 @@
-"""Where forces jump or bend."""
+"""Where forces jump or bend, or may do so to steps that are longer than it takes."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from typing import Any
 
 import sympy
 
+from eomc.model.symbols import dot
 from eomc.model.system import System
 
 KINDS = (sympy.sign, sympy.Heaviside, sympy.Abs, sympy.Min, sympy.Max)
-STEEP = (*KINDS, sympy.tanh)  # which is a corner to steps that are longer than it is wide
+STEEP = (*KINDS, sympy.tanh, sympy.atan)  # corners to steps longer than they are wide
 
 
 def corners(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
@@ -24,3 +25,31 @@ def corners(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
     )
     found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
     return ", ".join(sorted(found))
+
+
+def steep(system: System) -> bool:
+    """Whether there are corners, or what may be one to a long step.
+
+    That is tanh or atan of anything, and whatever is not a polynomial, sine or cosine in the
+    velocities, such as friction that is smoothed by v/sqrt(v**2 + w**2) or Stribeck's exp(-v**2).
+    """
+    if corners(system, STEEP):
+        return True
+    s, fast = system, set(system.qd)
+    for name, e in s.definitions:
+        if e.free_symbols & fast or e.has(dot):
+            fast.add(name)
+    exprs = (
+        s.dissipation, *s.forces, *(f for _, f in s.applied), *(e for _, e in s.definitions),
+        *(i.signal for i in s.inputs),
+    )  # fmt: skip
+    return any(
+        (f.free_symbols & fast or f.has(dot)) and not _gentle(f)
+        for e in exprs
+        for f in e.atoms(sympy.Function, sympy.Pow)
+    )
+
+
+def _gentle(f: sympy.Expr) -> bool:
+    whole = f.is_Pow and f.exp.is_Integer and f.exp > 0
+    return bool(whole or isinstance(f, (dot, sympy.sin, sympy.cos)))
