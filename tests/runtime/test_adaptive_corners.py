@@ -122,6 +122,28 @@ def test_friction_smoothed_otherwise_is_seen(friction: str, modules: Modules) ->
         assert run.status == "ok" and np.abs(run.x[-1] - end).max() < 20 * tol
 
 
+@pytest.mark.parametrize(
+    ("potential", "force"),
+    [
+        ("sqrt(x**2 + 1e-6)", "0"),
+        ("9.81*x + exp(-x/5e-4)/1000", "0"),
+        ("x**2/2", "0.1/(1 + exp(-x/0.001))"),
+        ("x**2/2", "0.1/(1 + exp(-(t - 2)/0.001))"),
+    ],
+)
+def test_what_is_steep_in_position_or_time_is_seen(
+    potential: str, force: str, modules: Modules
+) -> None:
+    """By coefficients that hardly fall; the square law was up to 1e6 tolerances off."""
+    text = RUBBED.replace("-0.3*sign(x_dot)", force).replace("8*x**2", potential)
+    text = text.replace("[run]", '[run]\nmethod = "dp8"').replace("rubbed", "passing")
+    module = modules.unoptimised(text)
+    end = module.simulate(h=2e-5, method="dp8").x[-1]
+    for tol in (1e-6, 1e-9):
+        run = module.simulate(tol=tol)
+        assert run.status == "ok" and np.abs(run.x[-1] - end).max() < 50 * tol
+
+
 def test_it_is_compiled_for_corners_alone(tmp_path: Path) -> None:
     smooth = PENDULUM.replace("limits", "note").replace("[-1.5, 1.5]", '"free"')
     for text, there in ((PENDULUM, True), (smooth, False)):
