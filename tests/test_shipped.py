@@ -1,0 +1,101 @@
+"""docs/SECURITY.md lists what is shipped and what it needs, with licences; it can't go stale."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import tomllib
+from importlib.metadata import PackageNotFoundError, metadata, requires
+from pathlib import Path
+
+from conftest import ROOT
+from packaging.requirements import Requirement
+
+PAGE = (ROOT / "docs" / "SECURITY.md").read_text(encoding="utf-8")
+ROWS = re.findall(r"^\| ([\w-]+) \| (>=[\d.]+) \| (MIT|BSD|PSF) \| (.+) \|$", PAGE, re.M)
+EXTRAS = {"plot": "eomc[plot]", "cc": "eomc[cc]"}
+SHIPPED = [f for part in ("generator/eomc", "templates", "csrc", "scenes") for f in
+           (ROOT / part).rglob("*") if f.is_file() and "__pycache__" not in f.parts]  # fmt: skip
+
+
+def licences(package: str) -> str:
+    """All that it says of its licence."""
+    said = metadata(package)
+    classified = [c for c in said.get_all("Classifier", []) if c.startswith("License")]
+    words = " ".join([said.get("License-Expression", ""), said.get("License", ""), *classified])
+    return words.replace("Python Software Foundation", "PSF")
+
+
+def test_the_table_is_what_the_project_declares() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = dict.fromkeys(project["dependencies"], "")
+    for extra, words in EXTRAS.items():
+        wanted |= dict.fromkeys(project["optional-dependencies"][extra], words)
+    assert {name + bound for name, bound, *_ in ROWS} == set(wanted)
+    for name, bound, _, use in ROWS:
+        assert (f"(`{wanted[name + bound]}`)" in use) == bool(wanted[name + bound])
+
+
+def test_licences_are_what_the_packages_say() -> None:
+    seen = 0
+    for name, _, licence, _ in ROWS:
+        try:
+            words = licences(name)
+        except PackageNotFoundError:
+            continue
+        assert licence in words, (name, words)
+        seen += 1
+    assert seen >= 8
+
+
+def test_what_these_need_is_told() -> None:
+    """Without extras, and of what eomc needs in any case."""
+    told = {name.strip().lower() for name in PAGE.split("need (")[1].split("):")[0].split(",")}
+    direct = {name for name, *_, use in ROWS if "eomc[" not in use}
+    needed: set[str] = set()
+    waiting = sorted(direct)
+    while waiting:
+        for text in requires(waiting.pop()) or []:
+            one = Requirement(text)
+            if one.marker is None or one.marker.evaluate({"extra": ""}):
+                name = one.name.lower().replace("_", "-")
+                if name not in needed | direct:
+                    needed.add(name)
+                    waiting.append(name)
+    assert needed <= {name.replace("\n", " ").strip() for name in told}
+
+
+def test_nothing_else_is_imported() -> None:
+    found = set()
+    for file in (ROOT / "generator" / "eomc").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                found.add(str(node.module).split(".")[0])
+    others = found - sys.stdlib_module_names - {"eomc"}
+    own = {
+        "_cffi_backend": "cffi",
+        "pydantic_core": "pydantic",
+        "mpmath": "sympy",
+        "markupsafe": "jinja2",
+    }
+    assert {own.get(name, name) for name in others} == {name for name, *_ in ROWS}
+
+
+def test_the_work_of_others_is_named() -> None:
+    theirs = {f.relative_to(ROOT) for f in SHIPPED if b"Copyright" in f.read_bytes()}
+    assert theirs == {Path(f"csrc/fmi/{name}") for name in [
+        "LICENSE.txt", "fmi2FunctionTypes.h", "fmi2Functions.h", "fmi2TypesPlatform.h",
+        "fmi3FunctionTypes.h", "fmi3Functions.h", "fmi3PlatformTypes.h",
+    ]}  # fmt: skip
+    texts = {".py", ".jinja", ".h", ".c", ".toml", ".txt", ".typed"}
+    assert {f.suffix for f in SHIPPED} <= texts  # nothing compiled, minified or packed
+
+
+def test_pages_load_nothing() -> None:
+    for page in (ROOT / "templates" / "report").glob("*.html.jinja"):
+        text = page.read_text(encoding="utf-8")
+        assert "default-src 'none'" in text, page
+        assert not re.search(r"<script[^>]* src|<link|@import|url\((?!data:)|//[\w.]+/", text), page
