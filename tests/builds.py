@@ -6,6 +6,7 @@ import importlib
 import shutil
 import stat
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,15 @@ import eomc
 KEPT = SCENES.parent / "build" / "tests" / "kept"  # builds to be copied, from run to run
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
 CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
+
+
+@pytest.fixture(scope="module")
+def unoptimised_file() -> Iterator[None]:
+    """`quickly_compiled` for a whole file of tests, with what its own fixtures build."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EOMC_CFLAGS", "-O0")
+        patch.delenv("CC", raising=False)
+        yield
 
 
 @pytest.fixture

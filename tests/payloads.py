@@ -85,6 +85,14 @@ HIDDEN = {
 }
 PAYLOADS = {**PLAIN, **HIDDEN}
 ORDINARY = "Κάρρο-εκκρεμές, «é» 30° θ₁ ẋ – m/s² 力 🙂 a\u200db: 'x' \"y\" 50 % #1 C:\\x [m] {} ?"
+# one of a kind
+FEW = [
+    PAYLOADS[name]
+    for name in (
+        "docstring", "comment", "backslash at the end", "trigraph at the end", "template", "N",
+        "spliced", "lines", "controls", "NUL", "half a character",
+    )
+]  # fmt: skip
 payloads = pytest.mark.parametrize("given", PAYLOADS.values(), ids=PAYLOADS)
 
 RAW = re.compile(

@@ -6,15 +6,11 @@ import re
 import shutil
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
-from types import ModuleType
 
 import pytest
-from cases import SCENES
 from conftest import ROOT, needs
-
-import eomc
+from fmus import plain
 
 TEXT = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
 SAID = r"x = (\S+) m, theta = (\S+) rad"
@@ -31,11 +27,6 @@ def ran(*command: str, at: Path) -> str:
     return done.stdout
 
 
-@cache
-def module() -> ModuleType:
-    return eomc.load(SCENES / "cartpole.toml", ROOT / "build" / "tests" / "fmu", form="plain")
-
-
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which the page's commands have been typed."""
@@ -47,7 +38,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def end() -> tuple[float, float]:
-    run = module().simulate(q0=[0.0, 0.1], qd0=[0.0, 0.0], h=0.001, steps=1000)
+    run = plain("cartpole").simulate(q0=[0.0, 0.1], qd0=[0.0, 0.0], h=0.001, steps=1000)
     return float(run.q[-1, 0]), float(run.q[-1, 1])
 
 
@@ -90,11 +81,11 @@ def test_casadi(page: Path) -> None:
     (program,) = blocks("python")
     said = ran(sys.executable, "-c", program, at=page)
     numbers = [float(x) for x in re.findall(r"[-\d.]+(?:e[-+]\d+)?", said)]
-    expected = module().acceleration([0.0, 0.1], [0.0, 0.0])
+    expected = plain("cartpole").acceleration([0.0, 0.1], [0.0, 0.0])
     assert numbers[:4] == pytest.approx([0, 0, *expected], rel=1e-5)
     # the Jacobian of [qd; qdd] along [q; qd]
     assert numbers[4:12] == [0, 0, 1, 0, 0, 0, 0, 1]
-    A, B = [module().acceleration([0.0, 0.1 + d], [0.0, 0.0]) for d in (1e-6, -1e-6)]
+    A, B = [plain("cartpole").acceleration([0.0, 0.1 + d], [0.0, 0.0]) for d in (1e-6, -1e-6)]
     assert [numbers[13], numbers[17]] == pytest.approx((A - B) / 2e-6, rel=1e-5)
 
 
@@ -110,6 +101,6 @@ def test_the_c_of_simulinks_block(page: Path) -> None:
         encoding="utf-8",
     )
     ran(needs("cc"), *STRICT, "block.c", "c/cartpole.c", "-lm", "-o", "block", at=page)
-    expected = module().acceleration([0.0, 0.1], [0.3, 0.2])
+    expected = plain("cartpole").acceleration([0.0, 0.1], [0.3, 0.2])
     found = [float(x) for x in ran("./block", at=page).split()]
     assert found == pytest.approx(list(expected), rel=1e-14)

@@ -24,6 +24,7 @@ import pytest
 import sympy
 from conftest import needs, tiers
 from payloads import (
+    FEW,
     ORDINARY,
     PAYLOADS,
     RAW,
@@ -53,15 +54,6 @@ from eomc.report import equations_text
 from eomc.report.equations import written
 from eomc.scene import schema
 from eomc.scene.read import parse
-
-# one of a kind
-FEW = [
-    PAYLOADS[name]
-    for name in (
-        "docstring", "comment", "backslash at the end", "trigraph at the end", "template", "N",
-        "spliced", "lines", "controls", "NUL", "half a character",
-    )
-]  # fmt: skip
 
 
 @pytest.fixture(autouse=True)

@@ -170,7 +170,7 @@ STATES = np.random.default_rng(5).uniform(-1, 1, (2, 6, 2))
 @pytest.mark.parametrize("how", [{}, {"outputs": True}, {"closed": True, "outputs": True}])
 @pytest.mark.parametrize("t", [0.4, np.linspace(0, 1, 6)])
 def test_many_states_are_each_of_them(modules: Modules, how: dict[str, bool], t: Any) -> None:
-    m = modules.of_text(LOOP)
+    m = modules.unoptimised(LOOP)
     q, qd = STATES
     many = m.linearize(q, qd, t=t, params={"k": 2.0}, **how)
     assert [x.shape for x in many[:2]] == [(6, 4, 4), (6, 4, 2)]
@@ -195,7 +195,7 @@ def test_the_state_that_has_none_is_named(modules: Modules) -> None:
 
 def test_the_closed_loop_is_that_of_the_motion(modules: Modules) -> None:
     """Accelerations and outputs under the signals by differences: good to 1e-10 or so."""
-    m = modules.of_text(LOOP)
+    m = modules.unoptimised(LOOP)
     for q, qd in np.moveaxis(STATES, 1, 0):
         A, B, C, D = m.linearize(q, qd, t=0.4, closed=True, outputs=True)
         held = m.linearize(q, qd, t=0.4, outputs=True)
@@ -214,7 +214,7 @@ def test_the_closed_loop_is_that_of_the_motion(modules: Modules) -> None:
 
 
 def test_a_loop_that_is_none_is_refused(modules: Modules, driven: ModuleType) -> None:
-    m, jumps = modules.of_text(LOOP), LOOP.replace('x_dot**2",', 'sign(x_dot)",')
+    m, jumps = modules.unoptimised(LOOP), LOOP.replace('x_dot**2",', 'sign(x_dot)",')
     assert "sign" in jumps
     for module, words in ((m, "give no u"), (modules.unoptimised(jumps), "has no loop to close")):
         with pytest.raises(ValueError, match=words):
@@ -238,7 +238,7 @@ def test_a_wrong_loop_fails_the_check(modules: Modules) -> None:
             A, B = m.linearize(*state, closed=closed, **how)
             return A + 1e-8 * closed * np.abs(A).max(), B
 
-    m, made = modules.of_text(LOOP), from_scene(parse(LOOP, "test.toml"))
+    m, made = modules.unoptimised(LOOP), from_scene(parse(LOOP, "test.toml"))
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
         rows_signals.report(of, None)

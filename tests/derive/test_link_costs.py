@@ -205,7 +205,7 @@ def test_a_mass_or_link_of_nothing_is_singular(gone: str) -> None:
 
 @pytest.mark.slow
 def test_singular_and_regular_in_c(modules: Modules) -> None:
-    made = modules.of_text(links([-1, 0, 1, 2], more='potential = "0"'))
+    made = modules.unoptimised(links([-1, 0, 1, 2], more='potential = "0"'))
     q, qd = np.array([0.1, 0.4, -0.3, 0.8]), np.array([1.0, -0.5, 0.7, 0.2])
     state = {f"q{k}": v for k, v in enumerate(q)} | {f"q{k}_dot": v for k, v in enumerate(qd)}
     text = made_of(links([-1, 0, 1, 2], more='potential = "0"'))

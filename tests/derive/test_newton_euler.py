@@ -296,7 +296,7 @@ def test_where_angles_are_singular_no_acceleration_is_given(joint: str, number: 
 
 @pytest.mark.slow
 def test_a_compiled_module_refuses_where_angles_are_singular(modules: Any) -> None:
-    module = modules.of_text(held("spherical", 3))
+    module = modules.unoptimised(held("spherical", 3))
     q = np.array([0.1, 0.2, np.pi / 2, 0.3])
     with pytest.raises(ArithmeticError, match=r"singular|definite"):
         module.acceleration(q, np.ones(4))

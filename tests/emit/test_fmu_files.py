@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
 from compilers import compiled, run
-from conftest import EVERYTHING, needs
-from fmus import BALL, FLOAT
-from payloads import RAW, derived, payloads, tokens, with_texts
+from conftest import EVERYTHING, needs, tiers
+from fmus import BALL, FLOAT, derived_of
+from payloads import FEW, PAYLOADS, RAW, derived, tokens, with_texts
 
 from eomc import pipeline
 from eomc.base import resources, texts
@@ -39,6 +40,10 @@ potential = "MAX_FORCE*cos(theta) + energy*near**2 + t_1*near"
 
 
 def made(text: str, version: int) -> Unit:
+    return render.unit(derived_of(text), version)
+
+
+def made_anew(text: str, version: int) -> Unit:
     return pipeline.unit(from_scene(parse(text, "test.toml")), version)
 
 
@@ -85,9 +90,9 @@ def test_other_texts_mean_nothing(text: str) -> None:
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_same_scene_same_text(version: int) -> None:
-    first, second = made(BALL, version), made(BALL, version)
+    first, second = made(BALL, version), made_anew(BALL, version)
     assert first == second
-    other = made(BALL.replace("g = { value = 9.81", "g = { value = 9.82"), version)
+    other = made_anew(BALL.replace("g = { value = 9.81", "g = { value = 9.82"), version)
     key = {2: "guid", 3: "instantiationToken"}[version]
     assert described(first).get(key) != described(other).get(key)
     assert f'"{described(first).get(key)}"' in first.files["sources/fmi/scene.h"]
@@ -184,31 +189,51 @@ def test_constraints_are_for_co_simulation_alone() -> None:
 
 def test_other_versions_are_refused() -> None:
     with pytest.raises(Exception, match="FMI 2 or 3, here 1"):
-        made(BALL, 1)
+        made_anew(BALL, 1)
 
 
-@payloads
-@pytest.mark.parametrize("version", [2, 3])
-def test_free_texts_stay_texts(given: str, version: int, tmp_path: Path) -> None:
-    """Whatever they hold: descriptions read back are they, and a C compiler sees none of them."""
+def filled(text: str, version: int) -> Unit:
+    """A unit with a text wherever one can be."""
     whole = derived()
-    found = [
-        render.unit(replace(whole, system=with_texts(whole.system, text)), version)
-        for text in ("plain", given)
-    ]
-    for unit in found:
-        for name, text in unit.files.items():
-            assert not RAW.search(text.replace("\t", "")), name
-    root = described(found[1])
+    return render.unit(replace(whole, system=with_texts(whole.system, text)), version)
+
+
+def without_digests(unit: Unit) -> dict[str, str]:
+    """Its sources but for what tells one from another."""
+    return {
+        name.removeprefix("sources/"): re.sub(r"[0-9a-f-]{36}", "", text)
+        for name, text in unit.files.items()
+        if name.startswith("sources/")
+    }
+
+
+@cache
+def plain(version: int) -> dict[str, str]:
+    return without_digests(filled("plain", version))
+
+
+@cache
+def plain_tokens(version: int, names: tuple[str, ...], folder: Path) -> str:
+    return tokens({name: plain(version)[name] for name in names}, folder)
+
+
+@pytest.mark.parametrize("given", tiers(PAYLOADS.values(), *FEW), ids=PAYLOADS)
+@pytest.mark.parametrize("version", [2, 3])
+def test_free_texts_stay_texts(
+    given: str, version: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Whatever they hold: descriptions read back are they, and a C compiler sees none of them."""
+    unit = filled(given, version)
+    for name, text in unit.files.items():
+        assert not RAW.search(text.replace("\t", "")), name
+    root = described(unit)
     words = {e.get("description") for e in root.iter() if e.get("description")}
     assert {texts.line(given), root.get("description")} <= {*words, *map(texts.line, words)}
-    seen = []
-    for k, unit in enumerate(found):
-        inside = {
-            name.removeprefix("sources/"): re.sub(r"[0-9a-f-]{36}", "", text)
-            for name, text in unit.files.items()
-            if name.startswith("sources/")
-        }
-        (tmp_path / str(k)).mkdir()
-        seen.append(tokens(inside, tmp_path / str(k)))
-    assert re.sub(r"0x\w+u", "", seen[0]) == re.sub(r"0x\w+u", "", seen[1])
+    found = without_digests(unit)
+    assert found.keys() == plain(version).keys()
+    changed = {name: text for name, text in found.items() if text != plain(version)[name]}
+    assert {"fmi/scene.h", "fields.h", "fields.c"} <= changed.keys()
+    folder = tmp_path_factory.getbasetemp() / f"plain{version}"
+    folder.mkdir(exist_ok=True)
+    expected = plain_tokens(version, tuple(changed), folder)
+    assert re.sub(r"0x\w+u", "", tokens(changed, tmp_path)) == re.sub(r"0x\w+u", "", expected)

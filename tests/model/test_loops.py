@@ -1,5 +1,7 @@
 """Loops: rows, and reactions by virtual work, against differences of the rows themselves."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import sympy
@@ -143,9 +145,14 @@ class Two:
         raise AssertionError("not closed")
 
 
+@cache
+def two_bodies(kind, plane, world):
+    return Two(kind, plane, world)
+
+
 @pytest.mark.parametrize(("kind", "plane", "world"), CASES)
 def test_reactions_do_the_work_of_the_rows(kind, plane, world):
-    two = Two(kind, plane, world)
+    two = two_bodies(kind, plane, world)
     random = np.random.default_rng(1)
     multipliers = random.normal(size=len(two.multipliers))
     for q, ends in ((random.uniform(-1, 1, len(two.system.q)), (1,)), (two.closed(2), (0, 1))):
@@ -164,7 +171,7 @@ def test_reactions_do_the_work_of_the_rows(kind, plane, world):
 
 @pytest.mark.parametrize(("kind", "plane", "world"), CASES)
 def test_rows_are_regular_where_the_loop_is_closed(kind, plane, world):
-    two = Two(kind, plane, world)
+    two = two_bodies(kind, plane, world)
     q = two.closed(3)
     values = np.linalg.svd(two.jacobian(q), compute_uv=False)
     assert len(values) == len(CLOSINGS[kind].rows(plane))

@@ -20,6 +20,7 @@ from conftest import ROOT, tiers
 import eomc
 from eomc.program.assembly import assembled
 
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILT = ROOT / "build" / "tests" / "constrained"
 NAMES = list(constrained.cases())
 MEASURED = [name for name in NAMES if constrained.cases()[name]["rk4_measured"]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import cache
 
 import constrained
 import numpy as np
@@ -46,10 +47,16 @@ def scene(coordinates: str, constraints: str, more: str = "") -> System:
     )
 
 
+@cache
+def assembled_case(name: str) -> System:
+    """A case from its guess, its redundant rows not marked."""
+    return assembled(constrained.system(name, "guess", redundant=False))
+
+
 @pytest.mark.parametrize("name", tiers(NAMES, *SMALL))
 def test_trusted_starts_are_found_from_their_guesses(name: str) -> None:
     given = constrained.system(name, "guess", redundant=False)
-    made = assembled(given)
+    made = assembled_case(name)
     q0, qd0 = constrained.ends(name, "q0", "qd0")
     q, qd = start_of(made)
     np.testing.assert_allclose(q, q0, rtol=0, atol=2.3e-16 * max(1, np.max(np.abs(q0))))
@@ -61,10 +68,7 @@ def test_trusted_starts_are_found_from_their_guesses(name: str) -> None:
 
 @pytest.mark.parametrize("name", tiers(NAMES, *SMALL))
 def test_ranks_and_freedoms_are_those_of_the_case(name: str) -> None:
-    case, closure = (
-        constrained.cases()[name],
-        assembled(constrained.system(name, "guess", redundant=False)).closure,
-    )
+    case, closure = constrained.cases()[name], assembled_case(name).closure
     assert closure is not None
     rows = len(case["constraints"]) + len(case["velocity_constraints"])
     assert closure.rank == (case["redundant"] or {"rank": rows})["rank"]
@@ -73,7 +77,7 @@ def test_ranks_and_freedoms_are_those_of_the_case(name: str) -> None:
 
 
 def test_of_bricard_s_rows_the_one_is_left_out_that_leaves_the_best_four() -> None:
-    made = assembled(constrained.system("bricard_cube", "guess", redundant=False))
+    made = assembled_case("bricard_cube")
     assert [c.redundant for c in made.constraints] == [False] * 4 + [True]
     assert made.closure is not None
     assert made.closure.ranks == (
@@ -87,7 +91,7 @@ def test_of_bricard_s_rows_the_one_is_left_out_that_leaves_the_best_four() -> No
     "name", tiers(SMALL, "four_bar_crank_rocker", "parallelogram_redundant_bar")
 )
 def test_a_start_is_assembled_once(name: str) -> None:
-    made = assembled(constrained.system(name, "guess", redundant=False))
+    made = assembled_case(name)
     assert assembled(made) is made
     again = assembled(replace(made, closure=None))
     for one, other in zip(start_of(made), start_of(again), strict=True):
@@ -313,7 +317,7 @@ def test_no_freedom_is_told_but_allowed() -> None:
 
 
 def test_what_has_moved_is_told() -> None:
-    made = assembled(constrained.system("four_bar_crank_rocker", "guess", redundant=False))
+    made = assembled_case("four_bar_crank_rocker")
     (note,) = made.warnings
     assert note.severity == "note"
     assert "q2 = 0.59085 (guess 0.7), q3 = 1.21122 (guess 1.6)" in str(note)
@@ -370,7 +374,7 @@ def test_a_coordinate_without_inertia_is_assembled() -> None:
 
 @pytest.mark.parametrize("name", tiers(SMALL, "four_bar_crank_rocker", "pendulum_on_a_winch"))
 def test_a_walk_stays_on_the_rows(name: str) -> None:
-    made = assembled(constrained.system(name, "guess", redundant=False))
+    made = assembled_case(name)
     manifold = Manifold(made)
     place = manifold.place(start_of(made)[0])
     assert place is not None

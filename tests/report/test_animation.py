@@ -250,7 +250,7 @@ def test_unknown_curves_of_a_batch_are_refused(batch):
 @pytest.mark.slow
 def test_a_batch_by_tolerance_moves_at_its_times(modules):
     text = (SCENES / "cartpole.toml").read_text().replace('"cartpole"', '"fitted_poles"')
-    many = modules.of_text(text.replace("[run]\n", "[run]\nbatch = true\ntolerance = 1e-6\n"))
+    many = modules.unoptimised(text.replace("[run]\n", "[run]\nbatch = true\ntolerance = 1e-6\n"))
     times, lengths = np.arange(61) / 60, np.linspace(1.0, 2.0, 3)
     runs = many.simulate_batch(params={"l": lengths}, times=times, tol=1e-6)
     given = data(runs.animate(instances=[2, 0]).page)["runs"][0]

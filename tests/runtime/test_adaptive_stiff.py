@@ -11,11 +11,13 @@ import cases
 import mpmath
 import numpy as np
 import pytest
+from conftest import Modules, tiers
 
 import eomc
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "adaptive"
 TRAIN = """eomc = 1
 name = "stiff_train"
@@ -169,9 +171,9 @@ method = "gauss8"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
-def test_the_governor_settles(tol: float) -> None:
+def test_the_governor_settles(tol: float, modules: Modules) -> None:
     text = cases.scene_text("iftomm_A05_governor").replace("[run]", "[run]\ntolerance = 1e-9")
-    module = eomc.load(from_scene(parse(text, "stiff.toml")), BUILDS)
+    module = modules.of_text(text)
     run = module.simulate(tol=tol)
     assert cases.error_of("iftomm_A05_governor", run.q[-1]) < 10 * tol
     assert run.stiff_steps > run.steps / 2 and run.steps < 400
@@ -264,20 +266,20 @@ duration = 300
 @pytest.mark.parametrize("how", [{"tol": 1e-4}, {}, {"tol": 1e-12}, {"stiff": True}])
 @pytest.mark.parametrize(
     ("name", "potential", "force", "end", "steps"),
-    [
+    tiers([
         ("sags", "9.81*x + 50*x**2", "-2*x_dot", -0.0981, 2500),
         ("comes_to_rest", "-9.81*cos(x - 0.2)", "-x_dot/2", 0.2, 700),
         ("lies", "9.81*x", "max(0, -1e6*x - 1e3*x_dot)", -9.81e-6, 500),
         ("lands", "9.81*x + exp(-x/5e-4)/1000", "-10*x_dot*exp(-x/5e-4)", None, 1000),
-    ],
-)
+    ], "comes_to_rest", "lands"),
+)  # fmt: skip
 def test_what_has_come_to_rest_takes_few_steps(
-    name: str, potential: str, force: str, end: float | None, steps: int, how: dict
-) -> None:
+    name: str, potential: str, force: str, end: float | None, steps: int, how: dict,
+    modules: Modules,
+) -> None:  # fmt: skip
     """There a velocity is rounding of the position: by parts of it, steps were 1e5 and more."""
     text = RESTS.format(name=name, potential=potential, force=force)
-    module = eomc.load(from_scene(parse(text, f"{name}.toml")), BUILDS)
-    run = module.simulate(**how)
+    run = modules.of_text(text).simulate(**how)
     assert run.status == "ok" and run.steps + run.rejected < steps
     if end is None:  # where exp(-x/L) = 9.81 1000 L
         end = -5e-4 * np.log(9.81 * 0.5)

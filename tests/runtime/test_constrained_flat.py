@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -30,9 +29,11 @@ def parallelogram() -> System:
     return replace(made, outputs=(), constraints=constraints, coordinates=free)
 
 
-@pytest.fixture(params=["plain", "fast"])
-def module(request: pytest.FixtureRequest, tmp_path: Path) -> ModuleType:
-    return eomc.load(parallelogram(), tmp_path, form=request.param)
+@pytest.fixture(scope="module", params=["plain", "fast"])
+def module(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, unoptimised_file: None
+) -> ModuleType:
+    return eomc.load(parallelogram(), tmp_path_factory.mktemp("flat"), form=request.param)
 
 
 @pytest.mark.parametrize("start", [0.05, 0.0503, 0.0471, 0.05 + 1e-5])

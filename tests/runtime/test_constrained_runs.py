@@ -16,6 +16,7 @@ import eomc
 from eomc.cli.main import main
 from eomc.model.system import Constraint, Reaction, System
 
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 EPS = 2.0**-52
 
 

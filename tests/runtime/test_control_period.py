@@ -36,7 +36,7 @@ PLAIN = SCENE.replace("batch = true\n", "").replace('"dp8"', '"gauss4"')
 
 @pytest.fixture(scope="module")
 def balanced(modules: Modules) -> ModuleType:
-    return modules.of_text(SCENE)
+    return modules.unoptimised(SCENE)
 
 
 def law(t: float, q: Any, qd: Any) -> list[float]:
@@ -48,7 +48,7 @@ def law(t: float, q: Any, qd: Any) -> list[float]:
 def test_a_function_is_called_once_a_period(
     modules: Modules, text: str, steps: int, every: int
 ) -> None:
-    module = modules.of_text(text)
+    module = modules.unoptimised(text)
     for method in module.methods:
         how: dict[str, Any] = {"steps": steps, "method": method}
         calls: list[float] = []

@@ -167,7 +167,7 @@ def test_against_differences_of_forty_digits(
     modules: Modules, text: str, method: str, given: str
 ) -> None:
     """All digits, but for the last two of the largest entry."""
-    m, u = modules.of_text(text), INPUTS[given]
+    m, u = modules.unoptimised(text), INPUTS[given]
     held = None if u is None else u[: len(m.inputs)]
     Phi, Gamma = m.discretize(Q, QD, 0.03, 0.4, held, method=method)
     right, right_u = derivative(text, method, 0.03, 0.4, u)
@@ -178,7 +178,7 @@ def test_against_differences_of_forty_digits(
 
 @pytest.mark.parametrize("text", tiers([EXPLICIT, IMPLICIT], EXPLICIT), ids=lambda t: t[-20:-1])
 def test_plain_c_has_the_same(modules: Modules, text: str, tmp_path: Any) -> None:
-    fast = modules.of_text(text)
+    fast = modules.unoptimised(text)
     plain = eomc.load(from_scene(parse(text, "test.toml")), tmp_path, form="plain")
     for method in fast.methods:
         for u in (None, [0.6, -0.4]):
@@ -190,7 +190,7 @@ def test_plain_c_has_the_same(modules: Modules, text: str, tmp_path: Any) -> Non
 @pytest.mark.parametrize("t", [0.3, np.linspace(0, 1, 3)])
 @pytest.mark.parametrize("period", [None, 0.06])
 def test_many_states_are_each_of_them(modules: Modules, t: Any, period: float | None) -> None:
-    m, how = modules.of_text(EXPLICIT), {"params": {"k": 3.0}, "control_period": period}
+    m, how = modules.unoptimised(EXPLICIT), {"params": {"k": 3.0}, "control_period": period}
     q, qd = np.array([Q, 2 * Q, -Q]), np.array([QD, -QD, QD])
     Phi, Gamma = m.discretize(q, qd, t=t, **how)
     assert Phi.shape == (3, 4, 4) and Gamma.shape == (3, 4, 2)
@@ -203,7 +203,7 @@ def test_many_states_are_each_of_them(modules: Modules, t: Any, period: float | 
 @pytest.mark.parametrize("method", ["rk4", "euler"])
 def test_a_control_period_is_its_steps(modules: Modules, method: str, given: str) -> None:
     """Against differences of runs with that period, good to 1e-10 or so."""
-    m, u = modules.of_text(EXPLICIT), INPUTS[given]
+    m, u = modules.unoptimised(EXPLICIT), INPUTS[given]
     x, how = np.hstack([Q, QD]), {"h": 0.02, "control_period": 0.1, "method": method}
     Phi, Gamma = m.discretize(Q, QD, u=u, **how)
 
@@ -222,7 +222,7 @@ def test_a_control_period_is_its_steps(modules: Modules, method: str, given: str
 
 
 def test_what_it_refuses(modules: Modules, cartpole: ModuleType) -> None:
-    m = modules.of_text(EXPLICIT)
+    m = modules.unoptimised(EXPLICIT)
     with pytest.raises(ValueError, match=r"cartpole was built without it.*discretize = true"):
         cartpole.discretize([0, 0], [0, 0])
     with pytest.raises(ValueError, match="'gauss4' is not in this module"):
@@ -281,7 +281,7 @@ def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
             Phi, Gamma = m.discretize(*state, **how)
             return Phi, Gamma * (1 + 1e-5)
 
-    m, made = modules.of_text(EXPLICIT), from_scene(parse(EXPLICIT, "test.toml"))
+    m, made = modules.unoptimised(EXPLICIT), from_scene(parse(EXPLICIT, "test.toml"))
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
         rows_discretize.report(of, None)

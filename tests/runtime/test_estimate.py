@@ -175,7 +175,7 @@ def test_a_motion_beyond_doubles_is_reported() -> None:
 
 
 def test_jumps_lower_the_observed_order(modules: Modules) -> None:
-    run = quiet(modules.of_text(JUMPING), estimate=True)
+    run = quiet(modules.unoptimised(JUMPING), estimate=True)
     assert run.error.observed < 3 and "forces jump" in run.error.verdict
 
 
@@ -207,7 +207,7 @@ def test_a_run_that_stopped_read_as_much_of_its_inputs(driven: ModuleType) -> No
 def test_no_convergence_is_reported(modules: Modules) -> None:
     """x'' = -4e4 x^3 in steps of 800 radians: no iteration finds the stages of an implicit step."""
     text = SPRING.format(name="stiff_implicit", k=1e4, dissipation="0")
-    module: Any = modules.of_text(text.replace("k*x**2/2", "k*x**4") + 'method = ["gauss4"]\n')
+    module: Any = modules.unoptimised(text.replace("k*x**2/2", "k*x**4") + 'method = ["gauss4"]\n')
     with pytest.warns(RuntimeWarning, match="does not converge: take a smaller h"):
         run = module.simulate(h=5.0, steps=10)
     assert run.status == "no convergence" and run.q.tolist() == [[1.0]]
@@ -289,7 +289,7 @@ def test_a_step_longer_than_the_run_is_reported(cartpole: ModuleType) -> None:
 
 def test_a_jump_is_no_fast_mode(modules: Modules) -> None:
     """sign(x_dot) at rest has a slope as steep as the difference is short."""
-    assert modules.of_text(JUMPING).advice(h=0.01) is None
+    assert modules.unoptimised(JUMPING).advice(h=0.01) is None
 
 
 def test_the_scenes_start_within_their_limits() -> None:
@@ -310,7 +310,7 @@ def test_linearize_is_the_slope_of_the_acceleration(modules: Modules) -> None:
     text = text.replace("[run]", "[run]\nlinearize = true").replace(
         'name = "cartpole_driven"', 'name = "cartpole_slopes"'
     )
-    module: Any = modules.of_text(text)
+    module: Any = modules.unoptimised(text)
     q, qd, u, d = np.array([0.3, 1.1]), np.array([-0.4, 0.7]), np.array([2.0]), 1e-6
     A, B = module.linearize(q, qd, u)
     assert A.shape == (4, 4) and B.shape == (4, 1)

@@ -22,6 +22,7 @@ from eomc.base.errors import SceneError
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "events"
 G = 9.81
 BALL = """eomc = 1

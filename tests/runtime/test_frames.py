@@ -104,7 +104,7 @@ Q, QD, QDD = np.array([0.4, -1.1]), np.array([0.7, 0.3]), np.array([-0.2, 1.9])
 
 @pytest.fixture(scope="module")
 def plane(modules: Modules) -> ModuleType:
-    return modules.of_text(PLANE)
+    return modules.unoptimised(PLANE)
 
 
 @pytest.fixture(scope="module")
@@ -203,7 +203,7 @@ def test_accelerations_are_second_derivatives(modules: Modules) -> None:
     wanted = "\n".join(f'a_{name} = "dot(dot({name}))"' for name in places)
     center = '\n[[point]]\nname = "middle"\nbody = "arm"\nplace = [0, 0, -0.5]\n'
     text = SPACE.replace("crane3", "crane5").replace("[run]", f"{center}[outputs]\n{wanted}\n[run]")
-    module, formulas = modules.of_text(text), Formulas(from_scene(parse(text, "test.toml")))
+    module, formulas = modules.unoptimised(text), Formulas(from_scene(parse(text, "test.toml")))
     random = np.random.default_rng(3)
     for _ in range(3):
         q, qd, qdd = random.uniform(-1, 1, (3, 3))
@@ -241,7 +241,7 @@ def test_wrong_arguments(plane: ModuleType, call, words: str) -> None:
 
 
 def test_what_was_not_asked_for_is_told(modules: Modules) -> None:
-    module = modules.of_text(PLANE.partition("[run]")[0])
+    module = modules.unoptimised(PLANE.partition("[run]")[0])
     with pytest.raises(
         AttributeError, match=r"pose: not built; a scene asks for it with \[run\] frames"
     ):
@@ -260,7 +260,7 @@ def test_a_rounding_of_a_sum_is_no_wrong_sine(space: ModuleType, monkeypatch) ->
 
 
 def test_wrenches_without_frames_are_refused(modules: Modules) -> None:
-    module = modules.of_text(f"{PLANE.partition('[run]')[0]}[run]\ninverse_dynamics = true\n")
+    module = modules.unoptimised(f"{PLANE.partition('[run]')[0]}[run]\ninverse_dynamics = true\n")
     with pytest.raises(ValueError, match=r"f_ext acts at frames: .* \[run\] frames = true"):
         module.inverse_dynamics(Q, QD, QDD, {"tip": [1.0, 2.0, 3.0]})
 

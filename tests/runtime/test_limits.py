@@ -49,13 +49,14 @@ duration = 2.0
 """
 BATCH = SCENE + 'batch = true\nmethod = ["rk4", "dp8", "euler"]\n'
 IMPLICIT = SCENE + 'method = ["gauss4", "gauss8", "gauss16"]\n'
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 LEAST, MOST = np.array([-2.0, 0.0, -np.inf]), np.array([3.0, np.inf, np.inf])
 TABLE = np.random.default_rng(3).uniform(-9, 9, (200, 3))
 
 
 @pytest.fixture(scope="module")
 def limited(modules: Modules) -> ModuleType:
-    return modules.of_text(BATCH)
+    return modules.unoptimised(BATCH)
 
 
 @pytest.mark.parametrize("form", tiers(["fast", "plain"], "plain"))
@@ -83,7 +84,7 @@ def test_signals_are_limited_at_every_stage(modules: Modules, limited: ModuleTyp
         "force + push", "push"
     )
     by_hand = by_hand.replace(", limits = [0, inf]", "").replace('"push"', '"max(push, 0)"')
-    other = modules.of_text(by_hand.replace('x = "both"', 'x = "a + both"'))
+    other = modules.unoptimised(by_hand.replace('x = "both"', 'x = "a + both"'))
     run, same = limited.simulate(), other.simulate()
     assert run.x == pytest.approx(same.x, rel=1e-11, abs=1e-11)
     signals = np.array([20 * run.theta + 3 * run.theta_dot, np.sin(9 * run.t), np.cos(run.t)]).T

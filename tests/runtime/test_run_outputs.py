@@ -55,7 +55,7 @@ INPUTS = {
 
 @pytest.fixture(scope="module")
 def crane(modules: Modules) -> ModuleType:
-    return modules.of_text(SCENE)
+    return modules.unoptimised(SCENE)
 
 
 def expected(crane: ModuleType, run: Any) -> dict[str, Any]:

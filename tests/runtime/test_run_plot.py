@@ -178,7 +178,7 @@ def test_rates_of_words_and_of_units() -> None:
 
 
 def test_batches_are_fans_lines_or_ends(modules: Modules) -> None:
-    module = modules.of_text(BATCH)
+    module = modules.unoptimised(BATCH)
     masses = np.linspace(1, 2, 21)
     runs = module.simulate_batch(np.full((21, 1), 1.0), params={"m": masses}, steps=40)
     axes = runs.plot("x", quantiles=(0.1, 0.5, 0.9))
@@ -218,7 +218,7 @@ batch = true
 
 
 def test_ends_of_instances_that_stopped_are_their_last_good_rows(modules: Modules) -> None:
-    runs = modules.of_text(BATCH).simulate_batch(np.ones((2, 1)), steps=10)
+    runs = modules.unoptimised(BATCH).simulate_batch(np.ones((2, 1)), steps=10)
     runs.q[1, 4:] = np.nan
     y = runs.plot("x", over="instance").get_lines()[0].get_ydata()
     assert np.array_equal(y, [runs.q[0, -1, 0], runs.q[1, 3, 0]])
@@ -256,7 +256,7 @@ def test_a_notebook_shows_the_mechanism_where_there_is_one(modules: Modules, mon
 
 
 def test_a_notebook_shows_curves_alone_of_what_says_nothing_of_its_shape(modules: Modules) -> None:
-    page = modules.of_text(BATCH).simulate(duration=0.5)._repr_html_()
+    page = modules.unoptimised(BATCH).simulate(duration=0.5)._repr_html_()
     assert 'alt="over time: x"' in page
 
 

@@ -58,7 +58,7 @@ class Wrong:
     [({}, []), ({"output": 1e-11}, ["outputs"]), ({"C": 1e-7}, ["outputs: C, D"])],
 )
 def test_wrong_ones_fail(modules: Modules, wrong: dict[str, float], failed: list[str]) -> None:
-    made, module = from_scene(parse(SCENE, "test.toml")), modules.of_text(SCENE)
+    made, module = from_scene(parse(SCENE, "test.toml")), modules.unoptimised(SCENE)
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
     rows_outputs.report(comparison, None)
     assert [row.name for row in comparison.rows] == ["outputs", "outputs: C, D"]
