@@ -111,6 +111,8 @@ def _compiled(made: Path | System, root: Path, flags: str | None) -> ModuleType:
         patch.delenv("EOMC_CFLAGS", raising=False)
         if flags is not None:
             patch.setenv("EOMC_CFLAGS", flags)
+        # the calls' own speed is no matter
+        patch.setattr("eomc.toolchain.extension.binding_flags", lambda: ("-O0",))
         return eomc.load(made, root)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 EXAMPLES = ROOT / "docs" / "examples"
 FOLDER = ROOT / "build" / "tests" / "examples"  # where their scene is built, once
 needs_gymnasium = pytest.mark.skipif(

@@ -54,6 +54,7 @@ def test_the_page_says_what_is_so() -> None:
     assert ends_there(TEXT)
 
 
+@pytest.mark.slow
 def test_rust(page: Path) -> None:
     cargo = needs("cargo")
     build, program = blocks("rust")

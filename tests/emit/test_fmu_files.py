@@ -135,11 +135,12 @@ def test_what_depends_on_what() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", [BALL, FLOAT, ODD, EVERYTHING], ids=["ball", "float", "odd", "all"]
+    ("version", "text"),
+    tiers([(3, BALL), (3, EVERYTHING), (2, BALL), (2, EVERYTHING)], 3)
+    + tiers([(k, text) for k in (2, 3) for text in (FLOAT, ODD)]),
 )
-@pytest.mark.parametrize("version", [2, 3])
 def test_its_c_is_strict_and_has_nothing_that_changes(
-    text: str, version: int, tmp_path: Path
+    version: int, text: str, tmp_path: Path
 ) -> None:
     unit = made(text, version)
     for file, content in unit.files.items():

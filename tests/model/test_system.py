@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
+from conftest import Modules
 from sympy.physics.mechanics import dynamicsymbols
 
 import eomc
@@ -17,7 +18,6 @@ from eomc.model.system import System, dot
 from eomc.scene.read import parse
 
 SCENES = Path(__file__).parents[2] / "scenes"
-MODULES = Path("build/tests/modules")
 
 m_c, m_p, l, g = sympy.symbols("m_c m_p l g", positive=True)  # noqa: E741 - the scene's name
 VALUES = {m_c: 2.0, m_p: 2.0, l: 2.0, g: 9.8}
@@ -45,14 +45,14 @@ def cartpole_by_symbols() -> System:
 
 
 @pytest.mark.parametrize("make", [cartpole_by_dynamicsymbols, cartpole_by_symbols])
-def test_it_moves_as_the_scene_does(make: object) -> None:
+def test_it_moves_as_the_scene_does(make: object, modules: Modules) -> None:
     assert callable(make)
-    made = eomc.load(make(), MODULES).simulate(h=0.005, duration=10.0)
-    scene = eomc.load(SCENES / "cartpole.toml", MODULES).simulate(h=0.005, duration=10.0)
+    made = modules.unoptimised(make()).simulate(h=0.005, duration=10.0)
+    scene = modules("cartpole").simulate(h=0.005, duration=10.0)
     assert np.max(np.abs(made.q - scene.q)) < 1e-12
 
 
-def test_inputs_forces_dissipation_and_units() -> None:
+def test_inputs_forces_dissipation_and_units(modules: Modules) -> None:
     theta = dynamicsymbols("theta")
     m, b, torque = sympy.symbols("m b torque")
     system = System.make(
@@ -60,7 +60,7 @@ def test_inputs_forces_dissipation_and_units() -> None:
         dissipation=b * theta.diff() ** 2 / 2, inputs={torque: sympy.cos(dynamicsymbols._t)},
         forces={theta: torque}, units={theta: "rad", m: "kg m^2"}, h=0.01, duration=1.0,
     )  # fmt: skip
-    wheel = eomc.load(system, MODULES)
+    wheel = modules.unoptimised(system)
     assert wheel.units == {"theta": "rad", "m": "kg m^2"}
     assert wheel.acceleration([0.0], [2.0], t=0.0) == pytest.approx([(1.0 - 0.6) / 2])
     assert wheel.acceleration([0.0], [2.0], u=[3.0]) == pytest.approx([(3.0 - 0.6) / 2])
@@ -75,8 +75,8 @@ def test_names_that_c_cannot_bear_are_mapped_and_reported() -> None:
     assert r"\theta_{1} is theta_1" in header and "lambda is lambda_1" in header
 
 
-def test_the_same_system_is_not_built_twice() -> None:
-    assert eomc.load(cartpole_by_symbols(), MODULES) is eomc.load(cartpole_by_symbols(), MODULES)
+def test_the_same_system_is_not_built_twice(tmp_path: Path, quickly_compiled: None) -> None:
+    assert eomc.load(cartpole_by_symbols(), tmp_path) is eomc.load(cartpole_by_symbols(), tmp_path)
 
 
 x, x_dot, u = sympy.symbols("x x_dot u")

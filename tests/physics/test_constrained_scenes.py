@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from cases import SCENES
-from conftest import MODULES, tiers
+from conftest import tiers
 
 import eomc
 
@@ -34,8 +34,8 @@ SHIPPED: list[tuple[str, str, Callable, list[int], float]] = [
 @pytest.mark.parametrize(
     ("name", "case", "of", "which", "h"), tiers(SHIPPED, "pendulum_xy", "slider_crank")
 )
-def test_runs_end_where_they_should(name, case, of, which, h):
-    module = eomc.load(SCENES / f"{name}.toml", MODULES)
+def test_runs_end_where_they_should(name, case, of, which, h, modules):
+    module = modules.unoptimised(eomc.read(SCENES / f"{name}.toml"))
     known = CASES[case]
     start = np.array([float(x) for x in known["q0"]])[which]
     assert np.allclose(of(np.array(module.start[0])), start, atol=1e-12)
@@ -47,8 +47,8 @@ def test_runs_end_where_they_should(name, case, of, which, h):
     assert error <= (2 if others else 1.5) * measured["err_q"]
 
 
-def test_the_reaction_of_a_pin_in_the_plane_is_its_multipliers():
-    module = eomc.load(SCENES / "slider_crank.toml", MODULES)
+def test_the_reaction_of_a_pin_in_the_plane_is_its_multipliers(modules):
+    module = modules.unoptimised(eomc.read(SCENES / "slider_crank.toml"))
     run = module.simulate(duration=0.5)
     assert run.reactions["pin"].shape == (len(run.t), 3)
     rows = np.array([run.multipliers["pin_x"], run.multipliers["pin_y"]]).T

@@ -109,7 +109,8 @@ STRIBECK = "-(1 + exp(-(x_dot/0.05)**2))*x_dot/(1 + 20*x_dot**2)/2"
 
 
 @pytest.mark.parametrize(
-    "friction", ["-atan(x_dot/0.02)/3", "-x_dot/sqrt(x_dot**2 + 4e-4)/2", STRIBECK]
+    "friction",
+    tiers(["-atan(x_dot/0.02)/3", "-x_dot/sqrt(x_dot**2 + 4e-4)/2", STRIBECK], STRIBECK),
 )
 def test_friction_smoothed_otherwise_is_seen(friction: str, modules: Modules) -> None:
     """Steep in a velocity: the end erred by 1e-3 and more, whatever the tolerance."""
@@ -125,9 +126,9 @@ def test_friction_smoothed_otherwise_is_seen(friction: str, modules: Modules) ->
 @pytest.mark.parametrize(
     ("potential", "force"),
     [
-        ("sqrt(x**2 + 1e-6)", "0"),
+        pytest.param("sqrt(x**2 + 1e-6)", "0", marks=pytest.mark.slow),
         ("9.81*x + exp(-x/5e-4)/1000", "0"),
-        ("x**2/2", "0.1/(1 + exp(-x/0.001))"),
+        pytest.param("x**2/2", "0.1/(1 + exp(-x/0.001))", marks=pytest.mark.slow),
         ("x**2/2", "0.1/(1 + exp(-(t - 2)/0.001))"),
     ],
 )

@@ -83,7 +83,10 @@ def test_it_is_valid(scene: str, version: int) -> None:
     assert validate_fmu(str(exported(scene, version))) == []
 
 
-@pytest.mark.parametrize("scene", ["cartpole", "kapitza_pendulum", "cartpole_bodies", "four_bar"])
+@pytest.mark.parametrize(
+    "scene",
+    tiers(["cartpole", "kapitza_pendulum", "cartpole_bodies", "four_bar"], "cartpole", "four_bar"),
+)
 def test_whole_steps_have_the_bits_of_the_module(
     scene: str, version: int, hosts: list[Host]
 ) -> None:
