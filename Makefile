@@ -3,6 +3,7 @@
 # make bench   against others (an environment of 2.6 GB, a C++ compiler); writes benchmarks/*.md
 # make wheel   a wheel and an sdist into dist/
 # make fuzz    attacks the readers of text, without end; finds go to build/hostile/finds
+# make endurance   builds, runs and checks in a loop, for a quarter of an hour: nothing may grow
 # make test-all, make test-slow, make lint, make golden, make clean
 
 PYTHON ?= python3
@@ -15,7 +16,7 @@ export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
 # some shells forbid bytecode: every command then takes four seconds to start, instead of 0.7
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo wheel test test-all test-slow fuzz lint golden bench clean
+.PHONY: demo wheel test test-all test-slow fuzz endurance lint golden bench clean
 
 demo: .venv/demo
 	@$(BIN)/eomc build $(DEMO)
@@ -48,6 +49,9 @@ fuzz: .venv/hostile
 	@while true; do for t in formula read scene urdf mjcf command; do \
 	$(BIN)/python tests/hostile/readers.py $$t --seconds 600 --seed 0 2>&1 | grep -v "^INFO\|^WARNING"; \
 	done; done
+
+endurance: .venv/dev
+	$(BIN)/python tests/hostile/endurance.py --minutes 15
 
 lint: .venv/dev
 	$(BIN)/ruff check .

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import gzip
 import json
-import os
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 
 import cffi
 from cases import fast_kit
+from forks import in_a_fork as in_a_fork
 
 import eomc
 from eomc.model.system import System
@@ -74,54 +74,6 @@ class Shipped:
         subprocess.run(
             [*self.compiler, *words], cwd=self.folder, check=True, capture_output=True, text=True
         )
-
-
-def in_a_fork(work: Callable[[], object], seconds: float) -> tuple[str, object]:
-    """What `work` returns, as JSON tells it, from a process of its own.
-
-    ("done", value), ("raised", its words), ("killed", the signal) or ("late", None).
-    """
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(reading)
-        try:
-            told: tuple[str, object] = ("done", work())
-        except BaseException as fault:
-            told = ("raised", f"{type(fault).__name__}: {fault}")
-        with os.fdopen(writing, "w") as pipe:
-            json.dump(told, pipe)
-        _flush_and_leave()
-    os.close(writing)
-    return _told(child, reading, seconds)
-
-
-def _flush_and_leave() -> None:
-    sys.stdout.flush()
-    os._exit(0)
-
-
-def _told(child: int, reading: int, seconds: float) -> tuple[str, object]:
-    import select
-    import signal
-    import time
-
-    end, text = time.monotonic() + seconds, b""
-    with os.fdopen(reading, "rb", buffering=0) as pipe:
-        while select.select([pipe], [], [], max(0.0, end - time.monotonic()))[0]:
-            part = pipe.read(65536)
-            if not part:
-                break
-            text += part
-        else:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return "late", None
-    _, status = os.waitpid(child, 0)
-    if os.WIFSIGNALED(status) or not text:
-        return "killed", os.WTERMSIG(status) if os.WIFSIGNALED(status) else status
-    kind, value = json.loads(text)
-    return str(kind), value
 
 
 # --- lines ----------------------------------------------------------------------------------------

@@ -15,17 +15,16 @@ from __future__ import annotations
 
 import argparse
 import random
-import re
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from cases import SCENES
+from changes import Mutant, of_c
 from instrument import Shipped, in_a_fork
 
 from eomc.model.from_scene import from_scene
@@ -56,46 +55,6 @@ DIVERSE = (
     "cartpole", "pendulum_dp8_gauss8", "cartpole_batch", "chain", "tumbling_box", "cartpole_driven",
 )  # fmt: skip
 
-# what is found, and what it may become
-CHANGES: Sequence[tuple[str, Sequence[str]]] = (
-    (r"(?<=[\w)\]]) \+ (?=[\w(-])", (" - ", " * ")),
-    (r"(?<=[\w)\]]) - (?=[\w(])", (" + ",)),
-    (r"(?<=[\w)\]])\*(?=[\w(])", (" + ", "/")),
-    (r"(?<== )-(?=[\w(])", ("",)),
-    (r"(?<=return )-(?=[\w(])", ("",)),
-    (r"\+=", ("-=", "=")),
-    (r"-=", ("+=",)),
-    (r"&=", ("|=", "=")),
-    (r" <= ", (" > ", " < ")),
-    (r" >= ", (" < ", " > ")),
-    (r" < ", (" <= ", " >= ")),
-    (r" > ", (" <= ", " >= ")),
-    (r" == ", (" != ",)),
-    (r" != ", (" == ",)),
-    (r" && ", (" || ",)),
-    (r" \|\| ", (" && ",)),
-    (r"(?<=[(\s])!(?=[\w(])", ("",)),
-    (r"(?<![\w.])\d+\.\d+(?:e[+-]?\d+)?(?![\w.])", ("number",)),
-    (r"(?<=\[)\d+(?=\])", ("index",)),
-    (r"(?<![\w.\[{])\d+(?![\w.\]}])", ("whole",)),
-    (r"\bsin_(?=\w)", ("cos_",)),
-    (r"\bcos_(?=\w)", ("sin_",)),
-    (r"\+\+|--", ("other",)),
-)
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """A change of a source: the characters from `at` to `end` become `new`."""
-
-    at: int
-    end: int
-    new: str
-
-    def of(self, source: str) -> str:
-        """The changed source."""
-        return source[: self.at] + self.new + source[self.end :]
-
 
 def variant(name: str) -> System:
     """A scene, or one of VARIANTS, as a system, its start assembled."""
@@ -103,50 +62,6 @@ def variant(name: str) -> System:
     text = (SCENES / f"{base}.toml").read_text(encoding="utf-8")
     made = from_scene(parse(text.replace("[run]\n", "[run]\n" + more), f"{name}.toml"))
     return assembled(made)
-
-
-def mutants(source: str) -> list[Mutant]:
-    """All of them, in the code alone: no comments, no #if, no prototypes, no declared sizes."""
-    found = []
-    for start, line in _code(source):
-        for pattern, changes in CHANGES:
-            for match in re.finditer(pattern, line):
-                for change in changes:
-                    new = _changed(match[0], change)
-                    if new != match[0]:
-                        found.append(Mutant(start + match.start(), start + match.end(), new))
-    return found
-
-
-def _changed(old: str, change: str) -> str:
-    if change == "number":
-        return repr(float(old) * 1.5 if float(old) else 1.0)
-    if change in ("index", "whole"):
-        return str(int(old) + 1 if int(old) == 0 else int(old) - 1)
-    if change == "other":
-        return "--" if old == "++" else "++"
-    return change
-
-
-def _code(source: str) -> Iterator[tuple[int, str]]:
-    """Lines inside functions, comments blanked, each with its place."""
-    blank = re.sub(r"/\*.*?\*/", lambda m: re.sub(r"[^\n]", " ", m[0]), source, flags=re.S)
-    inside, at, skipped, depth = False, 0, False, 0
-    for line in blank.splitlines(keepends=True):
-        if line.startswith("#"):
-            # what is left out for this compiler
-            if line.startswith(("#if", "#ifdef", "#ifndef")):
-                depth += 1
-            elif line.startswith("#endif"):
-                depth -= 1
-            skipped = (depth > 0 and line.startswith("#else")) or (skipped and depth > 0)
-        elif line.startswith("{"):
-            inside = True
-        elif line.startswith("}"):
-            inside = False
-        elif inside and not skipped:
-            yield at, line
-        at += len(line)
 
 
 # --- what a module computes -----------------------------------------------------------------------
@@ -188,7 +103,7 @@ class Bench:
         self.shipped = Shipped(self.system, folder / name)
         self.reference = comparison.of(self.system)
         comparison.of = lambda made: self.reference
-        self.mutants = mutants(self.shipped.source)
+        self.mutants = of_c(self.shipped.source)
         # What the reference compiles for itself is there in all forks then. A library that was
         # loaded once is not loaded again, so that the original has a place of its own.
         own = Shipped(self.system, folder / f"{name}_original")

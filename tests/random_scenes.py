@@ -76,16 +76,16 @@ def outcome(seed: int, negate: bool, root: Path, wide: bool = False) -> Outcome:
         except SceneError as fault:  # a loop that can't close from there, rightly
             return Outcome(seed, "no start", _words(fault))
         sources = eomc.sources(made, EXTENSION)
-        module = _built(sources, root / "right")
+        module = built(sources, root / "right")
         if not negate:  # what is wrong is to be seen without a right one beside it
-            plain = _built(sources, root / "plain", "plain")
+            plain = built(sources, root / "plain", "plain")
     except Exception as fault:
         return Outcome(seed, "not built", _words(fault))
     what = ""
     if negate:
         right, (sources, what) = module, negated.negated_sources(made, EXTENSION, seed)
         try:
-            module = _built(sources, root / "wrong")
+            module = built(sources, root / "wrong")
         except EomcError as fault:  # such as a D that is not positive definite
             return Outcome(seed, "refused", f"{what}: {_words(fault)}")
         if not negated.changes(right, module, seed):
@@ -111,7 +111,7 @@ def _words(fault: Exception) -> str:
     return f"{type(fault).__name__}: {str(fault)[-600:]}"
 
 
-def _built(sources: Sources, folder: Path, form: str = "fast") -> ModuleType:
+def built(sources: Sources, folder: Path, form: str = "fast") -> ModuleType:
     """The module of a form of these sources, as a build makes it, its binding not optimised."""
     folder.mkdir(parents=True)
     for file, text in sources.files.items():

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 from cases import SCENES
-from random_scenes import EXTENSION, _built
+from random_scenes import EXTENSION, built
 
 import eomc
 from eomc.model.from_scene import from_scene
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str]) -> int:
                 for form in ("plain", "fast"):
                     os.environ["CC"], os.environ["EOMC_CFLAGS"] = cc, " ".join([flags, *PLAIN])
                     with tempfile.TemporaryDirectory() as place:
-                        *off, same = made.off(_built(made.sources, Path(place) / "x", form))
+                        *off, same = made.off(built(made.sources, Path(place) / "x", form))
                     wrong = bool(max(off) > LIMIT) or not same
                     bad += wrong
                     told = "".join(f"{x:9.3g}" for x in off)

@@ -1,11 +1,13 @@
-"""Builds that are killed: at each change of a file, and at random moments.
+"""Builds that are killed, at each change of a file and at random moments, and builds on full disks.
 
     python tests/hostile/killed_builds.py                  at every change, then at 100 moments
     python tests/hostile/killed_builds.py --moments 1000
+    python tests/hostile/killed_builds.py --full 40        on a disk with room for less and less
 
 A good module is there, and its scene has changed. After each kill the module that is there has to
 be the old one or the new one, whole; the next build makes the new one, and the next that has
-something to do leaves nothing else.
+something to do leaves nothing else. A disk may be out of bytes or of files; the build says so, and
+leaves nothing behind. The disk is in memory, mounted in a namespace of its own (unshare, Linux).
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import argparse
 import os
 import random
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -40,6 +43,7 @@ CHANGES = RENAMES | {
     "open",
 }
 WRITES = os.O_WRONLY | os.O_RDWR
+ALONE = ["unshare", "--map-root-user", "--mount"]
 OLD = 8.2548  # its g at 1 rad
 
 
@@ -98,6 +102,30 @@ class Killed:
         os.waitpid(child, 0)
         self.judge(f"{seconds:.3f} s")
 
+    def on_full_disks(self, steps: int) -> str:
+        """What was done and found, in a line: bytes, then files, are less by a part each time."""
+        self.root.mkdir(exist_ok=True)
+        self._mount("size=64m,nr_inodes=4096")
+        for step in range(steps):
+            for kind in ("size", "nr_inodes"):
+                self.renew()
+                now = os.statvfs(self.root)
+                used = {"size": (now.f_blocks - now.f_bfree) * now.f_frsize,
+                        "nr_inodes": now.f_files - now.f_ffree}[kind]  # fmt: skip
+                limit = f"{kind}={int(used * (1 + 1.5 * step / steps)) + 1}"
+                self._mount(f"remount,{limit}")
+                how, words = in_a_fork(lambda: eomc.build(self.scene, self.root).name, 60)
+                assert how == "done" or "No space left on device" in str(words), (limit, words)
+                assert leftovers(self.root) == [], (limit, leftovers(self.root))
+                self._mount("remount,size=64m,nr_inodes=4096")
+                before = self.outcomes["new"]
+                self.judge(limit)
+                assert (self.outcomes["new"] > before) == (how == "done"), (limit, words)
+        return f"{steps} sizes and {steps} numbers of files: {dict(self.outcomes)}"
+
+    def _mount(self, options: str) -> None:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", self.root], check=True)
+
     def judge(self, when: str) -> None:
         """Old or new, and mended by the next build."""
         found = gravity(self.root)
@@ -128,9 +156,20 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--moments", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--full", type=int, metavar="N", help="so many sizes of full disks")
     parser.add_argument("--renames", action="store_true", help="at renames alone, not each change")
     given = parser.parse_args(arguments)
+    if given.full and "EOMC_ALONE" not in os.environ:
+        own = [sys.executable, __file__, *arguments]
+        return subprocess.run([*ALONE, *own], env=os.environ | {"EOMC_ALONE": "1"}).returncode
     with tempfile.TemporaryDirectory() as folder:
+        if given.full:
+            killed = Killed(Path(folder))
+            try:
+                print(killed.on_full_disks(given.full))
+            finally:
+                subprocess.run(["umount", killed.root], check=True)
+            return 0
         kinds = RENAMES if given.renames else CHANGES
         print(Killed(Path(folder)).everything(kinds, given.moments, given.seed))
     return 0

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from changes import Mutant, of_c
 from instrument import in_a_fork
-from mutants import Mutant, mutants, tried
+from mutants import tried
 
 SOURCE = """/* a + b */
 int f(double a, double b);
@@ -29,7 +30,7 @@ int f(double a, double b)
 
 
 def test_mutants_are_of_code_alone() -> None:
-    found = {(SOURCE[m.at : m.end], m.new) for m in mutants(SOURCE)}
+    found = {(SOURCE[m.at : m.end], m.new) for m in of_c(SOURCE)}
     assert found == {
         (" <= ", " > "), (" <= ", " < "), ("0.5", "0.75"), ("*", " + "), ("*", "/"),
         (" - ", " + "), ("1", "0"),
