@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sympy
 
+from eomc.derive.constraints import _faded
 from eomc.derive.lagrange import derive
 from eomc.model.symbols import symbol
 from eomc.model.system import Constraint, System
@@ -93,3 +95,10 @@ def test_a_correction_moves_onto_the_rows_with_the_least_change_in_the_metric_of
     left = np.array(evaluator(program["constraint_rates"], exact=True)(off | after)[0])
     before = np.array(evaluator(program["constraint_rates"], exact=True)(off)[0])
     assert np.abs(left).max() < 1e-3 * np.abs(before).max()
+
+
+def test_a_row_with_a_number_in_it_never_fades() -> None:
+    x, zero, one = symbol("x1"), sympy.S.Zero, sympy.S.One
+    assert _faded([x, zero], 1e-5) == sympy.Float("1e-05")
+    assert _faded([zero, zero], 1e-5) == sympy.Float("1e-05")
+    assert _faded([x, -one], 1e-5) == _faded([zero, one], 1e-5) == 0

@@ -23,6 +23,7 @@ from eomc.emit.fast import views as fast_views
 from eomc.emit.fmu import views as fmu_views
 from eomc.emit.plain import views as plain_views
 from eomc.emit.public import Public
+from eomc.model.system import System
 from eomc.program import program
 
 MODULES = (views, plain_views, fast_views, fmu_views)
@@ -100,3 +101,10 @@ def test_public_functions_are_those_of_the_header(name: str) -> None:
     declared = re.findall(r"^\w[\w *]*\b\w+\([^;{]*\);", bare, re.MULTILINE)
     told = [re.sub(r"\s+", " ", text).removesuffix(";") for text in declared]
     assert [f.prototype for f in expected] == [t.replace("( ", "(") for t in told]
+
+
+def test_constants_are_computed_where_there_are_any() -> None:
+    made = System.make("free", ["x"], "x_dot**2/2", "x**2/2")
+    assert "compute_constants" not in eomc.sources(made).files["fast/free.c"]
+    made = System.make("free", ["x"], "m*x_dot**2/2", "x**2/2", parameters={"m": 1.0})
+    assert "free_compute_constants(" in eomc.sources(made).files["fast/free.c"]

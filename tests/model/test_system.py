@@ -373,3 +373,14 @@ def test_a_scene_named_without_its_folder_is_suggested(
     for given in ("crane", "crane.toml", "scenes/crane"):
         with pytest.raises(EomcError, match=r"did you mean 'scenes/crane\.toml'\?"):
             eomc.read(given)
+
+
+def test_what_is_left_out() -> None:
+    made = System.make("free", ["x"], "x_dot**2/2")
+    assert (made.potential, made.dissipation, made.forces) == (0, 0, (0,))
+    assert (made.inputs, made.outputs, made.constraints, made.events) == ((), (), (), ())
+    assert (made.run.h, made.run.duration, made.run.methods) == (0.001, 10.0, ("rk4",))
+    assert (made.run.real, made.run.batch, made.run.tolerance) == ("double", False, None)
+    assert not made.run.linearize and not made.run.discretize
+    (x,) = made.coordinates
+    assert (x.start, x.rate) == (0, 0)

@@ -122,6 +122,7 @@ def test_python_keeps_the_names_of_the_author() -> None:
             "energy.potential",
             "no real value",
         ),
+        ({"definitions": "z = '-2'", "potential": "x*z**0.5"}, "energy.potential", "no real"),
         (
             {"definitions": "a = '3**64'\nb = 'a**64'", "potential": "x*b"},
             "definitions.b",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from fractions import Fraction
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from types import ModuleType
 
@@ -154,3 +154,23 @@ def test_inputs_are_held_or_followed_by_each_method() -> None:
     exact = m.simulate(h=0.05, duration=2.0, u=[0.3]).q[-1]
     errors = [np.max(np.abs(q - exact)) for q in held]
     assert all(12 < a / b < 20 for a, b in pairwise(errors))
+
+
+def test_steps_are_the_methods_at_any_speed(cartpole: ModuleType) -> None:
+    """Angles that a stage turns by little are rotated by a series, by more by another, or anew."""
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x[2:], cartpole.acceleration(x[:2], x[2:])])
+
+    worst = 0.0
+    for h, turned in product(np.geomspace(0.01, 0.4, 30), 1.3 * 2.0 ** np.arange(-9, 2)):
+        run = cartpole.simulate(q0=[0.1, 0.7], qd0=[-0.2, turned / h], h=h, steps=5)
+        for x, found in pairwise(np.hstack([run.q, run.qd])):
+            k1 = slope(x)
+            k2 = slope(x + h / 2 * k1)
+            k3 = slope(x + h / 2 * k2)
+            k4 = slope(x + h * k3)
+            expected = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            scale = 1 + np.abs(x) + h * np.max(np.abs([k1, k2, k3, k4]), axis=0)
+            worst = max(worst, float(np.max(np.abs(found - expected) / scale)))
+    assert worst < 5e-15

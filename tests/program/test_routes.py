@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,7 +14,9 @@ from cases import scene_system
 
 from eomc.derive.lagrange import derive
 from eomc.derive.ldl import Solution
+from eomc.program import admissible
 from eomc.program.interpret import evaluate, nearby
+from eomc.program.ir import Cost, Function
 from eomc.program.lower import lower
 from eomc.program.routes import ROUTES, Material
 
@@ -73,3 +77,12 @@ def test_no_other_file_compares_their_names() -> None:
     ]
     assert len(files) > 100
     assert not compared
+
+
+def test_states_where_no_route_has_a_result_say_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = {"one": [math.inf, *[1e-16] * 3, 3e-16], "other": [math.inf, *[1e-16] * 3, math.inf]}
+    monkeypatch.setattr(admissible, "_errors", lambda made, *_: errors[made.name])
+    empty = Function("", (), (), (), (), Cost(), "", ())
+    made = {name: replace(empty, name=name) for name in errors}
+    found = admissible._roundings(made, scene_system("cartpole"))
+    assert found == {"one": 3e-16, "other": math.inf}

@@ -263,6 +263,35 @@ def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
         assert reported(robot, *words), words
 
 
+def test_what_joints_actuators_and_couplings_have_besides_is_reported(tmp_path: Path) -> None:
+    inside = f"""<body name="a"><freejoint name="fly" align="true"/>{BALL}
+      <body name="b"><joint name="turn" type="ball" damping="1" armature="0.1"/>{BALL}
+      <body name="c"><joint name="j" springyield="2" actuatorfrcrange="-3 3"/>{BALL}
+      <body name="d"><joint name="k"/>{BALL}</body></body></body></body>"""
+    after = """<actuator><motor name="late" joint="j" delay="0.1"/> <lever joint="j"/>
+        <motor name="slow" joint="j" damping="0 1"/> <motor name="spin" joint="turn"/></actuator>
+      <tendon><spatial name="rope"/><fixed name="sum"><joint joint="k" coef="1"/></fixed></tendon>
+      <equality><flex name="cloth"/><joint name="tied" joint1="turn" joint2="j"/>
+        <joint name="held" joint1="k"/>
+        <tendon name="wound" tendon1="rope" tendon2="sum"/></equality>"""
+    robot = model(tmp_path, inside, after=after)
+    for words in (
+        ("alignfree", "fly"),
+        ("damping of whole turns", "turn"),
+        ("yield of the springs", "j"),
+        ("force on joints, kept as notes", "j"),
+        ("delays of actuators", "late"),
+        ("elements that MJCF does not have", "lever in actuator"),
+        ("damping in the square and cube of actuators", "slow"),
+        ("actuators on free and ball joints", "spin"),
+        ("equality constraints of other kinds", "flex cloth"),
+        ("couplings of free and ball joints", "tied"),
+        ("softness of equality constraints", "held"),
+        ("couplings of tendons through space", "wound"),
+    ):
+        assert reported(robot, *words), (words, robot.left_out)
+
+
 def test_many_names_are_cut_and_counted(tmp_path: Path) -> None:
     sites = "".join(f'<site name="s{i}"/>' for i in range(30))
     robot = model(tmp_path, BODY + sites)
