@@ -12,6 +12,7 @@ import sympy
 from sympy import Expr
 
 from eomc.model.exact import Vector
+from eomc.model.symbols import needed
 from eomc.model.system import System, t
 from eomc.model.tree import Link, Tree
 from eomc.report.equations_text import (
@@ -84,12 +85,7 @@ def _declared(system: System) -> list[tuple[sympy.Symbol, Expr]] | None:
     along = (e for pair in system.applied for e in pair)
     shown = [*(c.formula for c in system.constraints), *along, system.dissipation, *system.forces]
     shown += [e for _, e in _energies(system)]
-    wanted = {s for e in shown for s in e.free_symbols}
-    known: list[tuple[sympy.Symbol, Expr]] = []
-    for name, e in reversed(system.definitions):
-        if name in wanted:
-            wanted |= e.free_symbols
-            known.insert(0, (name, e))
+    known = needed(system.definitions, shown)
     return known if len(known) <= DECLARED else None
 
 
