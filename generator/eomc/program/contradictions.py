@@ -12,7 +12,7 @@ from eomc.base.errors import Problem
 from eomc.base.texts import listed
 from eomc.model.symbols import Constraint
 from eomc.model.system import System
-from eomc.program.manifold import FADED, Flags, Frame, Manifold, Place, Vector
+from eomc.program.manifold import RANK_TOLERANCE, Flags, Frame, Manifold, Place, Vector
 
 PART = 0.01  # of the row that is furthest from zero: a row contradicts
 MOST = 12  # held values that are let go one by one
@@ -160,9 +160,9 @@ def _clash(manifold: Manifold, place: Place) -> list[int]:
 
     def kept(rows: Sequence[int]) -> bool:
         U, s, _ = np.linalg.svd(A[rows], full_matrices=False)
-        within = U[:, s > FADED]
+        within = U[:, s > RANK_TOLERANCE]
         left = aim[rows] - within @ (within.T @ aim[rows])
-        return bool(np.linalg.norm(left) <= FADED * np.linalg.norm(aim))
+        return bool(np.linalg.norm(left) <= RANK_TOLERANCE * np.linalg.norm(aim))
 
     rows = list(manifold.rows)
     if kept(rows):
@@ -181,7 +181,7 @@ def _alike(manifold: Manifold, rows: Sequence[int], place: Place) -> bool:
     for _ in range(PLACES):
         beside = manifold.place(place.q + reach * random.normal(size=len(free)), place.t)
         if beside is not None and len(rows) <= len(free):
-            if Frame(beside, free, rows).parts[1][-1] > FADED:
+            if Frame(beside, free, rows).parts[1][-1] > RANK_TOLERANCE:
                 return False
     return True
 

@@ -23,7 +23,7 @@ from eomc.program.lower import lower
 Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-FADED = 1e-7  # singular values below are zero, where rows hold to rounding
+RANK_TOLERANCE = 1e-7  # singular values below are zero, where rows hold to rounding
 LINEAR = 0.25  # of a step: what rows may differ by from their tangent at its end
 LEAP = 0.5  # of a coordinate or rad: a step, at most
 SHORTEST = 2.0**-13  # part of a step
@@ -133,7 +133,7 @@ class Frame:
         """The same as far as they can, rows that depend on others left to these."""
         U, s, V = self.parts
         aim = values[self.rows] / self.place.sizes[self.rows]
-        return -self.back(V.T @ (U.T @ aim / np.where(s > FADED, s, np.inf)))
+        return -self.back(V.T @ (U.T @ aim / np.where(s > RANK_TOLERANCE, s, np.inf)))
 
     def along(self, direction: Vector) -> Vector:
         """(nq,): what of a direction leaves the rows as they are."""

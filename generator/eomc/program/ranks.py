@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from eomc.program.interpret import context
-from eomc.program.manifold import FADED, Flags, Frame, Manifold, Place, Vector
+from eomc.program.manifold import RANK_TOLERANCE, Flags, Frame, Manifold, Place, Vector
 
 POSITIONS = 12  # beside the start
 MANY, FEWER = 24, 3  # rows of a large system; positions of one whose rank is full at the start
@@ -67,18 +67,18 @@ def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
     """Without weights and slopes, and the places that were looked at."""
     free = np.ones(len(start.q), dtype=bool)
     first = Frame(start, free, manifold.rows)
-    sure = len(first.parts[1]) == len(manifold.rows) and first.parts[1][-1] > FADED
+    sure = len(first.parts[1]) == len(manifold.rows) and first.parts[1][-1] > RANK_TOLERANCE
     positions = FEWER if sure and len(manifold.rows) > MANY else POSITIONS
     rest = [Frame(place, free, manifold.rows) for place in walk(manifold, start, positions)]
     frames, places = [first, *rest], [start, *(f.place for f in rest)]
     if flat := _flat(manifold, places):
         return Ranks(0, (), (), False, (0.0, 0.0), len(places), flat=flat), places
-    counts = [int(np.sum(f.parts[1] > FADED)) for f in frames]
+    counts = [int(np.sum(f.parts[1] > RANK_TOLERANCE)) for f in frames]
     rank, m = max(counts), len(manifold.rows)
     regular = [f for f, n in zip(frames, counts, strict=True) if n == rank]
     ends = [(float(f.parts[1][rank - 1]), float(f.parts[1][0])) if rank else (1, 1) for f in frames]
     ratios = [least / most if most else 0.0 for least, most in ends]
-    ratios = [x if x > FADED else 0.0 for x in ratios]
+    ratios = [x if x > RANK_TOLERANCE else 0.0 for x in ratios]
     sigma = (ratios[0], min(ratios))
     if rank == m:
         return Ranks(rank, (), (), True, sigma, len(places)), places

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .model import Model
 
 _MOST = 100  # steps of Newton's method
-_FADED = 1e-9  # of the largest singular value of A: a row that is none here
+_RANK_TOLERANCE = 1e-9  # of the largest singular value of A: a row that is none here
 _SHORTEST = 2.0**-20  # part of a step that is tried
 
 
@@ -124,7 +124,7 @@ class _Rows:
         n, moved = self.model.nq, np.flatnonzero(self.moved[: self.model.nq])
         A = self.model.constraint_jacobian(z[:n], t=self.t, params=self.params)[:, moved]
         _, s, V = np.linalg.svd(A.astype(float))
-        rank = int(np.sum(s > _FADED * np.max(s, initial=0)))
+        rank = int(np.sum(s > _RANK_TOLERANCE * np.max(s, initial=0)))
         ways = np.zeros((len(moved) - rank, len(z)))
         ways[:, moved] = V[rank:]
         return np.concatenate([ways, np.eye(len(z))[n:][self.moved[n:]]])
@@ -132,5 +132,5 @@ class _Rows:
     def unborne(self, q: Array, forces: Array) -> Array:
         """What of the forces (nq,) no multipliers can bear."""
         A = self.model.constraint_jacobian(q, t=self.t, params=self.params).astype(float)
-        left: Array = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_FADED)[0]
+        left: Array = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
         return left

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-FADED = 1e-9  # of the largest singular value: a row that is none here
+RANK_TOLERANCE = 1e-9  # of the largest singular value: a row that is none here
 MOST = 60  # sweeps of Newton's method
 HELD = 1e-10  # of the terms of a row: what it may still be
 SETTLED = 16 * 2.0**-52  # of the state: what a correction may still be when it is rounding
@@ -51,11 +51,11 @@ def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, 
     matrix = scale[:, None] * np.block([[D, -A.T], [A, np.zeros((m, m))]]) * scale
     right = scale * np.concatenate([force, level])
     sizes = np.linalg.svd(matrix, compute_uv=False)
-    if sizes[-1] > FADED * sizes[0]:
+    if sizes[-1] > RANK_TOLERANCE * sizes[0]:
         found = np.linalg.solve(matrix, right)
         found += np.linalg.solve(matrix, right - matrix @ found)
     else:
-        found = np.linalg.lstsq(matrix, right, rcond=FADED)[0]
+        found = np.linalg.lstsq(matrix, right, rcond=RANK_TOLERANCE)[0]
     found *= scale
     return found[:n], found[n:]
 
