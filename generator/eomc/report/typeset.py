@@ -301,22 +301,6 @@ class _Text(PrettyPrinter):  # type: ignore[misc]
     def _print_Symbol(self, e: Symbol, bold_name: bool = False) -> prettyForm:
         return prettyForm(self._plain.get(e) or _set_as_name(self._names.get(e, e).name))
 
-    def _print_Mul(self, e: Expr) -> prettyForm:
-        """As SymPy's, without units of physics, whose import takes a tenth of a second."""
-        if e.args[0] == 1 or any(x.is_Number for x in e.args[1:]):
-            return super()._print_Mul(e)
-        above, below = list[Expr](), list[Expr]()
-        for x in e.args:
-            if x.is_Rational:
-                above += [sympy.Integer(x.p)] * (x.p != 1)
-                below += [sympy.Integer(x.q)] * (x.q != 1)
-            elif x.is_Pow and x.exp.is_Rational and x.exp < 0:
-                below.append(x.base if x.exp == -1 else sympy.Pow(x.base, -x.exp, evaluate=False))
-            else:
-                above.append(x)
-        top = prettyForm.__mul__(*map(self._print, above or [sympy.S.One]))
-        return top / prettyForm.__mul__(*map(self._print, below)) if below else top
-
     def _print_dot(self, e: Expr) -> prettyForm:
         inside = prettyForm(*self._print(e.args[0]).parens())
         return prettyForm(*prettyForm("d/dt ").right(inside))
