@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -53,20 +53,20 @@ class Values:
     @property
     def constraints(self) -> Mapping[str, Array]:
         """What each constraint lacks, (batch, n), by name: rounding."""
-        names = self._model.constraint_names
-        if not names:
-            return ByName("constraints", (), ())
-        found = self._values("constraints", self._model.constraints, (len(names),))
-        return ByName("constraints", names, np.ascontiguousarray(np.moveaxis(found, 2, 0)))
+        model, names = self._model, self._model.constraint_names
+        return _by_name(
+            "constraints", names,
+            lambda: self._values("constraints", model.constraints, (len(names),)),
+        )  # fmt: skip
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
         """The multiplier of each constraint, (batch, n), by name."""
-        names = self._model.constraint_names
-        if not names:
-            return ByName("multipliers", (), ())
-        found = self._driven("multipliers", self._model.multipliers, (len(names),))
-        return ByName("multipliers", names, np.ascontiguousarray(np.moveaxis(found, 2, 0)))
+        model, names = self._model, self._model.constraint_names
+        return _by_name(
+            "multipliers", names,
+            lambda: self._driven("multipliers", model.multipliers, (len(names),)),
+        )  # fmt: skip
 
     @property
     def reactions(self) -> Mapping[str, Array]:
@@ -75,14 +75,10 @@ class Values:
         Force and moment about the joint's point, (batch, n, 6); in the plane (batch, n, 3), force
         (2) and moment.
         """
-        model = self._model
-        loops = model.loops
-        if not loops:
-            return ByName("reactions", (), ())
+        model, loops = self._model, self._model.loops
         shape = (len(loops), 3 if model._plane else 6)
-        timed = model._timed & {"multipliers", "reactions"}
-        found = self._driven(min(timed, default="reactions"), model._reactions, shape)
-        return ByName("reactions", loops, np.moveaxis(found, -2, 0))
+        timed = min(model._timed & {"multipliers", "reactions"}, default="reactions")
+        return _by_name("reactions", loops, lambda: self._driven(timed, model._reactions, shape))
 
     def _driven(self, name: str, function: Callable[..., Any], shape: tuple[int, ...]) -> Array:
         """What a function of the state and the inputs gives at all rows."""
@@ -113,3 +109,8 @@ class Values:
         for k in [slice(None)] if alike else [slice(k, k + 1) for k in range(count)]:
             for j in [slice(None)] if steady else [slice(j, j + 1) for j in range(n)]:
                 yield k, j
+
+
+def _by_name(what: str, names: Sequence[str], rows: Callable[[], Array]) -> ByName:
+    """What `rows` gives, (batch, n, names, ...), by name; they are not asked for where none is."""
+    return ByName(what, names, np.ascontiguousarray(np.moveaxis(rows(), 2, 0)) if names else ())
