@@ -24,6 +24,7 @@ from eomc.emit.views import (
     Stub,
 )
 from eomc.integrators.tableaux import METHODS
+from eomc.runtime.package import CONSTRAINED
 
 _OF_STEPS = ("Phi", "Gamma")
 TIMED = (
@@ -35,7 +36,6 @@ FUNCTIONS = (
     "linearize load_run output potential_energy power rhs sensitivity signal simulate "
     "simulate_batch step step_batch tau"
 ).split()
-CONSTRAINED = "constraint_jacobian constraint_rates constraints multipliers project tangent".split()
 ASKED = {  # what only scenes have that ask for it in [run]
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
     "inverse_dynamics": ("inverse_dynamics", "drive_forces"),

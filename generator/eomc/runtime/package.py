@@ -42,10 +42,9 @@ def meant(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else ""
 
 
-CONSTRAINED = (
-    "constraint_jacobian constraint_names constraint_rates constraints loops multipliers project "
-    "reactions tangent"
-).split()
+# what only scenes with constraints have: functions, and what else
+CONSTRAINED = "constraint_jacobian constraint_rates constraints multipliers project tangent".split()
+_CONSTRAINED = (*CONSTRAINED, "constraint_names", "loops", "reactions")
 
 
 class Package(ModuleType):
@@ -54,7 +53,7 @@ class Package(ModuleType):
     def __getattr__(self, name: str) -> Any:
         """Raises AttributeError: of what only scenes with constraints have, with the reason."""
         model = self.__dict__.get("_model")
-        if model is not None and name in CONSTRAINED:
+        if model is not None and name in _CONSTRAINED:
             what = "[[loop]]" if hasattr(model, name) and model.constraint_names else (
                 "constraints: a scene has them by [constraints] or [[loop]]"
             )  # fmt: skip
