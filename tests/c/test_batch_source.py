@@ -11,9 +11,13 @@ from pathlib import Path
 
 import pytest
 from cases import SCENES, fast_kit
-from conftest import tiers
+from compilers import compiled
+from conftest import EVERYTHING, needs, tiers
+from corner_cases import CASES
 
 import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
 
 
 def test_no_instances_in_c_read_nothing(tmp_path: Path) -> None:
@@ -82,3 +86,16 @@ def test_strict_compilers_have_no_complaint(name: str, real: str, tmp_path: Path
     for compiler in filter(shutil.which, ("gcc", "clang")):
         given = [compiler, "-std=c99", *warnings, "-c", f"{name}.c", "-o", "out.o"]
         subprocess.run(given, cwd=tmp_path, check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "level"), [(EVERYTHING, "-Os"), (CASES["heaviside"].text, "-O1")], ids=["c", "out"]
+)
+def test_gcc_sees_that_all_is_initialised(text: str, level: str, tmp_path: Path) -> None:
+    """Constants of an empty batch, and vectors that are filled entry by entry."""
+    made = eomc.sources(from_scene(parse(text.replace("[run]", "[run]\nbatch = true"), "x.toml")))
+    for file, content in fast_kit(made).items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    flags = ["-std=gnu99", level, "-Wall", "-Wextra", "-Werror"]
+    compiled(needs("gcc"), *flags, "-c", f"{made.name}.c", "-o", "out.o", cwd=tmp_path)
