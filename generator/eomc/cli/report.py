@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from eomc import pipeline
+from eomc.base.errors import SceneError
 from eomc.cli import files, options
 from eomc.cli.terminal import progress_bar, say, shown
 
@@ -37,6 +38,12 @@ def command(
     measured = []
     for scene in scenes:
         system = pipeline.read(scene)
+        if system.modes:
+            why = (
+                'a report compares steps that pass over events, and friction = "stick" is made of '
+                'these: report on friction = "smooth", or run it by several tolerances'
+            )
+            raise SceneError([system.problem("run.friction", why)])
         with progress_bar(f"measuring {scene.stem}", quiet) as progress:
             made = cost_of_digits.measure(system, root, progress=progress)
         measured.append(pages.as_dict(made))

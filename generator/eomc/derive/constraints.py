@@ -34,7 +34,8 @@ class Constraints:
     a row that depends on others in this position: nothing is solved for it there; in accelerations,
     and in corrections. weights: where D alone is singular, of each row solved for, the part of
     A^T A that makes it regular; else none. faded: of each row solved for, the pivot that tells that
-    it has no slope at all in this position, where it may have none.
+    it has no slope at all in this position, where it may have none. switched: rows that hold in
+    some modes only.
     """
 
     values: Vector
@@ -47,6 +48,7 @@ class Constraints:
     drop: tuple[Expr, Expr]
     weights: Vector = ()
     faded: Vector = ()
+    switched: frozenset[int] = frozenset()
 
 
 def constraints(system: System, e: Energies) -> Constraints | None:
@@ -70,6 +72,7 @@ def constraints(system: System, e: Energies) -> Constraints | None:
         tuple(tape.scaled(S.NegativeOne, x) for x in moved), count, solved,
         DROPPED[system.run.real], tuple(sympy.Rational(weights[k]) for k in solved if weights),
         tuple(_faded(by[k], slopes[k] * FADED[system.run.real]) for k in solved),
+        frozenset(k for k, c in enumerate(system.constraints) if c.switched),
     )  # fmt: skip
 
 

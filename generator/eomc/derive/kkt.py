@@ -14,7 +14,7 @@ velocities off the rows grows as 1/y^2 through the stages left, so that 1 run of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import sympy
@@ -26,6 +26,7 @@ from eomc.derive.tape import Tape
 from eomc.model.symbols import pivot_inverse
 
 Pattern = Mapping[int, set[int]]
+UNHELD = sympy.Float("1e-9")  # of a row's pivot: what counts as that where it is dropped
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Factors:
 
     steps: in their order what is eliminated, the inverse of its pivot, and L below it. pivots: of
     coordinates, all positive, paired with the entries they were. inverses: of the rows' pivots, 0
-    where one is dropped.
+    where one is dropped. switched: of rows that modes switch the pivot, where it is dropped a part
+    of what coordinates alone make of it, and the entries under it, before L.
     """
 
     tape: Tape
@@ -42,11 +44,15 @@ class Factors:
     steps: tuple[tuple[int, Expr, Mapping[int, Expr]], ...]
     pivots: Pairs
     inverses: Vector
+    switched: Mapping[int, tuple[Expr, Mapping[int, Expr]]]
 
     def solve(
         self, b: Sequence[Expr], c: Sequence[Expr], short: Callable[[Expr], Expr]
-    ) -> tuple[Vector, Vector]:
-        """a and lambda. short: rewrites what elimination makes."""
+    ) -> tuple[Vector, Vector, Vector]:
+        """a and lambda, and of switched rows lambda times the pivot, dropped or not.
+
+        short: rewrites what elimination makes.
+        """
         tape, y = self.tape, [*b, *c]
         for k, _, factors in self.steps:
             for i, factor in factors.items():
@@ -56,7 +62,12 @@ class Factors:
             rest = [tape.define(-factor * x[i]) for i, factor in factors.items()]
             x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *rest))
         n, m = self.count, len(self.steps) - self.count
-        return tuple(x[i] for i in range(n)), tuple(tape.define(-x[n + r]) for r in range(m))
+        lacks = (
+            tape.total([y[n + r], *(tape.define(-a * x[i]) for i, a in below.items())])
+            for r, (_, below) in self.switched.items()
+        )
+        multipliers = tuple(tape.define(-x[n + r]) for r in range(m))
+        return tuple(x[i] for i in range(n)), multipliers, tuple(lacks)
 
 
 def factors(
@@ -66,10 +77,12 @@ def factors(
     drop: Expr,
     faded: Sequence[Expr],
     short: Callable[[Expr], Expr] = lambda atom: atom,
+    switched: Container[int] = (),
 ) -> Factors:
     """The KKT matrix of D and A, factored.
 
     drop, faded: the part of itself, and of each row the number, below which a pivot is none.
+    switched: rows that modes switch, of which more is told.
     """
     n = len(D)
     M = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
@@ -80,7 +93,7 @@ def factors(
     order = _order(_pattern(M, n + len(A)), n, tape, M)
     whole: dict[int, Expr] = {}  # of rows: what coordinates alone have made of the pivot
     left, steps, pivots = set(order), [], []
-    inverses: dict[int, Expr] = {}
+    inverses, told = dict[int, Expr](), dict[int, tuple[Expr, Mapping[int, Expr]]]()
     for k in order:
         left.remove(k)
         below = {i: M[i, k] for i in sorted(left) if (i, k) in M}
@@ -95,6 +108,10 @@ def factors(
             limit = tape.total([limit, faded[k - n]])
             inverses[k] = tape.define(pivot_inverse(pivot, limit))
             inverse = tape.define(-inverses[k])
+            if k - n in switched:
+                kept = tape.define(pivot * inverses[k])  # 1, or 0
+                spare = tape.times(tape.define(UNHELD * (1 - kept)), whole.get(k, S.Zero))
+                told[k - n] = tape.total([pivot, spare]), below
         found = {i: tape.define(a * inverse) for i, a in below.items()}
         for i, factor in found.items():
             for j, a in below.items():
@@ -105,7 +122,7 @@ def factors(
                         whole[i] = short(tape.define(whole.get(i, S.Zero) - part))
         steps.append((k, inverse, found))
     rows = tuple(inverses[n + r] for r in range(len(A)))
-    return Factors(tape, n, tuple(steps), tuple(pivots), rows)
+    return Factors(tape, n, tuple(steps), tuple(pivots), rows, told)
 
 
 def _pattern(M: Mapping[tuple[int, int], Expr], size: int) -> Pattern:
@@ -144,13 +161,19 @@ def accelerations(
     A = tuple(chosen(rows.jacobian, rows))
     c = [tape.scaled(S.NegativeOne, x) for x in chosen(rows.rest, rows)]
     D, b = with_mass(tape, D, b, A, c, rows.weights)
-    made = factors(tape, D, A, rows.drop[0], rows.faded, short)
-    a, some = made.solve(b, c, short)
+    switched = [r for r, k in enumerate(rows.solved) if k in rows.switched]
+    made = factors(tape, D, A, rows.drop[0], rows.faded, short, switched)
+    a, some, lacks = made.solve(b, c, short)
     multipliers = [S.Zero] * len(rows.values)
     for k, x in zip(rows.solved, some, strict=True):
         multipliers[k] = x
     order = tuple(k for k, _, _ in made.steps if k < len(D))
-    return Solution(tape, a, order, made.pivots, "D", tuple(multipliers))
+    told = zip(made.switched.items(), lacks, strict=True)
+    parts = {
+        rows.solved[r]: (lack, pivot, next(D[j][j] for j, a in enumerate(A[r]) if a != 0))
+        for (r, (pivot, _)), lack in told
+    }
+    return Solution(tape, a, order, made.pivots, "D", tuple(multipliers), parts)
 
 
 def with_mass(
@@ -181,15 +204,17 @@ def correction(
     """What is added to q and qd so that rows hold, and the inverses of the rows' pivots.
 
     Newton's step in the metric of D: the least change dq with A dq = -phi, then that of qd with
-    rates that are taken at q + dq, to the first order. Second: the pivots, as `Solution` has them.
+    rates that are taken at q + dq, to the first order. Of rows that modes switch there is no
+    inverse: it may well be 0. Second: the pivots, as `Solution` has them.
     """
     n, A = len(D), tuple(chosen(rows.jacobian, rows))
     D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)
     made = factors(tape, D, A, rows.drop[1], rows.faded)
     positions = [S.Zero if k >= rows.holonomic else -rows.values[k] for k in rows.solved]
     zero, same = [S.Zero] * n, lambda atom: atom
-    dq, _ = made.solve(zero, positions, same)
+    dq, _, _ = made.solve(zero, positions, same)
     moved = tape.forward(rows.rates, dict(zip(q, dq, strict=True)))
     rates = [tape.total([x, y]) for x, y in zip(rows.rates, moved, strict=True)]
-    dqd, _ = made.solve(zero, [tape.scaled(S.NegativeOne, rates[k]) for k in rows.solved], same)
-    return (*dq, *dqd, *made.inverses), made.pivots
+    dqd, _, _ = made.solve(zero, [tape.scaled(S.NegativeOne, rates[k]) for k in rows.solved], same)
+    told = (x for k, x in zip(rows.solved, made.inverses, strict=True) if k not in rows.switched)
+    return (*dq, *dqd, *told), made.pivots

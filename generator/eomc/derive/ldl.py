@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import sympy
 from sympy import Expr, S
@@ -24,7 +24,8 @@ class Solution:
     order: the order in which coordinates are eliminated; pivots: those of L diag(pivots) L^T, all
     positive where D is positive definite, each paired with a value of the size of its origin.
     matrix: what is eliminated, D or, for the forces that hold links together, S. multipliers: of
-    constraints, where there are.
+    constraints, where there are; parts: of those that modes switch, by their places, what these are
+    made of, as `Constraint.parts` says.
     """
 
     tape: Tape
@@ -33,6 +34,7 @@ class Solution:
     pivots: Pairs
     matrix: str = "D"
     multipliers: Vector = ()
+    parts: Mapping[int, Vector] = field(default_factory=dict)
 
 
 # qdd by one way of solving; or why that was not tried; or None where there is nothing to try

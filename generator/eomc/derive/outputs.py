@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from sympy import Expr, S, Symbol
@@ -24,13 +24,20 @@ class Outputs:
     slopes: Rows
 
 
-def outputs(system: System, sloped: bool, more: Sequence[Symbol] = ()) -> Outputs:
+def outputs(
+    system: System,
+    sloped: bool,
+    more: Sequence[Symbol] = (),
+    beside: tuple[Tape, Mapping[Symbol, Expr]] | None = None,
+) -> Outputs:
     """The system's outputs, with slopes where it is `sloped`. more: what they read besides.
 
-    Raises SceneError where a derivative is needed that does not exist.
+    beside: a tape that they go on, with what some symbols are there. Raises SceneError where a
+    derivative is needed that does not exist.
     """
+    tape, known = beside or (Tape(leaves(system, *system.qdd, *more)), {})
     try:
-        return _outputs(system, sloped, more)
+        return _outputs(system, sloped, tape, dict(known))
     except RoughError:
         message = (
             "a derivative of something that jumps is needed (sign or heaviside, in dot(...) or for "
@@ -45,11 +52,9 @@ def signal_slopes(system: System) -> Outputs:
     return outputs(replace(system, outputs=signals, inputs=()), sloped=True)
 
 
-def _outputs(system: System, sloped: bool, more: Sequence[Symbol]) -> Outputs:
-    tape = Tape(leaves(system, *system.qdd, *more))
+def _outputs(system: System, sloped: bool, tape: Tape, known: dict[Symbol, Expr]) -> Outputs:
     state = (*system.q, *system.qd)
     rates = {**dict(zip(state, (*system.qd, *system.qdd), strict=True)), t: S.One}
-    known: dict[Symbol, Expr] = {}
 
     def value(expr: Expr) -> Expr:
         """The expression's atom; dot(...) by the chain rule, from the innermost."""

@@ -26,7 +26,7 @@ TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
-BUSY = 32  # events in one step, from which on it ends there
+BUSY = 32  # events in one step, without those that happen at once
 
 
 def memory(functions: Functions) -> str:
@@ -197,8 +197,13 @@ def steps(made: Stepping) -> Adaptive:
     )
 
 
-def run(made: Stepping, happen: str = "", restart: str = "") -> AdaptiveRun:
-    """The loop. happen, restart: the calls that find events, and go on behind them."""
+def busy(system: System) -> int:
+    """Events in one step, from which on it ends there."""
+    return BUSY + sum(e.begins is not None for e in system.events)
+
+
+def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") -> AdaptiveRun:
+    """The loop. happen, restart, begun: the calls that find events, and go on behind them."""
     functions, form = made.functions, made.form
     target = functions.target
     row = {name: f"{name} + {functions.NQ}*rows" for name in ("q_rows", "qd_rows")}
@@ -223,7 +228,8 @@ def run(made: Stepping, happen: str = "", restart: str = "") -> AdaptiveRun:
         loosest=target.literal(LOOSEST),
         tightest=target.literal(1e-15 if target.real.epsilon < 1e-10 else 5e-7),
         events=bool(happen),
-        busy=BUSY,
+        begun=begun,
+        busy=busy(target.system),
         anew=ANEW,
         run=functions.public.adaptive(METHOD.name),
         advance=made.step.call(x="&x"),

@@ -62,6 +62,13 @@ KINDS: Mapping[str, Kind] = {
         qdd=True,
     ),
     "events": Kind("events", "e", True, True, "Of each event what is zero where it happens."),
+    "begins": Kind(
+        "begins",
+        "e",
+        True,
+        True,
+        "Of each event what is above zero where it happens as motion begins; -1 of others.",
+    ),
     "jumps": Kind(
         "after", "e*2*n", True, True, "[q; qd] behind each event, where it is one that jumps."
     ),

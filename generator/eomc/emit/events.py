@@ -7,15 +7,11 @@ from fractions import Fraction
 from math import cos, pi, prod
 
 from eomc.emit import c_function as c
-from eomc.emit.adaptive import BUSY, METHOD, Form, Stepping, run, steps
+from eomc.emit.adaptive import BUSY, METHOD, Form, Stepping, busy, run, steps
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
-from eomc.emit.plain.adaptive_views import (
-    Adaptive,
-    AdaptiveRun,
-    Events,
-)
+from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Begun, Events
 from eomc.integrators.tableaux import Row
 from eomc.scene.schema import ACTIONS
 
@@ -60,7 +56,7 @@ def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
     return [tuple(integral(n, at) for n in range(count)) for at in x]
 
 
-def views(functions: Functions, form: Form) -> Iterator[Adaptive | Events | AdaptiveRun]:
+def views(functions: Functions, form: Form) -> Iterator[Adaptive | Events | Begun | AdaptiveRun]:
     """Adaptive steps, the events in them, and the loop over both."""
     made = Stepping(functions, form)
     yield steps(made)
@@ -71,7 +67,34 @@ def views(functions: Functions, form: Form) -> Iterator[Adaptive | Events | Adap
     yield found
     here = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
     again = here | {"reached": "reached"}
-    yield run(made, found.happened.call(**here), found.restart.call(**again))
+    begun = _begun(made, found.restart) if "begins" in functions.target.program else None
+    if begun:
+        yield begun
+    begins = begun.function.call(x="&x") if begun else ""
+    yield run(made, found.happened.call(**here), found.restart.call(**again), begins)
+
+
+def _begun(made: Stepping, restart: CFunction) -> Begun:
+    functions, x = made.functions, made.state.name
+    values, record = functions.public.evaluation("begins"), functions.public.adaptive_events
+    taken = {a.name for f in (values, restart) for a in f.arguments}
+    own = [a for a in functions.usual("u", "p") if a.name in taken]
+    arguments = (made.state, *own, *record, made.held)
+    state = {name: c.member(x, name) for name in ("t", "q", "qd")}
+    return Begun(
+        **functions.names,
+        function=CFunction(
+            f"{made.method}_begun", functions.status, arguments, qualifier="static"
+        ),
+        values=values.call(begins="value", **state),
+        restart=restart.call(reached=state["t"]),
+        width=_width(functions),
+    )  # fmt: skip
+
+
+def _width(functions: Functions) -> str:
+    """Numbers of an event: t, q, qd."""
+    return f"(1 + 2*{functions.NQ})"
 
 
 def _events(made: Stepping) -> Events:
@@ -79,7 +102,7 @@ def _events(made: Stepping) -> Events:
     target, real, public = functions.target, functions.real, functions.public
     end, system = target.real.function_suffix, target.system
     jumps = "jumps" in target.program
-    asked = [public.evaluation(name) for name in ("events", "jumps")[: 1 + jumps]]
+    asked = [public.evaluation(n) for n in ("events", "begins", "jumps") if n in target.program]
     needed = {a.name for f in asked for a in f.arguments}
     values, number, k = asked[0], made.number, CArgument("int", "k")
     read = c.given(f"{method}_adaptive_state", "x")
@@ -124,13 +147,15 @@ def _events(made: Stepping) -> Events:
         twice=c.in_braces(numbers(row, target.real) for row in integrals(x, METHOD.stages, 2)),
         directions=tuple(DIRECTIONS[e.direction] for e in system.events),
         actions=tuple(ACTIONS.index(e.action) for e in system.events),
+        above=tuple(int(e.above) for e in system.events if "begins" in target.program),
         jumps=jumps,
-        busy=BUSY,
+        busy=busy(system),
+        together=BUSY + 4 * (busy(system) - BUSY),
         apart=target.literal(apart),
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
         chance=target.literal(1e-6),
-        width=f"(1 + 2*{functions.NQ})",
+        width=_width(functions),
         looked=looked,
         values=values.call(events="g", **within),
         bracketed=bracketed,

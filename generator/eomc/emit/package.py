@@ -229,6 +229,7 @@ def face(target: Target, extension: str) -> Face:
         held=(*(c.held for c in s.coordinates), *(c.held_rate for c in s.coordinates)),
         holonomic=sum(c.holonomic for c in s.constraints),
         redundant=tuple(k for k, c in enumerate(s.constraints) if c.redundant),
+        modes=tuple((m.at, m.of) for m in s.modes),
         reactions=tuple(r.name for r in s.reactions),
         timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,

@@ -223,6 +223,7 @@ class Face:
     held: tuple[bool, ...]
     holonomic: int
     redundant: tuple[int, ...]
+    modes: tuple[tuple[int, int], ...]
     reactions: tuple[str, ...]
     timed: tuple[str, ...]
     batch: bool

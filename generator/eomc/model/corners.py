@@ -21,7 +21,7 @@ def corners(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
         *(e for x in s.applied for e in x),
         *(e for _, e in s.definitions),
         *(i.signal for i in s.inputs),
-        *(c.formula for c in s.constraints),
+        *(c.formula for c in s.constraints if not c.switched),
     )
     found = {atom.func.__name__.lower() for e in exprs for atom in e.atoms(*kinds)}
     return ", ".join(sorted(found))

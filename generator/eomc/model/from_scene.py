@@ -11,6 +11,7 @@ from eomc.base.errors import Problem, SceneError
 from eomc.model import algebra, constraints, growth, limits
 from eomc.model.loops import Closed
 from eomc.model.multibody import Builder, Terms
+from eomc.model.sticking import Friction, sticking
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
@@ -61,8 +62,10 @@ class _Formulas:
             known[constant.name] = self.value(f"constants.{constant.name}", constant.formula)
         declared = [*known, *(name for name, _ in scene.definitions)]
         rates = {symbol(c.name): symbol(f"{c.name}_dot") for c in scene.coordinates}
-        builder = Builder(scene.assembly, self.value, rates, declared) if scene.assembly else None
-        made = []
+        builder, made = None, []
+        if scene.assembly:
+            sticks = scene.run.friction == "stick"
+            builder = Builder(scene.assembly, self.value, rates, declared, sticks)
         if builder:
             builder.build_tree()
             made += builder.terms.definitions
@@ -82,6 +85,32 @@ class _Formulas:
             signal = self.value(f"inputs.{i.name}.signal", i.signal)
             ends = (f and self.value(f"inputs.{i.name}.limits", f) for f in i.limits)
             yield Input(i.name, i.unit, signal, i.note, tuple(ends))
+
+    def frictions(self, more: Terms) -> tuple[dict[str, Expr], list[Friction]]:
+        """Friction along coordinates and in joints: smooth forces, or what sticks."""
+        smooth, sticks = dict[str, Expr](), list[Friction]()
+        for c in self.scene.coordinates:
+            if c.friction is not None and c.friction_width is not None:
+                key = f"coordinates.{c.name}.friction"
+                size = self.value(key, c.friction)
+                if self.scene.run.friction == "stick":
+                    sticks.append(Friction(c.name, size, key))
+                else:
+                    width = self.value(f"{key}_width", c.friction_width)
+                    smooth[c.name] = -size * sympy.tanh(symbol(f"{c.name}_dot") / width)
+        for q, friction in more.frictions:
+            if q in more.rates:
+                sticks.append(friction)
+            else:
+                why = "friction that sticks needs a joint with a coordinate of its own"
+                self.problems.append(
+                    self.scene.problem(
+                        friction.key,
+                        f"{why}: take a slip of the coordinates out, "
+                        'or friction = "smooth" in [run]',
+                    )
+                )
+        return smooth, sticks
 
     def events(self) -> Iterator[Event]:
         """The events, with what their jumps set."""
@@ -150,6 +179,7 @@ def from_scene(scene: Scene) -> System:
     zero = sympy.S.Zero
     kinetic_energy = sympy.Add(kinetic, more.kinetic, *more.tree_kinetic)
     potential_energy = sympy.Add(potential, more.potential, *more.tree_potential)
+    rubs, sticks = made.frictions(more)
     coordinates = tuple(
         Coordinate(c.name, c.unit, q, qd, c.note, c.held, c.held_rate)
         for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
@@ -162,7 +192,8 @@ def from_scene(scene: Scene) -> System:
         potential=potential_energy,
         dissipation=value("energy.dissipation", scene.dissipation) + more.dissipation,
         forces=tuple(
-            more.forces.get(c.name, zero) + forces.get(c.name, zero) for c in scene.coordinates
+            sympy.Add(*(some.get(c.name, zero) for some in (more.forces, forces, rubs)))
+            for c in scene.coordinates
         ),
         applied=tuple(more.applied),
         tree=more.tree(kinetic, potential),
@@ -186,7 +217,7 @@ def from_scene(scene: Scene) -> System:
     )
     if faults := made.problems or system.beyond_float():
         raise SceneError(faults)
-    return limits.within(system)
+    return sticking(limits.within(system), sticks)
 
 
 def _at_the_start(scene: Scene) -> list[Problem]:

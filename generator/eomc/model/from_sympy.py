@@ -17,6 +17,7 @@ from eomc.model import constraints, given
 from eomc.model.algebra import UNDEFINED
 from eomc.model.pictured import pictured
 from eomc.model.rewrite import JumpError, rewritten
+from eomc.model.sticking import Friction
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
@@ -52,6 +53,7 @@ class Maker:
         self.taken: dict[str, Any] = {}
         self.renamed: list[tuple[str, str]] = []
         self.fixed: dict[Symbol, bool] = {}  # parameters, and whether they are never negative
+        self.frictions: list[Friction] = []  # that stick
 
     def _name_of(self, one: Any, role: str) -> str:
         if not isinstance(one, (Symbol, AppliedUndef)):
@@ -115,7 +117,7 @@ class Maker:
         definitions: Mapping[Any, Any], outputs: Mapping[str, Any],
         rows: Mapping[str, Any], guess: Sequence[Any], units: Mapping[Any, str],
         title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
-        picture: Any,
+        picture: Any, friction: Any,
     ) -> System:  # fmt: skip
         """The system, of the class `of`."""
         starts = given.symbols(coordinates, "coordinates", None)
@@ -169,7 +171,8 @@ class Maker:
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
         }
-        whole = sympy.srepr(sorted(made_of.items())) + drawn_text
+        self.frictions = list(self._frictions(friction, starts, declared))
+        whole = sympy.srepr(sorted(made_of.items())) + drawn_text + str(self.frictions or "")
         digest = hashlib.sha256(whole.encode()).hexdigest()
         return of(**made_of, digest=digest, renamed=tuple(self.renamed), pictured=drawn)
 
@@ -328,6 +331,23 @@ class Maker:
                 raise given.fault(role, remedy)
             jump = ((state[key], self._expression(x, f"{role}: {key}")) for key, x in table.items())
             yield Event(str(name), when, direction, action, tuple(jump), note=note)
+
+    def _frictions(
+        self, friction: Any, starts: Iterable[Any], parameters: Iterable[Parameter]
+    ) -> Iterator[Friction]:
+        """Friction that sticks, along coordinates, over parameters."""
+        values = {p.symbol: p.value for p in parameters}
+        known = {given.name_of(one): self.map[one].name for one in starts}
+        for name, size in given.by_name(friction, "friction", "{x: mu*m*g}").items():
+            role = f"friction of {name}"
+            if name not in known:
+                raise given.fault(role, f"coordinates are {', '.join(known)}")
+            found = self._expression(size, role)
+            if moving := sorted(s.name for s in found.free_symbols - self.fixed.keys()):
+                raise given.fault(role, f"{moving[0]} is no parameter, of which it is made")
+            if (value := float(found.xreplace(values))) < 0:
+                raise given.fault(role, f"is {value:g}, and can't be negative")
+            yield Friction(known[name], found, "friction")
 
     def _outputs(
         self, outputs: Any, starts: Iterable[Any], made: Sequence[Coordinate],

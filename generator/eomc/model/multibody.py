@@ -18,6 +18,7 @@ from eomc.base.spatial import apply, plus, product, scaled, transposed
 from eomc.model import exact, loops
 from eomc.model.exact import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
 from eomc.model.loops import Closed
+from eomc.model.sticking import Friction
 from eomc.model.symbols import dot, symbol
 from eomc.model.tree import Frame, Link, Tree
 from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Loop, Spring
@@ -46,6 +47,7 @@ class Terms:
     links: list[Link] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
     closed: list[Closed] = field(default_factory=list)  # by each loop
+    frictions: list[tuple[Expr, Friction]] = field(default_factory=list)  # along what, that stick
     rates: dict[Symbol, Symbol] = field(default_factory=dict)  # of the coordinates of joints
     still: Vector = ZERO
     gravity: Vector = ZERO
@@ -85,11 +87,13 @@ class Builder:
         value: Value,
         coordinates: Mapping[Symbol, Symbol],
         taken: Sequence[str],
+        sticks: bool,
     ) -> None:
         self.assembly = assembly
         self.value = value
         self.coordinates = coordinates  # with their velocities
         self.taken = set(taken)
+        self.sticks = sticks
         self.terms = Terms()
         self.moved: dict[str, list[Expr]] = {}  # of each body the motions of its joint
         self.places: dict[str, _Place] = {WORLD: _Place(-1, ZERO, ONE, ZERO, ONE)}
@@ -209,7 +213,10 @@ class Builder:
                 force = S.Zero
                 if body.friction:
                     friction = self.value(f"{key}.friction", body.friction[k])
-                    force -= friction * sympy.tanh(rate / width)
+                    if self.sticks and friction != 0:
+                        terms.frictions.append((q, Friction(str(q), friction, f"{key}.friction")))
+                    else:
+                        force -= friction * sympy.tanh(rate / width)
                 if body.actuator:
                     force += self.value(f"{key}.actuator", body.actuator[k])
                 if force != 0 and q in terms.rates:

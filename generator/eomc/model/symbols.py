@@ -15,6 +15,7 @@ t = Symbol("t", real=True)
 # behind a name: a direction's entry along it; no name of a user's ends so
 ALONG = "_along_"
 MULTIPLIER = "_lambda_"  # likewise behind a constraint's name, its Lagrange multiplier
+PARTS = ("_lack_", "_pivot_", "_inertia_")  # and what that is made of
 
 
 class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
@@ -140,7 +141,9 @@ class Input(_Named):
 class Event(_Named):
     """Where `when` crosses zero, "rising", "falling" or "both"; action: "record", "stop", "jump".
 
-    jump: what coordinates and velocities are then, by their names.
+    jump: what coordinates and velocities are then, by their names. begins: what is above zero where
+    it happens, wherever `when` is, as a run or the motion behind a jump begins. above: whether
+    `when` can't leave zero downwards: where it seems to, that comes behind a short way upwards.
     """
 
     when: Expr
@@ -149,6 +152,8 @@ class Event(_Named):
     jump: tuple[tuple[str, Expr], ...] = ()
     unit: str = ""
     note: str = ""
+    begins: Expr | None = None
+    above: bool = False
 
 
 @dataclass(frozen=True)
@@ -157,6 +162,7 @@ class Constraint(_Named):
 
     holonomic: of positions and t alone; else it is linear in the rates. loop: the [[loop]] that the
     row is of. redundant: whether the other rows say the same, so that none is solved for it.
+    switched: whether it holds in some modes only, and is zero by itself in the others.
     """
 
     formula: Expr
@@ -165,11 +171,30 @@ class Constraint(_Named):
     note: str = ""
     loop: str = ""
     redundant: bool = False
+    switched: bool = False
 
     @property
     def multiplier(self) -> Symbol:
         """The row's Lagrange multiplier, in reactions."""
         return symbol(f"{self.name}{MULTIPLIER}")
+
+    @property
+    def parts(self) -> tuple[Symbol, ...]:
+        """Of one that is switched, in events: its multiplier times its pivot, this, > 0 or 0, and
+        the entry of D of the coordinate that it holds.
+        """
+        return tuple(symbol(f"{self.name}{part}") for part in PARTS)
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A coordinate that is 1, -1 or 0, as another slides forwards, backwards or sticks.
+
+    at, of: the places of both among the coordinates.
+    """
+
+    at: int
+    of: int
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,13 @@ from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
 from eomc.model.closure import Closure
 from eomc.model.limits import within
+from eomc.model.sticking import sticking
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
     Event,
     Input,
+    Mode,
     Output,
     Parameter,
     Reaction,
@@ -63,6 +65,7 @@ class System:
     made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
     was read from, where it was. `pictured`: where it was made in Python with a picture, a scene of
     its names and that alone. `closure`: what its constraints leave, once its start is assembled.
+    `modes`: of friction that sticks, the last coordinates.
     """
 
     name: str
@@ -93,6 +96,7 @@ class System:
     scene: Scene | None = field(default=None, compare=False, repr=False)
     pictured: Scene | None = field(default=None, compare=False, repr=False)
     closure: Closure | None = field(default=None, compare=False, repr=False)
+    modes: tuple[Mode, ...] = ()
 
     @property
     def q(self) -> tuple[Symbol, ...]:
@@ -172,6 +176,7 @@ class System:
         events: Mapping[str, Any] | None = None,
         tolerance: float | None = None,
         picture: Mapping[str, Any] | None = None,
+        friction: Mapping[Any, Any] | None = None,
     ) -> System:
         r"""A system from SymPy expressions.
 
@@ -188,8 +193,9 @@ class System:
         "direction": "falling", "action": "jump", y_dot: -e*y_dot}. tolerance: of adaptive steps;
         events have 1e-9 where none is given. picture: what it looks like, a dict as [picture] of a
         scene has it, with expressions or formulas: {"lines": [[[0, 0], [x, -l]]]}. Names that C
-        can't bear (`\theta`, `lambda`) are replaced, and `renamed` says how. Raises EomcError where
-        something is undeclared.
+        can't bear (`\theta`, `lambda`) are replaced, and `renamed` says how. friction: mapping from
+        coordinates to Coulomb's, N or N m, which sticks and slides exactly, as [run] friction =
+        "stick". Raises EomcError where something is undeclared.
 
         >>> from sympy.physics.mechanics import dynamicsymbols
         >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
@@ -198,17 +204,19 @@ class System:
         (theta_dot,)
         """
         run = given.run(
-            h, duration, methods, real, batch, linearize, discretize, tolerance, bool(events)
-        )
-        system = from_sympy.Maker(name).make(
+            h, duration, methods, real, batch, linearize, discretize, tolerance,
+            bool(events or friction),
+        )  # fmt: skip
+        maker = from_sympy.Maker(name)
+        system = maker.make(
             cls, coordinates, kinetic, potential, given.or_none(parameters), dissipation,
             given.or_none(forces), inputs, given.or_none(definitions), given.or_none(outputs),
             given.or_none(constraints), guess, given.or_none(units), title, run,
-            given.or_none(limits), given.or_none(events), picture,
+            given.or_none(limits), given.or_none(events), picture, given.or_none(friction),
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
-        return within(system)
+        return sticking(within(system), maker.frictions)
 
     def beyond_float(self) -> list[Problem]:
         """Faults of numbers that a system in single precision can't have."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from sympy import Expr
 
@@ -23,7 +23,8 @@ LOST = 2  # times the rounding of another route: a route that has more is not ta
 class Candidate:
     """A function by one route: results and (pivot, diagonal) pairs on a tape, and their names.
 
-    order: in which coordinates are eliminated; multipliers: of constraints, beside accelerations.
+    order: in which coordinates are eliminated; multipliers: of constraints, beside accelerations;
+    parts: what those are made of that modes switch.
     """
 
     tape: Tape
@@ -32,6 +33,7 @@ class Candidate:
     labels: Sequence[str] = ()
     order: tuple[int, ...] = ()
     multipliers: Sequence[Expr] = ()
+    parts: Mapping[int, Sequence[Expr]] = field(default_factory=dict)
 
 
 def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Function:

@@ -15,7 +15,7 @@ import numpy as np
 
 from eomc.base.errors import Problem, SceneError
 from eomc.base.texts import listed
-from eomc.model import loops
+from eomc.model import loops, sticking
 from eomc.model.closure import Closure, Move
 from eomc.model.system import System
 from eomc.program import contradictions
@@ -48,6 +48,10 @@ def assembled(system: System) -> System:
         return system
     if system.closure is not None and system.closure.made_for == _made_for(system):
         return system
+    if system.modes:
+        made = sticking.beside(system, assembled(sticking.without(system)))
+        assert made.closure is not None
+        return replace(made, closure=replace(made.closure, made_for=_made_for(made)))
     manifold = Manifold(system)
     _refuse_idle(manifold)
     start = _start(manifold)

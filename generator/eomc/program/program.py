@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+from sympy import S
+
 from eomc.base.errors import Problem, SceneError
 from eomc.derive import outputs
 from eomc.derive.frames import motions
@@ -83,7 +85,7 @@ def build(derived: Derivation) -> Program:
     more = (
         *constrained.functions(derived, taken),
         *_outputs(system),
-        *_events(system),
+        *_events(system, taken),
         *_applied(system),
         *_signal_slopes(system, functions),
     )
@@ -113,7 +115,7 @@ def _solving(solution: Solution, system: System) -> Candidate:
     pair = (solution.matrix.lower(), solution.matrix)
     labels += [f"{what}_{names[k]}" for k in solution.order for what in pair]
     found = (solution.acceleration, solution.pivots, labels, solution.order, solution.multipliers)
-    return Candidate(solution.tape, *found)
+    return Candidate(solution.tape, *found, solution.parts)
 
 
 def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
@@ -140,8 +142,11 @@ def _outputs(system: System) -> Iterator[Function]:
         yield lower("output_slopes", made.tape, rows, (), (), system.names)
 
 
-def _events(system: System) -> Iterator[Function]:
-    """What crosses zero where events are, and the states behind their jumps."""
+def _events(system: System, taken: Candidate) -> Iterator[Function]:
+    """What crosses zero where events are, and the states behind their jumps.
+
+    taken: the accelerations, on whose tape is what friction that sticks depends on.
+    """
     if not system.events:
         return
     state, values = [x.name for x in (*system.q, *system.qd)], []
@@ -149,11 +154,21 @@ def _events(system: System) -> Iterator[Function]:
         to = dict(e.jump)
         values += [to.get(name, symbol(name)) for name in state]
     jumps = any(e.action == "jump" for e in system.events)
-    for name, formulas in (("events", [e.when for e in system.events]), ("jumps", values)):
-        if name == "events" or jumps:
-            named = tuple(Output(f"{name}_{k}", value) for k, value in enumerate(formulas))
-            made = outputs.outputs(replace(system, outputs=named), sloped=False)
-            yield lower(name, made.tape, made.values, (), (), system.names)
+    held = dict(zip(system.qdd, taken.outputs, strict=True)) | {
+        x: value
+        for k, made in taken.parts.items()
+        for x, value in zip(system.constraints[k].parts, made, strict=True)
+    }
+    begins = [S.NegativeOne if e.begins is None else e.begins for e in system.events]
+    asked = {"events": [e.when for e in system.events]}
+    asked |= {"begins": begins} if any(e.begins is not None for e in system.events) else {}
+    asked |= {"jumps": values} if jumps else {}
+    for name, formulas in asked.items():
+        named = tuple(Output(f"{name}_{k}", value) for k, value in enumerate(formulas))
+        read = {x for f in formulas for x in f.free_symbols}
+        known = (taken.tape, held) if read & held.keys() else None
+        found = outputs.outputs(replace(system, outputs=named), sloped=False, beside=known)
+        yield lower(name, found.tape, found.values, (), (), system.names)
 
 
 def _asked(system: System) -> Iterator[Function]:

@@ -53,7 +53,8 @@ class _Sketch:
             p.name: p.value for p in (*scene.constants, *scene.parameters)
         }
         self.known |= {name: values[name] for name in values.keys() & self.known.keys()}
-        self.known |= dict(zip([c.name for c in scene.coordinates], q.T, strict=True)) | {"t": t}
+        names = [c.name for c in scene.coordinates]  # behind them come modes, where there are
+        self.known |= dict(zip(names, q.T, strict=False)) | {"t": t}
         self.definitions = dict(scene.definitions)
         self.marks = Marks(self.n)
         still = np.zeros((self.n, 3)), np.broadcast_to(np.eye(3), (self.n, 3, 3))

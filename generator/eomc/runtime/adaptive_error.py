@@ -54,9 +54,14 @@ def error_of(
 
     begin = np.ravel(own._begin).astype(float)
     finer = again(max(own.tol / _FINER, least), begin)
-    moved = again(own.tol, begin + size * scale * signs)
+    modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), np.ones(x.shape[1])
+    for at, of in modes:  # which are not moved, nor what sticks, and have no error
+        moves[[at, model.nq + at]] = 0
+        moves[model.nq + of] = begin[at] != 0
+    moved = again(own.tol, begin + moves * size * scale * signs)
     x = x[beside]
     error = np.maximum(np.abs(x - finer), eps * np.abs(x))
+    error[:, modes[:, 0]] = error[:, model.nq + modes[:, 0]] = 0.0
     error[own.t == own.t0] = 0.0
     error[~np.isfinite(error)] = np.inf
     with np.errstate(invalid="ignore", divide="ignore"):

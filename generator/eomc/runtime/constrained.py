@@ -19,12 +19,15 @@ from .frames import Frames
 from .functions import row_times
 from .trajectory import SAID, STATUS, MotionError, state_text
 
+AT_REST = 1e-12  # of the largest velocity
+
 
 class Rows(NamedTuple):
     """Names of constraints, of loops with reactions, and what a start holds of q, then of qd.
 
     holonomic: how many of the constraints are; they come first. redundant: which of them were left
-    out, as the others imply them.
+    out, as the others imply them. modes: of friction that sticks, places of the modes among the
+    coordinates, the last of these, and of what slides.
     """
 
     names: tuple[str, ...] = ()
@@ -32,6 +35,7 @@ class Rows(NamedTuple):
     held: tuple[bool, ...] = ()
     holonomic: int = 0
     redundant: tuple[int, ...] = ()
+    modes: tuple[tuple[int, int], ...] = ()
 
 
 class Constrained(Frames):
@@ -226,6 +230,7 @@ class Constrained(Frames):
         if not self._rows.names:
             return q, qd
         held = self._rows.held
+        q, qd = self._in_modes(q, qd)
         if len(table) == 1:
             return self._projected(q, qd, t0, table[0], held)
         both = [
@@ -246,5 +251,23 @@ class Constrained(Frames):
         if not self._rows.names or (q0 is None and qd0 is None and params is None and t0 == 0):
             return q0, qd0
         q, qd = self._start
-        q, qd = q if q0 is None else q0, qd if qd0 is None else qd0
+        given = (q if q0 is None else q0, qd if qd0 is None else qd0)
+        q, qd = self._in_modes(*map(self._with_modes, given))
         return self._projected(q, qd, t0, params, self._rows.held)
+
+    def _with_modes(self, x: Any) -> Any:
+        """q or qd, with the modes of friction where it was given without them."""
+        modes = len(self._rows.modes)
+        if not modes or np.shape(x)[-1:] != (self.nq - modes,):
+            return x
+        return np.concatenate([x, np.zeros((*np.shape(x)[:-1], modes))], axis=-1)
+
+    def _in_modes(self, q: Any, qd: Any) -> tuple[Any, Any]:
+        """A start whose modes are what its velocities say; one that is rounding is 0."""
+        if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
+            return q, qd
+        at, of = np.array(self._rows.modes).T
+        q, qd = np.array(q, self.dtype), np.array(qd, self.dtype)
+        qd[..., of] *= np.abs(qd[..., of]) > AT_REST * np.max(np.abs(qd), axis=-1, keepdims=True)
+        q[..., at] = np.sign(qd[..., of])
+        return q, qd

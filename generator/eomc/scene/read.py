@@ -21,11 +21,12 @@ from eomc.scene import (
     toml_text,
     validate_bodies,
     validate_constraints,
+    validate_coordinates,
     validate_events,
     validate_picture,
 )
 from eomc.scene.formulas import Formula, suggest
-from eomc.scene.scene import Coordinate, Input, Output, Quantity, Run, Scene
+from eomc.scene.scene import Input, Output, Quantity, Run, Scene
 from eomc.scene.scope import (
     DOUBT,
     INPUT,
@@ -111,7 +112,7 @@ class _Check(Checker):
         known: dict[str, float] = {}
         constants = self._quantities("constants", known)
         parameters = self._quantities("parameters", known)
-        coordinates = self._coordinates(known)
+        coordinates = list(validate_coordinates.coordinates(self, doc, known))
         self._definitions()
         inputs = self._inputs(known)
         energies = {key: self._energy(key) for key in ("kinetic", "potential", "dissipation")}
@@ -154,12 +155,18 @@ class _Check(Checker):
         """How it is run; events are found by adaptive steps."""
         asked = self.doc.run.model_dump()
         single = asked["real"] == "float"
-        if self.doc.event and asked["tolerance"] is None:
+        exact = asked["friction"] == "stick"
+        if (self.doc.event or exact) and asked["tolerance"] is None:
             asked["tolerance"] = schema.OF_EVENTS[asked["real"]]
         if single and (asked["tolerance"] or 1) < schema.LEAST_OF_FLOAT:
             least = schema.LEAST_OF_FLOAT
             why = f'a float can keep {least:g} at best: take that, or real = "double"'
             self.say(("run", "tolerance"), why)
+        rubs: list[object] = [c.friction for c in self.doc.coordinates.values()]
+        rubs += [body.friction for body in self.doc.body.values()]
+        if exact and all(friction is None for friction in rubs):
+            why = "there is no friction: add it to a [[body]] with a joint, or to a coordinate"
+            self.say(("run", "friction"), why)
         return Run(**asked)
 
     # document and names
@@ -277,27 +284,6 @@ class _Check(Checker):
                 known[name] = self.values.get(name, known[name])
             if formula:
                 out.append(Quantity(name, entry.unit, known[name], entry.note, formula))
-        return out
-
-    def _coordinates(self, known: Mapping[str, float]) -> list[Coordinate]:
-        def formula(path: tuple[str, ...], value: float | str) -> Formula | None:
-            rule = f"a {path[-1]} is made of numbers, constants and parameters"
-            found = self.formula(path, value, known, rule)
-            self.number(path, found, known)
-            return found
-
-        out = []
-        free = not (self.doc.constraints or self.doc.loop)
-        for name, entry in self.doc.coordinates.items():
-            start = formula(("coordinates", name, "start"), entry.start)
-            rate = formula(("coordinates", name, "rate"), entry.rate)
-            held = {
-                key: free or (key in entry.model_fields_set and not entry.guess)
-                for key in ("start", "rate")
-            }
-            if start and rate:
-                coordinate = Coordinate(name, entry.unit, start, rate, entry.note, *held.values())
-                out.append(coordinate)
         return out
 
     def _definitions(self) -> None:

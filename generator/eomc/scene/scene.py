@@ -18,6 +18,7 @@ class Coordinate:
     """A generalized coordinate; its velocity is `<name>_dot`. Start in `unit`, rate in unit/s.
 
     held, held_rate: whether constraints leave them as they are when a start is assembled.
+    friction: Coulomb's, N or N m; friction_width: the rate within which it is smoothed.
     """
 
     name: str
@@ -27,6 +28,8 @@ class Coordinate:
     note: str
     held: bool = True
     held_rate: bool = True
+    friction: Formula | None = None
+    friction_width: Formula | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,8 @@ class Run:
     derivatives of the accelerations are, "parameters" for those by parameters too. discretize:
     whether those of steps are. frames: of which bodies and points poses, velocities, accelerations
     and Jacobians are, True for all. inverse_dynamics, momentum: whether these are.
-    tolerance: of adaptive steps, None where the scene asks for none.
+    tolerance: of adaptive steps, None where the scene asks for none. friction: "smooth", or "stick"
+    where that of joints and coordinates holds them exactly.
     """
 
     h: float = 0.001
@@ -112,6 +116,7 @@ class Run:
     inverse_dynamics: bool = False
     momentum: bool = False
     tolerance: float | None = None
+    friction: str = "smooth"
 
     @property
     def sloped(self) -> bool:

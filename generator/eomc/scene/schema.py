@@ -14,7 +14,7 @@ from eomc.scene import messages, spelling
 from eomc.scene.aliases import ALIASES, ALIASES_OF
 from eomc.scene.formulas import nearest
 
-REALS = ("double", "float")
+REALS, FRICTIONS = ("double", "float"), ("smooth", "stick")
 DIRECTIONS, ACTIONS = ("both", "rising", "falling"), ("record", "stop", "jump")
 LEAST_TOLERANCE, LOOSEST = 1e-15, 1e-2
 LEAST_OF_FLOAT = 5e-7  # a tolerance, of single precision
@@ -43,6 +43,8 @@ class _Coordinate(_Table):
     start: _Value = 0.0
     rate: _Value = 0.0
     guess: pydantic.StrictBool = False
+    friction: _Value | None = None
+    friction_width: _Value | None = None
     note: _Note = ""
 
 
@@ -103,6 +105,7 @@ class _Run(_Table):
     inverse_dynamics: pydantic.StrictBool = False
     momentum: pydantic.StrictBool = False
     tolerance: _Tolerance | None = None
+    friction: Literal[FRICTIONS] = "smooth"  # type: ignore[valid-type]
 
 
 def _spelled_out(key: str, value: object) -> object:
@@ -362,8 +365,9 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
         return 'none is declared: add at least one, such as x = { unit = "m", start = 0.0 }'
     if path[:2] == ("run", "method"):
         return f"unknown method {here}: known are {', '.join(METHODS)}"
-    if path == ("run", "real"):
-        return f"unknown type {here}: known are {', '.join(REALS)}"
+    if path in (("run", "real"), ("run", "friction")):
+        what, words = ("type", REALS) if last == "real" else ("friction", FRICTIONS)
+        return f"unknown {what} {here}: known are {', '.join(words)}"
     if path[0] == "event" and last in ("direction", "action"):
         known = DIRECTIONS if last == "direction" else ACTIONS
         return f"unknown {last} {here}: known are {', '.join(known)}"

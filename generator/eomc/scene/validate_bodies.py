@@ -10,14 +10,12 @@ from typing import Any
 
 from eomc.base import names
 from eomc.base.errors import MOST
-from eomc.scene import formulas
 from eomc.scene.assembly import WORLD, Assembly, Body, Vector
 from eomc.scene.schema import BodyTable, Document, PointTable
 from eomc.scene.scope import Checker, Path, ring_text, rings
+from eomc.scene.validate_coordinates import FRICTION_WIDTH, check_width
 from eomc.scene.validate_joints import Joints
 from eomc.scene.validate_values import ORIGIN, ZERO
-
-FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
 
 _OF_JOINTS = (
     "parent", "coordinates", "axis", "offset", "center", "armature", "damping", "friction",
@@ -208,15 +206,7 @@ class _Bodies(Joints):
             width = FRICTION_WIDTH
         if entry.friction_width is not None:
             width, value = self._value((*path, "friction_width"), entry.friction_width)
-            if value <= 0:
-                check.say(
-                    (*path, "friction_width"),
-                    f"is {value:g}, and must be greater than zero: the rate within which friction "
-                    "is smoothed",
-                    text=width.text,
-                )
-            if entry.friction is None:
-                check.say((*path, "friction_width"), "there is no 'friction' with it: add it")
+            check_width(check, path, value, width, entry.friction)
         if parent is None or coordinates is None:
             return
         self.bodies[entry.name] = Body(

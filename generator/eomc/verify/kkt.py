@@ -45,7 +45,9 @@ def solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, V
 
 
 def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, Vector]:
-    """At one state."""
+    """At one state; rows of zeros say nothing, and have the multiplier 0."""
+    multipliers, on = np.zeros(len(A)), A.any(axis=1)
+    A, level = A[on], level[on]
     n, m = len(D), len(A)
     scale = scales(D, A)
     matrix = scale[:, None] * np.block([[D, -A.T], [A, np.zeros((m, m))]]) * scale
@@ -57,7 +59,8 @@ def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, 
     else:
         found = np.linalg.lstsq(matrix, right, rcond=RANK_TOLERANCE)[0]
     found *= scale
-    return found[:n], found[n:]
+    multipliers[on] = found[n:]
+    return found[:n], multipliers
 
 
 def kept(D: Vector, A: Vector, held: tuple[int, ...]) -> tuple[Vector, Vector]:
@@ -70,9 +73,12 @@ def kept(D: Vector, A: Vector, held: tuple[int, ...]) -> tuple[Vector, Vector]:
 
 
 def inverse(D: Vector, A: Vector) -> Vector:
-    """(n + m, n + m): of the matrix, the sizes of its entries: how it spreads what is rounded."""
-    m, scale = len(A), scales(D, A)
-    matrix = scale[:, None] * np.block([[D, -A.T], [A, np.zeros((m, m))]]) * scale
+    """(n + m, n + m): of the matrix, the sizes of its entries: how it spreads what is rounded.
+
+    A row of zeros has the multiplier 0.
+    """
+    scale, none = scales(D, A), np.diag((~A.any(axis=1)).astype(float))
+    matrix = scale[:, None] * np.block([[D, -A.T], [A, none]]) * scale
     return np.asarray(np.abs(scale[:, None] * np.linalg.inv(matrix) * scale))
 
 

@@ -68,6 +68,8 @@ def _error(of: Comparison, module: Any, tol: float, stiff: bool, s: State) -> fl
         return math.inf if first.status == "not finite" and begins else None
     ends = [first.events[e.name].t for e in of.system.events if e.action != "record"]
     first_end = min((float(t[0]) for t in ends if len(t)), default=math.inf)
+    if first_end <= s.t:  # the state jumps at once
+        return None
     moved = x + NUDGE * spread
     beside = of.sampler.onto(replace(s, q=moved[: len(s.q)], qd=moved[len(s.q) :]))
     nudged = np.concatenate([beside.q, beside.qd])

@@ -112,9 +112,10 @@ class _Adaptive:
     def longest(self) -> float:
         """No step is longer than asked for, the last ends at the end, and calls leave no trace."""
         first = self.drive(self.state, self.check.system.run.duration, LOOSE)
-        if not len(first.times):
+        later = first.times[first.times > self.state.t]  # the state may jump at once
+        if not len(later):
             return 0.0
-        span = float(first.times[0]) - self.state.t
+        span = float(later[0]) - self.state.t
         run, cut = (
             self.drive(self.state, span, LOOSE, h_most=span / PARTS, each=n) for n in (ROOM, 1)
         )

@@ -70,7 +70,8 @@ class Bodies:
 
     def off(self, name: str, e: Expected) -> float:
         """The difference at one state, in parts of its size; nan where nothing can be compared."""
-        s, found = e.state, []
+        s, found, system = e.state, [], self.check.system
+        slides = {system.coordinates[m.of].name: float(s.q[m.at]) for m in system.modes}
         rate = float(np.max(np.abs(s.qd) / self.check.sampler.spread)) or 1.0
         if name == "power":  # that of forces alone
             value = float(self.check.ask("tau", s) @ s.qd)
@@ -80,7 +81,7 @@ class Bodies:
         for width in WIDTHS:
             with np.errstate(all="ignore"):
                 key = id(e), width
-                line = self.lines.get(key) or Line(self.scene, s, width / rate)
+                line = self.lines.get(key) or Line(self.scene, s, width / rate, slides=slides)
                 ours = self.lines.setdefault(key, line).value(name)
             if not math.isnan(ours):
                 found.append(abs(value - ours) / (size or 1.0))
@@ -121,6 +122,7 @@ class Line:
     width: float
     stretch: float = 1.0  # of the velocities
     bend: Vector | float = 0.0  # accelerations
+    slides: Mapping[str, float] = field(default_factory=dict)  # of what may stick: its mode
     frames: dict[str, Frame] = field(default_factory=dict)
     known: dict[str, Any] = field(default_factory=dict)
 
@@ -133,7 +135,7 @@ class Line:
         self.algebra = {**_ALGEBRA, "dot": lambda x: self.rate @ (x + zero)}
         known = self.known = {"t": s.t + self.nodes}
         motion = np.broadcast_arrays(s.q, s.qd * self.stretch, self.bend)
-        for c, q, qd, qdd in zip(self.scene.coordinates, *motion, strict=True):
+        for c, q, qd, qdd in zip(self.scene.coordinates, *motion, strict=False):  # modes
             rate = qd + qdd * self.nodes
             known |= {c.name: q + (qd + rate) / 2 * self.nodes, f"{c.name}_dot": rate + zero}
         for constant in self.scene.constants:
@@ -304,17 +306,27 @@ class Line:
         power = 0 * self.nodes
         for name, formula in self.scene.forces.items():
             power = power + self.of(formula) * self.known[f"{name}_dot"]
+        for c in self.scene.coordinates:
+            if c.friction:
+                rate = self.known[f"{c.name}_dot"]
+                power = power - self.of(c.friction) * self.way(c.name, rate, c.friction_width)
         for body in self.assembly.bodies:
-            width = self.of(body.friction_width) if body.friction_width else 1.0
             for k, rate in enumerate(self.rates(body)):
                 if body.friction:
-                    power = power - self.of(body.friction[k]) * np.tanh(rate / width) * rate
+                    name, width = body.coordinates[k].text, body.friction_width
+                    power = power - self.of(body.friction[k]) * self.way(name, rate, width)
                 if body.actuator:
                     power = power + self.of(body.actuator[k]) * rate
         if self.assembly.forces:  # what moves with time alone is none of the coordinates' work
             still = Line(self.scene, self.state, self.width, 0.0)
             power = power + sum(self.work(f, still) for f in self.assembly.forces)
         return power
+
+    def way(self, name: str, rate: Vector, width: Formula | None) -> Vector:
+        """What friction of 1 takes, as it is smoothed, or as what may stick slides."""
+        if name in self.slides:
+            return self.slides[name] * rate
+        return np.tanh(rate / (self.of(width) if width else 1.0)) * rate
 
     def work(self, force: Force, still: Line) -> Vector:
         """F.v + torque.omega of a force on a body, less that of what moves at rest."""

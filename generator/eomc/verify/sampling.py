@@ -31,6 +31,7 @@ MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 HALVINGS, RESOLVED = 5, 0.1  # of steps ahead, until how far things go changes by so little
 FARTHER = 8.0  # times as far from the start, where a term that is small near it counts
+STUCK = 1 / 2  # in so many states something does, of what may stick so much
 SLOWER = (2.0**-6, 2.0**-10)  # times as fast
 DRAWS = 8  # how often: the influence is known to a quarter of itself
 
@@ -236,6 +237,7 @@ class Sampler:
         centre = np.where(self.angles, nearness < 1, 1) * start.q
         q = centre + nearness * self.spread * random.uniform(-1, 1, n)
         qd = start.qd + nearness * self.speed * random.uniform(-1, 1, n)
+        self._in_modes(q, qd)
         t = random.uniform(0, self.system.run.duration)
         u = None
         if given and self.system.inputs:
@@ -249,7 +251,24 @@ class Sampler:
             name: value * factor if value else factor - 0.5
             for (name, value), factor in zip(self.defaults.items(), factors.tolist(), strict=True)
         }
-        return self.onto(State(q, qd, t, u, None if usual else params))
+        found = self.onto(State(q, qd, t, u, None if usual else params))
+        for mode in self.system.modes:  # the rows may have turned what slides
+            found.q[mode.at] = np.sign(found.qd[mode.of]) * abs(q[mode.at])
+        return found
+
+    def _in_modes(self, q: Vector, qd: Vector) -> None:
+        """Of friction that sticks, modes as velocities say; in some states some are made 0.
+
+        Some freedom is left.
+        """
+        if self.system.modes and self.system.closure:
+            left = self.system.closure.freedoms - 1
+            some = self.random.uniform() < STUCK
+            for mode in self.system.modes:
+                sticks = some and left > 0 and self.random.uniform() < STUCK
+                left -= sticks
+                qd[mode.of] *= not sticks
+                q[mode.at], qd[mode.at] = np.sign(qd[mode.of]), 0.0
 
     def onto(self, s: State) -> State:
         """The state put onto the constraints; nan where that leads nowhere, or some row is off."""
@@ -278,7 +297,10 @@ class Sampler:
         """
         D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
         if self.system.constraints:
-            return kkt.regular(D, self.rows("constraint_jacobian", s), REGULAR)
+            A = self.rows("constraint_jacobian", s)
+            rows = [self.system.constraints[k] for k in self.reference.solved]
+            off = [row.switched and not np.any(a) for row, a in zip(rows, A, strict=True)]
+            return kkt.regular(D, A[~np.array(off)], REGULAR)
         diagonal = np.abs(np.diag(D))
         if not (np.all(np.isfinite(D)) and np.all(diagonal > 0)):
             return False
@@ -353,6 +375,10 @@ class Sampler:
         rounded = [size["motion"], (size["gamma"] + whole(a))[solved]]
         both = spread @ np.concatenate(rounded)
         size["acceleration"] = both[:n]
+        if self.system.modes:  # what sticks is held by forces that cancel what else moves it
+            slides = [self.system.constraints[k].switched for k in solved]
+            A = np.where(np.array(slides)[:, None], 0.0, value["constraint_jacobian"][solved])
+            size["acceleration"] += kkt.inverse(value["D"], A)[:n, :n] @ size["motion"]
         size["multipliers"] = np.zeros(len(A))
         size["multipliers"][solved] = both[n:]
         # what rounding of the rows makes of a state that is put onto them

@@ -98,8 +98,10 @@ class Events(Named):
     twice: tuple[str, ...]
     directions: tuple[int, ...]
     actions: tuple[int, ...]
+    above: tuple[int, ...]
     jumps: bool
     busy: int
+    together: int
     apart: str
     near: str
     close: str
@@ -125,6 +127,17 @@ class Events(Named):
 
 
 @dataclass(frozen=True)
+class Begun(Named):
+    """c/begun.c.jinja: events that happen as a motion begins, and calls in them."""
+
+    TEMPLATE: ClassVar[str] = "c/begun.c"
+    function: CFunction
+    values: str
+    restart: str
+    width: str
+
+
+@dataclass(frozen=True)
 class AdaptiveRun(Named):
     """c/adaptive_run.c.jinja: the loop over adaptive steps, rows and events."""
 
@@ -136,6 +149,7 @@ class AdaptiveRun(Named):
     loosest: str
     tightest: str
     events: bool
+    begun: str
     busy: int
     anew: int
     run: CFunction

@@ -115,7 +115,7 @@ def header(
             rooms[-1] or adaptive.kept(s, len(s.coordinates)),
             plain.public.adaptive(adaptive.METHOD.name),
         ) if s.run.tolerance else None,
-        busy=adaptive.BUSY,
+        busy=adaptive.busy(s),
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Events
+from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Begun, Events
 from eomc.emit.plain.constraint_views import Corrected, Project
 from eomc.emit.plain.parts import Computed, Named
 
@@ -288,5 +288,5 @@ class Loop(Named):
 
 View = (
     Header | Source | Slopes | Corrected | Project | Derivative | RungeKutta4 | Explicit | Implicit
-    | Gauss | Nodes | Adaptive | Events | AdaptiveRun | Loop
+    | Gauss | Nodes | Adaptive | Events | Begun | AdaptiveRun | Loop
 )  # fmt: skip

@@ -1,0 +1,59 @@
+"""Coordinates as they are written: where they start, what rubs along them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from eomc.scene import formulas
+from eomc.scene.formulas import Formula
+from eomc.scene.scene import Coordinate
+from eomc.scene.schema import Document
+from eomc.scene.scope import Checker
+
+FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
+
+
+def coordinates(check: Checker, doc: Document, known: Mapping[str, float]) -> Iterator[Coordinate]:
+    """The coordinates of a document; faults are reported. known: values of parameters."""
+
+    def formula(name: str, key: str, value: float | str) -> tuple[Formula | None, float]:
+        path = ("coordinates", name, key)
+        rule = f"a {key} is made of numbers, constants and parameters"
+        found = check.formula(path, value, known, rule)
+        return found, check.number(path, found, known)
+
+    free = not (doc.constraints or doc.loop)
+    for name, entry in doc.coordinates.items():
+        start, rate = (formula(name, key, getattr(entry, key))[0] for key in ("start", "rate"))
+        given = () if entry.guess else entry.model_fields_set
+        held, held_rate = (free or key in given for key in ("start", "rate"))
+        rubs, width = None, FRICTION_WIDTH
+        if entry.friction is not None:
+            rubs, value = formula(name, "friction", entry.friction)
+            if rubs and value < 0:
+                path = ("coordinates", name, "friction")
+                check.say(path, f"is {value:g}, and can't be negative", text=rubs.text)
+        if entry.friction_width is not None:
+            found, value = formula(name, "friction_width", entry.friction_width)
+            width = found or FRICTION_WIDTH
+            check_width(check, ("coordinates", name), value, found, entry.friction)
+        if start and rate:
+            yield Coordinate(
+                name, entry.unit, start, rate, entry.note, held, held_rate, rubs, width
+            )
+
+
+def check_width(
+    check: Checker, path: tuple[str, ...], value: float, width: Formula | None, friction: object
+) -> None:
+    """Report the width of a friction that is none, or has none."""
+    path = (*path, "friction_width")
+    if value <= 0:
+        check.say(
+            path,
+            f"is {value:g}, and must be greater than zero: the rate within which friction is "
+            "smoothed",
+            text=width.text if width else None,
+        )
+    if friction is None:
+        check.say(path, "there is no 'friction' with it: add it")

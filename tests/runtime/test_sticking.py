@@ -1,0 +1,246 @@
+"""`[run] friction = "stick"`: Coulomb friction, exactly, beside closed forms and SciPy's events."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cases
+import numpy as np
+import pytest
+import sympy
+from conftest import Modules
+from links import made_of
+from scipy.integrate import solve_ivp
+
+import eomc
+from eomc.base.errors import EomcError, SceneError
+from eomc.model.system import System
+from eomc.verify.check import check
+
+BLOCK = """eomc = 1
+name = "dry_block"
+[coordinates]
+x = { start = 1.0, friction = "mu*m*g" }
+[parameters]
+m  = 1.0
+k  = 10.0
+mu = 0.1
+g  = 9.81
+[energy]
+kinetic = "m*x_dot**2/2"
+potential = "k*x**2/2"
+[run]
+friction = "stick"
+tolerance = 1e-12
+batch = true
+"""
+
+CART = """eomc = 1
+name = "dry_cart"
+[coordinates]
+x     = { unit = "m", friction = "F" }
+theta = { unit = "rad", start = 0.5 }
+[parameters]
+M = 1.0
+m = 0.3
+l = 0.5
+g = 9.81
+F = 0.4
+[energy]
+kinetic = "M*x_dot**2/2 + m*((x_dot + l*theta_dot*cos(theta))**2 + (l*theta_dot*sin(theta))**2)/2"
+potential = "-m*g*l*cos(theta)"
+[run]
+friction = "stick"
+duration = 5.0
+"""
+
+ARM = """eomc = 1
+name = "dry_arm"
+gravity = [0, -9.81]
+[coordinates]
+q1 = { unit = "rad", start = 0.3 }
+q2 = { unit = "rad", start = 0.5 }
+q3 = { unit = "rad", start = -0.2 }
+[parameters]
+F = 2.0
+""" + "".join(f"""[[body]]
+name = "b{k}"
+mass = 1.0
+center = [0.25, 0]
+inertia = 0.02
+joint = "revolute"
+coordinates = "q{k}"
+friction = "F/{k}"
+{f'parent = "b{k - 1}"' if k > 1 else ""}
+{"offset = [0.5, 0]" if k > 1 else ""}
+""" for k in (1, 2, 3)) + """[run]
+friction = "stick"
+tolerance = 1e-10
+duration = 20.0
+"""  # fmt: skip
+
+FOUR_BAR = ((cases.SCENES / "four_bar.toml").read_text(encoding="utf-8")
+            .replace('note = "crank" }', 'friction = 0.6, note = "crank" }')
+            .replace('coordinates = "q3"\n', 'coordinates = "q3"\nfriction = 0.3\n')
+            .replace("[run]", '[run]\nfriction = "stick"\ntolerance = 1e-10'))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def block(modules: Modules) -> ModuleType:
+    return modules.unoptimised(BLOCK)
+
+
+@pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
+def test_a_block_comes_to_rest_where_it_should(block: ModuleType, tol: float) -> None:
+    case = cases.cases()["coulomb_friction"]
+    run = block.simulate(tol=tol, duration=6.0)
+    assert run.status == "ok" and run.steps + run.rejected < 50
+    assert run.q[-1, 0] == pytest.approx(float(case["q_ref"][0]), abs=max(tol, 1e-13))
+    assert run.q[-1, 1] == 0 and abs(run.qd[-1, 0]) < 1e-15
+    held = run.multipliers["x_sticks"][-1]
+    assert held == pytest.approx(10 * run.q[-1, 0], abs=1e-12)
+    assert len(run.events["x_slips"]) == len(run.events["x_stops"]) == 5
+
+
+def test_starts_need_no_modes_and_batches_are_as_one(block: ModuleType) -> None:
+    starts, rates = np.array([[1.0], [0.05], [-0.7]]), np.array([[0.0], [0.0], [2.0]])
+    many = block.simulate_batch(starts, rates, tol=1e-10, times=[0.0, 1.0, 5.0])
+    for q, qd, rows in zip(starts, rates, many.q, strict=True):
+        run = block.simulate(q, qd, tol=1e-10, times=[0.0, 1.0, 5.0])
+        assert run.q.tolist() == rows.tolist()
+        whole = block.simulate([*q, 1.0], [*qd, 0.0], tol=1e-10, times=[0.0, 1.0, 5.0])
+        assert whole.q.tolist() == run.q.tolist()  # its velocity says how it slides
+    assert many.q[1, -1].tolist() == [0.05, 0.0]  # held where it lies
+    half = block.simulate(tol=1e-12, duration=2.5)
+    rest = block.simulate(half.q[-1], half.qd[-1], tol=1e-12, t0=2.5, duration=3.5)
+    whole = block.simulate(tol=1e-12, duration=6.0)
+    np.testing.assert_allclose(rest.q[-1], whole.q[-1], rtol=0, atol=1e-13)
+
+
+def test_without_friction_it_never_sticks(block: ModuleType) -> None:
+    run = block.simulate(tol=1e-12, duration=6.0, params={"mu": 0.0})
+    assert run.q[-1, 0] == pytest.approx(math.cos(6 * math.sqrt(10.0)), abs=1e-10)
+
+
+def reference(F: float, duration: float) -> tuple[list[float], list[tuple[str, float]]]:
+    """The cart by SciPy, piece by piece; its end, and the events."""
+    M, m, length, g = 1.0, 0.3, 0.5, 9.81
+
+    def held(y: Any) -> Any:
+        a = -g / length * np.sin(y[1])
+        return m * length * (np.cos(y[1]) * a - np.sin(y[1]) * y[3] ** 2)
+
+    def rates(t: float, y: Any, s: float) -> list[float]:
+        if s == 0:
+            return [0, y[3], 0, -g / length * np.sin(y[1])]
+        across = m * length * np.cos(y[1])
+        D = [[M + m, across], [across, m * length**2]]
+        b = [m * length * np.sin(y[1]) * y[3] ** 2 - F * s, -m * g * length * np.sin(y[1])]
+        return [y[2], y[3], *np.linalg.solve(D, b)]
+
+    def stops(t: float, y: Any, s: float) -> Any:
+        return s * y[2]
+
+    def slips(t: float, y: Any, s: float) -> Any:
+        return F - abs(held(y))
+
+    for event in (stops, slips):
+        event.terminal, event.direction = True, -1  # type: ignore[attr-defined]
+    t, y, s, found = 0.0, np.array([0, 0.5, 0, 0]), 0.0, []
+    while t < duration:
+        if s == 0 and slips(t, y, s) < 1e-12:
+            s = -np.sign(held(y))
+            found.append(("x_slips", t))
+        made = solve_ivp(
+            rates, (t, duration), y, "DOP853", rtol=1e-12, atol=1e-13, max_step=0.02, args=(s,),
+            events=slips if s == 0 else stops,
+        )  # fmt: skip
+        t, y = made.t[-1], made.y[:, -1]
+        if made.status == 1 and s:
+            s, y[2] = 0.0, 0.0
+            found.append(("x_stops", t))
+    return y.tolist(), found
+
+
+@pytest.mark.parametrize("F", [0.15, 0.4, 0.6])
+def test_a_cart_beside_scipy(modules: Modules, F: float) -> None:
+    run = modules.unoptimised(CART).simulate(params={"F": F})
+    end, events = reference(F, 5.0)
+    np.testing.assert_allclose([*run.q[-1, :2], *run.qd[-1, :2]], end, rtol=0, atol=1e-8)
+    for name in ("x_stops", "x_slips"):
+        times = [t for which, t in events if which == name]
+        np.testing.assert_allclose(run.events[name].t, times, rtol=0, atol=1e-7)
+
+
+def test_an_arm_comes_to_rest(modules: Modules) -> None:
+    arm = modules.unoptimised(ARM)
+    random = np.random.default_rng(0)
+    for _ in range(6):
+        q, qd = random.normal(size=(2, 3)) * [[2], [4]]
+        run, finer = (arm.simulate(q, qd, tol=tol) for tol in (1e-10, 1e-13))
+        assert run.status == "ok" and np.all(np.diff(run.energy) < 1e-8)
+        np.testing.assert_allclose(run.q[-1], finer.q[-1], rtol=0, atol=1e-8)
+        counts = [[len(e) for e in r.events.values()] for r in (run, finer)]
+        assert counts[0] == counts[1] and min(counts[0]) > 0
+        assert np.all(np.abs(run.qd[-1]) < 1e-20)
+        for k in (1, 2, 3):
+            assert np.all(np.abs(run.multipliers[f"q{k}_sticks"]) <= 2 / k * (1 + 1e-9))
+
+
+def test_nothing_sticks_at_a_dead_point(modules: Modules) -> None:
+    """The rocker turns where the crank goes on; both rest in the end, and the loop holds."""
+    bar = modules.unoptimised(FOUR_BAR)
+    run = bar.simulate(tol=1e-10)
+    assert run.status == "ok" and run.steps < 300
+    assert np.abs(bar.constraints(run.q, run.qd)).max() < 1e-9
+    turns = run.events["q3_stops"]
+    assert np.sum(np.abs(turns.qd[:, 0]) > 0.5) > 3  # the crank goes on
+    assert np.all(np.diff(run.energy) < 1e-8) and np.all(np.abs(run.qd[-1]) < 1e-20)
+    assert not run.estimate().verdict
+
+
+def test_a_jump_sets_the_mode_of_what_it_turns(modules: Modules) -> None:
+    """Thrown at a wall it comes back: v^2 falls by 2 mu g a metre, and by e^2 there."""
+    text = BLOCK.replace('potential = "k*x**2/2"', "").replace("start = 1.0,", "rate = 2.0,")
+    text = text.replace("k  = 10.0\n", "e  = 0.9\n").replace("dry_block", "thrown_block")
+    wall = (
+        '[[event]]\nname = "wall"\nwhen = "x - 1"\ndirection = "rising"\naction = "jump"\n'
+        'x_dot = "-e*x_dot"\n'
+    )
+    run = modules.unoptimised(text + wall).simulate(duration=8.0)
+    back = 0.81 * (4 - 2 * 0.981)
+    assert run.status == "ok" and len(run.events["wall"]) == len(run.events["x_stops"]) == 1
+    assert run.q[-1].tolist() == [pytest.approx(1 - back / (2 * 0.981), abs=1e-12), 0]
+
+
+def test_systems_made_in_python_have_it() -> None:
+    x, F, m = sympy.symbols("x F m")
+    v = sympy.Symbol("x_dot")
+    made = System.make("slab", {x: (0, 1)}, m * v**2 / 2, parameters={m: 2, F: 1}, friction={x: F})
+    assert [c.name for c in made.coordinates] == ["x", "x_slides"]
+    assert made.coordinates[1].start == 1 and made.run.tolerance == 1e-9
+    for wrong, said in (
+        ({v: F}, "coordinates are x"),
+        ({x: v}, "x_dot is no parameter"),
+        ({x: -F}, "is -1, and can't be negative"),
+    ):
+        with pytest.raises(EomcError, match=said):
+            System.make("slab", {x: 0}, m * v**2 / 2, parameters={m: 2, F: 1}, friction=wrong)
+
+
+def test_names_that_it_needs_are_not_taken() -> None:
+    text = BLOCK.replace("k  = 10.0", "k  = 10.0\nx_slides = 1.0")
+    with pytest.raises(SceneError, match=r"needs the name 'x_slides': rename yours"):
+        made_of(text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [BLOCK, CART, ARM, FOUR_BAR], ids=["block", "cart", "arm", "bar"])
+def test_check_passes(text: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
+    system = eomc.read(tmp_path / "scene.toml")
+    report = check(system, eomc.load(system, tmp_path / "build"))
+    assert report.passed, str(report)
