@@ -102,14 +102,11 @@ class _Formulas:
             if q in more.rates:
                 sticks.append(friction)
             else:
-                why = "friction that sticks needs a joint with a coordinate of its own"
-                self.problems.append(
-                    self.scene.problem(
-                        friction.key,
-                        f"{why}: take a slip of the coordinates out, "
-                        'or friction = "smooth" in [run]',
-                    )
+                why = (
+                    "friction that sticks needs a joint with a coordinate of its own, no formula: "
+                    'write friction = "smooth" in [run], or close the mechanism by a [[loop]]'
                 )
+                self.problems.append(self.scene.problem(friction.key, why))
         return smooth, sticks
 
     def events(self) -> Iterator[Event]:

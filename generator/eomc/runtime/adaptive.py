@@ -389,7 +389,7 @@ class _Found:
 
 STOPPED = (
     "no step is short enough to go on; where forces keep jumping, as friction by sign(x_dot) that "
-    "sticks, take tanh(x_dot/0.001), or let events switch them; else a looser tolerance"
+    'sticks, take friction = "stick" in [run], or let events switch them; else a looser tolerance'
 )
 BOTH = "times: say where the run ends; give times or duration, not both"
 

@@ -19,7 +19,7 @@ _START = "starts stand with their coordinates: theta = { start = 0.5, rate = 0 }
 _RUN = "how a scene is run stands in [run]: h, duration, method"
 _LOSS = (
     "friction is a force, -b*x_dot in [forces], or b*x_dot**2/2 as dissipation in [energy]; "
-    'a [[body]] has damping = "b" and friction = "c"'
+    'a [[body]] has damping = "b" and friction = "c", and a coordinate friction = "c"'
 )
 _JOINT = 'a joint stands with the body that it moves, in [[body]]: joint = "revolute"'
 _ENERGY = "write [energy] with kinetic and potential, of which it is the difference"

@@ -167,6 +167,10 @@ class _Check(Checker):
         if exact and all(friction is None for friction in rubs):
             why = "there is no friction: add it to a [[body]] with a joint, or to a coordinate"
             self.say(("run", "friction"), why)
+        for key in ("linearize", "discretize"):
+            if exact and asked[key]:
+                why = 'friction that sticks has no derivatives: take friction = "smooth" for that'
+                self.say(("run", key), why)
         return Run(**asked)
 
     # document and names
