@@ -16,6 +16,8 @@ from conftest import tiers
 import eomc
 from eomc.base.errors import SceneError
 from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.runtime.trajectory import STATUS
 from eomc.scene.read import parse
 from eomc.verify.check import check
 
@@ -186,6 +188,34 @@ def test_what_makes_no_sense_is_refused(kepler: ModuleType, how: dict, words: st
     with pytest.raises(ValueError) as fault:
         kepler.simulate(**how)
     assert words in str(fault.value)
+
+
+def test_a_time_that_is_none_is_refused(kepler: ModuleType) -> None:
+    model = kepler._model
+    null = model._c[2]
+    for wrong in (math.nan, math.inf):
+        work, x = model._ffi.new("adaptive_work *"), np.array([0.1, 0, 0, 4.0])
+        t = np.array([wrong])
+        status = model._lib.adaptive(
+            model._pointer(x), model._pointer(t), 1.0, 1e-9, 0.0, null, 10, null, 0, null, null,
+            null, model._pointer(model._p0), work,
+        )  # fmt: skip
+        assert (status, work.rows, work.steps) == (STATUS.index("not finite"), 0, 0)
+        assert x.tolist() == [0.1, 0, 0, 4.0]
+
+
+def test_auto_is_by_a_tolerance(kepler: ModuleType, cartpole: ModuleType) -> None:
+    run, same = kepler.simulate(method="auto", duration=1.0), kepler.simulate(duration=1.0)
+    assert run.tol == kepler._model.tolerance and np.array_equal(run.q, same.q)
+    assert kepler.simulate(method="auto", tol=1e-6, duration=1.0).steps < run.steps
+    with pytest.raises(ValueError, match="not built"):
+        cartpole.simulate(method="auto")
+    text = (cases.SCENES / "cartpole.toml").read_text(encoding="utf-8")
+    for method, methods in (('"auto"', ("rk4",)), ('["auto", "dp8"]', ("dp8",))):
+        made = parse(text.replace("[run]", f"[run]\nmethod = {method}")).run
+        assert (made.methods, made.tolerance) == (methods, 1e-9)
+    made = System.make("free", ["x"], "x_dot**2/2", methods="auto").run
+    assert (made.methods, made.tolerance) == (("rk4",), 1e-9)
 
 
 def test_without_tolerance_nothing_is_built(cartpole: ModuleType) -> None:

@@ -50,6 +50,15 @@ def test_small_jumps_count_too(modules: Modules) -> None:
                 assert abs(run.q[-1, 0] - rubbed(start, mu)) < 10 * tol, (start, mu, tol)
 
 
+def test_many_corners_are_no_chatter(modules: Modules) -> None:
+    """Six hundred periods of a spring that is stiffer on one side."""
+    text = RUBBED.replace("8*x**2", "0").replace("-0.3*sign(x_dot)", "-1e6*x - 3e5*abs(x)")
+    module = modules.unoptimised(text.replace("rubbed", "two_sided"))
+    period = np.pi / np.sqrt(1.3e6) + np.pi / np.sqrt(7e5)
+    run = module.simulate([1.0], tol=1e-7, duration=600 * period)
+    assert run.status == "ok" and abs(run.q[-1, 0] - 1) < 1e-4
+
+
 @pytest.mark.parametrize("width", [1e-2, 1e-3])
 def test_smoothed_friction_is_a_corner_to_long_steps(width: float, modules: Modules) -> None:
     """Beside steps that are short against its width; 0.01 is that of a joint's friction."""

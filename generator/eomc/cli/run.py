@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 @click.option("--start", multiple=True, metavar="NAME=VALUE", help="A coordinate, or its velocity.")
 @click.option("--h", "h", type=float, help="Step size in s, instead of the scene's.")
 @click.option("--duration", type=float, help="In s, instead of the scene's.")
-@click.option("--method", help="A stepper that the scene asks for; its first where not given.")
+@click.option("--method", help="A stepper that the scene asks for, its first by default, or auto.")
 @click.option("--tol", type=float, help="Tolerance of adaptive steps, instead of the scene's.")
 @click.option("--every", type=click.IntRange(1), default=1, help="Keep every so many steps.")
 @click.option(
@@ -76,7 +76,8 @@ def command(
     }  # fmt: skip
     own, unstable, ends = module._model, None, None
     try:
-        if tol is None and not (own.tolerance and h is None and method is None):
+        fits = own.tolerance and h is None and method is None
+        if tol is None and method != "auto" and not fits:
             unstable = module.advice(q0, qd0, h, params=values, method=method)
             span = own.duration if duration is None else duration
             ends = beyond_end(own.h if h is None else h, span)

@@ -190,8 +190,11 @@ def run(
             raise fault(name, f"must be greater than zero, here {value!r}")
     methods = (methods,) if isinstance(methods, str) else methods
     methods = tuple(methods) if isinstance(methods, (tuple, list)) else (methods,)
-    if not methods or not all(isinstance(m, str) and m in METHODS for m in methods):
-        raise fault("methods", f"known are {', '.join(METHODS)}, here {methods!r}")
+    known = (*METHODS, "auto")
+    if not methods or not all(isinstance(m, str) and m in known for m in methods):
+        raise fault("methods", f"known are {', '.join(known)}, here {methods!r}")
+    events = events or "auto" in methods
+    methods = tuple(m for m in methods if m != "auto") or ("rk4",)
     if real not in REALS:
         raise fault("real", f"known are {', '.join(REALS)}, here {real!r}")
     for name, value in (("batch", batch), ("discretize", discretize)):

@@ -406,7 +406,7 @@ def as_limits(
             "run by fixed steps run(times) gives the states at any times)"
         )
     for name, value in fixed.items():
-        if value is not None and (name, value) != ("every", 1):
+        if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
             raise ValueError(
                 f"{name}: belongs to fixed steps; tol, times, h_most and stiff to adaptive ones: "
                 "give one or the other; run(times) gives the states of a run by fixed steps"

@@ -195,8 +195,7 @@ class BatchModel(Model):
         tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
         at the start and the end where None.
         """
-        given = tol is not None or times is not None or h_most is not None or stiff is not False
-        if given or self._fits(h, steps, method):
+        if self._fits((h, steps, method), tol, times, h_most, stiff):
             from . import batch_adaptive  # which needs this file
 
             fitted, whole = batch_adaptive.simulate(

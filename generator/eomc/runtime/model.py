@@ -213,8 +213,8 @@ class Model(Constrained):
         """A trajectory by fixed steps of size h, or by steps that fit a tolerance; the loop in C.
 
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration. method:
-        one of `methods`, the first where None. every: a row is kept of every so many steps, and the
-        first and last state always.
+        one of `methods`, the first where None; "auto": by a tolerance. every: a row is kept of
+        every so many steps, and the first and last state always.
         u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; a
         dict of all inputs by name, numbers or (steps,); or a function u(t, q, qd) called before
         each step, some hundred times slower. control_period: in s, a whole number of steps: the
@@ -230,8 +230,7 @@ class Model(Constrained):
         Ctrl-C raises Interrupted, which holds it.
         """
         q0, qd0 = self._assembled(q0, qd0, t0, params)
-        given = tol is not None or times is not None or h_most is not None or stiff is not False
-        if given or self._fits(h, steps, method):
+        if self._fits((h, steps, method), tol, times, h_most, stiff):
             fitted = adaptive.simulate(
                 self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff, h=h,
                 steps=steps, method=method, every=every, control_period=control_period, out=out,
@@ -282,9 +281,10 @@ class Model(Constrained):
         )
         return self._finished(result, estimate)
 
-    def _fits(self, *fixed: Any) -> bool:
-        """Whether runs are by the scene's tolerance, nothing being asked of fixed steps."""
-        return bool(self.tolerance) and all(x is None for x in fixed)
+    def _fits(self, fixed: tuple[Any, ...], *asked: Any) -> bool:
+        """Whether a run is by a tolerance: if asked, or where nothing is asked of fixed steps."""
+        some = fixed[-1] == "auto" or any(x is not None and x is not False for x in asked)
+        return some or (bool(self.tolerance) and all(x is None for x in fixed))
 
     def _finished(self, run: Run, estimate: bool) -> Run:
         """A run as `simulate` returns it: with warnings to its caller, and its error if asked."""

@@ -152,11 +152,12 @@ class _Check(Checker):
         )
 
     def _run(self) -> Run:
-        """How it is run; events are found by adaptive steps."""
+        """How it is run; events, and methods "auto", are by adaptive steps."""
         asked = self.doc.run.model_dump()
         single = asked["real"] == "float"
-        exact = asked["friction"] == "stick"
-        if (self.doc.event or exact) and asked["tolerance"] is None:
+        exact, auto = asked["friction"] == "stick", "auto" in asked["methods"]
+        asked["methods"] = tuple(m for m in asked["methods"] if m != "auto") or ("rk4",)
+        if (self.doc.event or exact or auto) and asked["tolerance"] is None:
             asked["tolerance"] = schema.OF_EVENTS[asked["real"]]
         if single and (asked["tolerance"] or 1) < schema.LEAST_OF_FLOAT:
             least = schema.LEAST_OF_FLOAT

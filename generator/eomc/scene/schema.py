@@ -19,7 +19,7 @@ DIRECTIONS, ACTIONS = ("both", "rising", "falling"), ("record", "stop", "jump")
 LEAST_TOLERANCE, LOOSEST = 1e-15, 1e-2
 LEAST_OF_FLOAT = 5e-7  # a tolerance, of single precision
 OF_EVENTS = {"double": 1e-9, "float": 1e-5}  # the tolerance of a scene that gives none
-_NAMES = tuple(METHODS)
+_NAMES = (*METHODS, "auto")
 
 _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
 _Value = _Number | pydantic.StrictStr
@@ -364,7 +364,7 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
     if kind == "too_short":
         return 'none is declared: add at least one, such as x = { unit = "m", start = 0.0 }'
     if path[:2] == ("run", "method"):
-        return f"unknown method {here}: known are {', '.join(METHODS)}"
+        return f"unknown method {here}: known are {', '.join(_NAMES)}"
     if path in (("run", "real"), ("run", "friction")):
         what, words = ("type", REALS) if last == "real" else ("friction", FRICTIONS)
         return f"unknown {what} {here}: known are {', '.join(words)}"
