@@ -265,6 +265,15 @@ def test_a_run_is_its_steps_bit_by_bit_however_it_is_cut() -> None:
         assert np.array_equal(np.hstack([q, qd]), whole.x[-1]), method
 
 
+@pytest.mark.parametrize(("method", "stages"), [("gauss4", 2), ("gauss6", 3), ("gauss8", 4)])
+def test_each_sweep_evaluates_all_stages(method: str, stages: int) -> None:
+    """And a step begins with one evaluation; two sweeps at least tell that they contract."""
+    plain = eomc.load(made("driven"), PLAIN, form="plain")
+    run = plain.simulate(steps=20, h=0.01, method=method)
+    sweeps, rest = divmod(run.evaluations - 20, stages)
+    assert rest == 0 and 2 * 20 <= sweeps <= 12 * 20
+
+
 @pytest.mark.parametrize("name", tiers(["many", "verlet"], "verlet"))
 def test_a_batch_is_a_loop_over_instances(name: str) -> None:
     fast, plain = both(name)

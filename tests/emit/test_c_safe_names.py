@@ -10,17 +10,21 @@ import random
 import re
 import subprocess
 import sysconfig
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import cffi
 import pytest
+from cases import scene_system
 from conftest import needs
 
 import eomc
 from eomc.base import names
+from eomc.derive import lagrange
 from eomc.emit import c_safe_names
 from eomc.model import from_scene as system
+from eomc.program import program
 from eomc.scene import read as scene
 
 MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
@@ -238,3 +242,14 @@ inverse_dynamics = true
 """
     source = eomc.sources(system.from_scene(scene.parse(text, "one.toml"))).files["one.c"]
     assert "small__ddot" in source and not re.search(r"\bsmall_ddot\b", source)
+
+
+def test_temporaries_of_each_function_get_names_that_c_can_bear() -> None:
+    made = program.build(lagrange.derive(scene_system("cartpole")))
+    for name, function in made.functions.items():
+        if not function.body:
+            continue
+        first = replace(function.body[0], name="NAN")
+        odd = replace(function, body=(first, *function.body[1:]))
+        found, _ = c_safe_names.borne(replace(made, functions={**made.functions, name: odd}))
+        assert found.functions[name].body[0].name == "NAN_", name

@@ -384,3 +384,21 @@ def test_what_is_left_out() -> None:
     assert not made.run.linearize and not made.run.discretize
     (x,) = made.coordinates
     assert (x.start, x.rate) == (0, 0)
+
+
+def test_accelerations_are_read_by_what_may_name_them() -> None:
+    def made(**asked: Any) -> System:
+        return System.make("free", ["x"], "x_dot**2/2", **asked)
+
+    assert not made().reads_qdd
+    assert made(outputs={"a": "x"}).reads_qdd
+    assert made(events={"low": "x"}, tolerance=1e-6).reads_qdd
+
+
+def test_a_step_is_a_number_of_full_precision() -> None:
+    def made(h: float) -> System:
+        return System.make("free", ["x"], "x_dot**2/2", real="float", h=h)
+
+    assert made(2.0**-126).run.h == 2.0**-126
+    with pytest.raises(EomcError, match="less than a float can be"):
+        made(2.0**-126.5)

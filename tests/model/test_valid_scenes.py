@@ -111,6 +111,9 @@ def test_python_keeps_the_names_of_the_author() -> None:
     assert "Names that C can't bear: NAN is NAN_, errno is errno_" in header
 
 
+LONG = "o = '(1234567/1234568)**64'\np = 'o**8'\n"  # of 7168 digits
+
+
 @pytest.mark.parametrize(
     ("change", "key", "words"),
     [
@@ -123,6 +126,14 @@ def test_python_keeps_the_names_of_the_author() -> None:
             "no real value",
         ),
         ({"definitions": "z = '-2'", "potential": "x*z**0.5"}, "energy.potential", "no real"),
+        *(
+            (
+                {"definitions": f"{LONG}r = '{longer}'", "potential": "x*r"},
+                "definitions.r",
+                "more than 10,000 digits",
+            )
+            for longer in ("p*p", "p/(1/p)", "p + p", "p - 2*p")
+        ),
         (
             {"definitions": "a = '3**64'\nb = 'a**64'", "potential": "x*b"},
             "definitions.b",

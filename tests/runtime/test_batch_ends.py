@@ -63,6 +63,8 @@ def test_positions_and_velocities_overflow_each_alone(method: str, modules: Modu
     q0[5], qd0[5] = largest, 1e300
     runs = m.simulate_batch(q0, qd0, steps=3)
     assert runs.steps.tolist() == [3, 3, 0, 3, 3, 0, 3, 3, 3]
+    first = m.simulate_batch(q0[2:4], qd0[2:4], steps=3)
+    assert first.status.tolist() == ["not finite", "ok"]
     for k in (2, 5):
         with pytest.warns(RuntimeWarning, match="no longer be finite"):
             alone = m.simulate(q0[k], qd0[k], steps=3)

@@ -282,6 +282,39 @@ def test_xarray(run: Any, batch: ModuleType) -> None:
     assert np.array_equal(data["theta"].sel(instance=1), runs["theta"][1])
 
 
+def test_what_they_are_given(run: Any, batch: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where they are not installed."""
+    monkeypatch.setitem(
+        sys.modules,
+        "pandas",
+        SimpleNamespace(
+            Index=lambda values, name: (list(values), name),
+            MultiIndex=SimpleNamespace(from_product=lambda parts, names: (parts, names)),
+            DataFrame=lambda columns, index: (columns, index),
+        ),
+    )
+    columns, index = run.to_pandas()
+    assert index == (list(run.t), "t") and list(columns) == list(run.to_dict())[1:]
+    assert np.array_equal(columns["theta_dot"], run["theta_dot"])
+    runs = batch.simulate_batch(np.tile(Q, (3, 1)), steps=4)
+    columns, ((instances, t), names) = runs.to_pandas()
+    assert (list(instances), list(names)) == ([0, 1, 2], ["instance", "t"])
+    assert np.array_equal(t, runs.t)
+    assert np.array_equal(columns["theta"], runs["theta"].ravel())
+
+    given = SimpleNamespace(Dataset=lambda variables, coords, attrs: (variables, coords, attrs))
+    monkeypatch.setitem(sys.modules, "xarray", given)
+    variables, coords, attributes = run.to_xarray()
+    assert list(variables) == list(run.to_dict())[1:]
+    assert coords["t"][::2] == ("t", {"units": "s"}) and np.array_equal(coords["t"][1], run.t)
+    axes, values, units = variables["theta_dot"]
+    assert (axes, units) == (("t",), {"units": "rad/s"}) and np.array_equal(
+        values, run["theta_dot"]
+    )
+    assert (attributes["scene"], attributes["h"]) == ("cartpole_driven", run.h)
+    assert (attributes["method"], len(attributes["digest"])) == (run.method, 64)
+
+
 # --- in a line ------------------------------------------------------------------------------------
 
 

@@ -263,6 +263,7 @@ def test_rows_that_contradict_one_another_later_are_told(tmp_path: Path) -> None
     with pytest.warns(RuntimeWarning, match=r"b is 0\.4 at the end, not 0: constraints contradict"):
         run = module.simulate()
     assert run.constraints["b"][-1] == pytest.approx(-0.4)
+    assert module.simulate(steps=0).status == "ok"  # of which there is one row
     words = ["run", str(tmp_path / "later.toml"), "--build", str(tmp_path / "build")]
     done = CliRunner().invoke(main, words)
     assert done.exit_code == 1 and "constraints contradict one another" in done.output
