@@ -267,7 +267,8 @@ def test_what_joints_actuators_and_couplings_have_besides_is_reported(tmp_path: 
     inside = f"""<body name="a"><freejoint name="fly" align="true"/>{BALL}
       <body name="b"><joint name="turn" type="ball" damping="1" armature="0.1"/>{BALL}
       <body name="c"><joint name="j" springyield="2" actuatorfrcrange="-3 3"/>{BALL}
-      <body name="d"><joint name="k"/>{BALL}</body></body></body></body>"""
+      <body name="d" sort="1"><joint name="k"/><frame tint="1">{BALL}</frame></body>
+      </body></body></body>"""
     after = """<actuator><motor name="late" joint="j" delay="0.1"/> <lever joint="j"/>
         <motor name="slow" joint="j" damping="0 1"/> <motor name="spin" joint="turn"/></actuator>
       <tendon><spatial name="rope"/><fixed name="sum"><joint joint="k" coef="1"/></fixed></tendon>
@@ -276,6 +277,7 @@ def test_what_joints_actuators_and_couplings_have_besides_is_reported(tmp_path: 
         <tendon name="wound" tendon1="rope" tendon2="sum"/></equality>"""
     robot = model(tmp_path, inside, after=after)
     for words in (
+        ("attributes that MJCF does not have", 'sort of body "d"', "tint of frame"),
         ("alignfree", "fly"),
         ("damping of whole turns", "turn"),
         ("yield of the springs", "j"),

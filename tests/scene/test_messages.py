@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import pytest
 
-from eomc.scene import messages
+from eomc.base.errors import EomcError
+from eomc.scene import messages, toml_text
+from eomc.scene.read import parse
 
 
 @pytest.mark.parametrize(
@@ -56,3 +59,17 @@ def test_long_texts_cost_nothing() -> None:
     for text in ("1 " + "m " * 500_000, "1" * 1_000_000, "=" + " " * 1_000_000, "m" * 1_000_000):
         messages.quantity(text), messages.bare(text), messages.number(text)
     assert time.perf_counter() - begun < 1
+
+
+def test_a_file_may_be_so_long_and_no_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(toml_text, "MAX_BYTES", 40)
+    file = tmp_path / "long.toml"
+    file.write_text("eomc = 1".ljust(40), encoding="utf-8")
+    assert toml_text.tree_and_digest(file)[0] == {"eomc": 1}
+    file.write_text("eomc = 1".ljust(41), encoding="utf-8")
+    with pytest.raises(ValueError, match="too large"):
+        toml_text.tree_and_digest(file)
+    with pytest.raises(EomcError, match="more than the 40 bytes"):
+        parse(file.read_bytes(), "long.toml")
