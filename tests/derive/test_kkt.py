@@ -102,3 +102,18 @@ def test_a_row_with_a_number_in_it_never_fades() -> None:
     assert _faded([x, zero], 1e-5) == sympy.Float("1e-05")
     assert _faded([zero, zero], 1e-5) == sympy.Float("1e-05")
     assert _faded([x, -one], 1e-5) == _faded([zero, one], 1e-5) == 0
+
+
+def test_a_pivot_that_varies_is_checked_where_its_entry_of_D_is_a_number() -> None:
+    kinetic = "(x_dot**2 + y_dot**2 + z_dot**2)/2 + (x_dot*y_dot + y_dot*z_dot)*cos(x)/2"
+    made = System.make("mixed", ["x", "y", "z"], kinetic, constraints={"row": "x + y*z"})
+    program = build(derive(made))
+    state = {"x": 0.3, "y": -0.3, "z": 1.0, "x_dot": 0.2, "y_dot": -0.1, "z_dot": 0.4, "t": 0.0}
+    a = np.array(evaluator(program["acceleration"], exact=True)(state)[0])
+    D = np.array(matrix(program, "D", state))
+    A, bias, multipliers = (
+        np.array(evaluator(program[name], exact=True)(state)[0])
+        for name in ("constraint_jacobian", "bias", "multipliers")
+    )
+    np.testing.assert_allclose(D @ a + bias, A * multipliers, atol=1e-13)
+    assert program["acceleration"].checks

@@ -65,6 +65,7 @@ def test_positions_and_velocities_overflow_each_alone(method: str, modules: Modu
     assert runs.steps.tolist() == [3, 3, 0, 3, 3, 0, 3, 3, 3]
     first = m.simulate_batch(q0[2:4], qd0[2:4], steps=3)
     assert first.status.tolist() == ["not finite", "ok"]
+    assert np.isnan(first.q[0, 1:]).all() and np.isfinite(first.q[1]).all()
     for k in (2, 5):
         with pytest.warns(RuntimeWarning, match="no longer be finite"):
             alone = m.simulate(q0[k], qd0[k], steps=3)
