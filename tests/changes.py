@@ -105,7 +105,9 @@ def _code(source: str) -> Iterator[tuple[int, str]]:
 
 TAG = re.compile(r"{[{%#].*?[}%#]}", re.S)
 CONDITION = re.compile(r"{%-? *(?:el)?if (.*?) *-?%}")
-STATEMENT = re.compile(r"^ +(?:[\w.\[\]>*-]+ [-+*/|&]?= |\w+\(|break|continue|return|\*).*;$", re.M)
+STATEMENT = re.compile(
+    r"^ +(?:(?:{{[^}]*}}|[^\s={])+ [-+*/|&]?= |\w+\(|break|continue|return|\*).*;", re.M
+)
 
 
 def of_template(source: str) -> list[Mutant]:
@@ -204,6 +206,14 @@ class _Python(ast.NodeVisitor):
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         for part in (*node.args.defaults, *filter(None, node.args.kw_defaults), *node.body):
             self.visit(part)
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        for part in node.body:
+            self.visit(part)
+
+    def visit_keyword(self, node: ast.keyword) -> None:
+        if node.arg != "strict":  # which says what holds
+            self.visit(node.value)
 
     def visit_If(self, node: ast.If) -> None:
         if ast.unparse(node.test) != "TYPE_CHECKING":

@@ -15,6 +15,7 @@ import io
 import json
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -22,6 +23,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import ExitStack, redirect_stdout
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -111,8 +113,13 @@ def _words(fault: Exception) -> str:
     return f"{type(fault).__name__}: {str(fault)[-600:]}"
 
 
-def built(sources: Sources, folder: Path, form: str = "fast") -> ModuleType:
-    """The module of a form of these sources, as a build makes it, its binding not optimised."""
+def built(
+    sources: Sources, folder: Path, form: str = "fast", kept: Path | None = None
+) -> ModuleType:
+    """The module of a form of these sources, as a build makes it, its binding not optimised.
+
+    kept: a folder of what was compiled from the same C before.
+    """
     folder.mkdir(parents=True)
     for file, text in sources.files.items():
         if file.startswith("fast/") == (form == "fast") or file.endswith(".py"):
@@ -122,18 +129,17 @@ def built(sources: Sources, folder: Path, form: str = "fast") -> ModuleType:
     ffi.set_source(EXTENSION, sources.binding)
     with redirect_stdout(io.StringIO()):  # it tells of itself
         ffi.emit_c_code(str(folder / "binding.c"))
-    include = {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}
     flags = [compiler.standard(form), *compiler.flags()]
-    library = f"{EXTENSION}{sysconfig.get_config_var('EXT_SUFFIX')}"
-    for words in (
-        ["-O0", *(f"-I{path}" for path in include), "-c", "binding.c"],
-        [*flags, "-c", f"{sources.name}.c"],
-        ["-shared", "binding.o", f"{sources.name}.o", "-lm", "-o", library],
-    ):
-        command = [*compiler.find_compiler().command, "-fPIC", *words]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise EomcError(done.stderr)
+    texts = [(file.name, file.read_text()) for file in sorted(folder.glob("*.[ch]"))]
+    digest = hashlib.sha256(repr((flags, texts)).encode()).hexdigest()
+    library = folder / f"{EXTENSION}{sysconfig.get_config_var('EXT_SUFFIX')}"
+    if kept is not None and (kept / digest).exists():
+        shutil.copy(kept / digest, library)
+    else:
+        _compile(sources.name, flags, library)
+        if kept is not None:
+            kept.mkdir(exist_ok=True)
+            shutil.copy(library, kept / digest)
     name = f"_random_{hashlib.sha256(str(folder).encode()).hexdigest()}"
     spec = importlib.util.spec_from_file_location(
         name, folder / "__init__.py", submodule_search_locations=[str(folder)]
@@ -142,6 +148,21 @@ def built(sources: Sources, folder: Path, form: str = "fast") -> ModuleType:
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def _compile(name: str, flags: Sequence[str], library: Path) -> None:
+    include = {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}
+    for words in (
+        ["-O0", *(f"-I{path}" for path in include), "-c", "binding.c"],
+        [*flags, "-c", f"{name}.c"],
+        ["-shared", "binding.o", f"{name}.o", "-lm", "-o", library.name],
+    ):
+        command = [*compiler.find_compiler().command, "-fPIC", *words]
+        done = subprocess.run(
+            command, cwd=library.parent, capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            raise EomcError(done.stderr)
 
 
 def _one(task: tuple[int, bool, bool]) -> Outcome:

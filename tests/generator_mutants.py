@@ -1,0 +1,283 @@
+"""Mutants of the generator: its Python, its templates and its C by hand, changed in one place each.
+
+    python tests/generator_mutants.py --count 300 --seed 1
+    python tests/generator_mutants.py --only derive/tape --count 50
+    python tests/generator_mutants.py --only derive/tape.py:120      all of a line
+
+Modules take turns, a random mutant each. One is caught where scenes are refused, don't compile or
+fail `eomc check`, or where a quick test fails: first those that execute the line. What does not
+even import, parse or compile counts as none. Of survivors it says whether any scene's files change.
+The first run executes all tests under coverage, which takes some minutes. Needs coverage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import json
+import random
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from changes import Mutant, of_python, of_template
+from executed import (
+    OF_TEXTS,
+    PACKAGE,
+    PLACE,
+    TREE,
+    Executed,
+    Seen,
+    briefly,
+    enter,
+    executed,
+    tests_of,
+)
+from forks import in_a_fork
+
+MODULES = (
+    "derive", "program", "emit", "model", "robots", "runtime", "scene", "integrators", "base",
+    "toolchain", "pipeline",
+)  # fmt: skip
+TEMPLATES = (
+    "templates/c",
+    "templates/python",
+    "templates/fmu",
+    "csrc/lanes",
+    "csrc/sincos",
+)  # their C
+HEAVY = ("numpy", "sympy", "cffi", "pydantic", "jinja2", "pytest", "hypothesis", "coverage",
+         "click", "rich", "defusedxml.ElementTree", "scipy.linalg")  # fmt: skip
+FEW, MORE, MOST = 12, 15.0, 40  # tests at once, seconds of others and their number
+CHECKED_FIRST = tuple(f"generator/eomc/{room}/" for room in ("derive", "program", "emit", "model"))
+
+
+@dataclass(frozen=True)
+class Place:
+    """A mutant in its file, whose name begins at the root of the tree."""
+
+    file: str
+    source: str
+    mutant: Mutant
+
+    @property
+    def line(self) -> int:
+        """Counted from one."""
+        return self.source.count("\n", 0, self.mutant.at) + 1
+
+    @property
+    def lines(self) -> set[int]:
+        """Those of its statement, one of which coverage counts; none in texts."""
+        if not self.file.endswith(".py"):
+            return set()
+        found = {self.line}
+        for node in ast.walk(ast.parse(self.source)):
+            if isinstance(node, ast.stmt):
+                inside = getattr(node, "body", None)
+                end = inside[0].lineno - 1 if inside else node.end_lineno
+                if node.lineno <= self.line <= (end or 0):
+                    found = set(range(node.lineno, (end or 0) + 1))
+        return found
+
+    def __str__(self) -> str:
+        old = self.source[self.mutant.at : self.mutant.end]
+        if len(old) > 60:
+            old = f"{old[:28]}...{old[-28:]}"
+        text = self.source.splitlines()[self.line - 1].strip()
+        return f"{self.file}:{self.line}: {old!r} -> {self.mutant.new[-60:]!r}   | {text}"
+
+
+def files() -> dict[str, list[Mutant]]:
+    """The mutants of each file."""
+    found = {}
+    for file in sorted(PACKAGE.rglob("*.py")):
+        name = str(file.relative_to(PACKAGE))
+        if name.split("/")[0].removesuffix(".py") in MODULES:
+            found[str(file.relative_to(TREE))] = of_python(file.read_text(encoding="utf-8"))
+    for folder in TEMPLATES:
+        for file in sorted((TREE / folder).rglob("*.[ch]*")):
+            found[str(file.relative_to(TREE))] = of_template(file.read_text(encoding="utf-8"))
+    return {name: mutants for name, mutants in found.items() if mutants}
+
+
+def sample(only: Sequence[str], count: int, seed: int) -> Iterator[Place]:
+    """Each file's in turn, in a random order that is the same for the same seed."""
+    draw = random.Random(seed)
+    places: dict[str, list[Place]] = {}
+    for name, mutants in files().items():
+        source = (TREE / name).read_text(encoding="utf-8")
+        own = [Place(name, source, mutant) for mutant in mutants]
+        own = [p for p in own if not only or any(part in f"{name}:{p.line}:" for part in only)]
+        if own:
+            places[name] = draw.sample(own, len(own))
+    while places and count > 0:
+        for name in draw.sample(sorted(places), len(places)):
+            yield places[name].pop()
+            if not places[name]:
+                del places[name]
+            count -= 1
+            if count == 0:
+                return
+
+
+def judge(place: Place, seen: Executed) -> tuple[str, str]:
+    """ "no mutant", "check", "tests", "other bytes" or "same bytes", and by what.
+
+    A test that fails without the mutant too, in the copy or on a busy machine, is not asked again.
+    """
+    while True:
+        file, before = TREE / place.file, PLACE / "before.json"
+        before.write_text(json.dumps({place.file: place.source}), encoding="utf-8")
+        file.write_text(place.mutant.of(place.source), encoding="utf-8")
+        try:
+            verdict, words = _judged(place, seen)
+        finally:
+            undone()
+        if words not in seen.tests:
+            return verdict, words
+        alone = [words]
+        right = in_a_fork(
+            lambda alone=alone: _asked("by_tests", alone), _limit(alone, seen), group=True
+        )
+        if right == ("done", ["passed", ""]):
+            return verdict, words
+        del seen.tests[words]
+
+
+def undone() -> None:
+    """The file of the last mutant as it was, also where a run was killed."""
+    before = PLACE / "before.json"
+    if before.exists():
+        for name, source in json.loads(before.read_text(encoding="utf-8")).items():
+            (TREE / name).write_text(source, encoding="utf-8")
+        before.unlink()
+
+
+def _judged(place: Place, seen: Executed) -> tuple[str, str]:
+    python = place.file.endswith(".py")
+    if python:
+        module = place.file.removeprefix("generator/").removesuffix(".py").replace("/", ".")
+
+        def imported() -> None:
+            enter()
+            importlib.import_module(module)
+
+        if in_a_fork(imported, 60, group=True)[0] != "done":
+            return "no mutant", ""
+    lines = place.lines
+    scenes = sorted(
+        (name for name, one in seen.scenes.items() if runs(one, place.file, lines)),
+        key=lambda name: seen.scenes[name].seconds,
+    )
+    right = {name: one.digest for name, one in seen.scenes.items()}
+    tests = list(tests_of(seen, place.file, lines))
+    few, more = tests[:FEW], _until(MORE, tests[FEW : FEW + MOST], seen)
+    ways: list[tuple[str, float, Callable[[], tuple[str, str]]]] = [
+        ("check", 90, lambda: _asked("by_check", scenes, right, 4, 15.0)),
+        ("tests", _limit(few, seen), lambda: _asked("by_tests", few)),
+        ("tests", _limit(more, seen), lambda: _asked("by_tests", more)),
+        # what passes all that is asked about at length
+        ("check", 400, lambda: _asked("by_check", scenes, right, 40, 200.0)),
+        ("tests", 900, lambda: _asked("by_tests", _own(place.file, seen))),
+    ]
+    if python and not place.file.startswith(CHECKED_FIRST):
+        ways[:2] = reversed(ways[:2])
+    left = ("", "")
+    for way, limit, ask in ways:
+        how, told = in_a_fork(ask, limit, group=True)
+        if how != "done":
+            return way, f"{how} {told}"
+        assert isinstance(told, list)
+        by, words = told
+        if by == "caught":
+            broken = ("Template", "compiler failed", "error: ")
+            known = python or way == "tests" or not any(b in words for b in broken)
+            return (way if known else "no mutant"), words
+        if way == "check":
+            left = by, words
+    return left
+
+
+def _limit(tests: Sequence[str], seen: Executed) -> float:
+    return 45 + 5 * sum(seen.tests[test].seconds for test in tests)
+
+
+def _own(file: str, seen: Executed) -> list[str]:
+    """The quick tests of the folder that a file belongs to, or of what is generated."""
+    room = Path(file).parts[2] if file.startswith("generator/") else ""
+    folders = (f"tests/{room}/",) if room else OF_TEXTS
+    return [test for test in seen.tests if test.startswith(folders)]
+
+
+def _asked(what: str, *given: object) -> tuple[str, str]:
+    enter()
+    import judged
+
+    told: tuple[str, str] = getattr(judged, what)(*given)
+    return told
+
+
+def runs(one: Seen, file: str, lines: set[int]) -> bool:
+    """Whether a scene's check executes lines; of texts, and of what was not watched, perhaps."""
+    return not lines or not one.lines or not lines.isdisjoint(one.lines.get(file, ()))
+
+
+def _until(seconds: float, tests: Sequence[str], seen: Executed) -> list[str]:
+    """As many as take so long."""
+    chosen, left = [], seconds
+    for test in tests:
+        left -= seen.tests[test].seconds + 0.01
+        if left < 0:
+            break
+        chosen.append(test)
+    return chosen
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="*", default=[], help="parts of a file's name, FILE:LINE")
+    parser.add_argument("--log", type=Path, help="a line of JSON for each mutant")
+    parser.add_argument("--minutes", type=float, default=1e9)
+    parser.add_argument("--kept", action="store_true", help="the copy of the last run")
+    parser.add_argument("--brief", action="store_true", help="three scenes alone, and no tests")
+    given = parser.parse_args(arguments)
+    (PLACE / "tmp").mkdir(parents=True, exist_ok=True)
+    undone()
+    for name in HEAVY:
+        importlib.import_module(name)
+    seen = briefly() if given.brief else executed(not given.kept)
+    counts: Counter[str] = Counter()
+    rooms: dict[str, Counter[str]] = defaultdict(Counter)
+    end = time.monotonic() + 60 * given.minutes
+    for place in sample(given.only, given.count, given.seed):
+        if time.monotonic() > end:
+            break
+        began = time.monotonic()
+        verdict, words = judge(place, seen)
+        counts[verdict] += 1
+        rooms["/".join(Path(place.file).parts[:3])][verdict] += 1
+        if given.log:
+            row = {"verdict": verdict, "place": str(place), "by": words,
+                   "seconds": round(time.monotonic() - began, 1)}  # fmt: skip
+            with given.log.open("a") as log:
+                print(json.dumps(row), file=log)
+        if verdict.endswith("bytes"):
+            print(f"{verdict}: {place}   {words}", flush=True)
+    for room, own in sorted(rooms.items()):
+        print(f"{room}: " + ", ".join(f"{n} {what}" for what, n in own.most_common()))
+    live = counts.total() - counts["no mutant"]
+    caught = counts["check"] + counts["tests"]
+    print(f"{caught} of {live} caught ({caught / max(1, live):.1%}): "
+          + ", ".join(f"{n} {what}" for what, n in counts.most_common()))  # fmt: skip
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,98 @@
+"""What `generator_mutants` asks of a mutant, in a process of its own, in its copy of the tree."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from executed import PLACE, PYTEST, TREE, scene_text
+from random_scenes import EXTENSION, built
+
+import eomc
+from eomc.model.from_scene import from_scene
+from eomc.program.assembly import assembled
+from eomc.scene.read import parse
+from eomc.toolchain import cache
+from eomc.verify.check import check
+
+
+class Scene:
+    """A scene derived and printed."""
+
+    def __init__(self, name: str) -> None:
+        os.environ["EOMC_CFLAGS"] = "-O0"
+        warnings.simplefilter("ignore")
+        self.made = assembled(from_scene(parse(scene_text(name), f"{name}.toml")))
+        self.sources = eomc.sources(self.made, EXTENSION)
+        texts = [*sorted(self.sources.files.items()), self.sources.binding, self.sources.cdef]
+        self.digest = hashlib.sha256(repr(texts).encode()).hexdigest()
+
+    def faults(self) -> list[str]:
+        """The rows of the check that fail."""
+        with tempfile.TemporaryDirectory(dir=PLACE / "tmp") as folder:
+            kept = PLACE / "compiled"
+            fast = built(self.sources, Path(folder) / "fast", "fast", kept)
+            plain = built(self.sources, Path(folder) / "plain", "plain", kept)
+            report = check(self.made, fast, plain=plain)
+        return [row.name for row in report.rows if not row.passed]
+
+
+def by_check(
+    scenes: Sequence[str], right: Mapping[str, str], most: int, seconds: float
+) -> tuple[str, str]:
+    """What `eomc check` says: ("caught", by what), ("other bytes", scenes) or ("same bytes", "").
+
+    right: the digest of each scene's sources as they are without the mutant. most: how many scenes
+    are checked. seconds: after which no other is begun.
+    """
+    others, began = [], time.monotonic()
+    for name in scenes:
+        if len(others) >= most or (others and time.monotonic() - began > seconds):
+            break
+        try:
+            scene = Scene(name)
+            if scene.digest == right[name]:
+                continue
+            others.append(name)
+            faults = scene.faults()
+        except Exception as fault:
+            return "caught", f"{name}: {type(fault).__name__}: {fault}"[:300]
+        if faults:
+            return "caught", f"{name}: {', '.join(faults)}"[:300]
+    return ("other bytes", ", ".join(others)) if others else ("same bytes", "")
+
+
+def by_tests(tests: Sequence[str]) -> tuple[str, str]:
+    """("caught", the first that fails), or ("passed", "")."""
+    if not tests:
+        return "passed", ""
+    # each mutant builds anew, but what is compiled from the same C is remembered
+    shutil.rmtree(TREE / "build", ignore_errors=True)
+    (TREE / "build").mkdir()
+    cache.generator_digest = lambda: "a mutant's"
+    cached = TREE / "tests" / "cached_cc.py"
+    os.environ |= {"EOMC_KEPT": str(PLACE / "compiled"), "CC": f"{sys.executable} -SI {cached}"}
+    failed = []
+
+    class First:
+        def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+            if report.failed:
+                failed.append(report.nodeid)
+
+        def pytest_collectreport(self, report: Any) -> None:
+            if report.failed:
+                failed.append(report.nodeid)
+
+    status = pytest.main([*PYTEST, "-x", *tests], plugins=[First()])
+    if failed or status not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
+        return "caught", failed[0] if failed else str(status)
+    return "passed", ""
