@@ -184,7 +184,9 @@ def _judged(place: Place, seen: Executed) -> tuple[str, str]:
         ("check", 400, lambda: _asked("by_check", scenes, right, 40, 200.0)),
         ("tests", 900, lambda: _asked("by_tests", _own(place.file, seen))),
     ]
-    if python and not place.file.startswith(CHECKED_FIRST):
+    if not seen.tests:
+        ways = ways[:1]
+    elif python and not place.file.startswith(CHECKED_FIRST):
         ways[:2] = reversed(ways[:2])
     left = ("", "")
     for way, limit, ask in ways:
