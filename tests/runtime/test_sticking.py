@@ -190,6 +190,25 @@ def test_an_arm_comes_to_rest(modules: Modules) -> None:
             assert np.all(np.abs(run.multipliers[f"q{k}_sticks"]) <= 2 / k * (1 + 1e-9))
 
 
+def test_nothing_slides_against_its_velocity(modules: Modules) -> None:
+    """Some of these slip where another drives them back at once."""
+    arm, random = modules.unoptimised(ARM), np.random.default_rng(5)
+    for _ in range(165):
+        q, qd = random.normal(size=(2, 3)) * [[2], [4]]
+        run = arm.simulate(q, qd, tol=1e-9)
+        assert run.status == "ok" and run.singular_steps == 0
+        assert np.all(run.q[:, 3:] * run.qd[:, :3] > -1e-9) and np.all(np.diff(run.energy) < 1e-7)
+
+
+def test_rounding_of_a_velocity_at_rest_is_none(modules: Modules) -> None:
+    arm = modules.unoptimised(ARM)
+    rest = arm.simulate(tol=1e-10).q[-1, :3]
+    for rates in ([3e-31, -2e-31, 0], [1e-31, 1e-30, 1e-32]):
+        run = arm.simulate(rest, rates, tol=1e-10, duration=1.0)
+        assert not any(len(e) for e in run.events.values()) and run.q[-1, 3:].tolist() == [0, 0, 0]
+        assert run.estimate().amplification < 2
+
+
 def test_nothing_sticks_at_a_dead_point(modules: Modules) -> None:
     """The rocker turns where the crank goes on; both rest in the end, and the loop holds."""
     bar = modules.unoptimised(FOUR_BAR)

@@ -169,10 +169,7 @@ def accelerations(
         multipliers[k] = x
     order = tuple(k for k, _, _ in made.steps if k < len(D))
     told = zip(made.switched.items(), lacks, strict=True)
-    parts = {
-        rows.solved[r]: (lack, pivot, next(D[j][j] for j, a in enumerate(A[r]) if a != 0))
-        for (r, (pivot, _)), lack in told
-    }
+    parts = {rows.solved[r]: (lack, pivot) for (r, (pivot, _)), lack in told}
     return Solution(tape, a, order, made.pivots, "D", tuple(multipliers), parts)
 
 

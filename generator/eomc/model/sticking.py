@@ -23,7 +23,6 @@ from eomc.model.symbols import Constraint, Coordinate, Event, Mode
 if TYPE_CHECKING:
     from eomc.model.system import System
 
-ROUNDED = sympy.Float("1e-9")  # of friction's acceleration: what begins to slip has hardly any
 NOTE = "1 where {name} slides forwards, -1 backwards, 0 where it sticks"
 
 
@@ -104,17 +103,15 @@ def _taken(system: System, whole: Iterable[str]) -> list[Problem]:
 def _events(c: Coordinate, s: Coordinate, force: Expr, row: Constraint) -> list[Event]:
     """It stops, and sticks if what holds it can; else it slips at once.
 
-    Where several stick or slip at one time each is taken for itself, and what begins to slip may
-    turn out to be driven back by another that slips behind it: it sticks again. The first in order
-    of all that are so or so wrong changes, which ends (Murty, *Linear Complementarity*, ch. 4).
+    Where several slip at one time each is taken for itself. What begins to slip and is driven back
+    by another that slips behind it stops again as soon as it moves.
     """
-    lack, pivot, inertia = row.parts
-    back = -s.q * c.qdd * (1 - sympy.Abs(sympy.sign(c.qd))) - ROUNDED * force / inertia
+    lack, pivot = row.parts
     still = ((c.qd.name, S.Zero), (s.name, S.Zero))
     slips = sympy.Abs(lack) - force * pivot - s.q**2
     goes = ((c.qd.name, S.Zero), (s.name, -sympy.sign(lack)))
     return [
-        Event(f"{c.name}_stops", s.q * c.qd, "falling", "jump", still, begins=back, above=True),
+        Event(f"{c.name}_stops", s.q * c.qd, "falling", "jump", still, above=True),
         Event(f"{c.name}_slips", slips, "rising", "jump", goes, begins=slips),
     ]
 

@@ -15,7 +15,7 @@ t = Symbol("t", real=True)
 # behind a name: a direction's entry along it; no name of a user's ends so
 ALONG = "_along_"
 MULTIPLIER = "_lambda_"  # likewise behind a constraint's name, its Lagrange multiplier
-PARTS = ("_lack_", "_pivot_", "_inertia_")  # and what that is made of
+PARTS = ("_lack_", "_pivot_")  # and what that is made of
 
 
 class dot(sympy.Function):  # type: ignore[misc]  # noqa: N801 - it prints as the scene writes it
@@ -180,9 +180,7 @@ class Constraint(_Named):
 
     @property
     def parts(self) -> tuple[Symbol, ...]:
-        """Of one that is switched, in events: its multiplier times its pivot, this, > 0 or 0, and
-        the entry of D of the coordinate that it holds.
-        """
+        """Of one that is switched, in events: its multiplier times its pivot, and this, >= 0."""
         return tuple(symbol(f"{self.name}{part}") for part in PARTS)
 
 

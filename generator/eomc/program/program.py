@@ -154,7 +154,7 @@ def _events(system: System, taken: Candidate) -> Iterator[Function]:
         to = dict(e.jump)
         values += [to.get(name, symbol(name)) for name in state]
     jumps = any(e.action == "jump" for e in system.events)
-    held = dict(zip(system.qdd, taken.outputs, strict=True)) | {
+    held = {
         x: value
         for k, made in taken.parts.items()
         for x, value in zip(system.constraints[k].parts, made, strict=True)

@@ -19,7 +19,7 @@ from .frames import Frames
 from .functions import row_times
 from .trajectory import SAID, STATUS, MotionError, state_text
 
-AT_REST = 1e-12  # of the largest velocity
+AT_REST, SLOWEST = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
 
 
 class Rows(NamedTuple):
@@ -268,6 +268,7 @@ class Constrained(Frames):
             return q, qd
         at, of = np.array(self._rows.modes).T
         q, qd = np.array(q, self.dtype), np.array(qd, self.dtype)
-        qd[..., of] *= np.abs(qd[..., of]) > AT_REST * np.max(np.abs(qd), axis=-1, keepdims=True)
+        fastest = np.max(np.abs(qd), axis=-1, keepdims=True)
+        qd[..., of] *= np.abs(qd[..., of]) > np.maximum(AT_REST * fastest, SLOWEST)
         q[..., at] = np.sign(qd[..., of])
         return q, qd
