@@ -146,3 +146,18 @@ def variant(scene: str, name: str, **replaced: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def block_at_rest(block: Any, tol: float) -> Any:
+    """The run of a block on a spring with dry friction, which goes and ends as it should."""
+    case = cases()["coulomb_friction"]
+    run = block.simulate(tol=tol, duration=6.0)
+    assert run.status == "ok" and run.steps + run.rejected < 50
+    (there,) = case["checkpoints"]
+    q, qd = run(float(there["t"]))
+    exact = max(tol, 1e-13)
+    assert abs(run.q[-1, 0] - float(case["q_ref"][0])) <= exact
+    assert run.q[-1, 1] == 0 and abs(run.qd[-1, 0]) < 1e-15
+    assert abs(q[0] - float(there["q"][0])) <= exact
+    assert abs(qd[0] - float(there["qd"][0])) <= 10 * exact
+    return run

@@ -18,6 +18,7 @@ from scipy.integrate import solve_ivp
 import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.model.system import System
+from eomc.program.assembly import assembled
 from eomc.verify.check import check
 
 BLOCK = """eomc = 1
@@ -95,11 +96,7 @@ def block(modules: Modules) -> ModuleType:
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
 def test_a_block_comes_to_rest_where_it_should(block: ModuleType, tol: float) -> None:
-    case = cases.cases()["coulomb_friction"]
-    run = block.simulate(tol=tol, duration=6.0)
-    assert run.status == "ok" and run.steps + run.rejected < 50
-    assert run.q[-1, 0] == pytest.approx(float(case["q_ref"][0]), abs=max(tol, 1e-13))
-    assert run.q[-1, 1] == 0 and abs(run.qd[-1, 0]) < 1e-15
+    run = cases.block_at_rest(block, tol)
     held = run.multipliers["x_sticks"][-1]
     assert held == pytest.approx(10 * run.q[-1, 0], abs=1e-12)
     assert len(run.events["x_slips"]) == len(run.events["x_stops"]) == 5
@@ -250,10 +247,30 @@ def test_systems_made_in_python_have_it() -> None:
             System.make("slab", {x: 0}, m * v**2 / 2, parameters={m: 2, F: 1}, friction=wrong)
 
 
+def test_what_a_start_is_assembled_from_is_still_told() -> None:
+    told = [str(w) for w in assembled(made_of(FOUR_BAR)).warnings]
+    assert any("the start is assembled: q2 = " in text for text in told)
+
+
 def test_names_that_it_needs_are_not_taken() -> None:
     text = BLOCK.replace("k  = 10.0", "k  = 10.0\nx_slides = 1.0")
     with pytest.raises(SceneError, match=r"needs the name 'x_slides': rename yours"):
         made_of(text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("text", "times"), [(CART, 5), (ARM, 8)], ids=["cart", "arm"])
+def test_it_takes_fewer_steps_than_smoothed(text: str, times: float, modules: Modules) -> None:
+    """The figures of docs/adaptive.md: pytest -s tests/runtime/test_sticking.py -k fewer."""
+    smooth = text.replace('friction = "stick"', 'friction = "smooth"\ntolerance = 1e-9')
+    smooth = smooth.replace("tolerance = 1e-10\n", "").replace("dry_", "rubbed_")
+    smooth = smooth.replace('friction = "F" }', 'friction = "F", friction_width = 0.001 }')
+    smooth = smooth.replace('friction = "F/', 'friction_width = 0.001\nfriction = "F/')
+    exact, other = (
+        modules.unoptimised(x).simulate(tol=1e-9, duration=5.0).steps for x in (text, smooth)
+    )
+    print(f"{exact} steps, smoothed by tanh(v/0.001) {other}")
+    assert times * exact < other
 
 
 @pytest.mark.slow

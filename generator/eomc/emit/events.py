@@ -87,14 +87,9 @@ def _begun(made: Stepping, restart: CFunction) -> Begun:
             f"{made.method}_begun", functions.status, arguments, qualifier="static"
         ),
         values=values.call(begins="value", **state),
+        method=made.method,
         restart=restart.call(reached=state["t"]),
-        width=_width(functions),
     )  # fmt: skip
-
-
-def _width(functions: Functions) -> str:
-    """Numbers of an event: t, q, qd."""
-    return f"(1 + 2*{functions.NQ})"
 
 
 def _events(made: Stepping) -> Events:
@@ -155,7 +150,6 @@ def _events(made: Stepping) -> Events:
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
         chance=target.literal(1e-6),
-        width=_width(functions),
         looked=looked,
         values=values.call(events="g", **within),
         bracketed=bracketed,

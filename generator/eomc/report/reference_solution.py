@@ -54,7 +54,6 @@ SECONDS = 120.0  # of either way
 PLAIN_SECONDS = 2.0  # of the plain equations in mpmath
 PLAIN_DIGITS = 40
 PLAIN_STATES = 5
-NOTHING = 1e-25  # of what moves: rounding in __float128 of what does not
 PLAIN_AGREES = 26.0  # digits of accelerations; fewer says that the equations are not the same
 
 
@@ -283,7 +282,7 @@ def _plainly(system: System, rows: Text, spacing: float) -> tuple[float, float, 
     with mpmath.workdps(PLAIN_DIGITS):
         found = [[mpmath.mpf(text) for text in row] for row in rows]
         plain = _Plain(system)
-        size = _sizes(rows[:, 2 * n :])
+        size = np.max(np.abs(rows[:, 2 * n :].astype(float)), axis=0)
         digits = MOST_DIGITS
         for k in sorted(set(np.linspace(0, len(rows) - 1, PLAIN_STATES).astype(int).tolist())):
             a = plain.acceleration(found[k][:n], found[k][n : 2 * n], mpmath.mpf(spacing) * k)
@@ -297,7 +296,7 @@ def _plainly(system: System, rows: Text, spacing: float) -> tuple[float, float, 
         motion, until = MOST_DIGITS, 0.0
         deadline = time.monotonic() + PLAIN_SECONDS
         x = found[0][: 2 * n]
-        sizes = _sizes(rows[:, : 2 * n])
+        sizes = np.max(np.abs(rows[:, : 2 * n].astype(float)), axis=0)
         for k in range(1, len(rows)):
             after = plain.over(x, mpmath.mpf(spacing) * (k - 1), mpmath.mpf(spacing), deadline)
             if after is None:
@@ -306,13 +305,6 @@ def _plainly(system: System, rows: Text, spacing: float) -> tuple[float, float, 
             for i in range(2 * n):
                 motion = min(motion, _digits(x[i] - found[k][i], sizes[i]))
         return digits, motion if until else 0.0, until
-
-
-def _sizes(rows: Text) -> Vector:
-    """Of each column the largest value; the largest of all where that is rounding of 0."""
-    found = np.max(np.abs(rows.astype(float)), axis=0)
-    most = np.max(found)
-    return np.asarray(np.where(found > NOTHING * most, found, most))
 
 
 def _digits(off: Any, size: float) -> float:

@@ -106,7 +106,6 @@ class Events(Named):
     near: str
     close: str
     chance: str
-    width: str
     looked: CFunction
     values: str
     bracketed: CFunction
@@ -134,7 +133,7 @@ class Begun(Named):
     function: CFunction
     values: str
     restart: str
-    width: str
+    method: str
 
 
 @dataclass(frozen=True)
