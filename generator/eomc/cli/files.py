@@ -6,6 +6,7 @@ from pathlib import Path
 
 from eomc.base.errors import EomcError
 from eomc.cli.terminal import shown
+from eomc.runtime.written import replacing
 
 
 def scene_path(name: str) -> Path:
@@ -20,17 +21,20 @@ def write_new(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             made = True
             file.write(text)
+        made = False
     except FileExistsError:
         raise EomcError(f"{shown(path)}: is there already, and stays as it is") from None
     except OSError as fault:
+        raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None
+    finally:
         if made:  # and not whole
             path.unlink(missing_ok=True)
-        raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file, over what is there."""
+    """Write a file, whole, over what is there."""
     try:
-        path.write_text(text, encoding="utf-8")
+        with replacing(path) as new:
+            new.write_text(text, encoding="utf-8")
     except OSError as fault:
         raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None

@@ -23,6 +23,7 @@ from eomc.report.labels import html_name
 from eomc.report.marks import Drawing
 from eomc.report.origin import Source, system_of
 from eomc.report.reel import Instances, Panel, Reel
+from eomc.runtime.written import replacing
 
 Array = NDArray[np.float64]
 
@@ -44,7 +45,8 @@ class Animation:
     def save(self, file: str | os.PathLike[str]) -> None:
         """Write the page. Raises EomcError where it can't be written."""
         try:
-            Path(file).write_text(self.page, encoding="utf-8")
+            with replacing(file) as new:
+                new.write_text(self.page, encoding="utf-8")
         except OSError as fault:
             words = fault.strerror or fault
             raise EomcError(f"{texts.line(str(file))}: can't be written ({words})") from None

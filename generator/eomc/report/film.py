@@ -13,6 +13,7 @@ from eomc.base.errors import EomcError
 from eomc.report.picture import frame, seen, still
 from eomc.report.reel import Reel
 from eomc.report.style import COLOURS, INK, colours
+from eomc.runtime.written import replacing
 
 RATES = {".gif": 25, ".mp4": 50}  # pictures a second; a GIF counts in hundredths of a second
 MOST = 1500  # pictures
@@ -55,7 +56,7 @@ def write(reels: Sequence[Reel], file: Path, title: str | None) -> None:
         figure = Figure(figsize=(SIZE * len(reels), SIZE), dpi=DPI, layout="constrained")
         panels = figure.subplots(1, len(reels), squeeze=False)[0]
         try:
-            with writer.saving(figure, str(file), DPI):
+            with replacing(file) as new, writer.saving(figure, str(new), DPI):
                 for k, t in enumerate(times):
                     for axes, reel, (drawn, flat) in zip(panels, reels, made, strict=True):
                         axes.clear()

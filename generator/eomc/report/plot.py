@@ -21,6 +21,7 @@ from eomc.report import picture as pictures
 from eomc.report.labels import mathtext, rate_unit, with_unit
 from eomc.report.style import COLOURS, INK, plain
 from eomc.runtime.plot import Curve, against, grouped, wrapped
+from eomc.runtime.written import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,9 +54,12 @@ def draw(
     import matplotlib
 
     undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
+    drawn = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "eomc", "text.usetex": False}):
+        made.savefig(drawn, format=suffix[1:], dpi=150, metadata=undated)
     try:
-        with matplotlib.rc_context({"svg.hashsalt": "eomc", "text.usetex": False}):
-            made.savefig(path, dpi=150, metadata=undated)
+        with replacing(path) as new:
+            new.write_bytes(drawn.getvalue())
     except OSError as fault:
         raise EomcError(f"{path}: can't be written ({fault.strerror or fault})") from None
 

@@ -41,6 +41,7 @@ from eomc.model.corners import corners
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
+from eomc.runtime.written import replacing
 from eomc.toolchain import cache as builds
 from eomc.verify import symbolic
 from eomc.verify.oracle import Vector
@@ -126,9 +127,8 @@ def of(
     kept["key"] = wanted
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        written = file.with_suffix(f".{os.getpid()}")
-        written.write_text(json.dumps(kept) + "\n", encoding="utf-8")
-        os.replace(written, file)
+        with replacing(file) as new:
+            new.write_text(json.dumps(kept) + "\n", encoding="utf-8")
     except OSError as fault:
         raise FolderError(f"{file}: can't be written ({fault.strerror})") from None
     return made

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 from .arguments import Array, not_one_of
+from .written import replacing
 
 if TYPE_CHECKING:
     from .model import Model
@@ -116,7 +117,7 @@ class Columns:
 
     def _to_csv(self, path: Path) -> None:
         columns = self.to_dict()
-        with path.open("w", newline="", encoding="utf-8") as file:
+        with replacing(path) as new, new.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
             for row in zip(*(c.astype(float).tolist() for c in columns.values()), strict=True):

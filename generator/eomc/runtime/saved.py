@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .arguments import Array
+from .written import replacing
 
 if TYPE_CHECKING:
     from .columns import Columns, File
@@ -31,7 +32,7 @@ def write(run: Columns, path: Path) -> None:
         arrays["jacobi"] = run.jacobi
     arrays |= {name: value for name, value in run._kept().items() if value is not None}
     made: Any = {name: np.asarray(value) for name, value in arrays.items()}
-    with path.open("wb") as file:
+    with replacing(path) as new, new.open("wb") as file:
         np.savez(file, **made)
 
 

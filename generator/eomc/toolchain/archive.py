@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 from eomc.base.errors import EomcError
+from eomc.runtime.written import replacing
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all that is inside, the earliest of a zip
 
@@ -19,10 +18,9 @@ def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None
     programs: the folder in it whose files are executable. Raises EomcError where it can't be
     written.
     """
-    new = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with zipfile.ZipFile(new, "w") as archive:
+        with replacing(file) as new, zipfile.ZipFile(new, "w") as archive:
             for name, data in contents.items():
                 entry = zipfile.ZipInfo(name, _DATE)
                 entry.compress_type = zipfile.ZIP_DEFLATED
@@ -30,9 +28,5 @@ def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None
                 runs = programs and name.startswith(f"{programs}/")
                 entry.external_attr = (0o755 if runs else 0o644) << 16
                 archive.writestr(entry, data)
-        os.replace(new, file)
     except OSError as fault:
         raise EomcError(f"{file}: can't be written ({fault.strerror})") from None
-    finally:
-        with contextlib.suppress(OSError):
-            new.unlink()

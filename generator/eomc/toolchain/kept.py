@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
+from eomc.runtime.written import replacing
 from eomc.toolchain.cache import generator_digest
 
 
@@ -33,7 +33,6 @@ def texts(
     if name:
         with contextlib.suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
-            new = file.with_name(f".{file.name}.{os.getpid()}")
-            new.write_text(json.dumps({"key": key, "texts": made}), encoding="utf-8")
-            os.replace(new, file)
+            with replacing(file) as new:
+                new.write_text(json.dumps({"key": key, "texts": made}), encoding="utf-8")
     return made
