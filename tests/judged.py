@@ -47,22 +47,28 @@ class Scene:
 
 
 def by_check(
-    scenes: Sequence[str], right: Mapping[str, str], most: int, seconds: float
+    scenes: Sequence[str],
+    right: Mapping[str, str],
+    most: int,
+    seconds: float,
+    same: bool = False,
 ) -> tuple[str, str]:
     """What `eomc check` says: ("caught", by what), ("other bytes", scenes) or ("same bytes", "").
 
     right: the digest of each scene's sources as they are without the mutant. most: how many scenes
-    are checked. seconds: after which no other is begun.
+    are checked. seconds: after which no other is begun. same: those of the same sources too.
     """
-    others, began = [], time.monotonic()
+    others, count, began = [], 0, time.monotonic()
     for name in scenes:
-        if len(others) >= most or (others and time.monotonic() - began > seconds):
+        if count >= most or (count and time.monotonic() - began > seconds):
             break
         try:
             scene = Scene(name)
-            if scene.digest == right[name]:
+            if scene.digest != right[name]:
+                others.append(name)
+            elif not same:
                 continue
-            others.append(name)
+            count += 1
             faults = scene.faults()
         except Exception as fault:
             return "caught", f"{name}: {type(fault).__name__}: {fault}"[:300]
