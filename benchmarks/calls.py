@@ -7,6 +7,7 @@
   that others on the same core do not count. On a machine shared with others it comes in two sizes,
   up to 1.8 apart: where somebody else has the other half of the physical core, an interpreter gets
   half of the instructions through, while a chain of dependent multiplications takes no longer;
+- overhead of `simulate()` by a tolerance: beside the same steps in C, which keep no rows;
 - `step_batch` of eight instances, whole: it has no bar, but learning loops pay it in every step;
 - import: of a built scene in a fresh process, bytecode in place, after NumPy is there.
 """
@@ -25,10 +26,11 @@ from pathlib import Path
 
 import numpy as np
 import work
+from searching import adaptive_in_c
 
 import eomc
 
-CALL_BAR, IMPORT_BAR = 5e-6, 50e-3  # s
+CALL_BAR, FIT_BAR, IMPORT_BAR = 5e-6, 3e-6, 50e-3  # s
 IMPORT = """
 import sys, time, numpy
 sys.path[:0] = [sys.argv[1]]
@@ -64,6 +66,18 @@ def call_overhead(root: Path, rounds: int) -> tuple[float, float, float]:
     return quartiles(found)
 
 
+def adaptive_overhead(root: Path, rounds: int) -> tuple[float, float, float]:
+    """Quartiles over the rounds of simulate() by a tolerance less its loop in C, s."""
+    module = work.load(work.CASES["cart-pole"], root, "tolerance = 1e-9\n")
+    bare = adaptive_in_c(module, 1.0, 1e-9)
+
+    def run() -> object:
+        return module.simulate(duration=1.0, tol=1e-9)
+
+    run()
+    return quartiles([seconds(run, 300) - seconds(bare, 300) for _ in range(rounds)])
+
+
 def batch_call(root: Path, rounds: int) -> tuple[float, float, float]:
     """Quartiles over the rounds of a step of eight instances, s."""
     case = work.CASES["cart-pole"]
@@ -90,6 +104,10 @@ def said(root: Path, rounds: int) -> str:
     lines = ["| | median | quartiles | bar |", "|---|---|---|---|"]
     for title, unit, scale, bar, found in (
         ("`simulate(steps=10)` beyond ten steps", "us", 1e6, CALL_BAR, call_overhead(root, rounds)),
+        (
+            "`simulate()` by a tolerance, beyond its loop in C",
+            "us", 1e6, FIT_BAR, adaptive_overhead(root, rounds),
+        ),
         ("`step_batch` of eight", "us", 1e6, math.inf, batch_call(root, rounds)),
         (
             "warm import of a built module, beyond NumPy's",

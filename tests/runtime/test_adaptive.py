@@ -83,9 +83,49 @@ def test_a_run_is_the_same_in_pieces(kepler: ModuleType, monkeypatch: pytest.Mon
     module = __import__(f"{kepler.__name__}.adaptive", fromlist=["adaptive"])
     monkeypatch.setattr(module, "_ROOM", 1)
     monkeypatch.setattr(module, "_MOST", 3)
+    monkeypatch.setattr(kepler._model, "_room", 0)
     again = kepler.simulate(duration=50.0)
     assert again == run and np.array_equal(again.t, run.t) and again.steps == run.steps
     assert pickle.loads(pickle.dumps(run)) == run
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"q0": [0.2, 0.1]}, {"qd0": (0.5, 3.0)}, {"params": {"mu": 2.0}, "t0": 1.5}],
+    ids=["plain", "q0", "qd0", "params"],
+)
+def test_a_run_in_one_call_is_the_same(kepler: ModuleType, how: dict) -> None:
+    """The way of what is asked again and again, beside the one that takes all questions."""
+    kepler.simulate(duration=PERIOD)  # how many steps there are
+    quick = kepler.simulate(duration=PERIOD, tol=1e-8, **how)
+    assert 0 < quick.steps + 1 <= kepler._model._room
+    long = kepler.simulate(duration=PERIOD, tol=1e-8, **how, progress=lambda done, of: None)
+    assert quick == long and quick.message == long.message
+    assert quick.evaluations == long.evaluations and quick.h == long.h
+    assert np.array_equal(quick(how.get("t0", 0.0) + 0.3), long(how.get("t0", 0.0) + 0.3))
+
+
+def test_a_run_of_more_steps_than_the_last_is_whole(kepler: ModuleType) -> None:
+    kepler.simulate(duration=0.1)
+    room = kepler._model._room
+    run = kepler.simulate(duration=20 * PERIOD)
+    assert run.steps > room and run.t[-1] == 20 * PERIOD
+    assert run == kepler.simulate(duration=20 * PERIOD)
+
+
+def test_a_run_in_one_call_refuses_the_same(kepler: ModuleType) -> None:
+    kepler.simulate(duration=1)
+    for wrong, words in (
+        ({"tol": 0.1}, "give one between"),
+        ({"duration": -1.0}, "not a time"),
+        ({"q0": [[0.1, 0.2]]}, "q0"),
+        ({"qd0": [math.nan, 1.0]}, "qd0"),
+        ({"t0": math.inf}, "t0"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            kepler.simulate(**wrong)
+    with pytest.warns(RuntimeWarning, match="stopped at"):
+        assert kepler.simulate(q0=[0.0, 0.0], qd0=[0.0, 0.0], duration=1).status != "ok"
 
 
 def test_a_run_tells_the_state_at_any_time(kepler: ModuleType) -> None:

@@ -10,15 +10,15 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import isfinite
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .adaptive_error import LEAST, error_of
-from .arguments import Array, as_number, as_step_size
+from .adaptive_arguments import BOTH, as_end, as_limits, as_times, as_tolerance
+from .adaptive_error import error_of
+from .arguments import Array, as_number
 from .dense import within
 from .estimate import Estimate
 from .package import reduced
@@ -29,13 +29,17 @@ from .trajectory import SAID, STATUS, Run, state_text
 if TYPE_CHECKING:
     from .model import Model
 
-LOOSEST = 1e-2
 _EVENTS = 1024  # of one call
 _ROOM = 48  # steps of the first call
+_AT_ONCE = 2048  # steps times coordinates of it, at most
 _MOST = 2**20  # of one call
 _DRAWN = 1_000  # rows of a curve, at least
 _EVEN = 8  # rows a step, as equally spaced ones need them
 _NONE = (np.empty(0, np.intc), np.empty((0, 1)))  # events
+STOPPED = (
+    "no step is short enough to go on; where forces keep jumping, as friction by sign(x_dot) that "
+    'sticks, take friction = "stick" in [run], or let events switch them; else a looser tolerance'
+)
 
 
 @dataclass(frozen=True)
@@ -237,9 +241,9 @@ class AdaptiveRun(Run):
 def simulate(
     model: Model, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
     params: Any, t0: float, progress: Callable[[int, int], None] | None, tol: float | None,
-    times: ArrayLike | None, h_most: float | None, stiff: bool, **fixed: Any,
+    times: ArrayLike | None, h_most: float | None, stiff: bool, fixed: tuple[Any, ...],
 ) -> AdaptiveRun:  # fmt: skip
-    """`Model.simulate` with a tolerance; fixed: what belongs to fixed steps, and was given."""
+    """`Model.simulate` with a tolerance; fixed: the values of FIXED."""
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     if u is not None and (callable(u) or np.ndim(u) > 1):
         raise ValueError(
@@ -267,75 +271,108 @@ def simulate(
     return found
 
 
+def plain(
+    model: Model, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
+    params: Any, t0: float, tol: float | None,
+) -> AdaptiveRun | None:  # fmt: skip
+    """A run with nothing unusual in one call, as long as the last was; None: it goes another way.
+
+    Not for scenes with events or constraints.
+    """
+    (from_q, from_qd, at_p), p = model._at, model._p0
+    if q0 is not None:
+        from_q = model._from(q0, "q0")[1]
+    if qd0 is not None:
+        from_qd = model._from(qd0, "qd0")[1]
+    if params is not None:
+        p = model._parameters(params).copy()
+        at_p = model._pointer(p)
+    tol = as_tolerance(model.tolerance if tol is None else tol, model.dtype)
+    end = as_end(model, t0, duration)
+    (address, real, null), nq, count = model._c, model.nq, model._room
+    work, whole = model._ffi.new("adaptive_work *"), np.empty(count * (1 + 2 * nq), model.dtype)
+    to_t = address(real, whole)
+    to_q = to_t + count
+    found = model._lib.adaptive_begin(
+        from_q, from_qd, t0, end, tol, 0.0, null, count - 1, null, 0, to_t, to_q,
+        to_q + nq * count, at_p, work,
+    )  # fmt: skip
+    if found or work.t < end:
+        model._room = 0
+        return None
+    steps, filled = work.steps, work.rows
+    both = whole[count:].reshape(2, count, nq)[:, :filled]
+    return AdaptiveRun(
+        model, t0, both, (end - t0) / steps if steps else 0.0, steps, "ok", p, 1, None, "gauss16",
+        work.evaluations, tol=tol, rejected=work.rejected, stiff_steps=work.stiff_steps,
+        _times=whole[:filled], _h_most=0.0, _stiff=False, _begin=both[:, 0], _t_end=end,
+    )  # fmt: skip
+
+
 def run(
     model: Model, q: Array, qd: Array, t0: float, t_end: float, tol: float, times: Array | None,
     u: Array | None, p: Array, h_most: float, progress: Callable[[int, int], None] | None,
     stiff: bool = False,
 ) -> AdaptiveRun:  # fmt: skip
     """A run from checked arguments, whatever its status; times (n,) later than t0."""
-    address, real, null = model._c
-    nq, work = model.nq, model._ffi.new("adaptive_work *")
-    work.stiff = bool(stiff)
-    place = np.empty(2 * nq + 1, model.dtype)  # q, qd and t, where the run is
-    place[:nq], place[nq:-1], place[-1] = q, qd, t0
-    at_x = address(real, place)
+    (address, real, null), nq = model._c, model.nq
+    work = model._ffi.new("adaptive_work *")
+    if stiff:
+        work.stiff = 1
     at_u = null if u is None else address(real, u)
     at_p = model._at[2] if p is model._p0 else address(real, p)
-    found_events = _Found(model) if model.events else None
-    each = 2 if model.events else 1  # rows of a step, beside a jump
-    room, spent = _ROOM, 0.0  # steps of a call, s of a call
-    pieces = list[tuple[Array, Array, int]]()  # times, rows, how many of them there are
-    own = times is None
-    if own:
-        stamps, both, to = _rows(model, 1 + each * room)
-        stamps[0], both[0, 0], both[1, 0], filled = t0, q, qd, 1
-        to_t = to
-    else:
-        stamps = np.ascontiguousarray(times, model.dtype)
-        _, both, to = _rows(model, len(stamps))
-        to_t, filled = address(real, stamps), 0
-    said = "ok"
+    events = _Found(model) if model.events else None
+    own, each = times is None, 2 if events else 1  # rows of a step, beside a jump
+    room = max(_ROOM, min(model._room, _AT_ONCE // nq))
+    pieces: list[tuple[Array, Array]] = []  # times and rows
+    whole, to, count = _rows(model, 1 + each * room if times is None else len(times))
+    stamps = None if times is None else np.ascontiguousarray(times, model.dtype)
+    to_t = to if stamps is None else address(real, stamps)
+    call = model._lib.adaptive_begin
+    place: tuple[Any, ...] = address(real, q), address(real, qd), t0
+    filled, said = 0, "ok"
     try:
-        while place[-1] < t_end and said == "ok" and not (model.events and work.stopped):
-            if spent:
-                if progress is not None:
-                    progress(round(1000 * (float(place[-1]) - t0) / (t_end - t0)), 1000)
-                room = min(longer(room, spent), _MOST)
-            left = len(stamps) - filled
-            if own and left < each:
-                pieces.append((stamps, both, filled))
-                left, filled = each * room, 0
-                stamps, both, to = _rows(model, left)
-                to_t = to
-            to_q = to + len(stamps) + nq * filled
-            begun = perf_counter()
-            found = model._lib.adaptive(
-                at_x, at_x + 2 * nq, t_end, tol, h_most, at_u, left // each if own else room,
+        while True:
+            left, to_q, begun = count - filled, to + (count + nq * filled), perf_counter()
+            found = call(
+                *place, t_end, tol, h_most, at_u, (left - (not filled)) // each if own else room,
                 null if own else to_t + filled, 0 if own else left,
-                to_t + filled if own else null, to_q, to_q + nq * len(stamps),
-                *(found_events.room() if found_events else ()), at_p, work,
+                to_t + filled if own else null, to_q, to_q + nq * count,
+                *(events.room() if events else ()), at_p, work,
             )  # fmt: skip
-            spent = perf_counter() - begun
-            filled += _kept(work, found_events)
+            filled += _kept(work, events)
             said = STATUS[found]
+            if found or work.t >= t_end or (events and work.stopped):
+                break
+            if progress is not None:
+                progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)
+            room = min(longer(room, perf_counter() - begun), _MOST)
+            call, place = model._lib.adaptive, (work.x, model._ffi.addressof(work, "t"))
+            if own and count - filled < each:
+                pieces.append(_parts(whole, count, filled, nq))
+                whole, to, count = _rows(model, 1 + each * room)
+                to_t, filled = to, 0
         if progress is not None and said == "ok":
             progress(1000, 1000)
     except KeyboardInterrupt:
-        filled += _kept(work, found_events)
+        filled += _kept(work, events)
         said = "interrupted"
-    stamps, both = stamps[:filled], both[:, :filled]
+    own_stamps, both = _parts(whole, count, filled, nq)
+    stamps = own_stamps if stamps is None else stamps[:filled]
     if pieces:
-        stamps = np.concatenate([*(t[:n] for t, _, n in pieces), stamps])
-        both = np.concatenate([*(rows[:, :n] for _, rows, n in pieces), both], axis=1)
+        stamps = np.concatenate([*(t for t, _ in pieces), stamps])
+        both = np.concatenate([*(rows for _, rows in pieces), both], axis=1)
     steps = work.steps
+    odd = events or model.constraint_names or nq * steps > _AT_ONCE
+    model._room = 0 if odd else steps + _ROOM
     made = AdaptiveRun(
-        model, t0, both, (float(place[-1]) - t0) / steps if steps else t_end - t0, steps, said, p,
-        1, None if u is None else u.copy(), "gauss16", work.evaluations, tol=tol,
+        model, t0, both, (work.t - t0) / steps if steps else t_end - t0, steps, said, p, 1,
+        None if u is None else u.copy(), "gauss16", work.evaluations, tol=tol,
         rejected=work.rejected, stiff_steps=work.stiff_steps, _times=stamps, _h_most=h_most,
-        _stiff=bool(stiff), _begin=np.array([q, qd]), _t_end=t_end,
+        _stiff=bool(stiff), _begin=both[:, 0] if own else np.array([q, qd]), _t_end=t_end,
     )  # fmt: skip
-    if found_events:
-        made._happened = found_events.all()
+    if events:
+        made._happened = events.all()
         made.stopped = model.events[work.stopped - 1] if work.stopped else ""
         made.limit = work.limit if said == "accumulated" else made.limit
     if model.constraint_names:
@@ -344,11 +381,16 @@ def run(
     return made
 
 
-def _rows(model: Model, count: int) -> tuple[Array, Array, Any]:
-    """Room for so many times (n,) and rows (2, n, nq), and its address."""
+def _rows(model: Model, count: int) -> tuple[Array, Any, int]:
+    """Room for so many times and rows, one behind the other, its address, and how many."""
     whole = np.empty(count * (1 + 2 * model.nq), model.dtype)
     address, real, _ = model._c
-    return whole[:count], whole[count:].reshape(2, count, model.nq), address(real, whole)
+    return whole, address(real, whole), count
+
+
+def _parts(whole: Array, count: int, filled: int, nq: int) -> tuple[Array, Array]:
+    """The times (n,) and rows (2, n, nq) that fill such room."""
+    return whole[:filled], whole[count:].reshape(2, count, nq)[:, :filled]
 
 
 def _kept(work: Any, events: _Found | None) -> int:
@@ -385,61 +427,3 @@ class _Found:
             return self.which[:0], self.rows[:0]
         which, rows = zip(*self.pieces, strict=True)
         return np.concatenate(which), np.concatenate(rows)
-
-
-STOPPED = (
-    "no step is short enough to go on; where forces keep jumping, as friction by sign(x_dot) that "
-    'sticks, take friction = "stick" in [run], or let events switch them; else a looser tolerance'
-)
-BOTH = "times: say where the run ends; give times or duration, not both"
-
-
-def as_limits(
-    model: Model, tol: float | None, h_most: float | None, stiff: Any, fixed: Mapping[str, Any]
-) -> tuple[float, float]:
-    """(tolerance, longest step or 0); fixed: what belongs to fixed steps, and may be given."""
-    if not isinstance(stiff, (bool, np.bool_)):
-        raise ValueError(f"stiff: {stiff!r} is not True or False")
-    if model.tolerance is None:
-        raise ValueError(
-            "tol, times, stiff: not built; a scene asks for them with [run] tolerance = 1e-9 (of a "
-            "run by fixed steps run(times) gives the states at any times)"
-        )
-    for name, value in fixed.items():
-        if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
-            raise ValueError(
-                f"{name}: belongs to fixed steps; tol, times, h_most and stiff to adaptive ones: "
-                "give one or the other; run(times) gives the states of a run by fixed steps"
-            )
-    most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
-    return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most
-
-
-def as_end(model: Model, t0: float, duration: float | None) -> float:
-    """The time at which a run ends."""
-    span = model.duration if duration is None else as_number(duration, "duration")
-    if span < 0:
-        raise ValueError(f"duration: {span:g} is not a time in s")
-    return float(t0 + span)
-
-
-def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
-    """A tolerance that the numbers have digits for, or a ValueError."""
-    least = LEAST[dtype.itemsize]
-    number = as_number(tol, "tol")
-    if not least <= number <= LOOSEST:
-        raise ValueError(f"tol: {number:g}: give one between {least:.1g} and {LOOSEST:g}")
-    return number
-
-
-def as_times(times: ArrayLike, t0: float, dtype: np.dtype[Any]) -> Array:
-    """Times in ascending order, not before t0, or a ValueError."""
-    try:
-        found = np.ascontiguousarray(times, dtype)
-    except (TypeError, ValueError):
-        raise ValueError(f"times: {times!r} is not an array of numbers") from None
-    if found.ndim != 1 or not len(found) or not (isfinite(found[0]) and isfinite(found[-1])):
-        raise ValueError("times: expected a row of finite numbers, in s")
-    if found[0] < t0 or not (found[1:] > found[:-1]).all():
-        raise ValueError(f"times: expected ascending times from t0 = {t0:g} s on")
-    return found

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import saved
+from .adaptive_arguments import fits
 from .arguments import (
     Array,
     Params,
@@ -195,12 +196,12 @@ class BatchModel(Model):
         tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
         at the start and the end where None.
         """
-        if self._fits((h, steps, method), tol, times, h_most, stiff):
+        if fits(self, h, steps, method, tol, times, h_most, stiff):
             from . import batch_adaptive  # which needs this file
 
             fitted, whole = batch_adaptive.simulate(
                 self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
-                stiff, h=h, steps=steps, method=method, every=every, control_period=control_period,
+                stiff, (h, steps, method, every, control_period, None),
             )  # fmt: skip
             if not whole:
                 raise Interrupted(fitted)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .adaptive import BOTH, as_end, as_limits, as_times
+from .adaptive_arguments import BOTH, as_end, as_limits, as_times
 from .arguments import Array, as_number
 from .batch import BatchRun
 from .batch_work import all_of, as_threads
@@ -83,7 +83,7 @@ def simulate(
     model: BatchModel, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
     params: Any, u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float | None, times: ArrayLike | None,
-    h_most: float | None, stiff: bool, **fixed: Any,
+    h_most: float | None, stiff: bool, fixed: tuple[Any, ...],
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
     """`simulate_batch` by a tolerance, and whether it is whole, not cut off by Ctrl-C."""
     tol, most = as_limits(model, tol, h_most, stiff, fixed)

@@ -6,7 +6,7 @@ of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from .arguments import Array, Parameters, as_number, not_one_of
 from .columns import ByName
 from .drives import drive_forces, driven
+from .equilibrium import equilibrium
 from .frames import Frames
 from .functions import row_times
 from .trajectory import SAID, STATUS, MotionError, state_text
@@ -224,6 +225,25 @@ class Constrained(Frames):
     @property
     def _states(self) -> tuple[str, ...]:
         return (*self.coordinates, *(f"{name}_dot" for name in self.coordinates))
+
+    def equilibrium(
+        self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, u: Any = None,
+        free: Collection[str] | None = None, *, t: float = 0.0, params: Parameters = None,
+    ) -> tuple[Array, Array | None]:  # fmt: skip
+        """(q, u) where no force is left, so that q̈ = 0: by Newton's method from the guess q, u.
+
+        q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates and
+        inputs that are found, all coordinates where None; the others stay. u None: the scene's
+        signals. u comes back as (nu,), None where the scene has no inputs.
+        Raises MotionError, status "no convergence", where none is found.
+        """
+        if isinstance(free, str):
+            free = (free,)
+        moving = qd if np.ndim(qd) else np.full(self.nq, as_number(qd, "qd"))
+        at, moving = self._one(self._start[0] if q is None else q, moving)
+        found = self.coordinates if free is None else tuple(free)
+        held = self._inputs(u)
+        return equilibrium(self, at, moving, held, found, as_number(t, "t"), params)
 
     def _assembled_rows(self, q: Array, qd: Array, table: Array, t0: float) -> tuple[Array, Array]:
         """The starts of many, (n, nq); table: their parameters, a row each or one for all."""

@@ -15,7 +15,7 @@ from .arguments import Array, not_one_of
 from .trajectory import MotionError, state_text
 
 if TYPE_CHECKING:
-    from .model import Model
+    from .constrained import Constrained
 
 _MOST = 100  # steps of Newton's method
 _RANK_TOLERANCE = 1e-9  # of the largest singular value of A: a row that is none here
@@ -23,7 +23,13 @@ _SHORTEST = 2.0**-20  # part of a step that is tried
 
 
 def equilibrium(
-    model: Model, q: Array, qd: Array, u: Array | None, free: Collection[str], t: float, params: Any
+    model: Constrained,
+    q: Array,
+    qd: Array,
+    u: Array | None,
+    free: Collection[str],
+    t: float,
+    params: Any,
 ) -> tuple[Array, Array | None]:
     """(q, u) near a guess where tau + A^T lambda = C qd + g, what is not `free` as it was.
 
@@ -107,7 +113,7 @@ def _tried(onto: Callable[[Array], Array], z: Array) -> Array | None:
 class _Rows:
     """Constraints of a model around coordinates and inputs z, of which `moved` (len(z),) may."""
 
-    model: Model
+    model: Constrained
     moved: Array
     t: float
     params: Any

@@ -7,7 +7,7 @@ NumPy and cffi only. Angles in rad, everything in SI units.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from math import ceil, isfinite
 from time import perf_counter
 from typing import Any
@@ -17,6 +17,7 @@ from numpy import empty
 from numpy.typing import ArrayLike
 
 from . import adaptive, saved
+from .adaptive_arguments import fits
 from .arguments import (
     Array,
     Parameters,
@@ -29,7 +30,6 @@ from .arguments import (
 from .columns import File
 from .constrained import Constrained, Rows
 from .discretize import discretize
-from .equilibrium import equilibrium
 from .estimate import advice, beyond_end
 from .laws import Law, Sampled
 from .package import reduced
@@ -65,6 +65,7 @@ class Model(Constrained):
         self._facts = dict(methods)
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
         self._warned: set[Any] = set()  # methods with a step size, and u
+        self._room = 0  # for the steps of an adaptive run
 
     @property
     def orders(self) -> dict[str, int]:
@@ -229,42 +230,44 @@ class Model(Constrained):
         A run that can't go on keeps what it has, warns, and says in `status` and `message` why;
         Ctrl-C raises Interrupted, which holds it.
         """
+        usual = (
+            u is None and out is None and progress is None and control_period is None
+            and not estimate and type(t0) is float and isfinite(t0)
+        )  # fmt: skip
+        if (
+            usual and self._room and h is None and steps is None and method is None
+            and times is None and h_most is None and every == 1 and stiff is False
+        ):  # fmt: skip
+            if (quick := adaptive.plain(self, q0, qd0, duration, params, t0, tol)) is not None:
+                return quick
         q0, qd0 = self._assembled(q0, qd0, t0, params)
-        if self._fits((h, steps, method), tol, times, h_most, stiff):
+        if fits(self, h, steps, method, tol, times, h_most, stiff):
+            fixed = h, steps, method, every, control_period, out
             fitted = adaptive.simulate(
-                self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff, h=h,
-                steps=steps, method=method, every=every, control_period=control_period, out=out,
-            )  # fmt: skip
+                self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff, fixed
+            )
             return self._finished(fitted, estimate)
         method = self.methods[0] if method is None else self._method(method)
-        q, qd = self._start
-        from_q, from_qd, at_p = self._at
+        (q, qd), (from_q, from_qd, at_p), p = self._start, self._at, self._p0
         if q0 is not None:
             q, from_q = self._from(q0, "q0")
         if qd0 is not None:
             qd, from_qd = self._from(qd0, "qd0")
         h = self.h if h is None else as_step_size(h, self.dtype)
-        p = self._p0
         if params is not None:
             p = self._parameters(params).copy()
             at_p = self._pointer(p)
-        if (
-            type(steps) is int and type(every) is int and type(t0) is float and isfinite(t0)
-            and u is None and duration is None and out is None and progress is None
-            and control_period is None and 0 < every <= RARELY and not estimate
-        ):  # fmt: skip
+        if usual and type(steps) is type(every) is int and duration is None and 0 < every <= RARELY:
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
             if 0 <= steps <= short and (steps < SOME or (method, h) in self._warned):
                 address, real, null = self._c
                 rows = empty((2, 1 - -steps // every, self.nq), self.dtype)
-                if run(
-                    address(real, rows), null, from_q, from_qd, t0, h, steps, null, 0,
-                    every, at_p, null,
-                ) == 8 * steps:  # fmt: skip
-                    return Run(
-                        self, t0, rows, h, steps, "ok", p, every, None, method, stages * steps
-                    )
+                to, done = address(real, rows), stages * steps
+                if 8 * steps == run(
+                    to, null, from_q, from_qd, t0, h, steps, null, 0, every, at_p, null
+                ):
+                    return Run(self, t0, rows, h, steps, "ok", p, every, None, method, done)
         t0 = as_number(t0, "t0")
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
@@ -272,19 +275,13 @@ class Model(Constrained):
         if u is None and control_period is not None and self.nu:
             u = Sampled(self, params)
         if steps >= SOME and (method, h) not in self._warned:
-            first = self._table(u, steps, every, hold)[1]
-            if first is not None and first.ndim == 2:
-                first = first[0]
+            held = self._table(u, steps, every, hold)[1]
+            first = held[0] if held is not None and held.ndim == 2 else held
             self._look(q, qd, h, t0, first, p, method)
         result = self._trajectory(
             q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress, hold
         )
         return self._finished(result, estimate)
-
-    def _fits(self, fixed: tuple[Any, ...], *asked: Any) -> bool:
-        """Whether a run is by a tolerance: if asked, or where nothing is asked of fixed steps."""
-        some = fixed[-1] == "auto" or any(x is not None and x is not False for x in asked)
-        return some or (bool(self.tolerance) and all(x is None for x in fixed))
 
     def _finished(self, run: Run, estimate: bool) -> Run:
         """A run as `simulate` returns it: with warnings to its caller, and its error if asked."""
@@ -320,25 +317,6 @@ class Model(Constrained):
         given, method = self._parameters(params), self._method(method)
         h = self.h if h is None else as_step_size(h, self.dtype)
         return advice(self, q, qd, h, as_number(t0, "t0"), u, given, method)
-
-    def equilibrium(
-        self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, u: Any = None,
-        free: Collection[str] | None = None, *, t: float = 0.0, params: Parameters = None,
-    ) -> tuple[Array, Array | None]:  # fmt: skip
-        """(q, u) where no force is left, so that q̈ = 0: by Newton's method from the guess q, u.
-
-        q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates and
-        inputs that are found, all coordinates where None; the others stay. u None: the scene's
-        signals. u comes back as (nu,), None where the scene has no inputs.
-        Raises MotionError, status "no convergence", where none is found.
-        """
-        if isinstance(free, str):
-            free = (free,)
-        moving = qd if np.ndim(qd) else np.full(self.nq, as_number(qd, "qd"))
-        at, moving = self._one(self._start[0] if q is None else q, moving)
-        found = self.coordinates if free is None else tuple(free)
-        held = self._inputs(u)
-        return equilibrium(self, at, moving, held, found, as_number(t, "t"), params)
 
     def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
         """A start, (nq,), and what C reads it from."""

@@ -1,0 +1,84 @@
+"""What is asked of adaptive steps, or a ValueError that says why not."""
+
+from __future__ import annotations
+
+from math import isfinite
+from operator import is_
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .adaptive_error import LEAST
+from .arguments import Array, as_number, as_step_size
+
+if TYPE_CHECKING:
+    from .model import Model
+
+LOOSEST = 1e-2
+FIXED = {  # what belongs to fixed steps, where nothing is said of it
+    "h": None, "steps": None, "method": None, "every": 1, "control_period": None, "out": None,
+}  # fmt: skip
+BOTH = "times: say where the run ends; give times or duration, not both"
+
+
+def fits(
+    model: Model, h: Any, steps: Any, method: Any, tol: Any, times: Any, h_most: Any, stiff: Any
+) -> bool:
+    """Whether a run is by a tolerance: if asked, or where nothing is asked of fixed steps."""
+    if tol is None and times is None and h_most is None and stiff is False and method != "auto":
+        return bool(model.tolerance) and h is None and steps is None and method is None
+    return True
+
+
+def as_limits(
+    model: Model, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
+) -> tuple[float, float]:
+    """(tolerance, longest step or 0); fixed: the values of FIXED, which belongs to fixed steps."""
+    if stiff is not False and not isinstance(stiff, (bool, np.bool_)):
+        raise ValueError(f"stiff: {stiff!r} is not True or False")
+    if model.tolerance is None:
+        raise ValueError(
+            "tol, times, stiff: not built; a scene asks for them with [run] tolerance = 1e-9 (of a "
+            "run by fixed steps run(times) gives the states at any times)"
+        )
+    if not all(map(is_, fixed, FIXED.values())):
+        for name, value in zip(FIXED, fixed, strict=True):
+            if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
+                raise ValueError(
+                    f"{name}: belongs to fixed steps; tol, times, h_most and stiff to adaptive "
+                    "ones: give one or the other; run(times) gives the states of a run by fixed "
+                    "steps"
+                )
+    most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
+    return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most
+
+
+def as_end(model: Model, t0: float, duration: float | None) -> float:
+    """The time at which a run ends."""
+    span = model.duration if duration is None else as_number(duration, "duration")
+    if span < 0:
+        raise ValueError(f"duration: {span:g} is not a time in s")
+    return float(t0 + span)
+
+
+def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
+    """A tolerance that the numbers have digits for, or a ValueError."""
+    least = LEAST[dtype.itemsize]
+    number = as_number(tol, "tol")
+    if not least <= number <= LOOSEST:
+        raise ValueError(f"tol: {number:g}: give one between {least:.1g} and {LOOSEST:g}")
+    return number
+
+
+def as_times(times: ArrayLike, t0: float, dtype: np.dtype[Any]) -> Array:
+    """Times in ascending order, not before t0, or a ValueError."""
+    try:
+        found = np.ascontiguousarray(times, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"times: {times!r} is not an array of numbers") from None
+    if found.ndim != 1 or not len(found) or not (isfinite(found[0]) and isfinite(found[-1])):
+        raise ValueError("times: expected a row of finite numbers, in s")
+    if found[0] < t0 or not (found[1:] > found[:-1]).all():
+        raise ValueError(f"times: expected ascending times from t0 = {t0:g} s on")
+    return found
