@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from typing import Any
 
@@ -14,7 +15,7 @@ from sympy.physics.mechanics import dynamicsymbols
 import eomc
 from eomc.base.errors import EomcError, SceneError
 from eomc.model.from_scene import from_scene
-from eomc.model.pictured import text
+from eomc.model.pictured import in_python, text
 from eomc.report.drawing import drawing
 from eomc.scene import formulas
 from eomc.scene.read import parse
@@ -125,8 +126,29 @@ def test_faults_are_told_as_those_of_a_scene(picture: str) -> None:
         parse(SCENE + "[picture]\n" + picture)
     with pytest.raises(SceneError, match=r"System\.make: error: picture") as of_python:
         made(tomllib.loads(picture))
-    told = [(p.key, p.message) for p in of_scene.value.problems if p.severity == "error"]
+    told = [(p.key, in_python(p.message)) for p in of_scene.value.problems if p.severity == "error"]
     assert told == [(p.key, p.message) for p in of_python.value.problems if p.severity == "error"]
+
+
+@pytest.mark.parametrize(
+    ("picture", "advice"),
+    [
+        ({}, 'such as "lines": [["cart", "tip"]]'),
+        ({"paths": ["tip"]}, 'add it to "points", such as "tip": ["x", "l*cos(theta)"]'),
+        ({"points": [1]}, 'a dict, such as {"tip": ["x", "l*cos(theta)"]}, here [1]'),
+        ({"points": {"a": {}}}, "such as [0, 1.5], here a dict"),
+        ({"boxes": [{}]}, 'such as [{"at": "cart", "size": [0.4, 0.2]}], here a dict'),
+        ({"circles": [1]}, 'such as [{"at": "wheel", "radius": 0.1}], here 1'),
+        ({"lines": [["world"]]}, 'such as [["cart", "tip"]], each through two points or more'),
+        ({"dots": [[True, False]]}, "a formula in quotes, here True"),
+    ],
+)
+def test_advice_is_in_the_words_of_python(picture: Any, advice: str) -> None:
+    with pytest.raises(SceneError) as told:
+        made(picture)
+    (problem,) = told.value.problems[:1]
+    assert advice in problem.message
+    assert not re.search(r"\w = |table|\[picture|{ | }", problem.message), problem.message
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,8 @@ def test_says_what_it_is(cartpole: ModuleType, driven: ModuleType) -> None:
     assert cartpole.parameters == ("m_c", "m_p", "l", "g")
     assert cartpole.inputs == ()
     assert driven.inputs == ("force",)
+    assert (cartpole.nq, cartpole.nu) == (2, 0) and (driven.nq, driven.nu) == (2, 1)
+    assert {"nq", "nu"} <= {*cartpole.__all__}
     assert cartpole.defaults == {"m_c": 2.0, "m_p": 2.0, "l": 2.0, "g": 9.8}
     assert cartpole.units["theta"] == "rad"
     assert driven.units["force"] == "N"

@@ -8,18 +8,34 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
 from sympy.printing.str import StrPrinter
 
+from eomc.base.errors import SceneError
 from eomc.model import given
 from eomc.model.symbols import Coordinate, Parameter
 from eomc.scene import read
 from eomc.scene.scene import Scene
 
 _EXAMPLE = '{"points": {"tip": ["l*sin(theta)", "-l*cos(theta)"]}, "lines": [[[0, 0], "tip"]]}'
+_WORDS = (  # of advice, as TOML has them and as Python does
+    ('lines = [["cart", "tip"]]', '"lines": [["cart", "tip"]]'),
+    ("[picture.points], such as tip = [", '"points", such as "tip": ['),
+    (
+        'a table, such as { tip = ["x", "l*cos(theta)"] }',
+        'a dict, such as {"tip": ["x", "l*cos(theta)"]}',
+    ),
+    ("a list of tables with", "a list of dicts with"),
+    ('[{ at = "cart", size = [0.4, 0.2] }]', '[{"at": "cart", "size": [0.4, 0.2]}]'),
+    ('[{ at = "wheel", radius = 0.1 }]', '[{"at": "wheel", "radius": 0.1}]'),
+    (", here a table", ", here a dict"),
+    (", here true", ", here True"),
+    (", here false", ", here False"),
+)
 _NAMES = {"Abs": "abs", "Max": "max", "Min": "min"}
 
 
@@ -46,7 +62,19 @@ def pictured(
         "energy": {"kinetic": f"{coordinates[0].name}_dot**2"},  # which a scene has; not drawn
         "picture": table,
     }
-    return read.of_tree(tree, "System.make"), json.dumps(table, sort_keys=True, default=str)
+    try:
+        scene = read.of_tree(tree, "System.make")
+    except SceneError as wrong:
+        told = [replace(p, message=in_python(p.message)) for p in wrong.problems]
+        raise SceneError(told) from None
+    return scene, json.dumps(table, sort_keys=True, default=str)
+
+
+def in_python(message: str) -> str:
+    """What is said of a scene's [picture], in the words of Python."""
+    for toml, python in _WORDS:
+        message = message.replace(toml, python)
+    return message
 
 
 def _metres(one: Coordinate | Parameter) -> dict[str, str]:

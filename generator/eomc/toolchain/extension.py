@@ -98,7 +98,7 @@ def _try(name: str, extension: str, library: Path, compiler: Compiler) -> None:
     where = os.path.dirname(backend.origin)
     done = subprocess.run(
         [sys.executable, "-I", "-S", "-c", _TRIAL, where, extension, str(library.resolve())],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="backslashreplace",
+        stdin=subprocess.DEVNULL, capture_output=True, errors="backslashreplace",
     )  # fmt: skip
     if done.returncode:
         lines = done.stderr.strip().splitlines()

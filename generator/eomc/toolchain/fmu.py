@@ -79,7 +79,7 @@ def _compiled(made: Unit, compiler: Compiler) -> tuple[dict[str, bytes], str]:
         load = f"import ctypes; ctypes.CDLL({str(sources / library)!r}).fmi{made.version}GetVersion"
         done = subprocess.run(
             [sys.executable, "-I", "-S", "-c", load], stdin=subprocess.DEVNULL, capture_output=True,
-            text=True, errors="backslashreplace",
+            errors="backslashreplace",
         )  # fmt: skip
         if done.returncode:
             said = [*done.stderr.strip().splitlines(), f"status {done.returncode}"][-2:][0]

@@ -15,7 +15,7 @@ def start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
     try:
         return subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="backslashreplace",
+            stderr=subprocess.STDOUT, encoding="utf-8", errors="backslashreplace",
         )  # fmt: skip
     except OSError as fault:
         raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
