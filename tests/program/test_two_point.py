@@ -11,7 +11,7 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
-from cases import FMA, scene_system
+from cases import FMA, SCENES, scene_system
 from conftest import Modules, tiers
 from sympy import S
 
@@ -232,6 +232,17 @@ def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
     qd = np.linspace(-1, 1, 5)
     expected = trusted.acceleration(q, qd)
     np.testing.assert_allclose(module.acceleration(q, qd), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_wide_angle_leaves_the_others_of_its_register_alone(modules: Modules) -> None:
+    """Angles are sums of coordinates, exact ones here."""
+    module = modules.unoptimised((SCENES / "chain.toml").read_text(encoding="utf-8"))
+    for at in range(5):
+        q = np.arange(5, 10) / 16
+        q[at] = 2.0**34
+        sines = np.sin(np.cumsum(q))
+        height = 0.5 * (np.arange(4.5, 0, -1) @ sines)
+        np.testing.assert_allclose(module.potential_energy(q), 9.81 * height, rtol=1e-13)
 
 
 @pytest.mark.parametrize("at", [0, 4])

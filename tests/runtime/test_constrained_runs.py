@@ -267,3 +267,23 @@ def test_rows_that_contradict_one_another_later_are_told(tmp_path: Path) -> None
     words = ["run", str(tmp_path / "later.toml"), "--build", str(tmp_path / "build")]
     done = CliRunner().invoke(main, words)
     assert done.exit_code == 1 and "constraints contradict one another" in done.output
+
+
+@pytest.mark.parametrize("one", ["sin(x) + 0.7*y*y", "0.7*y*y - 2*sin(x)"])
+def test_a_row_that_what_is_held_makes_depend_on_others_is_left_out(
+    one: str, tmp_path: Path
+) -> None:
+    """With z held the other row is a multiple of the first but for rounding, no direction."""
+    modules = list[ModuleType]()
+    for name, other in (("one_row", {}), ("two_rows", {"other": f"3.3*({one}) + 7*z"})):
+        made = system(
+            name, {"x": (0.0, 0.0), "y": (0.0, 0.0), "z": (0.0, 0.0)},
+            "x_dot**2/2 + 1.5*y_dot**2 + z_dot**2", "0", {"one": f"{one} + 5*z", **other},
+            h=0.01, duration=0.1,
+        )  # fmt: skip
+        modules.append(eomc.load(made, tmp_path))
+    for x, y in np.random.default_rng(7).uniform(-0.5, -0.1, (20, 2)):
+        (alone, _), (q, _) = (
+            module.project([x, y, 0.0], np.zeros(3), held=["z"]) for module in modules
+        )
+        np.testing.assert_allclose(q, alone, rtol=0, atol=1e-12)
