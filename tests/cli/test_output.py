@@ -13,7 +13,10 @@ import pytest
 from cases import SCENES
 from click.testing import CliRunner, Result
 
+from eomc import pipeline
 from eomc.cli.main import main
+from eomc.verify import check
+from eomc.verify.report import Report, Row
 
 
 @pytest.fixture
@@ -160,3 +163,20 @@ def test_letters_that_the_output_has_not(here: Path) -> None:
     assert "Traceback" not in done.stderr and "\\u03b8" in done.stdout, done.stderr
     done = shell(os.fsdecode(b"eomc build \xfe.toml; unset HOME; eomc run \xff.toml --plot x.png"))
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize("command", ["build", "check", "report"])
+def test_a_command_without_a_scene_says_what_is_missing(command: str, here: Path) -> None:
+    done = eomc(command)
+    assert done.exit_code == 2 and "Missing argument" in done.output, done.output
+
+
+@pytest.mark.parametrize("quiet", [(), ("--quiet",)])
+def test_a_check_that_fails_names_the_scene(
+    quiet: tuple[str, ...], here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = Report("simple_pendulum", (Row("D", 7.0, 1.0, False, "units"),), 1, 0, "none")
+    monkeypatch.setattr(check, "check", lambda *_, **__: report)
+    monkeypatch.setattr(pipeline, "load", lambda *_, **__: None)
+    done = eomc("check", "p.toml", *quiet)
+    assert done.exit_code == 1 and done.output.endswith("\nFAILED: simple_pendulum\n"), done.output

@@ -1,6 +1,7 @@
 """The page of a motion: one file, no network, text that is data; films, and what they need."""
 
 import base64
+import itertools
 import json
 import re
 from types import SimpleNamespace
@@ -287,6 +288,12 @@ def test_a_gif_has_a_picture_for_each_instant(tmp_path):
     film(scene("simple_pendulum"), tmp_path / "a.gif", seconds=0.2)
     with image.open(tmp_path / "a.gif") as made:
         assert made.n_frames == 6 and made.info["duration"] == 40  # ms
+        pictures = []
+        for k in range(6):
+            made.seek(k)
+            pictures.append(np.asarray(made.convert("L"), int)[60:])  # below the title
+    changes = [np.abs(a - b).sum() for a, b in itertools.pairwise(pictures)]
+    assert min(changes) > max(changes) / 3  # it moves from each to the next
 
 
 def test_films_that_can_not_be_made_say_why(tmp_path, monkeypatch):

@@ -222,6 +222,7 @@ def test_without_a_picture_only_paths_of_named_points_are_drawn():
     found = drawing(made, run.t, run.q)
     assert [m.kind for m in found.marks] == ["dot"]
     assert [p.name for p in found.paths] == ["(x_b, y_b)"] and found.labels == ("x_b", "y_b")
+    assert found.unit == "m"
 
 
 def test_what_has_no_place_is_not_drawn():

@@ -6,7 +6,7 @@ import json
 import math
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from eomc.model.system import System, symbol
 from eomc.scene.read import parse
 from eomc.verify import sampling
 from eomc.verify import symbolic as references
-from eomc.verify.check import check
+from eomc.verify.check import check, value_rows
 from eomc.verify.comparison import Comparison
 from eomc.verify.convergence import Convergence
 from eomc.verify.finding import Finding
@@ -268,13 +268,27 @@ def test_cancelling_terms_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     assert report.passed, report.table()
 
 
+def test_each_method_has_its_row_of_one_step() -> None:
+    for methods in (("rk4", "dp8", "gauss4"), ("gauss8", "euler")):
+        names = list[str]()
+        given = SimpleNamespace(
+            methods=methods, row=lambda name, *_, names=names: names.append(name), value=len,
+            steps=None, runs=None, run_energy=None, step_by=len,
+        )  # fmt: skip
+        value_rows(cast(Comparison, given))
+        assert [n.removeprefix("one step of ") for n in names if "one step of" in n] == [
+            m for m in methods if m != "rk4"
+        ]
+        assert ("one step" in names) == ("rk4" in methods)
+
+
 def test_the_report_can_be_read_by_programs_and_people() -> None:
     report = right()
     told = json.loads(json.dumps(report.as_dict(), allow_nan=False))
     assert told["passed"] is True
     assert told["reference"] == "equations written out"
     assert {row["name"] for row in told["rows"]} >= {"D", "acceleration", "run", "order of rk4"}
-    assert "order of rk4" in report.table()
+    assert all(row.name in report.table() for row in report.rows)
     assert max(map(len, report.table().splitlines())) <= 100
 
 
