@@ -213,6 +213,12 @@ def test_the_figures_as_json() -> None:
     assert figures["condition"][0] == pytest.approx(1.0)
 
 
+def test_times_have_a_unit() -> None:
+    given = (2.0, 1.2, 0.999, 4.88e-3, 1e-3, 1.23e-5, 1.1e-6, 3e-9, math.inf)
+    told = ["2 s", "1.2 s", "999 ms", "4.88 ms", "1 ms", "12.3 us", "1.1 us", "3 ns", "-"]
+    assert [page._time(seconds) for seconds in given] == told
+
+
 @pytest.mark.slow
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cost_of_digits, "METHODS", {n: METHODS[n] for n in ("rk4", "dp8")})
@@ -223,6 +229,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         done = CliRunner().invoke(main, [*words, "--json", str(file)])
     assert done.exit_code == 0, done.output
     assert "smallest error" in done.output
+    assert re.search(r"(?m)^wrote .*report\.html$", done.output)
     assert re.search(r"(?m)^for \d+ digits up to t = 20 s: (rk4|dp8) with h = ", done.output)
     assert (tmp_path / "mass_spring" / "report.html").read_text().startswith("<!DOCTYPE html>")
     assert json.loads(file.read_text())[0]["scene"] == "mass_spring"
