@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from cases import scene_system
 from conftest import Modules
 
+import eomc
 from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding
 from eomc.verify.rows_sines import LIMIT, vanishing
@@ -75,6 +77,60 @@ def test_what_is_left_of_a_sum_that_cancels_is_no_cosine(
     check.reference = SimpleNamespace(evaluate=evaluate)  # type: ignore[assignment]
     found = vanishing(check)
     assert isinstance(found, float) and (found > LIMIT) == judged
+
+
+FIVE_BAR = (
+    """eomc = 1
+name = "five_bar"
+gravity = [0, "-g"]
+[coordinates]
+q1 = { unit = "rad", start = 1.8 }
+q2 = { unit = "rad", start = 0.6, guess = true }
+q3 = { unit = "rad", start = 1.2 }
+q4 = { unit = "rad", start = 2.5, guess = true }
+[parameters]
+a = 0.6
+b = 1.06
+c = 0.6
+e = 0.94
+d = 0.65
+m = 1.59
+g = 9.81
+"""
+    + "".join(
+        f"""[[body]]
+name = "{name}"
+{parent}joint = "revolute"
+coordinates = "{q}"
+offset = {offset}
+mass = "m"
+center = ["{length}/2", 0]
+inertia = "m*{length}**2/12"
+"""
+        for name, parent, q, offset, length in (
+            ("one", "", "q1", "[0, 0]", "a"),
+            ("two", 'parent = "one"\n', "q2 - q1", '["a", 0]', "b"),
+            ("three", "", "q3", '["d", 0]', "c"),
+            ("four", 'parent = "three"\n', "q4", '["c", 0]', "e"),
+        )
+    )
+    + """[[loop]]
+name = "pin"
+joint = "revolute"
+bodies = ["two", "four"]
+points = [["b", 0], ["e", 0]]
+"""
+)
+
+
+@pytest.mark.slow
+def test_differences_of_angles_are_no_sines(tmp_path: Path) -> None:
+    """What q2 - q1 rounds far out is the same at neighbours, and now and then with others moved."""
+    (tmp_path / "five_bar.toml").write_text(FIVE_BAR, encoding="utf-8")
+    made = eomc.read(tmp_path / "five_bar.toml")
+    module = eomc.load(made, tmp_path / "build")
+    found = [vanishing(Comparison(made, module, np.random.default_rng(k), 4)) for k in range(12)]
+    assert all(isinstance(x, float) and x <= LIMIT for x in found), found
 
 
 @pytest.mark.slow
