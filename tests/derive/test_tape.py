@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from sympy import Expr, Symbol, cosh, log, sinh, sqrt, tanh
+from sympy import Expr, Integer, Symbol, cosh, log, sinh, sqrt, tanh
 
 from eomc.derive.tape import Stage, Tape
 
@@ -38,3 +38,14 @@ def test_the_slope_of_log_cosh_is_a_tanh() -> None:
     tape = Tape({x: Stage.POSITION, a: Stage.PARAMETER})
     (slope,) = tape.gradient([(tape.define(a * log(cosh(x / 2))), x**0)], [x])
     assert written(tape, slope) == a * tanh(x / 2) / 2
+
+
+def test_sums_of_leaves_are_written_out_where_terms_cancel() -> None:
+    """Of q1 + (q2 - q1) far out rounding would be left; b1 + (b2 + b3) is no shorter."""
+    b1, b2, b3 = (Symbol(f"b{k}", real=True) for k in (1, 2, 3))
+    tape = Tape(dict.fromkeys((b1, b2, b3), Stage.POSITION))
+    apart, both = tape.define(b2 - b1), tape.define(b2 + b3)
+    assert tape.total([b1, apart]) == b2
+    assert tape.total([2 * b1, tape.scaled(Integer(2), apart)]) == 2 * b2
+    assert set(tape.rhs(tape.total([b1, both])).args) == {b1, both}
+    assert tape.define(3 + b1 + apart - b2) == 3

@@ -91,35 +91,47 @@ def factors(
             if entry != 0:
                 M[n + r, j] = M[j, n + r] = entry
     order = _order(_pattern(M, n + len(A)), n, tape, M)
-    whole: dict[int, Expr] = {}  # of rows: what coordinates alone have made of the pivot
+    parts: dict[tuple[int, int], list[Expr]] = {}  # of what is left: what is yet to be added
+    alone: dict[int, list[Expr]] = {}  # of rows: what coordinates alone make of the pivot
     left, steps, pivots = set(order), [], []
     inverses, told = dict[int, Expr](), dict[int, tuple[Expr, Mapping[int, Expr]]]()
+
+    def read(i: int, j: int) -> Expr:
+        """An entry, i >= j, as one sum: what pivots of many coordinates have in common leads it."""
+        if added := parts.pop((i, j), None):
+            M[i, j] = M[j, i] = short(tape.total([M[i, j], *added]))
+        return M[i, j]
+
     for k in order:
         left.remove(k)
-        below = {i: M[i, k] for i in sorted(left) if (i, k) in M}
+        below = {i: read(max(i, k), min(i, k)) for i in sorted(left) if (i, k) in M}
         if k < n:
-            pair = (M[k, k], tape.define(D[k][k]))
+            pair = (read(k, k), tape.define(D[k][k]))
             if not all(x.is_Number for x in pair) or pair[0] <= 1e-12 * pair[1]:
                 pivots.append(pair)
             inverse = tape.define(1 / M[k, k])
         else:
-            pivot = tape.define(-M.get((k, k), S.Zero))
-            limit = tape.define(drop * whole[k]) if pivot != whole.get(k, S.Zero) else S.Zero
+            whole = M[k, k] = short(tape.total(alone.get(k, [])))
+            pivot = tape.define(-read(k, k))
+            limit = tape.define(-drop * whole) if pivot != -whole else S.Zero
             limit = tape.total([limit, faded[k - n]])
             inverses[k] = tape.define(pivot_inverse(pivot, limit))
             inverse = tape.define(-inverses[k])
             if k - n in switched:
                 kept = tape.define(pivot * inverses[k])  # 1, or 0
-                spare = tape.times(tape.define(UNHELD * (1 - kept)), whole.get(k, S.Zero))
+                spare = tape.times(tape.define(UNHELD * (kept - 1)), whole)
                 told[k - n] = tape.total([pivot, spare]), below
         found = {i: tape.define(a * inverse) for i, a in below.items()}
         for i, factor in found.items():
             for j, a in below.items():
                 if j <= i:
                     part = tape.define(-factor * a)
-                    M[i, j] = M[j, i] = short(tape.define(M.get((i, j), S.Zero) + part))
                     if i == j >= n and k < n:
-                        whole[i] = short(tape.define(whole.get(i, S.Zero) - part))
+                        alone.setdefault(i, []).append(part)
+                    else:
+                        M.setdefault((i, j), S.Zero)
+                        M.setdefault((j, i), S.Zero)
+                        parts.setdefault((i, j), []).append(part)
         steps.append((k, inverse, found))
     rows = tuple(inverses[n + r] for r in range(len(A)))
     return Factors(tape, n, tuple(steps), tuple(pivots), rows, told)

@@ -15,7 +15,7 @@ import sympy
 from sympy import Add, Expr, Mul, Pow, S, Symbol, tanh
 
 from eomc.base.errors import EomcError
-from eomc.derive.atoms import is_negative, split
+from eomc.derive.atoms import is_negative, split, written_out
 
 _ROUGH = (sympy.DiracDelta, sympy.Derivative, sympy.Subs)
 
@@ -251,6 +251,7 @@ class Tape:
             else:
                 weights[symbol] = factor
         weights = {symbol: w for symbol, w in weights.items() if w is not S.Zero}
+        weights, constant = written_out(weights, constant, self)
         if len(weights) + (constant is not S.Zero) < 2:
             return constant if not weights else self.scaled(*weights.popitem()[::-1])
         if self._can_gather(weights, constant):
