@@ -89,14 +89,20 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
 
 
 def behind_steps(name: str, source: str) -> set[int]:
-    """What refuses the end of a step under constraints, and counts singular positions passed.
+    """What refuses the end of a step under constraints, counts singular positions, judges these.
 
     Where a step is lost, its stages nearly always are before; these linkages have no singular
     positions on their way. tests/runtime/test_constrained_runs.py has others that do.
     """
     found: set[int] = set()
-    within = False
+    within = judges = False
     for number, line in enumerate(source.splitlines(), start=1):
+        judges |= bool(
+            re.match(rf"\S.*\b{name}_rate_terms\w*\(|\s+if \(!far && \*singular\)", line)
+        )
+        if judges:
+            found.add(number)
+            judges = line not in ("}", " " * 8 + "}")
         within = (within or bool(re.match(rf".*\b{name}_projected\(.*[^;]$", line))) and line != "}"
         refuses = within and re.search("return|break", line) and "OK" not in line
         if refuses or re.match(r"\s+x\.first = \(\w+\)\(first \+ n\)\*h;", line):

@@ -13,6 +13,7 @@ from sympy import Expr, S
 
 from eomc.derive.energies import Energies
 from eomc.derive.ldl import Rows, Vector
+from eomc.derive.tape import Tape
 from eomc.model.system import System, t
 
 # parts of pivots: rows of accelerations, and of corrections, which lead far where pivots are small
@@ -80,6 +81,20 @@ def _faded(row: Sequence[Expr], limit: float) -> Expr:
     """The limit of a row's pivot; 0 where it is always one, an entry of the row being a number."""
     bounded = any(entry.is_Number and entry != 0 for entry in row)
     return S.Zero if bounded else sympy.Float(f"{limit:.0e}")
+
+
+def rate_terms(tape: Tape, rows: Constraints, qd: Sequence[sympy.Symbol]) -> Vector:
+    """Rates of the rows solved for that no mode switches, then the sums of their terms' sizes.
+
+    Where a row depends on others its multiplier can't make it hold: what is left of its rate beside
+    these tells a position that only others lead on from.
+    """
+    told = [k for k in rows.solved if k not in rows.switched]
+    sizes = []
+    for k in told:
+        terms = [tape.times(a, v) for a, v in zip(rows.jacobian[k], qd, strict=True)]
+        sizes.append(tape.total([tape.define(sympy.Abs(x)) for x in (*terms, rows.moved[k])]))
+    return (*(rows.rates[k] for k in told), *sizes)
 
 
 def chosen(some: Sequence[Expr], rows: Constraints) -> list[Expr]:

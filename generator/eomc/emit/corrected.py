@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from eomc.emit.c_function import CFunction
 from eomc.emit.c_names import Target
 from eomc.emit.functions import Functions
@@ -10,6 +12,9 @@ from eomc.emit.plain.parts import Computed
 
 # beside singular positions: squares of what corrections may change; how much more rounding is
 SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
+# beside such positions, of a row's terms what its rate may be where the row is left out: some 3
+# times the root of the part of a pivot below which it is; and of the largest row's terms
+UNHELD = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
 APART = 1e-12  # of the squares of all coordinates together: a coordinate that is less is 0
 
 
@@ -24,12 +29,14 @@ def width(target: Target) -> int:
 
 
 def view(
-    functions: Functions, correction: Computed, function: CFunction, call: str, *,
+    functions: Functions, correction: Computed, function: CFunction, call: str,
+    rate_terms: Computed | None = None, state: Mapping[str, str] | None = None, *,
     lane: str = "", L: str = "", mask: str = "", extent: str = "", increments: bool = False,
 ) -> Corrected:  # fmt: skip
-    """The view for one form and lane."""
+    """The view for one form and lane. state: where it is, for `rate_terms`."""
     target = functions.target
     little, noise = SINGULAR[target.system.run.real]
+    part, loose = UNHELD[target.system.run.real]
     large = near(target)
     return Corrected(
         PREFIX=functions.PREFIX,
@@ -43,6 +50,12 @@ def view(
         correction=correction,
         function=function,
         call=call,
+        rate_terms=rate_terms,
+        rate_terms_call=rate_terms.function.call(**(state or {})) if rate_terms else "",
+        rows=width(target) - 2 * len(target.names),
+        loose=target.literal(loose),
+        part=target.literal(part),
+        fabs=f"fabs{target.real.function_suffix}",
         near=target.literal(large),
         apart=target.literal(APART),
         little=target.literal(little),
@@ -56,8 +69,9 @@ def plain(functions: Functions) -> Corrected | None:
     correction = functions.correction
     if correction is None:
         return None
-    call = correction.function.call(q="r", qd="v")
-    return view(functions, correction, functions.corrected, call)
+    state = {"q": "r", "qd": "v"}
+    call = correction.function.call(**state)
+    return view(functions, correction, functions.corrected, call, functions.rate_terms, state)
 
 
 def project(functions: Functions) -> Project:

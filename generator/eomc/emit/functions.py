@@ -29,6 +29,7 @@ from eomc.program.program import Program
 
 STATE = ("q", "qd")
 READ = (*STATE, "qdd", "wrenches", "lambda", "t", "u", "p")
+RATE_TERMS = "Rates of rows that may be left out, then the sums of their terms' sizes."
 FEW = 16  # statements that are read at a glance, without comments between them
 
 
@@ -312,6 +313,14 @@ class Functions:
         if function is None:
             return None
         return self.static(function, "projection", "d", sentence(function), fails=True)
+
+    @cached_property
+    def rate_terms(self) -> Computed | None:
+        """Rates of rows that corrections may leave out, and sizes of their terms; static."""
+        function = self.target.program.functions.get("rate_terms")
+        if function is None:
+            return None
+        return self.static(function, "rate_terms", "rates", RATE_TERMS)
 
     @cached_property
     def correction_along(self) -> Computed | None:

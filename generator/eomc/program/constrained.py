@@ -8,6 +8,7 @@ from dataclasses import replace
 from sympy import S
 
 from eomc.derive import kkt, outputs
+from eomc.derive.constraints import rate_terms
 from eomc.derive.equations import Equations
 from eomc.derive.lagrange import Derivation
 from eomc.derive.linearize import along
@@ -31,6 +32,8 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
     assert e.rows is not None
     values, pivots = kkt.correction(e.tape, e.D, e.rows, system.q)
     yield lower("correction", e.tape, values, pivots, (), system.names)
+    if terms := rate_terms(e.tape, e.rows, system.qd):
+        yield lower("rate_terms", e.tape, terms, (), (), system.names)
     if system.run.discretize:
         moves = values[: 2 * len(system.q)]
         both = [*moves, *along(system, e.tape, moves)]

@@ -7,7 +7,7 @@ from eomc.emit import corrected
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
 from eomc.emit.fast.lanes import NOINLINE, Lane
-from eomc.emit.functions import Functions
+from eomc.emit.functions import RATE_TERMS, Functions
 from eomc.emit.plain.constraint_views import Corrected
 from eomc.emit.plain.parts import Computed
 from eomc.program.program import TIME
@@ -15,11 +15,12 @@ from eomc.program.program import TIME
 
 def view(functions: Functions, lane: Lane) -> Corrected:
     """The view of a lane."""
-    made = _correction(lane)
-    call = made.function.call(q="at", qd="moving")
+    made, state = _correction(lane), {"q": "at", "qd": "moving"}
+    call = made.function.call(**state)
+    terms = None if lane.name else _rate_terms(lane)
     return corrected.view(
-        functions, made, projected(lane), call, lane=lane.real.name, L=lane.end, mask=lane.mask,
-        extent=lane.extent, increments=True,
+        functions, made, projected(lane), call, terms, state, lane=lane.real.name, L=lane.end,
+        mask=lane.mask, extent=lane.extent, increments=True,
     )  # fmt: skip
 
 
@@ -43,6 +44,19 @@ def _correction(lane: Lane) -> Computed:
     return lane.computed(
         function, "projection", c.filled(lane.real.name, "d"), places, doc=sentence(function),
         takes=_placed(lane), constants=own,
+    )  # fmt: skip
+
+
+def _rate_terms(lane: Lane) -> Computed | None:
+    """Rates of rows that corrections may leave out, and sizes of their terms."""
+    function = lane.target.program.functions.get("rate_terms")
+    if function is None:
+        return None
+    own = {n: c.member("c", n) for n in lane.accelerations.own}
+    places = [f"rates[{k}]" for k in range(len(function.outputs))]
+    return lane.computed(
+        function, "rate_terms", c.filled(lane.real.name, "rates"), places, doc=RATE_TERMS,
+        takes=_placed(lane), constants=own, inline=False,
     )  # fmt: skip
 
 

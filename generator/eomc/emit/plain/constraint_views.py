@@ -15,6 +15,8 @@ class Corrected:
 
     L, lane, mask: of the lane, L "" for one number. increments: whether r, v are what a step adds.
     near, apart: squares of parts of a coordinate, and of all, beyond which a correction is large.
+    rate_terms, rate_terms_call: of rows that may be left out, where there are; rows: their number;
+    loose, part: of the largest of their terms, and of a row's own, what its rate may be then.
     little, slight: squares of parts of all coordinates and of all velocities, which corrections
     near a singular position are below; rounded: of coordinates, where one may be rounding there.
     """
@@ -31,6 +33,12 @@ class Corrected:
     correction: Computed
     function: CFunction
     call: str
+    rate_terms: Computed | None
+    rate_terms_call: str
+    rows: int
+    loose: str
+    part: str
+    fabs: str
     near: str
     apart: str
     little: str
