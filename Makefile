@@ -70,6 +70,7 @@ bench: build/bench/done
 	build/bench/bin/python benchmarks/bodies.py
 	build/bench/bin/python benchmarks/digits.py
 	build/bench/bin/python benchmarks/adaptive.py
+	build/bench/bin/python benchmarks/adaptive_batches.py
 	build/bench/bin/python benchmarks/constrained.py
 	build/bench/bin/python benchmarks/iftomm.py
 

@@ -31,7 +31,7 @@ import work
 
 import eomc
 from eomc.derive import link_multipliers
-from eomc.emit import c_expression
+from eomc.emit import adaptive, c_expression
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.steppers import Steppers
 
@@ -57,6 +57,10 @@ def without_side_by_side() -> Any:
     return patch.object(c_expression, "SEVERAL", 1000)
 
 
+def without_lanes() -> Any:
+    return patch.object(adaptive, "SMALL", 0)
+
+
 # trick, what takes it away, the cases that it could change, what else is asked for under [run]
 TRICKS: tuple[tuple[str, Change, tuple[str, ...], str], ...] = (
     ("predicted angles", without_prediction, ("cart-pole", "double pendulum"), ""),
@@ -64,6 +68,8 @@ TRICKS: tuple[tuple[str, Change, tuple[str, ...], str], ...] = (
     ("link multipliers", without_multipliers, ("chain of 5", "chain of 10", "chain of 20"), ""),
     ("link multipliers, 4,096 at once", without_multipliers, ("chain of 5", "chain of 10"),
      "batch = true\n"),
+    ("adaptive steps of 4,096 side by side", without_lanes, ("cart-pole", "double pendulum"),
+     "batch = true\ntolerance = 1e-9\n"),
 )  # fmt: skip
 
 
@@ -96,12 +102,15 @@ def ratio(one: Callable[[], Any], other: Callable[[], Any], rounds: int) -> floa
     return float(np.median([a / b for a, b in pairs]))
 
 
-def run(module: ModuleType, case: work.Case, many: bool) -> Callable[[], Any]:
+def run(module: ModuleType, case: work.Case, extra: str) -> Callable[[], Any]:
     """A run of the case, or short ones of 4,096 instances."""
     n = len(case.x0) // 2
-    if many:
+    if extra:
         q, qd = np.tile(case.x0[:n], (4096, 1)), np.tile(case.x0[n:], (4096, 1))
         q += np.linspace(0, 1e-3, 4096)[:, None]
+    if "tolerance" in extra:
+        return lambda: module.simulate_batch(q, qd, duration=1.0, threads=1)
+    if extra:
         return lambda: module.simulate_batch(q, qd, case.h, steps=20, every=20, threads=1)
     steps = min(case.steps, 4000)
     return lambda: module.simulate(case.x0[:n], case.x0[n:], case.h, steps=steps, every=steps)
@@ -115,7 +124,7 @@ def tricks(rounds: int) -> Iterator[str]:
                 built(case, nullcontext(), extra, f"with_{k}") as full,
                 built(case, change(), extra, f"without_{k}") as less,
             ):
-                jobs = [run(module, case, bool(extra)) for module in (less, full)]
+                jobs = [run(module, case, extra) for module in (less, full)]
                 ends = [np.asarray(job().q)[..., -1, :] for job in jobs]
                 apart = float(np.max(np.abs(ends[0] - ends[1])))
                 if not apart < 1e-9 * max(1.0, float(np.max(np.abs(ends[0])))):

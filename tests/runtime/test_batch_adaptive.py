@@ -33,20 +33,129 @@ def starts(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([1 - e, zero]), np.column_stack([zero, np.sqrt((1 + e) / (1 - e))])
 
 
+def same(one: object, other: object) -> bool:
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
+        for name in ("q", "qd", "steps", "evaluations", "rejected", "stiff_steps", "reached")
+    )
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_each_is_as_it_is_alone(orbits: ModuleType, threads: int) -> None:
     q0, qd0 = starts(50)
     times = np.array([0.0, 0.7, 2.0, 2 * np.pi])
-    run = orbits.simulate_batch(q0, qd0, tol=1e-9, times=times, threads=threads)
+    how = {"tol": 1e-9, "times": times}
+    run = orbits.simulate_batch(q0, qd0, **how, threads=threads)
     assert run.q.shape == (50, 4, 2) and run.t.tolist() == times.tolist()
     assert set(run.status.tolist()) == {"ok"} and np.all(run.reached == times[-1])
+    back = orbits.simulate_batch(q0[::-1], qd0[::-1], **how, threads=threads)
+    assert np.array_equal(back.q[::-1], run.q) and np.array_equal(back.steps[::-1], run.steps)
     for k in (0, 1, 17, 49):
-        alone = orbits.simulate(q0[k], qd0[k], tol=1e-9, times=times)
-        assert np.array_equal(run.q[k], alone.q) and run.steps[k] == alone.steps
+        alone = orbits.simulate_batch(q0[k : k + 1], qd0[k : k + 1], **how)
+        assert np.array_equal(run.q[k], alone.q[0]) and run.evaluations[k] == alone.evaluations[0]
+        single = orbits.simulate(q0[k], qd0[k], **how)
+        # the same steps, in sums of another order
+        assert single.steps == run.steps[k] and single.rejected == run.rejected[k]
+        assert np.abs(run.q[k] - single.q).max() < 1e-10
     assert np.abs(run.q[:, -1] - q0).max() < 1e-7
     assert run.steps[-1] > 2 * run.steps[0]
     assert pickle.loads(pickle.dumps(run)) == run
     assert "50 instances" in run.message and "tolerance 1e-09" in run.message
+
+
+def test_it_is_the_same_in_pieces(orbits: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However few steps a call has, and however many instances a thread takes at once."""
+    how = {"tol": 1e-10, "times": np.linspace(0.1, 40.0, 30)}
+    run = orbits.simulate_batch(*starts(21), **how)
+    module = __import__(f"{orbits.__name__}.batch_adaptive", fromlist=["batch_adaptive"])
+    monkeypatch.setattr(module, "longer", lambda many, spent: many)
+    for few, group in ((1, 16), (7, 5), (64, 128)):
+        monkeypatch.setattr(module, "_FEW", few)
+        monkeypatch.setattr(module, "_FEWEST", group)
+        assert same(orbits.simulate_batch(*starts(21), **how), run)
+
+
+def test_steps_are_limited_in_each(orbits: ModuleType) -> None:
+    run = orbits.simulate_batch(*starts(9), tol=1e-4, duration=6.0, h_most=0.05)
+    assert np.all(run.steps >= 120)
+    free = orbits.simulate_batch(*starts(9), tol=1e-4, duration=6.0)
+    assert free.steps[0] < 20 and np.abs(run.q - free.q).max() < 1e-2
+
+
+def test_one_that_stops_leaves_the_others_alone(orbits: ModuleType) -> None:
+    q0, qd0 = starts(20)
+    q0[3] = qd0[3] = 0  # in the centre: no acceleration
+    run = orbits.simulate_batch(q0, qd0, duration=3.0, tol=1e-8)
+    rest = np.delete(np.arange(20), 3)
+    assert run.status[3] == "not finite" and set(run.status[rest]) == {"ok"}
+    assert run.reached[3] == 0 and np.isnan(run.q[3, -1]).all()
+    alone = orbits.simulate_batch(q0[rest], qd0[rest], duration=3.0, tol=1e-8)
+    assert np.array_equal(run.q[rest], alone.q)
+
+
+def test_one_that_ends_on_its_way_says_where() -> None:
+    """x'' = k x^2 from x = 1, v = sqrt(2 k/3) goes to infinity: x = 1/(1 - t sqrt(k/6))^2."""
+    text = STIFF.replace("many_stiff", "many_far").replace("k*x**2/2", "-k*x**3/3")
+    module = eomc.load(from_scene(parse(text, "far.toml")), BUILDS)
+    k = np.array([0.1, 6.0, 0.2, 24.0, 0.3])
+    run = module.simulate_batch(
+        qd0=np.sqrt(2 * k / 3)[:, None], params={"k": k, "c": 0.0}, duration=2.0, tol=1e-10
+    )
+    assert run.reached == pytest.approx([2, 1, 2, 0.5, 2], abs=1e-6)
+    assert [said == "ok" for said in run.status] == [True, False, True, False, True]
+    exact = (1 - 2 * np.sqrt(k / 6)) ** -2.0
+    assert run.q[::2, -1, 0] == pytest.approx(exact[::2], rel=1e-8)
+    assert np.isnan(run.q[1::2, -1]).all()
+
+
+STIFF = """eomc = 1
+name = "many_stiff"
+[coordinates]
+x = { unit = "m", start = 1 }
+[parameters]
+k = 1e4
+c = 1e4
+[energy]
+kinetic = "x_dot**2/2"
+potential = "k*x**2/2"
+[forces]
+x = "-c*x_dot"
+[run]
+batch = true
+tolerance = 1e-9
+"""
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_stiff_ones_go_on_by_newtons_method(told: bool) -> None:
+    """x = exp(-t) but for what has died out in 1e-4 s, where c = k is large; the others swing."""
+    springs = eomc.load(from_scene(parse(STIFF, "stiff.toml")), BUILDS)
+    c = np.array([1e4, 0.0, 1e4, 0.1, 1e5])
+    params = {"c": c, "k": np.where(c > 1, c, 1.0)}
+    run = springs.simulate_batch(params=params, times=[1.0, 5.0], stiff=told)
+    assert set(run.status.tolist()) == {"ok"}
+    assert np.all(run.stiff_steps[[0, 2, 4]] > 5) and np.array_equal(run.q[0], run.q[2])
+    for k, rate in ((0, 1e4), (4, 1e5)):
+        slow = (rate - np.sqrt(rate**2 - 4 * rate)) / 2
+        fast = rate - slow
+        exact = (fast * np.exp(-slow * run.t) - slow * np.exp(-fast * run.t)) / (fast - slow)
+        assert run.q[k, :, 0] == pytest.approx(exact, abs=1e-8)
+    assert run.q[1, :, 0] == pytest.approx(np.cos(run.t), abs=1e-8)
+    if not told:
+        assert run.stiff_steps[1] == 0
+
+
+def test_signals_and_single_precision_are_followed() -> None:
+    text = KEPLER.replace("eccentric", "many_single").replace("[run]\n", MANY)
+    text = text.replace('push = { unit = "N" }', 'push = { unit = "N", signal = "0.1*sin(3*t)" }')
+    text = text.replace("tolerance = 1e-9", 'tolerance = 1e-4\nreal = "float"')
+    module = eomc.load(from_scene(parse(text, "single.toml")), BUILDS)
+    q0, qd0 = starts(30)
+    run = module.simulate_batch(q0[:15], qd0[:15], times=[1.0, 4.0])
+    assert run.q.dtype == np.float32 and set(run.status.tolist()) == {"ok"}
+    for k in (0, 7, 14):
+        single = module.simulate(q0[k], qd0[k], times=[1.0, 4.0])
+        assert np.abs(run.q[k] - single.q).max() < 1e-3
 
 
 def test_rows_are_start_and_end_where_no_times_are_asked_for(orbits: ModuleType) -> None:
@@ -55,7 +164,7 @@ def test_rows_are_start_and_end_where_no_times_are_asked_for(orbits: ModuleType)
     run = orbits.simulate_batch(q0, qd0, duration=1.0, params={"mu": mu}, u=[[0.0], [0.1], [0.2]])
     assert run.t.tolist() == [0, 1] and np.array_equal(run.q[:, 0], q0) and run.tol == 1e-9
     alone = orbits.simulate(q0[2], qd0[2], duration=1.0, params={"mu": 2.0}, u=[0.2])
-    assert np.array_equal(run.q[2, -1], alone.q[-1])
+    assert np.abs(run.q[2, -1] - alone.q[-1]).max() < 1e-12
     assert run.energy.shape == (3, 2) and run["x"].shape == (3, 2)
 
 

@@ -251,11 +251,12 @@ def test_what_was_not_asked_for_is_told(modules: Modules) -> None:
 
 
 def test_a_rounding_of_a_sum_is_no_wrong_sine(space: ModuleType, monkeypatch) -> None:
-    """Of a body placed by formulas entries cancel; other coordinates tell that from a sine."""
+    """Of a body placed by formulas entries cancel; other states tell that from a sine."""
     made = from_scene(parse(SPACE, "crane3.toml"))
     of = Comparison(made, space, np.random.default_rng(0), None)
     assert rows_sines.vanishing(of) <= rows_sines.LIMIT
-    monkeypatch.setattr(rows_sines, "NUDGES", ())
+    monkeypatch.setattr(rows_sines, "MOVES", ())
+    monkeypatch.setattr(rows_sines, "NEIGHBOURS", range(-2, 3))
     assert rows_sines.vanishing(of) > rows_sines.LIMIT
 
 

@@ -18,6 +18,7 @@ VARIANTS = {
     "batch of a tree": ("chain", "batch = true"),
     "float": ("cartpole", 'real = "float"\nbatch = true'),
     "tolerance": ("cartpole_driven", "tolerance = 1e-9"),
+    "batch by a tolerance": ("cartpole", "batch = true\ntolerance = 1e-9"),
     "linearize": ("cartpole_driven", 'linearize = "parameters"'),
 }
 

@@ -9,16 +9,16 @@ from fractions import Fraction
 from functools import cached_property
 
 from eomc.emit import c_function as c
+from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
+from eomc.emit.c_names import Target
 from eomc.emit.coefficients import matrix, numbers, rounded
 from eomc.emit.functions import Functions
-from eomc.emit.plain.adaptive_views import (
-    Adaptive,
-    AdaptiveRun,
-)
+from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun
 from eomc.integrators.tableaux import GAUSS16, Row
 from eomc.model.corners import steep
 from eomc.model.system import System
+from eomc.program import outline
 from eomc.scene.schema import LOOSEST
 
 METHOD = GAUSS16
@@ -26,6 +26,7 @@ TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
+SMALL = 150  # operations of accelerations, up to which many instances go side by side
 BUSY = 32  # events in one step, without those that happen at once
 
 
@@ -202,15 +203,23 @@ def busy(system: System) -> int:
     return BUSY + sum(e.begins is not None for e in system.events)
 
 
+def keep(made: Stepping) -> CFunction:
+    """A state into a row."""
+    arguments = (c.filled(made.functions.real, n) for n in ("q_row", "qd_row", "q", "qd"))
+    return CFunction(f"{made.method}_kept", "void", tuple(arguments))
+
+
+def tightest(real: Real) -> float:
+    """The least tolerance that numbers have digits for."""
+    return 1e-15 if real.epsilon < 1e-10 else 5e-7
+
+
 def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") -> AdaptiveRun:
     """The loop. happen, restart, begun: the calls that find events, and go on behind them."""
     functions, form = made.functions, made.form
     target = functions.target
     row = {name: f"{name} + {functions.NQ}*rows" for name in ("q_rows", "qd_rows")}
-    kept = CFunction(
-        f"{made.method}_kept", "void",
-        tuple(c.filled(functions.real, n) for n in ("q_row", "qd_row", "q", "qd")),
-    )  # fmt: skip
+    kept = keep(made)
     to = {"q_row": row["q_rows"], "qd_row": row["qd_rows"]}
     takes_p = "p" in {a.name for a in made.rest} or bool(
         form.compute_constants or happen or form.project
@@ -226,7 +235,7 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
         unread_p=target.needs_p and not takes_p,
         compute_constants=form.compute_constants,
         loosest=target.literal(LOOSEST),
-        tightest=target.literal(1e-15 if target.real.epsilon < 1e-10 else 5e-7),
+        tightest=target.literal(tightest(target.real)),
         events=bool(happen),
         begun=begun,
         busy=busy(target.system),
@@ -240,6 +249,38 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
         look=made.within.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
         project_row=projected(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]"),
         project_restart=projected(q="x.q", qd="x.qd", t="x.t"),
+    )
+
+
+def together(target: Target) -> bool:
+    """Whether the fast form has the steps of many side by side: of small systems without corners.
+
+    Large ones have enough to do in one sweep (docs/tricks.md has the measurement).
+    """
+    s = target.system
+    plain = not (s.events or s.constraints or steep(s))
+    return plain and s.run.batch and outline.weight(target.program["acceleration"]) <= SMALL
+
+
+def alone(functions: Functions) -> str:
+    """The call for instance k of a batch."""
+    NQ = functions.NQ
+    rows = {f"{n}_rows": f"{n}_rows ? {n}_rows + {NQ}*row : 0" for n in ("q", "qd")}
+    return functions.public.adaptive(METHOD.name).call(
+        q=f"q + {NQ}*k", qd=f"qd + {NQ}*k", t="t + k", u="u ? u + u_instance*k : 0",
+        times="times ? times + kept[k] : 0", count="row_count - kept[k]", t_rows="0", **rows,
+        room="0", events="0", which="0", event_rows="0", p="p + p_instance*k",
+        memory="memory + k", status="&found",
+    )  # fmt: skip
+
+
+def batch(functions: Functions) -> AdaptiveBatch:
+    """Many, one after the other."""
+    return AdaptiveBatch(
+        prefix=functions.prefix,
+        batch=functions.public.adaptive_batch(METHOD.name),
+        alone=alone(functions),
+        events=bool(functions.target.system.events),
     )
 
 

@@ -134,7 +134,8 @@ def _adaptive(target: Target) -> BoundAdaptive | None:
         q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target), status="&found",
         memory=f"&{member('work', 'memory')}", events=f"&{member('work', 'events')}",
     )  # fmt: skip
-    return BoundAdaptive(f"{run.name}_memory", call, bool(target.system.events))
+    many = Public(target).adaptive_batch(adaptive.METHOD.name).call(p=_parameters(target))
+    return BoundAdaptive(f"{run.name}_memory", call, bool(target.system.events), many)
 
 
 def _derivative(target: Target, method: str) -> str:

@@ -146,6 +146,26 @@ class Public:
             ),
         )  # fmt: skip
 
+    def adaptive_batch(self, method: str) -> CFunction:
+        """The same of many instances."""
+        target, real = self.target, self.target.real.name
+        name = f"{target.prefix}_{method}_adaptive"
+        strides = [CArgument("long", name) for name in ("u_instance", "p_instance")]
+        return CFunction(
+            f"{name}_batch",
+            "int",
+            (
+                CArgument("long", "count"), *(filled(real, n) for n in (*STATE, "t")),
+                *(CArgument(real, n) for n in LIMITS),
+                *self.usual("u"), *(strides[:1] if target.system.inputs else []),
+                CArgument("long", "steps"), given(real, "times"), CArgument("long", "row_count"),
+                *(filled(real, f"{n}_rows") for n in STATE), *self.usual("p"),
+                *(strides[1:] if target.needs_p else []),
+                CArgument(f"{name}_memory *", "memory"), CArgument("long *", "kept"),
+                CArgument("int *", "status"),
+            ),
+        )  # fmt: skip
+
     @property
     def adaptive_events(self) -> tuple[CArgument, ...]:
         """Where events that were found go."""

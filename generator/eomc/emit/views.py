@@ -141,11 +141,12 @@ class BoundMethod:
 
 @dataclass(frozen=True)
 class BoundAdaptive:
-    """Adaptive steps in the binding: the type of their memory, their call, whether events are."""
+    """Adaptive steps in the binding: the type of their memory, calls, whether events are."""
 
     memory: str
     run: str
     events: bool
+    batch: str
 
 
 @dataclass(frozen=True)

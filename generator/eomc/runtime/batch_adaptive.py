@@ -22,7 +22,8 @@ from .trajectory import STATUS
 if TYPE_CHECKING:
     from .batch import BatchModel
 
-_GROUP = 16  # instances that a thread takes at once
+_GROUP, _FEWEST = 128, 16  # instances that a thread takes at once, of many and of few
+_COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
 _FEW = 64  # steps of an instance before the first look at Ctrl-C
 _NAMES = ("tol", "evaluations", "rejected", "stiff_steps", "reached", "_times")
 
@@ -96,20 +97,21 @@ def simulate(
     rows = as_times(times, t0, model.dtype)
     starts, table, held, _ = model._instances(q0, qd0, params, u, 1, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
-    work = _Work(model, np.ascontiguousarray(np.hstack([q, qd])), t0, rows, tol, most, held, table)
-    for w in work.works:
-        w.stiff = bool(stiff)
+    work = _Work(model, q.copy(), qd.copy(), t0, rows, tol, most, held, table)
+    for memory in work.memory if stiff else ():
+        memory.stiff = 1
     whole = work.run(threads, progress)
     kept = np.arange(len(rows)) < work.kept[:, None]
     for values in work.rows:
         values[~kept] = np.nan
-    counts = np.array([[w.steps, w.evaluations, w.rejected, w.stiff_steps] for w in work.works])
+    counts = work.counts
     codes = np.where((work.status == 0) & work.open, len(STATUS), work.status).astype("i")
     span = float(rows[-1]) - t0
     made = AdaptiveBatchRun(
-        model, t0, work.rows[0], work.rows[1], span / max(1.0, float(counts[:, 0].mean())),
-        counts[:, 0], codes, 1, 0, table.copy(), held, "gauss16", tol=tol,
-        evaluations=counts[:, 1], rejected=counts[:, 2], stiff_steps=counts[:, 3],
+        model, t0, work.rows[0], work.rows[1], span / max(1.0, float(counts["steps"].mean())),
+        counts["steps"], codes, 1, 0, table.copy(), held, "gauss16", tol=tol,
+        evaluations=counts["evaluations"], rejected=counts["rejected"],
+        stiff_steps=counts["stiff_steps"],
         reached=work.t, _times=rows,
     )  # fmt: skip
     return made, whole
@@ -119,25 +121,37 @@ class _Work:
     """Instances on their way: where each is, its memory, and the rows of all."""
 
     def __init__(
-        self, model: BatchModel, x: Array, t0: float, times: Array, tol: float, most: float,
-        held: Array | None, table: Array,
+        self, model: BatchModel, q: Array, qd: Array, t0: float, times: Array, tol: float,
+        most: float, held: Array | None, table: Array,
     ) -> None:  # fmt: skip
-        self.model, self.x, self.times, self.held, self.table = model, x, times, held, table
-        self.limits = float(times[-1]), tol, most
-        count, n = len(x), len(times)
+        self.model, self.q, self.qd, self.times = model, q, qd, times
+        self.held, self.table, self.limits = held, table, (float(times[-1]), tol, most)
+        count, n = len(q), len(times)
         self.t = np.full(count, t0, model.dtype)
         self.rows = np.empty((2, count, n, model.nq), model.dtype)
         self.kept, self.status = np.zeros(count, "l"), np.zeros(count, "i")
-        self.works = model._ffi.new("adaptive_work[]", count)
+        self.memory = model._ffi.new("adaptive_memory[]", count)
         self.open, self.stop, self.ended = np.ones(count, bool), False, 0
         if times[0] == t0:
             self.kept[:] = 1
-            self.rows[0, :, 0], self.rows[1, :, 0] = x[:, : model.nq], x[:, model.nq :]
+            self.rows[0, :, 0], self.rows[1, :, 0] = q, qd
+
+    @property
+    def counts(self) -> dict[str, Array]:
+        """Steps and so on of each instance, (batch,), by their names in C."""
+        ffi, memory = self.model._ffi, "adaptive_memory"
+        layout: Any = {
+            "names": _COUNTED, "formats": ["l"] * len(_COUNTED), "itemsize": ffi.sizeof(memory),
+            "offsets": [ffi.offsetof(memory, name) for name in _COUNTED],
+        }  # fmt: skip
+        found: Any = np.frombuffer(ffi.buffer(self.memory), np.dtype(layout))
+        return {name: found[name].copy() for name in _COUNTED}
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
-        count = len(self.x)
-        groups = [(at, min(_GROUP, count - at)) for at in range(0, count, _GROUP)]
+        count = len(self.q)
+        group = _GROUP if count > 8 * _GROUP else _FEWEST
+        groups = [(at, min(group, count - at)) for at in range(0, count, group)]
         return all_of(
             self, groups, as_threads(threads), lambda: progress and progress(self.ended, count)
         )
@@ -155,11 +169,12 @@ class _Work:
         while more and not self.stop:
             begun = perf_counter()
             more = model._lib.adaptive_batch(
-                count, pointer(self.x[at:end]), pointer(self.t[at:end]), *self.limits, u,
+                count, pointer(self.q[at:end]), pointer(self.qd[at:end]), pointer(self.t[at:end]),
+                *self.limits, u,
                 model.nu if u_each else 0, many, pointer(self.times), n,
                 pointer(self.rows[0, at:end]), pointer(self.rows[1, at:end]),
                 pointer(self.table[at:end] if p_each else self.table), int(p_each),
-                self.works + at, address(long, self.kept[at:end]),
+                self.memory + at, address(long, self.kept[at:end]),
                 address(integer, self.status[at:end]),
             )  # fmt: skip
             many = min(longer(many, perf_counter() - begun), 2**40)

@@ -15,6 +15,7 @@ import numpy as np
 from eomc.model.system import System
 from eomc.verify import (
     rows_adaptive,
+    rows_adaptive_batch,
     rows_adaptive_refusals,
     rows_constraints,
     rows_derivatives,
@@ -59,7 +60,7 @@ def check(
         compiled = hasattr(module, "_model")
         if compiled:  # what is compiled has several ways to one answer
             module._model._warned.add("events")  # which fixed steps are to pass over here
-            compiled_rows(made)
+            compiled_rows(made, plain)
         scene = system.scene
         if scene is not None and scene.assembly is not None:
             Bodies(made, scene).report()
@@ -111,7 +112,7 @@ def property_rows(made: Comparison) -> None:
         made.convergence_rows()
 
 
-def compiled_rows(made: Comparison) -> None:
+def compiled_rows(made: Comparison, plain: Any) -> None:
     """Add the rows about runs, refusals and, where the module has them, batches."""
     runs, refusals = Runs(made), Refusals(made)
     runs.report()
@@ -123,3 +124,4 @@ def compiled_rows(made: Comparison) -> None:
         rows_projection.of_inertia(made, refusals)
     if hasattr(made.module, "simulate_batch"):
         Batches(runs, refusals.singular).report()
+        rows_adaptive_batch.report(made, refusals.singular, plain)

@@ -16,7 +16,7 @@ from eomc.emit import c_function as c
 from eomc.emit.c_expression import C_NAMES, DOUBLE, PIVOT
 from eomc.emit.c_names import Target
 from eomc.emit.derivatives import derivatives
-from eomc.emit.fast import projection, runs, views
+from eomc.emit.fast import adaptive_lanes, projection, runs, views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, Lane
 from eomc.emit.fast.runs import ahead_count
@@ -109,6 +109,7 @@ def _csrc(made: Steppers) -> Iterator[str]:
         texts += [("lanes/vector.h", name, width)]
         texts += [(f"lanes/sincos{end}.h", name, width)] * target.sincos
         texts += [(f"lanes/rotate{end}.h", name, width)] * (turns and rotates)
+        texts += [("lanes/select.h", name, width)] * (name == "wide" and adaptive.together(target))
         texts += [("lanes/four.h", name, width)] * (name == "four" and made.two_point)
         texts += [("lanes/angles.h", name, width)] * (name == "four" and made.functions.several)
     for file, name, width in texts:
@@ -206,6 +207,9 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
 
 def _library_text(lane: Lane, show: Show) -> str:
     """The functions of the mathematics library over a lane of several numbers."""
+    names = set(lane.calls)
+    if lane.name == "wide" and adaptive.together(lane.accelerations.target):
+        names.add("sqrt")
     return show(
         views.LibraryText(
             prefix=lane.prefix,
@@ -215,7 +219,9 @@ def _library_text(lane: Lane, show: Show) -> str:
             L=lane.end,
             mask=lane.mask,
             count=f"{lane.target.PREFIX}_{lane.name.upper()}_COUNT",
-            calls=tuple(_library(lane.accelerations, n, lane.end == "_wide") for n in lane.calls),
+            calls=tuple(
+                _library(lane.accelerations, n, lane.end == "_wide") for n in sorted(names)
+            ),
         )
     )
 
@@ -279,6 +285,10 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
         if adaptive.METHOD not in made.methods:
             yield show(made.stages(adaptive.METHOD))
         yield from map(show, events.views(made.functions, _adaptive(made)))
+        if run.batch:
+            side_by_side = adaptive.together(made.accelerations.target)
+            many = adaptive_lanes.view(made, _adaptive(made)) if side_by_side else None
+            yield show(many or adaptive.batch(made.functions))
     yield from map(show, derivatives(made.functions))
 
 

@@ -391,7 +391,52 @@ class Batch(Named):
     project_alone: str
 
 
+@dataclass(frozen=True)
+class AdaptiveLanes(Named):
+    """c/fast/adaptive_lanes.c.jinja: adaptive steps of many instances side by side.
+
+    As Adaptive has them: the tableau, powers, top, most, anew. roughest: of the root of tol/2, what
+    refuses a step after two sweeps. accelerate: of each at a stage; forces: of one at its start;
+    alone: the call for one; kept, look: the calls that write a row, at the end of a step or in it.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/fast/adaptive_lanes.c"
+    method: str
+    extent: str
+    inline: str
+    noinline: str
+    stages: int
+    f: str
+    fabs: str
+    sqrt: str
+    eps: str
+    tiny: str
+    most: int
+    anew: int
+    roughest: str
+    loosest: str
+    tightest: str
+    c: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+    powers: tuple[str, ...]
+    top: tuple[str, ...]
+    inputs: bool
+    constants: bool
+    members: tuple[str, ...]
+    compute_constants: str
+    compute_own: str
+    own: bool
+    accelerate: str
+    forces: str
+    batch: CFunction
+    alone: str
+    kept: str
+    look: str
+
+
 View = (
     Source | LibraryText | LaneText | Blocks | TwoPoints | RungeKutta4 | Predictions
     | Predicted | Explicit | Factors | Gauss | Stages | Sweeps | State | Loop | Batch
+    | AdaptiveLanes
 )  # fmt: skip

@@ -160,3 +160,14 @@ class AdaptiveRun(Named):
     look: str
     project_row: str
     project_restart: str
+
+
+@dataclass(frozen=True)
+class AdaptiveBatch:
+    """c/adaptive_batch.c.jinja: many, one after the other. alone: the call for one."""
+
+    TEMPLATE: ClassVar[str] = "c/adaptive_batch.c"
+    prefix: str
+    batch: CFunction
+    alone: str
+    events: bool

@@ -114,6 +114,8 @@ def header(
             adaptive.TITLE, adaptive.memory(plain),
             rooms[-1] or adaptive.kept(s, len(s.coordinates)),
             plain.public.adaptive(adaptive.METHOD.name),
+            plain.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
+            adaptive.together(target),
         ) if s.run.tolerance else None,
         busy=adaptive.busy(s),
     )  # fmt: skip
@@ -350,7 +352,8 @@ def _adaptive(plain: Functions) -> list[View]:
         around, sweep.call(b="&b"), accelerate(qdd="f"), plain.NQ,
         project=onto if plain.correction else "", whole=True,
     )  # fmt: skip
-    return [nodes, *events.views(plain, form)]
+    many = [adaptive.batch(plain)] if plain.target.system.run.batch else []
+    return [nodes, *events.views(plain, form), *many]
 
 
 def loop(plain: Functions, m: Method) -> Loop:

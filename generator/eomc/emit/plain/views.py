@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Begun, Events
+from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, Begun, Events
 from eomc.emit.plain.constraint_views import Corrected, Project
 from eomc.emit.plain.parts import Computed, Named
 
@@ -48,12 +48,17 @@ class Declared:
 
 @dataclass(frozen=True)
 class AdaptiveDeclared:
-    """Adaptive steps in the header. memory: the type of what they keep, kept numbers of it."""
+    """Adaptive steps in the header. memory: the type of what they keep, kept numbers of it.
+
+    together: whether the fast form has many side by side.
+    """
 
     title: str
     memory: str
     kept: int
     run: CFunction
+    batch: CFunction | None
+    together: bool
 
 
 @dataclass(frozen=True)
@@ -288,5 +293,5 @@ class Loop(Named):
 
 View = (
     Header | Source | Slopes | Corrected | Project | Derivative | RungeKutta4 | Explicit | Implicit
-    | Gauss | Nodes | Adaptive | Events | Begun | AdaptiveRun | Loop
+    | Gauss | Nodes | Adaptive | Events | Begun | AdaptiveRun | AdaptiveBatch | Loop
 )  # fmt: skip

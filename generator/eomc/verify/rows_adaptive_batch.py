@@ -1,0 +1,170 @@
+"""Rows of `check` about adaptive steps of many: each beside its run alone.
+
+Side by side they are computed by another text than alone, and end within its tolerance; at another
+place, in other calls or behind others that can't go on, they have the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from eomc.verify.finding import Finding, largest
+from eomc.verify.oracle import Vector
+from eomc.verify.rows_refusals import NOT_FINITE, SINGULAR
+from eomc.verify.rows_runs import parameters
+
+if TYPE_CHECKING:
+    from eomc.verify.comparison import Comparison
+    from eomc.verify.sampling import State
+
+COUNT = 19  # instances: more than twice what any register holds
+FEW = 4  # singular states
+STEPS = 4  # of a run that is compared with that of one alone
+TOLERANCE, LONGEST = {8: 1e-12, 4: 1e-6}, 0.3  # by bytes of a number; h_most, of a run
+LIMIT, UNIT = 1.0, "tolerances a step"
+ROUNDING = 1e3  # in a tolerance's place, where that is smaller
+
+
+@dataclass
+class Left:
+    """What calls of C left in place: states (n, 2 nq), times, rows, counts, statuses."""
+
+    x: Vector
+    t: Vector
+    rows: Vector
+    counts: Vector
+    status: Vector
+
+    def __getitem__(self, which: Any) -> list[Vector]:
+        return [x[which] for x in (self.x, self.t, self.rows, self.counts, self.status)]
+
+
+def report(of: Comparison, singular: list[State], plain: Any) -> None:
+    """Add the rows of a scene that asks for both. plain: the module of the plain form, or None."""
+    if of.system.run.tolerance is None or not of.system.run.batch:
+        return
+    made = Many(of, singular)
+    of.row("adaptive steps of many", LIMIT, UNIT, made.beside)
+    for module, form in ((of.module, ""), (plain, "plain C: ")):
+        if module is not None:
+            many = Many(of, singular, module)
+            of.row(f"{form}adaptive steps of many: bits", 0, "instances", many.alike)
+            of.row(f"{form}adaptive steps of many: refusals", 0, "instances", many.refused)
+
+
+class Many:
+    """Instances beside the first sampled state, under its inputs, at its time."""
+
+    def __init__(self, of: Comparison, singular: list[State], module: Any = None) -> None:
+        self.of, self.module, self.singular = of, module or of.module, singular
+        self.model = self.module._model
+        self.state = s = of.few(2)[-1].state
+        random, sampler = np.random.default_rng(3), of.sampler
+        self.starts = [
+            sampler.onto(replace(s, q=s.q + dq, qd=s.qd + dv)) if of.system.constraints
+            else replace(s, q=s.q + dq, qd=s.qd + dv)
+            for dq, dv in zip(
+                1e-2 * sampler.spread * random.standard_normal((COUNT, len(s.q))),
+                1e-2 * sampler.speed * random.standard_normal((COUNT, len(s.q))), strict=True,
+            )
+        ]  # fmt: skip
+        self.tol = TOLERANCE[self.model.dtype.itemsize]
+
+    def alone(self, s: State, **span: Any) -> Any:
+        """A run of one from there."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            how = {"tol": self.tol, "t0": s.t, "u": s.u, "params": s.params}
+            return self.module.simulate(s.q, s.qd, **how, **span)
+
+    def span(self) -> float:
+        """How long some steps take; 0 where there is none."""
+        run = self.alone(self.state, duration=self.of.system.run.duration)
+        return float(run.t[min(STEPS, len(run) - 1)]) - self.state.t if len(run) else 0.0
+
+    def beside(self) -> float | Finding:
+        """The ends and rows of some steps of each, beside those of its run alone."""
+        s, T = self.state, self.span()
+        times = s.t + T * np.array([0.4, 1.0])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            q, qd = (np.array([getattr(x, name) for x in self.starts]) for name in ("q", "qd"))
+            many = self.module.simulate_batch(
+                q, qd, times=times, tol=self.tol, t0=s.t, params=s.params,
+                u=None if s.u is None else np.tile(s.u, (COUNT, 1)), threads=1,
+            )  # fmt: skip
+        return largest((self.off(many, k, times) for k in range(COUNT)), "no instance has a step")
+
+    def off(self, many: Any, k: int, times: Vector) -> float | None:
+        """How far an instance is from its run alone; None where that stops."""
+        one = self.alone(self.starts[k], times=times)
+        if one.status != "ok" or len(one) < len(times):
+            return None
+        x = np.hstack([many.q[k], many.qd[k]]).astype(float)
+        sampler = self.of.sampler
+        scale = np.abs(one.x).max(axis=0) + np.concatenate([sampler.spread, sampler.speed])
+        allowed = (self.tol + ROUNDING * self.of.eps) * (one.steps + 1)
+        return float(np.nan_to_num(np.max(np.abs(x - one.x) / scale) / allowed, nan=math.inf))
+
+    def drive(
+        self, starts: list[State], span: float, steps: int, *, stiff: bool = False,
+        longest: float = 0.0,
+    ) -> Left:  # fmt: skip
+        """The C function called until none is left, `steps` of each at once."""
+        model, n, s = self.model, len(starts), starts[0]
+        new = model._ffi.new
+        q, qd = (np.array([getattr(x, k) for x in starts], model.dtype) for k in ("q", "qd"))
+        t = np.array([x.t for x in starts], model.dtype)
+        end = self.state.t + span
+        times = np.array([self.state.t + 0.6 * span, end], model.dtype)
+        rows = np.full((2, n, 2, model.nq), np.nan, model.dtype)
+        kept, status, memory = np.zeros(n, "l"), np.zeros(n, "i"), new("adaptive_memory[]", n)
+        for one in memory if stiff else ():
+            one.stiff = 1
+        u = None if s.u is None else np.array([x.u for x in starts], model.dtype)
+        p = np.array([parameters(model, x) for x in starts], model.dtype)
+        address, (long, integer) = model._c[0], model._whole
+        for _ in range(100_000):
+            if not model._lib.adaptive_batch(
+                n, *map(model._pointer, (q, qd, t)), end, self.tol, longest, model._pointer(u),
+                model.nu, steps, model._pointer(times), 2, model._pointer(rows[0]),
+                model._pointer(rows[1]), model._pointer(p), 1, memory, address(long, kept),
+                address(integer, status),
+            ):  # fmt: skip
+                break
+        counts = [[m.steps, m.rejected, m.evaluations, m.stiff_steps] for m in memory]
+        return Left(np.hstack([q, qd]), t, np.hstack([rows[0], rows[1]]), np.array(counts), status)
+
+    def alike(self) -> float:
+        """How many differ in other places, in calls of one step each, or where some begin stiff."""
+        wrong, T = 0, self.span()
+        for stiff, longest in ((False, LONGEST * T), (False, 0.0), (True, 0.0)):
+            how: Any = {"stiff": stiff, "longest": longest}
+            whole, few = (self.drive(self.starts, T, n, **how) for n in (1000, 1))
+            back = self.drive(self.starts[::-1], T, 3, **how)
+            alone = [self.drive([x], T, 1000, **how) for x in self.starts[:3]]
+            for k in range(COUNT):
+                others = [few[k], back[COUNT - 1 - k], *([alone[k][0]] if k < len(alone) else [])]
+                wrong += any(_differ(whole[k], other) for other in others)
+        return float(wrong)
+
+    def refused(self) -> float:
+        """How many do not say that they can't begin, or disturb those who can."""
+        T, rest = self.span(), self.starts[3:]
+        odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]
+        known = self.singular[:: max(1, len(self.singular) // FEW)]
+        odd += [replace(x, t=self.state.t, u=self.state.u) for x in known]
+        found, expected = (self.drive(x, T, 1000) for x in ([*odd, *rest], rest))
+        wrong = sum(_differ(found[k + len(odd)], expected[k]) for k in range(len(rest)))
+        wrong += int(found.status[0] != NOT_FINITE) + int(found.status[1] == 0)
+        wrong += sum(code not in (SINGULAR, NOT_FINITE) for code in found.status[2 : len(odd)])
+        return float(wrong)
+
+
+def _differ(one: list[Vector], other: list[Vector]) -> bool:
+    return not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
