@@ -113,6 +113,21 @@ def test_a_run_of_more_steps_than_the_last_is_whole(kepler: ModuleType) -> None:
     assert run == kepler.simulate(duration=20 * PERIOD)
 
 
+def test_a_run_in_one_call_has_its_room_whatever_others_do(
+    kepler: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread whose run stops meanwhile takes the room of the next ones away, not of this one."""
+    run, model = kepler.simulate(q0=[0.2, 0.0], duration=1.0), kepler._model
+
+    def meanwhile(x0: object, name: str) -> object:
+        model._room = 0
+        return type(model)._from(model, x0, name)
+
+    monkeypatch.setattr(model, "_from", meanwhile, raising=False)
+    assert model._room and kepler.simulate(q0=[0.2, 0.0], duration=1.0) == run
+    assert model._room == 0  # the long way would have found it anew
+
+
 def test_a_run_in_one_call_refuses_the_same(kepler: ModuleType) -> None:
     kepler.simulate(duration=1)
     for wrong, words in (
@@ -126,6 +141,17 @@ def test_a_run_in_one_call_refuses_the_same(kepler: ModuleType) -> None:
             kepler.simulate(**wrong)
     with pytest.warns(RuntimeWarning, match="stopped at"):
         assert kepler.simulate(q0=[0.0, 0.0], qd0=[0.0, 0.0], duration=1).status != "ok"
+
+
+def test_a_run_ends_at_a_time_that_single_precision_rounds() -> None:
+    """0.7 s is later than the float next to it, 0.3 s earlier."""
+    text = KEPLER.replace("eccentric", "single_end").replace("1e-9", '1e-4\nreal = "float"')
+    module = eomc.load(from_scene(parse(text, "single.toml")), BUILDS)
+    for room in (0, 48):
+        for t0, duration in ((0.0, 0.7), (0.0, 0.3), (0.7, 0.0), (0.1, 0.6)):
+            module._model._room = room
+            run = module.simulate(duration=duration, t0=t0)
+            assert run.status == "ok" and run.t[-1] == np.float32(t0 + duration)
 
 
 def test_a_run_tells_the_state_at_any_time(kepler: ModuleType) -> None:

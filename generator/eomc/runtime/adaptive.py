@@ -273,9 +273,9 @@ def simulate(
 
 def plain(
     model: Model, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
-    params: Any, t0: float, tol: float | None,
+    params: Any, t0: float, tol: float | None, count: int,
 ) -> AdaptiveRun | None:  # fmt: skip
-    """A run with nothing unusual in one call, as long as the last was; None: it goes another way.
+    """A run with nothing unusual in one call, of count rows at most; None: it goes another way.
 
     Not for scenes with events or constraints.
     """
@@ -289,7 +289,7 @@ def plain(
         at_p = model._pointer(p)
     tol = as_tolerance(model.tolerance if tol is None else tol, model.dtype)
     end = as_end(model, t0, duration)
-    (address, real, null), nq, count = model._c, model.nq, model._room
+    (address, real, null), nq = model._c, model.nq
     work, whole = model._ffi.new("adaptive_work *"), np.empty(count * (1 + 2 * nq), model.dtype)
     to_t = address(real, whole)
     to_q = to_t + count

@@ -55,11 +55,12 @@ def as_limits(
 
 
 def as_end(model: Model, t0: float, duration: float | None) -> float:
-    """The time at which a run ends."""
+    """The time at which a run ends, as the module's numbers hold it."""
     span = model.duration if duration is None else as_number(duration, "duration")
     if span < 0:
         raise ValueError(f"duration: {span:g} is not a time in s")
-    return float(t0 + span)
+    end = float(t0 + span)
+    return end if model.dtype.itemsize == 8 else float(model.dtype.type(end))
 
 
 def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:

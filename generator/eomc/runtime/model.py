@@ -235,11 +235,11 @@ class Model(Constrained):
             and not estimate and type(t0) is float and isfinite(t0)
         )  # fmt: skip
         if (
-            usual and self._room and h is None and steps is None and method is None
+            usual and (room := self._room) and h is None and steps is None and method is None
             and times is None and h_most is None and every == 1 and stiff is False
         ):  # fmt: skip
-            if (quick := adaptive.plain(self, q0, qd0, duration, params, t0, tol)) is not None:
-                return quick
+            if (fit := adaptive.plain(self, q0, qd0, duration, params, t0, tol, room)) is not None:
+                return fit
         q0, qd0 = self._assembled(q0, qd0, t0, params)
         if fits(self, h, steps, method, tol, times, h_most, stiff):
             fixed = h, steps, method, every, control_period, out
