@@ -71,6 +71,25 @@ def test_a_step_longer_than_the_run_is_said(there: Path) -> None:
     assert said["beyond_duration"].startswith("h = 0.3 s") and said["beyond_stability"] is None
 
 
+def test_a_run_of_no_step_has_no_speed(there: Path) -> None:
+    done = eomc("run", "p.toml", "--duration", "0")
+    assert done.exit_code == 0 and "Simple pendulum: 0 steps of rk4" in done.output
+    assert done.output.endswith(" ms, 0 steps a second\n")
+
+
+@pytest.mark.parametrize("words", ["", "rows of 4 numbers don't fit in memory"])
+def test_memory_that_does_not_suffice_is_said(
+    words: str, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise MemoryError(*[words] * bool(words))
+
+    monkeypatch.setattr(pipeline, "load", full)
+    done = eomc("run", "p.toml")
+    assert done.exit_code == 2
+    assert done.output == f"eomc: {words or 'not enough memory'}\n"
+
+
 def test_fewer_rows_than_one_in_all_steps(there: Path) -> None:
     done = eomc("run", "p.toml", "--every", "9" * 20, "--duration", "0.1", "--out", "run.csv")
     assert done.exit_code == 0, done.output
@@ -153,6 +172,17 @@ def test_an_output_that_is_closed(here: Path) -> None:
     }.items():
         done = shell(line)
         assert (done.returncode, done.stderr) == (status, ""), (line, done.stderr)
+
+
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_without_an_output_at_all(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where the caller has closed it before Python began."""
+    monkeypatch.setattr(sys, name, None)
+    with pytest.raises(SystemExit) as ended:
+        main(["list", "nowhere"])
+    assert ended.value.code == 2
+    with getattr(sys, name) as stream:
+        assert stream.name == os.devnull
 
 
 @pytest.mark.slow

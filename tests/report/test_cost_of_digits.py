@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from eomc.emit.render import Sources
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import Event, System
 from eomc.report import cost_of_digits, linearised, page
-from eomc.report.cost_of_digits import Report
+from eomc.report.cost_of_digits import Point, Report
 
 REPORTS = ROOT / "build" / "tests" / "reports"
 
@@ -211,6 +212,39 @@ def test_the_figures_as_json() -> None:
         assert best is None or best["along"] <= 10.0 ** -int(digits)
     assert figures["digits"] > 25
     assert figures["condition"][0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("mode", "steps"), [(0.0, 8), (10j, 128)])
+def test_the_first_steps_are_few_to_a_turn(
+    mode: complex, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 12 radians at most, a quarter of that to be sure; a motion without modes has eight."""
+    asked, like = [], measured().lines[0].points[0]
+
+    def point(_: object, __: object, name: str, duration: float, steps: int) -> Point:
+        asked.append(steps)
+        return replace(like, seconds=math.inf)
+
+    monkeypatch.setattr(cost_of_digits, "_point", point)
+    given: Any = None
+    cost_of_digits._line(given, given, "gauss8", np.array([mode, -mode]), 400.0, 1.0)
+    assert asked == [steps]
+
+
+def test_a_stepper_without_a_digit_is_left_out_of_the_figure_of_energy() -> None:
+    report, drawn = measured(), list[str]()
+    lost = tuple(replace(p, along=math.inf) for p in report.lines[0].points)
+    lines = (replace(report.lines[0], points=lost), report.lines[1])
+
+    class Axes:
+        def semilogy(self, *_: Any, label: str, **__: Any) -> None:
+            drawn.append(label.split(",")[0])
+
+        def __getattr__(self, name: str) -> Any:
+            return lambda *_, **__: None
+
+    page._energy(Axes(), replace(report, lines=lines), report.lines[1].points[0])
+    assert drawn == ["dp8"]
 
 
 def test_times_have_a_unit() -> None:

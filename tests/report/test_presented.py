@@ -1,6 +1,7 @@
 """The report as the scene's own page: what it is, its equations, its motion; nothing is fetched."""
 
 import re
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from payloads import PAYLOADS
 
 from eomc import pipeline
 from eomc.base import texts
+from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.report import cost_of_digits, equations, mathml, page, presented
@@ -68,6 +70,16 @@ def test_equations_become_mathml() -> None:
     first, _ = mathml.lines(swing)
     assert [more for more, _ in first] == [False, True, False]
     assert '<mo lspace="0.17em" rspace="0.17em">sin</mo>' in first[0][1]
+
+
+def test_without_latex2mathml_equations_say_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("latex2mathml")]:
+        monkeypatch.setitem(sys.modules, name, None)
+    mathml._made.cache_clear()
+    with pytest.raises(EomcError, match=r'need latex2mathml: pip install "eomc\[plot\]"'):
+        mathml.lines(equations.of(system()))
 
 
 @pytest.mark.slow

@@ -150,6 +150,16 @@ def test_what_it_can_not_do_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         reference_solution.of(oscillator(), rows=4, root=tmp_path)
 
 
+@pytest.mark.parametrize(("status", "words"), [(3, "got to t = 1 s of 2 s"), (1, "t = 1 s: D is")])
+def test_how_far_it_came_is_said(tmp_path: Path, status: int, words: str) -> None:
+    """Six rows of ten, the first of which is the start."""
+    rows = "".join("0 0 0 ;\n" for _ in range(6))
+    (tmp_path / "quad").write_text(f"#!/bin/sh\nprintf '{rows}'\nexit {status}\n")
+    (tmp_path / "quad").chmod(0o700)
+    with pytest.raises(EomcError, match=words):
+        reference_solution._run(tmp_path / "quad", oscillator(), 2.0, 10, 4, 1e-25)
+
+
 @pytest.mark.slow
 def test_a_jump_costs_digits(tmp_path: Path) -> None:
     """sign(x_dot) is not smooth where the block turns: both ways must not claim 25 digits."""

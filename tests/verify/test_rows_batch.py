@@ -32,6 +32,7 @@ h = 0.02
 batch = true
 """
 ALL_BUT_LOST = 5e305
+SOON_LOST = 8e306  # after a few steps
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
@@ -56,6 +57,24 @@ def test_rows_without_digits_are_compared_by_their_own_rounding(
     assert not b.parts("rk4", s, kept, alone)
     assert not b.parts("rk4", s, beside.rows[:, :6], alone)
     assert b.parts("rk4", s, kept * 1.01, alone) == digits
+
+
+def test_the_last_row_of_an_instance_that_stops_is_that_alone(modules: Modules) -> None:
+    """Also where it stops after its first step; one that goes on has no digit left to compare."""
+    b = batches(modules, "-x/7")
+    s = replace(b.instances[0], q=np.zeros(1), qd=np.array([SOON_LOST]), params=None)
+    alone = drive(b.model, "rk4", s, b.h, STEPS)
+    assert 0 < alone.done < STEPS and alone.status
+    whole = b.simulate("rk4", [s] * len(b.instances), None)
+    for steps in range(alone.done, 0, -1):  # rounding may decide a step that all but fails
+        whole.steps[0] = steps
+        whole.q[0, steps + 1 :] = whole.qd[0, steps + 1 :] = np.nan
+        assert not b.ends_otherwise("rk4", whole, 0, s)
+        whole.q[0, steps] *= 1.01
+        assert b.ends_otherwise("rk4", whole, 0, s)
+    whole = b.simulate("rk4", b.instances, None)
+    whole.q[0, STEPS] *= 1.01
+    assert not b.ends_otherwise("rk4", whole, 0, b.instances[0])
 
 
 def test_own_and_shared_parameters_are_compared_by_what_rounding_does(modules: Modules) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from eomc.scene.read import parse
 from eomc.verify import rows_plain
 from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT
+from eomc.verify.sampling import State
 
 QUARTIC = """eomc = 1
 name = "well_of_fourth"
@@ -79,6 +80,20 @@ def test_no_form_has_to_find_stages_that_nothing_finds_soon(modules: Modules) ->
     with pytest.raises(RuntimeError, match="24 steps of the fast form, 4 of plain"):
         compared(modules, "30.0", 5, text=linear)
     assert compared(modules, "30.0", 25, 1e-6, linear) > 1e4
+
+
+def test_steps_under_inputs_can_go_on_too() -> None:
+    """Inputs are held over a step, for each of its stages: (..., nu) beside q of (..., nq)."""
+
+    def acceleration(q: Any, qd: Any, t: Any, u: Any, params: Any) -> Any:
+        assert u.shape == (*q.shape[:-1], 1)
+        return -q + u
+
+    reference = SimpleNamespace(acceleration=acceleration)
+    of: Any = SimpleNamespace(reference=reference)
+    x, s = np.array([[0.3, -0.2], [0.1, 0.4]]), State(*np.zeros((2, 2)), u=np.array([0.5]))
+    for method in ("rk4", "gauss8", "gauss16"):
+        assert rows_plain._can_go_on(of, method, s, x, 0.01, 3)
 
 
 FRICTION = """eomc = 1

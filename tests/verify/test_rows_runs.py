@@ -14,9 +14,12 @@ from instrument import Shipped, in_a_fork
 from mutants import variant
 from stand_in import StandIn
 
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
 from eomc.verify import symbolic
 from eomc.verify.comparison import Comparison
-from eomc.verify.rows_runs import Runs
+from eomc.verify.rows_runs import TURNS, Runs
+from eomc.verify.sampling import State
 
 MADE = variant("pendulum_gauss16")
 STAGE = "x[k] = at[k][j];"
@@ -50,6 +53,33 @@ def test_a_step_that_is_refused_without_need_fails() -> None:
     module.simulate = lambda **how: SimpleNamespace(status="no convergence")
     comparison = Comparison(system, module, np.random.default_rng(0), 4)
     assert comparison.step_by("gauss16") == math.inf
+
+
+GEARS = """eomc = 1
+name = "gears"
+[coordinates]
+a = { start = 0.3 }
+b = { start = 0.1, guess = true }
+[energy]
+kinetic = "a_dot**2/2 + b_dot**2/3"
+potential = "cos(a)"
+[constraints]
+teeth = "a - 3*b"
+"""
+
+
+def test_angles_far_out_are_asked_where_gears_still_mesh() -> None:
+    """Of a - 3 b: three turns of a to one of b, off by no more than their last digits."""
+    system = from_scene(parse(GEARS, "gears.toml"))
+    module: Any = StandIn(symbolic.derive(system))
+    module._model = None
+    runs = Runs(Comparison(system, module, np.random.default_rng(0), 4))
+    turns = 2 * np.pi * np.round(TURNS / 2 / np.pi)
+    for by, holds in (((3, 1), True), ((-3, -1), True), ((1, 1), False), ((1, -1), False)):
+        assert runs.holds(State(np.array([0.3, 0.1]) + turns * np.array(by), np.zeros(2))) == holds
+    for off, holds in ((1e-8, True), (1e-3, False)):  # digits of 2.5e7 are of 4e-9
+        q = np.array([0.3, 0.1]) + turns * np.array([3, 1]) + [off, 0]
+        assert runs.holds(State(q, np.zeros(2))) == holds
 
 
 @pytest.mark.slow

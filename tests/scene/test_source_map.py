@@ -1,0 +1,25 @@
+"""Where a key stands, however deep it is written in its statement."""
+
+from __future__ import annotations
+
+import pytest
+
+from eomc.scene.source_map import SourceMap
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "coordinates = { x = { start = 1, strat = 2 } }",
+        "coordinates.x = { start = 1, strat = 2 }",
+        "coordinates.x.strat = 2",
+        "[coordinates]\nx = { start = 1, strat = 2 }",
+        "[coordinates]\nx.strat = 2",
+        "[coordinates.x]\nstart = 1\nstrat = 2",
+    ],
+)
+def test_a_key_of_a_coordinate_has_its_place(text: str) -> None:
+    found = SourceMap(text, "s.toml").problem(("coordinates", "x", "strat"), "unknown")
+    lines = text.split("\n")
+    assert found.line == len(lines) and found.source == lines[-1]
+    assert (found.column, found.width) == (lines[-1].index("strat"), len("strat"))
