@@ -43,6 +43,7 @@ VARIANTS: dict[str, tuple[str, str]] = {
     "four_bar": (
         "four_bar", "batch = true\ntolerance = 1e-9\nlinearize = true\ndiscretize = true\n",
     ),
+    "cartpole": ("cartpole", "batch = true\ntolerance = 1e-9\n"),
     "bouncer": ("bouncer", ""),
     "arm": ("arm", ""),
     "single": ("double_pendulum", 'real = "float"\nmethod = ["rk4", "gauss8"]\ntolerance = 1e-4\n'),
@@ -131,20 +132,28 @@ class Driver:
             if name in names:
                 value = BESIDE[name].format(nu=self.nu)
                 lines.append(f"const long {name} = {value};")
-        if batch:
+        many = f.name.endswith("_adaptive_batch")
+        if many:
+            lines.append("const long row_count = up_to(6);")
+        elif batch:
             lines[:] = [x.replace(BESIDE["first"], "up_to(9)") for x in lines]
             lines.append("const long row_count = (first + steps)/(every ? every : 1) + 2;")
         if "times" in names:
             lines.append("const int asked = byte() % 2;")
-            rows = "(asked ? count : 2*steps)"
+            rows = rows if many else "(asked ? count : 2*steps)"
         made = [self._value(f, a, rows, batch) for a in f.arguments]
         results = [
             (a, name) for a, (name, _) in zip(f.arguments, made, strict=True) if self._result(a)
         ]
         lines += [text for _, text in made if text]
+        row_count = "row_count" if many else "count"
+        if many:
+            lines.append(
+                "{ long i; for (i = 0; i < count; i++) a_memory[i].stiff = byte() % 5 == 0; }"
+            )
         if "times" in names:
             lines.append(
-                "{ REAL at = *a_t; long i; for (i = 0; a_times && i < count; i++) "
+                f"{{ REAL at = *a_t; long i; for (i = 0; a_times && i < {row_count}; i++) "
                 "a_times[i] = at += (REAL)ldexp(1.0, -(int)(byte() % 30)); }"
             )
         call = f"{f.name}({', '.join(name for name, _ in made)})"
@@ -178,7 +187,8 @@ class Driver:
                 fine += " && isfinite(before_t)"
             lines.append(f"if ({fine}) {{ {' '.join(self._kept(f, n, s) for n, s in before)} }}")
             return lines
-        return [f"(void){call};"]
+        again = [f"if (byte() % 2) (void){call};"] if f.name.endswith("_adaptive_batch") else []
+        return [f"(void){call};", *again]
 
     def _kept(self, f: Function, name: str, size: str) -> str:
         what = f'"{f.name}", "a run left what is not finite"'
@@ -206,14 +216,17 @@ class Driver:
             made = f"{self.n}_params *{own} = "
             default = "" if batch else f"byte() % 2 ? ({self.n}_params *)&{self.n}_defaults : "
             return own, f"{made}{default}parameters({count});"
+        if name == "memory" and batch:
+            made = f"space((size_t)(count + 1)*sizeof *{own})"
+            return own, f"{f.name.removesuffix('_batch')}_memory *{own} = {made};"
         if name == "memory":
             return own, f"{f.name.removesuffix('_run')}_memory *{own} = NULL;"
         if name == "status":
             kind = "int" if batch else f"{self.n}_status"
             count = "(size_t)count*" if batch else ""
             return own, f"{kind} *{own} = space({count}sizeof *{own});"
-        if name in ("done", "events"):
-            count = "count" if name == "done" else "1"
+        if name in ("done", "events", "kept"):
+            count = "1" if name == "events" else "count + 1"
             return own, f"long *{own} = space((size_t)({count})*sizeof *{own});"
         if name == "held":
             fill = f"for (i = 0; {own} && i < 2*{self.N}_NQ; i++) {own}[i] = (int)(byte() % 2);"
@@ -248,9 +261,11 @@ class Driver:
         if name in ("q", "qd"):  # of a batch
             return own, f"{R} *{own} = given(count*{self.N}_NQ);"
         if name == "t":
-            return own, f"{R} *{own} = given(1); const {R} before_t = *{own}; (void)before_t;"
+            count = "count + 1" if batch else "1"
+            made = f"{R} *{own} = given({count})"
+            return own, f"{made}; const {R} before_t = *{own}; (void)before_t;"
         if name == "times":
-            return own, f"{R} *{own} = asked ? given(count) : NULL;"
+            return own, f"{R} *{own} = asked ? given({'row_count' if batch else 'count'}) : NULL;"
         if name in ARRAYS:
             size = ARRAYS[name].format(rows=rows, N=self.N)
             return own, f"{R} *{own} = unwritten({size});"

@@ -265,7 +265,7 @@ def together(target: Target) -> bool:
 def alone(functions: Functions) -> str:
     """The call for instance k of a batch."""
     NQ = functions.NQ
-    rows = {f"{n}_rows": f"{n}_rows ? {n}_rows + {NQ}*row : 0" for n in ("q", "qd")}
+    rows = {f"{n}_rows": f"times ? {n}_rows + {NQ}*row : 0" for n in ("q", "qd")}
     return functions.public.adaptive(METHOD.name).call(
         q=f"q + {NQ}*k", qd=f"qd + {NQ}*k", t="t + k", u="u ? u + u_instance*k : 0",
         times="times ? times + kept[k] : 0", count="row_count - kept[k]", t_rows="0", **rows,
