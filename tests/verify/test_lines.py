@@ -172,7 +172,7 @@ def test_lines_that_are_not_executed_are_found(
     import instrument
 
     needs("gcov")
-    without = "check.compiled_rows = check.property_rows = lambda made: None\nreport = check.check"
+    without = "check.compiled_rows = check.property_rows = lambda *_: None\nreport = check.check"
     monkeypatch.setattr(
         instrument, "CHECK", instrument.CHECK.replace("report = check.check", without)
     )
