@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from typing import Any
 
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import Real
@@ -24,6 +25,7 @@ from eomc.scene.schema import LOOSEST
 METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
+ROUGHEST = 2 * 0.8**-8  # of the root of tol/2: a step that is refused after two sweeps
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
 SMALL = 150  # operations of accelerations, up to which many instances go side by side
@@ -139,33 +141,41 @@ class Stepping:
         )
 
 
+def tableau(made: Stepping) -> dict[str, Any]:
+    """The numbers that both texts of adaptive steps have, by the names of their views."""
+    m, target = METHOD, made.functions.target
+    real = target.real
+    return {
+        **made.functions.names,
+        "method": made.method,
+        "extent": made.form.extent,
+        "stages": m.stages,
+        "f": real.suffix,
+        "fabs": f"fabs{real.function_suffix}",
+        "sqrt": f"sqrt{real.function_suffix}",
+        "eps": target.literal(real.epsilon),
+        "tiny": target.literal(1e-30),
+        "most": MOST,
+        "c": numbers(m.c, real),
+        "b": numbers(rounded(m.b, real), real),
+        "bA": numbers(m.b_a, real),
+        "powers": matrix(list(zip(*m.powers, strict=True)), real),
+        "top": c.in_braces(numbers(m.legendre(n), real) for n in range(m.stages - 4, m.stages)),
+        "anew": ANEW,
+    }
+
+
 def steps(made: Stepping) -> Adaptive:
     """A step, and the state within it."""
     functions, m, form = made.functions, METHOD, made.form
     target, real = functions.target, functions.target.real
-    end = real.function_suffix
     known = {"a": "&a", "rough": "&rough", "sweeps": "&sweeps", "m": "newton ? &m : 0"}
     eigenvalues, to_parts, from_parts = m.eigen
     return Adaptive(
-        prefix=functions.prefix,
-        PREFIX=functions.PREFIX,
-        real=functions.real,
+        **tableau(made),
         title=TITLE,
-        method=made.method,
-        extent=form.extent,
-        stages=m.stages,
-        f=real.suffix,
-        fabs=f"fabs{end}",
-        sqrt=f"sqrt{end}",
-        eps=target.literal(real.epsilon),
-        tiny=target.literal(1e-30),
-        most=MOST,
-        c=numbers(m.c, real),
-        b=numbers(rounded(m.b, real), real),
-        bA=numbers(m.b_a, real),
         lanes=form.lanes and f"{form.lanes} ",
         total=_total([f"x[{i}]" for i in range(m.stages)]),
-        powers=matrix(list(zip(*m.powers, strict=True)), real),
         last=numbers(m.legendre(m.stages - 1), real),
         before=numbers(m.legendre(m.stages - 2), real),
         timed=target.driven,
@@ -176,12 +186,11 @@ def steps(made: Stepping) -> Adaptive:
         sweep=form.sweep,
         step=made.step,
         start=form.start,
-        settled=made.settle.call(most=f"{target.literal(2 * 0.8**-8)}*aim", **known),
+        settled=made.settle.call(most=f"{target.literal(ROUGHEST)}*aim", **known),
         within=made.within,
         corners=steep(target.system),
         close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
         share=target.literal(SHARE),
-        top=c.in_braces(numbers(m.legendre(n), real) for n in range(m.stages - 4, m.stages)),
         ends=c.in_braces(numbers(row, real) for row in _ends()),
         forces=made.forces,
         forces_here=made.forces.call(f="here", q="at_q", qd="at_qd"),
@@ -192,7 +201,6 @@ def steps(made: Stepping) -> Adaptive:
         eigenvalues=c.in_braces(numbers(row, real) for row in eigenvalues),
         to_parts=c.in_braces(numbers(row, real) for row in to_parts),
         from_parts=c.in_braces(numbers(row, real) for row in from_parts),
-        anew=ANEW,
         forces_there=made.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
         settled_within=made.settle.call(most=target.literal(1e30), **known),
     )
@@ -255,7 +263,7 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
 def together(target: Target) -> bool:
     """Whether the fast form has the steps of many side by side: of small systems without corners.
 
-    Large ones have enough to do in one sweep (docs/tricks.md has the measurement).
+    Large ones have enough to do in one sweep: docs/tricks.md has chains.
     """
     s = target.system
     plain = not (s.events or s.constraints or steep(s))

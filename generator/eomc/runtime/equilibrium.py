@@ -23,14 +23,9 @@ _SHORTEST = 2.0**-20  # part of a step that is tried
 
 
 def equilibrium(
-    model: Constrained,
-    q: Array,
-    qd: Array,
-    u: Array | None,
-    free: Collection[str],
-    t: float,
+    model: Constrained, q: Array, qd: Array, u: Array | None, free: Collection[str], t: float,
     params: Any,
-) -> tuple[Array, Array | None]:
+) -> tuple[Array, Array | None]:  # fmt: skip
     """(q, u) near a guess where tau + A^T lambda = C qd + g, what is not `free` as it was.
 
     Forces, not accelerations: D couples these, and may be singular. Their slopes are differences,

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
+from eomc.emit.plain.adaptive_views import Tableau
 from eomc.emit.plain.parts import (
     Computed,
     Named,
@@ -392,35 +393,20 @@ class Batch(Named):
 
 
 @dataclass(frozen=True)
-class AdaptiveLanes(Named):
+class AdaptiveLanes(Tableau):
     """c/fast/adaptive_lanes.c.jinja: adaptive steps of many instances side by side.
 
-    As Adaptive has them: the tableau, powers, top, most, anew. roughest: of the root of tol/2, what
-    refuses a step after two sweeps. accelerate: of each at a stage; forces: of one at its start;
-    alone: the call for one; kept, look: the calls that write a row, at the end of a step or in it.
+    roughest: of the root of tol/2, what refuses a step after two sweeps. accelerate: of each at a
+    stage; forces: of one at its start; alone: the call for one; kept, look: the calls that write a
+    row, at the end of a step or in it.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/adaptive_lanes.c"
-    method: str
-    extent: str
     inline: str
     noinline: str
-    stages: int
-    f: str
-    fabs: str
-    sqrt: str
-    eps: str
-    tiny: str
-    most: int
-    anew: int
     roughest: str
     loosest: str
     tightest: str
-    c: tuple[str, ...]
-    b: tuple[str, ...]
-    bA: tuple[str, ...]
-    powers: tuple[str, ...]
-    top: tuple[str, ...]
     inputs: bool
     constants: bool
     members: tuple[str, ...]

@@ -10,25 +10,14 @@ from eomc.emit.plain.parts import Named
 
 
 @dataclass(frozen=True)
-class Adaptive:
-    """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
+class Tableau(Named):
+    """The numbers that both texts of adaptive steps have.
 
-    method: what its C names begin with. total: the sum of x[0], ... over the stages. powers, last,
-    before: from accelerations at the stages, one a row, to their polynomial's powers, and to its
-    parts in the last two of Legendre's. most: sweeps of a step. lanes: before loops over stages.
-    project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
-    corners: whether forces jump or bend; share: of the tolerance, for a step in which they do;
-    top, ends: from accelerations at the stages to the parts in the last four of Legendre's, and to
-    the ends of the polynomial through them; forces: the accelerations at a state; slopes: their
-    derivatives, by differences over `nudge`. eigenvalues, to_parts, from_parts: of A, as
-    Method.eigen has them; anew: steps by Newton's method, before sweeps alone are tried again.
+    method: what C names begin with. powers: from accelerations at the stages, one a row, to their
+    polynomial's powers; top: to their parts in the last four of Legendre's. most: sweeps of a step;
+    anew: steps by Newton's method, before sweeps alone are tried again.
     """
 
-    TEMPLATE: ClassVar[str] = "c/adaptive.c"
-    prefix: str
-    PREFIX: str
-    real: str
-    title: str
     method: str
     extent: str
     stages: int
@@ -41,9 +30,28 @@ class Adaptive:
     c: tuple[str, ...]
     b: tuple[str, ...]
     bA: tuple[str, ...]
+    powers: tuple[str, ...]
+    top: tuple[str, ...]
+    anew: int
+
+
+@dataclass(frozen=True)
+class Adaptive(Tableau):
+    """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
+
+    total: the sum of x[0], ... over the stages. last, before: from accelerations at the stages to
+    their polynomial's parts in the last two of Legendre's. lanes: before loops over stages.
+    project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
+    corners: whether forces jump or bend; share: of the tolerance, for a step in which they do;
+    ends: from accelerations at the stages to the ends of the polynomial through them; forces: the
+    accelerations at a state; slopes: their derivatives, by differences over `nudge`. eigenvalues,
+    to_parts, from_parts: of A, as Method.eigen has them.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/adaptive.c"
+    title: str
     lanes: str
     total: str
-    powers: tuple[str, ...]
     last: tuple[str, ...]
     before: tuple[str, ...]
     timed: bool
@@ -60,7 +68,6 @@ class Adaptive:
     corners: bool
     close: str
     share: str
-    top: tuple[str, ...]
     ends: tuple[str, ...]
     forces: CFunction
     forces_there: str
@@ -72,7 +79,6 @@ class Adaptive:
     eigenvalues: tuple[str, ...]
     to_parts: tuple[str, ...]
     from_parts: tuple[str, ...]
-    anew: int
 
 
 @dataclass(frozen=True)
