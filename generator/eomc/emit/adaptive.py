@@ -28,7 +28,7 @@ MOST = 14  # sweeps of a step
 ROUGHEST = 2 * 0.8**-8  # of the root of tol/2: a step that is refused after two sweeps
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
-SMALL = 150  # operations of accelerations, up to which many instances go side by side
+SMALL = 300  # operations of accelerations, up to which many instances go side by side
 BUSY = 32  # events in one step, without those that happen at once
 
 
@@ -263,7 +263,7 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
 def together(target: Target) -> bool:
     """Whether the fast form has the steps of many side by side: of small systems without corners.
 
-    Large ones have enough to do in one sweep: docs/tricks.md has chains.
+    Large ones have enough to do in one sweep.
     """
     s = target.system
     plain = not (s.events or s.constraints or steep(s))
