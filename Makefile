@@ -8,6 +8,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# Python compiles what it imports; to compile all there is takes as long as to install it
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile
 # a half of the tests each, in their order: neighbours share what they derive and compile
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 DEMO := scenes/cartpole.toml scenes/cartpole_driven.toml scenes/cartpole_tutorial.toml
@@ -32,10 +34,10 @@ demo: .venv/demo
 	@echo "the command:         $(BIN)/eomc --help"
 
 wheel: .venv/bin/python
-	@$(BIN)/python -m pip install --quiet "hatchling>=1.26"
+	@$(INSTALL) "hatchling>=1.26"
 	@$(BIN)/python -m hatchling build -d dist
 
-test: .venv/dev
+test: .venv/test
 	$(PYTEST) -m "not slow"
 
 test-all: .venv/robots .venv/hostile build/katex/done build/axe/done
@@ -50,7 +52,7 @@ fuzz: .venv/hostile
 	$(BIN)/python tests/hostile/readers.py $$t --seconds 600 --seed 0 2>&1 | grep -v "^INFO\|^WARNING"; \
 	done; done
 
-endurance: .venv/dev
+endurance: .venv/test
 	$(BIN)/python tests/hostile/endurance.py --minutes 15
 
 lint: .venv/dev
@@ -58,7 +60,7 @@ lint: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p eomc --cache-dir build/mypy
 
-golden: .venv/dev
+golden: .venv/test
 	$(BIN)/python tests/c/test_golden.py --accept
 	$(BIN)/python tests/scene/test_bad_scenes.py
 	PYTHONPATH=tests $(BIN)/python tests/report/test_drawing.py
@@ -92,7 +94,7 @@ build/bench/done: pyproject.toml benchmarks/requirements.txt
 
 # what fuzzes; there are wheels for Linux and some Pythons alone
 .venv/hostile: .venv/dev
-	-$(BIN)/python -m pip install --quiet --only-binary :all: --editable ".[hostile]"
+	-$(INSTALL) --only-binary :all: --editable ".[hostile]"
 	@touch $@
 
 clean:
@@ -100,18 +102,22 @@ clean:
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(INSTALL) --upgrade pip
 
 .venv/demo: pyproject.toml .venv/bin/python
-	$(BIN)/python -m pip install --quiet --editable ".[plot]"
+	$(INSTALL) --editable ".[plot]"
 	@touch $@
 
-.venv/dev: pyproject.toml .venv/bin/python
-	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+.venv/test: pyproject.toml .venv/bin/python
+	$(INSTALL) --editable ".[test]"
 	@touch $@ .venv/demo
+
+.venv/dev: pyproject.toml .venv/bin/python
+	$(INSTALL) --editable ".[dev]"
+	@touch $@ .venv/test .venv/demo
 
 # half a gigabyte of robots, the simulator that they are held against, compilers for other machines,
 # importers of units of FMI
 .venv/robots: .venv/dev
-	$(BIN)/python -m pip install --quiet --editable ".[robots,cross,fmu]"
+	$(INSTALL) --editable ".[robots,cross,fmu]"
 	@touch $@

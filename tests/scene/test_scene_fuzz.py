@@ -4,6 +4,7 @@ import codecs
 import re
 import sys
 import warnings
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -128,12 +129,15 @@ def _audit(event, args):
         watch.append(f"{event} {args}")
 
 
-sys.addaudithook(_audit)
+@cache
+def _hooked():
+    sys.addaudithook(_audit)  # for good: it would slow the tests of other files as well
 
 
 def harmless(text):
     """Read `text`: a scene or an error in words, and nothing is run or opened."""
     global watch
+    _hooked()
     watch = []
     try:
         with warnings.catch_warnings():
