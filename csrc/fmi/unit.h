@@ -472,6 +472,8 @@ static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t un
                 a, unitRefused, "derivatives are along coordinates, velocities and inputs only");
     }
     status = unitLinearize(Aq, Aqd, B, x->q, x->qd, t, u, &x->p);
+    if (!status)
+        status = unitOutputSlopes(slopes, x->q, x->qd, t, u, &x->p);
     if (status)
         return unitFailed(a, status);
     for (int i = 0; i < unitNQ; i++) {
@@ -484,7 +486,6 @@ static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t un
             sum += (double)B[unitNU*i + j]*along[unitNX + j];
         rates[i] = sum;
     }
-    unitOutputSlopes(slopes, x->q, x->qd, t, u, &x->p);
     for (size_t k = 0; k < unknownCount; k++) {
         const long r = (long)unknowns[k];
         double sum = 0;

@@ -150,13 +150,17 @@ def _overrides(
     values: dict[str, float] = {}
     for name, value in pairs(parameters, "--set", module.defaults):
         if name not in module.defaults:
-            raise EomcError(f"--set: '{name}' is not a parameter{suggest(name, module.defaults)}")
+            remedy = suggest(name, module.defaults)
+            if name in module.coordinates:
+                remedy = f", but a coordinate: --start {name}={value:g}"
+            raise EomcError(f"--set: '{name}' is not a parameter{remedy}")
         values[name] = value
     q0, qd0 = module.start
     if values:  # the start may be a formula in the parameters
         from eomc.scene import read as scenes
 
-        q0[:], qd0[:] = scenes.read(scene, values).start()  # and may be bad for a body
+        for whole, own in zip((q0, qd0), scenes.read(scene, values).start(), strict=True):
+            whole[: len(own)] = own  # and may be bad for a body; behind them is what jumps set
     states = {name: (q0, k) for k, name in enumerate(module.coordinates)}
     states |= {f"{name}_dot": (qd0, k) for k, name in enumerate(module.coordinates)}
     for name, value in pairs(start, "--start", {**module.defaults, **values}):

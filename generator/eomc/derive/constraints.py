@@ -57,7 +57,7 @@ def constraints(system: System, e: Energies) -> Constraints | None:
     if not system.constraints:
         return None
     tape, q, qd = e.tape, system.q, system.qd
-    along = {**dict(zip(q, qd, strict=True)), t: S.One}
+    along = {**system.rates, t: S.One}
     count = sum(c.holonomic for c in system.constraints)
     phi, psi = e.rows[:count], e.rows[count:]
     rates = [*tape.forward(phi, along), *psi]

@@ -46,8 +46,8 @@ def on_tape(
 ) -> Energies:
     """K and P, with the system's dissipation, forces and signals, and what they are made of."""
     more = system.qdd if accelerations else directions(system).values()
-    tape = Tape(leaves(system, *more))
-    rates: dict[Symbol, Expr] = {**dict(zip(system.q, system.qd, strict=True)), t: S.One}
+    tape = Tape(leaves(system, *more), frozenset(system.q) - system.rates.keys())
+    rates: dict[Symbol, Expr] = {**system.rates, t: S.One}
     known: dict[Symbol, Expr] = {}
     points: dict[Symbol, Expr] = {}
 

@@ -101,7 +101,8 @@ class Sweep(Links):
         self.system, self.plane, self.frames = system, system.plane, frames
         self.d, self.width = (2, 3) if system.plane else (3, 6)
         self.along: Mapping[Symbol, Expr] = {
-            **dict(zip((*system.q, *system.qd), (*system.qd, *system.qdd), strict=True)),
+            **system.rates,
+            **dict(zip(system.qd, system.qdd, strict=True)),
             t: S.One,
         }
         self.joint_accelerations = self.by_link(

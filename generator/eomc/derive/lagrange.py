@@ -223,8 +223,7 @@ def _momenta(
     system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
 ) -> tuple[list[Expr], list[Expr]]:
     """dF/dqd and dF/dw, and their rates; velocities without an acceleration are steady."""
-    along = dict(zip(system.q, system.qd, strict=True))
-    rates: dict[Symbol, Expr] = {**along, t: S.One, **accelerations}
+    rates: dict[Symbol, Expr] = {**system.rates, t: S.One, **accelerations}
     wanted = [*system.qd, *e.points]
     momenta = e.tape.gradient([(e.kinetic, S.One)], wanted, frozenset(e.points))
     return momenta, e.tape.forward(momenta, rates)

@@ -79,6 +79,8 @@ def solution(system: System) -> Solution:
         raise UnsuitedError(f"{len(speeds)} velocities in K, more than {most}")
     if system.applied:
         raise UnsuitedError("forces at points")
+    if system.discrete:
+        raise UnsuitedError("parameters that jumps set")
     return _Links(system, on_tape(system, system.kinetic, system.potential)).solution()
 
 
@@ -199,7 +201,7 @@ class _Links(Vectors):
 
     def _group(self, direction: tuple[Expr, ...], found: Mapping[int, Expr]) -> Group:
         tape, system, slopes = self.tape, self.system, tuple(found.values())
-        rates = {**dict(zip(system.q, system.qd, strict=True)), t: S.One}
+        rates = {**system.rates, t: S.One}
         speeds = tape.forward([self.increments[a] for a in found], rates)
         beta = tuple(tape.forward(speeds, rates))
         return Group(direction, tuple(found), slopes, beta, self._across(slopes))

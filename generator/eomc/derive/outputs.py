@@ -54,7 +54,7 @@ def signal_slopes(system: System) -> Outputs:
 
 def _outputs(system: System, sloped: bool, tape: Tape, known: dict[Symbol, Expr]) -> Outputs:
     state = (*system.q, *system.qd)
-    rates = {**dict(zip(state, (*system.qd, *system.qdd), strict=True)), t: S.One}
+    rates = {**system.rates, **dict(zip(system.qd, system.qdd, strict=True)), t: S.One}
 
     def value(expr: Expr) -> Expr:
         """The expression's atom; dot(...) by the chain rule, from the innermost."""

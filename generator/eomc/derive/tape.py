@@ -46,8 +46,8 @@ class Tape:
     of names; one function of atoms.
     """
 
-    def __init__(self, leaves: Mapping[Symbol, Stage]) -> None:
-        self.leaves = dict(leaves)
+    def __init__(self, leaves: Mapping[Symbol, Stage], still: Set[Symbol] = frozenset()) -> None:
+        self.leaves, self.still = dict(leaves), still  # along these every gradient is 0
         self.stage: dict[Symbol, Stage] = dict(leaves)
         self.hint: dict[Symbol, str] = {}
         self.parts: dict[Symbol, tuple[Symbol, ...]] = {}  # names in each right-hand side
@@ -430,9 +430,11 @@ class Tape:
                 continue
             adjoint = self.total(terms[symbol])
             for part in self.parts[symbol]:
+                if part in self.still:
+                    continue
                 slope = self.partial(symbol, part)
                 terms.setdefault(part, []).append(self.times(slope, adjoint))
-        return [self.total(terms.get(symbol, ())) for symbol in wrt]
+        return [self.total(() if x in self.still else terms.get(x, ())) for x in wrt]
 
     def substitute(self, outputs: Sequence[Expr], values: Mapping[Symbol, Expr]) -> list[Expr]:
         """The outputs with `values` in place of leaves."""

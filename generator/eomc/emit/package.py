@@ -231,6 +231,7 @@ def face(target: Target, extension: str) -> Face:
         holonomic=sum(c.holonomic for c in s.constraints),
         redundant=tuple(k for k, c in enumerate(s.constraints) if c.redundant),
         modes=tuple((m.at, m.of) for m in s.modes),
+        discrete=len(s.discrete),
         reactions=tuple(r.name for r in s.reactions),
         timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
         batch=s.run.batch,

@@ -225,6 +225,7 @@ class Face:
     holonomic: int
     redundant: tuple[int, ...]
     modes: tuple[tuple[int, int], ...]
+    discrete: int
     reactions: tuple[str, ...]
     timed: tuple[str, ...]
     batch: bool

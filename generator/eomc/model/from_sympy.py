@@ -166,7 +166,7 @@ class Maker:
             "inputs": tuple(self._inputs(pending, given_inputs, units, ends)),
             "definitions": tuple(ordered),
             **self._constraints(rows, made, ordered, given_inputs.values(), units),
-            "events": tuple(self._events(events, starts)),
+            "events": tuple(self._events(events, starts, declared)),
             "outputs": tuple(self._outputs(outputs, starts, made, units, [*map(str, rows)])),
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
@@ -295,7 +295,9 @@ class Maker:
             found[name] = (least, most)
         return found
 
-    def _events(self, events: Any, starts: Iterable[Any]) -> Iterator[Event]:
+    def _events(
+        self, events: Any, starts: Iterable[Any], parameters: Iterable[Parameter]
+    ) -> Iterator[Event]:
         """The events, each a formula or a dict as [[event]] has it."""
         if not isinstance(events, Mapping):
             raise given.fault("events", f'give a dict, such as {{"impact": y}}, here {events!r}')
@@ -305,6 +307,7 @@ class Maker:
             rate = one.diff() if isinstance(one, AppliedUndef) else f"{one}_dot"
             state |= {str(one): name, given.name_of(one): name}
             state |= {str(rate): f"{name}_dot", f"{given.name_of(one)}_dot": f"{name}_dot"}
+        state |= {given.name_of(self.taken[p.name]): p.name for p in parameters}
         for name, entry in events.items():
             role = f"event {name}"
             if not isinstance(name, (str, Symbol)):
@@ -324,7 +327,7 @@ class Maker:
                 if word not in known:
                     raise given.fault(role, f"{key} is one of {', '.join(known)}, here {word!r}")
             if strange := [key for key in table if key not in state]:
-                why = f"{strange[0]} is no coordinate or velocity, which a jump sets"
+                why = f"{strange[0]} is no coordinate, velocity or parameter, which a jump sets"
                 raise given.fault(role, why)
             if (action == "jump") != bool(table):
                 remedy = 'add "action": "jump" where something is set, and only there'

@@ -148,11 +148,11 @@ def beside(system: System, core: System) -> System:
         for m in system.modes
     ]
     own = system.constraints[len(core.constraints) :]
-    found = core.closure or Closure((), len(core.coordinates), 0)
+    found = core.closure or Closure((), len(core.rates), 0)
     closure = replace(
         found,
         rows=(*found.rows, *(row.name for row in own)),
-        coordinates=len(system.coordinates),
+        coordinates=found.coordinates + len(modes),
         rank=found.rank + len(own),
         weights=(*found.weights, *[0.0] * len(own)) if found.weights else (),
         slopes=(*found.slopes, *[0.0] * len(own)),

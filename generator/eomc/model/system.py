@@ -16,6 +16,7 @@ from sympy import Expr, Symbol
 from eomc.base.errors import Problem, SceneError
 from eomc.model import from_sympy, given
 from eomc.model.closure import Closure
+from eomc.model.discrete import discrete
 from eomc.model.limits import within
 from eomc.model.sticking import sticking
 from eomc.model.symbols import (
@@ -65,7 +66,8 @@ class System:
     made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
     was read from, where it was. `pictured`: where it was made in Python with a picture, a scene of
     its names and that alone. `closure`: what its constraints leave, once its start is assembled.
-    `modes`: of friction that sticks, the last coordinates.
+    `modes`: of friction that sticks, the last coordinates. `discrete`: coordinates before them that
+    jumps alone change, which no derivative is taken along.
     """
 
     name: str
@@ -97,6 +99,7 @@ class System:
     pictured: Scene | None = field(default=None, compare=False, repr=False)
     closure: Closure | None = field(default=None, compare=False, repr=False)
     modes: tuple[Mode, ...] = ()
+    discrete: tuple[str, ...] = ()
 
     @property
     def q(self) -> tuple[Symbol, ...]:
@@ -112,6 +115,11 @@ class System:
     def qdd(self) -> tuple[Symbol, ...]:
         """The accelerations' symbols, in scene order."""
         return tuple(c.qdd for c in self.coordinates)
+
+    @property
+    def rates(self) -> dict[Symbol, Symbol]:
+        """The velocities of all that moves between events, by their coordinates."""
+        return {c.q: c.qd for c in self.coordinates if c.name not in self.discrete}
 
     def problem(self, key: str, message: str, severity: str = "error") -> Problem:
         """A problem at a key such as `energy.kinetic`, with its line where there is a scene."""
@@ -216,7 +224,7 @@ class System:
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
-        return sticking(within(system), maker.frictions)
+        return sticking(discrete(within(system)), maker.frictions)
 
     def beyond_float(self) -> list[Problem]:
         """Faults of numbers that a system in single precision can't have."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from eomc.base.errors import Problem, SceneError
 from eomc.base.texts import listed
-from eomc.model import loops, sticking
+from eomc.model import discrete, loops, sticking
 from eomc.model.closure import Closure, Move
 from eomc.model.system import System
 from eomc.program import contradictions
@@ -50,6 +50,10 @@ def assembled(system: System) -> System:
         return system
     if system.modes:
         made = sticking.beside(system, assembled(sticking.without(system)))
+        assert made.closure is not None
+        return replace(made, closure=replace(made.closure, made_for=_made_for(made)))
+    if system.discrete:
+        made = discrete.beside(system, assembled(discrete.constant(system)))
         assert made.closure is not None
         return replace(made, closure=replace(made.closure, made_for=_made_for(made)))
     manifold = Manifold(system)

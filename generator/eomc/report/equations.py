@@ -10,6 +10,7 @@ from sympy import Expr, ImmutableMatrix
 
 from eomc import pipeline
 from eomc.base.errors import EomcError
+from eomc.model.discrete import constant
 from eomc.model.system import System, symbol
 from eomc.pipeline import ScenePath
 from eomc.report import abbreviations, equations_text, large_system
@@ -106,6 +107,7 @@ def equations(scene: System | ScenePath) -> Equations:
 
 def of(system: System) -> Equations:
     """The equations of a system, simplified. Raises EomcError where they would fill many pages."""
+    system = constant(system)
     if not symbolic.is_small(system, EXPANDED):
         raise too_long(system)
     plain = symbolic.derive(symbolic.written_out(system))
@@ -151,6 +153,7 @@ def written(system: System, form: str = "text") -> str:
     except EomcError:
         if form == "python":
             raise
+        system = constant(system)
         return large_system.latex(system) if form == "latex" else large_system.text(system)
     forms = {"text": equations_text.text, "latex": equations_text.latex}
     return forms.get(form, equations_text.python)(found)

@@ -38,6 +38,7 @@ from eomc.emit.plain import steppers as plain
 from eomc.emit.render import show
 from eomc.emit.views import Quad
 from eomc.model.corners import corners
+from eomc.model.discrete import constant
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
@@ -317,7 +318,8 @@ class _Plain:
     """The reference's D, bias, tau, constraints and signals with mpmath numbers."""
 
     def __init__(self, system: System) -> None:
-        r = symbolic.derive(system)
+        core = constant(system)
+        r = symbolic.derive(core)
         symbols = (*system.q, *system.qd, time_symbol, *system.u)
         symbols += tuple(p.symbol for p in system.parameters)
         rows = [k for k, c in enumerate(system.constraints) if not c.redundant]
@@ -326,7 +328,9 @@ class _Plain:
         whole = sympy.BlockMatrix([[r.D, -A[rows, :].T], [A[rows, :], sympy.zeros(len(rows))]])
         matrix = whole.as_explicit() if rows else r.D
         parts = [*matrix, *(r.tau - r.bias), *(-gamma[k] for k in rows)]
-        self.size = len(system.coordinates) + len(rows)
+        self.size = len(core.coordinates) + len(rows)
+        names = [c.name for c in system.coordinates]
+        self.own = [names.index(c.name) for c in core.coordinates]
         # Floats are the doubles that they are
         exact = [e.xreplace({f: sympy.Rational(f) for f in e.atoms(sympy.Float)}) for e in parts]
         self.n, self.m = len(system.coordinates), len(system.inputs)
@@ -342,7 +346,10 @@ class _Plain:
         v = self.values(*q, *qd, t, *u, *self.parameters)
         n = self.size
         matrix = mpmath.matrix([v[i * n : (i + 1) * n] for i in range(n)])
-        return list(mpmath.lu_solve(matrix, mpmath.matrix(v[n * n :])))[: self.n]
+        found, whole = mpmath.lu_solve(matrix, mpmath.matrix(v[n * n :])), [mpmath.mpf(0)] * self.n
+        for i, k in enumerate(self.own):
+            whole[k] = found[i]
+        return whole
 
     def over(self, x: list[Any], t: Any, span: Any, deadline: float) -> list[Any] | None:
         """The state after `span`, by extrapolated midpoint steps; None where time is up."""

@@ -214,6 +214,8 @@ class Arguments:
         if isinstance(params, Mapping):
             given = self.Params()
             for name, value in params.items():
+                if name in self.coordinates:
+                    raise ValueError(f"params: '{name}' is a coordinate: give it in q0")
                 given._set(name, value)
             return np.asarray(given._array)
         unmasked(params, "params")

@@ -318,8 +318,8 @@ class BatchModel(Model):
         when they start, on the constraints.
         """
         start = self._start
-        q = self._rows_of(start[0] if q0 is None else self._with_modes(q0), "q0")
-        qd = self._rows_of(start[1] if qd0 is None else self._with_modes(qd0), "qd0")
+        q = self._rows_of(start[0] if q0 is None else self._completed(q0, 0), "q0")
+        qd = self._rows_of(start[1] if qd0 is None else self._completed(qd0, 1), "qd0")
         table = self._parameter_rows(params)
         held = self._input_rows(u, steps)
         sizes = {

@@ -28,7 +28,8 @@ class Rows(NamedTuple):
 
     holonomic: how many of the constraints are; they come first. redundant: which of them were left
     out, as the others imply them. modes: of friction that sticks, places of the modes among the
-    coordinates, the last of these, and of what slides.
+    coordinates, the last of these, and of what slides. discrete: how many parameters that jumps set
+    are coordinates, before the modes.
     """
 
     names: tuple[str, ...] = ()
@@ -37,6 +38,7 @@ class Rows(NamedTuple):
     holonomic: int = 0
     redundant: tuple[int, ...] = ()
     modes: tuple[tuple[int, int], ...] = ()
+    discrete: int = 0
 
 
 class Constrained(Frames):
@@ -268,19 +270,20 @@ class Constrained(Frames):
 
     def _assembled(self, q0: Any, qd0: Any, t0: float, params: Any) -> tuple[Any, Any]:
         """A start on the constraints: what the scene holds stays as it is given, the rest moves."""
+        q0, qd0 = self._completed(q0, 0), self._completed(qd0, 1)
         if not self._rows.names or (q0 is None and qd0 is None and params is None and t0 == 0):
             return q0, qd0
         q, qd = self._start
-        given = (q if q0 is None else q0, qd if qd0 is None else qd0)
-        q, qd = self._in_modes(*map(self._with_modes, given))
+        q, qd = self._in_modes(q if q0 is None else q0, qd if qd0 is None else qd0)
         return self._projected(q, qd, t0, params, self._rows.held)
 
-    def _with_modes(self, x: Any) -> Any:
-        """q or qd, with the modes of friction where it was given without them."""
-        modes = len(self._rows.modes)
-        if not modes or np.shape(x)[-1:] != (self.nq - modes,):
+    def _completed(self, x: Any, half: int) -> Any:
+        """q or qd, half 0 or 1, where it was given without what jumps set: as the scene has it."""
+        more = len(self._rows.modes) + self._rows.discrete
+        if not more or np.shape(x)[-1:] != (self.nq - more,):
             return x
-        return np.concatenate([x, np.zeros((*np.shape(x)[:-1], modes))], axis=-1)
+        shape = (*np.shape(x)[:-1], more)
+        return np.concatenate([x, np.broadcast_to(self._start[half][-more:], shape)], axis=-1)
 
     def _in_modes(self, q: Any, qd: Any) -> tuple[Any, Any]:
         """A start whose modes are what its velocities say; one that is rounding is 0."""

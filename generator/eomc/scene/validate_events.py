@@ -10,10 +10,8 @@ from eomc.scene.scene import Event
 from eomc.scene.schema import Document, EventTable
 from eomc.scene.scope import Checker
 
-MODE = (
-    ", and does not change in a run: what events change is a coordinate of its own, with "
-    "{name}_dot**2/2 in the kinetic energy"
-)
+FACTOR = ": write '{name}*on' where it acts, with a parameter on = 1, and set that to 0"
+FIXED = ", and does not change in a run: make it a parameter"
 
 
 def events(check: Checker, doc: Document) -> Iterator[Event]:
@@ -40,17 +38,20 @@ def events(check: Checker, doc: Document) -> Iterator[Event]:
 def _jump(
     check: Checker, doc: Document, k: str, entry: EventTable
 ) -> Iterator[tuple[str, Formula]]:
-    """What coordinates and velocities are after a jump."""
+    """What coordinates, velocities and parameters are after a jump."""
     state = [name for c in doc.coordinates for name in (c, f"{c}_dot")]
+    state += doc.parameters
     given = entry.model_extra or {}
     for name, value in given.items():
         path = ("event", k, name)
         if name not in state:
             remedy = suggest(name, [*state, *EventTable.model_fields])
-            if name in {**doc.parameters, **doc.inputs, **doc.constants}:
-                remedy = MODE.format(name=name)
+            if name in doc.inputs:
+                remedy = FACTOR.format(name=name)
+            elif name in doc.constants:
+                remedy = FIXED
             remedy = remedy or f": a jump sets {', '.join(state[:9])}"
-            check.say(path, f"'{name}' is no coordinate or velocity{remedy}")
+            check.say(path, f"'{name}' is no coordinate, velocity or parameter{remedy}")
         elif isinstance(value, bool) or not isinstance(value, (int, float, str)):
             check.say(path, "must be a number or a formula in quotes")
         elif formula := check.formula(path, float(value) if isinstance(value, int) else value):

@@ -81,7 +81,8 @@ class Bodies:
         for width in WIDTHS:
             with np.errstate(all="ignore"):
                 key = id(e), width
-                line = self.lines.get(key) or Line(self.scene, s, width / rate, slides=slides)
+                told = self.check.sampler.told(s)
+                line = self.lines.get(key) or Line(self.scene, told, width / rate, slides=slides)
                 ours = self.lines.setdefault(key, line).value(name)
             if not math.isnan(ours):
                 found.append(abs(value - ours) / (size or 1.0))

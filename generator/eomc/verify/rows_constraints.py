@@ -88,6 +88,7 @@ class Rows:
         The best of some widths counts: no width makes a wrong A right.
         """
         of, spread = self.of, self.of.sampler.spread
+        moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
 
         def error(e: Expected) -> float:
             s = e.state
@@ -98,7 +99,7 @@ class Rows:
 
             def off(width: float) -> float:
                 found = np.zeros_like(A)
-                for i in range(len(s.q)):
+                for i in moving:
                     step = width * spread[i]
                     for field, rows in (("q", self.holonomic), ("qd", ~self.holonomic)):
                         if np.any(rows):
@@ -183,7 +184,7 @@ class Rows:
             qd = np.zeros(len(s.q))
             qd[j] = rate
             with np.errstate(all="ignore"):
-                line = Line(scene, replace(s, qd=qd), width)
+                line = Line(scene, self.of.sampler.told(replace(s, qd=qd)), width)
                 m, second = line.middle, line.frames[loop.bodies[1]]
                 point = line.vector(loop.points[1]) if loop.points else np.zeros(3)
                 at = second.point(point)[m]

@@ -84,7 +84,7 @@ class _Frames:
         rate = float(np.max(np.abs(s.qd) / self.of.sampler.spread)) or 1.0
         for width in WIDTHS:
             with np.errstate(all="ignore"):
-                yield Line(self.scene, s, width / rate, 1.0, bend)
+                yield Line(self.scene, self.of.sampler.told(s), width / rate, 1.0, bend)
 
     def off(
         self, found: Vector, exact: Callable[[Line], Vector], *state: Any, least: float = 0.0
@@ -167,7 +167,7 @@ class _Frames:
         """Twists by one rate after the other, less what moves with time alone."""
         s = e.state
         found = np.asarray(self.module.jacobian(s.q, **self.held(s)), float)
-        still = replace(s, qd=0 * s.qd)
+        still = self.of.sampler.told(replace(s, qd=0 * s.qd))
         worst = 0.0
         for k, direction in enumerate(np.eye(len(s.q))):
 

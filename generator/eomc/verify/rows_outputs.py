@@ -145,7 +145,7 @@ class _Motion:
     def __init__(self, formulas: Formulas, given: Mapping[Symbol, Any]) -> None:
         self.formulas, self.given, system = formulas, given, formulas.system
         self.definitions = dict(system.definitions)
-        self.rates = dict(zip((*system.q, *system.qd), (*system.qd, *system.qdd), strict=True))
+        self.rates = {**system.rates, **dict(zip(system.qd, system.qdd, strict=True))}
         self.known: dict[tuple[Symbol, Any], Any] = {}
 
     def value(self, e: Expr, time: Any) -> Any:

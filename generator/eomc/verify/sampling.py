@@ -163,6 +163,8 @@ class Sampler:
             (turns if link.turns else slides).update(link.q.free_symbols)
         slides -= turns
         self.angles = np.array([c.unit == "rad" and c.q not in slides for c in system.coordinates])
+        names = enumerate(c.name for c in system.coordinates)
+        self.discrete = [k for k, name in names if name in system.discrete]
         far, fast = self._ahead(effort)
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
         self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
@@ -214,6 +216,7 @@ class Sampler:
         way = np.array([usual[0].q - self.start.q, usual[0].qd - self.start.qd])
         reach = np.array([self.spread, self.speed])
         q, qd = [self.start.q, self.start.qd] + way * np.maximum(1, 1 / reach)
+        q[self.discrete] = usual[0].q[self.discrete]
         states = [replace(usual[0], q=q, qd=qd)]
         states += [replace(s, qd=p * s.qd) for s, p in zip(usual[1:], SLOWER, strict=False)]
         found = []
@@ -237,24 +240,37 @@ class Sampler:
         centre = np.where(self.angles, nearness < 1, 1) * start.q
         q = centre + nearness * self.spread * random.uniform(-1, 1, n)
         qd = start.qd + nearness * self.speed * random.uniform(-1, 1, n)
+        for k in self.discrete:
+            q[k], qd[k] = self._near(float(start.q[k]), random.uniform(-0.5, 0.5)), 0.0
         self._in_modes(q, qd)
         t = random.uniform(0, self.system.run.duration)
         u = None
         if given and self.system.inputs:
             signals = np.abs(self.reference.evaluate("signals", q, qd, t))
             u = random.normal(size=len(signals)) * np.where(signals > 0, signals, 1)
-        # a parameter that is 0 by default, such as a friction, is tried too; a loop may not close
-        # with lengths that are far from the scene's
+        # a loop may not close with lengths that are far from the scene's
         some = nearness if self.system.constraints else 1.0
-        factors = np.exp(some * random.uniform(-0.5, 0.5, len(self.defaults)))
+        by = some * random.uniform(-0.5, 0.5, len(self.defaults))
         params = {
-            name: value * factor if value else factor - 0.5
-            for (name, value), factor in zip(self.defaults.items(), factors.tolist(), strict=True)
+            name: self._near(value, x)
+            for (name, value), x in zip(self.defaults.items(), by.tolist(), strict=True)
         }
         found = self.onto(State(q, qd, t, u, None if usual else params))
         for mode in self.system.modes:  # the rows may have turned what slides
             found.q[mode.at] = np.sign(found.qd[mode.of]) * abs(q[mode.at])
         return found
+
+    def told(self, s: State) -> State:
+        """The state with parameters that jumps set among the others, as the scene has them."""
+        if not self.discrete:
+            return s
+        values = {self.system.coordinates[k].name: float(s.q[k]) for k in self.discrete}
+        return replace(s, params={**(s.params or self.defaults), **values})
+
+    @staticmethod
+    def _near(value: float, by: float) -> float:
+        """A parameter's, as far away as `by`; one that is 0, such as a friction, is tried too."""
+        return value * math.exp(by) if value else math.exp(by) - 0.5
 
     def _in_modes(self, q: Vector, qd: Vector) -> None:
         """Of friction that sticks, modes as velocities say; in some states some are made 0.

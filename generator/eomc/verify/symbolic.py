@@ -19,7 +19,9 @@ from numpy.typing import ArrayLike
 from sympy import Expr, ImmutableMatrix
 
 from eomc.base.errors import EomcError
+from eomc.model.discrete import constant
 from eomc.model.system import System, dot, t
+from eomc.verify.discrete import Discrete
 from eomc.verify.oracle import MATRICES, SCALARS, Answer, Values, Vector
 from eomc.verify.shorter import by_rates, shorter
 from eomc.verify.taylor import Jets
@@ -129,11 +131,13 @@ def written_out(system: System) -> System:
     )  # fmt: skip
 
 
-def of(system: System) -> Reference | Jets:
+def of(system: System) -> Answer:
     """The independent answer: written out where that is small, else by Taylor arithmetic.
 
     Raises EomcError as `derive` and `Jets` do.
     """
+    if system.discrete:
+        return Discrete(system, of(constant(system)))
     return derive(system) if is_small(system) else Jets(system)
 
 

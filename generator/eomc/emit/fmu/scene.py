@@ -60,6 +60,7 @@ def view(target: Target, token: str) -> SceneCalls:
         ) if by_tolerance else "",
         linearization=public.linearization.call() if s.run.sloped else "",
         output_slopes=_called(target, "output_slopes"),
+        slopes_solved="output_slopes" in target.program and takes_qdd(target, "output_slopes"),
     )  # fmt: skip
 
 

@@ -24,8 +24,9 @@ class SceneCalls:
     """fmu/scene.h.jinja. inputs: their starts; from acceleration on calls, "" for none.
 
     project: onto constraints; held: whether each of q and qd stays there as it is. run, step: of
-    steps of fixed size; adaptive: of those that fit a tolerance, one or the other. solved: whether
-    outputs read accelerations. feedback: whether signals answer the state.
+    steps of fixed size; adaptive: of those that fit a tolerance, one or the other. solved,
+    slopes_solved: whether outputs, and their slopes, read accelerations. feedback: whether signals
+    answer the state.
     """
 
     TEMPLATE: ClassVar[str] = "fmu/scene.h"
@@ -57,6 +58,7 @@ class SceneCalls:
     adaptive: str
     linearization: str
     output_slopes: str
+    slopes_solved: bool
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,92 @@
+"""Parameters that jumps set: discrete variables, constant between events.
+
+Each becomes a coordinate, so that runs, batches and C have its value at any time. It is no
+coordinate of Lagrange's: nothing is differentiated along it, its rate counts as 0, and
+x_dot**2/2 in K, which stands beside all else, leaves it at rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from eomc.base.errors import Problem, SceneError
+from eomc.model.symbols import Coordinate, Parameter
+
+if TYPE_CHECKING:
+    from eomc.model.system import System
+
+
+def discrete(system: System) -> System:
+    """The system whose parameters that jumps set are discrete variables, behind its coordinates.
+
+    Raises SceneError where a name that one needs is taken.
+    """
+    jumped = {name for event in system.events for name, _ in event.jump}
+    found = [p for p in system.parameters if p.name in jumped]
+    if not found:
+        return system
+    if taken := _taken(system, found):
+        raise SceneError(taken)
+    more = tuple(Coordinate(p.name, p.unit, p.value, note=p.note) for p in found)
+    energy = sum(c.qd**2 for c in more) / 2
+    tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic + energy)
+    return replace(
+        system,
+        coordinates=(*system.coordinates, *more),
+        kinetic=system.kinetic + energy,
+        forces=system.forces and (*system.forces, *[0 * energy] * len(more)),
+        parameters=tuple(p for p in system.parameters if p not in found),
+        discrete=tuple(p.name for p in found),
+        tree=tree,
+    )
+
+
+def _taken(system: System, found: list[Parameter]) -> list[Problem]:
+    """Names of the scene's that the rates of discrete variables need."""
+    known = {*system.names, *(s.name for s, _ in system.definitions)}
+    known |= {o.name for o in system.outputs}
+    return [
+        system.problem(
+            f"parameters.{p.name}", f"a jump sets it, which needs the name '{name}': rename yours"
+        )
+        for p in found
+        for name in (f"{p.name}_dot", f"{p.name}_ddot")
+        if name in known
+    ]
+
+
+def constant(system: System) -> System:
+    """The system with parameters in place of its discrete variables, which nothing sets."""
+    if not system.discrete:
+        return system
+    own = [c for c in system.coordinates if c.name not in system.discrete]
+    more = [c for c in system.coordinates if c.name in system.discrete]
+    energy = sum(c.qd**2 for c in more) / 2
+    tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic - energy)
+    forces = zip(system.coordinates, system.forces or (), strict=False)
+    return replace(
+        system,
+        coordinates=tuple(own),
+        kinetic=system.kinetic - energy,
+        forces=tuple(force for c, force in forces if c.name not in system.discrete),
+        parameters=(
+            *system.parameters,
+            *(Parameter(c.name, c.start, c.unit, c.note) for c in more),
+        ),
+        discrete=(),
+        events=(),
+        tree=tree,
+    )
+
+
+def beside(system: System, core: System) -> System:
+    """The system with start and rows of its `core`, which has parameters and is assembled."""
+    more = [c for c in system.coordinates if c.name in system.discrete]
+    return replace(
+        system,
+        coordinates=(*core.coordinates, *more),
+        constraints=core.constraints,
+        closure=core.closure,
+        warnings=core.warnings,
+    )

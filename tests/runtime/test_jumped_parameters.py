@@ -1,0 +1,307 @@
+"""Parameters that jumps set: discrete variables, beside SciPy between the jumps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import sympy
+from conftest import Modules
+from scipy.integrate import solve_ivp
+
+import eomc
+from eomc.base.errors import SceneError
+from eomc.model.discrete import constant
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.program.assembly import assembled
+from eomc.report import equations
+from eomc.scene.read import parse
+from eomc.verify.check import check
+
+GRIPPER = """eomc = 1
+name = "gripper"
+[coordinates]
+x = { rate = 1.0 }
+theta = { start = 0.3 }
+[parameters]
+m = { value = 1.0, unit = "kg", note = "of the cart, and what it has gripped" }
+m_p = 0.3
+l = 0.5
+g = 9.81
+k = 4.0
+on = 1.0
+[inputs]
+u = { unit = "N", signal = "2*sin(3*t)" }
+[definitions]
+px = "x + l*sin(theta)"
+py = "-l*cos(theta)"
+[energy]
+kinetic = "m*x_dot**2/2 + m_p*(dot(px)**2 + dot(py)**2)/2"
+potential = "m_p*g*py + k*x**2/2"
+[forces]
+x = "on*u"
+[outputs]
+ax = "dot(dot(px))"
+stored = "k*x**2/2"
+[[event]]
+name = "grips"
+when = "x - 0.2"
+direction = "rising"
+action = "jump"
+m = "m + 0.5"
+x_dot = "x_dot*m/(m + 0.5)"
+[[event]]
+name = "cutoff"
+when = "t - 3"
+action = "jump"
+on = 0
+k = "2*k"
+l = "0.9*l"
+[run]
+tolerance = 1e-12
+duration = 5.0
+h = 0.01
+linearize = true
+batch = true
+"""
+CUTOFF = 3.0
+
+
+@pytest.fixture(scope="module")
+def gripper(modules: Modules) -> ModuleType:
+    return modules.unoptimised(GRIPPER)
+
+
+def rates(t: float, x: np.ndarray, m: float, rod: float, k: float, on: float) -> list[float]:
+    """Of the gripper, written out by hand."""
+    far, angle, v, w = x
+    c, s = np.cos(angle), np.sin(angle)
+    D = np.array([[m + 0.3, 0.3 * rod * c], [0.3 * rod * c, 0.3 * rod * rod]])
+    b = [on * 2 * np.sin(3 * t) - k * far + 0.3 * rod * s * w * w, -0.3 * 9.81 * rod * s]
+    return [v, w, *np.linalg.solve(D, b)]
+
+
+def grips(t: float, x: np.ndarray, *_: float) -> float:
+    return float(x[0] - 0.2)
+
+
+grips.direction, grips.terminal = 1, True  # type: ignore[attr-defined]
+
+
+def by_scipy(m: float) -> tuple[np.ndarray, list[float]]:
+    """(x, theta, and their rates) at 5 s, and when it gripped."""
+    t, x, times = 0.0, np.array([0.0, 0.3, 1.0, 0.0]), list[float]()
+    values = [m, 0.5, 4.0, 1.0]
+
+    def go(end: float, **more: object) -> object:
+        return solve_ivp(rates, (t, end), x, "DOP853", args=values, rtol=1e-12, atol=1e-13, **more)
+
+    while t < 5:
+        done = go(CUTOFF if t < CUTOFF else 5.0, events=grips)
+        t, x = done.t[-1], done.y[:, -1]
+        if done.status == 1:
+            times.append(t)
+            x = x * [1, 1, values[0] / (values[0] + 0.5), 1]
+            values[0] += 0.5
+            done = go(t + 1e-3)  # off the zero
+            t, x = done.t[-1], done.y[:, -1]
+        elif t == CUTOFF:
+            values[1:] = [0.9 * 0.5, 8.0, 0.0]
+    return x, times
+
+
+@pytest.mark.parametrize("m", [1.0, 2.3])
+def test_mass_length_stiffness_and_drive_change_as_in_scipy(gripper: ModuleType, m: float) -> None:
+    x, times = by_scipy(m)
+    run = gripper.simulate(q0=[0, 0.3, m, 0.5, 4, 1])
+    own = [0, 1, 6, 7]
+    assert run.status == "ok" and len(times) >= 1
+    np.testing.assert_allclose(run.x[-1][own], x, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(run.events["grips"].t, times, rtol=0, atol=1e-11)
+    assert run.q[-1, 2:].tolist() == [m + 0.5 * len(times), 0.45, 8, 0]
+    assert not run.qd[:, 2:].any()
+
+
+def test_values_stand_beside_the_rows(gripper: ModuleType) -> None:
+    run = gripper.simulate()
+    assert gripper.coordinates == ("x", "theta", "m", "l", "k", "on")
+    assert gripper.parameters == ("m_p", "g") and gripper.units["m"] == "kg"
+    before = run.t < CUTOFF
+    assert set(run["k"][before]) == {4.0} and run["k"][-1] == 8.0
+    np.testing.assert_allclose(run["stored"], run["k"] * run["x"] ** 2 / 2, rtol=1e-15)
+    times = np.array([0, 2.0, 4.0])
+    assert gripper.simulate(times=times)["on"].tolist() == [1, 1, 0]
+
+
+def test_starts_without_them_have_the_scenes(gripper: ModuleType) -> None:
+    run = gripper.simulate(q0=[0, 0.3], qd0=[1, 0])
+    assert np.array_equal(run.q, gripper.simulate().q)
+    q0 = np.tile([0, 0.3], (3, 1))
+    many = gripper.simulate_batch(q0, np.tile([1.0, 0], (3, 1)), tol=1e-12)
+    assert np.array_equal(many.q[:, -1], np.tile(run.q[-1], (3, 1)))
+    with pytest.raises(ValueError, match="'m' is a coordinate: give it in q0"):
+        gripper.simulate(params={"m": 2.0})
+
+
+def test_nothing_pulls_at_them(gripper: ModuleType) -> None:
+    """D, C, g and accelerations are those of a system in which they are parameters."""
+    random = np.random.default_rng(5)
+    system = from_scene(parse(GRIPPER, "gripper.toml"))
+    q, qd = random.uniform(0.5, 1.5, (2, 6))
+    D, C = gripper.D(q), gripper.C(q, qd)
+    assert np.array_equal(D[2:, 2:], np.eye(4)) and not D[:2, 2:].any() and not D[2:, :2].any()
+    assert not C[2:].any() and not C[:, 2:].any() and not gripper.g(q)[2:].any()
+    assert not gripper.acceleration(q, qd)[2:].any()
+    A = gripper.linearize(q, qd)[0]
+    assert A[6, 2] != 0 and not A[8:].any()  # they move others, and nothing moves them
+    core = constant(system)
+    assert [c.name for c in core.coordinates] == ["x", "theta"]
+    assert {p.name: p.value for p in core.parameters}["l"] == 0.5
+    assert "q = (x, theta)" in equations.written(system)
+
+
+MARKED = """eomc = 1
+name = "arm_drop"
+gravity = [0, -9.81, 0]
+[coordinates]
+a = { unit = "rad", start = 0.5 }
+b = { unit = "rad", start = 0.2 }
+[parameters]
+l = 0.5
+load = 2.0
+[[body]]
+name = "one"
+joint = "revolute"
+coordinates = "a"
+axis = [0, 0, 1]
+mass = 1
+center = ["l/2", 0, 0]
+inertia = [0.001, 0.02, 0.02]
+[[body]]
+name = "two"
+parent = "one"
+joint = "revolute"
+coordinates = "b"
+axis = [0, 1, 0]
+offset = ["l", 0, 0]
+mass = "0.4 + load"
+center = ["l/3", 0, 0]
+inertia = [0.01, "0.01 + load*l**2/100", 0.02]
+[[event]]
+name = "drop"
+when = "t - 1"
+action = "jump"
+load = 0.0
+l = "l*1.1"
+[run]
+tolerance = 1e-9
+duration = 3.0
+momentum = true
+inverse_dynamics = true
+frames = true
+"""
+ROD = """eomc = 1
+name = "reeled"
+[coordinates]
+x = { start = 0.0, rate = 4.0 }
+y = { start = "-l", guess = true }
+[parameters]
+m = 1.3
+l = 0.8
+mu = 0.2
+[constraints]
+rod = "x**2 + y**2 - l**2"
+[energy]
+kinetic = "m*(x_dot**2 + y_dot**2)/2"
+potential = "m*9.81*y"
+[forces]
+x = "-mu*x_dot"
+[[event]]
+name = "reels"
+when = "t - 1"
+action = "jump"
+l = "0.9*l"
+x = "0.9*x"
+y = "0.9*y"
+[run]
+tolerance = 1e-10
+duration = 2.0
+"""
+GREASED = """eomc = 1
+name = "greased"
+[coordinates]
+x = { rate = 1.0, friction = "mu*m*9.81" }
+th = { start = 0.5 }
+[parameters]
+m = 1.0
+mu = 0.3
+l = 0.4
+[energy]
+kinetic = "m*x_dot**2/2 + 0.1*(x_dot**2 + 2*x_dot*l*th_dot*cos(th) + l**2*th_dot**2)"
+potential = "10*x**2 - 0.2*9.81*l*cos(th)"
+[[event]]
+name = "grease"
+when = "t - 0.7"
+action = "jump"
+mu = "mu/4"
+[run]
+friction = "stick"
+tolerance = 1e-9
+duration = 3.0
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [GRIPPER, MARKED, ROD, GREASED], ids=lambda x: x.split('"')[1])
+def test_check_compares_them_with_constants(text: str, tmp_path: Path) -> None:
+    system = assembled(from_scene(parse(text, "test.toml")))
+    plain = eomc.load(system, tmp_path, form="plain")
+    report = check(system, eomc.load(system, tmp_path), plain=plain)
+    assert report.passed, str(report)
+
+
+def test_a_rod_that_is_reeled_in_stays_tight(modules: Modules) -> None:
+    run = modules.unoptimised(ROD).simulate()
+    far = np.hypot(run["x"], run["y"])
+    np.testing.assert_allclose(far, run["l"], rtol=1e-14)
+    assert run["l"][-1] == 0.9 * 0.8 and run.status == "ok"
+
+
+def test_friction_that_sticks_eases_where_it_is_greased(modules: Modules) -> None:
+    module = modules.unoptimised(GREASED)
+    run = module.simulate(q0=[0, 0.5], qd0=[1, 0])
+    assert run["mu"][-1] == 0.075 and run.status == "ok"
+    q, qd = (x[run.t == 0.7][-1].copy() for x in (run.q, run.qd))
+    assert q[2] == 0.075
+    rest = module.simulate(q0=q, qd0=qd, t0=0.7, duration=2.3)
+    np.testing.assert_allclose(rest.q[-1], run.q[-1], rtol=0, atol=1e-8)
+    q[2] = 0.3  # as if it had not been greased
+    assert abs(module.simulate(q0=q, qd0=qd, t0=0.7, duration=2.3).q[-1] - run.q[-1])[0] > 1e-3
+
+
+def test_a_system_made_in_python_has_them(tmp_path: Path) -> None:
+    x, m, k, factor = sympy.symbols("x m k lambda")
+    made = System.make(
+        "osc", {x: (0, 1.0)}, "m*x_dot**2/2", k * x**2 / 2,
+        parameters={m: 1, k: 4, factor: 0.5}, tolerance=1e-10,
+        events={"soft": {
+            "when": x - 0.3, "direction": "rising", "action": "jump",
+            k: factor * k, "lambda": 1,
+        }},
+    )  # fmt: skip
+    run = eomc.load(made, tmp_path).simulate(duration=3)
+    assert run["k"][-1] == 2 and run.q[-1].tolist()[1:] == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("k_dot", "needs the name 'k_dot'"), ("k_ddot", "needs the name 'k_ddot'")]
+)
+def test_names_that_their_rates_need_are_taken(name: str, words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        System.make(
+            "osc", ["x"], "m*x_dot**2/2", "k*x**2/2", parameters={"m": 1, "k": 4, name: 3},
+            events={"soft": {"when": "x - 0.3", "action": "jump", "k": "k/2"}},
+        )  # fmt: skip
