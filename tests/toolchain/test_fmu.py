@@ -406,6 +406,37 @@ def test_directional_derivatives_are_the_modules(
     assert found == pytest.approx([*(whole @ seeds), -0.1], rel=1e-14, abs=1e-15)
 
 
+PULLED = """
+eomc = 1
+name = "pulled"
+[coordinates]
+th = { start = 0.4 }
+[parameters]
+l = 0.8
+[inputs]
+T = {}
+[energy]
+kinetic = "l**2*th_dot**2/2"
+potential = "-9.81*l*cos(th)"
+[forces]
+th = "T"
+[outputs]
+ax = "dot(dot(l*sin(th)))"
+[run]
+linearize = true
+"""
+
+
+def test_slopes_of_outputs_may_read_accelerations(version: int, hosts: list[Host]) -> None:
+    module, host = plain(PULLED), Host(exported(PULLED, version), "ModelExchange")
+    hosts.append(host)
+    host.set(th=0.4, th_dot=1.5, T=0.7)
+    host.start()
+    *_, C, D = module.linearize([0.4], [1.5], u=[0.7], outputs=True)
+    found = [host.slope(["ax"], [known], [1.0])[0] for known in ("th", "th_dot", "T")]
+    assert found == pytest.approx([*C[0], *D[0]], rel=1e-14)
+
+
 def test_derivatives_that_there_are_not_are_refused_in_words(
     version: int, hosts: list[Host]
 ) -> None:
