@@ -225,6 +225,17 @@ def test_without_a_picture_only_paths_of_named_points_are_drawn():
     assert found.unit == "m"
 
 
+def test_what_jumps_set_is_drawn_as_it_is_then():
+    x = symbol("x")
+    made = System.make(
+        "reach", [x], "m*x_dot**2/2", parameters={"m": 1, "l": 2},
+        events={"grows": {"when": "t - 1", "action": "jump", "l": "3*l"}},
+        picture={"lines": [[["x", 0], ["x", "l"]]]},
+    )  # fmt: skip
+    found = drawing(made, np.array([0.0, 2.0]), np.array([[0.0, 2.0], [0.5, 6.0]]))
+    assert sorted(found.points[:, :, 1].tolist()) == [[0, 2], [0, 6]]
+
+
 def test_what_has_no_place_is_not_drawn():
     r, theta = symbol("r"), symbol("theta")
     made = System.make("polar", [r, theta], symbol("r_dot") ** 2 + symbol("theta_dot") ** 2)

@@ -248,7 +248,7 @@ def test_random_events_are_those_of_the_exact_motion(springs: ModuleType, seed: 
         ('action = "stop"', 'action = "halt"', "unknown action"),
         ('name = "top"', 'name = "impact"', "is an event already"),
         ('y_dot = "-e*y_dot"', "", "a jump sets something"),
-        ('y_dot = "-e*y_dot"', 'z_dot = "1"', "'z_dot' is no coordinate or velocity"),
+        ('y_dot = "-e*y_dot"', 'z_dot = "1"', "'z_dot' is no coordinate, velocity or parameter"),
         ('y_dot = "-e*y_dot"', "y_dot = true", "must be a number or a formula"),
         ('name = "away"', 'name = "away"\nx = 0', "only a jump sets 'x'"),
         ('name = "away"', 'nam = "away"', "nam"),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import sympy
@@ -46,7 +47,9 @@ def drawings(systems: Sequence[System], t: Array, q: Array, names: Sequence[str]
 
 
 def _made(system: System, t: Array, q: Array) -> Drawing | None:
-    values = {p.name: p.value for p in system.parameters}
+    values: dict[str, Any] = {p.name: p.value for p in system.parameters}
+    columns = zip(system.coordinates, q.T, strict=True)
+    values |= {c.name: own for c, own in columns if c.name in system.discrete}
     scene = system.scene or system.pictured
     made = sketch.declared(scene, values, t, q) if scene else None
     return made or _named(system, t, q)

@@ -37,17 +37,17 @@ ARRAYS: Mapping[str, Any] = {
 }  # fmt: skip
 
 
-def declared(scene: Scene, values: Mapping[str, float], t: Array, q: Array) -> Drawing | None:
+def declared(scene: Scene, values: Mapping[str, Any], t: Array, q: Array) -> Drawing | None:
     """The drawing of what a scene declares; None where that is nothing.
 
-    values: of parameters. t: (n,), s; q: (n, nq).
+    values: of parameters, numbers or (n,). t: (n,), s; q: (n, nq).
     """
     with np.errstate(all="ignore"):  # what has no value is not drawn
         return _Sketch(scene, values, t, q).drawing()
 
 
 class _Sketch:
-    def __init__(self, scene: Scene, values: Mapping[str, float], t: Array, q: Array) -> None:
+    def __init__(self, scene: Scene, values: Mapping[str, Any], t: Array, q: Array) -> None:
         self.scene, self.n = scene, len(t)
         self.known: dict[str, Any] = {
             p.name: p.value for p in (*scene.constants, *scene.parameters)
