@@ -126,7 +126,7 @@ BAD_RUNS = [
     ({"t0": NAN}, r"t0: nan is not a finite number"),
     ({"t0": "a"}, r"t0: "),
     ({"method": "euler"}, r"method: 'euler' is not in this module"),
-    ({"params": {"x": 1}}, r"params: 'x' is not one of"),
+    ({"params": {"x": 1}}, r"params: 'x' is a coordinate: give it in q0"),
     ({"u": [1, 2, 3], "steps": 2}, r"u: 3 rows for 2 steps: give one row a step"),
     ({"u": np.ones((3, 2)), "steps": 3}, r"u: shape \(3, 2\), expected \(1,\) or \(n, 1\)"),
     ({"u": [1, NAN], "steps": 2}, r"u\[1, 0\]: nan in float64 is not finite"),
