@@ -132,7 +132,11 @@ x, x_dot, u = sympy.symbols("x x_dot u")
             {"events": {"at": {"when": x, "direction": "up"}}},
             "direction is one of both, rising, falling, here 'up'",
         ),
-        (("a", [x], x_dot**2), {"events": {"at": {"when": x, "y": 1}}}, "y is no coordinate, velocity or"),
+        (
+            ("a", [x], x_dot**2),
+            {"events": {"at": {"when": x, "y": 1}}},
+            "y is no coordinate, velocity or",
+        ),
         (
             ("a", [x], x_dot**2),
             {"events": {"at": {"when": x, "action": "jump"}}},

@@ -20,6 +20,9 @@ from eomc.program.assembly import assembled
 from eomc.report import equations
 from eomc.scene.read import parse
 from eomc.verify.check import check
+from eomc.verify.discrete import Discrete
+from eomc.verify.symbolic import of
+from eomc.verify.taylor import Jets
 
 GRIPPER = """eomc = 1
 name = "gripper"
@@ -261,6 +264,22 @@ def test_check_compares_them_with_constants(text: str, tmp_path: Path) -> None:
     plain = eomc.load(system, tmp_path, form="plain")
     report = check(system, eomc.load(system, tmp_path), plain=plain)
     assert report.passed, str(report)
+
+
+@pytest.mark.parametrize("text", [MARKED, ROD], ids=["arm_drop", "reeled"])
+def test_both_references_have_them_as_constants(text: str) -> None:
+    system = assembled(from_scene(parse(text, "test.toml")))
+    n = len(system.q)
+    q, qd = np.random.default_rng(2).uniform(0.3, 0.9, (2, 5, n))
+    one, other = of(system), Discrete(system, Jets(constant(system)))
+    names = ["D", "C", "g", "bias", "tau", "kinetic", "potential", "energy", "power"]
+    names += ["constraint_jacobian", "gamma"] if system.constraints else []
+    for name in names:
+        found, expected = (x.evaluate(name, q, qd) for x in (other, one))
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(other.acceleration(q, qd), one.acceleration(q, qd), rtol=1e-9)
+    state = {"q": q[0], "qd": qd[0]}
+    assert one.terms(state) >= abs(one.evaluate("kinetic", q[0], qd[0])) * (1 - 1e-12)
 
 
 def test_a_rod_that_is_reeled_in_stays_tight(modules: Modules) -> None:
