@@ -17,8 +17,9 @@ import re
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -27,11 +28,13 @@ from unittest.mock import PropertyMock, patch
 
 import bodies
 import numpy as np
+import physics
 import work
 
 import eomc
 from eomc.derive import link_multipliers
 from eomc.emit import adaptive, c_expression
+from eomc.emit.fast import files
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.steppers import Steppers
 
@@ -67,6 +70,40 @@ def with_lanes() -> Any:
     return patch.object(adaptive, "SMALL", 10**6)
 
 
+def without_exponentials() -> Any:
+    return patch.object(files, "OURS", frozenset())
+
+
+def with_friction(case: work.Case, names: Sequence[str]) -> work.Case:
+    """In each of the coordinates, smoothed."""
+    forces = "".join(f'{x} = "-0.1*tanh({x}_dot/0.05)"\n' for x in names)
+    return replace(case, scene=case.scene.replace("[run]", f"[forces]\n{forces}\n[run]"))
+
+
+TODA = """
+eomc = 1
+name = "toda"
+[coordinates]
+q1 = {}
+q2 = {}
+q3 = {}
+[energy]
+kinetic = "(q1_dot**2 + q2_dot**2 + q3_dot**2)/2"
+potential = "exp(q1 - q2) + exp(q2 - q3) + exp(q3 - q1)"
+[run]
+h = 0.02
+"""
+CASES = work.CASES | {
+    "Toda lattice": work.Case(
+        TODA, physics.chain, np.array([0.5, -0.2, 0.1, 0.3, 1.1, -1.4]), 0.02, 5000
+    ),
+    "cart-pole with friction": with_friction(work.CASES["cart-pole"], ("x", "theta")),
+    "chain of 5 with friction": with_friction(
+        work.CASES["chain of 5"], [f"a{k}" for k in range(1, 6)]
+    ),
+}
+EXPONENTIALS = ("Toda lattice", "cart-pole with friction", "chain of 5 with friction")
+
 # trick, what takes it away, the cases that it could change, what else is asked for under [run]
 TRICKS: tuple[tuple[str, Change, tuple[str, ...], str], ...] = (
     ("predicted angles", without_prediction, ("cart-pole", "double pendulum"), ""),
@@ -75,6 +112,10 @@ TRICKS: tuple[tuple[str, Change, tuple[str, ...], str], ...] = (
     ("link multipliers, 4,096 at once", without_multipliers, ("chain of 5", "chain of 10"),
      "batch = true\n"),
     (SIDE_BY_SIDE, without_lanes, ("cart-pole", "double pendulum", "chain of 5"),
+     "batch = true\ntolerance = 1e-9\n"),
+    ("exp and tanh", without_exponentials, EXPONENTIALS, "tolerance = 1e-9\n"),
+    ("exp and tanh, 4,096 at once", without_exponentials, EXPONENTIALS, "batch = true\n"),
+    ("exp and tanh, adaptive steps of 4,096", without_exponentials, EXPONENTIALS,
      "batch = true\ntolerance = 1e-9\n"),
 )  # fmt: skip
 
@@ -111,11 +152,13 @@ def ratio(one: Callable[[], Any], other: Callable[[], Any], rounds: int) -> floa
 def run(module: ModuleType, case: work.Case, extra: str) -> Callable[[], Any]:
     """A run of the case, or short ones of 4,096 instances."""
     n = len(case.x0) // 2
-    if extra:
+    if "batch" in extra:
         q, qd = np.tile(case.x0[:n], (4096, 1)), np.tile(case.x0[n:], (4096, 1))
         q += np.linspace(0, 1e-3, 4096)[:, None]
-    if "tolerance" in extra:
+    if "batch" in extra and "tolerance" in extra:
         return lambda: module.simulate_batch(q, qd, duration=1.0, threads=1)
+    if "tolerance" in extra:
+        return lambda: module.simulate(case.x0[:n], case.x0[n:], duration=4000 * case.h, tol=1e-9)
     if extra:
         return lambda: module.simulate_batch(q, qd, case.h, steps=20, every=20, threads=1)
     steps = min(case.steps, 4000)
@@ -126,7 +169,7 @@ def tricks(rounds: int) -> Iterator[str]:
     for k, (trick, change, names, extra) in enumerate(TRICKS):
         whole = with_lanes if trick == SIDE_BY_SIDE else nullcontext
         for name in names:
-            case = work.CASES[name]
+            case = CASES[name]
             with (
                 built(case, whole(), extra, f"with_{k}") as full,
                 built(case, change(), extra, f"without_{k}") as less,

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
+import subprocess
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +15,12 @@ from sincos_bench import bench
 
 VECTORS = {"_16": 16, "_32": 32, "_64": 64}  # bytes by what names end in
 LANES = ("", *VECTORS)
+BUILDS = {
+    "native": bench.SPEED,
+    "native, no FMA": (*bench.SPEED, *bench.WITHOUT_FMA),
+    "narrow registers": ("-O1",),
+}
+EXPONENTIALS = ("exp", "tanh")
 MOST = 16  # numbers in the widest of them
 
 ONE = """
@@ -132,6 +142,13 @@ void same_LANE(const EOMC_REAL *x, EOMC_REAL *to)
     *(eomc_LANE_loose *)to = eomc_same_LANE(*x);
 }
 """
+EACH = """
+void NAME_LANE(long n, const EOMC_REAL *x, EOMC_REAL *y)
+{
+    for (long i = 0; i < n; i += EOMC_LANE_COUNT)
+        *(eomc_LANE_loose *)(y + i) = eomc_NAME_LANE(*(const eomc_LANE_loose *)(x + i));
+}
+"""
 FOUR = """
 void put(const EOMC_REAL *x, EOMC_REAL *to)
 {
@@ -177,7 +194,33 @@ def source(of: Any) -> str:
 
     sincos, rotate = file(f"sincos{of.suffix}"), file(f"rotate{of.suffix}")
     texts = [over(of, file("scalar") + rotate + ONE + ROTATING)]
-    several = file("vector") + sincos + rotate + ROTATING + SEVERAL
+    several = file("vector") + sincos + rotate + ROTATING + SEVERAL + file("select")
+    several += file(f"exp{of.suffix}") + file(f"tanh{of.suffix}")
+    several += "".join(EACH.replace("NAME", name) for name in EXPONENTIALS)
     texts += [over(of, several, name, width) for name, width in VECTORS.items()]
     texts += [over(of, file("vector"), f"_{n}", k * size) for n, k in (("two", 2), ("four", 4))]
     return "\n".join([bench.HARNESS, *texts, over(of, file("four") + FOUR)])
+
+
+@cache
+def built(folder: Path, of: Any, name: str) -> ctypes.CDLL | None:
+    """The library; None where the compiler does not know the flags."""
+    given = ["-std=gnu99", "-Wno-psabi", *BUILDS[name], *of.flags]
+    try:
+        return bench.build(source(of), name.replace(" ", "_") + of.suffix, folder, given)
+    except subprocess.CalledProcessError:
+        if "-mno-fma" not in given:
+            raise
+        return None
+
+
+def call(library: ctypes.CDLL, function: str, *arrays: np.ndarray) -> None:
+    """For all numbers of the arrays, which are as long as the first."""
+    assert not len(arrays[0]) % MOST
+    getattr(library, function)(ctypes.c_long(len(arrays[0])), *map(bench.pointer, arrays))
+
+
+def of_lane(library: ctypes.CDLL, function: str, x: np.ndarray) -> np.ndarray:
+    """A function of one number of them all."""
+    call(library, function, x, y := np.empty_like(x))
+    return y

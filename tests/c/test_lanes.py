@@ -5,8 +5,6 @@ from __future__ import annotations
 import ctypes
 import re
 import shutil
-import subprocess
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,36 +12,18 @@ import mpmath
 import numpy as np
 import pytest
 from conftest import ROOT, tiers
-from lane_source import LANES, MOST, VECTORS, source
+from lane_source import BUILDS, EXPONENTIALS, LANES, MOST, VECTORS, built, call, of_lane
 from sincos_bench import LARGEST_ERROR, bench, nearest_multiples
 
 from eomc.emit.fast.lanes import interleaved
 
 pytestmark = pytest.mark.skipif(shutil.which(bench.compiler()) is None, reason="no C compiler")
 
-BUILDS = {
-    "native": bench.SPEED,
-    "native, no FMA": (*bench.SPEED, *bench.WITHOUT_FMA),
-    "narrow registers": ("-O1",),
-}
-
 
 @pytest.fixture(scope="module", params=["double", "float"])
 def of(request: pytest.FixtureRequest) -> Any:
     """The precision, as the benchmark describes it."""
     return {"double": bench.DOUBLE, "float": bench.SINGLE}[request.param]
-
-
-@cache
-def built(folder: Path, of: Any, name: str) -> ctypes.CDLL | None:
-    """The library; None where the compiler does not know the flags."""
-    given = ["-std=gnu99", "-Wno-psabi", *BUILDS[name], *of.flags]
-    try:
-        return bench.build(source(of), name.replace(" ", "_") + of.suffix, folder, given)
-    except subprocess.CalledProcessError:
-        if "-mno-fma" not in given:
-            raise
-        return None
 
 
 @pytest.fixture(scope="module")
@@ -69,12 +49,6 @@ def library(request: pytest.FixtureRequest, of: Any, folder: Path) -> ctypes.CDL
 def made(of: Any, folder: Path) -> list[ctypes.CDLL]:
     """All libraries of this precision."""
     return [library for name in BUILDS if (library := built(folder, of, name)) is not None]
-
-
-def call(library: ctypes.CDLL, function: str, *arrays: np.ndarray) -> None:
-    """For all numbers of the arrays, which are as long as the first."""
-    assert not len(arrays[0]) % MOST
-    getattr(library, function)(ctypes.c_long(len(arrays[0])), *map(bench.pointer, arrays))
 
 
 def told(library: ctypes.CDLL, function: str, *arrays: np.ndarray) -> list[bool]:
@@ -250,7 +224,8 @@ def test_builds_without_fma_agree_bit_for_bit(made: list[ctypes.CDLL], of: Any) 
     for library in made:
         d, s, c, *_ = turns(of, 4 if of.suffix else 6)
         call(library, "rotate_32", d, s, c)
-        arrays = (*bench.sincos(library, "small_32", x), s, c)
+        exponentials = [of_lane(library, f"{name}_32", d) for name in EXPONENTIALS]
+        arrays = (*bench.sincos(library, "small_32", x), s, c, *exponentials)
         if not library.fast_fma():
             found.append(b"".join(a.tobytes() for a in arrays))
     if len(found) < 2:

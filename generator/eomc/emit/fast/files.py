@@ -30,6 +30,7 @@ Show = Callable[[views.View | plain_views.View], str]  # a view by its template
 
 # what stands in csrc for names, types and sizes of a lane
 PLACEHOLDERS = ("BITS_OF_SIZE", "INTEGER", "LANE_ALIGNED", "LANE_BYTES", "LANE_COUNT", "REAL")
+OURS = frozenset({"exp", "tanh"})  # functions of the mathematics library that csrc has over a lane
 TWO = ("atan2", "pow", "min", "max", PIVOT)  # of two arguments
 
 
@@ -109,7 +110,11 @@ def _csrc(made: Steppers) -> Iterator[str]:
         texts += [("lanes/vector.h", name, width)]
         texts += [(f"lanes/sincos{end}.h", name, width)] * target.sincos
         texts += [(f"lanes/rotate{end}.h", name, width)] * (turns and rotates)
-        texts += [("lanes/select.h", name, width)] * (name == "wide" and adaptive.together(target))
+        ours = OURS & set(made.one.calls) if name in ("wide", "two") else frozenset()
+        selects = bool(ours) or (name == "wide" and adaptive.together(target))
+        texts += [("lanes/select.h", name, width)] * selects
+        texts += [(f"lanes/exp{end}.h", name, width)] * bool(ours)
+        texts += [(f"lanes/tanh{end}.h", name, width)] * ("tanh" in ours)
         texts += [("lanes/four.h", name, width)] * (name == "four" and made.two_point)
         texts += [("lanes/angles.h", name, width)] * (name == "four" and made.functions.several)
     for file, name, width in texts:
@@ -207,7 +212,7 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
 
 def _library_text(lane: Lane, show: Show) -> str:
     """The functions of the mathematics library over a lane of several numbers."""
-    names = set(lane.calls)
+    names = set(lane.calls) - OURS
     if lane.name == "wide" and adaptive.together(lane.accelerations.target):
         names.add("sqrt")
     return show(
