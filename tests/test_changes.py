@@ -91,6 +91,7 @@ def test_every_mutant_of_the_generator_is_python() -> None:
 @pytest.mark.slow
 def test_a_sample_is_noticed(tmp_path: Path) -> None:
     """A third at least by four scenes alone; the whole tool asks forty, and the tests."""
+    pytest.importorskip("coverage")
     tool = ROOT / "tests" / "generator_mutants.py"
     only = ["derive/ldl", "c/plain/rk4", "fast/rk4", "lanes/rotate.h"]
     done = subprocess.run(

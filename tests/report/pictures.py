@@ -55,6 +55,7 @@ def system(made: Scene, title: str = "") -> Any:
     return SimpleNamespace(
         scene=made, pictured=None, name=made.name, title=title or made.title, outputs=(),
         coordinates=made.coordinates, parameters=(*made.parameters,), inputs=(), q=made.coordinates,
+        discrete=(),
     )  # fmt: skip
 
 
