@@ -10,8 +10,9 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from functools import cache
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 import pytest
@@ -22,6 +23,7 @@ import eomc
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.scene.read import parse
+from eomc.toolchain import compiler, extension
 
 # in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -36,6 +38,25 @@ os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", str(ROOT / "build" / ".hyp
 # how long a busy machine takes to think of inputs is no fault of what they are given to
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
+# what is copied beside each built module is the same in all of them: compiled once
+_get_code = SourceFileLoader.get_code
+_codes: dict[bytes, CodeType] = {}
+
+
+def _code_once(loader: SourceFileLoader, name: str) -> CodeType | None:
+    path = Path(loader.get_filename(name))
+    if not (path.parent / "build.json").exists():
+        return _get_code(loader, name)
+    text = path.read_bytes()
+    if text not in _codes:
+        _codes[text] = loader.source_to_code(text, str(path))
+    return _codes[text]
+
+
+SourceFileLoader.get_code = _code_once  # type: ignore[method-assign]
+# the calls' own speed is no matter
+extension.binding_flags = lambda: compiler.given_flags() or ("-O0",)
+
 # kept from one run of the tests to the next
 MODULES = ROOT / "build" / "tests" / "modules"
 UNOPTIMISED = ROOT / "build" / "tests" / "unoptimised"
@@ -111,8 +132,6 @@ def _compiled(made: Path | System, root: Path, flags: str | None) -> ModuleType:
         patch.delenv("EOMC_CFLAGS", raising=False)
         if flags is not None:
             patch.setenv("EOMC_CFLAGS", flags)
-        # the calls' own speed is no matter
-        patch.setattr("eomc.toolchain.extension.binding_flags", lambda: ("-O0",))
         return eomc.load(made, root)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 from collections.abc import Sequence
 
 from scene_author import Author
@@ -27,6 +28,7 @@ class _Wide(Author):
         self.arrays: list[str] = []
         self.frames: list[str] = []
         self.held = False  # whether what a jump changes would have to obey rows
+        self.jumped = random.Random(f"jumped parameters {seed}")
 
     # --- what is added to a scene of either kind
 
@@ -81,7 +83,19 @@ class _Wide(Author):
                 lines.append(f'{x}_dot = "{self.one([f"-{x}_dot/2", f"{x}_dot + 0.1", "0"])}"')
                 if self.chance(0.3) and not self.held:
                     lines.append(f'{x} = "{x} + 0.05"')
+                lines += self.jump_of_parameter(x)
             self.arrays += lines
+
+    def jump_of_parameter(self, x: str) -> list[str]:
+        """The line that sets one, where neither rows nor limits use it."""
+        text = "\n".join([*self.rows, *(u for u in self.tables.inputs if "limits" in u)])
+        named = (line.split(" = ")[0] for line in self.tables.parameters)
+        free = [p for p in named if not re.search(rf"\b{p}\b", text)]
+        if not free or self.jumped.random() < 0.5:
+            return []
+        p = self.jumped.choice(free)
+        to = [f"1.1*{p}", f"{p}*(1 + sin({x})**2/10)", f"{p} + 0.05*{x}_dot**2", "0.7"]
+        return [f'{p} = "{self.jumped.choice(to)}"']
 
     def wishes(self) -> None:
         """Functions besides."""

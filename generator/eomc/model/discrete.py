@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 def discrete(system: System) -> System:
     """The system whose parameters that jumps set are discrete variables, behind its coordinates.
 
-    Raises SceneError where a name that one needs is taken.
+    Raises SceneError where a name that one needs is taken, or one is a limit of an input.
     """
     jumped = {name for event in system.events for name, _ in event.jump}
     found = [p for p in system.parameters if p.name in jumped]
     if not found:
         return system
-    if taken := _taken(system, found):
-        raise SceneError(taken)
+    if problems := _taken(system, found) + _limiting(system, found):
+        raise SceneError(problems)
     more = tuple(Coordinate(p.name, p.unit, p.value, note=p.note) for p in found)
     energy = sum(c.qd**2 for c in more) / 2
     tree = system.tree and replace(system.tree, beside_kinetic=system.tree.beside_kinetic + energy)
@@ -53,6 +53,20 @@ def _taken(system: System, found: list[Parameter]) -> list[Problem]:
         for p in found
         for name in (f"{p.name}_dot", f"{p.name}_ddot")
         if name in known
+    ]
+
+
+def _limiting(system: System, found: list[Parameter]) -> list[Problem]:
+    """Inputs whose limits depend on discrete variables."""
+    names = {p.name for p in found}
+    return [
+        system.problem(
+            f"inputs.{u.name}.limits",
+            f"a jump sets '{min(jumped)}', and limits stay the same throughout a run: leave out"
+            f" these limits, and write min and max around '{u.name}' where it acts",
+        )
+        for u in system.inputs
+        if (jumped := names & {str(s) for end in u.limits if end for s in end.free_symbols})
     ]
 
 
