@@ -68,6 +68,7 @@ def test_the_pole_is_swung_up() -> None:
     assert 0 < numbers(text, r"saturated (\d+)%")[0] < 50
 
 
+@pytest.mark.slow
 def test_a_heavier_pole_is_caught_less_far() -> None:
     lines = np.reshape(numbers(said("sweep.py"), r"(\S+) kg: up to (\S+) rad"), (-1, 2))
     assert lines[:, 0].tolist() == pytest.approx(np.linspace(0.1, 0.8, 8))

@@ -285,7 +285,9 @@ def test_auto_is_by_a_tolerance(kepler: ModuleType, cartpole: ModuleType) -> Non
 
 
 def test_without_tolerance_nothing_is_built(cartpole: ModuleType) -> None:
-    with pytest.raises(ValueError, match=r"tol, times, stiff: not built; a scene asks for them"):
+    with pytest.raises(
+        ValueError, match=r"tol, stiff and, in a batch, times: not built; a scene asks for them"
+    ):
         cartpole.simulate(tol=1e-9)
     assert not hasattr(cartpole._model._lib, "adaptive")
 

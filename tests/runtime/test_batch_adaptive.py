@@ -8,6 +8,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from conftest import tiers
 from test_adaptive import KEPLER
 from test_events import BALL
 
@@ -40,7 +41,7 @@ def same(one: object, other: object) -> bool:
     )
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", tiers([1, 2], 2))
 def test_each_is_as_it_is_alone(orbits: ModuleType, threads: int) -> None:
     q0, qd0 = starts(50)
     times = np.array([0.0, 0.7, 2.0, 2 * np.pi])

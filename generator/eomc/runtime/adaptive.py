@@ -21,7 +21,6 @@ from .adaptive_error import error_of
 from .arguments import Array, as_number
 from .dense import within
 from .estimate import Estimate
-from .package import reduced
 from .section import crossings
 from .slices import longer
 from .trajectory import SAID, STATUS, Run, state_text
@@ -215,7 +214,7 @@ class AdaptiveRun(Run):
         return super()._kept() | own
 
     @classmethod
-    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> AdaptiveRun:
+    def _of_kept(cls, model: Model, kept: Mapping[str, Any], **own: Any) -> AdaptiveRun:
         return cls(
             model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
             kept["params"], 1, kept.get("held"), kept["method"], kept["evaluations"],
@@ -230,9 +229,6 @@ class AdaptiveRun(Run):
         found = super()._state() | {"_times": self._times}
         found.pop("events", None)
         return found
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return reduced("adaptive.AdaptiveRun._of_state", self._state())
 
     def _settings(self) -> tuple[Any, ...]:
         return (*super()._settings(), self.tol, self._times.tolist())

@@ -22,11 +22,9 @@ FIXED = {  # what belongs to fixed steps, where nothing is said of it
 BOTH = "times: say where the run ends; give times or duration, not both"
 
 
-def fits(
-    model: Model, h: Any, steps: Any, method: Any, tol: Any, times: Any, h_most: Any, stiff: Any
-) -> bool:
+def fits(model: Model, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any) -> bool:
     """Whether a run is by a tolerance: if asked, or where nothing is asked of fixed steps."""
-    if tol is None and times is None and h_most is None and stiff is False and method != "auto":
+    if tol is None and h_most is None and stiff is False and method != "auto":
         return bool(model.tolerance) and h is None and steps is None and method is None
     return True
 
@@ -39,16 +37,15 @@ def as_limits(
         raise ValueError(f"stiff: {stiff!r} is not True or False")
     if model.tolerance is None:
         raise ValueError(
-            "tol, times, stiff: not built; a scene asks for them with [run] tolerance = 1e-9 (of a "
-            "run by fixed steps run(times) gives the states at any times)"
+            "tol, stiff and, in a batch, times: not built; a scene asks for them with [run] "
+            "tolerance = 1e-9 (of a batch by fixed steps run(times) gives the states at any times)"
         )
     if not all(map(is_, fixed, FIXED.values())):
         for name, value in zip(FIXED, fixed, strict=True):
             if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
                 raise ValueError(
-                    f"{name}: belongs to fixed steps; tol, times, h_most and stiff to adaptive "
-                    "ones: give one or the other; run(times) gives the states of a run by fixed "
-                    "steps"
+                    f"{name}: belongs to fixed steps; tol, h_most, stiff and, in a batch, times to "
+                    "adaptive ones: give one or the other"
                 )
     most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
     return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most

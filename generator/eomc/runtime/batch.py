@@ -196,7 +196,7 @@ class BatchModel(Model):
         tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
         at the start and the end where None.
         """
-        if fits(self, h, steps, method, tol, times, h_most, stiff):
+        if times is not None or fits(self, h, steps, method, tol, h_most, stiff):
             from . import batch_adaptive  # which needs this file
 
             fitted, whole = batch_adaptive.simulate(

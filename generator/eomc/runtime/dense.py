@@ -32,14 +32,20 @@ def states(run: Run, t: ArrayLike) -> tuple[Array, Array]:
     the run. Raises ValueError outside of it, or where rows don't tell what a function gave as u.
     """
     times = within(run, t)
-    nq, h = run._model.nq, run.h
+    nq, (whole, rest) = run._model.nq, parts(times.ravel(), run.t0, run.h, run.steps)
     out = np.empty((2, times.size, nq), run._model.dtype)
-    steps = (times.ravel() - run.t0) / h
-    for k, (time, step) in enumerate(zip(times.ravel(), steps, strict=True)):
-        n = min(int(step + _AT), run.steps)
-        out[:, k] = _state(run, n, 0.0 if step - n < _AT else float(time - (run.t0 + n * h)))
+    for k, (n, left) in enumerate(zip(whole.tolist(), rest.tolist(), strict=True)):
+        out[:, k] = _state(run, n, left)
     q, qd = out.reshape(2, *times.shape, nq)
     return q, qd
+
+
+def parts(times: Array, t0: float, h: float, most: int = 2**60) -> tuple[Array, Array]:
+    """The steps of size h to each of these times (n,), most of them, and what is left of it, s."""
+    steps = (times - t0) / h
+    near = _AT + 4 * np.finfo(float).eps * steps  # times are rounded
+    whole = np.minimum((steps + near).astype(int), most)
+    return whole, np.where(steps - whole < near, 0.0, times - (t0 + whole * h))
 
 
 def _state(run: Run, n: int, rest: float) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy import empty
 from numpy.typing import ArrayLike
 
-from . import adaptive, saved
+from . import adaptive, saved, timed
 from .adaptive_arguments import fits
 from .arguments import (
     Array,
@@ -106,7 +106,12 @@ class Model(Constrained):
 
     def _single(self, kind: str, kept: Mapping[str, Any]) -> Run:
         """A run of one, by its kind and what was kept of it."""
-        return (Run if kind == "Run" else adaptive.AdaptiveRun)._of_kept(self, kept)
+        kinds: dict[str, type[Run]] = {
+            "Run": Run,
+            "TimedRun": timed.TimedRun,
+            "AdaptiveRun": adaptive.AdaptiveRun,
+        }
+        return kinds[kind]._of_kept(self, kept)
 
     def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
         """A method's step and loop in C, steps at once, stages; what is kept and counted."""
@@ -224,24 +229,24 @@ class Model(Constrained):
         whether to find the run's own error, `run.error`, by shorter steps, nine times as long.
         tol: of adaptive steps, each of which errs by about tol of how far it moves; built where the
         scene says [run] tolerance, which is taken where h, steps and method are not given.
-        times: (n,) ascending, instead of duration: the rows, at no extra steps. h_most: the longest
-        adaptive step, in s, so that none leaps over a short pulse. stiff: whether they begin by
-        Newton's method, which they else take up where the motion turns out to be stiff.
+        times: (n,) ascending, instead of duration: the rows, by the same steps and, between fixed
+        ones, a shorter one. h_most: the longest adaptive step, in s, so that none leaps over a
+        short pulse. stiff: whether they begin by Newton's method, else taken up where it is needed.
         A run that can't go on keeps what it has, warns, and says in `status` and `message` why;
         Ctrl-C raises Interrupted, which holds it.
         """
         usual = (
             u is None and out is None and progress is None and control_period is None
-            and not estimate and type(t0) is float and isfinite(t0)
+            and not estimate and times is None and type(t0) is float and isfinite(t0)
         )  # fmt: skip
         if (
             usual and (room := self._room) and h is None and steps is None and method is None
-            and times is None and h_most is None and every == 1 and stiff is False
+            and h_most is None and every == 1 and stiff is False
         ):  # fmt: skip
             if (fit := adaptive.plain(self, q0, qd0, duration, params, t0, tol, room)) is not None:
                 return fit
         q0, qd0 = self._assembled(q0, qd0, t0, params)
-        if fits(self, h, steps, method, tol, times, h_most, stiff):
+        if fits(self, h, steps, method, tol, h_most, stiff):
             fixed = h, steps, method, every, control_period, out
             fitted = adaptive.simulate(
                 self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff, fixed
@@ -269,18 +274,18 @@ class Model(Constrained):
                 ):
                     return Run(self, t0, rows, h, steps, "ok", p, every, None, method, done)
         t0 = as_number(t0, "t0")
-        steps = self._steps(h, duration, steps)
+        at, steps = timed.as_asked(self, times, t0, h, duration, steps, every, out)
+        steps = self._steps(h, duration if at is None else None, steps)
         every = min(as_count(every, "every", 1), RARELY)
         hold = min(as_period(control_period, h), max(steps, 2))  # a period may be beyond the run
         if u is None and control_period is not None and self.nu:
             u = Sampled(self, params)
         if steps >= SOME and (method, h) not in self._warned:
-            held = self._table(u, steps, every, hold)[1]
-            first = held[0] if held is not None and held.ndim == 2 else held
-            self._look(q, qd, h, t0, first, p, method)
+            self._look(q, qd, h, t0, self._first(u, steps, hold), p, method)
         result = self._trajectory(
-            q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress, hold
-        )
+            q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress, hold,
+            at,
+        )  # fmt: skip
         return self._finished(result, estimate)
 
     def _finished(self, run: Run, estimate: bool) -> Run:
@@ -330,12 +335,18 @@ class Model(Constrained):
     def _trajectory(
         self, q: Array, qd: Array, from_q: Any, from_qd: Any, h: float, steps: int, every: int,
         u: Any, p: Array, at_p: Any, method: str, t0: float, out: tuple[Array, Array] | None,
-        progress: Callable[[int, int], None] | None, hold: int = 1,
+        progress: Callable[[int, int], None] | None, hold: int = 1, at: Array | None = None,
     ) -> Run:  # fmt: skip
-        """A run from checked arguments, whatever its status; C reads from_q, from_qd and at_p."""
+        """A run from checked arguments, whatever its status; C reads from_q, from_qd and at_p.
+
+        at: the times of its rows, where it is not `every` that says them.
+        """
         _, run, _, stages, work_type, counted = self._loops[method]
         nq, (address, real, null) = self.nq, self._c
         law, held, stride = (None, None, 0) if u is None else self._table(u, steps, every, hold)
+        if at is not None:
+            acts = law, held, stride, hold
+            return timed.run(self, q, qd, t0, h, steps, at, acts, p, method, progress)
         rows = 1 - -steps // every
         both: Any = out
         try:
@@ -395,6 +406,11 @@ class Model(Constrained):
             made._hold = hold
             made._applied = law.rows(len(made), self.nu)
         return made
+
+    def _first(self, u: Any, steps: int, hold: int) -> Array | None:
+        """What is held over the first step; None: a signal, or a function."""
+        held = self._table(u, steps, 1, hold)[1]
+        return held[0] if held is not None and held.ndim == 2 else held
 
     def _table(
         self, u: Any, steps: int, every: int, hold: int

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .columns import Columns, File
     from .model import Model
 
-KINDS = ("Run", "AdaptiveRun", "BatchRun", "AdaptiveBatchRun")
+KINDS = ("Run", "AdaptiveRun", "TimedRun", "BatchRun", "AdaptiveBatchRun")
 _KIND = "eomc {} 1"  # and the version of what such a file holds
 
 

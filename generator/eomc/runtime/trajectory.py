@@ -281,12 +281,15 @@ class Run(ConstrainedRun, Columns):
         if isinstance(self._u, str):
             raise ValueError(f"estimate: {self._u}")
         try:
-            self.error = estimate(self, progress)
+            self.error = self._estimated(progress)
         except KeyboardInterrupt:
             raise Interrupted(self) from None
         if words := self.error.warning:
             warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
         return self.error
+
+    def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
+        return estimate(self, progress)
 
     def _again(
         self, parts: int, every: int, nudge: Array | None,
@@ -317,12 +320,12 @@ class Run(ConstrainedRun, Columns):
         }  # fmt: skip
 
     @classmethod
-    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> Run:
+    def _of_kept(cls, model: Model, kept: Mapping[str, Any], **own: Any) -> Run:
         applied = kept.get("applied")
         u = kept.get("held") if applied is None else _LEFT_OUT
         run = cls(
             model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
-            kept["params"], kept["every"], u, kept["method"], kept["evaluations"],
+            kept["params"], kept["every"], u, kept["method"], kept["evaluations"], **own,
         )  # fmt: skip
         run._applied = applied
         for name in ("singular_steps", "first_singular"):
@@ -350,7 +353,8 @@ class Run(ConstrainedRun, Columns):
         state = self._state()
         if callable(self._u):
             state["_u"] = _LEFT_OUT
-        return reduced("trajectory.Run._of_state", state)
+        kind = type(self)
+        return reduced(f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}._of_state", state)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Run):
