@@ -42,6 +42,10 @@ class _Wide(Author):
                 lines[k] = line.replace(" }", f", limits = {ends} }}")
                 self.corners = True
 
+    def free_name(self) -> str:
+        """No column of every run's."""
+        return next(n for n in iter(self.name, "") if n not in ("energy", "power"))
+
     def asked(self) -> None:
         """Outputs."""
         for _ in range(self.random.choice([0, 1, 2, 3])):
@@ -58,7 +62,7 @@ class _Wide(Author):
                 forms.append(f"{self.one(self.u)}*{x}_dot")
             text = self.one(forms)
             unit = f'{{ formula = "{text}", unit = "N" }}' if self.chance(0.3) else f'"{text}"'
-            name = next(n for n in iter(self.name, "") if n not in ("energy", "power"))
+            name = self.free_name()
             self.outputs.append(f"{name} = {unit}")
 
     def adaptive(self) -> None:
@@ -127,7 +131,7 @@ class _Wide(Author):
                 f"{name} + {name}**3/3 - {a}*{x}", f"{a}*{name} - cos({x}) + 0.1*sin(2*t)",
                 f"{name} - {a}*atan({x}) - {y}**2/4", f"{name}_dot - {a}*sin({y})*{x}_dot",
             ]  # fmt: skip
-            self.rows.append(f'{self.name()} = "{self.one(forms)}"')
+            self.rows.append(f'{self.free_name()} = "{self.one(forms)}"')
         self.held = True
 
     # --- scenes

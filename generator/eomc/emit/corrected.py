@@ -15,6 +15,7 @@ SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
 # beside such positions, of a row's terms what its rate may be where the row is left out: some 3
 # times the root of the part of a pivot below which it is; and of the largest row's terms
 UNHELD = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
+CROSSED = 30  # roundings: what corrections of q and qd together leave of rates
 APART = 1e-12  # of the squares of all coordinates together: a coordinate that is less is 0
 
 
@@ -57,6 +58,7 @@ def view(
         part=target.literal(part),
         fabs=f"fabs{target.real.function_suffix}",
         near=target.literal(large),
+        crossed=target.literal((CROSSED * target.real.epsilon) ** 2),
         apart=target.literal(APART),
         little=target.literal(little),
         slight=target.literal(1e4 * little),

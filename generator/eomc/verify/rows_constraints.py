@@ -37,6 +37,7 @@ STEPS = 200  # of a run that is to stay on the rows
 SHARE = 0.02  # of how far things go, in a step of it
 HELD = 450.0  # units: what rows may be along it, 1e-13 of their terms
 SLOPE = 1e-7  # of A: differences of order 8, in 16 digits; a wrong sign makes 1
+SLIGHT = 1e-4  # of how far things go: a difference for the size of a slope
 STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 UNITS = "units of rounding"
 
@@ -220,7 +221,22 @@ class Rows:
             scale = np.abs(s.qd) + self.of.sampler.speed
         if not len(off):
             return None
-        return self.of.units(off, 0 * off, A @ scale)
+        turned = self._turned(s) if name == "constraint_rates" else 0.0
+        return self.of.units(off, 0 * off, A @ scale + turned)
+
+    def _turned(self, s: State) -> Vector:
+        """What rates of rows change by with each coordinate, times how large that is.
+
+        A sine that is predicted is as exact as its angle, which may have gone far.
+        """
+        total = np.zeros(len(self.system.constraints))
+        for i, q in enumerate(s.q):
+            step, x = SLIGHT * self.of.sampler.spread[i], s.q.copy()
+            x[i] += step
+            change = ask(self.module, "constraint_rates", replace(s, q=x))
+            change = change - ask(self.module, "constraint_rates", s)
+            total += np.abs(change) / step * abs(q)
+        return total
 
 
 def _quiet(module: Any, s: State, method: str, h: float) -> Any:

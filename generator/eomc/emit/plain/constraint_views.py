@@ -40,6 +40,7 @@ class Corrected:
     part: str
     fabs: str
     near: str
+    crossed: str
     apart: str
     little: str
     slight: str
