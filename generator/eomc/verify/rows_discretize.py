@@ -19,7 +19,7 @@ from eomc.verify.derivatives import STENCIL, WIDTHS, apart
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.sampling import State
+from eomc.verify.sampling import FARTHEST, State
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
@@ -77,7 +77,7 @@ def _error(
     n, scales = len(s.q), _scales(of, s)
     for h in (part * of.system.run.h for part in SHORTER):
         near = exact(h)
-        if not any(np.isfinite(J).all() for J in near):
+        if not any(np.isfinite(J).all() for J in near) or _thrown(of, method, s, h):
             continue
         held = {"h": h, "t": s.t, "u": s.u, "params": s.params, "method": method}
         found = [np.asarray(x, float) for x in module.discretize(s.q, s.qd, **held)]
@@ -90,6 +90,13 @@ def _error(
         ]
         return float(np.nan_to_num(np.max(np.fmin.reduce(off)), nan=math.inf))
     return None
+
+
+def _thrown(of: Comparison, method: str, s: State, h: float) -> bool:
+    """Whether a step is so long that it throws the state far, where no width of differences fits."""
+    run = of.simulate(s, method=method, h=h, steps=1, t0=s.t)
+    moved = np.abs(np.subtract([run.q[-1], run.qd[-1]], [s.q, s.qd]))
+    return not bool(np.all(moved < FARTHEST * np.array([of.sampler.spread, of.sampler.speed])))
 
 
 def _differences(of: Comparison, method: str, s: State, h: float, by: Vector) -> Vector:
