@@ -93,7 +93,7 @@ def _error(
 
 
 def _thrown(of: Comparison, method: str, s: State, h: float) -> bool:
-    """Whether a step is so long that it throws the state far, where no width of differences fits."""
+    """Whether a step throws the state so far that no width of differences fits."""
     run = of.simulate(s, method=method, h=h, steps=1, t0=s.t)
     moved = np.abs(np.subtract([run.q[-1], run.qd[-1]], [s.q, s.qd]))
     return not bool(np.all(moved < FARTHEST * np.array([of.sampler.spread, of.sampler.speed])))
