@@ -14,7 +14,7 @@ from eomc.emit.plain.parts import Computed
 SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
 # beside such positions, of a row's terms what its rate may be where the row is left out: some 3
 # times the root of the part of a pivot below which it is; and of the largest row's terms
-UNHELD = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
+LEFT_OUT = {"double": (1e-4, 1e-9), "float": (1e-2, 1e-4)}
 CROSSED = 30  # roundings: what corrections of q and qd together leave of rates
 APART = 1e-12  # of the squares of all coordinates together: a coordinate that is less is 0
 
@@ -37,7 +37,7 @@ def view(
     """The view for one form and lane. state: where it is, for `rate_terms`."""
     target = functions.target
     little, noise = SINGULAR[target.system.run.real]
-    part, loose = UNHELD[target.system.run.real]
+    part, loose = LEFT_OUT[target.system.run.real]
     large = near(target)
     return Corrected(
         PREFIX=functions.PREFIX,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .adaptive_error import LEAST
-from .arguments import Array, as_number, as_step_size
+from .arguments import Array, as_number, as_step_size, unmasked
 
 if TYPE_CHECKING:
     from .model import Model
@@ -71,9 +71,13 @@ def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
 
 def as_times(times: ArrayLike, t0: float, dtype: np.dtype[Any]) -> Array:
     """Times in ascending order, not before t0, or a ValueError."""
+    unmasked(times, "times")
     try:
-        found = np.ascontiguousarray(times, dtype)
-    except (TypeError, ValueError):
+        given = np.asarray(times)
+        if given.dtype.kind in "cUSmM":  # text that looks like a number is none
+            raise TypeError
+        found = np.ascontiguousarray(given, dtype)
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"times: {times!r} is not an array of numbers") from None
     if found.ndim != 1 or not len(found) or not (isfinite(found[0]) and isfinite(found[-1])):
         raise ValueError("times: expected a row of finite numbers, in s")
