@@ -324,3 +324,21 @@ def test_names_that_their_rates_need_are_taken(name: str, words: str) -> None:
             "osc", ["x"], "m*x_dot**2/2", "k*x**2/2", parameters={"m": 1, "k": 4, name: 3},
             events={"soft": {"when": "x - 0.3", "action": "jump", "k": "k/2"}},
         )  # fmt: skip
+
+
+def test_a_run_ends_at_the_third_impact_by_a_time_that_it_sets(tmp_path: Path) -> None:
+    made = System.make(
+        "counted", {"y": 1.0}, "y_dot**2/2", "9.81*y",
+        parameters={"e": 0.8, "count": 0, "until": 1e9}, tolerance=1e-10,
+        events={
+            "impact": {
+                "when": "y", "direction": "falling", "action": "jump", "y_dot": "-e*y_dot",
+                "count": "count + 1", "until": "t + 1e-6 + 1e9*heaviside(1.5 - count)",
+            },
+            "third": {"when": "t - until", "action": "stop"},
+        },
+    )  # fmt: skip
+    run = eomc.load(made, tmp_path).simulate(duration=10)
+    fall = (2 / 9.81) ** 0.5
+    assert run.stopped == "third" and run["count"][-1] == 3
+    assert run.t[-1] == pytest.approx(fall * (1 + 2 * 0.8 + 2 * 0.64) + 1e-6, rel=1e-12)

@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 def discrete(system: System) -> System:
     """The system whose parameters that jumps set are discrete variables, behind its coordinates.
 
-    Raises SceneError where a name that one needs is taken, or one is a limit of an input.
+    Raises SceneError where a name that one needs is taken, one is a limit of an input, or an
+    event watches nothing else.
     """
     jumped = {name for event in system.events for name, _ in event.jump}
     found = [p for p in system.parameters if p.name in jumped]
     if not found:
         return system
-    if problems := _taken(system, found) + _limiting(system, found):
+    if problems := _taken(system, found) + _limiting(system, found) + _idle(system, found):
         raise SceneError(problems)
     more = tuple(Coordinate(p.name, p.unit, p.value, note=p.note) for p in found)
     energy = sum(c.qd**2 for c in more) / 2
@@ -68,6 +69,24 @@ def _limiting(system: System, found: list[Parameter]) -> list[Problem]:
         for u in system.inputs
         if (jumped := names & {str(s) for end in u.limits if end for s in end.free_symbols})
     ]
+
+
+def _idle(system: System, found: list[Parameter]) -> list[Problem]:
+    """Events of discrete variables alone, which nothing carries through zero between jumps."""
+    jumped, still = {p.name for p in found}, {p.name for p in system.parameters}
+    problems = []
+    for k, event in enumerate(system.events, start=1):
+        names = {str(s) for s in event.when.free_symbols}
+        if names & jumped and names <= still:
+            problems.append(
+                system.problem(
+                    f"event.{k}.when",
+                    f"only jumps change '{min(names & jumped)}', and a jump over zero is no "
+                    'crossing: let the jump set a time, until = "t + 1e-6" with a parameter '
+                    'until = 1e9, and write when = "t - until"',
+                )
+            )
+    return problems
 
 
 def constant(system: System) -> System:
