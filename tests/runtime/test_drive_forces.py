@@ -124,6 +124,7 @@ def test_what_it_refuses(linkage: ModuleType) -> None:
     linkage.drive_forces(q, qd, qdd + 3 * along, ["q1"])  # what rows allow is not
 
 
+@pytest.mark.slow
 def test_redundant_rows_give_nothing(modules: Modules) -> None:
     text = (SCENES / "bricard.toml").read_text(encoding="utf-8").split("[picture]")[0]
     text = text.replace('name    = "bricard"', 'name = "bricard_drives"')

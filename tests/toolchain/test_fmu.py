@@ -55,7 +55,12 @@ def moved(run: Any) -> np.ndarray:
     return np.hstack([run.q, run.qd])
 
 
-@pytest.fixture(params=VERSIONS, ids=["fmi2", "fmi3"])
+# the scene's own functions are the same in both; what only tells them is tested in both quickly
+NAMED = ("fmi2", "fmi3")
+both = pytest.mark.parametrize("version", VERSIONS, ids=NAMED)
+
+
+@pytest.fixture(params=tiers(VERSIONS, 3), ids=NAMED)
 def version(request: pytest.FixtureRequest) -> int:
     return int(request.param)
 
@@ -76,6 +81,7 @@ SCENES_TESTED = [
 IDS = [s if "\n" not in s else s.split('"')[1] for s in SCENES_TESTED]
 
 
+@both
 @pytest.mark.parametrize("scene", tiers(SCENES_TESTED, *SCENES_TESTED[:3]), ids=IDS)
 def test_it_is_valid(scene: str, version: int) -> None:
     from fmpy.validation import validate_fmu
@@ -83,6 +89,7 @@ def test_it_is_valid(scene: str, version: int) -> None:
     assert validate_fmu(str(exported(scene, version))) == []
 
 
+@both
 @pytest.mark.parametrize(
     "scene",
     tiers(["cartpole", "kapitza_pendulum", "cartpole_bodies", "four_bar"], "cartpole", "four_bar"),
@@ -159,6 +166,7 @@ def test_many_short_steps_drift_no_further_than_their_sum(version: int, hosts: l
     assert np.array_equal(host.get("x", "theta"), run.q[-1])
 
 
+@both
 def test_inputs_are_held_over_steps(version: int, hosts: list[Host]) -> None:
     module = plain("cartpole_driven")
     forces = np.array([[0.5], [-0.2], [0.1], [0.0], [1.0]])
@@ -190,6 +198,7 @@ def test_the_scenes_signals_act_where_that_is_wished(version: int, hosts: list[H
     assert still.get("x", "x_dot", "force") == pytest.approx([0, 0, 0], abs=1e-12)
 
 
+@both
 def test_parameters_and_starts_are_set(version: int, hosts: list[Host]) -> None:
     module = plain("cartpole")
     run = module.simulate(steps=40, params={"m_p": 3.5, "l": 1.5}, q0=[0.1, 0.2], qd0=[0.3, -0.4])
@@ -227,6 +236,7 @@ def test_accelerations_and_outputs_are_the_modules(version: int, hosts: list[Hos
     )
 
 
+@both
 def test_states_are_kept_and_restored(version: int, hosts: list[Host]) -> None:
     host, other = Host(exported(BALL, version)), Host(exported(BALL, version))
     hosts += [host, other]
@@ -309,6 +319,7 @@ def test_events_are_those_of_the_module(version: int, hosts: list[Host]) -> None
     assert len(run.events["impact"].t) == 6
 
 
+@both
 def test_an_event_stops_the_unit(version: int, hosts: list[Host]) -> None:
     run = plain(BALL).simulate(tol=1e-9, duration=3.0, u=[0.0])
     host = Host(exported(BALL, version))
@@ -373,6 +384,7 @@ def test_events_in_model_exchange(version: int) -> None:
     assert result["y"][-1] == pytest.approx(run.q[-1, 0], abs=1e-6)
 
 
+@both
 def test_an_event_ends_model_exchange(version: int) -> None:
     from fmpy import simulate_fmu
 
@@ -384,6 +396,7 @@ def test_an_event_ends_model_exchange(version: int) -> None:
     assert result["time"][-1] == pytest.approx(run.t[-1], abs=1e-6)
 
 
+@both
 @pytest.mark.parametrize("kind", KINDS)
 def test_directional_derivatives_are_the_modules(
     kind: str, version: int, hosts: list[Host]
@@ -668,6 +681,7 @@ def test_what_is_at_zero_at_the_start_has_not_happened(version: int) -> None:
 # --- other importers ------------------------------------------------------------------------------
 
 
+@both
 def test_casadi_reads_it(version: int, tmp_path: Path) -> None:
     """Derivatives, outputs and their exact Jacobians in CasADi."""
     casadi = pytest.importorskip("casadi", reason="CasADi is not installed")
