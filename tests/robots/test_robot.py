@@ -324,7 +324,9 @@ def test_joints_that_move_nothing_are_refused_with_the_remedy() -> None:
                                            ((1.0, 0.0, 0.0),), note="a mesh only"))  # fmt: skip
     with pytest.raises(EomcError) as fault:
         scene_text.finished(replace(arm(), bodies=bodies))
-    assert "joint f-1 moves nothing that has inertia, only finger (a mesh only)" in str(fault.value)
+    assert "joint f-1: it moves nothing that has inertia, only finger (a mesh only)" in str(
+        fault.value
+    )
     assert "--lock f-1=0" in str(fault.value)
     locked = edit.lock(replace(arm(), bodies=bodies), {"f-1": 0.0})
     assert len(scene_text.finished(locked).motions) == 3

@@ -285,7 +285,7 @@ def test_a_mesh_only_is_refused_where_a_joint_needs_inertia(read: Reader) -> Non
     )
     with pytest.raises(EomcError) as fault:
         scene_text.finished(read(text))
-    assert "joint extend moves nothing that has mass" in str(fault.value)
+    assert "joint extend: it moves nothing that has mass" in str(fault.value)
     assert "slide (a mesh only, no <inertial>)" in str(fault.value)
     assert "--lock extend=0" in str(fault.value)
 

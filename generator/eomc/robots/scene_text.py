@@ -175,7 +175,7 @@ def _without_inertia(robot: Robot) -> list[str]:
             those = texts.listed([b.name + (f" ({b.note})" if b.note else "") for b in mine], 4)
             lacks = "mass" if kind == "t" else "inertia"
             faults[motion.name] = (
-                f"joint {motion.name} moves nothing that has {lacks}, only {those}"
+                f"joint {motion.name}: it moves nothing that has {lacks}, only {those}"
             )
             if len(body.motions) == 1:
                 locks[motion.name] = f"--lock {motion.name}=0"
