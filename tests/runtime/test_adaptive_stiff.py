@@ -268,7 +268,8 @@ duration = 300
     ("name", "potential", "force", "end", "steps"),
     tiers([
         ("sags", "9.81*x + 50*x**2", "-2*x_dot", -0.0981, 2500),
-        ("comes_to_rest", "-9.81*cos(x - 0.2)", "-x_dot/2", 0.2, 700),
+        # at 1e-4 rounding at rest decides: 230 to 760 over nine starts
+        ("comes_to_rest", "-9.81*cos(x - 0.2)", "-x_dot/2", 0.2, 1000),
         ("lies", "9.81*x", "max(0, -1e6*x - 1e3*x_dot)", -9.81e-6, 500),
         ("lands", "9.81*x + exp(-x/5e-4)/1000", "-10*x_dot*exp(-x/5e-4)", None, 1000),
     ], "comes_to_rest", "lands"),

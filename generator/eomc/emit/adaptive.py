@@ -101,9 +101,10 @@ class Stepping:
         """The accelerations over a step."""
         real = self.functions.real
         out = c.filled(f"{self.method}_stages", "a")
-        told = (c.filled(real, "rough"), c.filled("int", "sweeps"))
+        measured = (c.filled(real, name) for name in ("scale", "rough", "beyond"))
         by = c.given(f"{self.method}_newton", "m")
         given = (*self.form.around, self.number("tol"), self.number("most"), by)
+        told = (*measured, c.filled("int", "sweeps"))
         return CFunction(f"{self.method}_settled", "int", (out, *given, *told), qualifier="static")
 
     @cached_property
@@ -157,10 +158,7 @@ def tableau(made: Stepping) -> dict[str, Any]:
         "tiny": target.literal(1e-30),
         "most": MOST,
         "c": numbers(m.c, real),
-        "b": numbers(rounded(m.b, real), real),
-        "bA": numbers(m.b_a, real),
         "powers": matrix(list(zip(*m.powers, strict=True)), real),
-        "top": c.in_braces(numbers(m.legendre(n), real) for n in range(m.stages - 4, m.stages)),
         "anew": ANEW,
     }
 
@@ -169,15 +167,17 @@ def steps(made: Stepping) -> Adaptive:
     """A step, and the state within it."""
     functions, m, form = made.functions, METHOD, made.form
     target, real = functions.target, functions.target.real
-    known = {"a": "&a", "rough": "&rough", "sweeps": "&sweeps", "m": "newton ? &m : 0"}
+    known = {name: f"&{name}" for name in ("a", "rough", "beyond", "sweeps")}
+    known["m"] = "newton ? &m : 0"
     eigenvalues, to_parts, from_parts = m.eigen
+    last, b = [m.legendre(n) for n in range(m.stages - 4, m.stages)], rounded(m.b, real)
     return Adaptive(
         **tableau(made),
         title=TITLE,
         lanes=form.lanes and f"{form.lanes} ",
-        total=_total([f"x[{i}]" for i in range(m.stages)]),
-        last=numbers(m.legendre(m.stages - 1), real),
-        before=numbers(m.legendre(m.stages - 2), real),
+        total=_total([f"half[{i}]" for i in range(m.stages // 2)]),
+        top=c.in_braces(numbers(row, real) for row in zip(*last, strict=True)),
+        weights=c.in_braces(zip(numbers(m.b_a, real), numbers(b, real), strict=True)),
         timed=target.driven,
         events=bool(target.system.events),
         project=form.project,

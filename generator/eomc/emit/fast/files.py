@@ -300,7 +300,7 @@ def _steppers(made: Steppers, show: Show) -> Iterator[str]:
 def _adaptive(made: Steppers) -> adaptive.Form:
     """The sweeps of adaptive steps, stages in a lane each."""
     one, m = made.one, adaptive.METHOD
-    sweep = made.sweep(m).call(b="&b", w=f"&{one.prefix}_{m.name}_within")
+    sweep = made.sweep(m).call(b="to", a="from", w=f"&{one.prefix}_{m.name}_within")
     return adaptive.Form(
         made.stepping(one), sweep, made.accelerate(one, a="f"), one.extent,
         bool(made.accelerations.constants), runs.constants_call(made),

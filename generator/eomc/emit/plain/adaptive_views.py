@@ -14,8 +14,8 @@ class Tableau(Named):
     """The numbers that both texts of adaptive steps have.
 
     method: what C names begin with. powers: from accelerations at the stages, one a row, to their
-    polynomial's powers; top: to their parts in the last four of Legendre's. most: sweeps of a step;
-    anew: steps by Newton's method, before sweeps alone are tried again.
+    polynomial's powers. most: sweeps of a step; anew: steps by Newton's method, before sweeps alone
+    are tried again.
     """
 
     method: str
@@ -28,10 +28,7 @@ class Tableau(Named):
     tiny: str
     most: int
     c: tuple[str, ...]
-    b: tuple[str, ...]
-    bA: tuple[str, ...]
     powers: tuple[str, ...]
-    top: tuple[str, ...]
     anew: int
 
 
@@ -39,8 +36,9 @@ class Tableau(Named):
 class Adaptive(Tableau):
     """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
 
-    total: the sum of x[0], ... over the stages. last, before: from accelerations at the stages to
-    their polynomial's parts in the last two of Legendre's. lanes: before loops over stages.
+    total: the sum of half[0], ... over half of the stages. lanes: before loops over stages. top:
+    from accelerations at the stages, one a row, to their polynomial's parts in the last four of
+    Legendre's; weights: to what a step adds to a position and a velocity.
     project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
     corners: whether forces jump or bend; share: of the tolerance, for a step in which they do;
     ends: from accelerations at the stages to the ends of the polynomial through them; forces: the
@@ -52,8 +50,8 @@ class Adaptive(Tableau):
     title: str
     lanes: str
     total: str
-    last: tuple[str, ...]
-    before: tuple[str, ...]
+    top: tuple[str, ...]
+    weights: tuple[str, ...]
     timed: bool
     events: bool
     project: str

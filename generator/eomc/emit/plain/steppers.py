@@ -349,7 +349,7 @@ def _adaptive(plain: Functions) -> list[View]:
     end = f"{c.member('x', 't')} + h"
     onto = plain.corrected.call(r="at", v="moving", t=end, singular="&singular")
     form = adaptive.Form(
-        around, sweep.call(b="&b"), accelerate(qdd="f"), plain.NQ,
+        around, sweep.call(b="to", a="from"), accelerate(qdd="f"), plain.NQ,
         project=onto if plain.correction else "", whole=True,
     )  # fmt: skip
     many = [adaptive.batch(plain)] if plain.target.system.run.batch else []
