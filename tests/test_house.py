@@ -114,8 +114,8 @@ def test_what_lies_beside_a_built_module_needs_no_eomc() -> None:
             assert not imports(name), name
 
 
-def test_pictures_alone_are_asked_of_eomc_beside_a_built_module() -> None:
-    """By name, when a run is drawn; an import would be of no use where eomc is not installed."""
+def test_pictures_and_events_alone_are_asked_of_eomc_beside_a_built_module() -> None:
+    """By name, when they are wanted; an import would be of no use where eomc is not installed."""
     asking = [
         name
         for name in modules()

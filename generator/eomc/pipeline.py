@@ -11,11 +11,11 @@ from __future__ import annotations
 import gc
 import hashlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from eomc.base.errors import EomcError
 
@@ -251,6 +251,56 @@ def load(
     own = Path(os.path.abspath(scene)) if isinstance(scene, (str, os.PathLike)) else scene
     module._model.source = own
     return module
+
+
+def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> Any:
+    """The model of a built module's scene with events besides its own; built once, in `folder`.
+
+    events: by name a formula, or a dict as [[event]] has it.
+    Raises SceneError for faulty ones, EomcError where the scene is not there or has changed.
+    """
+    from dataclasses import replace
+
+    from eomc.base.errors import SceneError
+    from eomc.runtime.written import replacing
+    from eomc.scene import read as scenes
+    from eomc.scene import toml_text
+
+    name, source, what = model.name, model.source, "simulate(events=)"
+    if source is None:
+        raise EomcError(f"{what}: {name} was imported without its scene: load it with eomc.load")
+    if not isinstance(source, Path):
+        raise EomcError(f"{what}: {name} was made in Python: give System.make its events")
+    data = source.read_bytes()
+    if hashlib.sha256(data).hexdigest() != model.digest:
+        raise EomcError(f"{what}: {source} has changed since it was built: load it again")
+    text = data.decode() + toml_text.events(events, what)
+    root = folder / ".events" / hashlib.sha256(text.encode()).hexdigest()[:16]
+    file = root / f"{name}.toml"
+    if not file.is_file():
+        try:
+            scenes.parse(text, what)
+        except SceneError as wrong:
+            own = len(model.events)
+            names = {f"event.{own + k + 1}": called for k, called in enumerate(events)}
+            told = [
+                replace(p, line=0, column=-1, source="", key=_renamed(p.key, names))
+                for p in wrong.problems
+            ]
+            raise SceneError(told) from None
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+            with replacing(file) as new:
+                new.write_text(text, encoding="utf-8")
+        except OSError as fault:
+            raise EomcError(f"{what}: {file}: can't be written ({fault.strerror})") from None
+    return load(file, root)._model
+
+
+def _renamed(key: str, names: Mapping[str, str]) -> str:
+    """The key of an event, by its name in place of its number."""
+    start = ".".join(key.split(".")[:2])
+    return names.get(start, start) + key[len(start) :]
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,7 @@ from .batch_work import WORTH, Work
 from .columns import Columns, File
 from .model import LARGE, RARELY, SOME, Model
 from .package import reduced
+from .shown import with_events
 from .trajectory import STATUS, Interrupted
 
 _NAMES = np.array([*STATUS, "interrupted"])
@@ -177,6 +178,20 @@ class BatchModel(Model):
             return batch_adaptive.AdaptiveBatchRun._of_kept(self, kept)
         return BatchRun._of_kept(self, kept) if kind == "BatchRun" else self._single(kind, kept)
 
+    def _ends_and_rows(self, count: int, rows: int) -> tuple[list[Array], list[Array]]:
+        """Room for q and qd at the ends, (batch, nq), and in the rows, (batch, rows, nq)."""
+        try:
+            if count * rows * self.nq > LARGE and self._bytes(count * rows) > machine_memory():
+                raise MemoryError
+            shapes = (count, self.nq), (count, rows, self.nq)
+            ends, kept = ([np.empty(shape, self.dtype) for _ in range(2)] for shape in shapes)
+        except MemoryError:
+            raise MemoryError(
+                f"{count} times {rows} rows of {2 * self.nq} numbers don't fit in memory: "
+                "keep fewer with every="
+            ) from None
+        return ends, kept
+
     def simulate_batch(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
@@ -184,6 +199,7 @@ class BatchModel(Model):
         method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
         progress: Callable[[int, int], None] | None = None, tol: float | None = None,
         times: ArrayLike | None = None, h_most: float | None = None, stiff: bool = False,
+        events: Mapping[str, Any] | None = None,
     ) -> BatchRun:  # fmt: skip
         """Trajectories of many instances; see `simulate` for what is not here.
 
@@ -194,8 +210,11 @@ class BatchModel(Model):
         threads: as many as there are processors where None. An instance that can't go on has its
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
         tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
-        at the start and the end where None.
+        at the start and the end where None. events: of which jumps and stops act.
         """
+        if events is not None:
+            other, given = with_events(dict(locals()))
+            return cast(BatchRun, other.simulate_batch(**given))
         if times is not None or fits(self, h, steps, method, tol, h_most, stiff):
             from . import batch_adaptive  # which needs this file
 
@@ -219,16 +238,7 @@ class BatchModel(Model):
         if held is not None and hold > 1 and held.shape[1] > 1:
             held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])
         rows = 1 + steps // every + (steps % every > 0)
-        try:
-            if count * rows * self.nq > LARGE and self._bytes(count * rows) > machine_memory():
-                raise MemoryError
-            q, qd = (np.empty((count, self.nq), self.dtype) for _ in range(2))
-            q_rows, qd_rows = (np.empty((count, rows, self.nq), self.dtype) for _ in range(2))
-        except MemoryError:
-            raise MemoryError(
-                f"{count} times {rows} rows of {2 * self.nq} numbers don't fit in memory: "
-                "keep fewer with every="
-            ) from None
+        (q, qd), (q_rows, qd_rows) = self._ends_and_rows(count, rows)
         work = Work(self, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows, starts)
         whole = work.run(threads, progress)
         if steps % every:

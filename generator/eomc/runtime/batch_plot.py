@@ -41,7 +41,7 @@ class Fans:
         instances: how many, spread evenly, or which, at most 24. One that has stopped stands where
         it did. Raises KeyError for unknown names, EomcError for instances that there are not.
         """
-        page = by_eomc("animation")
+        page = by_eomc("report.animation")
         return page.instances(self, file, names=names, chosen=instances, scene=scene, title=title)
 
 

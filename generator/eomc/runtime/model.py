@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from math import ceil, isfinite
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy import empty
@@ -33,6 +33,7 @@ from .discretize import discretize
 from .estimate import advice, beyond_end
 from .laws import Law, Sampled
 from .package import reduced
+from .shown import with_events
 from .slices import longer
 from .trajectory import PASSED_OVER, SAID, STATUS, Interrupted, MotionError, Run, state_text
 
@@ -214,27 +215,28 @@ class Model(Constrained):
         control_period: float | None = None, out: tuple[Array, Array] | None = None,
         progress: Callable[[int, int], None] | None = None, estimate: bool = False,
         tol: float | None = None, times: ArrayLike | None = None, h_most: float | None = None,
-        stiff: bool = False,
+        stiff: bool = False, events: Mapping[str, Any] | None = None,
     ) -> Run:  # fmt: skip
         """A trajectory by fixed steps of size h, or by steps that fit a tolerance; the loop in C.
 
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration. method:
         one of `methods`, the first where None; "auto": by a tolerance. every: a row is kept of
-        every so many steps, and the first and last state always.
-        u: None, the scene's signals; (nu,), constant; (steps, nu), a row held over each step; a
-        dict of all inputs by name, numbers or (steps,); or a function u(t, q, qd) called before
-        each step, some hundred times slower. control_period: in s, a whole number of steps: the
-        function is called, a row taken, or the signals are read, once in it, and held to the next.
-        out: (q, qd) arrays to write the rows to. progress: called with (done, steps). estimate:
-        whether to find the run's own error, `run.error`, by shorter steps, nine times as long.
-        tol: of adaptive steps, each of which errs by about tol of how far it moves; built where the
-        scene says [run] tolerance, which is taken where h, steps and method are not given.
-        times: (n,) ascending, instead of duration: the rows, by the same steps and, between fixed
-        ones, a shorter one. h_most: the longest adaptive step, in s, so that none leaps over a
-        short pulse. stiff: whether they begin by Newton's method, else taken up where it is needed.
-        A run that can't go on keeps what it has, warns, and says in `status` and `message` why;
-        Ctrl-C raises Interrupted, which holds it.
+        every so many steps, and the ends. u: None, the scene's signals; (nu,), constant; (steps,
+        nu), held over a step each; a dict of all inputs by name, numbers or (steps,); or a function
+        u(t, q, qd) called before each step, and slow. control_period: in s, a whole number of
+        steps: the function is called, a row taken, or the signals are read, once in it. out: (q,
+        qd), arrays for the rows. progress: called with (done, steps). estimate: whether to find the
+        run's own error, `run.error`, by shorter steps, nine times as long. tol: of adaptive steps,
+        each of which errs by about tol of how far it moves; of a scene with [run] tolerance, which
+        holds where h, steps and method are not given. times: (n,) ascending, instead of duration:
+        the rows, between fixed steps by a shorter one. h_most: the longest adaptive step, in s.
+        stiff: whether they begin by Newton's method. events: more, by name a formula or a dict as
+        [[event]] has it; built once. A run that can't go on keeps what it has and warns; Ctrl-C
+        raises Interrupted, with the run.
         """
+        if events is not None:
+            other, given = with_events(dict(locals()))
+            return cast(Run, other.simulate(**given))
         usual = (
             u is None and out is None and progress is None and control_period is None
             and not estimate and times is None and type(t0) is float and isfinite(t0)
@@ -242,9 +244,9 @@ class Model(Constrained):
         if (
             usual and (room := self._room) and h is None and steps is None and method is None
             and h_most is None and every == 1 and stiff is False
+            and (fit := adaptive.plain(self, q0, qd0, duration, params, t0, tol, room)) is not None
         ):  # fmt: skip
-            if (fit := adaptive.plain(self, q0, qd0, duration, params, t0, tol, room)) is not None:
-                return fit
+            return fit
         q0, qd0 = self._assembled(q0, qd0, t0, params)
         if fits(self, h, steps, method, tol, h_most, stiff):
             fixed = h, steps, method, every, control_period, out
@@ -283,8 +285,7 @@ class Model(Constrained):
         if steps >= SOME and (method, h) not in self._warned:
             self._look(q, qd, h, t0, self._first(u, steps, hold), p, method)
         result = self._trajectory(
-            q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress, hold,
-            at,
+            q, qd, from_q, from_qd, h, steps, every, u, p, at_p, method, t0, out, progress, hold, at
         )  # fmt: skip
         return self._finished(result, estimate)
 

@@ -74,6 +74,6 @@ def _picture(run: Any) -> str:
 def _mechanism(run: Any) -> Any:
     """What draws the mechanism of a run; None where nothing says what it looks like."""
     try:
-        return by_eomc("picture").of_run(run)
+        return by_eomc("report.picture").of_run(run)
     except ImportError:
         return None

@@ -1,19 +1,36 @@
-"""Pictures of runs: drawn by eomc, where it is installed; all else here needs nothing of it."""
+"""What eomc does for a built module, where it is installed; all else here needs nothing of it."""
 
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
-def by_eomc(room: str) -> Any:
-    """The module `room` of eomc's report. Raises ImportError with the remedy where there is none.
+def by_eomc(room: str, what: str = "runs are drawn") -> Any:
+    """The module `room` of eomc. Raises ImportError with the remedy where there is none.
 
-    It is asked for by its name when a picture is wanted, the one thing here that is.
+    It is asked for by its name where a picture is wanted, or events that the scene has not.
     """
     try:
-        return import_module(f"eomc.report.{room}")
+        return import_module(f"eomc.{room}")
     except ModuleNotFoundError as fault:
         if not str(fault.name).startswith("eomc"):
             raise
-        raise ImportError("runs are drawn by eomc, which is not here: pip install eomc") from None
+        raise ImportError(f"{what} by eomc, which is not here: pip install eomc") from None
+
+
+def with_events(given: dict[str, Any]) -> Any:
+    """The model in `given` with the events there besides its own, and the other arguments.
+
+    Of parameters the other has fewer where a jump sets some: what differs from the scene is given.
+    """
+    model, events = given.pop("self"), given.pop("events")
+    known = vars(model).setdefault("_eventful", {})
+    if (key := repr(events)) not in known:
+        build = by_eomc("pipeline", "events of a run are compiled").with_events
+        known[key] = build(model, events, Path(__file__).parent)
+    if hasattr(params := given["params"], "_names"):
+        values = {name: getattr(params, name) for name in params._names}
+        given["params"] = {k: x for k, x in values.items() if x != model.defaults[k]}
+    return known[key], given

@@ -264,7 +264,7 @@ class Run(ConstrainedRun, Columns):
         not loaded by eomc.load. Returns an Animation; see docs/pictures.md. Raises ImportError
         without eomc, EomcError where it can't be drawn or written.
         """
-        page = by_eomc("animation")
+        page = by_eomc("report.animation")
         return page.animate([self, *others], file, scene=scene, title=title)
 
     def estimate(self, progress: Callable[[int, int], None] | None = None) -> Estimate:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,23 @@ def tree_and_digest(path: Path) -> tuple[dict[str, Any], str]:
     if len(data) > MAX_BYTES:
         raise ValueError("the file is too large for a scene")
     return loads(data.decode()), hashlib.sha256(data).hexdigest()
+
+
+def events(given: Any, what: str) -> str:
+    """Tables of events, by name a formula or a dict of the keys of [[event]], as TOML."""
+    if not isinstance(given, Mapping):
+        raise EomcError(f'{what}: give a dict, such as {{"section": "theta"}}, here {given!r}')
+    lines: list[str] = []
+    for name, entry in given.items():
+        table = {"name": name, **(entry if isinstance(entry, Mapping) else {"when": entry})}
+        lines += ["", "[[event]]"]
+        for key, value in table.items():
+            if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+                remedy = 'give a formula, or a dict such as {"when": "y", "direction": "falling"}'
+                raise EomcError(f"{what}: {name}: {key}: {remedy}, here {value!r}")
+            written = texts.toml(value) if isinstance(value, str) else repr(value)
+            lines.append(f"{texts.toml(str(key))} = {written}")
+    return "\n".join(["", *lines, ""])
 
 
 def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:

@@ -1,0 +1,139 @@
+"""Events that a call asks for, besides those of the scene."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import shutil
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import eomc
+from eomc.base.errors import EomcError
+
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
+TOL = 1e-9  # of a scene with events that names none
+TEXT = """eomc = 1
+name = "oscillator"
+[coordinates]
+x = { unit = "m", start = 1 }
+[parameters]
+k = 4
+m = 1
+[energy]
+kinetic = "m*x_dot**2/2"
+potential = "k*x**2/2"
+[[event]]
+name = "turns"
+when = "x_dot"
+direction = "rising"
+[run]
+duration = 10
+batch = true
+"""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("asked") / "oscillator.toml"
+    file.write_text(TEXT)
+    return file
+
+
+@pytest.fixture(scope="module")
+def oscillator(scene: Path) -> ModuleType:
+    return eomc.load(scene, scene.parent / "build")
+
+
+def test_they_stand_beside_the_scene_s(oscillator: ModuleType) -> None:
+    run = oscillator.simulate(events={"section": {"when": "x", "direction": "rising"}})
+    assert run.events["section"].t == pytest.approx((np.arange(3) + 0.75) * math.pi, abs=TOL)
+    assert run.events["turns"].t == pytest.approx((np.arange(3) + 0.5) * math.pi, abs=TOL)
+    assert "section" not in oscillator.simulate().events
+
+
+def test_a_formula_alone_records_both_ways(oscillator: ModuleType) -> None:
+    run = oscillator.simulate(duration=math.pi, events={"through": "x - 0.5"})
+    assert run.events["through"].t == pytest.approx([math.pi / 6, 5 * math.pi / 6], abs=TOL)
+
+
+def test_they_stop_and_jump(oscillator: ModuleType) -> None:
+    stop = {"wall": {"when": "x + 0.5", "action": "stop"}}
+    run = oscillator.simulate(events=stop)
+    assert run.stopped == "wall" and run.t[-1] == pytest.approx(math.pi / 3, abs=TOL)
+    both = oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, events=stop)
+    assert both.reached == pytest.approx([math.pi / 3, 10], abs=TOL)
+    heavier = {"drop": {"when": "x", "direction": "falling", "action": "jump", "m": 4, "k": "4*k"}}
+    run = oscillator.simulate(duration=3.0, params=oscillator.Params(), events=heavier)
+    assert run["m"][-1] == 4 and run["k"][-1] == 16
+
+
+def test_parameters_of_the_module_serve(oscillator: ModuleType) -> None:
+    events = {"through": "x"}
+    ways = (oscillator.Params(k=16), {"k": 16})
+    first, second = (oscillator.simulate(params=p, duration=1.0, events=events) for p in ways)
+    assert (
+        first.events["through"].t
+        == second.events["through"].t
+        == pytest.approx([math.pi / 8], abs=TOL)
+    )
+
+
+def test_they_are_compiled_once(oscillator: ModuleType, scene: Path) -> None:
+    events, made = {"once": "x - 0.25"}, scene.parent / "build" / "oscillator" / ".events"
+    before = {*made.glob("*")}
+    oscillator.simulate(duration=1.0, events=events)
+    (folder,) = {*made.glob("*")} - before
+    (extension,) = folder.glob("oscillator/_oscillator_*")
+    date = extension.stat().st_mtime_ns
+    vars(oscillator._model).pop("_eventful")  # as in another process
+    run = oscillator.simulate(duration=1.0, events=events)
+    assert len(run.events["once"]) == 1 and extension.stat().st_mtime_ns == date
+    assert {*made.glob("*")} - before == {folder}
+    assert pickle.loads(pickle.dumps(run)).events["once"].t == run.events["once"].t
+
+
+@pytest.mark.parametrize(
+    ("events", "words"),
+    [
+        ({"a": "y"}, "a.when: 'y' is not declared"),
+        ({"a": "x", "b": {"when": "x", "action": "jmp"}}, "b.action: unknown action 'jmp'"),
+        ({"2x": "x"}, "2x.name: '2x' is not a plain name"),
+        ({"turns": "x"}, "turns.name: 'turns' is an event already"),
+        ({"a": {"when": "x", "action": "jump", "z": 1}}, "a.z: 'z' is no coordinate"),
+        ({"a": "x\"\n[run]\nh = 5"}, "a.when"),
+        ({"a": None}, "a: when: give a formula"),
+        (["x"], "give a dict"),
+    ],
+)  # fmt: skip
+def test_a_fault_is_named(oscillator: ModuleType, events: dict, words: str) -> None:
+    with pytest.raises(EomcError, match=r"simulate\(events=\)") as fault:
+        oscillator.simulate(events=events)
+    assert words in str(fault.value)
+
+
+def test_a_scene_that_is_not_there_or_another_is_told(scene: Path, tmp_path: Path) -> None:
+    file = tmp_path / scene.name
+    shutil.copy(scene, file)
+    module = eomc.load(file, tmp_path / "build")
+    file.write_text(TEXT.replace("k = 4", "k = 5"))
+    with pytest.raises(EomcError, match="has changed since it was built: load it again"):
+        module.simulate(events={"a": "x"})
+    made = eomc.System.make("free", {"x": 1.0}, "x_dot**2/2", "x**2")
+    with pytest.raises(EomcError, match=r"give System\.make its events"):
+        eomc.load(made, tmp_path / "build").simulate(events={"a": "x"})
+    vars(module._model)["source"] = None
+    with pytest.raises(EomcError, match=r"load it with eomc\.load"):
+        module.simulate(events={"a": "x"})
+
+
+def test_what_can_t_be_written_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "oscillator.toml"
+    file.write_text(TEXT.replace("k = 4", "k = 6"))
+    module = eomc.load(file, tmp_path)
+    (tmp_path / "oscillator" / ".events").write_text("")
+    with pytest.raises(EomcError, match="can't be written"):
+        module.simulate(events={"a": "x"})
