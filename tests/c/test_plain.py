@@ -212,6 +212,7 @@ def test_it_agrees_with_the_reference_and_the_fast_form(name: str) -> None:
     assert {f"plain C beside fast: {method}" for method in fast.methods} < {r.name for r in rows}
 
 
+@pytest.mark.slow
 def test_a_wrong_weight_is_found_by_check(tmp_path: Path) -> None:
     right = resources.text
 

@@ -168,6 +168,7 @@ def built(project: Path, text: str, *words: str) -> str:
     return run("./out/robot", cwd=project).stdout
 
 
+@pytest.mark.slow
 def test_a_cpp_project_adds_the_folder(tmp_path: Path, printed: str) -> None:
     needs("cmake"), needs("g++")
     made(tmp_path / "cartpole")

@@ -281,6 +281,7 @@ def test_verlet_and_euler() -> None:
         eomc.sources(eomc.read(variant("cartpole", "verlet_no", method='"verlet"')))
 
 
+@pytest.mark.slow
 def test_feedback_in_a_signal_is_as_cheap_as_in_a_force() -> None:
     """u = -1e6 x - 2e5 x_dot: the derivatives of Newton's corrections follow the signals.
 

@@ -76,6 +76,7 @@ def test_ranks_and_freedoms_are_those_of_the_case(name: str) -> None:
     assert len(closure.redundant) == rows - closure.rank
 
 
+@pytest.mark.slow
 def test_of_bricard_s_rows_the_one_is_left_out_that_leaves_the_best_four() -> None:
     made = assembled_case("bricard_cube")
     assert [c.redundant for c in made.constraints] == [False] * 4 + [True]

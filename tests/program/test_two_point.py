@@ -224,6 +224,7 @@ def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
     np.testing.assert_allclose(run.qd, qd, rtol=1e-10, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
     """Where reduction by pi/2 in parts has no digit left."""
     module = modules.of_text(chain(5))

@@ -47,6 +47,7 @@ def measured() -> Report:
     return cost_of_digits.measure(oscillator(), REPORTS, longest=0.02, methods=("rk4", "dp8"))
 
 
+@pytest.mark.slow
 def test_errors_of_rk4_are_those_of_theory() -> None:
     """x'' = -w^2 x: phase lag w t z^4/120 with z = w h; energy falls by w t z^5/72 of itself."""
     rk4 = measured().lines[0]

@@ -118,6 +118,7 @@ def _closed(values, branches, n):
     raise AssertionError("not closed")
 
 
+@pytest.mark.slow
 def test_rows_hold_in_the_pose_of_the_file(tmp_path: Path) -> None:
     hard = [e for e in HARD if "site" not in e and "relpose" not in e and "0.1 2" not in e]
     hard = [e for e in hard if 'polycoef="0.2"' not in e and "0.01" not in e]

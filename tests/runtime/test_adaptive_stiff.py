@@ -139,6 +139,7 @@ def test_single_precision() -> None:
     assert np.abs(run.x[-1] - fine.x[-1]).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_constraints_hold_in_stiff_steps() -> None:
     text = """eomc = 1
 name = "stiff_rod"

@@ -94,6 +94,7 @@ def test_one_that_stops_leaves_the_others_alone(orbits: ModuleType) -> None:
     assert np.array_equal(run.q[rest], alone.q)
 
 
+@pytest.mark.slow
 def test_one_that_ends_on_its_way_says_where() -> None:
     """x'' = k x^2 from x = 1, v = sqrt(2 k/3) goes to infinity: x = 1/(1 - t sqrt(k/6))^2."""
     text = STIFF.replace("many_stiff", "many_far").replace("k*x**2/2", "-k*x**3/3")
@@ -146,6 +147,7 @@ def test_stiff_ones_go_on_by_newtons_method(told: bool) -> None:
         assert run.stiff_steps[1] == 0
 
 
+@pytest.mark.slow
 def test_signals_and_single_precision_are_followed() -> None:
     text = KEPLER.replace("eccentric", "many_single").replace("[run]\n", MANY)
     text = text.replace('push = { unit = "N" }', 'push = { unit = "N", signal = "0.1*sin(3*t)" }')

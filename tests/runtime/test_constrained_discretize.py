@@ -147,6 +147,7 @@ def hanging(modules: Modules, form: str) -> ModuleType:
     return modules.unoptimised(head + "[inputs]\npush = {}\n" + text + run)
 
 
+@pytest.mark.slow
 def test_a_regulator_of_it_is_that_of_minimal_coordinates(modules: Modules) -> None:
     """About the equilibrium T^T Phi T is the step of the angle, in steps and control periods."""
     xy, angle = (hanging(modules, form) for form in ("xy", "angle"))
@@ -181,6 +182,7 @@ def test_a_step_that_can_not_be_made_has_none(modules: Modules) -> None:
     assert caught.value.status in ("locked", "singular", "not finite")
 
 
+@pytest.mark.slow
 def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
     class Wrong:
         """Derivatives that are a little off."""

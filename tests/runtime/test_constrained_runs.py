@@ -268,6 +268,7 @@ duration = 2
 """
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly_compiled")
 def test_rows_that_contradict_one_another_later_are_told(tmp_path: Path) -> None:
     """The start and its rates obey them all; the motion can't."""

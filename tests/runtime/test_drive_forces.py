@@ -74,6 +74,7 @@ def test_forces_from_outside_are_borne_too(linkage: ModuleType) -> None:
     assert abs(work) > 0.1
 
 
+@pytest.mark.slow
 def test_wheels_and_massless_ropes_have_them_too(modules: Modules) -> None:
     sleigh: Any = modules.unoptimised(SLEIGH + "inverse_dynamics = true\n")
     q, qd = sleigh.start

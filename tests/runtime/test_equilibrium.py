@@ -75,6 +75,7 @@ def test_a_steady_precession(modules: Modules) -> None:
     assert np.sin(upright[top.coordinates.index("theta")]) == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_chain_comes_to_rest_from_afar(modules: Modules) -> None:
     chain = modules("chain")
     q, _ = chain.equilibrium()

@@ -301,6 +301,7 @@ def test_friction_that_sticks_eases_where_it_is_greased(modules: Modules) -> Non
     assert abs(module.simulate(q0=q, qd0=qd, t0=0.7, duration=2.3).q[-1] - run.q[-1])[0] > 1e-3
 
 
+@pytest.mark.slow
 def test_a_system_made_in_python_has_them(tmp_path: Path) -> None:
     x, m, k, factor = sympy.symbols("x m k lambda")
     made = System.make(

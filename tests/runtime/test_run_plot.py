@@ -224,6 +224,7 @@ def test_ends_of_instances_that_stopped_are_their_last_good_rows(modules: Module
     assert np.array_equal(y, [runs.q[0, -1, 0], runs.q[1, 3, 0]])
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_the_end_the_verdict_and_a_picture(driven: ModuleType) -> None:
     run = driven.simulate(duration=0.5)
     page = run._repr_html_()

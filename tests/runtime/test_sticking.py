@@ -172,6 +172,7 @@ def test_a_cart_beside_scipy(modules: Modules, F: float) -> None:
         np.testing.assert_allclose(run.events[name].t, times, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_arm_comes_to_rest(modules: Modules) -> None:
     arm = modules.unoptimised(ARM)
     random = np.random.default_rng(0)
@@ -187,6 +188,7 @@ def test_an_arm_comes_to_rest(modules: Modules) -> None:
             assert np.all(np.abs(run.multipliers[f"q{k}_sticks"]) <= 2 / k * (1 + 1e-9))
 
 
+@pytest.mark.slow
 def test_nothing_slides_against_its_velocity(modules: Modules) -> None:
     """Some of these slip where another drives them back at once."""
     arm, random = modules.unoptimised(ARM), np.random.default_rng(5)
@@ -206,6 +208,7 @@ def test_rounding_of_a_velocity_at_rest_is_none(modules: Modules) -> None:
         assert run.estimate().amplification < 2
 
 
+@pytest.mark.slow
 def test_nothing_sticks_at_a_dead_point(modules: Modules) -> None:
     """The rocker turns where the crank goes on; both rest in the end, and the loop holds."""
     bar = modules.unoptimised(FOUR_BAR)

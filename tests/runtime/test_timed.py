@@ -146,6 +146,7 @@ def test_ctrl_c_keeps_the_rows_that_were_made(cartpole: ModuleType) -> None:
     assert run.status == "interrupted" and run.t.tolist() == [0.2, 0.405, 0.6] and run.steps == 60
 
 
+@pytest.mark.slow
 def test_rows_are_on_the_constraints(modules: Modules) -> None:
     linkage = modules("four_bar")
     times = np.linspace(0, 1, 7)

@@ -49,6 +49,7 @@ def ran(python: Path | str, code: str, at: Path, **variables: str) -> str:
 # --- what is in it --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_wheel_has_the_scene_types_and_a_record(
     tmp_path: Path, quickly_compiled: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

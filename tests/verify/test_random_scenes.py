@@ -410,6 +410,7 @@ duration = 1.0
 """
 
 
+@pytest.mark.slow
 def test_steps_too_long_for_the_motion_do_not_say_how_far_it_goes(modules: Modules) -> None:
     """RK4 is lost in steps of this h: what it says of the motion after some is nothing."""
     module = modules.unoptimised(LEAVING)

@@ -111,6 +111,7 @@ h = 0.02
 """
 
 
+@pytest.mark.slow
 def test_few_sweeps_are_compared_in_steps_so_short_that_they_do(modules: Modules) -> None:
     """The fast form leaves stages where five sweeps come to, as far as they were to settle."""
     module = modules.unoptimised(FRICTION)

@@ -44,6 +44,7 @@ def rows(monkeypatch: pytest.MonkeyPatch, module: Projecting) -> dict[str, Row]:
     return {row.name: row for row in made.rows}
 
 
+@pytest.mark.slow
 def test_states_are_put_back_with_nothing_held_and_with_one_held(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
