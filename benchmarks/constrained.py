@@ -311,7 +311,7 @@ def of_flops() -> list[str]:
         flops = made["acceleration"].cost.flops
         rows.append(bar(f"flops of the accelerations, {name}", flops, most))
         if name in SHARES:
-            one = made["correction"].cost.flops
+            one = made["projection"].cost.flops
             share = one / (4 * flops + one)
             what = f"the correction's share of an RK4 step's flops, {name}"
             rows.append(bar(what, share, SHARES[name], "", f" ({one} of {4 * flops + one})"))

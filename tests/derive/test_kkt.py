@@ -71,7 +71,7 @@ def test_accelerations_and_multipliers_solve_the_dense_system(massless: bool) ->
 def test_a_row_that_depends_on_others_here_is_dropped_and_told() -> None:
     twice = constrained(DOUBLE, **LINKS, again="2*x1**2 + 2*y1**2 - 2*l**2")
     program = build(derive(twice))
-    *_, inverses = np.split(values(program, "correction"), [8])
+    *_, inverses = np.split(values(program, "projection"), [8])
     assert sum(inverses == 0) == 1
     alone = values(build(derive(constrained(DOUBLE, **LINKS))), "acceleration")
     np.testing.assert_allclose(values(program, "acceleration"), alone, rtol=1e-13)
@@ -83,7 +83,7 @@ def test_a_correction_moves_onto_the_rows_with_the_least_change_in_the_metric_of
     program = build(derive(constrained(DOUBLE, **LINKS)))
     off = STATE | {"x1": 0.6003, "y2": -1.2797}
     names = [c.name for c in DOUBLE.coordinates]
-    d = np.array(evaluator(program["correction"], exact=True)(off)[0])
+    d = np.array(evaluator(program["projection"], exact=True)(off)[0])
     A = np.array(evaluator(program["constraint_jacobian"], exact=True)(off)[0]).reshape(2, 4)
     phi = np.array(evaluator(program["constraints"], exact=True)(off)[0])
     D = np.array(matrix(program, "D", off))

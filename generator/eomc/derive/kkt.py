@@ -207,7 +207,7 @@ def with_mass(
     return more, [added(b[i], i, c) for i in n]
 
 
-def correction(
+def projection(
     tape: Tape, D: Rows, rows: Constraints, q: Sequence[sympy.Symbol]
 ) -> tuple[Vector, Pairs]:
     """What is added to q and qd so that rows hold, and the inverses of the rows' pivots.

@@ -120,7 +120,7 @@ class Target:
     @cached_property
     def driven(self) -> bool:
         """Whether motion depends on the time, by itself or by the signals."""
-        moved = [f for n in ("acceleration", "correction") if (f := self.program.functions.get(n))]
+        moved = [f for n in ("acceleration", "projection") if (f := self.program.functions.get(n))]
         return any(TIME in f.uses for f in moved) or self.signal_t
 
     @cached_property

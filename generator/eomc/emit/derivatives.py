@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from eomc.emit import c_function as c
 from eomc.emit.c_function import CFunction
 from eomc.emit.coefficients import tableau
-from eomc.emit.corrected import APART, near
 from eomc.emit.functions import Functions
 from eomc.emit.plain.views import Derivative
+from eomc.emit.projection import APART, near
 from eomc.integrators.tableaux import METHODS
 
 TURNS = 50  # of Newton's method for the stages
@@ -31,8 +31,8 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
     if "signal_slopes" in target.program:
         feedback = plain.public.evaluation("signal_slopes").call(slopes="K")
     accelerate = plain.acceleration.function.call
-    correction = plain.correction_along
-    moved = _moved(plain) if correction else None
+    projection = plain.projection_along
+    moved = _moved(plain) if projection else None
     methods = [METHODS[name] for name in run.methods]
     first_implicit = next((m for m in methods if m.implicit), None)
     for m in methods:
@@ -44,9 +44,9 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
             linearization=plain.public.linearization.call(),
             feedback=feedback,
             eliminate=m is first_implicit,
-            correction=correction if m is methods[0] else None,
+            projection=projection if m is methods[0] else None,
             moved=moved,
-            correction_call=correction.function.call(q="r", qd="v") if correction else "",
+            projection_call=projection.function.call(q="r", qd="v") if projection else "",
             move=moved.call(X="ends", t="t + h") if moved else "",
             near=target.literal(near(target)),
             apart=target.literal(APART),
@@ -71,7 +71,7 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
 def _moved(plain: Functions) -> CFunction:
     """A step's end and its derivatives, moved onto the constraints."""
     state = (c.filled(plain.real, "X"), *(c.filled(plain.real, n) for n in "rv"))
-    read = plain.read(plain.target.program["correction_along"])
+    read = plain.read(plain.target.program["projection_along"])
     more = (plain.argument("q"), *plain.usual(*(n for n in ("t", "p") if n in read)))
     return CFunction(
         f"{plain.prefix}_derivative_projected", plain.status, (*state, *more), qualifier="static"

@@ -307,9 +307,9 @@ class Functions:
         return Computed(made, parts, values)
 
     @cached_property
-    def correction(self) -> Computed | None:
+    def projection(self) -> Computed | None:
         """What q and qd lack for constraints to hold, where there are; static."""
-        function = self.target.program.functions.get("correction")
+        function = self.target.program.functions.get("projection")
         if function is None:
             return None
         return self.static(function, "projection", "d", sentence(function), fails=True)
@@ -323,19 +323,19 @@ class Functions:
         return self.static(function, "rate_terms", "rates", RATE_TERMS)
 
     @cached_property
-    def correction_along(self) -> Computed | None:
+    def projection_along(self) -> Computed | None:
         """The same, and its derivatives along a direction, where steps have them; static."""
-        function = self.target.program.functions.get("correction_along")
+        function = self.target.program.functions.get("projection_along")
         if function is None:
             return None
         doc = f"The same, and its derivatives along `along`. {sentence(function)}"
         return self.static(function, "projection_along", "column", doc, fails=True)
 
     @cached_property
-    def corrected(self) -> CFunction:
+    def projected(self) -> CFunction:
         """A state behind a step, moved onto the constraints; of the plain form."""
         state = (*(c.filled(self.real, n) for n in "rv"), self.argument("q"))
-        read = self.read(self.target.program["correction"]) if self.correction else frozenset()
+        read = self.read(self.target.program["projection"]) if self.projection else frozenset()
         more = self.usual(*(n for n in ("t", "p") if n in read))
         far = CArgument("int *", "singular")
         return CFunction(

@@ -30,14 +30,14 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
     yield lower("multipliers", taken.tape, taken.multipliers, (), names, system.names)
     e = _equations(derived)
     assert e.rows is not None
-    values, pivots = kkt.correction(e.tape, e.D, e.rows, system.q)
-    yield lower("correction", e.tape, values, pivots, (), system.names)
+    values, pivots = kkt.projection(e.tape, e.D, e.rows, system.q)
+    yield lower("projection", e.tape, values, pivots, (), system.names)
     if terms := rate_terms(e.tape, e.rows, system.qd):
         yield lower("rate_terms", e.tape, terms, (), (), system.names)
     if system.run.discretize:
         moves = values[: 2 * len(system.q)]
         both = [*moves, *along(system, e.tape, moves)]
-        yield lower("correction_along", e.tape, both, pivots, (), system.names)
+        yield lower("projection_along", e.tape, both, pivots, (), system.names)
     if system.reactions:
         yield _reactions(system)
     if system.run.sloped:

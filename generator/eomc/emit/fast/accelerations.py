@@ -41,7 +41,7 @@ class Accelerations:
         """What parameters alone decide, as a function of its own; and the rest."""
         first, rest = outline.staged(self.whole, self.own)
         kept = [o.name for o in first.outputs]
-        others = ("signal", "correction", "rate_terms")  # what else steps read parameters for
+        others = ("signal", "projection", "rate_terms")  # what else steps read parameters for
         there = [f for n in others if (f := self.target.program.functions.get(n))]
         if there:
             read = frozenset[str]().union(*(f.uses for f in there))

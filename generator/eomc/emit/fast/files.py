@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 from eomc.base import resources
 from eomc.base.texts import FreeText
-from eomc.emit import adaptive, corrected, events, heading
+from eomc.emit import adaptive, events, heading
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import C_NAMES, DOUBLE, PIVOT
 from eomc.emit.c_names import Target
@@ -24,6 +24,7 @@ from eomc.emit.fast.steppers import Steppers
 from eomc.emit.functions import Functions, parameters
 from eomc.emit.plain import steppers as plain
 from eomc.emit.plain import views as plain_views
+from eomc.emit.projection import project
 from eomc.integrators.tableaux import RK4
 
 Show = Callable[[views.View | plain_views.View], str]  # a view by its template
@@ -153,8 +154,8 @@ def _lanes(made: Steppers, show: Show) -> Iterator[str]:
     if _wide(made):
         yield _library_text(made.wide, show)
         yield _lane(made, made.wide, show)
-    if made.functions.correction:
-        yield show(corrected.project(made.functions))
+    if made.functions.projection:
+        yield show(project(made.functions))
         for lane in (made.one, *([made.wide] * batch)):
             yield show(projection.view(made.functions, lane))
     if batch:
@@ -306,6 +307,6 @@ def _adaptive(made: Steppers) -> adaptive.Form:
         bool(made.accelerations.constants), runs.constants_call(made),
         f"{one.target.PREFIX}_LANES",
         projection.projected(one).call(t=f"{c.member('x', 't')} + h", singular="&singular")
-        if made.functions.correction
+        if made.functions.projection
         else "",
     )  # fmt: skip

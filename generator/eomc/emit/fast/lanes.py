@@ -375,7 +375,7 @@ class Lane:
     def calls(self) -> tuple[str, ...]:
         """Functions of the mathematics library that the lane has to have."""
         read = [self.accelerations.whole]
-        others = ("signal", "correction")
+        others = ("signal", "projection")
         read += [f for n in others if (f := self.target.program.functions.get(n))]
         names = {
             a.value.function

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from eomc.emit import c_function as c
-from eomc.emit import corrected
+from eomc.emit import projection
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
 from eomc.emit.fast.lanes import NOINLINE, Lane
 from eomc.emit.functions import RATE_TERMS, Functions
-from eomc.emit.plain.constraint_views import Corrected
+from eomc.emit.plain.constraint_views import Projection
 from eomc.emit.plain.parts import Computed
 from eomc.program.program import TIME
 
 
-def view(functions: Functions, lane: Lane) -> Corrected:
+def view(functions: Functions, lane: Lane) -> Projection:
     """The view of a lane."""
     made, state = _correction(lane), {"q": "at", "qd": "moving"}
     call = made.function.call(**state)
     terms = None if lane.name else _rate_terms(lane)
-    return corrected.view(
+    return projection.view(
         functions, made, projected(lane), call, terms, state, lane=lane.real.name, L=lane.end,
         mask=lane.mask, extent=lane.extent, increments=True,
     )  # fmt: skip
@@ -38,7 +38,7 @@ def projected(lane: Lane) -> CFunction:
 
 def _correction(lane: Lane) -> Computed:
     """What q and qd lack for the constraints to hold."""
-    function = lane.target.program["correction"]
+    function = lane.target.program["projection"]
     own = {n: c.member("c", n) for n in lane.accelerations.own}
     places = [f"d[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
@@ -62,6 +62,6 @@ def _rate_terms(lane: Lane) -> Computed | None:
 
 def _placed(lane: Lane) -> tuple[str, ...]:
     """What constraints are read from: q, qd, t, c, as far as they are."""
-    timed = TIME in lane.target.program["correction"].uses
+    timed = TIME in lane.target.program["projection"].uses
     names = ("q", "qd", *(["t"] if timed else []), "c")
     return tuple(n for n in lane.there if n in names)

@@ -27,7 +27,7 @@ def state(made: Steppers, m: Method) -> views.State:
         sweeps=m.sweeps,
         implicit=m.implicit,
         inputs=bool(lane.target.system.inputs),
-        constrained=bool(made.functions.correction),
+        constrained=bool(made.functions.projection),
     )
 
 
@@ -35,7 +35,7 @@ def kept(made: Steppers, m: Method) -> int:
     """Numbers of the state that the header gives room for."""
     n, angles, s = len(made.one.target.names), len(made.accelerations.angles), m.stages
     size = 4 * made.one.width + 32
-    if made.functions.correction:
+    if made.functions.projection:
         size += 4
     if predicts(made, m):
         size += n + 2 * angles + 5 * ahead_count(angles)
@@ -86,7 +86,7 @@ def loop(made: Steppers, m: Method) -> views.Loop:
         advance=advance.call(**here),
         otherwise=alone.call(**here) if m is RK4 and s.angles else "",
         project=projected(lane).call(q="x.q", qd="x.qd", t="t + h", singular="&singular")
-        if made.functions.correction
+        if made.functions.projection
         else "",
     )
 
@@ -115,10 +115,10 @@ def batch(made: Steppers, m: Method) -> views.Batch:
         compute_own=lane.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
         alone=alone.call(q="at", qd="moving", u="given"),
         project=projected(made.wide).call(q="from[b].q", qd="from[b].qd", t="t + h", c="&from[b].c")
-        if made.functions.correction
+        if made.functions.projection
         else "",
         project_alone=projected(lane).call(q="at", qd="moving", t="t + h", singular="&singular")
-        if made.functions.correction
+        if made.functions.projection
         else "",
     )
 

@@ -10,8 +10,8 @@ from eomc.emit.plain.parts import Computed, Named
 
 
 @dataclass(frozen=True)
-class Corrected:
-    """c/corrected.c.jinja, for both forms of C: a step's end moved onto the constraints.
+class Projection:
+    """c/projection.c.jinja, for both forms of C: a step's end moved onto the constraints.
 
     L, lane, mask: of the lane, L "" for one number. increments: whether r, v are what a step adds.
     near, apart: squares of parts of a coordinate, and of all, beyond which a correction is large.
@@ -21,7 +21,7 @@ class Corrected:
     near a singular position are below; rounded: of coordinates, where one may be rounding there.
     """
 
-    TEMPLATE: ClassVar[str] = "c/corrected.c"
+    TEMPLATE: ClassVar[str] = "c/projection.c"
     PREFIX: str
     real: str
     L: str
@@ -30,7 +30,7 @@ class Corrected:
     extent: str
     size: int
     increments: bool
-    correction: Computed
+    projection: Computed
     function: CFunction
     call: str
     rate_terms: Computed | None

@@ -7,7 +7,7 @@ from dataclasses import replace
 from math import isfinite, sqrt
 
 from eomc.base.texts import FreeText
-from eomc.emit import adaptive, corrected, events, heading
+from eomc.emit import adaptive, events, heading, projection
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
@@ -56,8 +56,8 @@ def files(
         view for m, run in zip(methods, loops, strict=True) for view in (stepper(plain, m), run)
     ]
     views += [*derivatives(plain), *_adaptive(plain)]
-    if onto := corrected.plain(plain):
-        views[:0] = [onto, corrected.project(plain)]
+    if onto := projection.plain(plain):
+        views[:0] = [onto, projection.project(plain)]
     steppers = [show(view).rstrip("\n") for view in views]
     slopes = linearization(plain)
     texts = (
@@ -242,12 +242,12 @@ def _advance(plain: Functions, m: Method) -> tuple[CFunction, str]:
     the call that ends it on these.
     """
     step = plain.public.step(m.name)
-    if not plain.correction:
+    if not plain.projection:
         return step, ""
-    told = plain.corrected.arguments[-1]
+    told = plain.projected.arguments[-1]
     name = f"{plain.prefix}_{m.name}"
     inner = CFunction(name, plain.status, (*step.arguments, told), qualifier="static")
-    return inner, plain.corrected.call(t="t + h")
+    return inner, plain.projected.call(t="t + h")
 
 
 def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
@@ -297,7 +297,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     )
     one = plain.public.step(m.name)
     count = CArgument("long *", "evaluations")
-    told = plain.corrected.arguments[-1:] if plain.correction else ()
+    told = plain.projected.arguments[-1:] if plain.projection else ()
     solve = CFunction(method, plain.status, (*one.arguments, count, *told), qualifier="static")
     return Gauss(
         **plain.names,
@@ -322,7 +322,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
         matrix_start=matrix_function.call(),
         matrix_mid=matrix_function.call(q="q_mid", qd="qd_mid", t="t + h/2"),
         solve_call=solve.call(evaluations="&evaluations", singular="&singular"),
-        correct=plain.corrected.call(t="t + h") if plain.correction else "",
+        correct=plain.projected.call(t="t + h") if plain.projection else "",
     )
 
 
@@ -347,10 +347,10 @@ def _adaptive(plain: Functions) -> list[View]:
         stage=accelerate(qdd="f", q="r", qd="v", t="t + c[i]*h"),
     )
     end = f"{c.member('x', 't')} + h"
-    onto = plain.corrected.call(r="at", v="moving", t=end, singular="&singular")
+    onto = plain.projected.call(r="at", v="moving", t=end, singular="&singular")
     form = adaptive.Form(
         around, sweep.call(b="to", a="from"), accelerate(qdd="f"), plain.NQ,
-        project=onto if plain.correction else "", whole=True,
+        project=onto if plain.projection else "", whole=True,
     )  # fmt: skip
     many = [adaptive.batch(plain)] if plain.target.system.run.batch else []
     return [nodes, *events.views(plain, form), *many]
@@ -365,7 +365,7 @@ def loop(plain: Functions, m: Method) -> Loop:
     return Loop(
         **plain.names,
         implicit=m.implicit,
-        constrained=bool(plain.correction),
+        constrained=bool(plain.projection),
         run=run,
         batch=plain.public.batch(m.name) if plain.target.system.run.batch else None,
         one_step=advance.call(

@@ -8,7 +8,7 @@ from typing import ClassVar
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
 from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, Begun, Events
-from eomc.emit.plain.constraint_views import Corrected, Project
+from eomc.emit.plain.constraint_views import Project, Projection
 from eomc.emit.plain.parts import Computed, Named
 
 
@@ -128,10 +128,10 @@ class Derivative(Named):
     """c/derivative.c.jinja: of a step by a tableau. rates, eliminate: what methods share.
 
     width: of a row along q, qd and u. feedback: the call of the signals' derivatives, if there are.
-    correction, moved: under constraints how rows move a state, shared too, and what moves a step's
-    end by that; near, apart: as of Corrected. start, stage: calls of accelerations. settled, loose:
-    corrections of stages, of a velocity; other: how far apart ends are of stages that are not the
-    step's.
+    projection, moved: under constraints how rows move a state, shared too, and what moves a step's
+    end by that; near, apart: as of Projection. start, stage: calls of accelerations. settled,
+    loose: corrections of stages, of a velocity; other: how far apart ends are of stages that are
+    not the step's.
     """
 
     TEMPLATE: ClassVar[str] = "c/derivative.c"
@@ -141,9 +141,9 @@ class Derivative(Named):
     linearization: str
     feedback: str
     eliminate: bool
-    correction: Computed | None
+    projection: Computed | None
     moved: CFunction | None
-    correction_call: str
+    projection_call: str
     move: str
     near: str
     apart: str
@@ -292,6 +292,6 @@ class Loop(Named):
 
 
 View = (
-    Header | Source | Slopes | Corrected | Project | Derivative | RungeKutta4 | Explicit | Implicit
+    Header | Source | Slopes | Projection | Project | Derivative | RungeKutta4 | Explicit | Implicit
     | Gauss | Nodes | Adaptive | Events | Begun | AdaptiveRun | AdaptiveBatch | Loop
 )  # fmt: skip

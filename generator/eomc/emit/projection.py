@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from eomc.emit.c_function import CFunction
 from eomc.emit.c_names import Target
 from eomc.emit.functions import Functions
-from eomc.emit.plain.constraint_views import Corrected, Project
+from eomc.emit.plain.constraint_views import Project, Projection
 from eomc.emit.plain.parts import Computed
 
 # beside singular positions: squares of what corrections may change; how much more rounding is
@@ -26,20 +26,20 @@ def near(target: Target) -> float:
 
 def width(target: Target) -> int:
     """Numbers of a correction: of q, of qd, of the rows' pivots."""
-    return len(target.program["correction"].outputs)
+    return len(target.program["projection"].outputs)
 
 
 def view(
-    functions: Functions, correction: Computed, function: CFunction, call: str,
+    functions: Functions, projection: Computed, function: CFunction, call: str,
     rate_terms: Computed | None = None, state: Mapping[str, str] | None = None, *,
     lane: str = "", L: str = "", mask: str = "", extent: str = "", increments: bool = False,
-) -> Corrected:  # fmt: skip
+) -> Projection:  # fmt: skip
     """The view for one form and lane. state: where it is, for `rate_terms`."""
     target = functions.target
     little, noise = SINGULAR[target.system.run.real]
     part, loose = LEFT_OUT[target.system.run.real]
     large = near(target)
-    return Corrected(
+    return Projection(
         PREFIX=functions.PREFIX,
         real=functions.real,
         L=L,
@@ -48,7 +48,7 @@ def view(
         extent=extent or functions.NQ,
         size=width(target),
         increments=increments,
-        correction=correction,
+        projection=projection,
         function=function,
         call=call,
         rate_terms=rate_terms,
@@ -66,14 +66,14 @@ def view(
     )
 
 
-def plain(functions: Functions) -> Corrected | None:
+def plain(functions: Functions) -> Projection | None:
     """That of the plain form, where there are constraints."""
-    correction = functions.correction
-    if correction is None:
+    projection = functions.projection
+    if projection is None:
         return None
     state = {"q": "r", "qd": "v"}
-    call = correction.function.call(**state)
-    return view(functions, correction, functions.corrected, call, functions.rate_terms, state)
+    call = projection.function.call(**state)
+    return view(functions, projection, functions.projected, call, functions.rate_terms, state)
 
 
 def project(functions: Functions) -> Project:
