@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 import tempfile
 import time
 import warnings
@@ -239,13 +240,35 @@ def gauss16(rounds: int) -> Iterator[str]:
                 yield f"| gauss16 | {name}, error {limit:.0e}, else {best} | {found:.2f} |"
 
 
+def calls(rounds: int) -> Iterator[str]:
+    """A thousand short runs, with the short ways of `simulate` and without."""
+    case, extra = work.CASES["cart-pole"], "tolerance = 1e-9\n"
+    ways: dict[str, dict[str, float]] = {
+        "simulate(steps=10)": {"steps": 10, "h": 0.005}, "simulate() of 0.5 s": {"duration": 0.5}
+    }  # fmt: skip
+    with (
+        built(case, nullcontext(), extra, "with_calls") as full,
+        built(case, nullcontext(), extra, "without_calls") as less,
+    ):
+        loops = less._model._loops  # the third: up to how many steps there is one
+        loops |= {name: (*loop[:2], -1, *loop[3:]) for name, loop in loops.items()}
+        vars(sys.modules[f"{less.__name__}.adaptive"])["plain"] = lambda *_: None
+        for name, how in ways.items():
+            one, other = (m.simulate(**how).q for m in (less, full))
+            if not np.array_equal(one, other):
+                raise SystemExit(f"short ways of calls, {name}: runs differ")
+            jobs = [lambda m=m, how=how: [m.simulate(**how) for _ in range(1000)]
+                    for m in (less, full)]  # fmt: skip
+            yield f"| short ways of calls | {name}, cart-pole | {ratio(*jobs, rounds):.2f} |"
+
+
 def main() -> None:
     asked = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     asked.add_argument("--rounds", type=int, default=15)
     rounds = asked.parse_args().rounds
     warnings.simplefilter("ignore", RuntimeWarning)  # steps too long end runs early
     print("| trick | row | time without, over with |\n|---|---|---|")
-    for rows in (tricks(rounds), sines(rounds), gauss16(rounds)):
+    for rows in (tricks(rounds), sines(rounds), gauss16(rounds), calls(rounds)):
         for row in rows:
             print(row, flush=True)
 
