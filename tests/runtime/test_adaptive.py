@@ -225,6 +225,17 @@ def test_no_step_is_longer_than_asked(kepler: ModuleType) -> None:
     assert np.diff(run.t).max() <= 0.05 * (1 + 1e-12) and run.steps > 120
 
 
+@pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-9, 1e-10, 1e-12, 1e-14])
+def test_a_fall_into_a_centre_ends_there(kepler: ModuleType, tol: float) -> None:
+    """Steps shrink below what time resolves: their line of sizes was 0/0, the next to the end."""
+    for sideways in (0.0, 1e-9):
+        with pytest.warns(RuntimeWarning, match="forces grow without end"):
+            run = kepler.simulate([1, 0], [0, sideways], duration=3, tol=tol)
+        assert run.status == "no convergence"
+        assert run.t[-1] == pytest.approx(math.pi / math.sqrt(8), rel=1e-6)
+        assert abs(run.q[-1]).max() < 1e-4
+
+
 def test_a_motion_into_a_singularity_stops_and_says_where(kepler: ModuleType) -> None:
     with pytest.warns(RuntimeWarning, match="stopped at t = 0.03"):
         run = kepler.simulate(q0=[0.1, 0], qd0=[0, 0], duration=1.0)  # straight into the centre

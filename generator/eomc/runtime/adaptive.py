@@ -36,8 +36,9 @@ _DRAWN = 1_000  # rows of a curve, at least
 _EVEN = 8  # rows a step, as equally spaced ones need them
 _NONE = (np.empty(0, np.intc), np.empty((0, 1)))  # events
 STOPPED = (
-    "no step is short enough to go on; where forces keep jumping, as friction by sign(x_dot) that "
-    'sticks, take friction = "stick" in [run], or let events switch them; else a looser tolerance'
+    "no step is short enough to go on: forces grow without end there, as in a fall into a centre, "
+    "or keep jumping: for friction by sign(x_dot) that sticks take friction = "
+    '"stick" in [run], or let events switch it; else a looser tolerance'
 )
 
 
