@@ -253,8 +253,8 @@ def load(
     return module
 
 
-def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> Any:
-    """The model of a built module's scene with events besides its own; built once, in `folder`.
+def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleType:
+    """The module of a model's scene with events besides its own; built once, in `folder`.
 
     events: by name a formula, or a dict as [[event]] has it.
     Raises SceneError for faulty ones, EomcError where the scene is not there or has changed.
@@ -294,7 +294,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> Any:
                 new.write_text(text, encoding="utf-8")
         except OSError as fault:
             raise EomcError(f"{what}: {file}: can't be written ({fault.strerror})") from None
-    return load(file, root)._model
+    return load(file, root)
 
 
 def _renamed(key: str, names: Mapping[str, str]) -> str:

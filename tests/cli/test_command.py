@@ -165,6 +165,23 @@ def test_bad_input_is_status_2_and_says_what_to_do(
     assert said in done.output
 
 
+def test_run_tells_events_that_it_is_asked_for(there: Path) -> None:
+    options = ["--duration", "3", "--event", "level = theta - pi", "--event", "far=x+0.4"]
+    found = json.loads(eomc("run", "cartpole.toml", *options, "--json").output)
+    level, far = found["events"]["level"], found["events"]["far"]
+    assert len(level) == len(far) == 2 and found["tolerance"] == 1e-9
+    module = pipeline.load(there / "cartpole.toml", there / "build")
+    for times, column, value in ((level, "theta", np.pi), (far, "x", -0.4)):
+        states = module.simulate(h=1e-3, duration=3.0)(np.array(times))[0]
+        assert states[:, module.coordinates.index(column)] == pytest.approx(value, abs=1e-8)
+    wrong = eomc("run", "cartpole.toml", "--event", "level=thta")
+    assert wrong.exit_code == 2
+    assert (
+        "--event: error: level.when: 'thta' is not declared; did you mean 'theta'?" in wrong.output
+    )
+    assert eomc("run", "cartpole.toml", "--event", "level").exit_code == 2
+
+
 def test_two_scenes_of_one_name_do_not_replace_each_other(here: Path) -> None:
     shutil.copy("cartpole.toml", "copy.toml")
     done = eomc("build", "cartpole.toml", "copy.toml")

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 @click.option("--duration", type=float, help="In s, instead of the scene's.")
 @click.option("--method", help="A stepper that the scene asks for, its first by default, or auto.")
 @click.option("--tol", type=float, help="Tolerance of adaptive steps, instead of the scene's.")
+@click.option(
+    "--event", multiple=True, metavar="NAME=FORMULA", help="Tell when a formula crosses zero."
+)
 @click.option("--every", type=click.IntRange(1), default=1, help="Keep every so many steps.")
 @click.option(
     "--out", type=click.Path(path_type=Path), help="Write the rows: FILE.csv or FILE.npz."
@@ -51,8 +55,9 @@ if TYPE_CHECKING:
 @options.JSON
 def command(
     scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str], h: float | None,
-    duration: float | None, method: str | None, tol: float | None, every: int, out: Path | None,
-    plot: Path | None, wrap: bool, animate: Path | None, quiet: bool, as_json: bool,
+    duration: float | None, method: str | None, tol: float | None, event: Sequence[str],
+    every: int, out: Path | None, plot: Path | None, wrap: bool, animate: Path | None,
+    quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Simulate a scene; print the end, the error and the speed.
 
@@ -69,7 +74,7 @@ def command(
     if wrap and not plot:
         raise EomcError("--wrap: says how --plot draws angles: give --plot FILE.png too")
     with status_line(f"building {scene.stem}", quiet or as_json):
-        module = pipeline.load(scene, root, warn=warn)
+        module = _with_events(pipeline.load(scene, root, warn=warn), event)
     values, q0, qd0 = _overrides(scene, module, parameters, start)
     options: dict[str, Any] = {
         "h": h, "duration": duration, "params": values, "method": method, "tol": tol,
@@ -126,6 +131,22 @@ def command(
         say(f"eomc: {done.message}", err=True)
     if stopped or not whole:
         sys.exit(130 if stopped else 1)
+
+
+def _with_events(module: ModuleType, given: Sequence[str]) -> ModuleType:
+    """The module of the same scene with the events NAME=FORMULA besides."""
+    events: dict[str, str] = {}
+    for pair in given:
+        name, equals, formula = pair.partition("=")
+        if not equals:
+            raise EomcError(f"--event {pair}: write --event NAME=FORMULA, as in low=theta2")
+        events[name.strip()] = formula.strip()
+    if not events:
+        return module
+    try:
+        return pipeline.with_events(module._model, events, Path(str(module.__file__)).parent)
+    except EomcError as fault:
+        raise EomcError(str(fault).replace("simulate(events=)", "--event")) from None
 
 
 @contextmanager

@@ -29,7 +29,7 @@ def with_events(given: dict[str, Any]) -> Any:
     known = vars(model).setdefault("_eventful", {})
     if (key := repr(events)) not in known:
         build = by_eomc("pipeline", "events of a run are compiled").with_events
-        known[key] = build(model, events, Path(__file__).parent)
+        known[key] = build(model, events, Path(__file__).parent)._model
     if hasattr(params := given["params"], "_names"):
         values = {name: getattr(params, name) for name in params._names}
         given["params"] = {k: x for k, x in values.items() if x != model.defaults[k]}
