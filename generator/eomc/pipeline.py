@@ -271,7 +271,10 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
         raise EomcError(f"{what}: {name} was imported without its scene: load it with eomc.load")
     if not isinstance(source, Path):
         raise EomcError(f"{what}: {name} was made in Python: give System.make its events")
-    data = source.read_bytes()
+    try:
+        data = source.read_bytes()
+    except OSError as fault:
+        raise EomcError(f"{what}: {source}: can't be read ({fault.strerror})") from None
     if hashlib.sha256(data).hexdigest() != model.digest:
         raise EomcError(f"{what}: {source} has changed since it was built: load it again")
     text = data.decode() + toml_text.events(events, what)

@@ -70,7 +70,15 @@ def test_they_stop_and_jump(oscillator: ModuleType) -> None:
     assert run.stopped == "wall" and run.t[-1] == pytest.approx(math.pi / 3, abs=TOL)
     both = oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, events=stop)
     assert both.reached == pytest.approx([math.pi / 3, 10], abs=TOL)
-    heavier = {"drop": {"when": "x", "direction": "falling", "action": "jump", "m": 4, "k": "4*k"}}
+    heavier = {
+        "drop": {
+            "when": "x",
+            "direction": "falling",
+            "action": "jump",
+            "m": np.float64(4),
+            "k": "4*k",
+        }
+    }
     run = oscillator.simulate(duration=3.0, params=oscillator.Params(), events=heavier)
     assert run["m"][-1] == 4 and run["k"][-1] == 16
 
@@ -115,6 +123,7 @@ def test_a_scene_that_is_not_there_or_another_is_told(
     other.write_text(TEXT.replace("k = 4", "k = 5"))
     made = eomc.System.make("free", {"x": 1.0}, "x_dot**2/2", "x**2")
     for source, words in (
+        (tmp_path / "gone.toml", r"gone\.toml: can't be read \(No such file"),
         (other, "has changed since it was built: load it again"),
         (made, r"give System\.make its events"),
         (None, r"load it with eomc\.load"),

@@ -64,7 +64,8 @@ def events(given: Any, what: str) -> str:
             if isinstance(value, bool) or not isinstance(value, (str, int, float)):
                 remedy = 'give a formula, or a dict such as {"when": "y", "direction": "falling"}'
                 raise EomcError(f"{what}: {name}: {key}: {remedy}, here {value!r}")
-            written = texts.toml(value) if isinstance(value, str) else repr(value)
+            number = float.__repr__ if isinstance(value, float) else int.__repr__  # NumPy's too
+            written = texts.toml(value) if isinstance(value, str) else number(value)
             lines.append(f"{texts.toml(str(key))} = {written}")
     return "\n".join(["", *lines, ""])
 
