@@ -22,6 +22,20 @@ from eomc.scene.read import parse
 pytest.importorskip("matplotlib")
 pytest.importorskip("latex2mathml")
 
+KEPLER = """
+eomc = 1
+name = "kep"
+[coordinates]
+x = {{ start = 0.1 }}
+y = {{ rate = 4.358898943540674 }}
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "-1/sqrt(x**2 + y**2)"
+{constraints}
+[run]
+duration = 0.5
+tolerance = 1e-9
+"""
 REPORTS = ROOT / "build" / "tests" / "reports"
 SLIDER = """
 eomc = 1
@@ -144,3 +158,26 @@ def test_in_a_browser_nothing_is_fetched_and_400_pixels_are_enough(tmp_path: Pat
         assert window.logged() == []
         asked = [url for url in window.requested() if not url.startswith(("data:", "chrome"))]
         assert {*asked} == {file.as_uri()}
+
+
+@pytest.mark.slow
+def test_a_motion_that_adaptive_steps_do_best_is_drawn_by_them(tmp_path: Path) -> None:
+    text = KEPLER.format(constraints="")
+    system = from_scene(parse(text, "kep.toml"))
+    report = cost_of_digits.measure(system, tmp_path, methods=("rk4", "adaptive"), longest=0.01)
+    best = report.best(6)
+    assert best is not None and best.adaptive
+    assert presented.of(system, report, tmp_path).said.startswith(
+        f"By steps that fit a tolerance of {best.tol:.0e}, within "
+    )
+
+
+@pytest.mark.slow
+def test_differences_grow_along_the_constraints(tmp_path: Path) -> None:
+    """From where a coordinate can't grow by itself: the end of a rod."""
+    rod = '[constraints]\nrod = "x**2 + y**2 - 0.01"'
+    file = tmp_path / "kep.toml"
+    file.write_text(KEPLER.format(constraints=rod))
+    system = pipeline.read(file)
+    report = cost_of_digits.measure(system, tmp_path, methods=("rk4",), longest=0.01)
+    assert 1 < report.growth.amplification[-1] < 1000

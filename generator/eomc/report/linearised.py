@@ -100,6 +100,14 @@ def spectrum(
     return np.concatenate(values) if values else np.zeros(0, complex), worst, place
 
 
+def _on_rows(module: ModuleType, x: Vector, t: float) -> Vector:
+    """The state nearest to [q; qd] that obeys the constraints, if there are; nothing is held."""
+    if not module._model.constraint_names:
+        return x
+    n = len(x) // 2
+    return np.hstack(module.project(x[:n], x[n:], t=t))
+
+
 def growth(module: ModuleType, reference: Reference, method: str, steps: int) -> Growth:
     """The norm of the product of transition matrices from row to row of the reference.
 
@@ -115,7 +123,7 @@ def growth(module: ModuleType, reference: Reference, method: str, steps: int) ->
         x, t0 = reference.halves[0][k * stride], float(reference.t[k * stride])
         ends = []
         for by in (np.zeros(2 * n), *np.diag(scale * NUDGE)):
-            y = x + by
+            y = _on_rows(module, x + by, t0)
             run = simulate(
                 module, method=method, q0=y[:n], qd0=y[n:], h=duration / SEGMENTS / steps,
                 steps=steps, every=steps, t0=t0,

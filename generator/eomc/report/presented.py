@@ -73,7 +73,13 @@ def _motion(system: System, report: Report, root: Path) -> tuple[Markup, str]:
     best = report.best(6) or report.finest
     module, _ = variant(system, [p.method for p in report.lines], root / system.name / "report")
     finer = max(1, math.ceil(ROWS / best.steps))  # enough rows for smooth curves
-    run = module.simulate(h=best.h / finer, steps=best.steps * finer, method=best.method)
+    if best.adaptive:
+        run = module.simulate(tol=best.tol, duration=report.duration)._drawn
+        said = f"By steps that fit a tolerance of {best.tol:.0e}"
+    else:
+        h, steps = best.h / finer, best.steps * finer
+        run = module.simulate(h=h, steps=steps, method=best.method)
+        said = f"By {best.method}, h = {run.h:.3g} s"
     jacobi = run.jacobi if run._model.has_jacobi else None
     inputs = dict(zip(module.inputs, run.u.T, strict=True))
     balance = run.balance() if run._model.has_power else None
@@ -81,7 +87,6 @@ def _motion(system: System, report: Report, root: Path) -> tuple[Markup, str]:
         system, run.t, run.q, run.qd, run.energy, " ", jacobi, run.outputs,
         balance.words if balance else "", inputs,
     )  # fmt: skip
-    said = f"By {best.method}, h = {run.h:.3g} s"
-    if finer == 1:
+    if best.adaptive or finer == 1:
         said += f", within {best.along:.1g} of the reference solution"
     return plot.svg(figure), said + "."
