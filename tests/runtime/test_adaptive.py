@@ -248,6 +248,11 @@ def test_a_motion_into_a_singularity_stops_and_says_where(kepler: ModuleType) ->
     [
         ({"tol": 1e-16}, "tol: 1e-16: give one between 1e-15 and 0.01"),
         ({"tol": 1}, "tol: 1: give one between"),
+        ({"tol": 1e-6, "q0": [1]}, "q0: shape (1,), expected (2,) or (n, 2)"),
+        (
+            {"qd0": [[0, 1]]},
+            "qd0: shape (1, 2), expected one state, (2,): x, y; simulate_batch takes many",
+        ),
         ({"tol": "x"}, "tol: 'x' is not a number"),
         ({"tol": 1e-6, "h": 0.1}, "h: belongs to fixed steps"),
         ({"tol": 1e-6, "every": 2}, "every: belongs to fixed steps"),
@@ -285,7 +290,7 @@ def test_auto_is_by_a_tolerance(kepler: ModuleType, cartpole: ModuleType) -> Non
     run, same = kepler.simulate(method="auto", duration=1.0), kepler.simulate(duration=1.0)
     assert run.tol == kepler._model.tolerance and np.array_equal(run.q, same.q)
     assert kepler.simulate(method="auto", tol=1e-6, duration=1.0).steps < run.steps
-    with pytest.raises(ValueError, match="not built"):
+    with pytest.raises(ValueError, match="built without adaptive steps"):
         cartpole.simulate(method="auto")
     text = (cases.SCENES / "cartpole.toml").read_text(encoding="utf-8")
     for method, methods in (('"auto"', ("rk4",)), ('["auto", "dp8"]', ("dp8",))):
@@ -297,7 +302,8 @@ def test_auto_is_by_a_tolerance(kepler: ModuleType, cartpole: ModuleType) -> Non
 
 def test_without_tolerance_nothing_is_built(cartpole: ModuleType) -> None:
     with pytest.raises(
-        ValueError, match=r"tol, stiff and, in a batch, times: not built; a scene asks for them"
+        ValueError,
+        match=r"tol: cartpole was built without adaptive steps.* add tolerance = 1e-9 under",
     ):
         cartpole.simulate(tol=1e-9)
     assert not hasattr(cartpole._model._lib, "adaptive")

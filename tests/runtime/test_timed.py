@@ -180,7 +180,7 @@ def test_many_steps_take_no_memory(cartpole: ModuleType) -> None:
         ({"times": [1], "every": 2}, "every: times say where rows are"),
         ({"times": [1], "out": (1, 2)}, "out: times say where rows are"),
         ({"times": [1], "duration": 2.0}, "give times or duration, not both"),
-        ({"times": [1], "tol": 1e-9}, "not built; a scene asks for them"),
+        ({"times": [1], "tol": 1e-9}, "was built without adaptive steps"),
         ({"times": [1], "h": 0}, "h: 0 is not a step size"),
     ],
 )

@@ -37,8 +37,9 @@ def as_limits(
         raise ValueError(f"stiff: {stiff!r} is not True or False")
     if model.tolerance is None:
         raise ValueError(
-            "tol, stiff and, in a batch, times: not built; a scene asks for them with [run] "
-            "tolerance = 1e-9 (of a batch by fixed steps run(times) gives the states at any times)"
+            f"tol: {model.name} was built without adaptive steps, to which tol, h_most, stiff and, "
+            "in a batch, times belong: add tolerance = 1e-9 under [run] of its scene (of a batch "
+            "by fixed steps run(times) gives the states at any times)"
         )
     if not all(map(is_, fixed, FIXED.values())):
         for name, value in zip(FIXED, fixed, strict=True):

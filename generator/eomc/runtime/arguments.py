@@ -167,7 +167,9 @@ class Arguments:
                 raise TypeError
             return aligned(np.ascontiguousarray(array, self.dtype))
         except (TypeError, ValueError, OverflowError):
-            raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
+            order = f": give them in order, {', '.join(self.coordinates)}"
+            remedy = order if isinstance(value, Mapping) else ""
+            raise ValueError(f"{name}: {value!r} is not an array of numbers{remedy}") from None
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:
         """Finite numbers, (width,) or (n, width)."""
@@ -196,6 +198,18 @@ class Arguments:
         if at.shape != moving.shape:
             raise ValueError(f"qd: shape {moving.shape} with q of shape {at.shape}")
         return at, moving
+
+    def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
+        """A start, (nq,), and what C reads it from."""
+        if (numbers := self._listed(x0)) is not None:
+            return x0, numbers  # type: ignore[return-value]  # an array, as was seen
+        x = self._array(x0, name, self.nq)
+        if x.ndim != 1:
+            raise ValueError(
+                f"{name}: shape {x.shape}, expected one state, ({self.nq},): "
+                f"{', '.join(self.coordinates)}; simulate_batch takes many"
+            )
+        return x, self._pointer(x)
 
     def _one(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
         at, moving = self._state(q, qd)

@@ -271,6 +271,9 @@ class Constrained(Frames):
     def _assembled(self, q0: Any, qd0: Any, t0: float, params: Any) -> tuple[Any, Any]:
         """A start on the constraints: what the scene holds stays as it is given, the rest moves."""
         q0, qd0 = self._completed(q0, 0), self._completed(qd0, 1)
+        for x, name in ((q0, "q0"), (qd0, "qd0")):
+            if x is not None:
+                self._from(x, name)
         if not self._rows.names or (q0 is None and qd0 is None and params is None and t0 == 0):
             return q0, qd0
         q, qd = self._start

@@ -324,15 +324,6 @@ class Model(Constrained):
         h = self.h if h is None else as_step_size(h, self.dtype)
         return advice(self, q, qd, h, as_number(t0, "t0"), u, given, method)
 
-    def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
-        """A start, (nq,), and what C reads it from."""
-        if (numbers := self._listed(x0)) is not None:
-            return x0, numbers  # type: ignore[return-value]  # an array, as was seen
-        x = self._array(x0, name, self.nq)
-        if x.ndim != 1:
-            raise ValueError(f"q0, qd0: expected one state, ({self.nq},)")
-        return x, self._pointer(x)
-
     def _trajectory(
         self, q: Array, qd: Array, from_q: Any, from_qd: Any, h: float, steps: int, every: int,
         u: Any, p: Array, at_p: Any, method: str, t0: float, out: tuple[Array, Array] | None,

@@ -37,7 +37,10 @@ SAID = {
     "is far too long",
     "interrupted": "interrupted",
 }
-PASSED_OVER = "fixed steps pass over the scene's events: give tol=, not h, steps or method"
+PASSED_OVER = (
+    "fixed steps pass over the scene's events, friction that sticks among them: give tol=, not h, "
+    "steps or method; a law u is then the signal of its input in the scene"
+)
 _LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
 
 
@@ -171,6 +174,8 @@ class Run(ConstrainedRun, Columns):
         Else, as in a frame that is turned, this is what is conserved where there is no power.
         """
         return self._values("jacobi")
+
+    stopped = ""  # by which event; fixed steps pass over them
 
     @property
     def events(self) -> Mapping[str, Any]:
