@@ -104,6 +104,15 @@ def test_rounding_is_no_zero(modules: Modules) -> None:
     assert np.max(exact_error) < 10 * np.max(run.error.q)
 
 
+def test_its_text_is_a_line(cartpole: ModuleType) -> None:
+    estimate = cartpole.simulate(duration=1.0).estimate()
+    assert str(estimate).startswith(f"error at the end about x {estimate.end['x']:.1g} (")
+    assert f", theta {estimate.end['theta']:.1g} ({estimate.digits['theta']:.0f} digits)," in str(
+        estimate
+    )
+    assert str(estimate).endswith(f" {estimate.amplification:.2g} times as large")
+
+
 def test_no_step_no_error(cartpole: ModuleType) -> None:
     error = cartpole.simulate(steps=0, estimate=True).error
     assert not error.q.any() and error.resolved

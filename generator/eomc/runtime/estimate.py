@@ -59,6 +59,15 @@ class Estimate:
         """What is to be said of a run that is not resolved, or ""."""
         return f"this motion is not resolved: {self.verdict}" if self.verdict else ""
 
+    def __str__(self) -> str:
+        """The end in a line: errors, right digits, what the motion makes of a difference."""
+        ends = ", ".join(
+            f"{name} {self.end[name]:.1g} ({digits:.0f} digits)"
+            for name, digits in self.digits.items()
+        )
+        grown = f"a difference at the start has become {self.amplification:.2g} times as large"
+        return f"error at the end about {'; '.join(x for x in (ends, grown, self.warning) if x)}"
+
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("estimate.Estimate", *self.__dict__.values())
 
