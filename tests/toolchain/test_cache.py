@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import importlib.util
 import os
@@ -220,6 +221,41 @@ def test_no_compiler_is_left_running_after_a_failure(
         return False
 
     assert in_a_fork(build, 20) == ("done", True), "a compiler is still running"
+
+
+def test_a_compiler_that_is_ended_removes_its_temporary_files(
+    scene: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One compilation fails while the other has a file of its own, as gcc has."""
+    own = tmp_path / "ccOwn.s"
+    text = f"""case "$*" in *binding.c*)
+        trap 'rm {own}; exit 1' TERM; touch {own}; sleep 20 & wait;; esac
+    until [ -f {own} ]; do sleep 0.01; done; exit 1\n"""
+    monkeypatch.setenv("CC", script(tmp_path / "failing", text))
+    with pytest.raises(eomc.EomcError, match="status 1"):
+        eomc.build(scene, root)
+    assert not own.exists()
+
+
+def test_a_build_that_cant_be_moved_leaves_no_library(
+    scene: Path, root: Path, built: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the face is there the new one goes, after it the old one."""
+    folder, move = root / "simple_pendulum", os.replace
+    for last, gravity_then in (("__init__.py", built), ("build.json", 2 * built)):
+
+        def failing(old: Path, new: Path, last: str = last) -> None:
+            if Path(new).name == last:
+                raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), str(new))
+            move(old, new)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "replace", failing)
+            with pytest.raises(eomc.EomcError, match=r"can't be written \(Disk quota exceeded\)"):
+                eomc.build(scene, root)
+        assert len(list(folder.glob("_simple_pendulum_*"))) == 1
+        assert leftovers(root) == []
+        assert gravity(root) == gravity_then
 
 
 @contextlib.contextmanager

@@ -166,12 +166,17 @@ def _build(
     for file in kept:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
     stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
-    # the face last: until it is there, the old one is whole; the manifest after it
-    for file in [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST]:
-        _date_later(new / file, folder / file)
-        os.replace(new / file, folder / file)
-    for path in stale:
-        path.unlink(missing_ok=True)
+    unused = [] if (folder / library).exists() else [folder / library]
+    try:
+        # the face last: until it is there, the old one is whole; the manifest after it
+        for file in [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST]:
+            _date_later(new / file, folder / file)
+            os.replace(new / file, folder / file)
+            if file == "__init__.py":
+                unused = stale
+    finally:
+        for path in unused:
+            path.unlink(missing_ok=True)
 
 
 def _date_later(new: Path, old: Path) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError
 from eomc.toolchain.compiler import STANDARD, Compiler, binding_flags, flags, standard
-from eomc.toolchain.running import finish, run, start
+from eomc.toolchain.running import end, finish, run, start
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
@@ -59,8 +59,7 @@ def build(
             finish(name, job, process)
     finally:
         for _, process in running:  # none goes on where another failed
-            process.kill()
-            process.wait()
+            end(process)
     link = [*compiler.command, "-shared", "scene.o", "binding.o", "-lm", "-o", library]
     if sys.platform == "darwin":
         link.insert(1, "-undefined")

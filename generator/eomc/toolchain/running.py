@@ -31,6 +31,16 @@ def finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) ->
         )
 
 
+def end(process: subprocess.Popen[str]) -> None:
+    """End a compiler that may be at work, in time for it to remove its temporary files."""
+    process.terminate()
+    try:
+        process.wait(1)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
 def run(name: str, command: Sequence[str], folder: Path) -> None:
     """Start it, and wait for it. Raises EomcError as they do."""
     finish(name, command, start(command, folder))
