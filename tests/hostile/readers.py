@@ -273,8 +273,8 @@ class Mutator:
 class Run:
     """Calls a target, and keeps what it does that it should not."""
 
-    def __init__(self, name: str, seconds: float) -> None:
-        self.name, self.target = name, TARGETS[name]
+    def __init__(self, name: str, seconds: float, most: int) -> None:
+        self.name, self.target, self.most = name, TARGETS[name], most
         self.end = time.monotonic() + seconds if seconds else float("inf")
         self.began, self.count, self.accepted = time.monotonic(), 0, 0
         self.found: dict[str, int] = {}
@@ -283,7 +283,7 @@ class Run:
 
     def __call__(self, data: bytes) -> None:
         began = time.monotonic()
-        if began > self.end:
+        if began > self.end or self.count == self.most:
             self.leave()
         self.count += 1
         signal.setitimer(signal.ITIMER_REAL, SECONDS)
@@ -364,9 +364,7 @@ def fuzz(name: str, seconds: float, seed: int, runs: int) -> None:
         sys.argv[0], str(grown), *map(str, seeds(name)), f"-seed={seed}", "-timeout=0",
         "-max_len=20000", "-rss_limit_mb=0", "-verbosity=0", "-len_control=0",
     ]  # fmt: skip
-    run = Run(name, seconds)
-    if runs:
-        words.append(f"-runs={runs}")
+    run = Run(name, seconds, runs or -1)  # libFuzzer's own -runs= ends without a word
     with folder_of_its_own(name):
         atheris.Setup(words, run, custom_mutator=Mutator(name))
         atheris.Fuzz()
