@@ -18,6 +18,7 @@ from scene_author import scene_text
 from scene_author_wide import wide_text
 
 from eomc.model.from_scene import from_scene
+from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify import rows_derivatives
 from eomc.verify.check import check
@@ -260,6 +261,32 @@ def test_wide_scenes_pass(seed: str, tmp_path: Path) -> None:
     """With outputs, limits, events, tolerances, forces, points, frames, constraints and loops."""
     found = outcome(int(seed), False, tmp_path, wide=True)
     assert found.outcome == "passed", (found, wide_text(int(seed)))
+
+
+@pytest.mark.slow
+def test_short_steps_end_where_rounding_of_constraints_lets_them(modules: Modules) -> None:
+    """15 units without it, 29 on another machine: of 20, where wrong sines make hundreds."""
+    text = wide_text(1034)
+    comparison = Comparison(
+        assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text),
+        np.random.default_rng(1034), None,
+    )  # fmt: skip
+    found = Runs(comparison).short()
+    assert isinstance(found, float) and found < 5
+
+
+@pytest.mark.slow
+def test_stages_by_sweeps_end_at_rounding_of_far_angles(modules: Modules) -> None:
+    """As those by Newton's method do: 8,417 units without it, of 1,000."""
+    own = wide_text(25099).split("method = ")[0]
+    text = own + 'method = ["gauss16"]\nh = 0.004\nduration = 0.5\n'
+    comparison = Comparison(
+        assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text),
+        np.random.default_rng(25099), None,
+    )  # fmt: skip
+    runs = Runs(comparison)
+    runs.sines()  # which draws before it
+    assert 0 < runs.far() < 100
 
 
 def test_wide_scenes_have_all_of_it() -> None:

@@ -282,7 +282,8 @@ class Comparison:
         kick = h * e.size["acceleration"]  # of whose rounding a step makes a difference
         moved = np.array([self.sampler.spread + h * kick, self.sampler.speed + kick])
         run = self.simulate(s, h=h, steps=len(t) - 1)
-        size = np.arange(1, len(t) + 1)[:, None, None] * (growth * moved + np.abs(x))
+        size = growth * moved + np.abs(x) + _corrected(e)
+        size = np.arange(1, len(t) + 1)[:, None, None] * size
         if str(getattr(run.status, "value", run.status)) != "ok":
             raise RuntimeError(f"the run ended with status {run.status}")
         off_time = self.units(run.t, t, np.abs(t) + h)

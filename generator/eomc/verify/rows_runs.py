@@ -258,7 +258,7 @@ class Runs:
                 errors.append(self.far_steps(at, gain))
             for method in self.check.methods:
                 if method != "rk4":
-                    solved = self.solved(far) if METHODS[method].newton else far
+                    solved = self.solved(far) if METHODS[method].implicit else far
                     errors.append(self.check.one_step_of(method, solved, self.h) or 0.0)
         return float(np.max(errors, initial=0))
 
