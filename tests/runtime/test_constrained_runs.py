@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from conftest import tiers
+from conftest import Modules, tiers
 
 import eomc
 from eomc.cli.main import main
@@ -197,6 +198,47 @@ def test_a_start_where_rows_depend_on_each_other_is_left_as_it_is(tmp_path: Path
     module = eomc.load(made, tmp_path)
     q, qd = module.project(np.zeros(3), np.zeros(3), held=["a"])
     assert not q.any() and not qd.any()
+
+
+SCALED = """eomc = 1
+name = "scaled"
+[coordinates]
+x = { unit = "m" }
+y = { unit = "m" }
+z = { unit = "m" }
+w = { unit = "m" }
+[parameters]
+a = 1.0
+b = 1.0
+c = 1.0
+k = 2.0
+[energy]
+kinetic = "(x_dot**2 + 2*y_dot**2 + z_dot**2 + w_dot**2)/2 + x_dot*y_dot/3"
+[constraints]
+one = "a*(1.1*x + 2.3*y - 3.7*z - 1)"
+two = "b*(k*1.1*x + 2.3*y - 3.7*z - 1)"
+three = "c*(x - y + 2*z + 5*w)"
+[run]
+h = 0.01
+duration = 0.1
+"""
+
+
+@pytest.mark.parametrize("k", [2.0, 1.0])  # where it is 1, `two` says what `one` does
+def test_a_projection_judges_each_row_by_its_own_size(modules: Modules, k: float) -> None:
+    """In any order of rows that differ by 1e40; mutants of the norm in project.c do not."""
+    module, draw = modules.unoptimised(SCALED), np.random.default_rng(1)
+    D = np.array([[1, 1 / 3, 0, 0], [1 / 3, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    A = np.array([[1.1, 2.3, -3.7, 0], [1.1 * k, 2.3, -3.7, 0], [1, -1, 2, 5]])
+    independent = [0, 1, 2] if k != 1 else [0, 2]
+    A, constants = A[independent], np.array([-1, -1, 0])[independent]
+    onto = np.linalg.solve(D, A.T) @ np.linalg.inv(A @ np.linalg.solve(D, A.T))
+    for scales in permutations((1e-20, 1.0, 1e20)):
+        q, qd = draw.normal(size=(2, 4))
+        params = dict(zip("abc", scales, strict=True), k=k)
+        found = module.project(q, qd, params=params)
+        expected = q - onto @ (A @ q + constants), qd - onto @ (A @ qd)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_a_projection_does_not_leap_across_turns(tmp_path: Path) -> None:
