@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 
 ScenePath = str | os.PathLike[str]
+LOADS = 5  # where other builds replace the module each time
 
 
 @contextmanager
@@ -157,7 +158,7 @@ def build(
         name, digest = name_and_digest(Path(scene))
     wanted = cache.key(digest, form)
     if name and cache.found(folder := cache.place(name, Path(root), form), wanted):
-        return cache.Built(name, folder, False)
+        return cache.Built(name, folder, False, wanted)
     if made is None:
         assert isinstance(scene, (str, os.PathLike))
         made = read(scene)
@@ -246,7 +247,13 @@ def load(
     """
     from eomc.toolchain import cache
 
-    module = cache.load(build(scene, root, form=form, warn=warn))
+    for tries in range(1, LOADS + 1):
+        try:
+            module = cache.load(build(scene, root, form=form, warn=warn))
+            break
+        except cache.ReplacedError:
+            if tries == LOADS:
+                raise
     # what pictures are made from
     own = Path(os.path.abspath(scene)) if isinstance(scene, (str, os.PathLike)) else scene
     module._model.source = own

@@ -36,11 +36,16 @@ MANIFEST = "build.json"
 
 @dataclass(frozen=True)
 class Built:
-    """A module on disk; `fresh` where it was built just now and not found."""
+    """A module on disk; `fresh` where it was built just now and not found; key: "" for any."""
 
     name: str
     folder: Path
     fresh: bool
+    key: str = ""
+
+
+class ReplacedError(EomcError):
+    """Another build has taken a module's place before it was loaded."""
 
 
 @lru_cache(maxsize=1)
@@ -99,12 +104,12 @@ def build(
     folder = place(name, root, form)
     root = folder.parent
     if found(folder, wanted):
-        return Built(name, folder, False)
+        return Built(name, folder, False, wanted)
     try:
         root.mkdir(parents=True, exist_ok=True)
         with locked(root / f".{folder.name}.lock"):
             if found(folder, wanted):  # by another process, meanwhile
-                return Built(name, folder, False)
+                return Built(name, folder, False, wanted)
             _free(folder)
             for left in root.glob(f".{folder.name}.build-*"):  # by a build that was killed
                 shutil.rmtree(left, ignore_errors=True)
@@ -114,7 +119,7 @@ def build(
         raise FolderError(
             f"{fault.filename or folder}: can't be written ({fault.strerror})"
         ) from None
-    return Built(name, folder, True)
+    return Built(name, folder, True, wanted)
 
 
 def place(name: str, root: Path, form: str = "fast") -> Path:
@@ -192,10 +197,19 @@ def _date_later(new: Path, old: Path) -> None:
 
 
 def load(built: Built) -> ModuleType:
-    """Import a built module, whatever else bears its name; the same build gives the same module."""
+    """Import a built module, whatever else bears its name; the same build gives the same module.
+
+    Raises ReplacedError where another build has replaced it.
+    """
     folder = built.folder.resolve()  # Python caches finders by path, whatever the current folder
-    manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-    alias = f"_eomc_{built.name}_{manifest['key'][:12]}"
+    key = _key(folder)
+    replaced = ReplacedError(
+        f"{folder}: other builds of a scene of this name replace the module while it is loaded: "
+        "rename the scene, or use --build DIR"
+    )
+    if built.key not in ("", key):
+        raise replaced
+    alias = f"_eomc_{built.name}_{key[:12]}"
     if alias in sys.modules:
         return sys.modules[alias]
     spec = importlib.util.spec_from_file_location(
@@ -206,13 +220,22 @@ def load(built: Built) -> ModuleType:
     sys.modules[alias] = module
     try:
         spec.loader.exec_module(module)
-    except BaseException:
+        if f"{alias}._{built.name}_{key[:12]}" not in sys.modules:  # another face was read
+            raise replaced
+    except BaseException as fault:
         del sys.modules[alias]
+        if isinstance(fault, Exception) and _key(folder) != key:
+            raise replaced from None
         raise
     # another process can't import the alias; what is pickled here is found by its place there
     place = (built.name, str(built.folder.resolve()), alias)
     sys.modules[f"{alias}.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
     return module
+
+
+def _key(folder: Path) -> str:
+    """Of the build that lies there now."""
+    return str(json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["key"])
 
 
 def unpickled(name: str, folder: str, alias: str, path: str, arguments: tuple[Any, ...]) -> Any:
