@@ -54,15 +54,31 @@ def _adaptive(module: Any, s: State, x: Vector, T: float, tol: float, **how: Any
     n = len(s.q)
     with warnings.catch_warnings():  # a run that stops is seen by its rows
         warnings.simplefilter("ignore", RuntimeWarning)
-        span = how if "times" in how else {"duration": T}
+        span = how if "times" in how else {"duration": T, **how}
         return module.simulate(x[:n], x[n:], tol=tol, t0=s.t, u=s.u, params=s.params, **span)
+
+
+def _begun(module: Any, s: State, x: Vector, T: float, tol: float, stiff: bool) -> Any:
+    """The run, or its first call of C, which has more steps than are compared.
+
+    Jumps that add energy may come for ever, in less and less time.
+    """
+
+    def enough(done: int, whole: int) -> None:
+        if done < whole:
+            raise KeyboardInterrupt
+
+    try:
+        return _adaptive(module, s, x, T, tol, stiff=stiff, progress=enough)
+    except module.Interrupted as stop:
+        return stop.run
 
 
 def _error(of: Comparison, module: Any, tol: float, stiff: bool, s: State) -> float | None:
     """At the end and at times within steps, from one state; None where nothing can be compared."""
     x = np.concatenate([s.q, s.qd])
     spread = np.concatenate([of.sampler.spread, of.sampler.speed])
-    first = _adaptive(module, s, x, of.system.run.duration, tol, stiff=stiff)
+    first = _begun(module, s, x, of.system.run.duration, tol, stiff)
     if len(first) < 2:  # not a single step
         begins = np.isfinite(of.reference.acceleration(s.q, s.qd, s.t, s.u, s.params)).all()
         return math.inf if first.status == "not finite" and begins else None
