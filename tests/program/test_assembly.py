@@ -296,6 +296,24 @@ def test_a_row_without_a_slope_where_it_holds_is_refused(
     assert "ground" not in text and not recwarn
 
 
+@pytest.mark.parametrize(
+    ("formula", "instead"),
+    [
+        ("(x - y)**2", "write x - y for (x - y)**2"),
+        ("-3*(x - y)**2", "write x - y for -3*(x - y)**2"),
+        ("(x - y)**2 + (z - 1)**4", "write each thing that is zero by itself"),
+        ("gap", "write each thing that is zero by itself"),
+    ],
+)
+def test_a_row_without_a_slope_is_refused_where_the_held_start_obeys_it(
+    formula: str, instead: str
+) -> None:
+    held = "x = { start = 1.0 }\ny = { start = 1.0 }\nz = { start = 1.0 }"
+    more = '[definitions]\ngap = "(x - y)**2"' if formula == "gap" else ""
+    text = refusal(scene(held, f'rod = "{formula}"', more))
+    assert f"constraints.rod: has no slope where it holds, and so no force: {instead}" in text
+
+
 @pytest.mark.slow
 def test_rows_that_fade_out_at_a_start_and_nowhere_else_are_allowed(
     recwarn: pytest.WarningsRecorder,
@@ -303,6 +321,9 @@ def test_rows_that_fade_out_at_a_start_and_nowhere_else_are_allowed(
     for rows in ('a = "x*y"', 'a = "x**2*y + sin(x) - x"', 'a = "y**2 - x**3"'):
         made = assembled(scene("x = {}\ny = {}\nz = {}", rows))
         assert "singular position" in str(made.warnings[0])
+    away = "x = { start = 1.0 }\ny = { start = 1.0 }\nz = {}"
+    for rows in ('a = "(x - 1)*(y - 1)"', 'a = "(y - 1)**2 - (x - 1)**3"'):
+        assert "singular position" in str(assembled(scene(away, rows)).warnings[0])
     small = 'a = "x**2 + y**2 - 1e-14"'
     made = assembled(scene("x = { start = 1e-7 }\ny = {}", small))
     assert made.closure is not None and made.closure.freedoms == 1 and not recwarn

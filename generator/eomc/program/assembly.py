@@ -58,6 +58,8 @@ def assembled(system: System) -> System:
         return replace(made, closure=replace(made.closure, made_for=_made_for(made)))
     manifold = Manifold(system)
     _refuse_idle(manifold)
+    if flat := contradictions.powers(system):
+        raise SceneError(list(contradictions.of_slopes(system, flat)))
     start = _start(manifold)
     found = ranks(manifold, start.place)
     if found.rank == 0:

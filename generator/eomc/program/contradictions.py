@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from sympy import Add
 
 from eomc.base.errors import Problem
 from eomc.base.texts import listed
@@ -186,10 +187,27 @@ def _alike(manifold: Manifold, rows: Sequence[int], place: Place) -> bool:
     return True
 
 
+def powers(system: System) -> list[int]:
+    """Rows that their formulas alone show to have no slope where they hold.
+
+    A power above 1, or a sum of even ones, with numbers before them.
+    """
+    found = []
+    for k, c in enumerate(system.constraints):
+        terms = [term.as_coeff_Mul() for term in Add.make_args(c.formula)]
+        exponents = [power.as_base_exp()[1] for _, power in terms]
+        signs = {bool(factor > 0) for factor, _ in terms}
+        alike = len(signs) == 1 and all(e.is_even and e > 0 for e in exponents)
+        alone = len(terms) == 1 and exponents[0].is_number and exponents[0] > 1
+        if c.holonomic and (alone or alike):
+            found.append(k)
+    return found
+
+
 def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
     """What is wrong with rows that have no slope where they hold: with all, where none is told."""
     for row in [system.constraints[k] for k in flat]:
-        base, power = row.formula.as_base_exp()
+        base, power = row.formula.as_coeff_Mul()[1].as_base_exp()
         simple = power.is_number and power != 1 and not base.is_Number and len(str(base)) < LONGEST
         instead = f"{base} for {row.formula}" if simple else BY_ITSELF
         why = f"has no slope where it holds, and so no force: write {instead}"

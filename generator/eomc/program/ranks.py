@@ -27,6 +27,7 @@ SAME = 1e-20  # of a row: it is a sum of others in forty digits
 GOOD = 1e-2  # of the singular value of all rows: what that of the kept ones is at least
 BETTER = 1.02  # times another set's: a set is better
 BESIDE, REACH = 3, 0.1  # places beside the start, and how far, of the coordinates' size
+KNOWN = 1e-7  # of the coordinates: how well a place that holds a square is known
 FLAT = 1e-6  # of the slope beside: a row has none
 MOST_SETS = 4000  # that are tried; beyond, rows are left out one by one
 
@@ -105,6 +106,8 @@ def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
             # a walk from a singular position ends near it, where slopes grow with the way gone
             span = sizes if place is start else place.q - start.q
             reach = REACH * (float(np.max(np.abs(span))) or 1.0)
+            # nearer, slopes beside are as small as what is left where a square counts as zero
+            reach = max(reach, KNOWN * float(np.max(np.abs(place.q))))
             q = [place.q + reach * random.normal(size=len(place.q)) for _ in range(BESIDE)]
             found = [p for p in (manifold.place(x, place.t) for x in q) if p is not None]
             beside = np.max([_slopes(p) for p in found], axis=0, initial=0.0)
