@@ -58,6 +58,6 @@ def _jump(
             yield name, formula
     if entry.action == "jump" and not given:
         check.say(("event", k, "action"), f'a jump sets something: add {state[1]} = "..."')
-    elif given and entry.action != "jump":
-        first = next(iter(given))
+    first = next((name for name in given if name in state), "")
+    if first and entry.action != "jump":
         check.say(("event", k, first), f"only a jump sets '{first}': add action = \"jump\"")
