@@ -184,7 +184,7 @@ class Checker:
                 return f"{start}: nobody knows the rate of an input; add it as a further input"
             case "parameters" | "constants" as table:
                 return f"{start}: '{owner}' stands in [{table}], so it doesn't move"
-        if meant := messages.velocity(name, self.tables):
+        if meant := self._respelt(name) or messages.velocity(name, self.tables):
             return f"{start}; did you mean '{meant}'?"
         if name == "time":
             return f"{start}; did you mean 't'?"
@@ -193,6 +193,12 @@ class Checker:
         if name in ("e", "E"):
             return f"{start}: write exp(1), or declare it in [constants]"
         return f"{start}: add it to [parameters], [constants], [inputs] or [definitions]"
+
+    def _respelt(self, name: str) -> str:
+        """The known name that differs by underscores only, or the empty string."""
+        plain = name.replace("_", "")
+        known = self.kinds if self.faults < SUGGESTED else ()
+        return next((k for k in known if k.replace("_", "") == plain), "")
 
     def _no_rate(self, inside: ast.expr) -> str:
         """Why there is no dot(inside), or the empty string."""
