@@ -160,6 +160,8 @@ def _toml_problem(fault: ValueError, text: str, file: str) -> Problem:
     elif "Cannot declare" in message:
         remedy = ": a [table] stands once, put its entries together"
         column, width = 0, len(source)
+    elif "Invalid value" in message and (truth := re.match("True|False", source[column:])):
+        remedy, width = f": write {truth[0].lower()}, in small letters", len(truth[0])
     else:
         meant = messages.bare(source)
         remedy = next((r for m, r in _TOML_REMEDIES.items() if m in message), "")
