@@ -401,7 +401,10 @@ class _Check(Checker):
         self.solve([f"{name}_ddot" for name in self.doc.coordinates])
         out = []
         for name, entry in self.doc.outputs.items():
-            formula = self.formula(("outputs", name, "formula"), entry.formula)
+            path = ("outputs", name, "formula")
+            if validate_constraints.multiplier(self, self.doc, path, entry.formula):
+                continue
+            formula = self.formula(path, entry.formula)
             if name in self.centers and formula and formula.text.strip() != name:
                 message = (
                     f"'{name}' is a place of a body or point already: use that, or another name"

@@ -6,9 +6,12 @@ import re
 from collections.abc import Iterator
 
 from eomc.base import names
+from eomc.scene.formulas import FormulaError
 from eomc.scene.scene import Constraint
 from eomc.scene.schema import Document
-from eomc.scene.scope import INPUT, Checker
+from eomc.scene.scope import INPUT, Checker, Path
+
+_MULTIPLIER = r"lambda(_\w+)?|(\w+_)?(multiplier|reaction)s?"
 
 
 def constraints(check: Checker, doc: Document) -> Iterator[Constraint]:
@@ -59,6 +62,23 @@ def fault_of_row(check: Checker, doc: Document, name: str) -> str:
     if why := names.fault(name):
         return why
     return f"'{name}' {taken[name]} already" if name in taken else ""
+
+
+def multiplier(check: Checker, doc: Document, path: Path, text: float | str) -> bool:
+    """Whether an output names a multiplier or reaction, which is reported."""
+    rows = {*doc.constraints, *(entry.name for entry in doc.loop.values())}
+    if not rows or not isinstance(text, str):
+        return False
+    for word in re.finditer(r"(?<![\w.])[A-Za-z_]\w*", text):
+        named = word[0] in rows or re.fullmatch(_MULTIPLIER, word[0])
+        if named and word[0] not in check.kinds:
+            message = (
+                f"'{word[0]}' can't be used here: multipliers and reactions are no outputs, a run "
+                "in Python has them in run.multipliers and run.reactions"
+            )
+            check.say(path, message, FormulaError(message, word.start(), len(word[0])), text)
+            return True
+    return False
 
 
 def guesses(check: Checker, doc: Document) -> None:
