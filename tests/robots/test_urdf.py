@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import eomc
 from eomc.base.errors import EomcError
 from eomc.cli.main import main
 from eomc.model import kinematics
 from eomc.model.from_scene import from_scene
-from eomc.robots import rotations, scene_text, urdf
+from eomc.robots import edit, rotations, scene_text, urdf
 from eomc.robots.robot import Robot, moved
 from eomc.scene import read as scene
 from eomc.scene.read import parse
@@ -276,6 +278,23 @@ def test_files_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("eomc.robots.xml.MAX_BYTES", 100)
     with pytest.raises(EomcError, match="more than the 100"):
         urdf.read(tmp_path / "crane.urdf")
+
+
+def test_a_free_root_without_inertia_is_told(read: Reader) -> None:
+    """Of one joint; several, whose axes are not alike, leave D regular."""
+    robot = edit.based(read(ARM), free=True)
+    root = robot.bodies[0]
+    light = replace(root, mass=0.0, inertia=(0.0,) * 6)
+    robot_of_light = replace(robot, bodies=(light, *robot.bodies[1:]))
+    told = scene_text.finished(robot_of_light).left_out[-1]
+    assert told.startswith(f"body {root.name}: it is free and has neither mass nor inertia")
+    assert "--base fixed" in told
+    heavy = replace(root, mass=1.0)
+    for bodies in ((heavy, *robot.bodies[1:]), read(ARM).bodies):
+        said = scene_text.finished(replace(robot, bodies=bodies)).left_out
+        assert not any("free" in words for words in said)
+    with pytest.raises(EomcError, match=r"body\.base: D is not .* 'base' has no inertia"):
+        eomc.sources(from_scene(parse(scene_text.scene_text(robot_of_light), "crane.toml")))
 
 
 def test_a_mesh_only_is_refused_where_a_joint_needs_inertia(read: Reader) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sympy import S
 
 from eomc.base.errors import Problem, SceneError
+from eomc.base.texts import listed
 from eomc.derive import outputs
 from eomc.derive.frames import motions
 from eomc.derive.inverse_dynamics import inverse_dynamics
@@ -277,10 +278,11 @@ def inertia(program: Program) -> list[Problem]:
     Raises SceneError where it is so at states around the start as well: no motion can be computed.
     """
     s = program.system
-    weak = _without_inertia(program, 0)
-    if weak is None:
+    found = _without_inertia(program, 0)
+    if not found:
         return []
-    if all(_without_inertia(program, k) is not None for k in range(1, 6)):
+    weak = found[-1]
+    if all(_without_inertia(program, k) for k in range(1, 6)):
         message = (
             f"D is not positive definite: '{weak}' has no inertia of its own. Give it a mass, "
             "or leave out a coordinate that others determine"
@@ -293,6 +295,12 @@ def inertia(program: Program) -> list[Problem]:
                 f"D is not positive definite, '{weak}' has no inertia, at {', '.join(wrong)}: "
                 "masses and moments of inertia are positive"
             )
+        elif body := _massless(s, found):
+            message = (
+                f"D is not positive definite: nothing resists {listed(found)} as they move "
+                f"together, '{body}' has no inertia of its own. Give it mass and inertia, or fix it"
+            )
+            raise SceneError([s.problem(f"body.{body}", message)])
         raise SceneError([s.problem("energy.kinetic", message)])
     message = (
         f"D is not positive definite at the start, '{weak}' has no inertia there: "
@@ -315,8 +323,19 @@ def matrix(program: Program, name: str, values: Mapping[str, float]) -> list[lis
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def _without_inertia(program: Program, k: int) -> str | None:
-    """The coordinate without a positive pivot in D at the k-th state; None where D is regular."""
+def _massless(system: System, names: Sequence[str]) -> str:
+    """The first body without mass that moves by several such coordinates, or ""."""
+    links = system.tree.links if system.tree and len(names) > 1 else ()
+    heavy = {link.name for link in links if any((link.mass, *link.inertia, link.armature))}
+    moved = (link.name for link in links if {x.name for x in link.q.free_symbols} & {*names})
+    return next((name for name in moved if name not in heavy), "")
+
+
+def _without_inertia(program: Program, k: int) -> list[str]:
+    """Coordinates that can move together without inertia at the k-th state, [] where D is regular.
+
+    The last is the first without a positive pivot in D.
+    """
     names = [c.name for c in program.system.coordinates]
     n = len(names)
     values = nearby(program.system, k)
@@ -324,7 +343,7 @@ def _without_inertia(program: Program, k: int) -> str | None:
         D = matrix(program, "D", values)
         rows = constrained.weighted(program.functions, program.system, values)
     except (ArithmeticError, ValueError):
-        return names[0]
+        return names[:1]
     for w, row in rows:
         D = [
             [x + w * a * b for x, b in zip(of, row, strict=True)]
@@ -333,8 +352,17 @@ def _without_inertia(program: Program, k: int) -> str | None:
     A = [list(row) for row in D]
     for i in range(n):
         if not A[i][i] > 8 * n * 2.0**-52 * D[i][i]:
-            return names[i]
+            return _together(A, i, names)
         for j in range(i + 1, n):
             factor = A[j][i] / A[i][i]
             A[j] = [a - factor * b for a, b in zip(A[j], A[i], strict=True)]
-    return None
+    return []
+
+
+def _together(A: Sequence[Sequence[float]], i: int, names: Sequence[str]) -> list[str]:
+    """Names of what moves where D qd = 0, as pivot i is nothing. A: D eliminated up to it."""
+    qd = [0.0] * i + [1.0]
+    for j in reversed(range(i)):
+        qd[j] = -sum(A[j][k] * qd[k] for k in range(j + 1, i + 1)) / A[j][j]
+    most = max(map(abs, qd))
+    return [name for name, x in zip(names, qd, strict=False) if abs(x) > 1e-9 * most or x == 1]

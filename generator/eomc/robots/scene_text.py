@@ -11,6 +11,7 @@ from eomc.base import names, texts
 from eomc.base.errors import EomcError
 from eomc.base.texts import line, toml
 from eomc.robots.inertias import indefinite, unbalanced
+from eomc.robots.massless import light_root, without_inertia
 from eomc.robots.robot import (
     BARE,
     Coupling,
@@ -49,7 +50,7 @@ def finished(robot: Robot) -> Robot:
         for b in robot.bodies
         if (why := indefinite(b.inertia))
     ]
-    if faults := [*faults, *_without_inertia(robot)]:
+    if faults := [*faults, *without_inertia(robot)]:
         raise EomcError("\n".join(faults))
     robot = _named(robot)  # after the faults, which have the names that --lock takes
     found = tuple(
@@ -57,6 +58,12 @@ def finished(robot: Robot) -> Robot:
         for body in robot.bodies
         if (why := unbalanced(body.inertia))
     )
+    if light := light_root(robot):
+        found += (
+            f"body {light}: it is free and has neither mass nor inertia, so the joint that it "
+            "carries moves nothing against it: give it both, or import with --base fixed; until "
+            "then the scene is refused",
+        )
     rough = [b.name for b in robot.bodies if any(_rough(by) for _, by in turns_of(b.rotation))]
     if rough:
         found += (
@@ -154,37 +161,6 @@ def _of(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
 
 def _renamed(old: str, new: str, note: str) -> str:
     return note if old == new else joined(f"'{old}' in the file", note)
-
-
-def _without_inertia(robot: Robot) -> list[str]:
-    """In words, each joint that moves nothing with mass or inertia."""
-    faults: dict[str, str] = {}  # by coordinate
-    locks: dict[str, str] = {}
-    resisted: set[str] = set()
-    carries: dict[str, list[RobotBody]] = {}
-    for body in reversed(robot.bodies):  # children come before parents
-        mine = [body, *carries.get(body.name, ())]
-        carries[body.parent] = [*mine, *carries.get(body.parent, ())]
-        kinds = JOINTS[body.joint].motions
-        for kind, motion in zip(kinds, body.motions, strict=True):
-            has = any(b.mass or (kind == "r" and any(b.inertia)) for b in mine)
-            if has or motion.armature:
-                resisted.add(motion.mimics.coordinate if motion.mimics else motion.name)
-            if has or motion.armature or motion.mimics:
-                continue
-            those = texts.listed([b.name + (f" ({b.note})" if b.note else "") for b in mine], 4)
-            lacks = "mass" if kind == "t" else "inertia"
-            faults[motion.name] = (
-                f"joint {motion.name}: it moves nothing that has {lacks}, only {those}"
-            )
-            if len(body.motions) == 1:
-                locks[motion.name] = f"--lock {motion.name}=0"
-    names = [name for name in reversed(faults) if name not in resisted]
-    if not names:
-        return []
-    freeze = " ".join(locks[name] for name in names if name in locks)
-    freeze = f", or freeze what moves nothing: {freeze}" if freeze else ""
-    return [*(faults[name] for name in names), f"add mass and inertia to the file{freeze}"]
 
 
 # --- the text -------------------------------------------------------------------------------------
