@@ -138,6 +138,8 @@ def test_parameters_and_start_on_the_command_line(there: Path) -> None:
     ("words", "said"),
     [
         (["run", "cartpole.toml", "--set", "mc=3"], "did you mean 'm_c'?"),
+        (["run", "cartpole.toml", "--set", "Q=1"], "is not a parameter; there are m_c, m_p, l"),
+        (["run", "cartpole.toml", "--start", "phi=1"], "; there are x, theta, x_dot, theta_dot"),
         (["run", "cartpole.toml", "--set", "m_c"], "write --set NAME=VALUE"),
         (["run", "cartpole_bodies.toml", "--set", "m_p=-1"], "body.pole.mass: is -1 kg"),
         (["run", "cartpole.toml", "--start", "theta=1/0"], "divides by zero"),
@@ -174,6 +176,8 @@ def test_run_tells_events_that_it_is_asked_for(there: Path) -> None:
     for times, column, value in ((level, "theta", np.pi), (far, "x", -0.4)):
         states = module.simulate(h=1e-3, duration=3.0)(np.array(times))[0]
         assert states[:, module.coordinates.index(column)] == pytest.approx(value, abs=1e-8)
+    told = eomc("run", "cartpole.toml", "--duration", "1.5", *options[2:]).output
+    assert re.search(r"event level: 1 time, at t = [\d.]+ s\n", told), told
     wrong = eomc("run", "cartpole.toml", "--event", "level=thta")
     assert wrong.exit_code == 2
     assert (

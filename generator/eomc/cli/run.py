@@ -7,7 +7,7 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -171,7 +171,7 @@ def _overrides(
     values: dict[str, float] = {}
     for name, value in pairs(parameters, "--set", module.defaults):
         if name not in module.defaults:
-            remedy = suggest(name, module.defaults)
+            remedy = suggest(name, module.defaults) or _there_are(module.defaults)
             if name in module.coordinates:
                 remedy = f", but a coordinate: --start {name}={value:g}"
             raise EomcError(f"--set: '{name}' is not a parameter{remedy}")
@@ -186,12 +186,15 @@ def _overrides(
     states |= {f"{name}_dot": (qd0, k) for k, name in enumerate(module.coordinates)}
     for name, value in pairs(start, "--start", {**module.defaults, **values}):
         if name not in states:
-            raise EomcError(
-                f"--start: '{name}' is not a coordinate or velocity{suggest(name, states)}"
-            )
+            remedy = suggest(name, states) or _there_are(states)
+            raise EomcError(f"--start: '{name}' is not a coordinate or velocity{remedy}")
         array, k = states[name]
         array[k] = value
     return values, q0, qd0
+
+
+def _there_are(known: Iterable[str]) -> str:
+    return f"; there are {texts.listed([*known])}"
 
 
 def _error(done: Run) -> dict[str, Any] | None:
@@ -276,7 +279,7 @@ def _print_summary(
     _print_energy(done, balance, summary)
     for name, times in summary["events"].items():
         last = f", at t = {times[-1]:.9g} s{' at last' if len(times) > 1 else ''}" if times else ""
-        say(f"  event {name}: {len(times)} times{last}")
+        say(f"  event {name}: {len(times)} {'time' if len(times) == 1 else 'times'}{last}")
     for name, part in summary["saturated"].items():
         say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
     if module._model.events and summary["tolerance"] is None:
