@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -23,6 +24,8 @@ from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, yaw_p
 from eomc.robots.stops import stops
 from eomc.scene.assembly import WORLD
 from eomc.scene.formulas import suggest
+
+_LIMITS = re.compile(r"limits of (\d+ )?joints?\b")  # in what readers leave out
 
 
 def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
@@ -69,7 +72,8 @@ def stopped(robot: Robot) -> Robot:
     if not stops(robot):
         raise EomcError("--stops: no joint of this robot has limits")
     told = "stops: at limits of positions [forces] pushes back; those of speed and effort are notes"
-    return replace(robot, stopped=True, left_out=(told, *robot.left_out))
+    others = (words for words in robot.left_out if not _LIMITS.match(words))
+    return replace(robot, stopped=True, left_out=(told, *others))
 
 
 def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:

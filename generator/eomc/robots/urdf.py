@@ -377,7 +377,8 @@ class _Reader:
             )
         limited = [j for j in joints if j.first("limit") is not None and j.get("type") != "fixed"]
         if limited:
-            out.append(f"limits of {len(limited)} joints: their values are in the notes")
+            many = f"{len(limited)} {texts.plural('joint', len(limited))}"
+            out.append(f"limits of {many}: their values are in the notes")
         rest = Counter(e.kind for e in self.root.children if e.kind not in ("link", "joint"))
         for parts, known in ((links, _LINK_PARTS), (joints, _JOINT_PARTS)):
             rest.update(e.kind for part in parts for e in part.children if e.kind not in known)
