@@ -171,6 +171,7 @@ def test_constraints_of_what_is_cut_off_or_locked_are_told(tmp_path: Path) -> No
         ('<connect body1="rocker" anchor="1 2"/>', "takes 3"),
         ('<connect anchor="1 2 3"/>', "it needs body1"),
         ('<connect body1="x" anchor="1 2 3"/>', 'there is no body "x"'),
+        ('<connect body1="rockr" anchor="1 2 3"/>', "\"rockr\"; did you mean 'rocker'?"),
         ('<connect body1="crank" body2="crank" anchor="1 2 3"/>', 'holds body "crank" to itself'),
         ('<connect site1="end"/>', "it needs both site1 and site2"),
         ('<weld site1="end" site2="tip"/>', 'there is no site "tip"'),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from eomc.robots.mjcf.file import ACTUATORS, Given, Report
+from eomc.robots.mjcf.file import ACTUATORS, Given, Report, missing
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
 from eomc.robots.robot import Drive, joined
@@ -39,7 +39,7 @@ def actuated(
             report.leave("actuators on tendons, sites, bodies and slider-cranks", name)
             continue
         if on not in found:
-            a.fault(f'there is no joint "{on}"')
+            a.fault(missing("joint", on, found))
             continue
         joint = found[on]
         if joint.type in {"free", "ball"}:

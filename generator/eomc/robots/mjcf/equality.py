@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from eomc.base.spatial import apply, plus, scaled, transposed
 from eomc.robots import rotations
-from eomc.robots.mjcf.file import Given
+from eomc.robots.mjcf.file import Given, missing
 from eomc.robots.mjcf.joints import Found, fresh
 from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader, pose_of, rounded
 from eomc.robots.robot import Coupling, Motion, RobotBody, RobotLoop, moved
@@ -127,8 +127,8 @@ class _Reading:
         """A site: its body, its place in our frame of that, and the body's axes along its own."""
         placed = self.reader.sites.get(name)
         if placed is None:
-            what = f'there is no site "{name}"' if name else "it needs both site1 and site2"
-            a.fault(what)
+            what = missing("site", name, self.reader.sites)
+            a.fault(what if name else "it needs both site1 and site2")
             return None
         self.reader.report.read("sites", name)
         site = placed.pose.of(pose_of(self.reader.given(placed, "site"), self.reader.settings))
@@ -140,7 +140,7 @@ class _Reading:
         names = [a.get("body1"), a.get("body2", WORLD)]
         for name in names:
             if name not in self.ends.poses:
-                a.fault(f'there is no body "{name}"' if name else "it needs body1")
+                a.fault(missing("body", name, self.ends.poses) if name else "it needs body1")
                 return [None, None]
         one, other = names
         first, second = self.ends.of_file(one), self.ends.of_file(other)
@@ -188,7 +188,7 @@ class _Reading:
     def _joint(self, joint: str, name: str, a: Given) -> Sides | None:
         """The coordinate of a joint, as a sum of one; None where there is none."""
         if joint not in self.joints:
-            a.fault(f'there is no joint "{joint}"' if joint else "it needs joint1")
+            a.fault(missing("joint", joint, self.joints) if joint else "it needs joint1")
             return None
         found = self.joints[joint]
         if len(found.motions) > 1:
@@ -200,7 +200,7 @@ class _Reading:
         """A tendon's length in coordinates; None where it is not a sum of these."""
         tag = self.tendons.get(tendon)
         if tag is None:
-            a.fault(f'there is no tendon "{tendon}"' if tendon else "it needs tendon1")
+            a.fault(missing("tendon", tendon, self.tendons) if tendon else "it needs tendon1")
             return None
         if tag.kind != "fixed":
             self.reader.report.leave("couplings of tendons through space", name)

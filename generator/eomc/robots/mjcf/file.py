@@ -8,7 +8,7 @@ asked for included files; entities and document types are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from eomc.base.errors import Problem
 from eomc.robots import xml
 from eomc.robots.rotations import Vector
 from eomc.robots.xml import Tag
+from eomc.scene.formulas import suggest
 
 SHOWN = 12  # names in one line of what is left out
 
@@ -226,6 +227,11 @@ def called(tag: Tag) -> str:
     """A tag as errors call it."""
     name = tag.get("name")
     return f'{tag.kind} "{name}"' if name else tag.kind
+
+
+def missing(kind: str, name: str, known: Iterable[str]) -> str:
+    """In words, that nothing of a kind has a name, and the near one that is meant."""
+    return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
 def unknown(tag: Tag, report: Report) -> None:

@@ -17,7 +17,16 @@ from eomc.robots.inertias import (
     rotated_inertia,
     unbalanced,
 )
-from eomc.robots.mjcf.file import ORIENTATION, Classes, Given, Report, Settings, merged, unknown
+from eomc.robots.mjcf.file import (
+    ORIENTATION,
+    Classes,
+    Given,
+    Report,
+    Settings,
+    merged,
+    missing,
+    unknown,
+)
 from eomc.robots.robot import RobotBody
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, toward, unit
 from eomc.robots.xml import Tag
@@ -85,7 +94,7 @@ class Reader:
     def class_of(self, name: str, tag: Tag) -> dict[str, dict[str, str]]:
         """The default class that a tag names; the outermost one for "", or for a fault."""
         if name and name not in self.classes:
-            self.own(tag).fault(f'there is no default class "{name}"')
+            self.own(tag).fault(missing("default class", name, self.classes))
             name = ""
         return self.classes[name or "main"]
 
