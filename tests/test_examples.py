@@ -160,6 +160,13 @@ def test_an_arm_is_held_and_pushed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "[ 0.   0.   0.1  0.   0.   0. ]" in done.stdout.replace("-0. ", " 0. ")
 
 
+def test_without_its_scene_one_says_how_it_is_run() -> None:
+    words = [sys.executable, EXAMPLES / "arm.py"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "python docs/examples/arm.py ur5.toml\n" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_the_documents_name_each() -> None:
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     for file in sorted(EXAMPLES.iterdir()):

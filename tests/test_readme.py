@@ -50,3 +50,22 @@ def test_python_answers_as_shown() -> None:
     session = session.replace('"scenes/cartpole.toml"', where)
     test = doctest.DocTestParser().get_doctest(session, {}, "README.md", None, 0)
     assert doctest.DocTestRunner().run(test).failed == 0
+
+
+def headings(page: Path) -> set[str]:
+    """The anchors of a page's headings, outside its blocks of code."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+    titles = re.findall(r"^#+ +(.+?) *$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    root = Path(__file__).parents[1]
+    lost = []
+    for page in sorted([*root.glob("*.md"), *root.glob("docs/**/*.md")]):
+        for to in re.findall(r"\]\(([^)\s:]+)\)", page.read_text(encoding="utf-8")):
+            file, _, anchor = to.partition("#")
+            there = (page.parent / file).resolve() if file else page
+            if not there.exists() or (anchor and anchor not in headings(there)):
+                lost.append(f"{page.name}: {to}")
+    assert not lost

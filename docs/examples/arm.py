@@ -13,6 +13,8 @@ import numpy as np
 import eomc
 
 np.set_printoptions(precision=4, suppress=True)
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
 arm = eomc.load(sys.argv[1])
 q = np.array([0.3, -1.2, 1.5, -0.4, 0.7, 0.1])
 rest = np.zeros(6)
