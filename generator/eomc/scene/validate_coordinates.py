@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
-from eomc.scene import formulas
+from eomc.scene import formulas, messages
 from eomc.scene.formulas import Formula
 from eomc.scene.scene import Coordinate
 from eomc.scene.schema import Document
 from eomc.scene.scope import Checker
 
+MANY_TURNS = 7.0  # rad: more than one, as a bare number
 FRICTION_WIDTH = formulas.parse("0.01")  # rad/s or m/s
 
 
@@ -25,6 +27,8 @@ def coordinates(check: Checker, doc: Document, known: Mapping[str, float]) -> It
     free = not (doc.constraints or doc.loop)
     for name, entry in doc.coordinates.items():
         start, rate = (formula(name, key, getattr(entry, key))[0] for key in ("start", "rate"))
+        if entry.unit == "rad" and isinstance(entry.start, (int, float)):
+            check_turns(check, ("coordinates", name, "start"), entry.start)
         given = () if entry.guess else entry.model_fields_set
         held, held_rate = (free or key in given for key in ("start", "rate"))
         rubs, width = None, FRICTION_WIDTH
@@ -41,6 +45,16 @@ def coordinates(check: Checker, doc: Document, known: Mapping[str, float]) -> It
             yield Coordinate(
                 name, entry.unit, start, rate, entry.note, held, held_rate, rubs, width
             )
+
+
+def check_turns(check: Checker, path: tuple[str, ...], angle: float) -> None:
+    """Warn of an angle of a turn and more, written as a number: degrees may be meant."""
+    if MANY_TURNS <= abs(angle) < math.inf:
+        message = (
+            f"{angle:.6g} rad are {abs(angle) / math.tau:.3g} turns; for degrees write "
+            f"{messages.radians(f'{angle:.15g}')}"
+        )
+        check.say(path, message, severity="warning")
 
 
 def check_width(
