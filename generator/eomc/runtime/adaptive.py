@@ -21,9 +21,10 @@ from .adaptive_error import error_of
 from .arguments import Array, as_number
 from .dense import within
 from .estimate import Estimate
+from .periods import Acting, Periods, as_acting, held_at
 from .section import crossings
 from .slices import longer
-from .trajectory import SAID, STATUS, Run, state_text
+from .trajectory import LEFT_OUT, SAID, STATUS, Run, state_text
 
 if TYPE_CHECKING:
     from .model import Model
@@ -76,6 +77,8 @@ class AdaptiveRun(Run):
     _happened: tuple[Array, Array] = field(default=_NONE, kw_only=True)  # which, rows of t, q, qd
     stopped: str = field(default="", kw_only=True)
     limit: float = field(default=float("nan"), kw_only=True)
+    _period: float = field(default=0.0, kw_only=True)  # over which inputs are held, if any are,
+    _held: Array | None = field(default=None, kw_only=True)  # and these, (n, nu)
 
     @property
     def t(self) -> Array:
@@ -114,7 +117,8 @@ class AdaptiveRun(Run):
         rows[:, :first] = [[q], [qd]]
         if len(asked) > first:
             made = run(
-                self._model, q, qd, self.t0, self._t_end, self.tol, asked[first:], self._u,
+                self._model, q, qd, self.t0, self._t_end, self.tol, asked[first:],
+                self._u if self._held is None else Periods(self._held, self._period),
                 self._params, self._h_most, None, self._stiff,
             )  # fmt: skip
             rows[:, first:] = made._rows
@@ -148,7 +152,7 @@ class AdaptiveRun(Run):
     @property
     def _drawn(self) -> Run:
         """Itself, with rows between where steps are too long for curves."""
-        if len(self) < 2 or len(self) >= _DRAWN or callable(self._u) or isinstance(self._u, str):
+        if len(self) < 2 or len(self) >= _DRAWN:
             return self
         return self._with(np.linspace(self.t[0], self.t[-1], _DRAWN + 1)[1:-1])
 
@@ -165,7 +169,13 @@ class AdaptiveRun(Run):
         for name in ("q", "qd", "outputs"):  # which are kept once they were made
             made.__dict__.pop(name, None)
         made._rows, made._times, made._energy = rows, times, None
+        made._told_inputs()
         return made
+
+    def _told_inputs(self) -> None:
+        """Find which of the values that are held over periods acts at each row."""
+        if self._held is not None:
+            self._applied = held_at(self._times, self.t0, self._period, self._held)
 
     def section(
         self, name: str, value: float = 0.0, *, rising: bool | None = None,
@@ -197,6 +207,8 @@ class AdaptiveRun(Run):
         return self._at(times, np.array(self(times)))
 
     def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
+        if isinstance(self._u, str):
+            raise ValueError(f"estimate: {self._u}")
         self.error = error_of(self, run, progress)
         if words := self.error.warning:
             warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
@@ -211,20 +223,25 @@ class AdaptiveRun(Run):
             "times": self.t, "h_most": self._h_most, "stiff": self._stiff, "begin": self._begin,
             "t_end": self._t_end, "which": self._happened[0],
             "event_rows": self._happened[1], "stopped": self.stopped, "limit": self.limit,
+            "period": self._period, "values": self._held,
         }  # fmt: skip
         return super()._kept() | own
 
     @classmethod
     def _of_kept(cls, model: Model, kept: Mapping[str, Any], **own: Any) -> AdaptiveRun:
-        return cls(
+        held, values = kept.get("held"), kept.get("values")
+        made = cls(
             model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
-            kept["params"], 1, kept.get("held"), kept["method"], kept["evaluations"],
+            kept["params"], 1, held if values is None or held is not None else LEFT_OUT,
+            kept["method"], kept["evaluations"],
             tol=kept["tol"], rejected=kept["rejected"], stiff_steps=kept.get("stiff_steps", 0),
             _times=kept["times"], _h_most=kept["h_most"], _stiff=bool(kept.get("stiff", False)),
             _begin=kept["begin"], _t_end=kept["t_end"],
             _happened=(kept["which"], kept["event_rows"]), stopped=kept["stopped"],
-            limit=kept["limit"],
+            limit=kept["limit"], _period=kept.get("period", 0.0), _held=values,
         )  # fmt: skip
+        made._told_inputs()
+        return made
 
     def _state(self) -> dict[str, Any]:
         found = super()._state() | {"_times": self._times}
@@ -238,33 +255,30 @@ class AdaptiveRun(Run):
 def simulate(
     model: Model, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
     params: Any, t0: float, progress: Callable[[int, int], None] | None, tol: float | None,
-    times: ArrayLike | None, h_most: float | None, stiff: bool, fixed: tuple[Any, ...],
+    times: ArrayLike | None, h_most: float | None, stiff: bool, control_period: float | None,
+    fixed: tuple[Any, ...],
 ) -> AdaptiveRun:  # fmt: skip
     """`Model.simulate` with a tolerance; fixed: the values of FIXED."""
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
-    if u is not None and (callable(u) or np.ndim(u) > 1):
-        raise ValueError(
-            "u: adaptive steps take the scene's signals, or one value an input, held over the "
-            "run; a function or a table is for fixed steps: give h="
-        )
     q, qd = model._start
     if q0 is not None or qd0 is not None:
         q, qd = model._one(q if q0 is None else q0, qd if qd0 is None else qd0)
-    t0, held = as_number(t0, "t0"), model._inputs(u)
+    t0 = as_number(t0, "t0")
     p = model._p0 if params is None else model._parameters(params).copy()
+    rows, first = None, 0
     if times is None:
         end = as_end(model, t0, duration)
-        found = run(model, q, qd, t0, end, tol, None, held, p, most, progress, stiff)
     else:
         if duration is not None:
             raise ValueError(BOTH)
         rows = as_times(times, t0, model.dtype)
-        first = int(rows[0] == t0)
-        end = float(rows[-1])
-        found = run(model, q, qd, t0, end, tol, rows[first:], held, p, most, progress, stiff)
-        if first:
-            both = np.concatenate([np.array([[q], [qd]]), found._rows], axis=1)
-            found._rows, found._times = both, rows[: both.shape[1]]
+        first, end = int(rows[0] == t0), float(rows[-1])
+    held = as_acting(model, u, control_period, end - t0, params)
+    asked = None if rows is None else rows[first:]
+    found = run(model, q, qd, t0, end, tol, asked, held, p, most, progress, stiff)
+    if first:
+        both = np.concatenate([np.array([[q], [qd]]), found._rows], axis=1)
+        return found._at(rows[: both.shape[1]], both)  # type: ignore[index]
     return found
 
 
@@ -308,15 +322,15 @@ def plain(
 
 def run(
     model: Model, q: Array, qd: Array, t0: float, t_end: float, tol: float, times: Array | None,
-    u: Array | None, p: Array, h_most: float, progress: Callable[[int, int], None] | None,
-    stiff: bool = False,
+    u: Array | Periods | None, p: Array, h_most: float,
+    progress: Callable[[int, int], None] | None, stiff: bool = False,
 ) -> AdaptiveRun:  # fmt: skip
     """A run from checked arguments, whatever its status; times (n,) later than t0."""
     (address, real, null), nq = model._c, model.nq
     work = model._ffi.new("adaptive_work *")
     if stiff:
         work.stiff = 1
-    at_u = null if u is None else address(real, u)
+    acting = Acting(model, u, t0, t_end, q, qd)
     at_p = model._at[2] if p is model._p0 else address(real, p)
     events = _Found(model) if model.events else None
     own, each = times is None, 2 if events else 1  # rows of a step, beside a jump
@@ -331,19 +345,21 @@ def run(
     try:
         while True:
             left, to_q, begun = count - filled, to + (count + nq * filled), perf_counter()
+            most = (left - (not filled)) // each if own else room
             found = call(
-                *place, t_end, tol, h_most, at_u, (left - (not filled)) // each if own else room,
+                *place, acting.stop, tol, h_most, acting.at, most,
                 null if own else to_t + filled, 0 if own else left,
                 to_t + filled if own else null, to_q, to_q + nq * count,
                 *(events.room() if events else ()), at_p, work,
             )  # fmt: skip
             filled += _kept(work, events)
             said = STATUS[found]
-            if found or work.t >= t_end or (events and work.stopped):
+            ended, cut = found or (events and work.stopped), work.t < acting.stop
+            if ended or not acting.on(work):
                 break
             if progress is not None:
                 progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)
-            room = min(longer(room, perf_counter() - begun), _MOST)
+            room = min(longer(room, perf_counter() - begun), _MOST) if cut else room
             call, place = model._lib.adaptive, (work.x, model._ffi.addressof(work, "t"))
             if own and count - filled < each:
                 pieces.append(_parts(whole, count, filled, nq))
@@ -364,10 +380,13 @@ def run(
     model._room = 0 if odd else steps + _ROOM
     made = AdaptiveRun(
         model, t0, both, (work.t - t0) / steps if steps else t_end - t0, steps, said, p, 1,
-        None if u is None else u.copy(), "gauss16", work.evaluations, tol=tol,
+        acting.u, "gauss16", work.evaluations, tol=tol,
         rejected=work.rejected, stiff_steps=work.stiff_steps, _times=stamps, _h_most=h_most,
         _stiff=bool(stiff), _begin=both[:, 0] if own else np.array([q, qd]), _t_end=t_end,
     )  # fmt: skip
+    if acting.periods:
+        made._period, made._held = acting.periods.period, np.array(acting.values)
+        made._told_inputs()
     if events:
         made._happened = events.all()
         made.stopped = model.events[work.stopped - 1] if work.stopped else ""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 LOOSEST = 1e-2
 FIXED = {  # what belongs to fixed steps, where nothing is said of it
-    "h": None, "steps": None, "method": None, "every": 1, "control_period": None, "out": None,
+    "h": None, "steps": None, "method": None, "every": 1, "out": None, "control_period": None,
 }  # fmt: skip
 BOTH = "times: say where the run ends; give times or duration, not both"
 
@@ -42,7 +42,7 @@ def as_limits(
             "by fixed steps run(times) gives the states at any times)"
         )
     if not all(map(is_, fixed, FIXED.values())):
-        for name, value in zip(FIXED, fixed, strict=True):
+        for name, value in zip(FIXED, fixed, strict=False):  # the last is asked of batches alone
             if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
                 raise ValueError(
                     f"{name}: belongs to fixed steps; tol, h_most, stiff and, in a batch, times to "

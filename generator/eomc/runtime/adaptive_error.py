@@ -9,6 +9,7 @@ import numpy as np
 
 from .arguments import Array
 from .estimate import Estimate, scales
+from .periods import Periods
 
 if TYPE_CHECKING:
     from .adaptive import AdaptiveRun
@@ -25,6 +26,7 @@ def error_of(
 ) -> Estimate:  # fmt: skip
     """The error of a run, beside one of a hundredth of its tolerance, and from a moved start."""
     model, x = own._model, own.x.astype(float)
+    u = Periods(own._u, own._period) if own._period else own._u
     eps = float(np.finfo(model.dtype).eps) / 2
     least = LEAST[model.dtype.itemsize]
     scale = scales(x)
@@ -41,7 +43,7 @@ def error_of(
         out[own.t == own.t0] = start
         if len(kept):
             made = run(
-                model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], own._u,
+                model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], u,
                 own._params, own._h_most, progress, own._stiff,
             )  # fmt: skip
             if made.status == "interrupted":

@@ -220,7 +220,7 @@ class BatchModel(Model):
 
             fitted, whole = batch_adaptive.simulate(
                 self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
-                stiff, (h, steps, method, every, control_period, None),
+                stiff, (h, steps, method, every, None, control_period),
             )  # fmt: skip
             if not whole:
                 raise Interrupted(fitted)

@@ -223,8 +223,8 @@ class Model(Constrained):
         one of `methods`, the first where None; "auto": by a tolerance. every: a row is kept of
         every so many steps, and the ends. u: None, the scene's signals; (nu,), constant; (steps,
         nu), held over a step each; a dict of all inputs by name, numbers or (steps,); or a function
-        u(t, q, qd) called before each step, and slow. control_period: in s, a whole number of
-        steps: the function is called, a row taken, or the signals are read, once in it. out: (q,
+        u(t, q, qd) called before each step, and slow. control_period: in s, of fixed steps a whole
+        number: the function is called, a row taken, or the signals are read, once in it. out: (q,
         qd), arrays for the rows. progress: called with (done, steps). estimate: whether to find the
         run's own error, `run.error`, by shorter steps, nine times as long. tol: of adaptive steps,
         each of which errs by about tol of how far it moves; of a scene with [run] tolerance, which
@@ -249,10 +249,10 @@ class Model(Constrained):
             return fit
         q0, qd0 = self._assembled(q0, qd0, t0, params)
         if fits(self, h, steps, method, tol, h_most, stiff):
-            fixed = h, steps, method, every, control_period, out
             fitted = adaptive.simulate(
-                self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff, fixed
-            )
+                self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff,
+                control_period, (h, steps, method, every, out),
+            )  # fmt: skip
             return self._finished(fitted, estimate)
         method = self.methods[0] if method is None else self._method(method)
         (q, qd), (from_q, from_qd, at_p), p = self._start, self._at, self._p0

@@ -39,9 +39,9 @@ SAID = {
 }
 PASSED_OVER = (
     "fixed steps pass over the scene's events, friction that sticks among them: give tol=, not h, "
-    "steps or method; a law u is then the signal of its input in the scene"
+    "steps or method; a function as u then takes control_period="
 )
-_LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
+LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
 
 
 class MotionError(ArithmeticError):
@@ -327,7 +327,7 @@ class Run(ConstrainedRun, Columns):
     @classmethod
     def _of_kept(cls, model: Model, kept: Mapping[str, Any], **own: Any) -> Run:
         applied = kept.get("applied")
-        u = kept.get("held") if applied is None else _LEFT_OUT
+        u = kept.get("held") if applied is None else LEFT_OUT
         run = cls(
             model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
             kept["params"], kept["every"], u, kept["method"], kept["evaluations"], **own,
@@ -357,7 +357,7 @@ class Run(ConstrainedRun, Columns):
     def __reduce__(self) -> tuple[Any, ...]:
         state = self._state()
         if callable(self._u):
-            state["_u"] = _LEFT_OUT
+            state["_u"] = LEFT_OUT
         kind = type(self)
         return reduced(f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}._of_state", state)
 

@@ -1,0 +1,124 @@
+"""Inputs of adaptive steps: followed or held throughout, or set anew at each control period."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import ceil
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .arguments import Array, as_step_size
+from .laws import Sampled
+
+if TYPE_CHECKING:
+    from .model import Model
+
+NO_PERIOD = (
+    "u: a function, or one row after another, is held over a control period each, and steps that "
+    "fit a tolerance don't tell how long that is: give control_period=, in s"
+)
+
+
+@dataclass(frozen=True)
+class Periods:
+    """What is held over one period after another: by a function u(t, q, qd), or by rows (n, nu)."""
+
+    of: Callable[..., Any] | Array
+    period: float  # s
+
+
+def held_at(times: Array, t0: float, period: float, values: Array) -> Array:
+    """Which of values (n, nu) are held at some times, (m, nu): at a start what it begins with."""
+    starts = np.asarray(t0 + period * np.arange(len(values)), times.dtype)
+    begun = np.searchsorted(starts, times, side="right") - 1
+    return np.asarray(values[np.maximum(begun, 0)])
+
+
+def as_acting(
+    model: Model, u: Any, control_period: float | None, span: float, params: Any
+) -> Array | Periods | None:
+    """The inputs of a run by a tolerance as `Acting` takes them, or a ValueError."""
+    period = None
+    if control_period is not None:
+        period = as_step_size(control_period, model.dtype, "control_period")
+    if u is None:
+        sampled = period is not None and model.nu
+        return Periods(Sampled(model, params), period) if sampled and period else None
+    if not model.nu:
+        raise ValueError("u: this scene has no inputs")
+    if not callable(u):
+        if isinstance(u, Mapping):
+            u = model._by_name(u)
+        rows = model._numbers(u, "u")
+        if rows.ndim == 1 and model.nu == 1 < rows.size:
+            rows = rows[:, None]
+        if rows.ndim < 2:
+            return model._inputs(u)
+        rows = model._array(rows, "u", model.nu)
+        if period is not None and len(rows) != (count := _count(span, period)):
+            raise ValueError(
+                f"u: {len(rows)} rows for {count} control periods of {period:g} s: give a row each"
+            )
+        u = rows.copy()
+    if period is None:
+        raise ValueError(NO_PERIOD)
+    return Periods(u, period)
+
+
+def _count(span: float, period: float) -> int:
+    """Periods in a span, the last of which may be shorter."""
+    return max(ceil(span / period * (1 - 1e-12)), 1)
+
+
+class Acting:
+    """The inputs of a run on its way: what C takes now, and the time until which that holds."""
+
+    def __init__(
+        self, model: Model, u: Array | Periods | None, t0: float, t_end: float, q: Array, qd: Array
+    ) -> None:
+        self.model, self.t0, self.t_end, self.stop = model, t0, t_end, t_end
+        self.periods = u if isinstance(u, Periods) else None
+        self.held: Any = None if self.periods else u
+        self.values: list[Array] = []  # of each period
+        if self.periods:
+            self.count = _count(t_end - t0, self.periods.period)
+            self._next(t0, q, qd)
+
+    @property
+    def at(self) -> Any:
+        """The address of what is held."""
+        return self.model._pointer(self.held)
+
+    def on(self, work: Any) -> bool:
+        """Whether the run goes on at the state that it has reached, by the next inputs."""
+        if work.t < self.stop:
+            return True
+        if self.stop >= self.t_end:
+            return False
+        x = np.frombuffer(self.model._ffi.buffer(work.x), self.model.dtype).copy()
+        self._next(work.t, *x.reshape(2, -1))
+        return True
+
+    def _next(self, t: float, q: Array, qd: Array) -> None:
+        """The inputs of the next period."""
+        assert self.periods
+        done, of, model = len(self.values), self.periods.of, self.model
+        if callable(of):
+            held = model._inputs(of(t, q.copy(), qd.copy()))
+            if held is None:
+                raise ValueError("u: the function returned None, not the inputs")
+            self.held = held.copy()
+        else:
+            self.held = of[done]
+        self.values.append(self.held)
+        self.stop = self.t_end
+        if done + 1 < self.count:
+            self.stop = float(model.dtype.type(self.t0 + (done + 1) * self.periods.period))
+
+    @property
+    def u(self) -> Any:
+        """The inputs as a run keeps them: a function, or a copy of what was held."""
+        of = self.periods.of if self.periods else self.held
+        return of if of is None or callable(of) else of.copy()
