@@ -91,8 +91,15 @@ def test_a_run_is_the_same_in_pieces(kepler: ModuleType, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize(
     "how",
-    [{}, {"q0": [0.2, 0.1]}, {"qd0": (0.5, 3.0)}, {"params": {"mu": 2.0}, "t0": 1.5}],
-    ids=["plain", "q0", "qd0", "params"],
+    [
+        {},
+        {"q0": [0.2, 0.1]},
+        {"qd0": (0.5, 3.0)},
+        {"params": {"mu": 2.0}, "t0": 1.5},
+        {"u": 0.01},
+        {"u": np.array([0.01])},
+    ],
+    ids=["plain", "q0", "qd0", "params", "u", "array"],
 )
 def test_a_run_in_one_call_is_the_same(kepler: ModuleType, how: dict) -> None:
     """The way of what is asked again and again, beside the one that takes all questions."""

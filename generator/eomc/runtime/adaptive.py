@@ -21,6 +21,7 @@ from .adaptive_error import error_of
 from .arguments import Array, as_number
 from .dense import within
 from .estimate import Estimate
+from .happened import Found, Happened
 from .periods import Acting, Periods, as_acting, held_at
 from .section import crossings
 from .slices import longer
@@ -29,7 +30,6 @@ from .trajectory import LEFT_OUT, SAID, STATUS, Run, state_text
 if TYPE_CHECKING:
     from .model import Model
 
-_EVENTS = 1024  # of one call
 _ROOM = 48  # steps of the first call
 _AT_ONCE = 2048  # steps times coordinates of it, at most
 _MOST = 2**20  # of one call
@@ -41,18 +41,6 @@ STOPPED = (
     "or keep jumping: for friction by sign(x_dot) that sticks take friction = "
     '"stick" in [run], or let events switch it; else a looser tolerance'
 )
-
-
-@dataclass(frozen=True)
-class Happened:
-    """Where an event happened: t (n,), s; q and qd (n, nq), before a jump."""
-
-    t: Array
-    q: Array
-    qd: Array
-
-    def __len__(self) -> int:
-        return len(self.t)
 
 
 @dataclass(eq=False, repr=False)
@@ -283,14 +271,20 @@ def simulate(
 
 
 def plain(
-    model: Model, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
+    model: Model, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
     params: Any, t0: float, tol: float | None, count: int,
 ) -> AdaptiveRun | None:  # fmt: skip
     """A run with nothing unusual in one call, of count rows at most; None: it goes another way.
 
     Not for scenes with events or constraints.
     """
-    (from_q, from_qd, at_p), p = model._at, model._p0
+    (from_q, from_qd, at_p), p, (address, real, null) = model._at, model._p0, model._c
+    held, at_u = None, null
+    if u is not None:
+        if not (type(u) is float or (type(u) is np.ndarray and u.ndim == 1 and len(u) == model.nu)):
+            return None
+        held = model._inputs(np.array([u] if type(u) is float else u, model.dtype))
+        at_u = address(real, held)
     if q0 is not None:
         from_q = model._from(q0, "q0")[1]
     if qd0 is not None:
@@ -300,13 +294,13 @@ def plain(
         at_p = model._pointer(p)
     tol = as_tolerance(model.tolerance if tol is None else tol, model.dtype)
     end = as_end(model, t0, duration)
-    (address, real, null), nq = model._c, model.nq
+    nq = model.nq
     work, whole = model._ffi.new("adaptive_work *"), np.empty(count * (1 + 2 * nq), model.dtype)
     to_t = address(real, whole)
     to_q = to_t + count
     found = model._lib.adaptive_begin(
-        from_q, from_qd, t0, end, tol, 0.0, null, count - 1, null, 0, to_t, to_q,
-        to_q + nq * count, at_p, work,
+        from_q, from_qd, t0, end, tol, 0.0, at_u, count - 1, null, 0,
+        to_t, to_q, to_q + nq * count, at_p, work,
     )  # fmt: skip
     if found or work.t < end:
         model._room = 0
@@ -314,7 +308,7 @@ def plain(
     steps, filled = work.steps, work.rows
     both = whole[count:].reshape(2, count, nq)[:, :filled]
     return AdaptiveRun(
-        model, t0, both, (end - t0) / steps if steps else 0.0, steps, "ok", p, 1, None, "gauss16",
+        model, t0, both, (end - t0) / steps if steps else 0.0, steps, "ok", p, 1, held, "gauss16",
         work.evaluations, tol=tol, rejected=work.rejected, stiff_steps=work.stiff_steps,
         _times=whole[:filled], _h_most=0.0, _stiff=False, _begin=both[:, 0], _t_end=end,
     )  # fmt: skip
@@ -332,7 +326,7 @@ def run(
         work.stiff = 1
     acting = Acting(model, u, t0, t_end, q, qd)
     at_p = model._at[2] if p is model._p0 else address(real, p)
-    events = _Found(model) if model.events else None
+    events = Found(model) if model.events else None
     own, each = times is None, 2 if events else 1  # rows of a step, beside a jump
     room = max(_ROOM, min(model._room, _AT_ONCE // nq))
     pieces: list[tuple[Array, Array]] = []  # times and rows
@@ -409,37 +403,9 @@ def _parts(whole: Array, count: int, filled: int, nq: int) -> tuple[Array, Array
     return whole[:filled], whole[count:].reshape(2, count, nq)[:, :filled]
 
 
-def _kept(work: Any, events: _Found | None) -> int:
+def _kept(work: Any, events: Found | None) -> int:
     """The rows of the last call, whose events are kept."""
     rows, work.rows = work.rows, 0
     if events:
         events.keep(work)
     return int(rows)
-
-
-class _Found:
-    """Room for the events of a call, and all that were found."""
-
-    def __init__(self, model: Model) -> None:
-        self.model, self.pieces = model, list[tuple[Array, Array]]()
-        self.which = np.empty(_EVENTS, np.intc)
-        self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)
-
-    def room(self) -> tuple[Any, ...]:
-        """What C is told of it."""
-        address, real, _ = self.model._c
-        which = self.model._ffi.from_buffer("int[]", self.which)
-        return len(self.which), which, address(real, self.rows)
-
-    def keep(self, work: Any) -> None:
-        """Copy what the last call has found."""
-        if work.events:
-            n, work.events = work.events, 0
-            self.pieces.append((self.which[:n].copy(), self.rows[:n].copy()))
-
-    def all(self) -> tuple[Array, Array]:
-        """Of each event which it is, and its row."""
-        if not self.pieces:
-            return self.which[:0], self.rows[:0]
-        which, rows = zip(*self.pieces, strict=True)
-        return np.concatenate(which), np.concatenate(rows)

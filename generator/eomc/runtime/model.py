@@ -227,24 +227,23 @@ class Model(Constrained):
         number: the function is called, a row taken, or the signals are read, once in it. out: (q,
         qd), arrays for the rows. progress: called with (done, steps). estimate: whether to find the
         run's own error, `run.error`, by shorter steps, nine times as long. tol: of adaptive steps,
-        each of which errs by about tol of how far it moves; of a scene with [run] tolerance, which
-        holds where h, steps and method are not given. times: (n,) ascending, instead of duration:
-        the rows, between fixed steps by a shorter one. h_most: the longest adaptive step, in s.
-        stiff: whether they begin by Newton's method. events: more, by name a formula or a dict as
-        [[event]] has it; built once. A run that can't go on keeps what it has and warns; Ctrl-C
-        raises Interrupted, with the run.
+        each of which errs by about tol of how far it moves; [run] tolerance, where h, steps and
+        method are not given. times: (n,) ascending, instead of duration: the rows, between fixed
+        steps by a shorter one. h_most: the longest adaptive step, in s. stiff: whether they begin
+        by Newton's method. events: more, by name a formula or a dict as [[event]] has it; built
+        once. A run that can't go on keeps what it has and warns; Ctrl-C raises Interrupted.
         """
         if events is not None:
             other, given = with_events(dict(locals()))
             return cast(Run, other.simulate(**given))
         usual = (
-            u is None and out is None and progress is None and control_period is None
-            and not estimate and times is None and type(t0) is float and isfinite(t0)
+            out is None and progress is None and control_period is None and not estimate
+            and times is None and type(t0) is float and isfinite(t0)
         )  # fmt: skip
         if (
             usual and (room := self._room) and h is None and steps is None and method is None
             and h_most is None and every == 1 and stiff is False
-            and (fit := adaptive.plain(self, q0, qd0, duration, params, t0, tol, room)) is not None
+            and (fit := adaptive.plain(self, q0, qd0, duration, u, params, t0, tol, room))
         ):  # fmt: skip
             return fit
         q0, qd0 = self._assembled(q0, qd0, t0, params)
@@ -264,11 +263,11 @@ class Model(Constrained):
         if params is not None:
             p = self._parameters(params).copy()
             at_p = self._pointer(p)
-        if usual and type(steps) is type(every) is int and duration is None and 0 < every <= RARELY:
+        if usual and u is duration is None and type(steps) is type(every) is int and every > 0:
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
             if 0 <= steps <= short and (steps < SOME or (method, h) in self._warned):
-                address, real, null = self._c
+                (address, real, null), every = self._c, min(every, RARELY)
                 rows = empty((2, 1 - -steps // every, self.nq), self.dtype)
                 to, done = address(real, rows), stages * steps
                 if 8 * steps == run(
