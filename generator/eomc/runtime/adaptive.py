@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from .adaptive_arguments import BOTH, as_end, as_limits, as_times, as_tolerance
 from .adaptive_error import error_of
+from .adaptive_memory import FULL, Kept, rows_for
 from .arguments import Array, as_number
 from .dense import within
 from .estimate import Estimate
@@ -335,7 +336,7 @@ def run(
     to_t = to if stamps is None else address(real, stamps)
     call = model._lib.adaptive_begin
     place: tuple[Any, ...] = address(real, q), address(real, qd), t0
-    filled, said = 0, "ok"
+    filled, said, kept = 0, "ok", Kept(model)
     try:
         while True:
             left, to_q, begun = count - filled, to + (count + nq * filled), perf_counter()
@@ -346,6 +347,7 @@ def run(
                 to_t + filled if own else null, to_q, to_q + nq * count,
                 *(events.room() if events else ()), at_p, work,
             )  # fmt: skip
+            kept.count(work, bool(events))
             filled += _kept(work, events)
             said = STATUS[found]
             ended, cut = found or (events and work.stopped), work.t < acting.stop
@@ -355,6 +357,9 @@ def run(
                 progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)
             room = min(longer(room, perf_counter() - begun), _MOST) if cut else room
             call, place = model._lib.adaptive, (work.x, model._ffi.addressof(work, "t"))
+            if not (room := kept.at_most(room, each)):
+                said = FULL
+                break
             if own and count - filled < each:
                 pieces.append(_parts(whole, count, filled, nq))
                 whole, to, count = _rows(model, 1 + each * room)
@@ -393,7 +398,7 @@ def run(
 
 def _rows(model: Model, count: int) -> tuple[Array, Any, int]:
     """Room for so many times and rows, one behind the other, its address, and how many."""
-    whole = np.empty(count * (1 + 2 * model.nq), model.dtype)
+    whole = rows_for(model, count)
     address, real, _ = model._c
     return whole, address(real, whole), count
 

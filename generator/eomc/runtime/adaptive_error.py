@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .adaptive_memory import FULL, REMEDY
 from .arguments import Array
 from .estimate import Estimate, scales
 from .periods import Periods
@@ -24,7 +25,12 @@ def error_of(
     own: AdaptiveRun, run: Callable[..., AdaptiveRun],
     progress: Callable[[int, int], None] | None,
 ) -> Estimate:  # fmt: skip
-    """The error of a run, beside one of a hundredth of its tolerance, and from a moved start."""
+    """The error of a run, beside one of a hundredth of its tolerance, and from a moved start.
+
+    Raises MemoryError where its own rows are as many as there is room for.
+    """
+    if own.status == FULL:
+        raise MemoryError(f"estimate: {REMEDY}")
     model, x = own._model, own.x.astype(float)
     u = Periods(own._u, own._period) if own._period else own._u
     eps = float(np.finfo(model.dtype).eps) / 2

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .adaptive_memory import FULL, REMEDY
 from .arguments import Array
 from .balance import Balance, balance
 from .columns import Columns, File
@@ -36,6 +37,7 @@ SAID = {
     "locked": "no state near obeys the constraints: they contradict one another there, or the step "
     "is far too long",
     "interrupted": "interrupted",
+    FULL: REMEDY,
 }
 PASSED_OVER = (
     "fixed steps pass over the scene's events, friction that sticks among them: give tol=, not h, "

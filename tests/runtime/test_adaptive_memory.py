@@ -1,0 +1,78 @@
+"""Runs by adaptive steps take no more memory than the machine has, also where jumps never cease."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+# the more it has jumped the sooner it jumps again: the n-th time after 0.1/(1 + n^2) s
+ENDLESS = """eomc = 1
+name = "endless_jumps"
+[coordinates]
+x = { unit = "m", start = 0.1, rate = 0.1 }
+y = { unit = "m" }
+[energy]
+kinetic = "x_dot**2/2 + y_dot**2/2"
+[forces]
+x = "-(1 + y_dot**2)"
+[[event]]
+name = "again"
+when = "x_dot"
+direction = "falling"
+action = "jump"
+x_dot = "x_dot + 0.1"
+y_dot = "y_dot + 1"
+[run]
+duration = 5.0
+tolerance = 1e-6
+"""
+MEMORY = 5_000_000  # bytes, in place of the machine's
+ROW = 5 * 8
+CALL = 3 * 1024 * ROW  # two rows and an event each, of one call of C
+LAST = 0.05 * (1 + np.pi / np.tanh(np.pi))  # s, which no jump comes to
+
+
+@pytest.fixture(scope="module")
+def endless(modules: Modules) -> ModuleType:
+    return modules.unoptimised(ENDLESS)
+
+
+@pytest.fixture(autouse=True)
+def small(endless: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine of 5 MB."""
+    memory = sys.modules[f"{endless.__name__}.adaptive_memory"]
+    monkeypatch.setattr(memory, "machine_memory", lambda: MEMORY)
+
+
+def test_a_run_of_jumps_for_ever_ends_with_what_there_is_memory_for(endless: ModuleType) -> None:
+    with pytest.warns(RuntimeWarning, match=r"\d+ steps, .* 40 % .* memory.*times=.*duration="):
+        run = endless.simulate()
+    found = run.events["again"]
+    assert run.status == "out of memory" and run.stopped == ""
+    assert 0.39 * MEMORY < (len(run) + len(found)) * ROW < 0.4 * MEMORY + CALL
+    assert len(found) > 10_000
+    gaps = 0.1 / (1 + np.arange(1.0, 50) ** 2)
+    np.testing.assert_allclose(np.diff(found.t[:50]), gaps, rtol=1e-9)
+    assert found.t[-1] <= run.t[-1] < LAST
+    with pytest.raises(MemoryError, match=r"estimate: rows and events fill 40 %.*times="):
+        run.estimate()
+
+
+def test_few_rows_and_jumps_for_ever_too(endless: ModuleType) -> None:
+    with pytest.warns(RuntimeWarning, match="duration="):
+        run = endless.simulate(times=[0.1, 0.2, 0.3])
+    assert run.status == "out of memory" and run.t.tolist() == [0.1, 0.2]
+    assert 0.39 * MEMORY < len(run.events["again"]) * ROW < 0.4 * MEMORY + CALL
+
+
+def test_what_fits_runs_on(endless: ModuleType) -> None:
+    assert endless.simulate(duration=0.2075).status == "ok"
+
+
+def test_more_times_than_there_is_memory_for_are_refused(endless: ModuleType) -> None:
+    with pytest.raises(MemoryError, match=r"200000 rows of 5 numbers don't fit.*fewer times="):
+        endless.simulate(times=np.linspace(0.0, 0.1, 200_001))
