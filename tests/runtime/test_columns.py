@@ -213,8 +213,6 @@ def test_a_file_that_is_no_run_of_this_scene(
         with pytest.raises(ValueError, match=rf"run\.npz: {words}"):
             driven.load_run(file)
 
-    with pytest.raises(FileNotFoundError):
-        driven.load_run(file)
     file.write_text("t,x\n0,1\n", encoding="utf-8")
     says("is no whole .npz file")
     np.savez(file, q=np.zeros((2, 2)))
@@ -240,6 +238,25 @@ def test_a_file_that_is_no_run_of_this_scene(
     np.savez(file, **kept | {"digest": "another"})
     with pytest.warns(RuntimeWarning, match=r"run\.npz: was saved from another version"):
         assert len(driven.load_run(file)) == 3
+
+
+def test_files_that_can_not_be_loaded_say_what_is_expected(
+    driven: ModuleType, tmp_path: Path
+) -> None:
+    written = r'load_run reads what run\.save\("NAME\.npz"\) wrote'
+    file = tmp_path / "missing.npz"
+    with pytest.raises(FileNotFoundError, match=rf"No such file .*: {written}: .*missing") as no:
+        driven.load_run(file)
+    assert no.value.filename == str(file)
+    with pytest.raises(IsADirectoryError, match=rf"Is a directory: {written}"):
+        driven.load_run(str(tmp_path))
+    file.write_text("mine", encoding="utf-8")
+    with pytest.raises(ValueError, match=rf"missing\.npz: is no whole .*: {written}$"):
+        driven.load_run(file)
+    rows = tmp_path / "run.csv"
+    driven.simulate(steps=2).save(rows)
+    with pytest.raises(ValueError, match=rf"run\.csv: is no .*: {written}; of a \.csv it has too"):
+        driven.load_run(rows)
 
 
 # --- pandas and xarray ----------------------------------------------------------------------------

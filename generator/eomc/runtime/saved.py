@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 import zlib
 from pathlib import Path
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from .model import Model
 
 KINDS = ("Run", "AdaptiveRun", "TimedRun", "BatchRun", "AdaptiveBatchRun")
+_WRITTEN = 'load_run reads what run.save("NAME.npz") wrote'
 _KIND = "eomc {} 1"  # and the version of what such a file holds
 
 
@@ -66,5 +68,10 @@ def _arrays(file: File) -> dict[str, Array]:
     try:
         with np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
+    except OSError as fault:
+        if fault.strerror is None:
+            raise
+        raise OSError(fault.errno, f"{fault.strerror}: {_WRITTEN}", os.fspath(file)) from None
     except (ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error):
-        raise ValueError(f"{file}: is no whole .npz file of a run") from None
+        csv = "; of a .csv it has too little" if str(file).endswith(".csv") else ""
+        raise ValueError(f"{file}: is no whole .npz file of a run: {_WRITTEN}{csv}") from None
