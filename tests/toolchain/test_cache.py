@@ -238,25 +238,45 @@ def test_a_compiler_that_is_ended_removes_its_temporary_files(
     assert not own.exists()
 
 
-def test_a_build_that_cant_be_moved_leaves_no_library(
-    scene: Path, root: Path, built: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Before the face is there the new one goes, after it the old one."""
-    folder, move = root / "simple_pendulum", os.replace
-    for last, gravity_then in (("__init__.py", built), ("build.json", 2 * built)):
+def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """Bytes and dates of the files below, by path."""
+    files = (f for f in folder.rglob("*") if f.is_file() and f.suffix != ".pyc")
+    return {str(f): (f.read_bytes(), f.stat().st_mtime_ns) for f in files}
 
-        def failing(old: Path, new: Path, last: str = last) -> None:
-            if Path(new).name == last:
-                raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), str(new))
-            move(old, new)
 
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "replace", failing)
-            with pytest.raises(eomc.EomcError, match=r"can't be written \(Disk quota exceeded\)"):
-                eomc.build(scene, root)
-        assert len(list(folder.glob("_simple_pendulum_*"))) == 1
-        assert leftovers(root) == []
-        assert gravity(root) == gravity_then
+@pytest.mark.parametrize("links", [True, False], ids=["links", "copies"])
+@pytest.mark.parametrize("fault", [OSError(errno.EDQUOT, "no"), KeyboardInterrupt()], ids=repr)
+def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
+    fault: BaseException, links: bool, scene: Path, root: Path, built: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Header, C, Python's files and library, at whichever of them it fails."""
+    folder, move, moved = root / "simple_pendulum", os.replace, list[str]()
+    (folder / "slices.py").write_text("of another version", encoding="utf-8")
+    (folder / "laws.py").unlink()  # which that had not yet
+    before, last = contents(folder), ""
+
+    def failing(old: Path, new: Path) -> None:
+        if ".old" not in Path(old).parts:
+            moved.append(str(Path(new).relative_to(folder)))
+            if moved[-1] == last:
+                raise fault
+        move(old, new)
+
+    def no_links(*_: Path) -> None:
+        raise OSError(errno.EPERM, "not here")
+
+    monkeypatch.setattr(os, "replace", failing)
+    if not links:
+        monkeypatch.setattr(os, "link", no_links)
+    for last in ("simple_pendulum.c", "slices.py", "__init__.py", "build.json"):
+        with pytest.raises(eomc.EomcError if isinstance(fault, OSError) else KeyboardInterrupt):
+            eomc.build(scene, root)
+        assert contents(folder) == before and leftovers(root) == []
+        assert moved[-1] == last and "simple_pendulum.h" in moved
+    last = ""
+    assert eomc.build(scene, root).fresh and leftovers(root) == []
+    assert gravity(root) == 2 * built
 
 
 @contextlib.contextmanager

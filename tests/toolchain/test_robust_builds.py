@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import resource
@@ -220,6 +221,20 @@ def test_flags_that_are_no_text(
     assert eomc.build(scene, root).fresh
     assert not eomc.build(scene, root).fresh
     assert len(list((root / "simple_pendulum").glob("_simple_pendulum_*"))) == 1
+
+
+def test_what_cffi_can_not_rename_is_said_by_its_cause(
+    scene: Path, root: Path, built: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It then removes what isn't there yet, which fails too."""
+
+    def failing(old: str, new: str) -> None:
+        raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), old, None, new)
+
+    monkeypatch.setattr(os, "rename", failing)
+    with pytest.raises(eomc.EomcError, match=r"binding\.c.*can't be written \(Disk quota exceeded"):
+        eomc.build(scene, root)
+    assert leftovers(root) == [] and gravity(root) == built
 
 
 def test_a_full_device(scene: Path, root: Path, built: float) -> None:

@@ -1,8 +1,9 @@
 """Built modules: found by a key, built under a lock, loaded.
 
 A module lies in `build/<name>/`. Its extension carries a digest in its name, and `__init__.py`,
-which says which extension is its own, is moved into place last: whatever interrupts a build, what
-was there before stays whole. A file lock keeps builds of one scene apart.
+which says which extension is its own, is moved into place last: whatever interrupts a build, the
+module that was there stays whole, and what fails is taken back. A file lock keeps builds of one
+scene apart.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import sys
 import sysconfig
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -171,17 +173,42 @@ def _build(
     for file in kept:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
     stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
-    unused = [] if (folder / library).exists() else [folder / library]
+    # the face last: until it is there, the old one is whole; the manifest after it
+    _move(new, folder, [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST])
+    for path in stale:
+        path.unlink(missing_ok=True)
+
+
+def _move(new: Path, folder: Path, files: list[str]) -> None:
+    """Move files into place, in their order; where that fails, those there before are there again.
+
+    Not where the process is killed: the next build mends that.
+    """
+    there = {file: _also_at(folder / file, new / ".old" / file) for file in files}
     try:
-        # the face last: until it is there, the old one is whole; the manifest after it
-        for file in [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST]:
+        for file in files:
             _date_later(new / file, folder / file)
             os.replace(new / file, folder / file)
-            if file == "__init__.py":
-                unused = stale
-    finally:
-        for path in unused:
-            path.unlink(missing_ok=True)
+    except BaseException:  # Ctrl-C too
+        for file in reversed(files):
+            with suppress(OSError):  # the others all the same
+                if there[file]:
+                    os.replace(new / ".old" / file, folder / file)
+                else:
+                    (folder / file).unlink(missing_ok=True)
+        raise
+
+
+def _also_at(file: Path, other: Path) -> bool:
+    """Whether a file is there; it is then also at another place, by a link if that can be."""
+    if not file.exists():
+        return False
+    other.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(file, other)
+    except OSError:  # file systems without, or that are full of them
+        shutil.copy2(file, other)
+    return True
 
 
 def _date_later(new: Path, old: Path) -> None:

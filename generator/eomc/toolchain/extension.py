@@ -36,7 +36,11 @@ def build(
     ffi.cdef(made.cdef)
     ffi.set_source(extension, made.binding, compiler_verbose=0)
     at = "fast/" if form == "fast" else ""  # where the header lies that the binding includes
-    ffi.emit_c_code(str(folder / f"{at}binding.c"))
+    try:
+        ffi.emit_c_code(str(folder / f"{at}binding.c"))
+    except FileNotFoundError as fault:  # of what cffi removes once it could not rename its file
+        first = fault.__context__
+        raise first if isinstance(first, OSError) else fault from None
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
     common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
     jobs = [
