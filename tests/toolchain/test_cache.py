@@ -18,6 +18,7 @@ from multiprocessing import get_context
 from multiprocessing.context import ForkProcess
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from builds import CHANGED, TEXT, gravity, leftovers, script
@@ -338,6 +339,33 @@ def test_a_build_that_is_killed_leaves_the_old_module(
         assert eomc.build(scene, root).fresh
         assert leftovers(root) == []
         assert gravity(root) == 2 * built
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_ctrl_c_while_a_compiler_is_started_ends_it_too(
+    n: int, scene: Path, root: Path, built: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the n-th, the linker at last, the process is there, but Popen not over."""
+
+    class Popen(subprocess.Popen):  # type: ignore[type-arg]
+        count = 0
+
+        def __init__(self, *args: Any, **how: Any) -> None:
+            super().__init__(*args, **how)
+            Popen.count += 1
+            if Popen.count == n:
+                wait_for(pids, 2 if n == 2 else 1)
+                os.kill(os.getpid(), signal.SIGINT)
+
+    with sleeping_compiler(tmp_path) as (cc, pids):
+        linker = f'case "$*" in *-shared*) exec {cc};; esac\nexec cc "$@"\n'
+        monkeypatch.setenv("CC", cc if n < 3 else script(tmp_path / "linker", linker))
+        monkeypatch.setattr(subprocess, "Popen", Popen)
+        begun = time.monotonic()
+        how, words = in_a_fork(lambda: eomc.build(scene, root).name, 20)
+        assert (how, words) == ("raised", "KeyboardInterrupt: ")
+        assert sleepers(pids) == [] and time.monotonic() - begun < 10
+    assert leftovers(root) == [] and gravity(root) == built
 
 
 @pytest.mark.usefixtures("quickly_compiled")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from eomc.base.errors import EomcError
 from eomc.toolchain.compiler import STANDARD, Compiler, binding_flags, flags, standard
-from eomc.toolchain.running import end, finish, run, start
+from eomc.toolchain.running import run
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
@@ -55,22 +55,14 @@ def build(
         ],
         [*common, STANDARD, *binding_flags(), *include, "-c", f"{at}binding.c", "-o", "binding.o"],
     ]
-    running = []
-    try:
-        for job in jobs:
-            running.append((job, start(job, folder)))  # Ctrl-C may come between them
-        for job, process in running:
-            finish(name, job, process)
-    finally:
-        for _, process in running:  # none goes on where another failed
-            end(process)
+    run(name, folder, *jobs)
     link = [*compiler.command, "-shared", "scene.o", "binding.o", "-lm", "-o", library]
     if sys.platform == "darwin":
         link.insert(1, "-undefined")
         link.insert(2, "dynamic_lookup")
     if sys.platform == "win32":
         link.insert(link.index("-lm"), python_library(library))
-    run(name, link, folder)
+    run(name, folder, link)
     _try(name, extension, folder / library, compiler)
 
 

@@ -75,7 +75,7 @@ def _compiled(made: Unit, compiler: Compiler) -> tuple[dict[str, bytes], str]:
             *compiler.command, standard("plain"), *flags("plain"), "-fPIC", "-fvisibility=hidden",
             "-shared", *made.sources, "-lm", "-o", library,
         ]  # fmt: skip
-        run(made.name, command, sources)
+        run(made.name, sources, command)
         load = f"import ctypes; ctypes.CDLL({str(sources / library)!r}).fmi{made.version}GetVersion"
         done = subprocess.run(
             [sys.executable, "-I", "-S", "-c", load], stdin=subprocess.DEVNULL, capture_output=True,

@@ -3,14 +3,56 @@
 from __future__ import annotations
 
 import shlex
+import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 from eomc.base.errors import EomcError
 
 
-def start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
+def run(name: str, folder: Path, *commands: Sequence[str]) -> None:
+    """Compilers at work side by side, until all are done; none goes on where one fails.
+
+    Raises EomcError with the words of the first that fails, or where one can't be run. name: the
+    scene's.
+    """
+    running: list[subprocess.Popen[str]] = []
+    try:
+        for command in commands:
+            with _undisturbed():
+                running.append(_start(command, folder))
+        for command, process in zip(commands, running, strict=True):
+            _finish(name, command, process)
+    finally:
+        for process in running:
+            _end(process)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """What Ctrl-C raises comes behind it: within Popen it would lose the process just begun.
+
+    It is raised in the main thread alone, where there is a handler of Python's.
+    """
+    before, came = signal.getsignal(signal.SIGINT), list[tuple[int, FrameType | None]]()
+    try:
+        if callable(before):
+            signal.signal(signal.SIGINT, lambda number, frame: came.append((number, frame)))
+    except ValueError:  # another thread
+        before = None
+    try:
+        yield
+    finally:
+        if callable(before):
+            signal.signal(signal.SIGINT, before)
+            for number, frame in came[:1]:
+                before(number, frame)
+
+
+def _start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
     """A compiler at work. Raises EomcError where it can't be run."""
     try:
         return subprocess.Popen(
@@ -21,8 +63,8 @@ def start(command: Sequence[str], folder: Path) -> subprocess.Popen[str]:
         raise EomcError(f"{command[0]}: can't be run ({fault.strerror})") from None
 
 
-def finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) -> None:
-    """Wait for it. Raises EomcError with its words where it fails. name: the scene's."""
+def _finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) -> None:
+    """Wait for it. Raises EomcError with its words where it fails."""
     words, _ = process.communicate()
     if process.returncode:
         raise EomcError(
@@ -31,7 +73,7 @@ def finish(name: str, command: Sequence[str], process: subprocess.Popen[str]) ->
         )
 
 
-def end(process: subprocess.Popen[str]) -> None:
+def _end(process: subprocess.Popen[str]) -> None:
     """End a compiler that may be at work, in time for it to remove its temporary files."""
     process.terminate()
     try:
@@ -39,8 +81,3 @@ def end(process: subprocess.Popen[str]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-def run(name: str, command: Sequence[str], folder: Path) -> None:
-    """Start it, and wait for it. Raises EomcError as they do."""
-    finish(name, command, start(command, folder))

@@ -86,8 +86,8 @@ def _compile(name: str, command: tuple[str, ...], folder: Path) -> None:
     *others, last = ([*command, *(word.format(name=name) for word in more)] for more in _STACKS)
     for asked in others:
         with contextlib.suppress(EomcError):
-            return run(name, asked, folder)
-    run(name, last, folder)
+            return run(name, folder, asked)
+    run(name, folder, last)
 
 
 def _object(name: str, command: tuple[str, ...], folder: Path) -> Object:
