@@ -33,10 +33,12 @@ from eomc.cli.terminal import say, shown
     "--mend-inertias", is_flag=True, help="Take the nearest inertia for one that no body can have."
 )
 @click.option("--stops", is_flag=True, help="Let limits of joints push back, as stops do.")
+@click.option("--limits", is_flag=True, help="Let limits of drives act, as limits of inputs.")
 @click.option("--include", is_flag=True, help="Open what <include> names, in the file's folder.")
 def command(
     file: Path, out: Path | None, name: str | None, locks: Sequence[str], root: str, tip: str,
-    base: str | None, no_drives: bool, mend_inertias: bool, stops: bool, include: bool,
+    base: str | None, no_drives: bool, mend_inertias: bool, stops: bool, limits: bool,
+    include: bool,
 ) -> None:  # fmt: skip
     """Write the scene of a robot file, URDF or MJCF, and say what it leaves out.
 
@@ -48,6 +50,7 @@ def command(
 
     from eomc.base import names
     from eomc.robots import edit, scene_text, urdf, xml
+    from eomc.robots.limits import limited
     from eomc.robots.mjcf import read
     from eomc.scene.toml_text import MAX_BYTES
 
@@ -68,6 +71,8 @@ def command(
         robot = edit.mended(robot)
     if stops:
         robot = edit.stopped(robot)
+    if limits:
+        robot = limited(robot)
     if name is not None:
         if why := names.module_fault(name):
             raise EomcError(f"--name: {why}")

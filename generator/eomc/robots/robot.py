@@ -17,6 +17,7 @@ from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
 BARE = "no <inertial>"  # the note of a link that has none, and no shape
+UNLIMITED = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Motion:
 
     damping: N m s/rad or N s/m; friction: N m or N; armature: kg m^2 or kg; stiffness (N m/rad or
     N/m) and rest: of the joint's own spring. note: its limits, in words. limits: where it ends.
-    effort: the most that drives it, N m or N; 0 where nobody says.
+    driven: the least and largest force that drives it, N m or N, infinite where nobody says.
     """
 
     name: str
@@ -51,8 +52,8 @@ class Motion:
     stiffness: float = 0.0
     rest: float = 0.0
     mimics: Mimic | None = None
-    limits: tuple[float, float] = (-math.inf, math.inf)
-    effort: float = 0.0
+    limits: tuple[float, float] = UNLIMITED
+    driven: tuple[float, float] = UNLIMITED
 
 
 @dataclass(frozen=True)
@@ -82,12 +83,16 @@ class RobotBody:
 
 @dataclass(frozen=True)
 class Drive:
-    """An input that acts along a coordinate with the force gear times its value."""
+    """An input that acts along a coordinate with the force gear times its value.
+
+    limits: of the input, in its own unit, before the gear.
+    """
 
     name: str
     coordinate: str
     gear: float = 1.0
     note: str = ""
+    limits: tuple[float, float] = UNLIMITED
 
 
 @dataclass(frozen=True)
@@ -124,7 +129,7 @@ class Coupling:
 class Robot:
     """A tree of bodies, parents first; gravity in m/s^2; what the file has besides, in words.
 
-    stopped: whether limits of joints are stops.
+    stopped: whether limits of joints are stops. limited: whether those of drives act on inputs.
     """
 
     name: str
@@ -135,6 +140,7 @@ class Robot:
     loops: tuple[RobotLoop, ...] = ()
     couplings: tuple[Coupling, ...] = ()
     stopped: bool = False
+    limited: bool = False
     left_out: tuple[str, ...] = ()
 
     @property

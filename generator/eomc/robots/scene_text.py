@@ -14,6 +14,7 @@ from eomc.robots.inertias import indefinite, unbalanced
 from eomc.robots.massless import light_root, without_inertia
 from eomc.robots.robot import (
     BARE,
+    UNLIMITED,
     Coupling,
     Drive,
     Mimic,
@@ -186,7 +187,8 @@ def scene_text(robot: Robot) -> str:
         _table("[coordinates]", {m.name: _coordinate(m, robot) for m in robot.motions}),
     ]
     if robot.drives:
-        parts.append(_table("[inputs]", {d.name: _input(d, units) for d in robot.drives}))
+        inputs = {d.name: _input(d, units, robot.limited) for d in robot.drives}
+        parts.append(_table("[inputs]", inputs))
     if found := stops(robot) if robot.stopped else []:
         kinds = [unit for unit in DEPTHS if any(s.unit == unit for s in found)]
         numbers = {}
@@ -324,11 +326,13 @@ def _coordinate(m: Motion, robot: Robot) -> str:
     return f"{{ unit = {toml(m.unit)}{start}{guess}{note} }}"
 
 
-def _input(drive: Drive, units: Mapping[str, str]) -> str:
+def _input(drive: Drive, units: Mapping[str, str], limited: bool) -> str:
     force = "N m" if units[drive.coordinate] == "rad" else "N"
     if drive.gear != 1:
         force = ""  # a signal, which the gear makes a force
     of = f"unit = {toml(force)}, " if force else ""
+    if limited and drive.limits != UNLIMITED:
+        of += f"limits = [{', '.join(map(number, drive.limits))}], "
     return f"{{ {of}note = {toml(drive.note or 'along ' + drive.coordinate)} }}"
 
 

@@ -40,7 +40,7 @@ def stops(robot: Robot) -> list[Stop]:
         one, other = carried.get(body.parent, (0.0, 0.0)), more
         carried[body.parent] = one[0] + other[0], one[1] + other[1]
     return [
-        Stop(m.name, m.unit, m.limits, _effort(m.effort, held[m.name]))
+        Stop(m.name, m.unit, m.limits, _effort(max(map(abs, m.driven)), held[m.name]))
         for m in robot.motions
         if m.limits[0] < m.limits[1] and all(map(math.isfinite, m.limits))
     ]

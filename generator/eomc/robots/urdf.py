@@ -6,6 +6,7 @@ frame; axes stand in it; ixy and its like are entries of the tensor.
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,6 +20,7 @@ from eomc.robots import xml
 from eomc.robots.inertias import NO_INERTIA, rotated_inertia
 from eomc.robots.robot import (
     BARE,
+    UNLIMITED,
     Drive,
     Mimic,
     Motion,
@@ -199,8 +201,8 @@ class _Reader:
         drive = None
         if len(motions) == 1:
             word, newton = ("torque", "N m") if motions[0].unit == "rad" else ("force", "N")
-            effort = motions[0].effort
-            note = f"along {name}" + (f", at most {effort:g} {newton}" if effort > 0 else "")
+            effort = motions[0].driven[1]
+            note = f"along {name}" + (f", at most {effort:g} {newton}" if effort < math.inf else "")
             drive = Drive(f"{name}_{word}", name, note=note)
         return _Joint(name, kind, ends[0], ends[1], offset, rotation, axis, motions, drive)
 
@@ -241,7 +243,8 @@ class _Reader:
             if lower or upper:
                 note, ends = f"{lower:g} to {upper:g}", (lower, upper)
                 start = min(max(0.0, lower), upper) if lower <= upper else 0.0
-        return (Motion(name, of, start, note, damping, friction, limits=ends, effort=effort),)
+        driven = (-effort, effort) if effort > 0 else UNLIMITED
+        return (Motion(name, of, start, note, damping, friction, limits=ends, driven=driven),)
 
     def _coupled(self, joints: list[_Joint], elements: Mapping[str, Tag]) -> list[_Joint]:
         """The joints, those with <mimic> moved by the coordinate that it leads to."""

@@ -6,10 +6,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+from eomc.robots.limits import both, through
 from eomc.robots.mjcf.file import ACTUATORS, Given, Report, missing
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
-from eomc.robots.robot import Drive, joined
+from eomc.robots.robot import UNLIMITED, Drive, joined
 from eomc.robots.rotations import from_quaternion, yaw_pitch_roll
 from eomc.robots.xml import Tag
 
@@ -58,25 +59,41 @@ def actuated(
         found[on] = joint._replace(motions=(motion,))
         law = a.get(" law", "general")
         laws = [a.get(key, "none") for key in ("dyntype", "biastype")]
-        if law in {"motor", "general"} and {*laws, a.get("gaintype", "fixed")} == {"none", "fixed"}:
-            gear *= (a.numbers("gainprm", 100, 1) or (1.0,))[0]
-        else:
+        plain = law in {"motor", "general"}
+        plain = plain and {*laws, a.get("gaintype", "fixed")} == {"none", "fixed"}
+        gain = (a.numbers("gainprm", 100, 1) or (1.0,))[0] if plain else 1.0
+        if not plain:
             report.leave("laws of actuators, whose input here is their force", f"{name} ({law})")
         if a.number("delay"):
             report.leave("delays of actuators", name)
-        note = joined(*(_within(a, key, name, reader) for key in ("ctrl", "force")))
-        drives.append(Drive(name, on, gear, note))
+        control, force = (_range(a, key, reader) for key in ("ctrl", "force"))
+        limits = both(control if plain else UNLIMITED, through(force, gain))
+        if limits is None:
+            report.leave("ranges of actuators that exclude each other", name)
+        note = _noted(a, name, control, force, plain)
+        drives.append(Drive(name, on, gear * gain, note, limits or UNLIMITED))
     return list(found.values()), tuple(drives)
 
 
-def _within(a: Given, key: str, name: str, reader: Reader) -> str:
-    """A range of an actuator in words, for its note; reported as left out."""
+def _range(a: Given, key: str, reader: Reader) -> tuple[float, float]:
+    """A range of an actuator that holds, or an unlimited one."""
     values = a.numbers(f"{key}range", 2)
     if not values or not limited(a, f"{key}limited", reader.settings):
-        return ""
-    a.report.leave("limits of actuators, kept as notes", name)
-    what = {"ctrl": "input", "force": "force"}[key]
-    return f"{what} from {values[0]:.6g} to {values[1]:.6g}"
+        return UNLIMITED
+    return values[0], values[1]
+
+
+def _noted(
+    a: Given, name: str, control: tuple[float, float], force: tuple[float, float], plain: bool
+) -> str:
+    """Ranges of an actuator in words, for its note; reported as left out."""
+    words = []
+    for what, ends in (("input" if plain else "control", control), ("force", force)):
+        if ends != UNLIMITED:
+            kind = "actuators" if what != "control" else "controls whose law is left out"
+            a.report.leave(f"limits of {kind}, kept as notes", name)
+            words.append(f"{what} from {ends[0]:.6g} to {ends[1]:.6g}")
+    return joined(*words)
 
 
 def started(root: Tag, joints: Sequence[Found], report: Report) -> list[Found]:

@@ -71,7 +71,7 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
         own |= {"stiffness": 0.0, "damping": 0.0}
     if a.number("springyield"):
         report.leave("yield of the springs of joints", name)
-    note, ends, effort = _limits(a, kind, settings, name)
+    note, ends, driven = _limits(a, kind, settings, name)
     anchor = plus(placed.pose.place, apply(placed.pose.turn, a.vector("pos") or ORIGIN))
     if kind == "free":
         align = a.get("align", "auto")
@@ -99,7 +99,7 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
         note=note,
         mimics=None,
         limits=ends,
-        effort=effort,
+        driven=driven,
         **own,
     )
     if turns:
@@ -139,9 +139,9 @@ def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
 
 def _limits(
     a: Given, kind: str, settings: Settings, name: str
-) -> tuple[str, tuple[float, float], float]:
-    """The limits of a joint in words, for its note, its ends and effort; reported as left out."""
-    notes, ends, effort = [], Motion.limits, 0.0
+) -> tuple[str, tuple[float, float], tuple[float, float]]:
+    """The limits of a joint in words, for its note, of position and force; reported as left out."""
+    notes, ends, driven = [], Motion.limits, Motion.driven
     limits = a.numbers("range", 2)
     if limits and kind != "free" and limited(a, "limited", settings):
         a.report.leave("limits of joints, kept as notes", name)
@@ -157,8 +157,8 @@ def _limits(
         a.report.leave("limits of the actuators' force on joints, kept as notes", name)
         newton = "N m" if kind == "hinge" else "N"
         notes.append(f"driven with {force[0]:.6g} to {force[1]:.6g} {newton}")
-        effort = max(map(abs, force))
-    return joined(*notes), ends, effort
+        driven = (force[0], force[1])
+    return joined(*notes), ends, driven
 
 
 def limited(a: Given, key: str, settings: Settings) -> bool:

@@ -1,0 +1,65 @@
+"""Limits of drives in robot files as limits of inputs, each in the unit of its input."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+from eomc.base import texts
+from eomc.base.errors import EomcError
+from eomc.robots.robot import UNLIMITED, Robot
+
+Range = tuple[float, float]  # the least and the largest
+
+# what readers say of limits that act now, and of those of position and speed beside them
+_ACTING = re.compile(r"limits of (actuators|the actuators' force on joints), kept as notes")
+_JOINTS = re.compile(r"^(limits of \d+ joints?)(?=: )")
+_STOPS = "those of speed and effort are notes"  # of edit.stopped
+
+
+def through(force: Range, factor: float) -> Range:
+    """The limits of an input whose force is factor times its value."""
+    if not factor:
+        return UNLIMITED
+    low, high = sorted(f / factor for f in force)
+    return low, high
+
+
+def both(one: Range, other: Range) -> Range | None:
+    """The limits of what obeys both; None where no more than a value does."""
+    low, high = max(one[0], other[0]), min(one[1], other[1])
+    return (low, high) if low < high else None
+
+
+def limited(robot: Robot) -> Robot:
+    """The robot with limits of drives as those of their inputs; with those of its joint's force.
+
+    A joint that several drives share has the sum of their forces within its own limits, which no
+    limits of inputs can say: these are told and left out. Raises EomcError where none has limits.
+    """
+    on = [d.coordinate for d in robot.drives]
+    driven = {m.name: m.driven for m in robot.motions if m.driven != UNLIMITED}
+    drives, apart = [], []
+    for d in robot.drives:
+        found: Range | None = d.limits
+        if d.coordinate in driven and on.count(d.coordinate) == 1:
+            found = both(d.limits, through(driven[d.coordinate], d.gear))
+        if found is None:
+            apart.append(d.name)
+        drives.append(replace(d, limits=found or d.limits))
+    free = [d.name for d in drives if d.limits == UNLIMITED]
+    if len(free) == len(drives):
+        raise EomcError("--limits: no input of this robot has limits")
+    many = len(drives) - len(free)
+    told = [f"limits of drives: {many} of {len(drives)} inputs have them, and act within"]
+    told[0] += f"; without are {texts.listed(free, 4)}" if free else ""
+    if shared := sorted({q for q in driven if on.count(q) > 1}):
+        told.append(f"limits of force on joints that several inputs share: {texts.listed(shared)}")
+    if apart:
+        told.append(f"limits of force that exclude those of the input: {texts.listed(apart)}")
+    others = (
+        _JOINTS.sub(r"\1, of position and speed", words).replace(_STOPS, "those of speed are notes")
+        for words in robot.left_out
+        if not _ACTING.match(words)
+    )
+    return replace(robot, drives=tuple(drives), limited=True, left_out=(*told, *others))

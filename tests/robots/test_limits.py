@@ -1,0 +1,135 @@
+"""Limits of drives in robot files as limits of inputs: the unit of each, gear and gain, signs."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import eomc
+from eomc.cli.main import main
+from eomc.robots.limits import both, through
+
+INERTIA = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+URDF = f"""<robot name="pusher"><link name="rail"/>
+<link name="cart"><inertial><mass value="2"/>{INERTIA}</inertial></link>
+<link name="arm"><inertial><mass value="1"/>{INERTIA}</inertial></link>
+<link name="tip"><inertial><mass value="1"/>{INERTIA}</inertial></link>
+<joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/><axis xyz="1 0 0"/>
+<limit lower="-0.4" upper="0.5" effort="80" velocity="1"/></joint>
+<joint name="turn" type="continuous"><parent link="cart"/><child link="arm"/><axis xyz="1 0 0"/>
+<limit effort="0" velocity="1"/></joint>
+<joint name="end" type="continuous"><parent link="arm"/><child link="tip"/><axis xyz="1 0 0"/>
+<limit effort="0.5" velocity="1"/></joint></robot>"""
+HINGE = '<body><joint name="{name}" {more}/><geom size="0.1" mass="1"/></body>'
+# gears, gains, ranges of controls and of forces, ranges of what drives a joint; shared and servos
+MOTORS = """
+<motor name="geared" joint="a" gear="150" ctrlrange="-1 2"/>
+<general name="gained" joint="b" gear="2" gainprm="-4" ctrlrange="-5 5" forcerange="-8 12"/>
+<motor name="weak" joint="c" gear="-10" ctrlrange="-1 1"/>
+<position name="servo" joint="d" kp="3" gear="2" ctrlrange="-1 1" forcerange="-7 7"/>
+<motor name="first" joint="e" gear="3" ctrlrange="-1 1"/><motor name="second" joint="e"/>
+<motor name="idle" joint="f" ctrlrange="-1 1" ctrllimited="false"/>
+<motor name="odd" joint="g" ctrlrange="1 2" forcerange="-0.5 0.5"/>"""
+LIMITS = {
+    "geared": [-1, 2],  # of the control, before the gear
+    "gained": [-3, 2],  # the force -4 u within -8 and 12
+    "weak": [-0.4, 0.3],  # the joint takes -3 to 4 N m of -10 u
+    "servo": [-7, 7],  # of the force, which is the input, before the gear
+    "first": [-1, 1],  # and second, idle and odd have none
+}
+
+
+def mjcf(*joints: str) -> str:
+    more = {"c": 'actuatorfrcrange="-3 4"', "e": 'actuatorfrcrange="-1 1"'}
+    bodies = "".join(HINGE.format(name=name, more=more.get(name, "")) for name in joints)
+    return (
+        f'<mujoco model="motors"><option gravity="0 0 0"/><worldbody>{bodies}</worldbody>'
+        f"<actuator>{MOTORS}</actuator></mujoco>"
+    )
+
+
+def imported(folder: Path, text: str, *words: str) -> tuple[str, dict]:
+    """What the command says, and the scene."""
+    file, scene = folder / "robot.xml", folder / "robot.toml"
+    file.write_text(text, encoding="utf-8")
+    done = CliRunner().invoke(main, ["import", str(file), "--out", str(scene), *words])
+    assert done.exit_code == (0 if scene.exists() else 2), done.output
+    return done.output, tomllib.loads(scene.read_text(encoding="utf-8")) if scene.exists() else {}
+
+
+def taken(scene: dict) -> dict:
+    return {name: u["limits"] for name, u in scene["inputs"].items() if "limits" in u}
+
+
+def test_an_effort_of_urdf_is_the_largest_force(tmp_path: Path) -> None:
+    said, scene = imported(tmp_path, URDF, "--limits")
+    assert taken(scene) == {"slide_force": [-80, 80], "end_torque": [-0.5, 0.5]}
+    assert "limits of drives: 2 of 3 inputs have them, and act within" in said
+    assert "without are turn_torque" in said
+    assert "limits of 3 joints, of position and speed: their values are in the notes" in said
+
+
+def test_without_the_option_they_are_notes(tmp_path: Path) -> None:
+    said, scene = imported(tmp_path, URDF)
+    assert not taken(scene) and "limits of 3 joints: their values" in said
+    assert "at most 80 N" in scene["inputs"]["slide_force"]["note"]
+
+
+def test_with_stops_speeds_alone_are_notes(tmp_path: Path) -> None:
+    said, scene = imported(tmp_path, URDF, "--limits", "--stops")
+    assert "pushes back; those of speed are notes" in said and taken(scene)
+
+
+def test_limits_of_mjcf_are_those_of_the_input_before_the_gear(tmp_path: Path) -> None:
+    said, scene = imported(tmp_path, mjcf(*"abcdefg"), "--limits")
+    assert taken(scene) == LIMITS
+    for words in (
+        "limits of drives: 5 of 8 inputs have them, and act within; without are second, idle, odd",
+        "limits of force on joints that several inputs share: e",
+        "limits of controls whose law is left out, kept as notes: servo",
+        "ranges of actuators that exclude each other: odd",
+    ):
+        assert words in said, said
+    assert "limits of actuators" not in said
+
+
+@pytest.mark.parametrize("words", [("--no-drives",), ("--lock", "slide=0", "--lock", "end=0")])
+def test_they_need_an_input_that_has_some(words: tuple[str, ...], tmp_path: Path) -> None:
+    said, scene = imported(tmp_path, URDF, "--limits", *words)
+    assert "--limits: no input of this robot has limits" in said and not scene
+
+
+def test_ranges_meet() -> None:
+    assert through((-8, 12), -4) == (-3, 2) and through((-8, 12), 0) == (-np.inf, np.inf)
+    assert both((-1, 2), (0, 5)) == (0, 2)
+    assert both((0, 1), (1, 2)) is None
+
+
+def test_they_act(tmp_path: Path, quickly_compiled: None) -> None:
+    imported(tmp_path, URDF, "--limits")
+    m = eomc.load(tmp_path / "robot.toml", tmp_path)
+    most, more = (m.acceleration([0, 0, 0], [0, 0, 0], u=[f, 0, 0]) for f in (80.0, 200.0))
+    np.testing.assert_array_equal(most, more)
+    assert most[0] == pytest.approx(80 / 4, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_the_forces_are_those_of_mujoco(tmp_path: Path, quickly_compiled: None) -> None:
+    """What drives each joint, of controls within and beyond all ranges; a servo's law is ours."""
+    mujoco = pytest.importorskip("mujoco", reason="pip install eomc[robots]")
+    text = mjcf(*"abc").split('<position name="servo"')[0] + "</actuator></mujoco>"
+    imported(tmp_path, text, "--limits")
+    m = eomc.load(tmp_path / "robot.toml", tmp_path)
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    random = np.random.default_rng(0)
+    for scale in (0.2, 1, 5, 20):
+        for u in random.normal(0, scale, (20, 3)):
+            data.ctrl[:] = u
+            mujoco.mj_forward(model, data)
+            force = m.tau([0, 0, 0], [0, 0, 0], u=u)
+            np.testing.assert_allclose(force, data.qfrc_actuator, rtol=1e-12)
