@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from eomc.base.errors import EomcError
 
 if TYPE_CHECKING:
-    from eomc.base.errors import Problem
+    from eomc.base.errors import Problem, SceneError
     from eomc.emit.fmu.files import Unit
     from eomc.emit.render import Sources
     from eomc.model.system import System
@@ -261,13 +261,11 @@ def load(
 
 
 def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleType:
-    """The module of a model's scene with events besides its own; built once, in `folder`.
+    """The module of a model's scene or System with events besides its own; built once, in `folder`.
 
-    events: by name a formula, or a dict as [[event]] has it.
+    events: by name a formula, or a dict as [[event]] has it; of a System also as System.make.
     Raises SceneError for faulty ones, EomcError where the scene is not there or has changed.
     """
-    from dataclasses import replace
-
     from eomc.base.errors import SceneError
     from eomc.runtime.written import replacing
     from eomc.scene import read as scenes
@@ -276,8 +274,11 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
     name, source, what = model.name, model.source, "simulate(events=)"
     if source is None:
         raise EomcError(f"{what}: {name} was imported without its scene: load it with eomc.load")
+    if not isinstance(source, Path) and source.scene and read(source.file) == source:
+        source = Path(source.file)
     if not isinstance(source, Path):
-        raise EomcError(f"{what}: {name} was made in Python: give System.make its events")
+        made = _eventful(source, events, what)
+        return load(made, folder / ".events" / made.digest[:16])
     try:
         data = source.read_bytes()
     except OSError as fault:
@@ -291,13 +292,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
         try:
             scenes.parse(text, what)
         except SceneError as wrong:
-            own = len(model.events)
-            names = {f"event.{own + k + 1}": called for k, called in enumerate(events)}
-            told = [
-                replace(p, line=0, column=-1, source="", key=_renamed(p.key, names))
-                for p in wrong.problems
-            ]
-            raise SceneError(told) from None
+            raise _by_name(wrong, len(model.events), events) from None
         try:
             root.mkdir(parents=True, exist_ok=True)
             with replacing(file) as new:
@@ -305,6 +300,42 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
         except OSError as fault:
             raise EomcError(f"{what}: {file}: can't be written ({fault.strerror})") from None
     return load(file, root)
+
+
+def _eventful(system: System, events: Mapping[str, Any], what: str) -> System:
+    """What System.make makes with events besides those that it was given."""
+    from dataclasses import replace
+
+    from eomc.base.errors import SceneError
+
+    remedy = f"{what}: {system.name} was changed since System.make made it: give that its events"
+    if not isinstance(events, Mapping):
+        raise EomcError(f'{what}: give a dict, such as {{"section": "x"}}, here {events!r}')
+    if system.again is None or system.again() != system:
+        raise EomcError(remedy)
+    own = system.again.keywords["events"] or {}
+    if double := sorted({*map(str, own)} & {*map(str, events)}):
+        raise EomcError(f"{what}: event {double[0]}: '{double[0]}' is an event already: rename it")
+    try:
+        return system.again(events={**own, **events})
+    except SceneError as wrong:
+        told = [replace(p, file=what) for p in _by_name(wrong, len(own), events).problems]
+        raise SceneError(told) from None
+    except EomcError as wrong:
+        raise EomcError(str(wrong).replace("System.make:", f"{what}:")) from None
+
+
+def _by_name(wrong: SceneError, own: int, events: Mapping[str, Any]) -> SceneError:
+    """Faults of events by their names, which stand behind so many of the scene's own."""
+    from dataclasses import replace
+
+    names = {f"event.{own + k}": str(called) for k, called in enumerate(events, start=1)}
+    return type(wrong)(
+        [
+            replace(p, line=0, column=-1, source="", key=_renamed(p.key, names))
+            for p in wrong.problems
+        ]
+    )
 
 
 def _renamed(key: str, names: Mapping[str, str]) -> str:

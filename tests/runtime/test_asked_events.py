@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import pickle
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import sympy
+from sympy.physics.mechanics import dynamicsymbols
 
 import eomc
+from eomc import pipeline
 from eomc.base.errors import EomcError
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
@@ -121,11 +124,9 @@ def test_a_scene_that_is_not_there_or_another_is_told(
 ) -> None:
     other = tmp_path / "oscillator.toml"
     other.write_text(TEXT.replace("k = 4", "k = 5"))
-    made = eomc.System.make("free", {"x": 1.0}, "x_dot**2/2", "x**2")
     for source, words in (
         (tmp_path / "gone.toml", r"gone\.toml: can't be read \(No such file"),
         (other, "has changed since it was built: load it again"),
-        (made, r"give System\.make its events"),
         (None, r"load it with eomc\.load"),
     ):
         monkeypatch.setattr(oscillator._model, "source", source)
@@ -142,3 +143,68 @@ def test_a_folder_that_can_t_be_written_is_named(
     monkeypatch.setattr(Path, "mkdir", refused)
     with pytest.raises(EomcError, match=r"oscillator\.toml: can't be written \(Read-only"):
         oscillator.simulate(events={"later": "x - 0.125"})
+
+
+def swinging(name: str = "swinging") -> eomc.System:
+    """A pendulum of dynamicsymbols, whose own event is its turning."""
+    theta, (w, d) = dynamicsymbols("theta"), sympy.symbols("w d")
+    return eomc.System.make(
+        name, {theta: 0.5}, theta.diff() ** 2 / 2, w**2 * theta**2 / 2,
+        parameters={w: 2.0, d: 0.0}, forces={theta: -d * theta.diff()}, batch=True,
+        events={"turns": {"when": theta.diff(), "direction": "rising"}},
+    )  # fmt: skip
+
+
+def test_a_system_has_them_beside_its_own(tmp_path: Path) -> None:
+    theta, d = dynamicsymbols("theta"), sympy.Symbol("d")
+    made = swinging()
+    m = eomc.load(made, tmp_path)
+    assert made == swinging() and pickle.loads(pickle.dumps(made)) == made
+    run = m.simulate(events={"down": {"when": theta, "direction": "rising"}, "half": "theta - 1/4"})
+    assert run.events["down"].t == pytest.approx((np.arange(3) + 0.75) * math.pi, abs=TOL)
+    assert run.events["turns"].t == pytest.approx((np.arange(3) + 0.5) * math.pi, abs=TOL)
+    assert run.events["half"].t[0] == pytest.approx(math.pi / 6, abs=TOL)
+    jump = {"brake": {"when": theta, "action": "jump", theta.diff(): 0, d: "d + 1"}}
+    run = m.simulate(duration=2.0, events=jump)
+    assert abs(run.q[-1, 0]) < TOL and run["d"][-1] == 1
+    both = m.simulate_batch(
+        [[0.5], [0.1]], tol=1e-9, events={"low": {"when": "theta - 0.2", "action": "stop"}}
+    )
+    assert both.reached == pytest.approx([math.acos(0.4) / 2, 10], abs=TOL)
+
+
+def test_of_a_system_they_are_compiled_once(tmp_path: Path) -> None:
+    dates = []
+    for _ in range(2):  # as in another process
+        m = eomc.load(swinging("again"), tmp_path)
+        vars(m._model).pop("_eventful", None)
+        m.simulate(duration=1.0, events={"once": "theta"})
+        (extension,) = tmp_path.glob("again/.events/*/again/_again_*")
+        dates.append(extension.stat().st_mtime_ns)
+    assert dates[0] == dates[1]
+
+
+@pytest.mark.parametrize(
+    ("events", "words"),
+    [
+        ({"a": "y"}, r"simulate\(events=\): event a: y not declared"),
+        ({"turns": "theta"}, "event turns: 'turns' is an event already"),
+        ({"a": {"when": "theta", "action": "jump", "z": 1}}, "event a: z is no coordinate"),
+        ({"a": {"when": "d - 1", "action": "jump", "d": 2}}, r"=\): .*a.when: only jumps"),
+        (["theta"], "give a dict"),
+    ],
+)  # fmt: skip
+def test_of_a_system_a_fault_is_named(events: dict, words: str, tmp_path: Path) -> None:
+    m = SimpleNamespace(name="swinging", source=swinging(), events=("turns",))
+    with pytest.raises(EomcError, match=words):
+        pipeline.with_events(m, events, tmp_path)
+
+
+def test_a_system_that_was_read_or_changed(scene: Path, tmp_path: Path) -> None:
+    own = eomc.read(scene)
+    run = eomc.load(own, tmp_path).simulate(duration=1.0, events=THROUGH)
+    assert run.events["through"].t == pytest.approx([math.pi / 6], abs=TOL)
+    for changed in (own.at({"k": 5.0}), swinging().at({"w": 1.0})):
+        m = SimpleNamespace(name=changed.name, source=changed, events=("turns",))
+        with pytest.raises(EomcError, match=r"was changed since .* made it: give"):
+            pipeline.with_events(m, THROUGH, tmp_path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import sympy
@@ -67,7 +68,8 @@ class System:
     was read from, where it was. `pictured`: where it was made in Python with a picture, a scene of
     its names and that alone. `closure`: what its constraints leave, once its start is assembled.
     `modes`: of friction that sticks, the last coordinates. `discrete`: coordinates before them that
-    jumps alone change, which no derivative is taken along.
+    jumps alone change, which no derivative is taken along. `again`: `make` with what made it; other
+    arguments take the place of those.
     """
 
     name: str
@@ -100,6 +102,11 @@ class System:
     closure: Closure | None = field(default=None, compare=False, repr=False)
     modes: tuple[Mode, ...] = ()
     discrete: tuple[str, ...] = ()
+    again: partial[System] | None = field(default=None, compare=False, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without `again`, whose symbols may not bear to be pickled."""
+        return {**self.__dict__, "again": None}
 
     @property
     def q(self) -> tuple[Symbol, ...]:
@@ -211,6 +218,7 @@ class System:
         ...             -m*g*l*sympy.cos(theta), parameters={m: 1, l: 1, g: 9.81}).qd
         (theta_dot,)
         """
+        asked = {key: x for key, x in locals().items() if key != "cls"}
         run = given.run(
             h, duration, methods, real, batch, linearize, discretize, tolerance,
             bool(events or friction),
@@ -224,7 +232,8 @@ class System:
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
-        return sticking(discrete(within(system)), maker.frictions)
+        system = sticking(discrete(within(system)), maker.frictions)
+        return replace(system, again=partial(cls.make, **asked))
 
     def beyond_float(self) -> list[Problem]:
         """Faults of numbers that a system in single precision can't have."""
