@@ -10,6 +10,7 @@ import pytest
 from conftest import Modules
 
 from eomc.model.from_scene import from_scene
+from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify import rows_outputs
 from eomc.verify.comparison import Comparison
@@ -62,4 +63,42 @@ def test_wrong_ones_fail(modules: Modules, wrong: dict[str, float], failed: list
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
     rows_outputs.report(comparison, None)
     assert [row.name for row in comparison.rows] == ["outputs", "outputs: C, D"]
+    assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
+
+
+ON_A_ROD = """eomc = 1
+name = "on_a_rod"
+[coordinates]
+x = { start = 0.6, rate = 0.3 }
+y = { start = -0.8, guess = true }
+[inputs]
+u = {}
+[energy]
+kinetic = "x_dot**2 + y_dot**2"
+potential = "9.81*y"
+[forces]
+x = "u"
+[constraints]
+rod = "x**2 + y**2 - 1"
+[outputs]
+far = "x_ddot"
+pull = "-2*lambda_rod"
+[run]
+linearize = true
+"""
+
+
+@pytest.mark.parametrize(
+    ("wrong", "failed"),
+    [({}, []), ({"output": 1e-11}, ["outputs"]), ({"C": 1e-4}, ["outputs: C, D"])],
+)
+def test_wrong_ones_of_multipliers_fail(
+    modules: Modules, wrong: dict[str, float], failed: list[str]
+) -> None:
+    made, module = (
+        assembled(from_scene(parse(ON_A_ROD, "test.toml"))),
+        modules.unoptimised(ON_A_ROD),
+    )
+    comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
+    rows_outputs.report(comparison, None)
     assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows

@@ -11,7 +11,7 @@ from eomc.base.errors import EomcError, SceneError
 from eomc.derive.energies import leaves
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import RoughError, Tape
-from eomc.model.symbols import Output, dot, needed
+from eomc.model.symbols import MULTIPLIER, Output, dot, needed
 from eomc.model.system import System, t
 
 
@@ -35,7 +35,10 @@ def outputs(
     beside: a tape that they go on, with what some symbols are there. Raises SceneError where a
     derivative is needed that does not exist.
     """
-    tape, known = beside or (Tape(leaves(system, *system.qdd, *more)), {})
+    given = leaves(system, *system.qdd, *more)
+    tape, known = beside or (Tape(given), {})
+    tape.leaves |= given  # which one that solves for accelerations has not
+    tape.stage |= given
     try:
         return _outputs(system, sloped, tape, dict(known))
     except RoughError:
@@ -54,12 +57,19 @@ def signal_slopes(system: System) -> Outputs:
 
 def _outputs(system: System, sloped: bool, tape: Tape, known: dict[Symbol, Expr]) -> Outputs:
     state = (*system.q, *system.qd)
+    multipliers = {c.multiplier for c in system.constraints}
     rates = {**system.rates, **dict(zip(system.qd, system.qdd, strict=True)), t: S.One}
 
     def value(expr: Expr) -> Expr:
         """The expression's atom; dot(...) by the chain rule, from the innermost."""
         found: dict[Expr, Expr] = {}
         for moving in expr.atoms(dot):
+            if held := sorted(map(str, moving.free_symbols & multipliers)):
+                name = held[0].removesuffix(MULTIPLIER)
+                raise EomcError(
+                    f"{system.file or system.name}: dot(...) holds lambda_{name}, the multiplier "
+                    "of a constraint, whose rate is not known"
+                )
             position = value(moving.args[0])
             if unknown := tape.leaves_of([position]) & {*system.u, *system.qdd}:
                 raise EomcError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import sympy
 from sympy import Expr, Symbol
@@ -21,6 +21,7 @@ from eomc.model.symbols import (
     Output,
     Parameter,
     Reaction,
+    multiplier_of,
     symbol,
     t,
 )
@@ -152,17 +153,44 @@ class _Formulas:
         rows += [row for loop in kept for row in loop.rows]
         return found.sorted(rows), tuple(r for loop in kept for r in loop.reactions)
 
-    def outputs(self, kinetic: Expr, potential: Expr) -> Iterator[Output]:
-        """The outputs, which may use accelerations and energies."""
+    def outputs(
+        self, kinetic: Expr, potential: Expr, forces: Mapping[str, Expr]
+    ) -> Iterator[Output]:
+        """The outputs, which may use accelerations, energies and `forces` of constraints."""
         accelerations = (f"{c.name}_ddot" for c in self.scene.coordinates)
         energies = (kinetic, potential, kinetic + potential)
         self.known = {
             **dict(zip(ENERGIES, energies, strict=True)),
             **{name: symbol(name) for name in accelerations},
+            **forces,
             **self.known,
         }
         for o in self.scene.outputs:
+            if missing := [n.id for n in o.formula.names() if n.id not in self.known]:
+                why = f"'{missing[0]}' is of a coordinate without friction that sticks"
+                key = f"outputs.{o.name}.formula"
+                self.problems.append(self.scene.problem(key, why, o.formula))
+                continue
             yield Output(o.name, self.value(f"outputs.{o.name}.formula", o.formula), o.unit, o.note)
+
+
+def _forces(
+    scene: Scene, rows: Sequence[Constraint], reactions: Sequence[Reaction],
+    sticks: Sequence[Friction],
+) -> dict[str, Expr]:  # fmt: skip
+    """Multipliers and entries of reactions, by what outputs call them."""
+    found: dict[str, Expr] = {}
+    if scene.assembly:
+        plane = scene.assembly.plane
+        entries = {r.name: r.values for r in reactions}
+        for loop in scene.assembly.loops:
+            # of rows that no motion changes, which are left out
+            found |= {f"lambda_{row}": sympy.S.Zero for row in loop.rows(plane).values()}
+            names = loop.reactions(plane)
+            found |= dict(zip(names, entries.get(loop.name, ()), strict=bool(names)))
+    found |= {f"lambda_{row.name}": row.multiplier for row in rows}
+    held = (f"{friction.coordinate}_sticks" for friction in sticks)
+    return found | {f"lambda_{name}": multiplier_of(name) for name in held}
 
 
 def from_scene(scene: Scene) -> System:
@@ -183,6 +211,7 @@ def from_scene(scene: Scene) -> System:
         for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
     )
     rows, reactions = made.constraints(coordinates, definitions, more.closed)
+    held = _forces(scene, rows, reactions, sticks)
     system = System(
         name=scene.name,
         coordinates=coordinates,
@@ -203,7 +232,7 @@ def from_scene(scene: Scene) -> System:
         events=tuple(made.events()),
         constraints=rows,
         reactions=reactions,
-        outputs=tuple(made.outputs(kinetic_energy, potential_energy)),
+        outputs=tuple(made.outputs(kinetic_energy, potential_energy, held)),
         run=scene.run,
         title=scene.title,
         note=scene.note,

@@ -26,6 +26,7 @@ from eomc.model.symbols import (
     Output,
     Parameter,
     dot,
+    multiplier_of,
     needed,
     symbol,
     t,
@@ -147,6 +148,8 @@ class Maker:
         if unknown := [f for f in forces if f not in map(given.name_of, starts)]:
             raise EomcError(f"System.make: forces: {', '.join(unknown)} not among the coordinates")
         expression = self._expression
+        rubbed = given.by_name(friction, "friction", "{x: mu*m*g}")
+        sticks = [f"{self.map[x].name}_sticks" for x in starts if given.name_of(x) in rubbed]
         drawn, drawn_text = None, ""
         if picture is not None:
             names = given_inputs.values()
@@ -167,7 +170,9 @@ class Maker:
             "definitions": tuple(ordered),
             **self._constraints(rows, made, ordered, given_inputs.values(), units),
             "events": tuple(self._events(events, starts, declared)),
-            "outputs": tuple(self._outputs(outputs, starts, made, units, [*map(str, rows)])),
+            "outputs": tuple(
+                self._outputs(outputs, starts, made, units, [*map(str, rows), *sticks])
+            ),
             "run": run,
             "title": title or self.name.replace("_", " ").capitalize(),
         }
@@ -356,13 +361,18 @@ class Maker:
         self, outputs: Any, starts: Iterable[Any], made: Sequence[Coordinate],
         units: Mapping[Any, str], rows: Sequence[str],
     ) -> Iterator[Output]:  # fmt: skip
-        """The outputs, which may use accelerations."""
+        """The outputs, which may use accelerations, and multipliers by names as lambda_rod."""
         for one, c in zip(starts, made, strict=True):
             if isinstance(one, AppliedUndef):
                 self.map[sympy.Derivative(one, (one.args[0], 2))] = c.qdd
             else:
                 self.map[Symbol(f"{one}_ddot", **one.assumptions0)] = c.qdd
             self.known.add(c.qdd)
+        for row in rows:
+            name, multiplier = symbol(f"lambda_{row}"), multiplier_of(row)
+            if name.name not in self.taken:
+                self.map |= {name: multiplier, Symbol(name.name): multiplier}
+                self.known |= {name, multiplier}
         if not isinstance(outputs, Mapping):
             raise given.fault("outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}')
         for name, formula in outputs.items():

@@ -176,7 +176,7 @@ class Constraint(_Named):
     @property
     def multiplier(self) -> Symbol:
         """The row's Lagrange multiplier, in reactions."""
-        return symbol(f"{self.name}{MULTIPLIER}")
+        return multiplier_of(self.name)
 
     @property
     def parts(self) -> tuple[Symbol, ...]:
@@ -207,6 +207,11 @@ class Reaction(_Named):
     values: tuple[Expr, ...]
     note: str = ""
     branches: tuple[Expr, ...] = ()
+
+
+def multiplier_of(row: str) -> Symbol:
+    """The Lagrange multiplier of a constraint of that name."""
+    return symbol(f"{row}{MULTIPLIER}")
 
 
 def needed(

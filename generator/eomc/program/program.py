@@ -85,7 +85,7 @@ def build(derived: Derivation) -> Program:
         functions[made.name] = replace(made, route=best.route)
     more = (
         *constrained.functions(derived, taken),
-        *_outputs(system),
+        *_outputs(system, taken),
         *_events(system, taken),
         *_applied(system),
         *_signal_slopes(system, functions),
@@ -132,11 +132,17 @@ def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
         yield lower("sensitivity", taken.tape, [x for row in rows for x in row], (), (), names)
 
 
-def _outputs(system: System) -> Iterator[Function]:
-    """The outputs, and their derivatives where those of the accelerations are asked for."""
+def _outputs(system: System, taken: Candidate) -> Iterator[Function]:
+    """The outputs, and their derivatives where those of the accelerations are asked for.
+
+    taken: the accelerations, on whose tape multipliers are; accelerations are given all the same.
+    """
     if not system.outputs:
         return
-    made = outputs.outputs(system, sloped=system.run.sloped)
+    held = dict(zip((c.multiplier for c in system.constraints), taken.multipliers, strict=False))
+    read = {x for o in system.outputs for x in o.formula.free_symbols}
+    known = (taken.tape, held) if read & held.keys() else None
+    made = outputs.outputs(system, sloped=system.run.sloped, beside=known)
     labels = [o.name for o in system.outputs]
     yield lower("outputs", made.tape, made.values, (), labels, system.names)
     if rows := [x for row in made.slopes for x in row]:

@@ -172,6 +172,7 @@ def _outputs(system: System) -> list[tuple[str, Expr]]:
     known: dict[sympy.Symbol, Expr] = {}
     for name, formula in system.definitions:
         known[name] = formula.xreplace(known)
+    known |= {c.multiplier: sympy.Symbol(f"lambda_{c.name}", real=True) for c in system.constraints}
     return [(o.name, o.formula.xreplace(known)) for o in system.outputs]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from eomc.scene.formulas import Formula
-from eomc.scene.joints import CLOSINGS
+from eomc.scene.joints import CLOSINGS, REACTIONS
 
 WORLD = "world"  # the frame that does not move, as a parent and at the ends of springs
 
@@ -135,6 +135,11 @@ class Loop:
         if len(kinds) == 1:
             return {kinds[0]: self.name}
         return {kind: f"{self.name}_{kind}" for kind in kinds}
+
+    def reactions(self, plane: bool) -> tuple[str, ...]:
+        """What outputs call the entries of its reaction; a gear has none."""
+        parts = () if self.joint == "gear" else REACTIONS[plane]
+        return tuple(f"{self.name}_{part}" for part in parts)
 
 
 @dataclass(frozen=True)

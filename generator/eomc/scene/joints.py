@@ -107,6 +107,12 @@ CLOSINGS = {
     "gear": Closing(("ratio",), ("ratio",), others=("gears", "belt", "mimic", "coupling")),
 }
 
+# what a loop between bodies does to the second: names behind its own, in the plane and in space
+REACTIONS = {
+    True: ("force_x", "force_y", "moment"),
+    False: ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z"),
+}
+
 CLOSING_MEANT = {other: kind for kind, joint in CLOSINGS.items() for other in joint.others}
 
 MEANT = {other: kind for kind, joint in JOINTS.items() for other in joint.others}

@@ -123,7 +123,7 @@ class _Check(Checker):
         validate_constraints.guesses(self, doc)
         run = self._run()
         picture = validate_picture.picture(self, doc, known)
-        outputs = self._outputs()
+        outputs = self._outputs(validate_constraints.forces(doc, assembly))
         self._asked()
         self._unused()
         if any(p.severity == "error" for p in self.problems):
@@ -396,13 +396,13 @@ class _Check(Checker):
                 out[name] = formula
         return out
 
-    def _outputs(self) -> list[Output]:
-        """Formulas over everything, the accelerations and energies too."""
-        self.solve([f"{name}_ddot" for name in self.doc.coordinates])
+    def _outputs(self, forces: Sequence[str]) -> list[Output]:
+        """Formulas over everything, the accelerations, energies and forces of constraints too."""
+        self.solve([f"{name}_ddot" for name in self.doc.coordinates], forces)
         out = []
         for name, entry in self.doc.outputs.items():
             path = ("outputs", name, "formula")
-            if validate_constraints.multiplier(self, self.doc, path, entry.formula):
+            if validate_constraints.multiplier(self, self.doc, path, entry.formula, forces):
                 continue
             formula = self.formula(path, entry.formula)
             if name in self.centers and formula and formula.text.strip() != name:

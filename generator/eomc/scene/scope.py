@@ -15,7 +15,7 @@ from eomc.scene.source_map import SourceMap
 
 # the kinds of thing a formula can depend on; what depends on something faulty is in doubt
 TIME, INPUT, POSITION, VELOCITY = "the time", "inputs", "coordinates", "velocities"
-ACCELERATION = "accelerations"
+ACCELERATION, FORCE = "accelerations", "forces of constraints"
 DOUBT = "something faulty"
 
 NOTHING: frozenset[str] = frozenset()
@@ -86,13 +86,17 @@ class Checker:
         self.definitions: dict[str, Formula] = {}
         self.solved = False  # whether formulas may use accelerations
 
-    def solve(self, accelerations: Collection[str]) -> None:
-        """From here on formulas may use accelerations and energies: they are computed last."""
+    def solve(self, accelerations: Collection[str], forces: Collection[str]) -> None:
+        """From here on formulas may use accelerations, energies and forces of constraints.
+
+        They are computed last.
+        """
         self.solved = True
         moving = frozenset({POSITION, VELOCITY})
         self.kinds = {
             **dict.fromkeys(ENERGIES, moving),
             **dict.fromkeys(accelerations, frozenset({ACCELERATION})),
+            **dict.fromkeys(forces, frozenset({FORCE})),
             **self.kinds,
         }
 
@@ -207,6 +211,8 @@ class Checker:
             return "it holds inputs, whose rate nobody knows; add the rate as a further input"
         if ACCELERATION in kinds:
             return "it holds accelerations, whose rate is not computed"
+        if FORCE in kinds:
+            return "it holds forces of constraints, whose rate is not computed"
         if VELOCITY in kinds and not self.solved:
             return "it holds velocities, and their rates are what is solved for"
         return ""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-from eomc.base import names
+from eomc.base import names, texts
+from eomc.scene.assembly import Assembly
 from eomc.scene.formulas import FormulaError
 from eomc.scene.scene import Constraint
-from eomc.scene.schema import Document
+from eomc.scene.schema import BodyTable, Document
 from eomc.scene.scope import INPUT, Checker, Path
 
 _MULTIPLIER = r"lambda(_\w+)?|(\w+_)?(multiplier|reaction)s?"
@@ -64,17 +65,40 @@ def fault_of_row(check: Checker, doc: Document, name: str) -> str:
     return f"'{name}' {taken[name]} already" if name in taken else ""
 
 
-def multiplier(check: Checker, doc: Document, path: Path, text: float | str) -> bool:
-    """Whether an output names a multiplier or reaction, which is reported."""
-    rows = {*doc.constraints, *(entry.name for entry in doc.loop.values())}
+def forces(doc: Document, assembly: Assembly | None) -> list[str]:
+    """What outputs call multipliers and the entries of reactions."""
+    plane, loops = (assembly.plane, assembly.loops) if assembly else (True, ())
+    rows = [*doc.constraints, *(row for loop in loops for row in loop.rows(plane).values())]
+    if doc.run.friction == "stick":
+        rubbed = {n for b in doc.body.values() if b.friction is not None for n in _along(b)}
+        rubbed |= {name for name, c in doc.coordinates.items() if c.friction is not None}
+        rows += [f"{name}_sticks" for name in doc.coordinates if name in rubbed]
+    reactions = [name for loop in loops for name in loop.reactions(plane)]
+    return [*(f"lambda_{row}" for row in rows), *reactions]
+
+
+def _along(body: BodyTable) -> tuple[str, ...]:
+    return body.coordinates or ()
+
+
+def multiplier(
+    check: Checker, doc: Document, path: Path, text: float | str, known: Sequence[str]
+) -> bool:
+    """Whether an output names a multiplier or reaction by another name than those `known`.
+
+    That is reported.
+    """
+    rows = {name.removeprefix("lambda_") for name in known}
+    rows |= {entry.name for entry in doc.loop.values()}
     if not rows or not isinstance(text, str):
         return False
     for word in re.finditer(r"(?<![\w.])[A-Za-z_]\w*", text):
         named = word[0] in rows or re.fullmatch(_MULTIPLIER, word[0])
         if named and word[0] not in check.kinds:
+            mine = [name for name in known if word[0] in rows and word[0] in name]
             message = (
-                f"'{word[0]}' can't be used here: multipliers and reactions are no outputs, a run "
-                "in Python has them in run.multipliers and run.reactions"
+                f"'{word[0]}' can't be used here: multipliers and reactions are called "
+                f"{texts.listed(mine or known, 6)}"
             )
             check.say(path, message, FormulaError(message, word.start(), len(word[0])), text)
             return True

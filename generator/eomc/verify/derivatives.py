@@ -20,11 +20,13 @@ WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of the scale of each variable
 
 
 def by_differences(
-    reference: Answer, s: State, scale: Vector, defaults: Mapping[str, float]
-) -> Iterator[tuple[Vector, Vector]]:
+    reference: Answer, s: State, scale: Vector, defaults: Mapping[str, float],
+    of: str = "acceleration",
+) -> Iterator[tuple[Vector, Vector]]:  # fmt: skip
     """dqdd/d[q, qd, u, p] (nq, 2 nq + nu + np) and the scales of these, for each of WIDTHS.
 
-    scale: (2, nq), of q and qd. u: held, at the signals where the state has none.
+    scale: (2, nq), of q and qd. u: held, at the signals where the state has none. of: what else the
+    reference has of a state, (m,), in place of qdd.
     """
     n, params = len(s.q), dict(s.params or defaults)
     u = np.zeros(0)
@@ -44,8 +46,8 @@ def by_differences(
             "params": dict(zip(params, rows[:, 2 * n + len(u) :].T, strict=True)),
         }
         t = np.full(len(rows), s.t)
-        a = reference.acceleration(rows[:, :n], rows[:, n : 2 * n], t, **given)
-        forward, back = np.moveaxis(a.reshape(len(STENCIL), 2, len(x), n), 1, 0)
+        a = getattr(reference, of)(rows[:, :n], rows[:, n : 2 * n], t, **given)
+        forward, back = np.moveaxis(a.reshape(len(STENCIL), 2, len(x), -1), 1, 0)
         weights = np.array([w for _, w in STENCIL])
         yield np.tensordot(weights, forward - back, 1).T / (width * scales), scales
 

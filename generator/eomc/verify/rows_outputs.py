@@ -1,14 +1,15 @@
 """Rows of `check` about outputs: in eighty digits, their rates by differences along the motion.
 
 Nothing is differentiated as a formula: q(s) = q + qd s + qdd s^2/2, formulas and definitions are
-evaluated as they stand, and dot(e) is (e(h) - e(-h))/2h.
+evaluated as they stand, and dot(e) is (e(h) - e(-h))/2h. Accelerations and multipliers, which other
+rows look at, are the module's own; slopes of multipliers are differences of the reference's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import mpmath
@@ -17,6 +18,7 @@ import sympy
 from sympy import Expr, Symbol
 
 from eomc.model.system import System, dot, symbol, t
+from eomc.verify import derivatives
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.sampling import NUDGE, State, ask, nudged
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
 DIGITS = 80  # three differences leave some thirty
 WIDTH = mpmath.mpf(10) ** -15  # of differences
 SLOPE_LIMIT = 1e-9  # of a row's largest derivative
+OF_MULTIPLIERS = 1e-6  # likewise, where an output reads multipliers
 STATES = 4
+_NONE: Vector = np.zeros(0)
 
 _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x == 0 else +(x > 0)}
 
@@ -36,17 +40,18 @@ _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x
 def report(of: Comparison, plain: Any) -> None:
     """Add the rows of a scene that has outputs. plain: the module of the plain form, or None."""
     formulas = Formulas(of.system)
+    limit = max(OF_MULTIPLIERS if formulas.multipliers else SLOPE_LIMIT, LIMIT * of.eps)
     for module, form in ((of.module, ""), (plain, "plain C: ")):
         if module is None:
             continue
         of.row(f"{form}outputs", LIMIT, "units of rounding", partial(_values, of, module, formulas))
         if of.system.run.linearize:
             unit, slopes = "of the largest derivative", partial(_slopes, of, module, formulas)
-            of.row(f"{form}outputs: C, D", max(SLOPE_LIMIT, LIMIT * of.eps), unit, slopes)
+            of.row(f"{form}outputs: C, D", limit, unit, slopes)
 
 
 def _values(of: Comparison, module: Any, formulas: Formulas) -> float:
-    """The outputs at some states, with the module's own accelerations."""
+    """The outputs at some states, with the module's own accelerations and multipliers."""
 
     def found(s: State) -> Vector:
         return np.asarray(module.output(s.q, s.qd, s.t, s.u, s.params), float)
@@ -56,7 +61,7 @@ def _values(of: Comparison, module: Any, formulas: Formulas) -> float:
         value = found(s)
         near = [found(x) for x in nudged(s, of.sampler.defaults)]
         size = np.abs(value) + sum(np.abs(x - value) / NUDGE for x in near)
-        return of.units(value, formulas.at(s, ask(module, "acceleration", s)), size)
+        return of.units(value, formulas.at(s, *_solved(module, s)), size)
 
     return float(np.max([error(e) for e in of.few(STATES)]))
 
@@ -70,15 +75,38 @@ def _slopes(of: Comparison, module: Any, formulas: Formulas) -> float:
         A, B, C, D = (
             np.asarray(x, float) for x in module.linearize(s.q, s.qd, outputs=True, **held)
         )
-        slopes = formulas.slopes(s, ask(module, "acceleration", s))
-        by_state, by_u, by_qdd = np.split(slopes, [2 * n, slopes.shape[1] - n], axis=1)
-        terms = [(by_state, by_qdd, A[n:]), (by_u, by_qdd, B[n:])]
-        exact = np.hstack([own + other @ of_qdd for own, other, of_qdd in terms])
-        sizes = np.hstack([abs(own) + abs(other) @ abs(of_qdd) for own, other, of_qdd in terms])
-        off = np.abs(np.hstack([C, D]) - exact)
-        return float(np.max(off / (np.max(sizes, axis=1, keepdims=True) + 1e-300), initial=0))
+        slopes, m = formulas.slopes(s, *_solved(module, s)), len(s.u) if s.u is not None else 0
+        own, by_qdd, by_force = np.split(slopes, [2 * n + m, 3 * n + m], axis=1)
+        solved, found = np.hstack([A[n:], B[n:]]), np.hstack([C, D])
+        least = np.inf  # of all widths of differences: what is wrong is so at each
+        for forces in _of_multipliers(of, s) if formulas.multipliers else [by_force[:0]]:
+            exact, sizes = own + by_qdd @ solved, abs(own) + abs(by_qdd) @ abs(solved)
+            if formulas.multipliers:
+                exact, sizes = exact + by_force @ forces, sizes + abs(by_force) @ abs(forces)
+            off = np.abs(found - exact) / (np.max(sizes, axis=1, keepdims=True) + 1e-300)
+            least = np.fmin(least, off)
+        return float(np.max(least, initial=0))
 
     return float(np.max([error(e) for e in of.few(2)]))
+
+
+def _of_multipliers(of: Comparison, s: State) -> Iterator[Vector]:
+    """Their slopes along q, qd and u, (nc, 2 nq + nu), by differences of several widths.
+
+    Along discrete variables there are none.
+    """
+    n, scale = len(s.q), np.array([of.sampler.spread, of.sampler.speed])
+    still = [k for k, q in enumerate(of.system.q) if q not in of.system.rates]
+    given = (of.reference, s, scale, of.sampler.defaults, "multipliers")
+    for slopes, _ in derivatives.by_differences(*given):
+        slopes[:, [*still, *(n + k for k in still)]] = 0
+        yield slopes[:, : 2 * n + len(of.system.inputs)]
+
+
+def _solved(module: Any, s: State) -> tuple[Vector, Vector]:
+    """The module's accelerations and multipliers."""
+    rows = getattr(module, "constraint_names", ())
+    return ask(module, "acceleration", s), ask(module, "multipliers", s) if rows else np.zeros(0)
 
 
 def _held(of: Comparison, module: Any, s: State) -> State:
@@ -97,25 +125,33 @@ class Formulas:
         default_factory=dict
     )
 
-    def at(self, s: State, qdd: Vector) -> Vector:
-        """(ny,): at a state with inputs and accelerations."""
-        with mpmath.workdps(DIGITS):
-            return np.array([float(y) for y in self._values(self._given(s, qdd))])
+    @cached_property
+    def multipliers(self) -> tuple[Symbol, ...]:
+        """Those of all constraints, where an output reads one."""
+        read = {x for o in self.system.outputs for x in o.formula.free_symbols}
+        found = tuple(c.multiplier for c in self.system.constraints)
+        return found if read & {*found} else ()
 
-    def slopes(self, s: State, qdd: Vector) -> Vector:
-        """(ny, 3 nq + nu): along q, qd, u and qdd, by differences."""
+    def at(self, s: State, qdd: Vector, forces: Vector = _NONE) -> Vector:
+        """(ny,): at a state with inputs, accelerations and multipliers."""
+        with mpmath.workdps(DIGITS):
+            return np.array([float(y) for y in self._values(self._given(s, qdd, forces))])
+
+    def slopes(self, s: State, qdd: Vector, forces: Vector = _NONE) -> Vector:
+        """(ny, 3 nq + nu): along q, qd, u, qdd, by differences; along multipliers that are read."""
         system = self.system
         with mpmath.workdps(DIGITS):
-            given, columns = self._given(s, qdd), []
-            for x in (*system.q, *system.qd, *system.u, *system.qdd):
+            given, columns = self._given(s, qdd, forces), []
+            for x in (*system.q, *system.qd, *system.u, *system.qdd, *self.multipliers):
                 ends = [self._values({**given, x: given[x] + h}) for h in (WIDTH, -WIDTH)]
                 columns.append([float((a - b) / (2 * WIDTH)) for a, b in zip(*ends, strict=True)])
         return np.array(columns).T
 
-    def _given(self, s: State, qdd: Vector) -> dict[Symbol, Any]:
+    def _given(self, s: State, qdd: Vector, forces: Vector) -> dict[Symbol, Any]:
         system = self.system
         given = dict(zip((*system.q, *system.qd, *system.qdd), (*s.q, *s.qd, *qdd), strict=True))
         given |= dict(zip(system.u, () if s.u is None else s.u, strict=True))
+        given |= dict(zip(self.multipliers, forces, strict=bool(self.multipliers)))
         given |= {symbol(n): v for n, v in (s.params or self._defaults).items()} | {t: s.t}
         return {name: mpmath.mpf(float(value)) for name, value in given.items()}
 
