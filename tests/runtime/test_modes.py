@@ -10,7 +10,10 @@ from types import ModuleType
 import cases
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from conftest import Modules
+
+from eomc.cli.main import main
 
 PAGE = Path(__file__).parents[2] / "docs" / "adaptive.md"
 RUBBED = """eomc = 1
@@ -66,3 +69,32 @@ def test_a_block_on_a_belt_sticks_and_slides(modules: Modules) -> None:
     assert starts[0] == pytest.approx(far / speed, rel=1e-13)
     np.testing.assert_allclose(stops - starts, slides, rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.diff(starts), slides + 2 * (far - middle) / speed, atol=1e-12)
+
+
+def test_a_ball_lies_after_its_last_bounce(modules: Modules, tmp_path: Path) -> None:
+    """The scenes and the session of the page."""
+    section = re.search(r"### After the last bounce\n(.*?)\n## ", PAGE.read_text(), re.S)
+    assert section
+    (text, event), (session,) = (
+        re.findall(rf"```{language}\n(.*?)```", section[1], re.S) for language in ("toml", "python")
+    )
+    known = {"ball": modules.unoptimised(text)}
+    with pytest.warns(RuntimeWarning, match="jumps follow one another ever sooner"):
+        exec(session, known)
+    bounces, lies = (known[name] for name in ("bounces", "lies"))
+    fall = math.sqrt(2 / 9.81)
+    assert bounces.status == "accumulated" and bounces.limit == pytest.approx(9 * fall, rel=1e-10)
+    assert lies.status == "ok" and lies.t[0] == bounces.limit and lies.t[-1] == 10.0
+    assert lies.q[-1] == pytest.approx([10, 0], abs=1e-12) and not lies.events["impact"]
+    at_rest = re.sub(r"\[\[event\]\].*?\n\n", event + "\n", text, flags=re.S)
+    at_rest = at_rest.replace("[parameters]\n", "[parameters]\nv_rest = 1e-3\n")
+    run = modules.unoptimised(at_rest.replace('"ball"', '"ball_rests"')).simulate()
+    last = run.events["impact"]
+    early = bounces.limit - last.t[-1]
+    assert run.status == "ok" and run.t[-1] == 10.0 and run["air"][-1] == 0
+    assert 0 < early < 2 * 0.8 * 1e-3 / (9.81 * 0.2) < 0.82e-3 and -1e-3 < last.qd[-1, 1] < 0
+    assert run.q[-1, :2] == pytest.approx([10, 0], abs=1e-12)
+    file = tmp_path / "ball.toml"
+    file.write_text(text, encoding="utf-8")
+    done = CliRunner().invoke(main, ["run", str(file)])
+    assert done.exit_code == 0 and "jumps follow one another ever sooner" in done.output
