@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import os
 import shutil
 import signal
@@ -13,7 +14,7 @@ from functools import cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import precompiled
 import pytest
@@ -25,6 +26,10 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.scene.read import parse
 from eomc.toolchain import compiler, extension
+
+if TYPE_CHECKING:
+    from eomc.emit.render import Sources
+    from eomc.toolchain.compiler import Compiler
 
 # in a shell's background Ctrl-C is switched off, and tests of it would wait for ever
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -66,6 +71,27 @@ def _binding_flags() -> tuple[str, ...]:
 
 
 extension.binding_flags = _binding_flags
+_build = extension.build
+_libraries: dict[str, bytes] = {}
+
+
+def _build_once(
+    made: Sources, name: str, folder: Path, library: str, by: Compiler, *how: Any
+) -> None:
+    """The same C by the same compiler, unless a test asks for one, gives what it gave before."""
+    if os.environ.get("CC"):
+        _build(made, name, folder, library, by, *how)
+        return
+    parts = (made.files, made.cdef, name, library, by, how, compiler.given_flags())
+    key = hashlib.sha256(repr(parts).encode()).hexdigest()
+    if key in _libraries:
+        (folder / library).write_bytes(_libraries[key])
+        return
+    _build(made, name, folder, library, by, *how)
+    _libraries[key] = (folder / library).read_bytes()
+
+
+extension.build = _build_once
 
 # kept from one run of the tests to the next
 MODULES = ROOT / "build" / "tests" / "modules"
