@@ -56,6 +56,10 @@ def differences(m: ModuleType, q: Any, qd: Any, t: float, u: Any) -> list[Any]:
     ]
 
 
+def with_slopes(scene: str) -> ModuleType:
+    return eomc.load(variant(scene, f"lin_{scene}", linearize='"parameters"'), MODULES)
+
+
 @pytest.mark.parametrize(
     "scene",
     tiers(
@@ -66,7 +70,7 @@ def differences(m: ModuleType, q: Any, qd: Any, t: float, u: Any) -> list[Any]:
 )
 @pytest.mark.usefixtures("quickly_compiled")
 def test_against_differences(scene: str) -> None:
-    m = eomc.load(variant(scene, f"lin_{scene}", linearize="true"), MODULES)
+    m = with_slopes(scene)
     rng = np.random.default_rng(3)
     q0, qd0 = m.start
     nu = len(m.inputs)
@@ -84,6 +88,24 @@ def test_against_differences(scene: str) -> None:
             linearization(m, q, qd, 0.37), linearization(m, q, qd, 0.37, u), strict=True
         ):
             assert np.array_equal(one, other)
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+def test_linearize_is_the_slope_of_the_acceleration() -> None:
+    module: Any = with_slopes("cartpole_driven")
+    q, qd, u, d = np.array([0.3, 1.1]), np.array([-0.4, 0.7]), np.array([2.0]), 1e-6
+    A, B = module.linearize(q, qd, u)
+    assert A.shape == (4, 4) and B.shape == (4, 1)
+    x = np.concatenate([q, qd, u])
+
+    def rate(x: Any) -> Any:
+        return module.rhs(0.0, x[:4], x[4:])
+
+    slopes = [(rate(x + e) - rate(x - e)) / (2 * d) for e in d * np.eye(5)]
+    # differences over 2e-6 of values below 100: off by d^2 and by rounding, 1e-16*100/1e-6
+    np.testing.assert_allclose(np.hstack([A, B]), np.transpose(slopes), rtol=1e-7, atol=1e-7)
+    with pytest.raises(ValueError, match="expected"):
+        module.linearize(q[None, None], qd[None, None], u)
 
 
 @pytest.mark.slow
@@ -118,14 +140,13 @@ def test_jumping_forces_are_refused() -> None:
         eomc.sources(eomc.read(path))
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.parametrize(
     "name", tiers(("cartpole", "cartpole_driven", "heavy_top", "chain"), "cartpole_driven")
 )
 def test_derivatives_by_parameters(name: str, modules: Modules) -> None:
     """Against central differences, whose own error is that of h^2 and of rounding over h."""
-    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
-    head, _, tail = text.partition("[run]\n")
-    m = modules.unoptimised(f'{head}[run]\nlinearize = "parameters"\n{tail}')
+    m = with_slopes(name)
     random = np.random.default_rng(3)
     q, qd = random.uniform(0.3, 1.0, (2, len(m.coordinates)))
     u = random.standard_normal(len(m.inputs)) if m.inputs else None

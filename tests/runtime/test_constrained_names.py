@@ -28,9 +28,9 @@ def rod(**asked: bool) -> System:
     return replace(made, outputs=(), constraints=(row,), reactions=(pull,), plane=True)
 
 
-@pytest.fixture
-def module(quickly_compiled: None, tmp_path: Path) -> ModuleType:
-    return eomc.load(rod(linearize=True), tmp_path)
+@pytest.fixture(scope="module")
+def module(unoptimised_file: None, tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
+    return eomc.load(rod(linearize=True), tmp_path_factory.mktemp("named"))
 
 
 def test_of_unknown_names_those_that_there_are_are_told(module: ModuleType) -> None:

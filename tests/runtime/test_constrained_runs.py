@@ -33,11 +33,11 @@ def system(name: str, starts: Any, K: str, P: str, rows: dict[str, str], **given
 
 @pytest.fixture(scope="module")
 def rod(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
-    """A pendulum in x and y, by RK4 and dp8, and many at once."""
+    """A pendulum in x and y that a force may push, by RK4 and dp8, and many at once."""
     made = system(
         "rod_xy", {"x": (0.6, 0.4), "y": (-0.8, 0.3)}, "m*(x_dot**2 + y_dot**2)/2", "9.81*m*y",
         {"rod": "x**2 + y**2 - l**2"}, parameters={"m": 2.0, "l": 1.0}, methods=("rk4", "dp8"),
-        batch=True, h=0.005, duration=3.0,
+        inputs=["f"], forces={"x": "f"}, linearize=True, batch=True, h=0.005, duration=3.0,
     )  # fmt: skip
     return eomc.load(made, tmp_path_factory.mktemp("rod"))
 
@@ -91,7 +91,7 @@ def test_a_start_is_assembled_and_held_values_stay(rod: ModuleType) -> None:
     assert longer.q[0].tolist() == [0.0, -2.0]
 
 
-@pytest.mark.parametrize("form", ["plain", "fast"])
+@pytest.mark.parametrize("form", tiers(["plain", "fast"], "fast"))
 def test_a_run_that_can_not_stay_on_its_rows_is_locked(tmp_path: Path, form: Any) -> None:
     """A slider that is driven away from a wall at which its rod is stretched, at 0.5 s.
 
@@ -119,48 +119,50 @@ def test_a_run_that_can_not_stay_on_its_rows_is_locked(tmp_path: Path, form: Any
             assert set(many.status) == {"locked"} and set(many.steps) == {49}
 
 
-def test_steps_behind_which_rows_depend_on_each_other_are_told(tmp_path: Path) -> None:
-    """A parallelogram whose third step ends where it lies flat, and which goes on as one."""
+@pytest.fixture(scope="module")
+def four_bar(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
+    """A parallelogram, or other lengths; a spring may hold the first bar."""
     made = system(
-        "flat", {"a": (-3 / 64, 1.0), "b": (-3 / 64, 1.0), "c": (0.0, 0.0)},
-        "(a_dot**2 + b_dot**2 + c_dot**2)/2", "0",
-        {"along": "cos(a) + cos(c) - cos(b) - 1", "across": "sin(a) + sin(c) - sin(b)"},
+        "four_bar", {"a": (-3 / 64, 1.0), "b": (-3 / 64, 1.0), "c": (0.0, 0.0)},
+        "(a_dot**2 + n*b_dot**2 + m*c_dot**2)/2", "k*(a - 0.9)**2 + g*(2*sin(a) + n*sin(b)/2)",
+        {"along": "r*cos(a) + s*cos(b) + l*cos(c) - d", "across": "r*sin(a) + s*sin(b) + l*sin(c)"},
+        parameters={"r": 1, "s": -1, "l": 1, "d": 1, "n": 1, "m": 1, "k": 0, "g": 0},
         h=1 / 64, duration=6 / 64,
     )  # fmt: skip
+    free = tuple(replace(c, held=False) for c in made.coordinates)
+    return eomc.load(replace(made, coordinates=free), tmp_path_factory.mktemp("bars"))
+
+
+def test_steps_behind_which_rows_depend_on_each_other_are_told(four_bar: ModuleType) -> None:
+    """A parallelogram whose third step ends where it lies flat, and which goes on as one."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        run = eomc.load(made, tmp_path).simulate()
+        run = four_bar.simulate()
     assert run.status == "ok" and run.singular_steps == 1 and run.first_singular == 3 / 64
     np.testing.assert_allclose(run.q[-1], [3 / 64, 3 / 64, 0.0], atol=1e-14)
     assert "a step ends where a constraint depends on others" in str(said[0].message)
 
 
 def test_the_linearization_along_the_constraints_is_that_of_minimal_coordinates(
-    tmp_path: Path,
+    rod: ModuleType,
 ) -> None:
-    """A pendulum in x and y with a torque's like, a force along x, hanging: w^2 = g/l."""
-    made = system(
-        "hanging", {"x": (0.0, 0.0), "y": (-0.5, 0.0)}, "m*(x_dot**2 + y_dot**2)/2", "9.81*m*y",
-        {"rod": "x**2 + y**2 - 1/4"}, parameters={"m": 2.0}, inputs=["f"], forces={"x": "f"},
-        linearize=True,
-    )  # fmt: skip
-    module = eomc.load(made, tmp_path)
-    x0 = np.array([0.0, -0.5]), np.zeros(2)
-    A, B = module.linearize(*x0, u=[0.0])
-    T = module.tangent(*x0)
+    """Of a pendulum in x and y that hangs: w^2 = g/l."""
+    x0, short = (np.array([0.0, -0.5]), np.zeros(2)), {"params": {"l": 0.5}}
+    A, B = rod.linearize(*x0, u=[0.0], **short)
+    T = rod.tangent(*x0, **short)
     assert T.shape == (4, 2)
     np.testing.assert_allclose(T.T @ T, np.eye(2), atol=1e-15)
     slow = T.T @ A @ T
     assert sorted(np.linalg.eigvals(slow).imag) == pytest.approx([-np.sqrt(19.62), np.sqrt(19.62)])
     np.testing.assert_allclose(A @ T, T @ slow, atol=1e-13)  # it leads nowhere else
     assert np.abs(T.T @ B).max() == pytest.approx(0.5)
-    moving = module.project([0.3, -0.4], [1.0, 0.0])
-    along = module.tangent(*moving)
+    moving = rod.project([0.3, -0.4], [1.0, 0.0], **short)
+    along = rod.tangent(*moving, **short)
     by = 1e-6
     for z in along.T:  # changes along it keep the rows, to the first order
         q, qd = moving[0] + by * z[:2], moving[1] + by * z[2:]
-        assert np.abs(module.constraints(q, qd)).max() < 4 * by**2
-        assert np.abs(module.constraint_rates(q, qd)).max() < 4 * by**2
+        assert np.abs(rod.constraints(q, qd, **short)).max() < 4 * by**2
+        assert np.abs(rod.constraint_rates(q, qd, **short)).max() < 4 * by**2
 
 
 def test_reactions_along_a_run_are_those_of_their_times(tmp_path: Path) -> None:
@@ -241,22 +243,13 @@ def test_a_projection_judges_each_row_by_its_own_size(modules: Modules, k: float
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def test_a_projection_does_not_leap_across_turns(tmp_path: Path) -> None:
+def test_a_projection_does_not_leap_across_turns(four_bar: ModuleType) -> None:
     """From where the rows' slopes nearly vanish, Newton's whole step would be some 1e9 rad."""
-    made = system(
-        "folded", {"a": (1.0, 0.0), "b": (np.pi - 1, 0.0), "c": (0.0, 0.0)},
-        "(a_dot**2 + b_dot**2 + c_dot**2)/2", "0",
-        {"along": "0.5*cos(a) + cos(b) - 0.5*cos(c) - 1",
-         "across": "0.5*sin(a) + sin(b) - 0.5*sin(c)"},
-        h=0.01, duration=0.1,
-    )  # fmt: skip
-    module = eomc.load(
-        replace(made, coordinates=tuple(replace(c, held=False) for c in made.coordinates)), tmp_path
-    )
+    folded = {"params": {"r": 0.5, "s": 1.0, "l": -0.5}}
     for off in (0.0, 1e-9):
-        q, _ = module.project([1.0, -1.0 + off, 1e-9], np.zeros(3))
+        q, _ = four_bar.project([1.0, -1.0 + off, 1e-9], np.zeros(3), **folded)
         assert np.abs(q).max() < 20
-        assert np.abs(module.constraints(q, np.zeros(3))).max() < 1e-14
+        assert np.abs(four_bar.constraints(q, np.zeros(3), **folded)).max() < 1e-14
 
 
 @pytest.mark.slow
@@ -271,19 +264,14 @@ def test_equilibrium_is_where_forces_and_multipliers_balance(rod: ModuleType) ->
         rod.equilibrium([0.6, -0.8], free=["y"])
 
 
-def test_equilibrium_of_a_linkage_with_a_spring(tmp_path: Path) -> None:
-    """A four-bar whose crank a torsion spring holds: no acceleration, and rows hold."""
-    made = system(
-        "sprung", {"a": (0.7, 0.0), "b": 0.3, "c": 1.2},
-        "(a_dot**2 + 3*b_dot**2 + 2*c_dot**2)/2",
-        "4*(a - 0.9)**2 + 9.81*(sin(a) + 3*sin(b)/2 + sin(a))",
-        {"px": "cos(a) + 3*cos(b) - 2*cos(c) - 2.5", "py": "sin(a) + 3*sin(b) - 2*sin(c)"},
-    )  # fmt: skip
-    m = eomc.load(made, tmp_path)
-    q, _ = m.equilibrium()
-    assert np.abs(m.constraints(q, 0 * q)).max() < 1e-14
-    assert np.abs(m.acceleration(q, 0 * q)).max() < 1e-12
-    assert np.abs(q - m.simulate(steps=0).q[0]).max() > 1e-3
+def test_equilibrium_of_a_linkage_with_a_spring(four_bar: ModuleType) -> None:
+    """Its crank is held by a torsion spring: no acceleration, and rows hold."""
+    m, how = four_bar, {"params": {"s": 3, "l": -2, "d": 2.5, "n": 3, "m": 2, "k": 4, "g": 9.81}}
+    start, _ = m.project([0.7, 0.3, 1.2], np.zeros(3), held=["a"], **how)
+    q, _ = m.equilibrium(start, **how)
+    assert np.abs(m.constraints(q, 0 * q, **how)).max() < 1e-14
+    assert np.abs(m.acceleration(q, 0 * q, **how)).max() < 1e-12
+    assert np.abs(q - start).max() > 1e-3
 
 
 def test_equilibrium_of_a_structure_that_can_not_move(rod: ModuleType) -> None:
