@@ -88,12 +88,8 @@ def made(name: str) -> System:
 @cache
 def generated(name: str) -> dict[str, str]:
     """The C of both forms by file, as it lies in a build."""
-    folder = eomc.build(made(name), PLAIN).folder
-    return {
-        str(file.relative_to(folder)): file.read_text(encoding="utf-8")
-        for file in folder.rglob("*.[ch]")
-        if ".plain" not in file.parts
-    }
+    files = eomc.sources(made(name)).files
+    return {file: text for file, text in files.items() if file.endswith((".c", ".h"))}
 
 
 def both(name: str) -> tuple[ModuleType, ModuleType]:

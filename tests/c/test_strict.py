@@ -30,13 +30,8 @@ MATHEMATICS = set(
 MATHEMATICS |= {f"{name}f" for name in MATHEMATICS}  # single precision
 
 
-@pytest.mark.parametrize(
-    ("which", "name"),
-    [
-        pytest.param(c, n, marks=() if (c, n) == ("gcc", "cartpole") else pytest.mark.slow)
-        for c, n in product(("gcc", "g++", "clang", "clang++"), MOST)
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("which", "name"), product(("gcc", "g++", "clang", "clang++"), MOST))
 def test_no_compiler_has_anything_to_say(which: str, name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
     cpp = which.endswith("++")

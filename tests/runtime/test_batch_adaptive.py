@@ -8,9 +8,9 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import tiers
+from conftest import Modules, tiers
 from test_adaptive import KEPLER
-from test_events import BALL
+from test_events import BALL, built
 
 import eomc
 from eomc.model.from_scene import from_scene
@@ -129,9 +129,9 @@ tolerance = 1e-9
 
 
 @pytest.mark.parametrize("told", [False, True])
-def test_stiff_ones_go_on_by_newtons_method(told: bool) -> None:
+def test_stiff_ones_go_on_by_newtons_method(modules: Modules, told: bool) -> None:
     """x = exp(-t) but for what has died out in 1e-4 s, where c = k is large; the others swing."""
-    springs = eomc.load(from_scene(parse(STIFF, "stiff.toml")), BUILDS)
+    springs = modules.unoptimised(STIFF)
     c = np.array([1e4, 0.0, 1e4, 0.1, 1e5])
     params = {"c": c, "k": np.where(c > 1, c, 1.0)}
     run = springs.simulate_batch(params=params, times=[1.0, 5.0], stiff=told)
@@ -171,9 +171,9 @@ def test_rows_are_start_and_end_where_no_times_are_asked_for(orbits: ModuleType)
     assert run.energy.shape == (3, 2) and run["x"].shape == (3, 2)
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_jumps_and_stops_act_in_each() -> None:
-    text = BALL.replace("bouncing", "many_balls").replace("[run]\n", MANY)
-    balls = eomc.load(from_scene(parse(text, "balls.toml")), BUILDS)
+    balls = built(BALL)
     far = np.array([1e9, 0.7, 1e9])
     run = balls.simulate_batch(params={"far": far, "e": [0.8, 0.8, 0.5]}, duration=2.0)
     assert run.status.tolist() == ["ok", "ok", "accumulated"]

@@ -17,23 +17,34 @@ LENGTHS = np.array([0.4, 0.35, 0.3])
 SHORT = {"steps": STEPS, "every": EVERY}
 GIVEN: dict[str, Any] = {
     "signals": None,
-    "constant": [0.7],
-    "each": np.array([[0.7], [-0.2], [0.1]]),
-    "tables": np.linspace(-1, 1, COUNT * STEPS).reshape(COUNT, STEPS, 1),
-    "a table": np.linspace(-1, 1, STEPS).reshape(1, STEPS, 1),
+    "constant": [0.7, 0.1],
+    "each": np.array([[0.7, 0.1], [-0.2, 0.2], [0.1, 0.0]]),
+    "tables": np.linspace(-1, 1, COUNT * STEPS * 2).reshape(COUNT, STEPS, 2),
+    "a table": np.linspace(-1, 1, STEPS * 2).reshape(1, STEPS, 2),
 }
+# a four-bar with motors at the crank and the rocker, and friction in both and between
+DRIVEN = (
+    (SCENES / "four_bar.toml").read_text(encoding="utf-8").split("[picture]")[0]
+    + """[inputs]
+at_crank = { signal = "sin(5*t) - q1_dot/9", limits = [-0.6, 0.6] }
+at_rocker = {}
+[forces]
+q1 = "at_crank - q1_dot/7"
+q2 = "-q2_dot/9"
+q3 = "at_rocker"
+[run]
+h = 0.01
+batch = true
+tolerance = 1e-9
+inverse_dynamics = true
+frames = true
+"""
+).replace('"four_bar"', '"driven_four_bar"')
 
 
 @pytest.fixture(scope="module")
 def linkage(modules: Modules) -> ModuleType:
-    """A four-bar whose crank a motor turns."""
-    text = (SCENES / "four_bar.toml").read_text(encoding="utf-8")
-    text = text.split("[picture]")[0].replace('"four_bar"', '"driven_four_bar"')
-    text += (
-        '[inputs]\ntorque = { signal = "sin(5*t) - q1_dot/9", limits = [-0.6, 0.6] }\n'
-        '[forces]\nq1 = "torque"\n[run]\nh = 0.01\nbatch = true\ntolerance = 1e-9\n'
-    )
-    return modules.unoptimised(text)
+    return modules.unoptimised(DRIVEN)
 
 
 def starts(m: ModuleType) -> dict[str, Any]:

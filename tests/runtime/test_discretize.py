@@ -176,6 +176,7 @@ def test_against_differences_of_forty_digits(
     assert np.any(right_u) or given == "beyond"
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.parametrize("text", tiers([EXPLICIT, IMPLICIT], EXPLICIT), ids=lambda t: t[-20:-1])
 def test_plain_c_has_the_same(modules: Modules, text: str, tmp_path: Any) -> None:
     fast = modules.unoptimised(text)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cases import SCENES
 from conftest import Modules
+from test_constrained_batch import DRIVEN
 from test_constrained_discretize import ROPE, SLEIGH
 
 ASK = "[run]\ninverse_dynamics = true\nframes = true\n"
@@ -16,13 +17,7 @@ ASK = "[run]\ninverse_dynamics = true\nframes = true\n"
 
 @pytest.fixture(scope="module")
 def linkage(modules: Modules) -> ModuleType:
-    """A four-bar with motors at the crank and the rocker, and friction in both and between."""
-    text = (SCENES / "four_bar.toml").read_text(encoding="utf-8")
-    text = text.split("[picture]")[0].replace('"four_bar"', '"driven_bars"')
-    return modules.unoptimised(
-        text + '[inputs]\nat_crank = { signal = "t" }\nat_rocker = {}\n'
-        '[forces]\nq1 = "at_crank - q1_dot/7"\nq2 = "-q2_dot/9"\nq3 = "at_rocker"\n' + ASK
-    )
+    return modules.unoptimised(DRIVEN)
 
 
 def motion(m: ModuleType, u: Any) -> tuple[Any, Any, Any]:
@@ -32,7 +27,7 @@ def motion(m: ModuleType, u: Any) -> tuple[Any, Any, Any]:
 
 
 def test_of_one_drive_it_is_what_has_acted(linkage: ModuleType) -> None:
-    for u, drive in (([1.3, 0.0], "q1"), ([0.0, -0.7], "q3")):
+    for u, drive in (([0.6, 0.0], "q1"), ([0.0, -0.7], "q3")):
         q, qd, qdd = motion(linkage, u)
         tau, multipliers = linkage.drive_forces(q, qd, qdd, [drive])
         right = np.zeros_like(q)
@@ -45,7 +40,7 @@ def test_of_one_drive_it_is_what_has_acted(linkage: ModuleType) -> None:
 
 @pytest.mark.parametrize("drives", [None, ["q1", "q3"], ["q2", "q3"]])
 def test_of_more_drives_than_freedoms_the_least_is_taken(linkage: ModuleType, drives: Any) -> None:
-    q, qd, qdd = (x[3] for x in motion(linkage, [1.3, -0.2]))
+    q, qd, qdd = (x[3] for x in motion(linkage, [0.6, -0.2]))
     tau, multipliers = linkage.drive_forces(q, qd, qdd, drives)
     A, D = linkage.constraint_jacobian(q), linkage.D(q)
     whole = linkage.inverse_dynamics(q, qd, qdd)

@@ -327,6 +327,7 @@ def test_names_that_their_rates_need_are_taken(name: str, words: str) -> None:
         )  # fmt: skip
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_a_run_ends_at_the_third_impact_by_a_time_that_it_sets(tmp_path: Path) -> None:
     made = System.make(
         "counted", {"y": 1.0}, "y_dot**2/2", "9.81*y",

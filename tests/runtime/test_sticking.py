@@ -199,6 +199,15 @@ def test_nothing_slides_against_its_velocity(modules: Modules) -> None:
         assert np.all(run.q[:, 3:] * run.qd[:, :3] > -1e-9) and np.all(np.diff(run.energy) < 1e-7)
 
 
+def test_rounding_of_a_velocity_at_rest_does_not_move_a_block(block: ModuleType) -> None:
+    rest = block.simulate().q[-1, :1]
+    for rate in (3e-31, -1e-32):
+        run = block.simulate(rest, [rate], duration=1.0)
+        assert not any(len(e) for e in run.events.values()) and run.q[-1, 1:].tolist() == [0]
+        assert run.q[-1, 0] == rest[0]
+
+
+@pytest.mark.slow
 def test_rounding_of_a_velocity_at_rest_is_none(modules: Modules) -> None:
     arm = modules.unoptimised(ARM)
     rest = arm.simulate(tol=1e-10).q[-1, :3]
