@@ -9,8 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from conftest import ROOT, needs
 from fmus import plain
+
+from eomc.cli.main import main
 
 TEXT = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
 SAID = r"x = (\S+) m, theta = (\S+) rad"
@@ -32,8 +35,12 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which the page's commands have been typed."""
     here = tmp_path_factory.mktemp("interfaces")
     (commands,) = blocks("sh")
-    for command in commands.splitlines():
-        ran(sys.executable, "-m", *command.split(), at=here)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(here)
+        for command in commands.splitlines():
+            name, *words = command.split()
+            done = CliRunner().invoke(main, words)
+            assert (name, done.exit_code) == ("eomc", 0), done.output
     return here
 
 

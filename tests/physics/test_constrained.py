@@ -120,10 +120,7 @@ def test_steps_that_end_where_a_four_bar_lies_flat() -> None:
 
 @pytest.mark.parametrize(
     ("method", "counts", "most"),
-    tiers(
-        [("dp8", [529, *range(660, 671), 515], 1e-6), ("rk4", [1036, 1109, 1113, 1125], 2e-5)],
-        "rk4",
-    ),
+    tiers([("dp8", [529, *range(660, 671), 515], 1e-6), ("rk4", [1036, 1109, 1113, 1125], 2e-5)]),
 )
 def test_stages_near_a_flat_position_do_no_harm(
     method: str, counts: list[int], most: float

@@ -116,8 +116,8 @@ def test_against_differences_of_steps(modules: Modules, text: str, method: str, 
 @pytest.mark.parametrize(
     "text",
     [
-        pytest.param(WINCH, id="winch"),
-        pytest.param(SLEIGH, id="sleigh", marks=pytest.mark.slow),
+        pytest.param(WINCH, id="winch", marks=pytest.mark.slow),
+        pytest.param(SLEIGH, id="sleigh"),
         pytest.param(ROPE, id="rope", marks=pytest.mark.slow),
     ],
 )

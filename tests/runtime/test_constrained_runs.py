@@ -119,8 +119,7 @@ def test_a_run_that_can_not_stay_on_its_rows_is_locked(tmp_path: Path, form: Any
             assert set(many.status) == {"locked"} and set(many.steps) == {49}
 
 
-@pytest.fixture(scope="module")
-def four_bar(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
+def four_bars() -> System:
     """A parallelogram, or other lengths; a spring may hold the first bar."""
     made = system(
         "four_bar", {"a": (-3 / 64, 1.0), "b": (-3 / 64, 1.0), "c": (0.0, 0.0)},
@@ -130,7 +129,12 @@ def four_bar(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
         h=1 / 64, duration=6 / 64,
     )  # fmt: skip
     free = tuple(replace(c, held=False) for c in made.coordinates)
-    return eomc.load(replace(made, coordinates=free), tmp_path_factory.mktemp("bars"))
+    return replace(made, coordinates=free)
+
+
+@pytest.fixture(scope="module")
+def four_bar(modules: Modules) -> ModuleType:
+    return modules.unoptimised(four_bars())
 
 
 def test_steps_behind_which_rows_depend_on_each_other_are_told(four_bar: ModuleType) -> None:

@@ -19,11 +19,7 @@ from eomc.verify.taylor import Jets
 NAMES = list(constrained.cases())
 SMALL = [n for n in NAMES if n != "iftomm_A02_four_bar_N40"]
 PLANE = [n for n in SMALL if n != "bricard_cube"]
-QUICK = (
-    "pendulum_over_the_top",
-    "pendulum_on_a_winch",
-    "chaplygin_sleigh",
-)
+QUICK = ("pendulum_on_a_winch", "chaplygin_sleigh")
 RUNS = [n for n in SMALL if constrained.cases()[n]["rk4_measured"]]
 
 
