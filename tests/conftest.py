@@ -9,7 +9,7 @@ import shutil
 import signal
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -71,7 +71,7 @@ def _binding_flags() -> tuple[str, ...]:
 
 
 extension.binding_flags = _binding_flags
-_build = extension.build
+_run, _build = extension.run, extension.build
 _libraries: dict[str, bytes] = {}
 
 
@@ -82,6 +82,8 @@ def _build_once(
     if os.environ.get("CC"):
         _build(made, name, folder, library, by, *how)
         return
+    if len(how) == 1 and compiler.given_flags() == ("-O0",):
+        how = (*how, precompiled.UNOPTIMISED)
     parts = (made.files, made.cdef, name, library, by, how, compiler.given_flags())
     key = hashlib.sha256(repr(parts).encode()).hexdigest()
     if key in _libraries:
@@ -91,7 +93,13 @@ def _build_once(
     _libraries[key] = (folder / library).read_bytes()
 
 
-extension.build = _build_once
+def _link(name: str, command: Sequence[str], folder: Path) -> None:
+    """What starts a program is not in a library that Python loads; left out, it is found sooner."""
+    plain = os.environ.get("CC") or sys.platform != "linux"
+    _run(name, command if plain else [*command, "-nostdlib"], folder)
+
+
+extension.build, extension.run = _build_once, _link
 
 # kept from one run of the tests to the next
 MODULES = ROOT / "build" / "tests" / "modules"
