@@ -227,7 +227,7 @@ def test_chains_by_tensions_too(links: int, modules: Modules) -> None:
 @pytest.mark.slow
 def test_a_wide_angle_goes_to_libm(modules: Modules) -> None:
     """Where reduction by pi/2 in parts has no digit left."""
-    module = modules.of_text(chain(5))
+    module = modules.unoptimised(chain(5))
     trusted = symbolic.of(system.from_scene(scene.parse(chain(5), "links.toml")))
     q = np.array([3e15, -2e12, 1e9, 7e22, 0.5])
     qd = np.linspace(-1, 1, 5)
@@ -249,7 +249,7 @@ def test_a_wide_angle_leaves_the_others_of_its_register_alone(modules: Modules) 
 @pytest.mark.parametrize("at", [0, 4])
 def test_steps_at_an_angle_too_wide_to_move(at: int, modules: Modules) -> None:
     """Of 7e22 rad, where numbers are 8e6 apart; the other links swing about it."""
-    module = modules.of_text(chain(5))
+    module = modules.unoptimised(chain(5))
     trusted = symbolic.of(system.from_scene(scene.parse(chain(5), "links.toml")))
     start, rates = module.start
     start[at] = 7e22
@@ -263,7 +263,7 @@ def test_steps_at_an_angle_too_wide_to_move(at: int, modules: Modules) -> None:
 def test_faults_are_told(modules: Modules) -> None:
     """A singular D, by parameters or at a place; a state that is not finite: each with the last
     good state."""
-    module = modules.of_text(chain(5))
+    module = modules.unoptimised(chain(5))
     q, qd = module.start
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -300,7 +300,7 @@ def test_all_that_shares_it_agrees(text: str, modules: Modules) -> None:
 
 
 def test_steps_take_it_and_predict_no_angles(modules: Modules) -> None:
-    header, source = (written(modules.of_text(chain(5)), end) for end in "hc")
+    header, source = (written(modules.unoptimised(chain(5)), end) for end in "hc")
     assert "predicted" not in header and "predicted" not in source
     # stages 0 and 2, each for two points: in the step, and in all the accelerations for themselves
     assert source.count("links5_both_configurations(&w->k, at, next") == 1
