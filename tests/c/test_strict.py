@@ -31,7 +31,7 @@ MATHEMATICS |= {f"{name}f" for name in MATHEMATICS}  # single precision
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("which", "name"), product(("gcc", "g++", "clang", "clang++"), MOST))
+@pytest.mark.parametrize(("which", "name"), [*product(("gcc", "g++", "clang", "clang++"), MOST)])
 def test_no_compiler_has_anything_to_say(which: str, name: str, tmp_path: Path) -> None:
     title = kit(name, tmp_path)
     cpp = which.endswith("++")

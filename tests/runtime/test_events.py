@@ -182,8 +182,8 @@ def test_crossings_close_together_in_one_long_step_are_seen(free: ModuleType) ->
 
 def roots(f, t_end: float) -> list[float]:
     """All zeros in (0, t_end], by fine sampling and bisection in 30 digits."""
-    times = np.linspace(0, t_end, 4001)
-    values = [f(mpmath.mpf(t)) for t in times]
+    times = np.linspace(0, t_end, 4001).tolist()
+    values = [f(t, math) for t in times]
     found = []
     with mpmath.workdps(30):
         for a, b, fa, fb in zip(times, times[1:], values, values[1:], strict=False):
@@ -203,18 +203,18 @@ def test_random_events_are_those_of_the_exact_motion(springs: ModuleType, seed: 
         q0, qd0, tol=1e-13, duration=12.0, params=dict(zip("kabcd", (k, a, b, c, d), strict=True))
     )
 
-    def motion(t):
-        w = mpmath.sqrt(mpmath.mpf(k))
-        x = q0[0] * mpmath.cos(t) + qd0[0] * mpmath.sin(t)
-        y = q0[1] * mpmath.cos(w * t) + qd0[1] / w * mpmath.sin(w * t)
-        return x, y, -q0[1] * w * mpmath.sin(w * t) + qd0[1] * mpmath.cos(w * t)
+    def motion(t, by):
+        w = by.sqrt(k)
+        x = q0[0] * by.cos(t) + qd0[0] * by.sin(t)
+        y = q0[1] * by.cos(w * t) + qd0[1] / w * by.sin(w * t)
+        return x, y, -q0[1] * w * by.sin(w * t) + qd0[1] * by.cos(w * t)
 
-    def line(t):
-        x, y, _ = motion(t)
+    def line(t, by=mpmath):
+        x, y, _ = motion(t, by)
         return a * x + b * y - c
 
-    def curve(t):
-        x, _, rate = motion(t)
+    def curve(t, by=mpmath):
+        x, _, rate = motion(t, by)
         return x * rate - d
 
     for name, f in (("line", line), ("curve", curve)):
