@@ -19,7 +19,7 @@ from eomc.toolchain.running import run
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
 
-_UNASSERTED = ("-DNDEBUG",)  # cffi asserts its own tables at each call: a seventh of the compilation
+_UNASSERTED = ("-DNDEBUG",)  # cffi asserts its own tables at each call: a seventh of the time
 
 
 def build(
@@ -45,6 +45,7 @@ def build(
         raise first if isinstance(first, OSError) else fault from None
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
     common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
+    bound = [*common, STANDARD, *_UNASSERTED, *binding_flags(), *include]
     jobs = [
         [
             *common,
@@ -55,8 +56,7 @@ def build(
             "-o",
             "scene.o",
         ],
-        [*common, STANDARD, *_UNASSERTED, *binding_flags(), *include]
-        + ["-c", f"{at}binding.c", "-o", "binding.o"],
+        [*bound, "-c", f"{at}binding.c", "-o", "binding.o"],
     ]
     run(name, folder, *jobs)
     link = [*compiler.command, "-shared", "scene.o", "binding.o", "-lm", "-o", library]
