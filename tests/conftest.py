@@ -93,10 +93,10 @@ def _build_once(
     _libraries[key] = (folder / library).read_bytes()
 
 
-def _link(name: str, command: Sequence[str], folder: Path) -> None:
+def _link(name: str, folder: Path, *commands: Sequence[str]) -> None:
     """What starts a program is not in a library that Python loads; left out, it is found sooner."""
-    plain = os.environ.get("CC") or sys.platform != "linux"
-    _run(name, command if plain else [*command, "-nostdlib"], folder)
+    plain = os.environ.get("CC") or sys.platform != "linux" or "-shared" not in commands[0]
+    _run(name, folder, *commands if plain else [[*commands[0], "-nostdlib"]])
 
 
 extension.build, extension.run = _build_once, _link
