@@ -92,7 +92,7 @@ class Place:
         scale = np.sqrt(np.diag(self.metric))
         return self.sizes * float(np.linalg.norm(scale * self.q) + 1e-3 * np.max(scale))
 
-    @property
+    @cached_property
     def off(self) -> float:
         """How far the rows are from zero, as a length."""
         return float(np.linalg.norm(self.phi / self.sizes))
@@ -159,6 +159,8 @@ class Manifold:
         D = lower("D", e.tape, [x for row in e.D for x in row], (), (), system.names)
         self.functions = {**made, "D": D}
         self.parameters = {p.name: p.value for p in system.parameters}
+        self._names = [x.name for x in (*system.q, *system.qd)]
+        self._fixed = {**self.parameters, **dict.fromkeys((u.name for u in system.u), 0.0)}
         self.holonomic = [k for k, c in enumerate(system.constraints) if c.holonomic]
         self.rows = range(len(system.constraints))
         self.timed = any(t.name in made[name].uses for name in ("constraints", "constraint_rates"))
@@ -172,13 +174,8 @@ class Manifold:
         return np.array([o.coefficient != 0 for o in outputs]).reshape(len(self.rows), -1)
 
     def _values(self, q: Sequence[Any], qd: Sequence[Any], time: Any) -> dict[str, Any]:
-        names = (*(x.name for x in self.system.q), *(x.name for x in self.system.qd))
-        return {
-            **self.parameters,
-            **dict.fromkeys((u.name for u in self.system.u), 0.0),
-            t.name: time,
-            **dict(zip(names, (*q, *qd), strict=True)),
-        }
+        moving = dict(zip(self._names, (*q, *qd), strict=True))
+        return {**self._fixed, t.name: time, **moving}
 
     def value(self, name: str, q: Vector, qd: Vector, time: float, /, **changed: float) -> Vector:
         """What a function gives, in doubles; nan where it has no value."""
@@ -199,14 +196,18 @@ class Manifold:
 
     def place(self, q: Vector, time: float = 0.0) -> Place | None:
         """The rows there; None where something has no value."""
-        n, rest = len(q), np.zeros(len(q))
-        phi = self.value("constraints", q, rest, time)
-        phi[len(self.holonomic) :] = 0
+        n, rest, phi = len(q), np.zeros(len(q)), self._off(q, time)
         A = self.value("constraint_jacobian", q, rest, time).reshape(-1, n)
         D = self.value("D", q, rest, time).reshape(n, n)
         if not all(np.all(np.isfinite(x)) for x in (phi, A, D)):
             return None
         return Place(q, time, phi, A, D)
+
+    def _off(self, q: Vector, time: float) -> Vector:
+        """(m,): what the rows of positions are there, 0 for the others."""
+        phi = self.value("constraints", q, np.zeros(len(q)), time)
+        phi[len(self.holonomic) :] = 0
+        return phi
 
     def rounding(self, q: Vector, qd: Vector, time: float, name: str = "constraints") -> Vector:
         """(m,): what one rounding of each coordinate, rate and parameter does to a row."""
@@ -254,22 +255,25 @@ class Manifold:
 
     def _rounded(self, place: Place) -> bool:
         """Whether rows are as near to zero as doubles can tell."""
-        limit = np.maximum(self.rounding(place.q, 0 * place.q, place.t), EPS * place.levels)
-        return bool(np.all(np.abs(place.phi) <= ROUNDED * limit))
+        off, limit = np.abs(place.phi), EPS * place.levels
+        if not np.all(off <= ROUNDED * limit):
+            limit = np.maximum(self.rounding(place.q, 0 * place.q, place.t), limit)
+        return bool(np.all(off <= ROUNDED * limit))
 
     def _shortened(self, place: Place, step: Vector, strict: bool, longest: float) -> Place | None:
         # rows of sines hold again and again: a step across turns leads anywhere
-        part = min(1.0, longest / max(longest, _most(step)))
+        part, change = min(1.0, longest / max(longest, _most(step))), place.A @ step
         while part > SHORTEST:
-            there = self.place(place.q + part * step, place.t)
-            if there is not None:
-                aim = place.phi + part * (place.A @ step)
-                aim[len(self.holonomic) :] = 0
-                bent = float(np.linalg.norm((there.phi - aim) / place.sizes))
-                less = float(np.linalg.norm(there.phi / place.sizes))
-                if less < (1 - part / 8) * place.off and (
-                    not strict or bent <= LINEAR * part * place.off
-                ):
+            q = place.q + part * step
+            phi, aim = self._off(q, place.t), place.phi + part * change
+            aim[len(self.holonomic) :] = 0
+            bent = float(np.linalg.norm((phi - aim) / place.sizes))
+            less = float(np.linalg.norm(phi / place.sizes))
+            if less < (1 - part / 8) * place.off and (
+                not strict or bent <= LINEAR * part * place.off
+            ):
+                there = self.place(q, place.t)
+                if there is not None:
                     return there
             part /= 2
         return None

@@ -233,7 +233,7 @@ class Answer(ABC):
         """What `of` makes of each state."""
         if q.ndim == 1:
             return of(q, qd, t, values)
-        times, *each = (np.broadcast_to(x, len(q)).tolist() for x in (t, *values))
+        times, *each = (by_rows(x, len(q)) for x in (t, *values))
         params = zip(*each, strict=True) if each else [()] * len(q)
         ends = np.array([of(*state) for state in zip(q, qd, times, params, strict=True)])
         return ends[:, 0], ends[:, 1]
@@ -311,3 +311,9 @@ class Answer(ABC):
             if self.system.constraints
             else (q, qd)
         )
+
+
+def by_rows(x: ArrayLike, rows: int) -> list[Any]:
+    """One value for each row, or the values of all."""
+    each: list[Any] = [np.asarray(x).tolist()] * rows
+    return each if np.ndim(x) == 0 else np.broadcast_to(x, rows).tolist()

@@ -22,7 +22,7 @@ from eomc.base.errors import EomcError
 from eomc.model.discrete import constant
 from eomc.model.system import System, dot, t
 from eomc.verify.discrete import Discrete
-from eomc.verify.oracle import MATRICES, SCALARS, Answer, Values, Vector
+from eomc.verify.oracle import MATRICES, SCALARS, Answer, Values, Vector, by_rows
 from eomc.verify.shorter import by_rates, shorter
 from eomc.verify.taylor import Jets
 
@@ -266,7 +266,7 @@ class Reference(Answer):
     ) -> Iterator[tuple[Vector, Vector, float, ArrayLike | None, Values]]:
         """The rows of arguments that have them, as those of single states."""
         rows = len(q)
-        times, *each = (np.broadcast_to(x, rows).tolist() for x in (t, *values))
+        times, *each = (by_rows(x, rows) for x in (t, *values))
         us: Any = [None] * rows if u is None else np.asarray(u, float)
         params = zip(*each, strict=True) if each else [()] * rows
         return zip(q, qd, times, us, params, strict=True)
