@@ -282,9 +282,12 @@ def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
 
 @contextlib.contextmanager
 def sleeping_compiler(folder: Path) -> Iterator[tuple[str, Path]]:
-    """A compiler that sleeps, and the file where it tells its process ids."""
+    """A compiler that sleeps, and the file where it tells its process ids.
+
+    It tells them late: by then who has started it knows it too, and may be interrupted.
+    """
     pids = folder / "pids"
-    cc = script(folder / "sleeping", f"echo $$ >> {pids}\nexec sleep 60\n")
+    cc = script(folder / "sleeping", f"sleep 0.3\necho $$ >> {pids}\nexec sleep 60\n")
     try:
         yield cc, pids
     finally:
