@@ -112,7 +112,7 @@ class Killed:
                 now = os.statvfs(self.root)
                 used = {"size": (now.f_blocks - now.f_bfree) * now.f_frsize,
                         "nr_inodes": now.f_files - now.f_ffree}[kind]  # fmt: skip
-                limit = f"{kind}={int(used * (1 + 1.5 * step / steps)) + 1}"
+                limit = f"{kind}={int(used * (1 + 2.5 * step / steps)) + 1}"
                 self._mount(f"remount,{limit}")
                 how, words = in_a_fork(lambda: eomc.build(self.scene, self.root).name, 60)
                 assert how == "done" or "No space left on device" in str(words), (limit, words)
