@@ -112,6 +112,28 @@ def test_a_run_in_one_call_is_the_same(kepler: ModuleType, how: dict) -> None:
     assert np.array_equal(quick(how.get("t0", 0.0) + 0.3), long(how.get("t0", 0.0) + 0.3))
 
 
+def test_the_first_step_is_no_longer_than_asked(kepler: ModuleType) -> None:
+    """Far away and at rest nothing else bounds it."""
+    far = {"q0": [1e3, 0.0], "qd0": [0.0, 0.0], "params": {"mu": 1e-12}}
+    run = kepler.simulate(duration=100.0, h_most=0.01, **far)
+    assert np.diff(run.t).max() <= 0.01 * (1 + 1e-9)
+    assert np.diff(kepler.simulate(duration=100.0, **far).t)[0] > 0.05
+
+
+@pytest.mark.parametrize("end", [1e10, 1e15, 1e300])
+def test_a_distant_end_changes_no_step(kepler: ModuleType, end: float) -> None:
+    def enough(done: int, whole: int) -> None:
+        raise KeyboardInterrupt
+
+    near = kepler.simulate(duration=1e3)
+    with pytest.raises(kepler.Interrupted) as stopped:
+        kepler.simulate(duration=end, progress=enough)
+    run = stopped.value.run
+    both = min(len(run), len(near)) - 2
+    assert both > 20 and np.array_equal(run.t[:both], near.t[:both])
+    assert np.array_equal(run.q[:both], near.q[:both])
+
+
 def test_a_run_of_more_steps_than_the_last_is_whole(kepler: ModuleType) -> None:
     kepler.simulate(duration=0.1)
     room = kepler._model._room

@@ -26,6 +26,7 @@ METHOD = GAUSS16
 TITLE = f"the implicit method of Gauss and Legendre with {METHOD.stages} stages"
 MOST = 14  # sweeps of a step
 ROUGHEST = 2 * 0.8**-8  # of the root of tol/2: a step that is refused after two sweeps
+LONGEST = 1e4  # times of the motion at the start: by no longer a time the least step is measured
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
 SMALL = 300  # operations of accelerations, up to which many instances go side by side
@@ -39,7 +40,7 @@ def memory(functions: Functions) -> str:
 
 def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
-    vectors, few = (8, 24) if steep(system) else (6, 20)
+    vectors, few = (8, 25) if steep(system) else (6, 21)
     stages = METHOD.stages * len(system.coordinates)
     return vectors * width + stages + few + 2 * len(system.events)
 
@@ -125,7 +126,7 @@ class Stepping:
     @cached_property
     def step(self) -> CFunction:
         """The next step."""
-        given = (self.number("t_end"), self.number("tol"), *self.rest)
+        given = (*map(self.number, ("t_end", "tol", "h_most")), *self.rest)
         arguments = (self.state, *given, self.held)
         return CFunction(
             f"{self.method}_adapted", self.functions.status, arguments, qualifier="static"
@@ -189,6 +190,7 @@ def steps(made: Stepping) -> Adaptive:
         settled=made.settle.call(most=f"{target.literal(ROUGHEST)}*aim", **known),
         within=made.within,
         corners=steep(target.system),
+        longest=target.literal(LONGEST),
         close=target.literal(float(f"{real.epsilon ** (-1 / 3):.0e}")),
         share=target.literal(SHARE),
         ends=c.in_braces(numbers(row, real) for row in _ends()),

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import sympy
 from numpy.typing import NDArray
 
 from eomc.derive import lagrange
@@ -209,19 +210,25 @@ class Manifold:
         phi[len(self.holonomic) :] = 0
         return phi
 
+    @cached_property
+    def constants(self) -> Vector:
+        """(m,): how large the numbers are that a row adds."""
+        rows = (sympy.Add.make_args(c.formula) for c in self.system.constraints)
+        return np.array([sum(abs(float(x)) for x in row if not x.free_symbols) for row in rows])
+
     def rounding(self, q: Vector, qd: Vector, time: float, name: str = "constraints") -> Vector:
-        """(m,): what one rounding of each coordinate, rate and parameter does to a row."""
-        total = np.zeros(len(self.rows))
+        """(m,): what one rounding of each coordinate, rate, parameter and number does to a row."""
+        total = self.constants if name == "constraints" else np.zeros(len(self.rows))
         value, step = self.value(name, q, qd, time), 2.0**-20
         for k in range(len(q)):
             for x in (q, qd) if name != "constraints" else (q,):
                 nudged = x.copy()
                 nudged[k] *= 1 + step
                 moved = self.value(name, *((nudged, qd) if x is q else (q, nudged)), time)
-                total += np.nan_to_num(np.abs(moved - value)) / step
+                total = total + np.nan_to_num(np.abs(moved - value)) / step
         for name_of, p in self.parameters.items():
             moved = self.value(name, q, qd, time, **{name_of: p * (1 + step)})
-            total += np.nan_to_num(np.abs(moved - value)) / step
+            total = total + np.nan_to_num(np.abs(moved - value)) / step
         return EPS * (total + np.abs(value))
 
     def descend(

@@ -64,6 +64,7 @@ class Adaptive(Tableau):
     within: CFunction
     settled_within: str
     corners: bool
+    longest: str
     close: str
     share: str
     ends: tuple[str, ...]
