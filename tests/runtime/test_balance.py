@@ -10,10 +10,59 @@ from types import ModuleType
 import numpy as np
 import pytest
 from conftest import Modules
-from scipy.integrate import trapezoid
+from scipy.integrate import solve_ivp, trapezoid
 
 from eomc.runtime.balance import _work as work
 
+FALLING = """
+eomc = 1
+name = "falling_down"
+[coordinates]
+y = { unit = "m", start = 1.0 }
+[parameters]
+e = 0.8
+g = 9.81
+c = 0.0
+m = 1.0
+at = 1e9
+[inputs]
+F = { unit = "N" }
+[energy]
+kinetic     = "m*y_dot**2/2"
+potential   = "m*g*y"
+dissipation = "c*y_dot**2/2"
+[forces]
+y = "F"
+[[event]]
+name      = "impact"
+when      = "y"
+direction = "falling"
+action    = "jump"
+y_dot     = "-e*y_dot"
+[[event]]
+name   = "sheds"
+when   = "t - at"
+action = "jump"
+m      = "m/2"
+[run]
+duration = 2.0
+tolerance = 1e-11
+"""
+STICKS = """
+eomc = 1
+name = "stopped_block"
+[coordinates]
+x = { start = 1.0, friction = "F" }
+[parameters]
+F = 1.0
+[energy]
+kinetic   = "x_dot**2/2"
+potential = "5*x**2"
+[run]
+friction  = "stick"
+tolerance = 1e-11
+duration  = 5.0
+"""
 SPRING = """
 eomc = 1
 name = "pushed"
@@ -141,3 +190,77 @@ def test_short_runs_have_one(pushed: ModuleType, steps: int) -> None:
 def test_a_balance_travels(pushed: ModuleType) -> None:
     balance = pushed.simulate(steps=30).balance()
     assert pickle.loads(pickle.dumps(balance)) == balance
+
+
+@pytest.fixture
+def falling(modules: Modules) -> ModuleType:
+    """A ball that bounces, with a drag, a force, and half of it lost at a time."""
+    return modules.unoptimised(FALLING)
+
+
+@pytest.mark.parametrize("times", [None, np.linspace(0.0, 2.0, 21)])
+def test_each_impact_takes_what_is_exact(falling: ModuleType, times: np.ndarray | None) -> None:
+    """(1 - e^2) of the kinetic energy, g e^2k before the impact k; whatever the rows are."""
+    run = falling.simulate() if times is None else falling.simulate(times=times)
+    count = len(run.events["impact"])
+    balance = run.balance()
+    assert count == 3 and balance.inputs == balance.forces == balance.lost == 0
+    assert balance.jumps == pytest.approx(-9.81 * (1 - 0.8 ** (2 * count)), rel=1e-12)
+    assert balance.told and balance.left < 1e-9
+    assert balance.words.startswith("jumps took 7.24 J; numerical error")
+    assert pickle.loads(pickle.dumps(balance)) == balance
+
+
+def test_work_between_jumps_is_told_apart(falling: ModuleType) -> None:
+    """With drag and a push, beside SciPy's ends of each fall; the push does F (y(T) - y(0))."""
+    run = falling.simulate(u=[1.5], params={"c": 0.3, "e": 0.7})
+    balance, y, lost, jumps = run.balance(), [1.0, 0.0, 0.0], 0.0, 0.0
+    times = [0.0, *run.events["impact"].t, 2.0]
+    for begin, end in pairwise(times):
+        y[2] = 0.0
+        y = solve_ivp(
+            lambda _, s: [s[1], -9.81 + 1.5 - 0.3 * s[1], 0.3 * s[1] ** 2], (begin, end), y,
+            method="DOP853", rtol=1e-12, atol=1e-13,
+        ).y[:, -1].tolist()  # fmt: skip
+        lost += y[2]
+        if end < 2.0:
+            jumps -= (1 - 0.7**2) * y[1] ** 2 / 2
+            y[1] *= -0.7
+    assert len(times) > 4 and balance.told
+    assert balance.lost == pytest.approx(lost, rel=1e-9)
+    assert balance.jumps == pytest.approx(jumps, rel=1e-9)
+    assert balance.inputs == pytest.approx(1.5 * (run.q[-1, 0] - 1.0), rel=1e-9)
+    assert balance.forces == pytest.approx(0, abs=1e-9)
+    change = run.energy[-1] - run.energy[0]
+    assert abs(balance.inputs - balance.lost + balance.jumps - change) <= balance.left + 1e-12
+    assert "J were lost, jumps took" in balance.words
+
+
+def test_what_a_jump_sheds_is_its_own_energy(falling: ModuleType) -> None:
+    """Half of the mass at 0.2 s: of K + P = m g, which it has all the way down, half."""
+    balance = falling.simulate(duration=0.4, params={"at": 0.2}).balance()
+    assert balance.jumps == pytest.approx(-9.81 / 2, rel=1e-12) and balance.told
+    with pytest.warns(RuntimeWarning, match="ever sooner"):
+        resting = falling.simulate(duration=9.0, params={"c": 0.2}).balance()
+    assert resting.told and resting.lost - resting.jumps == pytest.approx(9.81, rel=1e-9)
+    assert resting.left < 1e-8
+
+
+def test_friction_that_sticks_loses_all_and_its_jumps_take_nothing(modules: Modules) -> None:
+    """Amplitudes fall by 2 F/k, 0.2, each half swing, and F goes all the way: 1, .8, ..., 0."""
+    run = modules.unoptimised(STICKS).simulate()
+    balance = run.balance()
+    fall = 5 * (1 - run.q[-1, 0] ** 2)
+    assert (
+        balance.told and abs(balance.jumps) < 1e-12 and balance.forces == pytest.approx(0, abs=1e-9)
+    )
+    assert balance.lost == pytest.approx(fall, rel=1e-10) and run.qd[-1, 0] == 0
+    assert balance.words.startswith(f"{fall:.3g} J were lost; numerical error")
+
+
+def test_of_many_jumps_it_is_told_without_many_rows(falling: ModuleType) -> None:
+    """Ten thousand of them, elastic: nothing is taken, and nothing lost."""
+    run = falling.simulate(duration=9000.0, params={"e": 1.0})
+    balance = run.balance()
+    assert len(run.events["impact"]) > 9000 and balance.told
+    assert abs(balance.jumps) < 1e-9 and balance.left < 1e-6

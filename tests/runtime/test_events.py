@@ -315,10 +315,10 @@ def test_a_jump_to_no_state_ends_the_run_at_it_and_says_which(free: ModuleType) 
     assert run.q[-1, 0] == pytest.approx(0.5) and len(run.events["gap"]) == 1
 
 
-def test_a_stopped_run_has_an_error_and_a_jumping_one_no_balance(ball: ModuleType) -> None:
+def test_a_stopped_run_has_an_error_and_a_jumping_one_a_balance(ball: ModuleType) -> None:
     run = ball.simulate(params={"far": 0.7}, duration=5.0, estimate=True)
     assert run.stopped == "away" and max(run.error.end.values()) < 1e-9 and run.error.resolved
-    assert ball.simulate(duration=1.0).balance() is None
+    assert ball.simulate(duration=1.0).balance().jumps == pytest.approx(-0.36 * G, rel=1e-8)
     assert ball.simulate(duration=0.3).balance().left < 1e-9
     with pytest.warns(RuntimeWarning, match="ever sooner"):
         resting = ball.simulate(duration=10.0)

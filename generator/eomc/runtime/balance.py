@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,21 +12,28 @@ from .arguments import Array
 from .package import reduced
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .model import Model
     from .trajectory import Run
 
 _ROWS = 8  # of an interpolating polynomial, and so the order of an integral, at most
 _FEWEST = 2 * _ROWS + 1  # from which on every fourth shows something; below all may be wrong
 _LEAST = 0.5  # of the order that is taken for seen
 _TOLD = 0.005  # of the largest part: an integral that is off by more tells nothing
+_EVEN = 8  # rows for each step between jumps, beside
+_PIECE = 4 * _ROWS + 1  # for a piece
+_MOST = 400_000  # rows of all pieces
 
 
 @dataclass(frozen=True)
 class Balance:
-    """J: E(end) - E(0) = inputs + forces - lost, and what the method and rounding made of it.
+    """J: E(end) - E(0) = inputs + forces - lost + jumps, and what method and rounding made of it.
 
     E is the energy, or Jacobi's integral where that is another. inputs: their work, the signals'
     too. lost: what forces took that are odd in the velocities, as friction and dampers are. forces:
-    the work of all others, and of what moves with time. left: E - E(0) less all work, the largest
+    the work of all others, and of what moves with time. jumps: what the jumps of events put in,
+    less than 0 where they took, as impacts do. left: E - E(0) less all of these, the largest
     along the run: the method's error. unsure: how far the work may be off, since steps are long;
     less than that can't be seen of `left`. told: whether that is little beside the work.
     """
@@ -37,6 +44,7 @@ class Balance:
     left: float
     unsure: float
     told: bool
+    jumps: float = 0.0
 
     @property
     def words(self) -> str:
@@ -47,6 +55,7 @@ class Balance:
             (self.inputs, "inputs put in {} J", "inputs took {} J"),
             (self.forces, "forces put in {} J", "forces took {} J"),
             (self.lost, "{} J were lost", "negative damping put in {} J"),
+            (self.jumps, "jumps put in {} J", "jumps took {} J"),
         )
         found = [(more if x > 0 else less).format(f"{abs(x):.3g}")
                  for x, more, less in ways if abs(x) > self.unsure]  # fmt: skip
@@ -59,54 +68,138 @@ class Balance:
 
 
 def balance(run: Run) -> Balance | None:
-    """The balance of a run; None where it jumps, or inputs change from step to step, unseen."""
+    """The balance of a run; None where inputs change from step to step, unseen."""
     if run._u is not None and np.ndim(run._u) != 1:
         return None
     if not np.isfinite(run.jacobi).all():
         return None
-    run = run._even()  # all its rows: few may look smooth and not be
-    if (np.diff(run.t) == 0).any():  # the state jumps
-        return None
+    run = _between_jumps(run)  # all its rows: few may look smooth and not be
     model, energy = run._model, run.jacobi.astype(float)
     none = np.zeros(model.nu) if model.nu else None
     power, rest = (run._values("power", u=u).astype(float) for u in (run._u, none))
-    ahead, back = (
-        run._values("tau", lambda q, qd, way=way, **held: model.tau(q, way * qd, **held), u=none)
-        for way in (1, -1)
+    back = _turned_back(model)
+    ahead, behind = (
+        run._values("tau", lambda q, qd, way=way, **held: model.tau(*way(q, qd), **held), u=none)
+        for way in (lambda q, qd: (q, qd), back)
     )
-    braking = np.sum((back - ahead) / 2 * run.qd, axis=1).astype(float)
-    (work, off), (other, _), (lost, blur) = (_work(run.t, y) for y in (power, rest, braking))
+    braking = np.sum((behind - ahead) / 2 * run.qd, axis=1).astype(float)
+    jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # the rows behind them
+    (work, off), (other, _), (lost, blur) = (
+        _in_pieces(run.t, y, jumps) for y in (power, rest, braking)
+    )
+    leaps = np.zeros(len(energy))
+    leaps[jumps] = energy[jumps] - energy[jumps - 1]
     inputs, forces = float(work[-1] - other[-1]), float(other[-1] + lost[-1])
-    parts = inputs, forces, float(lost[-1])
+    parts, leapt = (inputs, forces, float(lost[-1])), np.cumsum(leaps)
     off, rounding = max(off, blur), float(np.finfo(model.dtype).eps * np.max(np.abs(energy)))
-    left = float(np.max(np.abs(energy - energy[0] - work)))
-    told = off <= max(_TOLD * max(map(abs, parts)), 10 * rounding)
-    return Balance(*parts, left, off + rounding, told=told)
+    left = float(np.max(np.abs(energy - energy[0] - work - leapt)))
+    jumped = float(leapt[-1])
+    told = off <= max(_TOLD * max(map(abs, (*parts, jumped))), 10 * rounding)
+    return Balance(*parts, left, off + rounding, told=told, jumps=jumped)
 
 
-def _work(t: Array, power: Array) -> tuple[Array, float]:
-    """The integral of the power up to each row, (n,), and how far it may be off.
+def _turned_back(model: Model) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """What takes a state to the one that moves back along the same way.
+
+    Friction that sticks has a mode beside each velocity, its sign.
+    """
+    signs = np.ones(model.nq, model.dtype)
+    signs[[at for at, _ in model._rows.modes]] = -1
+    return lambda q, qd: (signs * q, -qd)
+
+
+def _between_jumps(run: Run) -> Run:
+    """With rows equally far apart, in each piece between jumps, which stand on two rows each."""
+    happened = getattr(run, "_happened", ((),))[0]
+    if len(happened) and not (np.diff(run.t) == 0).any():
+        run = _of_steps(run)  # rows that were asked for pass jumps over
+    n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
+    if not len(jumps):
+        return run._even()
+    firsts, lasts = np.array([0, *jumps]), np.array([*(jumps - 1), n - 1])
+    if not run._model.has_power:
+        return run
+    times, grain = [], 16 * np.finfo(run._model.dtype).eps
+    for a, b in zip(firsts.tolist(), lasts.tolist(), strict=True):
+        rows = min(max(_EVEN * (b - a + 1), _PIECE), max(_MOST // len(firsts), 2))
+        begin, end = float(run.t[a]), float(run.t[b])
+        if end - begin > rows * grain * max(abs(begin), abs(end)):
+            times.append(np.linspace(begin, end, rows)[1:-1])
+    ends = np.unique([*firsts, *lasts])
+    adaptive: Any = run
+    bare = adaptive._at(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
+    made: Run = bare._with(np.concatenate(times)) if times else bare
+    return made
+
+
+def _of_steps(run: Any) -> Run:
+    """The same run with a row after each step, and both of each jump."""
+    q, qd = run._begin
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        made: Run = run._model.simulate(
+            q,
+            qd,
+            duration=run._t_end - run.t0,
+            u=run._u,
+            params=run._params,
+            t0=run.t0,
+            tol=run.tol,
+            h_most=run._h_most or None,
+            stiff=run._stiff,
+        )
+    return made
+
+
+def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:
+    """`_work`, of a power that is smooth between jumps alone; these: the rows behind them.
+
+    Pieces of as many rows, which are equally far apart in each, go together.
+    """
+    if not len(jumps):
+        sums, off = _work(t, power)
+        return sums, float(off)
+    firsts, behind = np.array([0, *jumps]), np.array([*jumps, len(t)])
+    counts, sums, unsure = behind - firsts, np.zeros(len(t)), 0.0
+    for n in np.unique(counts).tolist():
+        rows = firsts[counts == n][:, None] + np.arange(n)
+        apart = (t[rows[:, -1]] - t[rows[:, 0]]) / max(n - 1, 1)
+        work, off = _work(np.arange(n), power[rows])
+        sums[rows] = work * apart[:, None]
+        unsure += float(np.sum(off * apart))
+    before = np.concatenate([[0.0], np.cumsum(sums[behind - 1])])[:-1]
+    return sums + np.repeat(before, counts), unsure
+
+
+def _work(t: Array, power: Array) -> tuple[Array, Array]:
+    """The integral of a power (..., n) up to each row, (..., n), and how far it may be off, (...).
 
     That is thrice what the integrals over every second and fourth row show, by their order.
     """
     n = len(t)
+
+    def sums(rows: Array) -> Array:
+        parts = np.cumsum(_intervals(t[rows], power[..., rows]), axis=-1)
+        return np.concatenate([np.zeros((*power.shape[:-1], 1)), parts], axis=-1)
+
     if n < _FEWEST:
-        sums = np.concatenate([[0.0], np.cumsum(_intervals(t, power))])
-        return sums, float(np.max(np.abs(power)) * (t[-1] - t[0]))
+        return sums(np.arange(n)), np.max(np.abs(power), axis=-1) * (t[-1] - t[0])
     kept = [np.unique([*range(0, n, stride), n - 1]) for stride in (1, 2, 4)]
-    found = [np.concatenate([[0.0], np.cumsum(_intervals(t[k], power[k]))]) for k in kept]
+    found = [sums(rows) for rows in kept]
     whole, half, quarter = (
-        sums[np.searchsorted(k, kept[-1])] for sums, k in zip(found, kept, strict=True)
+        some[..., np.searchsorted(k, kept[-1])] for some, k in zip(found, kept, strict=True)
     )
-    near, far = (float(np.max(np.abs(x))) for x in (whole - half, half - quarter))
-    order = min(max(math.log2(far / near), _LEAST), _ROWS) if near and far else _LEAST
+    near, far = (np.max(np.abs(x), axis=-1) for x in (whole - half, half - quarter))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        order = np.log2(far / near)
+    order = np.clip(np.where((near > 0) & (far > 0), order, _LEAST), _LEAST, _ROWS)
     return found[0], 3 * near / (2.0**order - 1)
 
 
 def _intervals(t: Array, y: Array) -> Array:
-    """The integral of y from each row to the next, (n - 1,), by polynomials through some rows.
+    """The integral of y (..., n) from each row to the next, (..., n - 1), by polynomials.
 
-    Rows are equally far apart, but perhaps the last.
+    Each goes through some rows, which are equally far apart, but perhaps the last.
     """
     n, rows = len(t), min(_ROWS, len(t))
     k = np.arange(n - 1)
@@ -115,8 +208,8 @@ def _intervals(t: Array, y: Array) -> Array:
     weights = usual[k - first]
     last = first == n - rows
     weights[last] = _weights(t[n - rows :])[k[last] - (n - rows)]
-    windows = np.lib.stride_tricks.sliding_window_view(y, rows)[first]
-    return np.asarray(np.sum(weights * windows, axis=1))
+    windows = np.lib.stride_tricks.sliding_window_view(y, rows, axis=-1)[..., first, :]
+    return np.asarray(np.sum(weights * windows, axis=-1))
 
 
 def _weights(nodes: Array) -> Array:

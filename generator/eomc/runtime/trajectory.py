@@ -191,8 +191,8 @@ class Run(ConstrainedRun, Columns):
     def balance(self) -> Balance | None:
         """What inputs and forces put in and what was lost, J, and the error that this leaves.
 
-        None where the state jumps, or inputs are held that the rows or the power's formula don't
-        tell: take every=1.
+        What jumps of events put in or took stands apart. None where inputs are a table or a
+        function, which change from step to step.
         """
         return balance(self)
 
