@@ -102,3 +102,15 @@ def test_wrong_ones_of_multipliers_fail(
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
     rows_outputs.report(comparison, None)
     assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
+
+
+def test_slopes_along_what_jumps_set_are_right(modules: Modules) -> None:
+    text = ON_A_ROD.replace('"x_dot**2 + y_dot**2"', '"m*(x_dot**2 + y_dot**2)"')
+    text = text.replace("[inputs]", "[parameters]\nm = 1.5\n[inputs]").replace(
+        "lambda_rod", "m*x*lambda_rod"
+    )
+    text += '[[event]]\nname = "sheds"\nwhen = "t - 1"\naction = "jump"\nm = "m/2"\n'
+    made, module = assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text)
+    comparison = Comparison(made, module, np.random.default_rng(0), None)
+    rows_outputs.report(comparison, None)
+    assert [row.passed for row in comparison.rows] == [True, True], comparison.rows

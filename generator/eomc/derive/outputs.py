@@ -85,4 +85,7 @@ def _outputs(system: System, sloped: bool, tape: Tape, known: dict[Symbol, Expr]
     if not sloped:
         return Outputs(tape, values, ((),) * len(values))
     along = (*state, *system.u, *system.qdd)
-    return Outputs(tape, values, tuple(tuple(tape.gradient([(y, S.One)], along)) for y in values))
+    kept, tape.still = tape.still, frozenset()  # outputs have slopes along discrete variables
+    slopes = tuple(tuple(tape.gradient([(y, S.One)], along)) for y in values)
+    tape.still = kept
+    return Outputs(tape, values, slopes)

@@ -91,15 +91,10 @@ def _slopes(of: Comparison, module: Any, formulas: Formulas) -> float:
 
 
 def _of_multipliers(of: Comparison, s: State) -> Iterator[Vector]:
-    """Their slopes along q, qd and u, (nc, 2 nq + nu), by differences of several widths.
-
-    Along discrete variables there are none.
-    """
+    """Their slopes along q, qd and u, (nc, 2 nq + nu), by differences of several widths."""
     n, scale = len(s.q), np.array([of.sampler.spread, of.sampler.speed])
-    still = [k for k, q in enumerate(of.system.q) if q not in of.system.rates]
     given = (of.reference, s, scale, of.sampler.defaults, "multipliers")
     for slopes, _ in derivatives.by_differences(*given):
-        slopes[:, [*still, *(n + k for k in still)]] = 0
         yield slopes[:, : 2 * n + len(of.system.inputs)]
 
 
