@@ -17,6 +17,7 @@ from compilers import STRICT, compiled, run
 from conftest import EVERYTHING, MODULES, ROOT, Modules, needs, tiers
 
 import eomc
+from eomc import pipeline
 from eomc.emit import c_names
 from eomc.emit.fast.files import PLACEHOLDERS
 from eomc.model import from_scene as system
@@ -368,3 +369,44 @@ def test_a_misuse_is_told_by_the_compiler(tmp_path: Path) -> None:
     done = run("cc", "-std=c99", "-O2", "-ffast-math", "-c", "cartpole.c", cwd=tmp_path)
     assert done.returncode != 0
     assert "-ffast-math" in done.stderr
+
+
+BOUNCING = """eomc = 1
+name = "bouncing"
+[coordinates]
+y = { unit = "m", start = 1.0 }
+[energy]
+kinetic = "y_dot**2/2"
+potential = "9.81*y"
+[[event]]
+name = "impact"
+when = "y"
+direction = "falling"
+action = "jump"
+y_dot = "-0.9*y_dot"
+[[event]]
+name = "late"
+when = "t - 1.234"
+action = "stop"
+[outputs]
+height = "y + t"
+[run]
+h = 0.01
+duration = 3.0
+tolerance = 1e-10
+"""
+
+
+def test_the_example_of_a_scene_with_events_goes_by_its_tolerance(
+    modules: Modules, tmp_path: Path
+) -> None:
+    (tmp_path / "bouncing.toml").write_text(BOUNCING, encoding="utf-8")
+    pipeline.write_c(tmp_path / "bouncing.toml", tmp_path / "c")
+    compiled("cc", *STRICT, "-O0", "-I.", "main.c", "bouncing.c", "-lm", cwd=tmp_path / "c")
+    head, *rows = run("./a.out", cwd=tmp_path / "c").stdout.splitlines()
+    found = np.array([[float(x) for x in row.split(",")] for row in rows])
+    times = [*(3.0 * k / 200 for k in range(83)), 1.234]
+    wanted = modules.unoptimised(BOUNCING).simulate(times=times)
+    assert head == "t,y,y_dot,height,energy"
+    columns = [times, wanted["y"], wanted["y_dot"], wanted["height"], wanted.energy]
+    np.testing.assert_allclose(found, np.column_stack(columns), atol=1e-12)

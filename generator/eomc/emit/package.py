@@ -51,6 +51,17 @@ def main(target: Target) -> Main:
     method, asked = s.run.methods[0], [o.name for o in s.outputs]
     outputs = public.evaluation("outputs").call(u="NULL") if asked else ""
     solved = asked and takes_qdd(target, "outputs")
+    rows = {"q_rows": "NULL", "qd_rows": "NULL", "memory": "&memory", "status": "&status"}
+    if s.run.tolerance is None:
+        run = public.run(method).call(
+            t0="0", first="n", steps="next", u="NULL", u_stride="0", every="0", **rows
+        )
+    else:
+        method, limits = f"{adaptive.METHOD.name}_adaptive", {"t_end": "next", "h_most": "0"}
+        run = public.adaptive(adaptive.METHOD.name).call(
+            t="&t", **limits, u="NULL", steps="1000000", times="NULL", count="0", t_rows="NULL",
+            room="0", events="NULL", which="NULL", event_rows="NULL", **rows,
+        )  # fmt: skip
     return Main(
         title=FreeText(s.title),
         stamp=tuple(stamp(target)),
@@ -59,14 +70,16 @@ def main(target: Target) -> Main:
         real=target.real.name,
         has_p=target.needs_p,
         method=method,
+        adaptive=s.run.tolerance is not None,
+        rows=ROWS,
+        t_end=target.literal(s.run.duration),
+        tolerance=target.literal(s.run.tolerance or 0.0),
+        events=bool(s.events),
         h=target.literal(s.run.h),
         steps=steps,
         every=max(1, steps // ROWS),
         columns=("t", *names, *(f"{n}_dot" for n in names), *asked, "energy"),
-        run=public.run(method).call(
-            t0="0", first="n", steps="next", u="NULL", u_stride="0", every="0", q_rows="NULL",
-            qd_rows="NULL", memory="&memory", status="&status",
-        ),
+        run=run,
         energy=public.evaluation("energy").call(),
         outputs=outputs,
         accelerations=public.acceleration.call(u="NULL") if solved else "",

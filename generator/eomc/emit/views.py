@@ -13,7 +13,10 @@ from eomc.program.ir import Cost
 
 @dataclass(frozen=True)
 class Main:
-    """c/main.c.jinja: the scene's own run. run, energy, outputs: calls; accelerations: outputs'."""
+    """c/main.c.jinja: the scene's own run, adaptive where it has a tolerance.
+
+    run, energy, outputs: calls; accelerations: outputs'.
+    """
 
     TEMPLATE: ClassVar[str] = "c/main.c"
     title: FreeText
@@ -23,6 +26,11 @@ class Main:
     real: str
     has_p: bool
     method: str
+    adaptive: bool
+    rows: int
+    t_end: str
+    tolerance: str
+    events: bool
     h: str
     steps: int
     every: int
