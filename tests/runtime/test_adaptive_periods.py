@@ -138,10 +138,11 @@ def test_events_at_and_between_the_periods_happen_once(sampled: ModuleType) -> N
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"u": law}, "a function, or one row after another, .*: give control_period="),
-        ({"u": np.ones((4, 1))}, "give control_period="),
+        ({"u": law}, "a function is asked once a control period, .*: give control_period="),
+        ({"u": np.ones((4, 1))}, r"u: shape \(4, 1\), expected \(1,\).* take control_period="),
+        ({"u": [1.0, 2.0]}, r"u: shape \(2,\), expected \(1,\)"),
         ({"u": np.ones((4, 1)), "control_period": 0.1}, "4 rows for 20 control periods of 0.1 s"),
-        ({"u": law, "control_period": 0.0}, "control_period: 0 is not a step size"),
+        ({"u": law, "control_period": 0.0}, "control_period: 0 is not a period"),
         ({"u": law, "control_period": math.nan}, "control_period: nan is not a finite number"),
         ({"u": lambda t, q, qd: None, "control_period": 0.1}, "the function returned None"),
         ({"u": lambda t, q, qd: [1, 2], "control_period": 0.1}, r"u: shape \(2,\)"),
@@ -153,6 +154,21 @@ def test_what_can_not_be_held_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=words):
         sampled.simulate(tol=1e-9, **how)
+
+
+def test_what_a_function_raises_says_when(sampled: ModuleType) -> None:
+    def bad(t: float, q: Any, qd: Any) -> list[float]:
+        return [math.nan if t > 0.25 else 0.0]
+
+    for how in ({"tol": 1e-9}, {"h": 0.0025}):
+        with pytest.raises(ValueError, match="is not finite") as raised:
+            sampled.simulate(u=bad, control_period=0.1, **how)
+        assert "u was asked at t = 0.3 s, q = [" in raised.value.__notes__[0]
+
+
+def test_more_periods_than_memory_has_room_for_are_refused(sampled: ModuleType) -> None:
+    with pytest.raises(MemoryError, match="take a longer one, or a shorter duration"):
+        sampled.simulate(u=law, control_period=1e-12, duration=1e3)
 
 
 def test_ctrl_c_in_the_function_keeps_what_was_done(sampled: ModuleType) -> None:

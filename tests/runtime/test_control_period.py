@@ -149,3 +149,17 @@ def test_a_period_may_be_longer_than_the_run(balanced: ModuleType, period: float
     assert balanced.simulate(steps=7, control_period=period).steps == 7
     runs = balanced.simulate_batch(np.zeros((3, 2)), steps=7, u=[[1.0, 0.0]], control_period=period)
     assert np.all(runs.steps == 7)
+
+
+def test_a_law_that_does_not_repeat_itself_has_no_estimate(balanced: ModuleType) -> None:
+    draw = np.random.default_rng(3)
+
+    def noisy(t: float, q: Any, qd: Any) -> Any:
+        return np.array(law(t, q, qd)) + 1e-3 * draw.normal(size=2)
+
+    run = balanced.simulate(u=noisy, control_period=0.02, steps=40)
+    with pytest.raises(ValueError, match="other values at the start"):
+        run.estimate()
+    with pytest.warns(RuntimeWarning, match="other values at the start"):
+        again = balanced.simulate(u=noisy, control_period=0.02, steps=40, estimate=True)
+    assert again.error is None and len(again) == 41

@@ -153,7 +153,6 @@ def tableau(made: Stepping) -> dict[str, Any]:
         "extent": made.form.extent,
         "stages": m.stages,
         "f": real.suffix,
-        "fabs": f"fabs{real.function_suffix}",
         "sqrt": f"sqrt{real.function_suffix}",
         "eps": target.literal(real.epsilon),
         "tiny": target.literal(1e-30),
@@ -175,6 +174,7 @@ def steps(made: Stepping) -> Adaptive:
     return Adaptive(
         **tableau(made),
         title=TITLE,
+        fabs=f"fabs{real.function_suffix}",
         lanes=form.lanes and f"{form.lanes} ",
         total=_total([f"half[{i}]" for i in range(m.stages // 2)]),
         top=c.in_braces(numbers(row, real) for row in zip(*last, strict=True)),

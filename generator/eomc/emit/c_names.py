@@ -30,9 +30,9 @@ _OURS = frozenset(
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
 # that is called so has another name in C
 OWN = frozenset(
-    "ACCUMULATED AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE LANES LOCKED NC NE NF NOINLINE "
-    "NOT_FINITE NO_CONVERGENCE NQ NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS TWO_COUNT UNROLL "
-    "WIDE_BYTES WIDE_COUNT".split()
+    "ACCUMULATED AHEAD_COUNT FAST_FMA FAST_FMAF FOUR_COUNT H INLINE LANES LOCKED NC NE NE_ROOM NF "
+    "NOINLINE NOT_FINITE NO_CONVERGENCE NQ NU NY OK ROLLED SINGULAR STAMP TILE TILE_BLOCKS "
+    "TWO_COUNT UNROLL WIDE_BYTES WIDE_COUNT".split()
 )
 
 Access = Callable[[str, str], str]  # (array, name of the coordinate or input) -> its element in C

@@ -196,8 +196,7 @@ class AdaptiveRun(Run):
         return self._at(times, np.array(self(times)))
 
     def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
-        if isinstance(self._u, str):
-            raise ValueError(f"estimate: {self._u}")
+        self._repeated()
         self.error = error_of(self, run, progress)
         if words := self.error.warning:
             warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)

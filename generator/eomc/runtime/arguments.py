@@ -358,8 +358,9 @@ def as_step_size(h: Any, dtype: np.dtype[Any], name: str = "h") -> float:
     limits = np.finfo(dtype)
     if not limits.smallest_subnormal <= size <= limits.max:
         why = "" if size <= 0 else f" in {dtype}"
+        what = "period" if name == "control_period" else "step size"
         raise ValueError(
-            f"{name}: {size:g} is not a step size{why}: give a number of seconds greater than 0"
+            f"{name}: {size:g} is not a {what}{why}: give a number of seconds greater than 0"
         )
     return size
 

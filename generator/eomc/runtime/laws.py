@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .arguments import Array
-from .functions import Functions
+
+if TYPE_CHECKING:
+    from .functions import Functions
+
+
+def asked(
+    law: Callable[..., Any], inputs: Callable[[Any], Any], t: float, q: Array, qd: Array
+) -> Array:
+    """What a function gives at a state, as the inputs are; what it raises says when."""
+    try:
+        found = inputs(law(t, q.copy(), qd.copy()))
+    except Exception as fault:
+        fault.add_note(f"u was asked at t = {t:.9g} s, q = {q}, qd = {qd}")
+        raise
+    if found is None:
+        raise ValueError("u: the function returned None, not the inputs")
+    return np.array(found)
 
 
 class Law:
@@ -23,9 +39,7 @@ class Law:
 
     def __call__(self, t: float, q: Array, qd: Array) -> Array:
         """What the function gives at the start of so many steps."""
-        self.last = self.inputs(self.law(t, q.copy(), qd.copy()))
-        if self.last is None:
-            raise ValueError("u: the function returned None, not the inputs")
+        self.last = asked(self.law, self.inputs, t, q, qd)
         self.calls += 1
         rows = -(-self.calls * self.hold // self.every)  # that begin before the next call
         self.kept += [self.last.copy()] * (rows - len(self.kept))

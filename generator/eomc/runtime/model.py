@@ -295,7 +295,10 @@ class Model(Constrained):
         if words := run.message if run.status != "ok" else run._remark:
             warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=3)
         if estimate:
-            run._judged(None, 4)
+            try:
+                run._judged(None, 4)
+            except ValueError as fault:  # of what can't be done again; the run is there
+                warnings.warn(f"{self.name}: {fault}", RuntimeWarning, stacklevel=3)
         return run
 
     def _look(

@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .arguments import Array, as_step_size
-from .laws import Sampled
+from .arguments import Array, as_step_size, machine_memory
+from .laws import Sampled, asked
 
 if TYPE_CHECKING:
     from .model import Model
 
 NO_PERIOD = (
-    "u: a function, or one row after another, is held over a control period each, and steps that "
-    "fit a tolerance don't tell how long that is: give control_period=, in s"
+    "u: a function is asked once a control period, and steps that fit a tolerance don't tell how "
+    "long that is: give control_period=, in s"
 )
+_VALUE = 200  # bytes of what is held over a period, as it is kept
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,9 @@ def as_acting(
     if control_period is not None:
         period = as_step_size(control_period, model.dtype, "control_period")
     if u is None:
-        sampled = period is not None and model.nu
-        return Periods(Sampled(model, params), period) if sampled and period else None
+        if period is None or not model.nu:
+            return None
+        return _few(model, Periods(Sampled(model, params), period), span)
     if not model.nu:
         raise ValueError("u: this scene has no inputs")
     if not callable(u):
@@ -57,14 +59,30 @@ def as_acting(
         if rows.ndim < 2:
             return model._inputs(u)
         rows = model._array(rows, "u", model.nu)
-        if period is not None and len(rows) != (count := _count(span, period)):
+        if period is None:
+            raise ValueError(
+                f"u: shape {np.shape(u)}, expected ({model.nu},): one value an input; rows, each "
+                "held over a control period, take control_period=, in s"
+            )
+        if len(rows) != (count := _count(span, period)):
             raise ValueError(
                 f"u: {len(rows)} rows for {count} control periods of {period:g} s: give a row each"
             )
         u = rows.copy()
     if period is None:
         raise ValueError(NO_PERIOD)
-    return Periods(u, period)
+    return _few(model, Periods(u, period), span)
+
+
+def _few(model: Model, made: Periods, span: float) -> Periods:
+    """The same, or a MemoryError where its rows would take more than a half of the memory."""
+    count = _count(span, made.period)
+    if count * (model._bytes(1) + _VALUE) > machine_memory() / 2:
+        raise MemoryError(
+            f"control_period: the rows of {count:.3g} periods of {made.period:g} s don't fit in "
+            "memory: take a longer one, or a shorter duration"
+        )
+    return made
 
 
 def _count(span: float, period: float) -> int:
@@ -106,10 +124,7 @@ class Acting:
         assert self.periods
         done, of, model = len(self.values), self.periods.of, self.model
         if callable(of):
-            held = model._inputs(of(t, q.copy(), qd.copy()))
-            if held is None:
-                raise ValueError("u: the function returned None, not the inputs")
-            self.held = held.copy()
+            self.held = asked(of, model._inputs, t, q, qd)
         else:
             self.held = of[done]
         self.values.append(self.held)

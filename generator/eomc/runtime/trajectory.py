@@ -19,6 +19,7 @@ from .columns import Columns, File
 from .constrained_run import ConstrainedRun
 from .dense import states
 from .estimate import Estimate, estimate
+from .laws import asked
 from .notebook import html
 from .package import reduced
 from .plot import plot
@@ -44,6 +45,12 @@ PASSED_OVER = (
     "steps or method; a function as u then takes control_period="
 )
 LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
+
+
+NOISE = (
+    "estimate: u gives other values at the start than it gave in the run, as noise does, or what "
+    "keeps a state of its own: let it depend on t, q and qd alone"
+)
 
 
 class MotionError(ArithmeticError):
@@ -279,14 +286,13 @@ class Run(ConstrainedRun, Columns):
 
         Where u is a function, it is called again, as often as in the run for each finer one.
         Warns where the motion is not resolved. Raises ValueError where the run was pickled and lost
-        that function.
+        that function, or where this gives other values at the start than it gave: noise.
         """
         return self._judged(progress, 3)
 
     def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
         """`estimate`, its warning given to whoever called so many levels above."""
-        if isinstance(self._u, str):
-            raise ValueError(f"estimate: {self._u}")
+        self._repeated()
         try:
             self.error = self._estimated(progress)
         except KeyboardInterrupt:
@@ -294,6 +300,15 @@ class Run(ConstrainedRun, Columns):
         if words := self.error.warning:
             warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
         return self.error
+
+    def _repeated(self) -> None:
+        """Raise ValueError where the run can't be done again."""
+        if isinstance(self._u, str):
+            raise ValueError(f"estimate: {self._u}")
+        if callable(self._u) and self._applied is not None and len(self) and self.t[0] == self.t0:
+            now = asked(self._u, self._model._inputs, self.t0, self.q[0], self.qd[0])
+            if not np.array_equal(now, self._applied[0]):
+                raise ValueError(NOISE)
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
         return estimate(self, progress)

@@ -144,9 +144,11 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """The known name that `name` may have been meant for, or the empty string."""
     known = list(known)
     same = [k for k in known if k.lower() == name.lower()]
+    begun = [k for k in known if k.startswith(name)] if len(name) > 2 else []  # tol, dir
     if len(known) > MANY:  # difflib takes a tenth of a millisecond each
         known = [k for k in known if k[:1] == name[:1] and abs(len(k) - len(name)) < 2][:MANY]
-    return next(iter(same or difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), "")
+    close = same or difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
+    return next(iter(close or (begun if len(begun) == 1 else [])), "")
 
 
 def suggest(name: str, known: Iterable[str]) -> str:

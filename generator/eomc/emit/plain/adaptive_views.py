@@ -22,7 +22,6 @@ class Tableau(Named):
     extent: str
     stages: int
     f: str
-    fabs: str
     sqrt: str
     eps: str
     tiny: str
@@ -64,6 +63,7 @@ class Adaptive(Tableau):
     within: CFunction
     settled_within: str
     corners: bool
+    fabs: str
     longest: str
     close: str
     share: str
