@@ -231,6 +231,7 @@ def test_what_cffi_can_not_rename_is_said_by_its_cause(
     def failing(old: str, new: str) -> None:
         raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), old, None, new)
 
+    monkeypatch.setenv("CC", "cc")  # else what was compiled before is taken
     monkeypatch.setattr(os, "rename", failing)
     with pytest.raises(eomc.EomcError, match=r"binding\.c.*can't be written \(Disk quota exceeded"):
         eomc.build(scene, root)
