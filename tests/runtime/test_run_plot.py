@@ -51,6 +51,21 @@ def test_names_of_words_are_words(name: str, shown: str) -> None:
     assert mathtext(name) == shown
 
 
+def test_a_picture_is_written(run, tmp_path: Path) -> None:
+    for k, how in enumerate(({}, {"phase": "theta"}, {"phase": ("x", "theta")})):
+        run.plot("theta", file=tmp_path / f"{k}.png", **how)
+        assert pyplot.imread(tmp_path / f"{k}.png").shape[1] >= 600
+    with pytest.raises(ValueError, match=r"'p\.png' is no column: give file='p\.png'"):
+        run.plot("p.png")
+
+
+def test_inputs_that_are_held_are_drawn_as_stairs(run, driven: ModuleType) -> None:
+    (held,), (followed,) = (
+        r.plot("force").get_lines() for r in (run, driven.simulate(duration=2.0))
+    )
+    assert held.get_drawstyle() == "steps-post" and followed.get_drawstyle() == "default"
+
+
 def test_without_names_coordinates_inputs_and_energy_have_panels(run) -> None:
     axes = run.plot()
     wanted = ["$x$ (m)", r"$\theta$ (rad)", r"$\mathrm{force}$ (N)", "energy (J)"]

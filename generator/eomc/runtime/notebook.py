@@ -59,7 +59,7 @@ def _picture(run: Any) -> str:
         grid = figure.add_gridspec(len(panels), 2 if drawn else 1)
         axes = [figure.add_subplot(grid[0, 0])]
         axes += [figure.add_subplot(grid[k, 0], sharex=axes[0]) for k in range(1, len(panels))]
-        plot(run, shown, None, None, (), None, False, None, axes, {})
+        plot(run, shown, None, None, (), None, False, None, axes, None, {})
         for above in axes[:-1]:
             above.tick_params(labelbottom=False)
         if drawn:

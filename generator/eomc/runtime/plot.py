@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .columns import imported
+from .columns import File, imported
 from .labels import mathtext, plain, rate_unit, with_unit
 
 TOGETHER = 6  # curves of one panel, about; of more coordinates than this a few panels are made
@@ -100,6 +100,7 @@ class Source:
     def __init__(self, run: Any, wrap: bool | Collection[str] = False) -> None:
         model, run = run._model, getattr(run, "_drawn", run)
         self.run, self.t = run, np.asarray(run.t, float)
+        self.held = getattr(run, "_u", None) is not None  # inputs, from row to row
         self.coordinates = tuple(model.coordinates)
         self._units = dict(model.units)
         self._energy = "J" if any(self._units.get(c) for c in model.coordinates) else ""
@@ -136,9 +137,12 @@ class Source:
 def plot(
     run: Any, names: Sequence[str], phase: Any, section: Mapping[str, Array] | None, other: Any,
     labels: Sequence[str] | None, wrap: bool | Collection[str], ax: Any, axes: Any,
-    style: Mapping[str, Any],
+    file: File | None, style: Mapping[str, Any],
 ) -> Any:  # fmt: skip
     """See `Run.plot`."""
+    for name in names:
+        if str(name).endswith((".png", ".pdf", ".svg")):
+            raise ValueError(f"plot: '{name}' is no column: give file='{name}' to write a picture")
     others = [other] if hasattr(other, "_model") else [*(other or ())]
     sources = [Source(each, wrap) for each in (run, *others)]
     suffixes = _suffixes(len(sources), labels)
@@ -156,6 +160,9 @@ def plot(
         _panel(place, sources, [c.name for c in panel], suffixes, style)
     for place, (x, y) in zip(made[len(panels) :], pairs, strict=True):
         _portrait(place, sources, x, y, suffixes, section, style)
+    if file is not None:
+        figure = made[0].figure
+        getattr(figure, "figure", figure).savefig(file)  # of a part of a figure the whole
     return made[0] if count == 1 else np.array(made)
 
 
@@ -215,7 +222,9 @@ def _panel(
         curves = [source.curve(name) for name in names]
         for i, curve in enumerate(curves):
             own = {"color": colours[i], "linestyle": ("--", ":", "-.")[(k - 1) % 3]} if k else {}
-            lines = against(axes, source.t, [curve], suffix, **own, **style)
+            if curve.kind == "inputs" and source.held:
+                own["drawstyle"] = "steps-post"
+            lines = against(axes, source.t, [curve], suffix, **{**own, **style})
             colours += [line.get_color() for line in lines] if not k else []
     units = dict.fromkeys(c.unit for c in curves)
     kinds = dict.fromkeys(c.kind for c in curves)

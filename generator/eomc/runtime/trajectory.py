@@ -233,7 +233,8 @@ class Run(ConstrainedRun, Columns):
     def plot(
         self, *names: str, phase: Any = None, section: Mapping[str, Array] | None = None,
         other: Run | Sequence[Run] = (), labels: Sequence[str] | None = None,
-        wrap: bool | str | Sequence[str] = False, ax: Any = None, axes: Any = None, **style: Any,
+        wrap: bool | str | Sequence[str] = False, ax: Any = None, axes: Any = None,
+        file: File | None = None, **style: Any,
     ) -> Any:  # fmt: skip
         """Curves over time by name; coordinates, inputs, outputs and energy where none is given.
 
@@ -241,10 +242,11 @@ class Run(ConstrainedRun, Columns):
         pair of names, or a list of such; section: what `section` returns, drawn there as points.
         other: runs beside this one, dashed; labels: names of the runs, in a legend. wrap: angles
         from -pi to pi, those in rad or the named ones, without lines where they jump. ax: one Axes
-        for all, axes: one a panel. style: for matplotlib's `plot`. Returns the Axes, an array of
-        several. Raises ModuleNotFoundError without matplotlib, KeyError for unknown names.
+        for all, axes: one a panel. file: where the figure is written, too. style: for matplotlib's
+        `plot`. Returns the Axes, an array of several. Raises ModuleNotFoundError without
+        matplotlib, KeyError for unknown names.
         """
-        return plot(self, names, phase, section, other, labels, wrap, ax, axes, style)
+        return plot(self, names, phase, section, other, labels, wrap, ax, axes, file, style)
 
     def section(
         self, name: str, value: float = 0.0, *, rising: bool | None = None,
