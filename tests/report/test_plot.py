@@ -105,6 +105,16 @@ def test_axes_say_what_they_show():
     assert plot.figure(*cartpole(), title="Mine").get_suptitle() == "Mine"
 
 
+def test_what_only_jumps_change_has_no_velocity():
+    made, t, q, qd, energy = spring(3)
+    made = replace(made, discrete=("x_3",), coordinates=(
+        *made.coordinates[:2], replace(made.coordinates[2], unit="")
+    ))  # fmt: skip
+    shown = plot.figure(made, t, q, qd, energy)
+    kinds = [axes.get_ylabel() for axes in shown.axes]
+    assert kinds == ["coordinates (m)", "velocities (m/s)", "$x_{3}$", "$E$ (J)"]
+
+
 def test_one_coordinate_has_a_phase_portrait_and_lost_energy_is_drawn_as_it_is():
     *_, energy, phase = plot.figure(*spring()).axes
     assert (phase.get_xlabel(), phase.get_ylabel()) == ("$x_{1}$ (m)", r"$\dot{x}_{1}$ (m/s)")

@@ -275,7 +275,8 @@ def _print_summary(
     for name, q, qd in zip(module.coordinates, done.q[-1], done.qd[-1], strict=True):
         unit = texts.line(module.units.get(name, ""))
         rate = f"{unit}/s" if unit else ""
-        say(f"  {name:{wide}} {q: .9g} {unit}   {name}_dot {qd: .9g} {rate}".rstrip())
+        going = "" if name in module._model.still else f"   {name}_dot {qd: .9g} {rate}"
+        say(f"  {name:{wide}} {q: .9g} {unit}{going}".rstrip())
     _print_energy(done, balance, summary)
     for name, times in summary["events"].items():
         last = f", at t = {times[-1]:.9g} s{' at last' if len(times) > 1 else ''}" if times else ""

@@ -119,6 +119,8 @@ def _figure(
         for i, c in enumerate(system.coordinates)
     ]
     rates = {c.name: rate for c, rate in moving}
+    modes = (system.coordinates[m.at].name for m in system.modes)
+    still = {*system.discrete, *modes}  # between jumps
     groups = grouped([c for c, _ in moving])
     below = grouped(
         [
@@ -141,8 +143,10 @@ def _figure(
 
     first: Axes | None = None
     for row, group in enumerate(groups):
-        for column, curves in enumerate((group, [rates[c.name] for c in group])):
-            axes = made.add_subplot(grid[row, column], sharex=first)
+        going = [rates[c.name] for c in group if c.name not in still]
+        for column, curves in enumerate((group, going) if going else (group,)):
+            place = grid[row, column] if going else grid[row, :2]
+            axes = made.add_subplot(place, sharex=first)
             first = first or axes
             _curves(axes, t, curves)
     for row, group in enumerate(below, len(groups)):

@@ -280,9 +280,14 @@ class Constrained(Frames):
         q, qd = self._in_modes(q if q0 is None else q0, qd if qd0 is None else qd0)
         return self._projected(q, qd, t0, params, self._rows.held)
 
+    @property
+    def still(self) -> tuple[str, ...]:
+        """The coordinates that only jumps change: the last ones, without velocities."""
+        return self.coordinates[self.nq - len(self._rows.modes) - self._rows.discrete :]
+
     def _completed(self, x: Any, half: int) -> Any:
         """q or qd, half 0 or 1, where it was given without what jumps set: as the scene has it."""
-        more = len(self._rows.modes) + self._rows.discrete
+        more = len(self.still)
         if not more or np.shape(x)[-1:] != (self.nq - more,):
             return x
         shape = (*np.shape(x)[:-1], more)
