@@ -345,3 +345,16 @@ def test_a_run_ends_at_the_third_impact_by_a_time_that_it_sets(tmp_path: Path) -
     fall = (2 / 9.81) ** 0.5
     assert run.stopped == "third" and run["count"][-1] == 3
     assert run.t[-1] == pytest.approx(fall * (1 + 2 * 0.8 + 2 * 0.64) + 1e-6, rel=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quickly_compiled")
+def test_a_mass_that_is_no_number_may_lock_the_rows(tmp_path: Path) -> None:
+    """Accelerations on a rod don't depend on it, and corrections refuse it by the status LOCKED."""
+    made = System.make(
+        "rod", {"x": 0.6, "y": -0.8}, "m*(x_dot**2 + y_dot**2)/2", "9.81*m*y",
+        constraints={"rod": "x**2 + y**2 - 1"}, parameters={"m": 1.0}, tolerance=1e-9, h=0.01,
+        events={"drops": {"when": "x", "action": "jump", "m": "m/2"}},
+    )  # fmt: skip
+    report = check(made, eomc.load(made, tmp_path))
+    assert report.passed, str(report)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from eomc.verify.oracle import Vector
-from eomc.verify.rows_refusals import NO_CONVERGENCE, NOT_FINITE, OK, SINGULAR, Refusals
+from eomc.verify.rows_refusals import OK, REFUSED, SINGULAR, Refusals
 from eomc.verify.rows_runs import parameters
 
 if TYPE_CHECKING:
@@ -93,9 +93,7 @@ class _Adaptive:
                     x = getattr(self.state, field).copy()
                     x[i] = what
                     run = self.drive(replace(self.state, **{field: x}), 10 * h, tol)
-                    wrong += not run.stays or run.status not in (
-                        SINGULAR, NOT_FINITE, NO_CONVERGENCE,
-                    )  # fmt: skip
+                    wrong += not run.stays or run.status not in REFUSED
         return float(wrong + self.overflown())
 
     def overflown(self) -> int:

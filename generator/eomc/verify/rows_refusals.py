@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
     from eomc.verify.sampling import State
 
-OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE = range(4)
+OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE, _, LOCKED = range(6)
+REFUSED = (SINGULAR, NOT_FINITE, NO_CONVERGENCE, LOCKED)
 WORDS = ("ok", "singular", "not finite", "no convergence")
 CLEAR = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
 FACTORS = (0.0, -3.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
@@ -288,8 +289,7 @@ class Refusals:
                     wrong += silent and not self.bounded(at)
                     for method in self.check.methods:
                         run = drive(self.model, method, at, self.check.system.run.h, 3)
-                        wrong += run.done != 0 or run.status not in (SINGULAR, NOT_FINITE,
-                                                                     NO_CONVERGENCE)  # fmt: skip
+                        wrong += run.done != 0 or run.status not in REFUSED
                     wrong += self.model.has_slopes and not self.linearized(at)
         return float(wrong)
 
