@@ -97,10 +97,11 @@ def behind_steps(name: str, source: str) -> set[int]:
     """What refuses the end of a step under constraints, counts singular positions, judges these.
 
     Where a step is lost, its stages nearly always are before; these linkages have no singular
-    positions on their way. tests/runtime/test_constrained_runs.py has others that do.
+    positions on their way. Nor do they lie near zero, where positions are assembled to rounding.
+    tests/runtime/test_constrained_runs.py has others that do.
     """
     found: set[int] = set()
-    within = judges = False
+    within = judges = rounds = False
     for number, line in enumerate(source.splitlines(), start=1):
         judges |= bool(
             re.match(rf"\S.*\b{name}_rate_terms\w*\(|\s+if \(!far && \*singular\)", line)
@@ -108,6 +109,9 @@ def behind_steps(name: str, source: str) -> set[int]:
         if judges:
             found.add(number)
             judges = line not in ("}", " " * 8 + "}")
+        rounds = (rounds or "if (pass && 2*off > before)" in line) and line != " " * 8 + "}"
+        if rounds:
+            found.add(number)
         within = (within or bool(re.match(rf".*\b{name}_projected\(.*[^;]$", line))) and line != "}"
         refuses = within and re.search("return|break", line) and "OK" not in line
         if refuses or re.match(r"\s+x\.first = \(\w+\)\(first \+ n\)\*h;", line):

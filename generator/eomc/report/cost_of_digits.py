@@ -304,7 +304,7 @@ def _point_of_tolerance(
 ) -> Point:
     """A run by a tolerance."""
     run = simulate(module, tol=tol, times=against.reference.t)
-    again = partial(simulate, module, tol=tol, times=[duration])
+    again = partial(simulate, module, tol=tol, duration=duration)  # a row a step, which are few
     return replace(_judged(module, against, run, again, 1), method=ADAPTIVE, tol=tol)
 
 
