@@ -24,6 +24,7 @@ def test_what_grows_is_told() -> None:
         assert words.startswith(f"{name}: ")
 
 
+@pytest.mark.slow
 def test_what_is_in_use_is_seen_and_what_is_free_is_not(tmp_path: Path) -> None:
     if not sample(tmp_path).heap:
         pytest.skip("this C library does not tell what it has given out")
@@ -46,6 +47,7 @@ def test_what_is_in_use_is_seen_and_what_is_free_is_not(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_grows(tmp_path: Path) -> None:
+def test_nothing_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "cc")  # else what was compiled is kept, for other tests
     how, words = in_a_fork(lambda: grown(ran(tmp_path, 60)), 600)
     assert (how, words) == ("done", [])

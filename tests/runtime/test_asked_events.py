@@ -200,6 +200,7 @@ def test_of_a_system_a_fault_is_named(events: dict, words: str, tmp_path: Path) 
         pipeline.with_events(m, events, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_system_that_was_read_or_changed(scene: Path, tmp_path: Path) -> None:
     own = eomc.read(scene)
     run = eomc.load(own, tmp_path).simulate(duration=1.0, events=BESIDE)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sympy
-from conftest import Modules, tiers
+from conftest import Modules
 from fmus import VERSIONS, Host, exported, needs_fmpy, plain, rows
 
 import eomc
@@ -70,7 +70,8 @@ def test_a_tension_is_that_of_the_multiplier(modules: Modules) -> None:
     np.testing.assert_allclose(runs.outputs["tension"], -2 * runs.multipliers["rod"], rtol=1e-12)
 
 
-@pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["double", "float"])
 def test_the_check_compares_both_forms_and_slopes(real: str, tmp_path: Path) -> None:
     system = from_scene(parse(BALL + f'linearize = true\nreal = "{real}"\n', "test.toml"))
     fast, plain_form = (eomc.load(system, tmp_path, form=form) for form in ("fast", "plain"))

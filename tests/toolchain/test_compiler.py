@@ -33,6 +33,7 @@ def ziglang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "zig"
 
 
+@pytest.mark.slow
 def test_the_first_build_by_ziglang_says_that_it_prepares(
     scene: Path, root: Path, ziglang: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
