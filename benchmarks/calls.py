@@ -7,7 +7,8 @@
   that others on the same core do not count. On a machine shared with others it comes in two sizes,
   up to 1.8 apart: where somebody else has the other half of the physical core, an interpreter gets
   half of the instructions through, while a chain of dependent multiplications takes no longer;
-- overhead of `simulate()` by a tolerance: beside the same steps in C, which keep no rows;
+- overhead of `simulate()` by a tolerance: beside the same steps in C, which keep no rows; with an
+  input that is held, too;
 - `step_batch` of eight instances, whole: it has no bar, but learning loops pay it in every step;
 - import: of a built scene in a fresh process, bytecode in place, after NumPy is there.
 """
@@ -30,6 +31,7 @@ from searching import adaptive_in_c
 
 import eomc
 
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
 CALL_BAR, FIT_BAR, IMPORT_BAR = 5e-6, 3e-6, 50e-3  # s
 IMPORT = """
 import sys, time, numpy
@@ -66,13 +68,22 @@ def call_overhead(root: Path, rounds: int) -> tuple[float, float, float]:
     return quartiles(found)
 
 
-def adaptive_overhead(root: Path, rounds: int) -> tuple[float, float, float]:
-    """Quartiles over the rounds of simulate() by a tolerance less its loop in C, s."""
-    module = work.load(work.CASES["cart-pole"], root, "tolerance = 1e-9\n")
-    bare = adaptive_in_c(module, 1.0, 1e-9)
+def adaptive_overhead(root: Path, rounds: int, driven: bool = False) -> tuple[float, float, float]:
+    """Quartiles over the rounds of simulate() by a tolerance less its loop in C, s.
+
+    driven: with an input that is held.
+    """
+    if driven:
+        text = (SCENES / "cartpole_driven.toml").read_text(encoding="utf-8")
+        (root / "driven.toml").write_text(text + "tolerance = 1e-9\n", encoding="utf-8")
+        module = eomc.load(root / "driven.toml", root)
+    else:
+        module = work.load(work.CASES["cart-pole"], root, "tolerance = 1e-9\n")
+    u = np.array([0.5]) if driven else None
+    bare = adaptive_in_c(module, 1.0, 1e-9, u)
 
     def run() -> object:
-        return module.simulate(duration=1.0, tol=1e-9)
+        return module.simulate(duration=1.0, tol=1e-9, u=u)
 
     run()
     return quartiles([seconds(run, 300) - seconds(bare, 300) for _ in range(rounds)])
@@ -107,6 +118,10 @@ def said(root: Path, rounds: int) -> str:
         (
             "`simulate()` by a tolerance, beyond its loop in C",
             "us", 1e6, FIT_BAR, adaptive_overhead(root, rounds),
+        ),
+        (
+            "the same with an input that is held",
+            "us", 1e6, FIT_BAR, adaptive_overhead(root, rounds, driven=True),
         ),
         ("`step_batch` of eight", "us", 1e6, math.inf, batch_call(root, rounds)),
         (

@@ -54,21 +54,23 @@ def timed(ways: Sequence[Callable[[], object] | None], rounds: int) -> Array:
     return np.array([np.min(column) for column in times.T])
 
 
-def adaptive_in_c(module: ModuleType, end: float, tol: float) -> Callable[[], object]:
+def adaptive_in_c(
+    module: ModuleType, end: float, tol: float, u: Array | None = None
+) -> Callable[[], object]:
     """A run in steps that fit the tolerance: the loop in C, called with nothing around it."""
     model = module._model
     (address, real, null), work = model._c, model._ffi.new("adaptive_work *")
     start, nothing = np.concatenate(model.start), bytes(model._ffi.sizeof(work[0]))
     x, t = start.copy(), np.zeros(1)
     at_x, at_t, at_p = address(real, x), address(real, t), model._at[2]
-    memory, many = model._ffi.buffer(work), 2**40
+    at_u, memory, many = model._pointer(u), model._ffi.buffer(work), 2**40
 
     def run() -> None:
         x[:] = start
         t[0] = 0.0
         memory[:] = nothing
         model._lib.adaptive(
-            at_x, at_t, end, tol, 0.0, null, many, null, 0, null, null, null, at_p, work
+            at_x, at_t, end, tol, 0.0, at_u, many, null, 0, null, null, null, at_p, work
         )
 
     return run

@@ -112,6 +112,13 @@ def test_a_run_in_one_call_is_the_same(kepler: ModuleType, how: dict) -> None:
     assert np.array_equal(quick(how.get("t0", 0.0) + 0.3), long(how.get("t0", 0.0) + 0.3))
 
 
+@pytest.mark.parametrize("u", [np.array([1 + 2j]), np.array(["1"]), np.array([math.nan])])
+def test_the_short_way_refuses_what_the_long_one_does(kepler: ModuleType, u: np.ndarray) -> None:
+    kepler.simulate(duration=PERIOD)
+    with pytest.raises(ValueError, match=r"^u: "):
+        kepler.simulate(duration=PERIOD, u=u)
+
+
 def test_the_first_step_is_no_longer_than_asked(kepler: ModuleType) -> None:
     """Far away and at rest nothing else bounds it."""
     far = {"q0": [1e3, 0.0], "qd0": [0.0, 0.0], "params": {"mu": 1e-12}}

@@ -186,5 +186,6 @@ def test_ctrl_c_in_the_function_keeps_what_was_done(sampled: ModuleType) -> None
 def test_a_period_below_a_step_and_one_beyond_the_run(sampled: ModuleType) -> None:
     short = sampled.simulate(u=law, control_period=1e-4, duration=0.05, tol=1e-9)
     assert 500 <= short.steps < 510 and short.rejected == 0
+    assert short.evaluations < 4 * 8 * short.steps  # some three sweeps each
     held = sampled.simulate(u=law, control_period=1e9)
     assert held == sampled.simulate(u=law(0.0, *sampled.start))

@@ -215,3 +215,5 @@ def test_suggestions():
     assert suggest("thata", ["theta", "g"]) == "; did you mean 'theta'?"
     assert suggest("M_C", ["m_c", "m_p"]) == "; did you mean 'm_c'?"
     assert suggest("zzz", ["theta", "g"]) == ""
+    assert suggest("tol", ["tolerance", "h"]) == "; did you mean 'tolerance'?"
+    assert suggest("the", ["theta_shoulder_1", "theta_shoulder_2"]) == ""  # either

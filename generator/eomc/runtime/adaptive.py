@@ -66,8 +66,8 @@ class AdaptiveRun(Run):
     _happened: tuple[Array, Array] = field(default=_NONE, kw_only=True)  # which, rows of t, q, qd
     stopped: str = field(default="", kw_only=True)
     limit: float = field(default=float("nan"), kw_only=True)
-    _period: float = field(default=0.0, kw_only=True)  # over which inputs are held, if any are,
-    _held: Array | None = field(default=None, kw_only=True)  # and these, (n, nu)
+    _period: float = field(default=0.0, init=False)  # over which inputs are held, if any are,
+    _held: Array | None = field(default=None, init=False)  # and these, (n, nu)
 
     @property
     def t(self) -> Array:
@@ -226,8 +226,9 @@ class AdaptiveRun(Run):
             _times=kept["times"], _h_most=kept["h_most"], _stiff=bool(kept.get("stiff", False)),
             _begin=kept["begin"], _t_end=kept["t_end"],
             _happened=(kept["which"], kept["event_rows"]), stopped=kept["stopped"],
-            limit=kept["limit"], _period=kept.get("period", 0.0), _held=values,
+            limit=kept["limit"],
         )  # fmt: skip
+        made._period, made._held = kept.get("period", 0.0), values
         made._told_inputs()
         return made
 
@@ -283,7 +284,7 @@ def plain(
     if u is not None:
         if not (type(u) is float or (type(u) is np.ndarray and u.ndim == 1 and len(u) == model.nu)):
             return None
-        held = model._inputs(np.array([u] if type(u) is float else u, model.dtype))
+        held = model._inputs([u] if type(u) is float else u).copy()  # type: ignore[union-attr]
         at_u = address(real, held)
     if q0 is not None:
         from_q = model._from(q0, "q0")[1]

@@ -287,7 +287,7 @@ class Constrained(Frames):
 
     def _completed(self, x: Any, half: int) -> Any:
         """q or qd, half 0 or 1, where it was given without what jumps set: as the scene has it."""
-        more = len(self.still)
+        more = len(self._rows.modes) + self._rows.discrete  # in every call: no slice
         if not more or np.shape(x)[-1:] != (self.nq - more,):
             return x
         shape = (*np.shape(x)[:-1], more)

@@ -243,9 +243,9 @@ class Model(Constrained):
         if (
             usual and (room := self._room) and h is None and steps is None and method is None
             and h_most is None and every == 1 and stiff is False
-            and (fit := adaptive.plain(self, q0, qd0, duration, u, params, t0, tol, room))
+            and (r := adaptive.plain(self, q0, qd0, duration, u, params, t0, tol, room)) is not None
         ):  # fmt: skip
-            return fit
+            return r
         q0, qd0 = self._assembled(q0, qd0, t0, params)
         if fits(self, h, steps, method, tol, h_most, stiff):
             fitted = adaptive.simulate(
@@ -266,8 +266,8 @@ class Model(Constrained):
         if usual and u is duration is None and type(steps) is type(every) is int and every > 0:
             # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
-            if 0 <= steps <= short and (steps < SOME or (method, h) in self._warned):
-                (address, real, null), every = self._c, min(every, RARELY)
+            if 0 <= steps <= short >= every and (steps < SOME or (method, h) in self._warned):
+                address, real, null = self._c
                 rows = empty((2, 1 - -steps // every, self.nq), self.dtype)
                 to, done = address(real, rows), stages * steps
                 if 8 * steps == run(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .adaptive_memory import PART
 from .arguments import Array, as_step_size, machine_memory
 from .laws import Sampled, asked
 
@@ -75,9 +76,9 @@ def as_acting(
 
 
 def _few(model: Model, made: Periods, span: float) -> Periods:
-    """The same, or a MemoryError where its rows would take more than a half of the memory."""
+    """The same, or a MemoryError where a run can't keep its rows."""
     count = _count(span, made.period)
-    if count * (model._bytes(1) + _VALUE) > machine_memory() / 2:
+    if count * (model._bytes(1) + _VALUE) > PART * machine_memory():
         raise MemoryError(
             f"control_period: the rows of {count:.3g} periods of {made.period:g} s don't fit in "
             "memory: take a longer one, or a shorter duration"
