@@ -45,6 +45,7 @@ VARIANTS: dict[str, tuple[str, str]] = {
     ),
     "cartpole": ("cartpole", "batch = true\ntolerance = 1e-9\n"),
     "bouncer": ("bouncer", ""),
+    "bouncers": ("bouncer", "batch = true\nmethod = \"rk4\"\n"),
     "arm": ("arm", ""),
     "single": ("double_pendulum", 'real = "float"\nmethod = ["rk4", "gauss8"]\ntolerance = 1e-4\n'),
 }  # fmt: skip
@@ -226,19 +227,15 @@ class Driver:
             count = "(size_t)count*" if batch else ""
             return own, f"{kind} *{own} = space({count}sizeof *{own});"
         if name in ("done", "events", "kept"):
-            count = "1" if name == "events" else "count + 1"
+            count = "1" if name == "events" and not batch else "count + 1"
             return own, f"long *{own} = space((size_t)({count})*sizeof *{own});"
         if name == "held":
             fill = f"for (i = 0; {own} && i < 2*{self.N}_NQ; i++) {own}[i] = (int)(byte() % 2);"
             made = f"byte() % 2 ? space(2*{self.N}_NQ*sizeof *{own}) : NULL"
             return own, f"int *{own} = {made}; {{ int i; {fill} }}"
         if name == "which":
-            return (
-                own,
-                f"int *{own} = byte() % 2 ? space((size_t)room_*sizeof *{own}) : NULL;".replace(
-                    "room_", "(room)"
-                ),
-            )
+            made = f"space((size_t)({'count*' if batch else ''}room)*sizeof *{own})"
+            return own, f"int *{own} = byte() % 2 ? {made} : NULL;"
         return self._reals(f, a, rows, batch)
 
     def _reals(self, f: Function, a: Argument, rows: str, batch: bool) -> tuple[str, str]:
@@ -268,6 +265,7 @@ class Driver:
             return own, f"{R} *{own} = asked ? given({'row_count' if batch else 'count'}) : NULL;"
         if name in ARRAYS:
             size = ARRAYS[name].format(rows=rows, N=self.N)
+            size = f"count*{size}" if batch and name == "event_rows" else size
             return own, f"{R} *{own} = unwritten({size});"
         raise AssertionError(f"{f.name}: what is {a}?")
 

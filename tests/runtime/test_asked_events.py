@@ -73,6 +73,8 @@ def test_they_stop_and_jump(oscillator: ModuleType) -> None:
     assert run.stopped == "wall" and run.t[-1] == pytest.approx(math.pi / 3, abs=TOL)
     both = oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, events=stop)
     assert both.reached == pytest.approx([math.pi / 3, 10], abs=TOL)
+    assert both.stopped.tolist() == ["wall", ""] and both.events["wall"].instance.tolist() == [0]
+    assert both.events["turns"].of(1).t == pytest.approx((np.arange(3) + 0.5) * math.pi, abs=TOL)
     heavier = {
         "drop": {
             "when": "x",

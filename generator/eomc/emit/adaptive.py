@@ -279,7 +279,8 @@ def alone(functions: Functions) -> str:
     return functions.public.adaptive(METHOD.name).call(
         q=f"q + {NQ}*k", qd=f"qd + {NQ}*k", t="t + k", u="u ? u + u_instance*k : 0",
         times="times ? times + kept[k] : 0", count="row_count - kept[k]", t_rows="0", **rows,
-        room="0", events="0", which="0", event_rows="0", p="p + p_instance*k",
+        events="events ? events + k : 0", which="which ? which + room*k : 0",
+        event_rows=f"which ? event_rows + (1 + 2*{NQ})*room*k : 0", p="p + p_instance*k",
         memory="memory + k", status="&found",
     )  # fmt: skip
 

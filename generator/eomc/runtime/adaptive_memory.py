@@ -23,7 +23,7 @@ class Kept:
     """How many rows and events a run keeps, and how many more there is room for."""
 
     def __init__(self, model: Model) -> None:
-        self.rows, self.most = 0, PART * machine_memory() / _row(model)
+        self.rows, self.most = 0, room_for(model)
 
     def count(self, work: Any, events: bool) -> None:
         """Those of the last call of C."""
@@ -32,6 +32,11 @@ class Kept:
     def at_most(self, steps: int, each: int) -> int:
         """So many steps of `each` rows, or as many as there is room for; 0: none."""
         return int(min(steps, max(0.0, self.most - self.rows) // each))
+
+
+def room_for(model: Model) -> float:
+    """How many rows and events a run may keep."""
+    return PART * machine_memory() / _row(model)
 
 
 def rows_for(model: Model, count: int) -> Array:

@@ -210,7 +210,7 @@ class BatchModel(Model):
         threads: as many as there are processors where None. An instance that can't go on has its
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
         tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
-        at the start and the end where None. events: of which jumps and stops act.
+        at the start and the end where None. events: as in `simulate`.
         """
         if events is not None:
             other, given = with_events(dict(locals()))

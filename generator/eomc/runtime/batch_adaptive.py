@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .adaptive_arguments import BOTH, as_end, as_limits, as_times
+from .adaptive_memory import FULL, room_for
 from .arguments import Array, as_number
 from .batch import BatchRun
 from .batch_work import all_of, as_threads
+from .happened import FoundInBatch, HappenedInBatch
 from .package import reduced
 from .slices import longer
 from .trajectory import STATUS
@@ -26,6 +28,8 @@ _GROUP, _FEWEST = 128, 16  # instances that a thread takes at once, of many and 
 _COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
 _FEW = 64  # steps of an instance before the first look at Ctrl-C
 _NAMES = ("tol", "evaluations", "rejected", "stiff_steps", "reached", "_times")
+_HAPPENED = ("event_instances", "which", "event_rows")  # in what is kept of a run
+_ENDS = np.array([*STATUS, "interrupted", FULL])
 
 
 @dataclass(eq=False, repr=False)
@@ -33,8 +37,9 @@ class AdaptiveBatchRun(BatchRun):
     """Trajectories by steps that fit `tol`, rows at the same times for all.
 
     evaluations, rejected, stiff_steps: of each instance, (batch,). reached: the time to which each
-    has come, (batch,), s; rows behind it are nan, as where an event stops an instance. Everything
-    else as in a BatchRun.
+    has come, (batch,), s; rows behind it are nan, as where an event stops an instance. events: by
+    name where and when each happened, t, q, qd, instance, of all instances one after the other.
+    Everything else as in a BatchRun.
     """
 
     tol: float = field(kw_only=True)
@@ -43,6 +48,9 @@ class AdaptiveBatchRun(BatchRun):
     stiff_steps: Array = field(kw_only=True)
     reached: Array = field(kw_only=True)
     _times: Array = field(kw_only=True)
+    _happened: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
+    _stopped: Array | None = field(default=None, kw_only=True)  # 1 + which event, or 0
+    _limit: Array | None = field(default=None, kw_only=True)
 
     @property
     def t(self) -> Array:
@@ -52,7 +60,31 @@ class AdaptiveBatchRun(BatchRun):
     @cached_property
     def status(self) -> Array:
         """How each ended."""
-        return np.asarray(np.array([*STATUS, "interrupted"])[self._codes])
+        return np.asarray(_ENDS[self._codes])
+
+    @cached_property
+    def events(self) -> dict[str, HappenedInBatch]:
+        """Where and when each of the scene's events happened, and in which instances."""
+        if self._happened is None:
+            return {}
+        nq, (instances, which, rows) = self._model.nq, self._happened
+        found = {}
+        for k, name in enumerate(self._model.events):
+            own = which == k
+            t, q, qd = np.split(rows[own], [1, 1 + nq], axis=1)
+            found[name] = HappenedInBatch(t[:, 0], q, qd, instances[own])
+        return found
+
+    @property
+    def stopped(self) -> Array:
+        """The event that ended each, (batch,), or ""."""
+        codes = np.zeros(len(self), int) if self._stopped is None else self._stopped
+        return np.asarray(np.array(["", *self._model.events])[codes])
+
+    @property
+    def limit(self) -> Array:
+        """The time to which jumps of each accumulate, (batch,), s; nan where none do."""
+        return np.full(len(self), np.nan) if self._limit is None else self._limit
 
     @property
     def message(self) -> str:
@@ -60,7 +92,10 @@ class AdaptiveBatchRun(BatchRun):
         names, counts = np.unique(self.status, return_counts=True)
         found = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
         done = int(self.steps.sum())
-        return f"{len(self)} instances, {done} steps, tolerance {self.tol:g}: {found}"
+        names, counts = np.unique(self.stopped, return_counts=True)
+        ends = zip(counts, names, strict=True)
+        stops = "".join(f", {c} stopped by '{n}'" for c, n in ends if n)
+        return f"{len(self)} instances, {done} steps, tolerance {self.tol:g}: {found}{stops}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("batch_adaptive.AdaptiveBatchRun._of_kept", self._model, self._kept())
@@ -69,12 +104,20 @@ class AdaptiveBatchRun(BatchRun):
         return tuple(getattr(self, each.name) for each in fields(BatchRun))
 
     def _kept(self) -> dict[str, Any]:
-        return super()._kept() | {name: getattr(self, name) for name in _NAMES}
+        found = super()._kept() | {name: getattr(self, name) for name in _NAMES}
+        if self._happened is not None:
+            found |= zip(_HAPPENED, self._happened, strict=True)
+            found |= {"stopped": self._stopped, "limit": self._limit}
+        return found
 
     @classmethod
     def _of_kept(cls, model: Any, kept: Mapping[str, Any]) -> AdaptiveBatchRun:
         made = BatchRun._of_kept(model, kept)._all()
-        return cls(*made, **{name: kept[name] for name in _NAMES})
+        found = cls(*made, **{name: kept[name] for name in _NAMES})
+        if "which" in kept:
+            found._happened = tuple(kept[name] for name in _HAPPENED)
+            found._stopped, found._limit = kept["stopped"], kept["limit"]
+        return found
 
     def _settings(self) -> tuple[Any, ...]:
         return (*super()._settings(), self.tol, self._times.tolist())
@@ -105,7 +148,8 @@ def simulate(
     for values in work.rows:
         values[~kept] = np.nan
     counts = work.counts
-    codes = np.where((work.status == 0) & work.open, len(STATUS), work.status).astype("i")
+    cut = len(STATUS) + int(work.full)
+    codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
     span = float(rows[-1]) - t0
     made = AdaptiveBatchRun(
         model, t0, work.rows[0], work.rows[1], span / max(1.0, float(counts["steps"].mean())),
@@ -114,6 +158,11 @@ def simulate(
         stiff_steps=counts["stiff_steps"],
         reached=work.t, _times=rows,
     )  # fmt: skip
+    if work.events:
+        made._happened = work.events.all()
+        made._stopped = work.counts["stopped"]
+        at_limit = codes == STATUS.index("accumulated")
+        made._limit = np.where(at_limit, work.counts["limit"], np.nan)
     return made, whole
 
 
@@ -132,6 +181,7 @@ class _Work:
         self.kept, self.status = np.zeros(count, "l"), np.zeros(count, "i")
         self.memory = model._ffi.new("adaptive_memory[]", count)
         self.open, self.stop, self.ended = np.ones(count, bool), False, 0
+        self.events = FoundInBatch(model, room_for(model) - count * n) if model.events else None
         if times[0] == t0:
             self.kept[:] = 1
             self.rows[0, :, 0], self.rows[1, :, 0] = q, qd
@@ -140,12 +190,20 @@ class _Work:
     def counts(self) -> dict[str, Array]:
         """Steps and so on of each instance, (batch,), by their names in C."""
         ffi, memory = self.model._ffi, "adaptive_memory"
+        kinds = dict.fromkeys(_COUNTED, "l")
+        if self.events:
+            kinds |= {"stopped": "i", "limit": self.model.dtype.char}
         layout: Any = {
-            "names": _COUNTED, "formats": ["l"] * len(_COUNTED), "itemsize": ffi.sizeof(memory),
-            "offsets": [ffi.offsetof(memory, name) for name in _COUNTED],
+            "names": list(kinds), "formats": list(kinds.values()), "itemsize": ffi.sizeof(memory),
+            "offsets": [ffi.offsetof(memory, name) for name in kinds],
         }  # fmt: skip
         found: Any = np.frombuffer(ffi.buffer(self.memory), np.dtype(layout))
-        return {name: found[name].copy() for name in _COUNTED}
+        return {name: found[name].copy() for name in kinds}
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no memory for more events."""
+        return self.events is not None and self.events.full
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
@@ -165,18 +223,22 @@ class _Work:
         p_each = len(self.table) > 1
         u = null if self.held is None else pointer(self.held[at:end] if u_each else self.held)
         address, (long, integer) = model._c[0], model._whole
+        events = self.events.room(count) if self.events else None
         more = True
-        while more and not self.stop:
+        while more and not self.stop and not self.full:
             begun = perf_counter()
             more = model._lib.adaptive_batch(
                 count, pointer(self.q[at:end]), pointer(self.qd[at:end]), pointer(self.t[at:end]),
                 *self.limits, u,
                 model.nu if u_each else 0, many, pointer(self.times), n,
                 pointer(self.rows[0, at:end]), pointer(self.rows[1, at:end]),
+                *(events.given if events else ()),
                 pointer(self.table[at:end] if p_each else self.table), int(p_each),
                 self.memory + at, address(long, self.kept[at:end]),
                 address(integer, self.status[at:end]),
             )  # fmt: skip
+            if self.events and events:
+                self.events.keep(events, at)
             many = min(longer(many, perf_counter() - begun), 2**40)
             look()
         if not more:

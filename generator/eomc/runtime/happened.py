@@ -12,7 +12,7 @@ from .arguments import Array
 if TYPE_CHECKING:
     from .model import Model
 
-_EVENTS = 1024  # of one call
+_EVENTS, _EVENTS_EACH = 1024, 64  # of one call, beside those of a step: of one, of each of many
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,71 @@ class Happened:
         return len(self.t)
 
 
+@dataclass(frozen=True)
+class HappenedInBatch(Happened):
+    """The same of many: instance (n,) tells which; they follow one another, each in its order."""
+
+    instance: Array
+
+    def of(self, k: int) -> Happened:
+        """Those of instance k."""
+        own = self.instance == k
+        return Happened(self.t[own], self.q[own], self.qd[own])
+
+
+class FoundInBatch:
+    """All events of many instances, found in calls by any thread."""
+
+    def __init__(self, model: Model, most: float) -> None:
+        self.model, self.most, self.count = model, most, 0
+        self.pieces = list[tuple[Array, Array, Array]]()
+
+    def room(self, count: int) -> GroupRoom:
+        """Room for a call of so many instances."""
+        return GroupRoom(self.model, count)
+
+    def keep(self, room: GroupRoom, first: int) -> None:
+        """Copy what a call has found of instances from `first` on."""
+        some = np.arange(room.which.shape[1]) < room.counts[:, None]
+        if some.any():
+            self.pieces.append((some.nonzero()[0] + first, room.which[some], room.rows[some]))
+            self.count += int(some.sum())
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no memory for more."""
+        return self.count > self.most
+
+    def all(self) -> tuple[Array, Array, Array]:
+        """Of each event its instance, which it is, and its row."""
+        none = np.empty(0, int), np.empty(0, np.intc), np.empty((0, 1 + 2 * self.model.nq))
+        parts = zip(*self.pieces, strict=True) if self.pieces else [[x] for x in none]
+        instances, which, rows = (np.concatenate(list(x)) for x in parts)
+        order = np.argsort(instances, kind="stable")
+        return instances[order], which[order], rows[order]
+
+
+class GroupRoom:
+    """Room for the events of a call of some instances."""
+
+    def __init__(self, model: Model, count: int) -> None:
+        self.counts = np.zeros(count, "l")
+        each = _EVENTS_EACH + len(model.events)
+        self.which = np.empty((count, each), np.intc)
+        self.rows = np.empty((count, each, 1 + 2 * model.nq), model.dtype)
+        new = model._ffi.from_buffer
+        self.given = (
+            each, new("long[]", self.counts), new("int[]", self.which),
+            model._pointer(self.rows),
+        )  # fmt: skip
+
+
 class Found:
     """Room for the events of a call, and all that were found."""
 
     def __init__(self, model: Model) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
-        self.which = np.empty(_EVENTS, np.intc)
+        self.which = np.empty(_EVENTS + len(model.events), np.intc)
         self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)
 
     def room(self) -> tuple[Any, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
+import zlib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ FEW = 4  # singular states
 STEPS = 4  # of a run that is compared with that of one alone
 TOLERANCE, LONGEST = {8: 1e-12, 4: 1e-6}, 0.3  # by bytes of a number; h_most, of a run
 LIMIT, UNIT = 1.0, "tolerances a step"
+EVENTS = 64  # of a call of each, beside those of a step
 ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 
@@ -55,6 +57,30 @@ def report(of: Comparison, singular: list[State], plain: Any) -> None:
             many = Many(of, singular, module)
             of.row(f"{form}adaptive steps of many: bits", 0, "instances", many.alike)
             of.row(f"{form}adaptive steps of many: refusals", 0, "instances", many.refused)
+
+
+class Found:
+    """Room for the events of each in a call of C, and the number and digest of all of each."""
+
+    def __init__(self, model: Any, count: int) -> None:
+        self.said: list[list[int]] = [[0, 0] for _ in range(count)]
+        self.room: tuple[Any, ...] = ()
+        if not model.events:
+            return
+        each = EVENTS + len(model.events)
+        self.counts, self.which = np.zeros(count, "l"), np.zeros((count, each), "i")
+        self.rows = np.zeros((count, each, 1 + 2 * model.nq), model.dtype)
+        address, (long, integer) = model._c[0], model._whole
+        places = address(long, self.counts), address(integer, self.which)
+        self.room = (each, *places, model._pointer(self.rows))
+
+    def keep(self) -> None:
+        """Those of the last call."""
+        for k, n in enumerate(self.counts if self.room else ()):
+            number, digest = self.said[k]
+            for which, row in zip(self.which[k, :n], self.rows[k, :n], strict=True):
+                number, digest = number + 1, zlib.crc32(which.tobytes() + row.tobytes(), digest)
+            self.said[k] = [number, digest]
 
 
 class Many:
@@ -129,15 +155,21 @@ class Many:
         u = None if s.u is None else np.array([x.u for x in starts], model.dtype)
         p = np.array([parameters(model, x) for x in starts], model.dtype)
         address, (long, integer) = model._c[0], model._whole
+        found = Found(model, n)
         for _ in range(100_000):
-            if not model._lib.adaptive_batch(
+            left = model._lib.adaptive_batch(
                 n, *map(model._pointer, (q, qd, t)), end, self.tol, longest, model._pointer(u),
                 model.nu, steps, model._pointer(times), 2, model._pointer(rows[0]),
-                model._pointer(rows[1]), model._pointer(p), 1, memory, address(long, kept),
-                address(integer, status),
-            ):  # fmt: skip
+                model._pointer(rows[1]), *found.room, model._pointer(p), 1, memory,
+                address(long, kept), address(integer, status),
+            )  # fmt: skip
+            found.keep()
+            if not left:
                 break
-        counts = [[m.steps, m.rejected, m.evaluations, m.stiff_steps] for m in memory]
+        counts = [
+            [m.steps, m.rejected, m.evaluations, m.stiff_steps, *said]
+            for m, said in zip(memory, found.said, strict=True)
+        ]
         return Left(np.hstack([q, qd]), t, np.hstack([rows[0], rows[1]]), np.array(counts), status)
 
     def alike(self) -> float:
