@@ -314,7 +314,7 @@ duration = 10
     ("how", "words"),
     [
         ({"stiff": "no"}, "stiff: 'no' is not True or False"),
-        ({"stiff": True, "h": 0.1}, "h_most, stiff and, in a batch, times to"),
+        ({"stiff": True, "h": 0.1}, "h_most and stiff to adaptive ones"),
     ],
 )
 def test_what_stiff_is_not(train: ModuleType, how: dict, words: str) -> None:

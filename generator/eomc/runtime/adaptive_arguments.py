@@ -37,16 +37,15 @@ def as_limits(
         raise ValueError(f"stiff: {stiff!r} is not True or False")
     if model.tolerance is None:
         raise ValueError(
-            f"tol: {model.name} was built without adaptive steps, to which tol, h_most, stiff and, "
-            "in a batch, times belong: add tolerance = 1e-9 under [run] of its scene (of a batch "
-            "by fixed steps run(times) gives the states at any times)"
+            f"tol: {model.name} was built without adaptive steps, to which tol, h_most and stiff "
+            "belong: add tolerance = 1e-9 under [run] of its scene"
         )
     if not all(map(is_, fixed, FIXED.values())):
         for name, value in zip(FIXED, fixed, strict=False):  # the last is asked of batches alone
             if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
                 raise ValueError(
-                    f"{name}: belongs to fixed steps; tol, h_most, stiff and, in a batch, times to "
-                    "adaptive ones: give one or the other"
+                    f"{name}: belongs to fixed steps; tol, h_most and stiff to adaptive ones: give "
+                    "one or the other"
                 )
     most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
     return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most

@@ -7,14 +7,12 @@ vector registers and in threads; no result depends on either.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import saved
+from . import batch_adaptive, batch_fixed, saved
 from .adaptive_arguments import fits
 from .arguments import (
     Array,
@@ -23,138 +21,15 @@ from .arguments import (
     as_number,
     as_period,
     as_step_size,
-    machine_memory,
     unmasked,
 )
-from .batch_plot import Fans
-from .batch_values import Values
+from .batch_run import BatchRun
 from .batch_work import WORTH, Work
-from .columns import Columns, File
+from .columns import File
 from .model import LARGE, RARELY, SOME, Model
-from .package import reduced
 from .shown import with_events
-from .trajectory import STATUS, Interrupted
-
-_NAMES = np.array([*STATUS, "interrupted"])
-_KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as the fields go
-
-
-@dataclass(eq=False, repr=False)
-class BatchRun(Values, Fans, Columns):
-    """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
-
-    status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the
-    rows behind the last good one of an instance that could not go on are nan. steps: how many each
-    has made. By name, run["theta_dot"], (batch, n). Equal where scene, settings and rows are, bit
-    by bit; a pickled one keeps all of them.
-    """
-
-    _axes = ("instance", "t")
-    _model: Model
-    t0: float
-    q: Array
-    qd: Array
-    h: float
-    steps: Array
-    _codes: Array
-    every: int
-    _wanted: int
-    _params: Array  # (batch or 1, np)
-    _held: Array | None  # at the rows, (batch or 1, n or 1, nu)
-    method: str
-
-    @cached_property
-    def t(self) -> Array:
-        """The time of each row, (n,), s."""
-        steps = np.minimum(np.arange(self.q.shape[1]) * self.every, self._wanted)
-        return np.asarray(self.t0 + self.h * steps)
-
-    @cached_property
-    def status(self) -> Array:
-        """How each ended; made when it is asked for, since so many words take time."""
-        return np.asarray(_NAMES[self._codes])
-
-    @property
-    def u(self) -> Array:
-        """The inputs as they acted at each row, (batch, n, nu), so within their limits.
-
-        They are the signals there, or what was held from there on; in the last row what was held
-        over the last step.
-        """
-        return self._within(self._given)
-
-    @property
-    def saturated(self) -> Array:
-        """Whether each input was beyond its limits at each row, (batch, n, nu); not where nan."""
-        given = self._given
-        return np.asarray(np.abs(given - self._within(given)) > 0)
-
-    def _within(self, u: Array) -> Array:
-        """Inputs (batch, n, nu) within the limits of their instances."""
-        if not self._model.has_limits:
-            return u
-        ends = (
-            [self._model._within(u, self._params[0])]
-            if len(self._params) == 1
-            else [self._model._within(u[k], p) for k, p in enumerate(self._params)]
-        )
-        return np.reshape(ends, u.shape)
-
-    @property
-    def _given(self) -> Array:
-        """The inputs at each row, (batch, n, nu), whatever their limits."""
-        if self._held is None:
-            return self._values("signal", self._model.signal, (self._model.nu,))
-        found = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
-        found[np.isnan(self.q[..., 0])] = np.nan
-        return found
-
-    def _kept(self) -> dict[str, Any]:
-        """What a saved run keeps of it besides its columns; None: nothing."""
-        return dict(zip(_KEPT, self._all()[1:], strict=True))
-
-    @classmethod
-    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> BatchRun:
-        values: Any = map(kept.get, _KEPT)
-        return cls(model, *values)
-
-    @property
-    def message(self) -> str:
-        """What happened, in a sentence."""
-        names, counts = np.unique(self.status, return_counts=True)
-        found = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
-        done = int(self.steps.sum())
-        wanted = len(self) * self._wanted
-        return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {found}"
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return reduced("batch.BatchRun", *self._all())
-
-    def _all(self) -> tuple[Any, ...]:
-        return tuple(getattr(self, each.name) for each in fields(self))
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, BatchRun):
-            return NotImplemented
-        alike = self._settings() == other._settings()
-        both = zip(self._arrays(), other._arrays(), strict=True)
-        return alike and all(np.array_equal(a, b, equal_nan=True) for a, b in both)
-
-    __hash__ = None  # type: ignore[assignment]  # rows may be changed
-
-    def _settings(self) -> tuple[Any, ...]:
-        model = self._model
-        return (model.name, model.digest, self.t0, self.h, self.every, self._wanted, self.method)
-
-    def _arrays(self) -> tuple[Array, ...]:
-        held = np.empty(0) if self._held is None else self._held
-        return self.q, self.qd, self.steps, self._codes, self._params, held
-
-    def __len__(self) -> int:
-        return len(self._codes)
-
-    def __repr__(self) -> str:
-        return f"<BatchRun of {self._model.name}: {self.message}>"
+from .timed import as_asked
+from .trajectory import Interrupted
 
 
 class BatchModel(Model):
@@ -173,24 +48,10 @@ class BatchModel(Model):
         """A run or batch that `save` has written to an .npz file; see `Model.load_run`."""
         kind, kept = saved.read(self, file)
         if kind == "AdaptiveBatchRun":
-            from . import batch_adaptive
-
             return batch_adaptive.AdaptiveBatchRun._of_kept(self, kept)
+        if kind == "TimedBatchRun":
+            return batch_fixed.TimedBatchRun._of_kept(self, kept)
         return BatchRun._of_kept(self, kept) if kind == "BatchRun" else self._single(kind, kept)
-
-    def _ends_and_rows(self, count: int, rows: int) -> tuple[list[Array], list[Array]]:
-        """Room for q and qd at the ends, (batch, nq), and in the rows, (batch, rows, nq)."""
-        try:
-            if count * rows * self.nq > LARGE and self._bytes(count * rows) > machine_memory():
-                raise MemoryError
-            shapes = (count, self.nq), (count, rows, self.nq)
-            ends, kept = ([np.empty(shape, self.dtype) for _ in range(2)] for shape in shapes)
-        except MemoryError:
-            raise MemoryError(
-                f"{count} times {rows} rows of {2 * self.nq} numbers don't fit in memory: "
-                "keep fewer with every="
-            ) from None
-        return ends, kept
 
     def simulate_batch(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
@@ -209,15 +70,14 @@ class BatchModel(Model):
         dict of all inputs by name, numbers, (batch,), (batch, steps) or (1, steps).
         threads: as many as there are processors where None. An instance that can't go on has its
         own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
-        tol, times: by steps that fit a tolerance, each instance its own, with rows at the times,
-        at the start and the end where None. events: as in `simulate`.
+        tol: by steps that fit a tolerance, each instance its own. times: (n,), the rows, instead
+        of duration; without them those of adaptive steps are start and end. events: as in
+        `simulate`.
         """
         if events is not None:
             other, given = with_events(dict(locals()))
             return cast(BatchRun, other.simulate_batch(**given))
-        if times is not None or fits(self, h, steps, method, tol, h_most, stiff):
-            from . import batch_adaptive  # which needs this file
-
+        if fits(self, h, steps, method, tol, h_most, stiff):
             fitted, whole = batch_adaptive.simulate(
                 self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
                 stiff, (h, steps, method, every, None, control_period),
@@ -229,40 +89,23 @@ class BatchModel(Model):
         if progress is not None and not callable(progress):
             raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
+        at = None
+        if times is not None:
+            at, steps = as_asked(self, times, t0, h, duration, steps, every, None)
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
         hold = min(as_period(control_period, h), max(steps, 2))
         if u is None and control_period is not None and self.nu:
             raise ValueError("control_period: a batch follows the signals: give u, a row a period")
-        starts, table, held, count = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
+        starts, table, held, _ = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
         if held is not None and hold > 1 and held.shape[1] > 1:
             held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])
-        rows = 1 + steps // every + (steps % every > 0)
-        (q, qd), (q_rows, qd_rows) = self._ends_and_rows(count, rows)
-        work = Work(self, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows, starts)
-        whole = work.run(threads, progress)
-        if steps % every:
-            q_rows[:, -1], qd_rows[:, -1] = q, qd
-        if not whole or work.failed:
-            short = work.done < steps
-            for k in short.nonzero()[0]:
-                # the last good state stands where the next row would have
-                last = -(-work.done[k] // every)
-                q_rows[k, last], qd_rows[k, last] = q[k], qd[k]
-                q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
-            if not whole:
-                work.status[(work.status == 0) & short] = len(_NAMES) - 1
-        if held is not None and held.shape[1] > 1:  # a copy, as the caller's table may change
-            held = held[:, np.minimum(np.arange(rows) * every, steps - 1)]
         method = self._method(method)
         if steps >= SOME and (method, h) not in self._warned:
-            first = q_rows[0, 0], qd_rows[0, 0]
-            u0 = None if held is None else held[0, 0]
+            first, u0 = (starts[0][0], starts[1][0]), None if held is None else held[0, 0]
             self._look(*first, h, t0, u0, table[0], method, "the first instance: ")
-        run = BatchRun(
-            self, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
-            held, method,
-        )  # fmt: skip
+        asked = batch_fixed.Asked(step, h, t0, steps, every, at, method, threads, progress)
+        run, whole = batch_fixed.simulate(self, starts, held, table, asked)
         if not whole:
             raise Interrupted(run)
         return run

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from .adaptive_arguments import BOTH, as_end, as_limits, as_times
 from .adaptive_memory import FULL, room_for
 from .arguments import Array, as_number
-from .batch import BatchRun
+from .batch_run import BatchRun
 from .batch_work import all_of, as_threads
 from .happened import FoundInBatch, HappenedInBatch
 from .package import reduced
@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 _GROUP, _FEWEST = 128, 16  # instances that a thread takes at once, of many and of few
 _COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
 _FEW = 64  # steps of an instance before the first look at Ctrl-C
-_NAMES = ("tol", "evaluations", "rejected", "stiff_steps", "reached", "_times")
+_NAMES = (
+    "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "_begin", "_h_most",
+    "_stiff",
+)  # fmt: skip
 _HAPPENED = ("event_instances", "which", "event_rows")  # in what is kept of a run
 _ENDS = np.array([*STATUS, "interrupted", FULL])
 
@@ -48,6 +51,9 @@ class AdaptiveBatchRun(BatchRun):
     stiff_steps: Array = field(kw_only=True)
     reached: Array = field(kw_only=True)
     _times: Array = field(kw_only=True)
+    _begin: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
+    _h_most: float = field(kw_only=True)
+    _stiff: bool = field(kw_only=True)
     _happened: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
     _stopped: Array | None = field(default=None, kw_only=True)  # 1 + which event, or 0
     _limit: Array | None = field(default=None, kw_only=True)
@@ -74,6 +80,17 @@ class AdaptiveBatchRun(BatchRun):
             t, q, qd = np.split(rows[own], [1, 1 + nq], axis=1)
             found[name] = HappenedInBatch(t[:, 0], q, qd, instances[own])
         return found
+
+    def _states(self, times: Array) -> Array:
+        model: Any = self._model
+        p, limits = self._params, (float(self._times[-1]), self.tol, self._h_most)
+        work = _Work(
+            model, self._begin.copy(), self.t0, times.astype(model.dtype), limits,
+            self._held, p, self._stiff,
+        )  # fmt: skip
+        if len(times) and not work.run(None, None):
+            raise KeyboardInterrupt
+        return work.rows
 
     @property
     def stopped(self) -> Array:
@@ -140,13 +157,9 @@ def simulate(
     rows = as_times(times, t0, model.dtype)
     starts, table, held, _ = model._instances(q0, qd0, params, u, 1, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
-    work = _Work(model, q.copy(), qd.copy(), t0, rows, tol, most, held, table)
-    for memory in work.memory if stiff else ():
-        memory.stiff = 1
+    begin = np.array([q, qd])
+    work = _Work(model, begin.copy(), t0, rows, (float(rows[-1]), tol, most), held, table, stiff)
     whole = work.run(threads, progress)
-    kept = np.arange(len(rows)) < work.kept[:, None]
-    for values in work.rows:
-        values[~kept] = np.nan
     counts = work.counts
     cut = len(STATUS) + int(work.full)
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
@@ -156,7 +169,7 @@ def simulate(
         counts["steps"], codes, 1, 0, table.copy(), held, "gauss16", tol=tol,
         evaluations=counts["evaluations"], rejected=counts["rejected"],
         stiff_steps=counts["stiff_steps"],
-        reached=work.t, _times=rows,
+        reached=work.t, _times=rows, _begin=begin, _h_most=most, _stiff=bool(stiff),
     )  # fmt: skip
     if work.events:
         made._happened = work.events.all()
@@ -170,21 +183,23 @@ class _Work:
     """Instances on their way: where each is, its memory, and the rows of all."""
 
     def __init__(
-        self, model: BatchModel, q: Array, qd: Array, t0: float, times: Array, tol: float,
-        most: float, held: Array | None, table: Array,
+        self, model: BatchModel, begin: Array, t0: float, times: Array,
+        limits: tuple[float, float, float], held: Array | None, table: Array, stiff: bool,
     ) -> None:  # fmt: skip
-        self.model, self.q, self.qd, self.times = model, q, qd, times
-        self.held, self.table, self.limits = held, table, (float(times[-1]), tol, most)
-        count, n = len(q), len(times)
+        self.model, (self.q, self.qd), self.times = model, begin, times
+        self.held, self.table, self.limits = held, table, limits  # the end, tolerance, h_most
+        (count, _), n = self.q.shape, len(times)
         self.t = np.full(count, t0, model.dtype)
         self.rows = np.empty((2, count, n, model.nq), model.dtype)
         self.kept, self.status = np.zeros(count, "l"), np.zeros(count, "i")
         self.memory = model._ffi.new("adaptive_memory[]", count)
+        for memory in self.memory if stiff else ():
+            memory.stiff = 1
         self.open, self.stop, self.ended = np.ones(count, bool), False, 0
         self.events = FoundInBatch(model, room_for(model) - count * n) if model.events else None
         if times[0] == t0:
             self.kept[:] = 1
-            self.rows[0, :, 0], self.rows[1, :, 0] = q, qd
+            self.rows[:, :, 0] = begin
 
     @property
     def counts(self) -> dict[str, Array]:
@@ -210,9 +225,11 @@ class _Work:
         count = len(self.q)
         group = _GROUP if count > 8 * _GROUP else _FEWEST
         groups = [(at, min(group, count - at)) for at in range(0, count, group)]
-        return all_of(
+        whole = all_of(
             self, groups, as_threads(threads), lambda: progress and progress(self.ended, count)
         )
+        self.rows[:, np.arange(len(self.times)) >= self.kept[:, None]] = np.nan
+        return whole
 
     def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
         """Instances at, ..., at + count - 1 to the end, some steps of each at once."""

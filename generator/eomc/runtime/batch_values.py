@@ -18,7 +18,7 @@ _Rows = tuple[slice, slice]  # of instances and of times
 
 
 class Values:
-    """A part of `batch.BatchRun`: as in a single run, with the instances before all else."""
+    """A part of `batch_run.BatchRun`: as in a single run, with the instances before all else."""
 
     _model: Model
     q: Array

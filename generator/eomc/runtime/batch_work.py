@@ -15,6 +15,7 @@ from .slices import longer
 
 if TYPE_CHECKING:
     from .batch import BatchModel
+    from .batch_run import BatchRun
 _GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
 _TILES = 64  # at most in a group: threads ask for the next one seldom
 _SHARES = 8  # groups of a thread, so that all end together
@@ -34,6 +35,7 @@ class Work:
     ) -> None:  # fmt: skip
         self.model, self.step, self.count = model, step, len(q)
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
+        self.first = 0  # the step that `run` begins with
         self.held, self.table = held, table
         self.starts = starts
         self.rows = 0 if q_rows is None else q_rows.shape[1]
@@ -57,7 +59,7 @@ class Work:
         """All of it; False where Ctrl-C came in between."""
         count = self.count
         threads = as_threads(threads)
-        if count * self.steps < WORTH:
+        if count * (self.steps - self.first) < WORTH:
             threads = 1
         tiles = -(-count // _GROUP)
         size = _GROUP * max(1, min(_TILES, tiles // (_SHARES * threads) if threads > 1 else tiles))
@@ -80,6 +82,7 @@ class Work:
         else:
             for future in [_pool(threads).submit(self._begin, *part) for part in parts]:
                 future.result()
+        self.starts = None  # they have begun
 
     def _begin(self, at: int, count: int) -> None:
         assert self.starts is not None
@@ -106,7 +109,7 @@ class Work:
             u = pointer(self.held[at:end] if len(self.held) > 1 else self.held)
             u_instance = many * width if len(self.held) > 1 else 0
             u_step = width if many > 1 else 0
-        first, kind = 0, (self.step, count.bit_length())
+        first, kind = self.first, (self.step, count.bit_length())
         # the first piece is short: another batch may have been quicker
         many = max(1, int(_FIRST / (model._paces.get(kind, _SLOWEST * model.nq) * count)))
         while first < self.steps and not self.stop:
@@ -124,6 +127,54 @@ class Work:
             model._paces[kind] = max(1e-10, spent / (many * count))
             many = longer(many, spent, _SECONDS)
             look()
+
+
+class Way:
+    """Instances on their way by whole steps, with shorter ones to times between."""
+
+    def __init__(
+        self, model: BatchModel, method: str | None, both: Any, t0: float, h: float,
+        held: Array | None, table: Array, starts: tuple[Array, Array] | None = None, first: int = 0,
+    ) -> None:  # fmt: skip
+        self.model, self.method, self.state = model, method, both
+        step = model._stepper(method, "batch")
+        q, qd = both
+        self.work = Work(model, step, q, qd, h, t0, first, 0, held, table, None, None, starts)
+
+    @classmethod
+    def of(cls, run: BatchRun, both: Array, held: Array | None, first: int = 0) -> Way:
+        """That of a run again, from its states behind so many steps."""
+        model: Any = run._model
+        return cls(model, run.method, both, run.t0, run.h, held, run._params, None, first)
+
+    def rows(
+        self, places: tuple[Array, Array], into: Any, threads: int | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> bool:  # fmt: skip
+        """States so many steps on and a rest in s, (batch, n, nq) each; False: cut by Ctrl-C."""
+        work, (whole, rest) = self.work, places
+        last = work.count * int(whole[-1])
+        look = progress and (lambda done, _: progress(done, last))
+        for k, (n, left) in enumerate(zip(whole.tolist(), rest.tolist(), strict=True)):
+            work.first, work.steps = work.steps, n
+            if not work.run(threads, look):
+                for rows in into:
+                    rows[:, k:] = np.nan
+                return False
+            into[0][:, k], into[1][:, k] = self._between(left)
+        return True
+
+    def _between(self, rest: float) -> tuple[Array, Array]:
+        """The states so many seconds behind the last step, nan of who can't go on."""
+        work, (q, qd) = self.work, np.array(self.state)
+        good, held = work.status == 0, work.held
+        if rest:
+            n = work.steps
+            u = None if held is None else held[:, min(n, held.shape[1] - 1)]
+            t, p, method = work.t0 + n * work.h, work.table, self.method
+            good &= self.model.step_batch(q, qd, rest, t, u, p, method=method) == 0
+        q[~good] = qd[~good] = np.nan
+        return q, qd
 
 
 class Grouped(Protocol):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _AT = 1e-12  # of a step: so near a time is that of the step itself
 
 
-def within(run: Run, t: ArrayLike) -> Array:
+def within(run: Any, t: ArrayLike) -> Array:
     """Times as an array, or a ValueError where one is outside of the run."""
     times = np.asarray(t, float)
     begin, end = run.t0, float(run.t[-1])

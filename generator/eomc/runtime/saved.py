@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .columns import Columns, File
     from .model import Model
 
-KINDS = ("Run", "AdaptiveRun", "TimedRun", "BatchRun", "AdaptiveBatchRun")
+KINDS = ("Run", "AdaptiveRun", "TimedRun", "BatchRun", "TimedBatchRun", "AdaptiveBatchRun")
 _WRITTEN = 'load_run reads what run.save("NAME.npz") wrote'
 _KIND = "eomc {} 1"  # and the version of what such a file holds
 

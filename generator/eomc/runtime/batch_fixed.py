@@ -1,0 +1,166 @@
+"""Batches by fixed steps: rows after so many steps, or at any time.
+
+A state between two steps is found by a shorter one from the first of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from .arguments import Array, machine_memory
+from .batch_run import BatchRun
+from .batch_work import Way, Work
+from .dense import parts
+from .model import LARGE
+from .package import reduced
+from .trajectory import STATUS
+
+if TYPE_CHECKING:
+    from .batch import BatchModel
+
+_NAMES = ("_times", "_begin", "_u")
+_CUT = len(STATUS)  # interrupted
+
+
+@dataclass(eq=False, repr=False)
+class TimedBatchRun(BatchRun):
+    """Trajectories by fixed steps with rows at the times that were asked for.
+
+    steps: those of size h. Rows behind the last good step of an instance are nan. Everything else
+    as in a BatchRun.
+    """
+
+    _times: Array = field(kw_only=True)
+    _begin: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
+    _u: Array | None = field(kw_only=True)  # over all steps, (batch or 1, steps or 1, nu)
+
+    @property
+    def t(self) -> Array:
+        """The time of each row, (n,), s."""
+        return self._times
+
+    def _states(self, times: Array) -> Array:
+        found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
+        way = Way.of(self, self._begin.copy(), self._u)
+        way.rows(parts(times, self.t0, self.h), found)
+        return found
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("batch_fixed.TimedBatchRun._of_kept", self._model, self._kept())
+
+    def _all(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, each.name) for each in fields(BatchRun))
+
+    def _kept(self) -> dict[str, Any]:
+        return super()._kept() | {name: getattr(self, name) for name in _NAMES}
+
+    @classmethod
+    def _of_kept(cls, model: Any, kept: Mapping[str, Any]) -> TimedBatchRun:
+        made = BatchRun._of_kept(model, kept)._all()
+        own: Any = {name: kept.get(name) for name in _NAMES}
+        return cls(*made, **own)
+
+    def _settings(self) -> tuple[Any, ...]:
+        return (*super()._settings(), self._times.tolist())
+
+
+class Asked(NamedTuple):
+    """What a run by fixed steps was asked for; times (n,): rows there."""
+
+    step: Any  # of C
+    h: float
+    t0: float
+    steps: int
+    every: int
+    times: Array | None
+    method: str
+    threads: int | None
+    progress: Callable[[int, int], None] | None
+
+
+def simulate(
+    model: BatchModel, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+) -> tuple[BatchRun, bool]:
+    """From checked arguments, and whether it is whole, not cut off by Ctrl-C."""
+    made = _by_steps if asked.times is None else _at_times
+    return made(model, starts, held, table, asked)
+
+
+def _by_steps(
+    model: BatchModel, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+) -> tuple[BatchRun, bool]:
+    """Rows after every so many steps, and the last."""
+    step, h, t0, steps, every, _, method, threads, progress = asked
+    rows = 1 + steps // every + (steps % every > 0)
+    (q, qd), (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), rows)
+    work = Work(model, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows, starts)
+    whole = work.run(threads, progress)
+    if steps % every:
+        q_rows[:, -1], qd_rows[:, -1] = q, qd
+    if not whole or work.failed:
+        short = work.done < steps
+        for k in short.nonzero()[0]:
+            # the last good state stands where the next row would have
+            last = -(-work.done[k] // every)
+            q_rows[k, last], qd_rows[k, last] = q[k], qd[k]
+            q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
+        if not whole:
+            work.status[(work.status == 0) & short] = _CUT
+    if held is not None and held.shape[1] > 1:
+        held = _at_rows(held, np.arange(rows) * every, steps)
+    run = BatchRun(
+        model, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
+        held, method,
+    )  # fmt: skip
+    return run, whole
+
+
+def _at_times(
+    model: BatchModel, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+) -> tuple[BatchRun, bool]:
+    """Rows at the times that were asked for."""
+    h, t0, method, times = asked.h, asked.t0, asked.method, asked.times
+    assert times is not None
+    places = parts(times, t0, h, asked.steps)
+    both, (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), len(times))
+    way = Way(model, method, both, t0, h, held, table, starts)
+    whole = way.rows(places, (q_rows, qd_rows), asked.threads, asked.progress)
+    work, last = way.work, int(places[0][-1])
+    if not whole:
+        work.status[(work.status == 0) & (work.done < last)] = _CUT
+    given = held
+    if held is not None and held.shape[1] > 1:
+        given = _at_rows(held, places[0], asked.steps)
+    run = TimedBatchRun(
+        model, t0, q_rows, qd_rows, h, work.done, work.status, 1, last, table.copy(),
+        given, method, _times=times,
+        _begin=np.array(starts, model.dtype), _u=None if held is None else held.copy(),
+    )  # fmt: skip
+    return run, whole
+
+
+def _at_rows(held: Array, begun: Array, steps: int) -> Array:
+    """What is held from so many steps on; a copy, as the caller's table may change."""
+    return np.ascontiguousarray(held[:, np.minimum(begun, steps - 1)])
+
+
+def _ends_and_rows(
+    model: BatchModel, count: int, rows: int
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Room for q and qd at the ends, (batch, nq), and in the rows, (batch, rows, nq)."""
+    nq, dtype = model.nq, model.dtype
+    try:
+        if count * rows * nq > LARGE and model._bytes(count * rows) > machine_memory():
+            raise MemoryError
+        end, whole = (count, nq), (count, rows, nq)
+        ends = np.empty(end, dtype), np.empty(end, dtype)
+        return ends, (np.empty(whole, dtype), np.empty(whole, dtype))
+    except MemoryError:
+        raise MemoryError(
+            f"{count} times {rows} rows of {2 * nq} numbers don't fit in memory: "
+            "keep fewer with every="
+        ) from None

@@ -1,0 +1,172 @@
+"""Trajectories of many instances: what `simulate_batch` returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arguments import Array
+from .batch_plot import Fans
+from .batch_values import Values
+from .batch_work import Way
+from .columns import Columns
+from .dense import parts, within
+from .model import Model
+from .package import reduced
+from .trajectory import STATUS
+
+_ENDS = np.array([*STATUS, "interrupted"])
+_KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as the fields go
+
+
+@dataclass(eq=False, repr=False)
+class BatchRun(Values, Fans, Columns):
+    """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
+
+    status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the
+    rows behind the last good one of an instance that could not go on are nan. steps: how many each
+    has made. By name, run["theta_dot"], (batch, n). Equal where scene, settings and rows are, bit
+    by bit; a pickled one keeps all of them.
+    """
+
+    _axes = ("instance", "t")
+    _model: Model
+    t0: float
+    q: Array
+    qd: Array
+    h: float
+    steps: Array
+    _codes: Array
+    every: int
+    _wanted: int
+    _params: Array  # (batch or 1, np)
+    _held: Array | None  # at the rows, (batch or 1, n or 1, nu)
+    method: str
+
+    @cached_property
+    def t(self) -> Array:
+        """The time of each row, (n,), s."""
+        steps = np.minimum(np.arange(self.q.shape[1]) * self.every, self._wanted)
+        return np.asarray(self.t0 + self.h * steps)
+
+    @cached_property
+    def status(self) -> Array:
+        """How each ended; made when it is asked for, since so many words take time."""
+        return np.asarray(_ENDS[self._codes])
+
+    @property
+    def u(self) -> Array:
+        """The inputs as they acted at each row, (batch, n, nu), so within their limits.
+
+        They are the signals there, or what was held from there on; in the last row what was held
+        over the last step.
+        """
+        return self._within(self._given)
+
+    @property
+    def saturated(self) -> Array:
+        """Whether each input was beyond its limits at each row, (batch, n, nu); not where nan."""
+        given = self._given
+        return np.asarray(np.abs(given - self._within(given)) > 0)
+
+    def _within(self, u: Array) -> Array:
+        """Inputs (batch, n, nu) within the limits of their instances."""
+        if not self._model.has_limits:
+            return u
+        ends = (
+            [self._model._within(u, self._params[0])]
+            if len(self._params) == 1
+            else [self._model._within(u[k], p) for k, p in enumerate(self._params)]
+        )
+        return np.reshape(ends, u.shape)
+
+    @property
+    def _given(self) -> Array:
+        """The inputs at each row, (batch, n, nu), whatever their limits."""
+        if self._held is None:
+            return self._values("signal", self._model.signal, (self._model.nu,))
+        found = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
+        found[np.isnan(self.q[..., 0])] = np.nan
+        return found
+
+    def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
+        """(q, qd) of all at any time within the run, t (...,): each (batch, ..., nq).
+
+        By steps of the method from the last row before, or by the same steps again, so as exact as
+        the run; nan where an instance did not come so far. Raises ValueError outside of the run, or
+        where rows don't tell the inputs.
+        """
+        times = within(self, t)
+        asked, place = np.unique(times, return_inverse=True)
+        q, qd = self._states(asked)[:, :, place.ravel()]
+        shape = (len(self), *times.shape, self._model.nq)
+        return q.reshape(shape), qd.reshape(shape)
+
+    def _states(self, times: Array) -> Array:
+        """(2, batch, n, nq) at ascending times within the run, from the last row before each."""
+        held, every = self._held, self.every
+        if held is not None and held.shape[1] > 1 and every > 1:
+            raise ValueError("u was a table, of which rows tell some values only: take every=1")
+        whole, rest = parts(times, self.t0, self.h, self._wanted)
+        found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
+        for row in np.unique(whole // every):
+            own, first = (whole // every == row).nonzero()[0], int(row) * every
+            way = Way.of(self, np.array([self.q[:, row], self.qd[:, row]]), held, first)
+            way.work.status[self.steps < first] = STATUS.index(
+                "not finite"
+            )  # who never came so far
+            here = slice(own[0], own[-1] + 1)
+            way.rows((whole[own], rest[own]), found[:, :, here])
+        return found
+
+    def _kept(self) -> dict[str, Any]:
+        """What a saved run keeps of it besides its columns; None: nothing."""
+        return dict(zip(_KEPT, self._all()[1:], strict=True))
+
+    @classmethod
+    def _of_kept(cls, model: Model, kept: Mapping[str, Any]) -> BatchRun:
+        values: Any = map(kept.get, _KEPT)
+        return cls(model, *values)
+
+    @property
+    def message(self) -> str:
+        """What happened, in a sentence."""
+        names, counts = np.unique(self.status, return_counts=True)
+        found = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
+        done = int(self.steps.sum())
+        wanted = len(self) * self._wanted
+        return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {found}"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("batch_run.BatchRun", *self._all())
+
+    def _all(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, each.name) for each in fields(self))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, BatchRun):
+            return NotImplemented
+        alike = self._settings() == other._settings()
+        both = zip(self._arrays(), other._arrays(), strict=True)
+        return alike and all(np.array_equal(a, b, equal_nan=True) for a, b in both)
+
+    __hash__ = None  # type: ignore[assignment]  # rows may be changed
+
+    def _settings(self) -> tuple[Any, ...]:
+        model = self._model
+        return (model.name, model.digest, self.t0, self.h, self.every, self._wanted, self.method)
+
+    def _arrays(self) -> tuple[Array, ...]:
+        held = np.empty(0) if self._held is None else self._held
+        return self.q, self.qd, self.steps, self._codes, self._params, held
+
+    def __len__(self) -> int:
+        return len(self._codes)
+
+    def __repr__(self) -> str:
+        return f"<BatchRun of {self._model.name}: {self.message}>"
