@@ -6,7 +6,7 @@ A row is phi(q, t) = 0, of rate A qd + phi_t, or psi(q, qd, t) = 0, linear in qd
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import sympy
 from sympy import Expr, S
@@ -21,6 +21,7 @@ DROPPED = {
     "double": (sympy.Float("1e-12"), sympy.Float("1e-9")),
     "float": (sympy.Float("1e-5"), sympy.Float("1e-5")),
 }
+Sum = tuple[tuple[int, Expr], ...]  # of rows: the place and weight of each
 FADED = {"double": 1e-22, "float": 1e-12}  # of a row's usual pivot: it is rounding
 
 
@@ -30,13 +31,13 @@ class Constraints:
 
     values (m,); jacobian (m, nq); rates (m,): A qd + phi_t, and psi; rest (m,): what A qdd lacks to
     the rate of `rates`. moved (m,): what A qd is where `rates` are 0, by what time alone moves.
-    holonomic: how many are; solved: those that accelerations are solved for,
-    which leaves redundant ones out. drop: a pivot that is this part of what it was, or less, tells
-    a row that depends on others in this position: nothing is solved for it there; in accelerations,
-    and in corrections. weights: where D alone is singular, of each row solved for, the part of
-    A^T A that makes it regular; else none. faded: of each row solved for, the pivot that tells that
-    it has no slope at all in this position, where it may have none. switched: rows that hold in
-    some modes only.
+    holonomic: how many are; solved: what accelerations are solved for, sums of rows, (place,
+    weight) of each: single ones mostly, which leaves redundant ones out. drop: a pivot that is this
+    part of what it was, or less, tells a row that depends on others in this position: nothing is
+    solved for it there; in accelerations, and in corrections. weights: where D alone is singular,
+    of each row solved for, the part of A^T A that makes it regular; else none. faded: of each row
+    solved for, the pivot that tells that it has no slope at all in this position, where it may have
+    none. switched: rows that hold in some modes only.
     """
 
     values: Vector
@@ -45,7 +46,7 @@ class Constraints:
     rest: Vector
     moved: Vector
     holonomic: int
-    solved: tuple[int, ...]
+    solved: tuple[Sum, ...]
     drop: tuple[Expr, Expr]
     weights: Vector = ()
     faded: Vector = ()
@@ -65,16 +66,28 @@ def constraints(system: System, e: Energies) -> Constraints | None:
     by += [tape.gradient([(row, S.One)], qd) for row in psi]
     still = dict.fromkeys(qd, S.Zero)
     moved = [*tape.forward(phi, {t: S.One}), *tape.substitute(psi, still)]
-    solved = tuple(k for k, c in enumerate(system.constraints) if not c.redundant)
+    solved = tuple(
+        tuple((k, S.One if w == 1 else sympy.Float(w)) for k, w in row) for row in system.solved
+    )
     weights = system.closure.weights if system.closure else ()
     slopes = system.closure.slopes if system.closure else (0.0,) * len(system.constraints)
-    return Constraints(
+    made = Constraints(
         tuple(e.rows), tuple(map(tuple, by)), tuple(rates), tuple(tape.forward(rates, along)),
         tuple(tape.scaled(S.NegativeOne, x) for x in moved), count, solved,
-        DROPPED[system.run.real], tuple(sympy.Rational(weights[k]) for k in solved if weights),
-        tuple(_faded(by[k], slopes[k] * FADED[system.run.real]) for k in solved),
-        frozenset(k for k, c in enumerate(system.constraints) if c.switched),
+        DROPPED[system.run.real],
+        # the rows of sums have a slope of about 1
+        tuple(sympy.Rational(_of(row, weights)) for row in solved if weights),
+        switched=frozenset(k for k, c in enumerate(system.constraints) if c.switched),
     )  # fmt: skip
+    least = FADED[system.run.real]
+    A = jacobian(tape, made)
+    faded = (_faded(a, _of(row, slopes) * least) for a, row in zip(A, solved, strict=True))
+    return replace(made, faded=tuple(faded))
+
+
+def _of(row: Sum, numbers: Sequence[float]) -> float:
+    """That of a row that stands alone, 1 of a sum."""
+    return numbers[row[0][0]] if len(row) == 1 else 1.0
 
 
 def _faded(row: Sequence[Expr], limit: float) -> Expr:
@@ -89,14 +102,26 @@ def rate_terms(tape: Tape, rows: Constraints, qd: Sequence[sympy.Symbol]) -> Vec
     Where a row depends on others its multiplier can't make it hold: what is left of its rate beside
     these tells a position that only others lead on from.
     """
-    told = [k for k in rows.solved if k not in rows.switched]
+    told = [k for k, row in enumerate(rows.solved) if row[0][0] not in rows.switched]
+    A = jacobian(tape, rows)
+    rates, moved = (chosen(tape, some, rows) for some in (rows.rates, rows.moved))
     sizes = []
     for k in told:
-        terms = [tape.times(a, v) for a, v in zip(rows.jacobian[k], qd, strict=True)]
-        sizes.append(tape.total([tape.define(sympy.Abs(x)) for x in (*terms, rows.moved[k])]))
-    return (*(rows.rates[k] for k in told), *sizes)
+        terms = [tape.times(a, v) for a, v in zip(A[k], qd, strict=True)]
+        sizes.append(tape.total([tape.define(sympy.Abs(x)) for x in (*terms, moved[k])]))
+    return (*(rates[k] for k in told), *sizes)
 
 
-def chosen(some: Sequence[Expr], rows: Constraints) -> list[Expr]:
-    """Those of the rows that are solved for."""
-    return [some[k] for k in rows.solved]
+def jacobian(tape: Tape, rows: Constraints) -> Rows:
+    """That of what is solved for."""
+    columns = [chosen(tape, column, rows) for column in zip(*rows.jacobian, strict=True)]
+    return tuple(zip(*columns, strict=True))
+
+
+def chosen(tape: Tape, some: Sequence[Expr], rows: Constraints) -> list[Expr]:
+    """What is solved for, of numbers of all rows."""
+    return [
+        some[row[0][0]] if len(row) == 1
+        else tape.total([tape.scaled(w, some[k]) for k, w in row])
+        for row in rows.solved
+    ]  # fmt: skip

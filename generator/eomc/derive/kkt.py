@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import sympy
 from sympy import Expr, S
 
-from eomc.derive.constraints import Constraints, chosen
+from eomc.derive.constraints import Constraints, chosen, jacobian
 from eomc.derive.ldl import Pairs, Rows, Solution, Vector
 from eomc.derive.tape import Tape
 from eomc.model.symbols import pivot_inverse
@@ -170,19 +170,24 @@ def accelerations(
     short: Callable[[Expr], Expr] = lambda atom: atom,
 ) -> Solution:
     """qdd and the multipliers of all rows, 0 of redundant ones."""
-    A = tuple(chosen(rows.jacobian, rows))
-    c = [tape.scaled(S.NegativeOne, x) for x in chosen(rows.rest, rows)]
+    A = jacobian(tape, rows)
+    c = [tape.scaled(S.NegativeOne, x) for x in chosen(tape, rows.rest, rows)]
     D, b = with_mass(tape, D, b, A, c, rows.weights)
-    switched = [r for r, k in enumerate(rows.solved) if k in rows.switched]
+    switched = [r for r, row in enumerate(rows.solved) if row[0][0] in rows.switched]
     made = factors(tape, D, A, rows.drop[0], rows.faded, short, switched)
     a, some, lacks = made.solve(b, c, short)
-    multipliers = [S.Zero] * len(rows.values)
-    for k, x in zip(rows.solved, some, strict=True):
-        multipliers[k] = x
+    parts: dict[int, list[Expr]] = {}
+    for row, x in zip(rows.solved, some, strict=True):
+        for k, w in row:
+            parts.setdefault(k, []).append(tape.scaled(w, x))
+    multipliers = tuple(
+        S.Zero if k not in parts else parts[k][0] if len(parts[k]) == 1 else tape.total(parts[k])
+        for k in range(len(rows.values))
+    )
     order = tuple(k for k, _, _ in made.steps if k < len(D))
     told = zip(made.switched.items(), lacks, strict=True)
-    parts = {rows.solved[r]: (lack, pivot) for (r, (pivot, _)), lack in told}
-    return Solution(tape, a, order, made.pivots, "D", tuple(multipliers), parts)
+    lack_of = {rows.solved[r][0][0]: (lack, pivot) for (r, (pivot, _)), lack in told}
+    return Solution(tape, a, order, made.pivots, "D", multipliers, lack_of)
 
 
 def with_mass(
@@ -216,14 +221,17 @@ def projection(
     rates that are taken at q + dq, to the first order. Of rows that modes switch there is no
     inverse: it may well be 0. Second: the pivots, as `Solution` has them.
     """
-    n, A = len(D), tuple(chosen(rows.jacobian, rows))
+    n, A = len(D), jacobian(tape, rows)
     D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)
     made = factors(tape, D, A, rows.drop[1], rows.faded)
-    positions = [S.Zero if k >= rows.holonomic else -rows.values[k] for k in rows.solved]
+    places = [row[0][0] for row in rows.solved]  # sums are of positions
+    lacks = [tape.scaled(S.NegativeOne, x) for x in chosen(tape, rows.values, rows)]
+    positions = [S.Zero if k >= rows.holonomic else x for k, x in zip(places, lacks, strict=True)]
     zero, same = [S.Zero] * n, lambda atom: atom
     dq, _, _ = made.solve(zero, positions, same)
     moved = tape.forward(rows.rates, dict(zip(q, dq, strict=True)))
     rates = [tape.total([x, y]) for x, y in zip(rows.rates, moved, strict=True)]
-    dqd, _, _ = made.solve(zero, [tape.scaled(S.NegativeOne, rates[k]) for k in rows.solved], same)
-    told = (x for k, x in zip(rows.solved, made.inverses, strict=True) if k not in rows.switched)
+    off = [tape.scaled(S.NegativeOne, x) for x in chosen(tape, rates, rows)]
+    dqd, _, _ = made.solve(zero, off, same)
+    told = (x for k, x in zip(places, made.inverses, strict=True) if k not in rows.switched)
     return (*dq, *dqd, *told), made.pivots

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from eomc.emit.c_function import CFunction
+from eomc.emit.c_function import CFunction, in_braces
 from eomc.emit.c_names import Target
 from eomc.emit.functions import Functions
 from eomc.emit.plain.constraint_views import Project, Projection
@@ -87,6 +87,8 @@ def project(functions: Functions) -> Project:
     closure = target.system.closure
     weights = closure.weights if closure else ()
     rows = target.system.constraints
+    sums = closure.sums if closure else ()
+    mixed = sorted({k for row in sums for k, weight in enumerate(row) if weight})
     return Project(
         **functions.names,
         fabs=f"fabs{end}",
@@ -104,6 +106,10 @@ def project(functions: Functions) -> Project:
         loose=target.literal(4096 * eps),
         rounded=target.literal(4 * eps),
         weights="{ " + ", ".join(map(target.literal, weights)) + " }" if weights else "",
-        redundant=tuple(k for k, row in enumerate(rows) if row.redundant),
+        sums=in_braces([*map(target.literal, row)] for row in sums),
+        sum_places=tuple(mixed[: len(sums)]),
+        redundant=tuple(
+            k for k, row in enumerate(rows) if row.redundant or k in mixed[len(sums) :]
+        ),
         tiny=target.literal(1e-30),
     )

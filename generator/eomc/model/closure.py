@@ -33,8 +33,10 @@ class Closure:
     `positions` positions; rows in units of their own inverse inertia, coordinates in the metric of
     D: 0 at a singular position. weights: where D alone is singular, of each row r what makes
     D + sum of weights[r] A_r^T A_r regular; else none. slopes: of each row the largest
-    A D^-1 A^T of these positions. moves, rate_moves: what assembling changed.
-    remarks: in words. made_for: what of the system all that depends on.
+    A D^-1 A^T of these positions. sums: where rows depend on one another and no set of them does
+    everywhere, what is solved for in place of `shared`: the weights of all rows in each. moves,
+    rate_moves: what assembling changed. remarks: in words. made_for: what of the system all that
+    depends on.
     """
 
     rows: tuple[str, ...]
@@ -47,6 +49,7 @@ class Closure:
     positions: int = 1
     weights: tuple[float, ...] = ()
     slopes: tuple[float, ...] = ()
+    sums: tuple[tuple[float, ...], ...] = ()
     moves: tuple[Move, ...] = ()
     rate_moves: tuple[Move, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -66,8 +69,10 @@ class Closure:
                 f": {plural('row', len(self.redundant))} {listed(self.redundant)} "
                 f"{'is' if len(self.redundant) == 1 else 'are'} redundant"
             )
+        if self.sums:
+            text += f": {len(self.sums)} {plural('sum', len(self.sums))} of them stand for these"
         if self.shared:
-            start = "; the" if self.redundant else ": the"
+            start = "; the" if self.redundant or self.sums else ": the"
             text += f"{start} forces in {listed(self.shared)} are not unique"
         return text
 

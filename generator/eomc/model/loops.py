@@ -2,7 +2,7 @@
 
 With p from the first body's point to the second's, a and u axes of the first and b of the second,
 a row is one of
-  p.e, along an axis of the world: both points meet;
+  p.e, along an axis of the body that both hang from, or of the world: both points meet;
   p.u, across an axis of the first body: the second's point stays on a line;
   a.b = 0: axes at right angles; such rows are regular where the joint is closed, and of a second
   frame that is out by a small rotation d they are d along the axis that the row is named after;
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class End:
-    """A body at a joint: the point in the world, and its frame's rotation."""
+    """A body at a joint: the point, and its frame's rotation, in the frame both are seen from."""
 
     point: Vector
     R: Matrix
@@ -57,10 +57,13 @@ class Closed:
     reactions: list[Reaction] = field(default_factory=list)
 
 
-def close(loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length: Expr) -> Closed:
-    """The rows of one loop between bodies, and its reaction.
+def close(
+    loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length: Expr, seen: Matrix
+) -> Closed:
+    """The rows of one loop between bodies, and its reaction, along the world's axes.
 
-    turned: how the second frame stands in the first when closed; length: of a distance, m.
+    turned: how the second frame stands in the first when closed; length: of a distance, m. seen:
+    how the frame stands in the world in which the ends are told.
     """
     first, second = ends
     R = (product(first.R, turned), second.R)
@@ -77,6 +80,7 @@ def close(loop: Loop, plane: bool, ends: tuple[End, End], turned: Matrix, length
         made.append(row)
         force = plus(force, scaled(pull.force, row.multiplier))
         moment = plus(moment, scaled(pull.moment, row.multiplier))
+    force, moment = apply(seen, force), apply(seen, moment)
     values = (*force[:2], moment[2]) if plane else (*force, *moment)
     branches = [*_branches(kinds, *R)]
     if "ru" in kinds:

@@ -16,6 +16,7 @@ from sympy import Add, Expr, S, Symbol
 from eomc.base import spatial
 from eomc.base.spatial import apply, plus, product, scaled, transposed
 from eomc.model import exact, loops
+from eomc.model.chains import Chains, Named, Step, rotation_about
 from eomc.model.exact import ONE, ZERO, Matrix, Vector, numeric, numeric_entry
 from eomc.model.loops import Closed
 from eomc.model.sticking import Friction
@@ -96,6 +97,7 @@ class Builder:
         self.sticks = sticks
         self.terms = Terms()
         self.moved: dict[str, list[Expr]] = {}  # of each body the motions of its joint
+        self.chains = Chains(assembly.plane)
         self.places: dict[str, _Place] = {WORLD: _Place(-1, ZERO, ONE, ZERO, ONE)}
         self.loads: dict[str, tuple[Expr, tuple[Expr, ...]]] = {}  # of bodies placed by formulas
         self.terms.gravity = self._vector("gravity", assembly.gravity)
@@ -130,6 +132,9 @@ class Builder:
         kind, by = JOINTS[body.joint], [self._coordinate(key, c) for c in body.coordinates]
         for k, along in enumerate(zip(kind.motions, kind.along(body.axes), by, strict=True)):
             place = self._move(body.name, place, *along, armature[k] if armature else S.Zero)
+        moved = zip(kind.motions, kind.along(body.axes), self.moved.get(body.name, ()), strict=True)
+        turned = sum((self.value(f"{key}.rotation", x.angle) for x in body.rotation), S.Zero)
+        self.chains.steps[body.name] = Step(body.parent, offset, rotation, turned, tuple(moved))
         if not self.assembly.plane and body.joint != "fixed":
             R = self._entries(body.name, place.R)
             place = replace(place, R=R)
@@ -270,13 +275,17 @@ class Builder:
         if loop.ratio and loop.offset:
             ratio = self.value(f"{key}.ratio", loop.ratio)
             return loops.gear(loop, ratio, self.value(f"{key}.offset", loop.offset))
-        ends = []
+        ends, base = [], self.chains.common(*loop.bodies)
         for name, given in zip(loop.bodies, loop.points, strict=True):
             place, point = self.places[name], self._vector(f"{key}.points", given)
-            ends.append(loops.End(plus(place.at, apply(place.R, point)), place.R))
+            at, R = place.at, place.R
+            if base != WORLD:
+                at, R = self.chains.seen(name, base, self._later(f"{loop.name}_"))
+            ends.append(loops.End(plus(at, apply(R, point)), R))
         length = self.value(f"{key}.length", loop.length) if loop.length else S.Zero
         turned = self._rotation(f"{key}.rotation", loop)
-        return loops.close(loop, self.assembly.plane, (ends[0], ends[1]), turned, length)
+        R = self.places[base].R
+        return loops.close(loop, self.assembly.plane, (ends[0], ends[1]), turned, length, R)
 
     def _put(self, body: Body) -> None:
         assert body.position is not None
@@ -371,9 +380,19 @@ class Builder:
         x, y, z = made
         return (x, y, z)
 
-    def _world(self, name: str, at: Vector) -> Vector:
-        x, y, z = (self._named(f"{name}_{letter}", e) for letter, e in zip("xyz", at, strict=True))
+    def _world(self, name: str, at: Vector, later: bool = False) -> Vector:
+        named = zip("xyz", at, strict=True)
+        x, y, z = (self._named(f"{name}_{letter}", e, later) for letter, e in named)
         return (x, y, z)
+
+    def _later(self, begin: str) -> Named:
+        """What gives names to a body's place, behind the user's definitions."""
+
+        def named(body: str, at: Vector, R: Matrix) -> tuple[Vector, Matrix]:
+            R = R if self.assembly.plane else self._entries(begin + body, R, later=True)
+            return self._world(begin + body, at, later=True), R
+
+        return named
 
     def _entries(self, name: str, R: Matrix, later: bool = False) -> Matrix:
         rows = enumerate(R, start=1)
@@ -397,8 +416,3 @@ class Builder:
 
 def _rate(e: Expr) -> Expr:
     return dot(e) if e.free_symbols else S.Zero
-
-
-def rotation_about(axis: int, angle: Expr) -> Matrix:
-    """The rotation about a coordinate axis: takes vectors of the rotated frame to the old one."""
-    return spatial.about_axis(axis, sympy.cos(angle), sympy.sin(angle))

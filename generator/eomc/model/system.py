@@ -128,6 +128,20 @@ class System:
         """The velocities of all that moves between events, by their coordinates."""
         return {c.q: c.qd for c in self.coordinates if c.name not in self.discrete}
 
+    @property
+    def solved(self) -> tuple[tuple[tuple[int, float], ...], ...]:
+        """What accelerations are solved for: sums of constraints, (place, weight) of each.
+
+        One constraint each, but for those of `closure.sums`; these come first of all.
+        """
+        sums = self.closure.sums if self.closure else ()
+        mixed = {k for row in sums for k, w in enumerate(row) if w}
+        own = (k for k, c in enumerate(self.constraints) if not c.redundant and k not in mixed)
+        return (
+            *(tuple((k, w) for k, w in enumerate(row) if w) for row in sums),
+            *(((k, 1.0),) for k in own),
+        )
+
     def problem(self, key: str, message: str, severity: str = "error") -> Problem:
         """A problem at a key such as `energy.kinetic`, with its line where there is a scene."""
         if self.place is None:

@@ -199,6 +199,7 @@ def _closure(manifold: Manifold, start: Start, found: Ranks) -> Closure:
         positions=found.positions,
         weights=found.weights,
         slopes=found.slopes,
+        sums=found.sums,
         moves=tuple(_moves(units, guess, start.place.q, start.place)),
         rate_moves=tuple(_moves(speeds, rates, start.qd, start.place)),
         remarks=tuple(_remarks(manifold, start, found)),
@@ -251,7 +252,7 @@ def _warnings(
 ) -> Iterator[Problem]:
     """What a build says of it."""
     system = manifold.system
-    if closure.redundant:
+    if closure.redundant or closure.sums:
         yield system.problem("constraints", closure.ranks, severity="warning")
     for remark in closure.remarks:
         timely = manifold.timed and found.rank == len(system.q)

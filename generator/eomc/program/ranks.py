@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, islice
 from math import comb
 from typing import Any
 
@@ -29,6 +29,9 @@ BETTER = 1.02  # times another set's: a set is better
 BESIDE, REACH = 3, 0.1  # places beside the start, and how far, of the coordinates' size
 KNOWN = 1e-7  # of the coordinates: how well a place that holds a square is known
 FLAT = 1e-6  # of the slope beside: a row has none
+MIXED = 12  # rows that sums are made of, at most
+ALONG, TRIED, REFINED = 150, 1000, 20  # places along a motion; sums that are tried, how often
+MIXED_WELL = 0.03  # of sums: their least singular value on the rows' own
 MOST_SETS = 4000  # that are tried; beyond, rows are left out one by one
 
 
@@ -36,6 +39,7 @@ MOST_SETS = 4000  # that are tried; beyond, rows are left out one by one
 class Ranks:
     """rank: of all rows, almost everywhere. left_out: rows that others imply. shared: rows without
     a force of their own. good: whether some set of rows will do everywhere that was looked at.
+    sums: where none does, sums of `shared` that do, the weights of all rows in each.
     sigma: smallest over largest singular value that counts, at the start and at the worst place.
     weights: of the rows, that make D regular with them; none where it is so by itself. slopes: of
     each row the largest A D^-1 A^T. latest: the time of the last position, s.
@@ -52,6 +56,7 @@ class Ranks:
     slopes: tuple[float, ...] = ()
     latest: float = 0.0
     flat: tuple[int, ...] = ()
+    sums: tuple[tuple[float, ...], ...] = ()
 
 
 def ranks(manifold: Manifold, start: Place) -> Ranks:
@@ -89,8 +94,69 @@ def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
     shared = np.flatnonzero(np.max([np.linalg.norm(u, axis=1) for u in null], axis=0) > 1e-6)
     left_out, score = _chosen([f.B for f in regular], rank, shared.tolist())
     good = score >= GOOD and all(_implied(manifold, f.place, left_out) for f in regular[:3])
-    out = left_out if good else ()
-    return Ranks(rank, out, tuple(shared.tolist()), good, sigma, len(places)), places
+    found = Ranks(rank, (), tuple(shared.tolist()), good, sigma, len(places))
+    if good:
+        return replace(found, left_out=left_out), places
+    sums = _sums(manifold, start, rank, shared.tolist())
+    return replace(found, sums=sums, good=bool(sums)), places
+
+
+def _sums(
+    manifold: Manifold, start: Place, rank: int, shared: list[int]
+) -> tuple[tuple[float, ...], ...]:
+    """Sums of the rows `shared`, as many as these are worth, that are solved for in their place.
+
+    A set of rows is singular somewhere along most motions of linkages in space, since its
+    determinant changes its sign; of some sums it does not. They are found by chance, and then made
+    better, over places all along the motion. None where that leads to no good ones.
+    """
+    m, count = len(manifold.rows), len(shared) - (len(manifold.rows) - rank)
+    if manifold.timed or not set(shared) <= set(manifold.holonomic) or len(shared) > MIXED:
+        return ()
+    places = [start, *islice(along(manifold, start), ALONG)]
+    usual = np.max([_slopes(place) for place in places], axis=0)[shared]
+    free, spans = np.ones(len(start.q), dtype=bool), list[Vector]()
+    for place in places:
+        B = Frame(place, free, manifold.rows).B[shared] * (place.sizes[shared] / usual)[:, None]
+        U, s, _ = np.linalg.svd(B)
+        if s[count - 1] > RANK_TOLERANCE * s[0]:
+            U = U[:, :count]
+            if spans and np.linalg.det(spans[-1].T @ U) < 0:  # turned as the last one is
+                U[:, 0] *= -1
+            spans.append(U)
+    score, found = _best(np.array(spans), np.random.default_rng(5))
+    if score < MIXED_WELL:
+        return ()
+    sums = np.zeros((count, m))
+    sums[:, shared] = [[float(f"{x:.3g}") for x in row] for row in found / usual]
+    return tuple(map(tuple, sums.tolist()))
+
+
+def _best(spans: Vector, random: np.random.Generator) -> tuple[float, Vector]:
+    """Weights (count, n) of sums whose least singular value on all spans (k, n, count) is most.
+
+    And that value; -1 where determinants on some have other signs than on others.
+    """
+    _, n, count = spans.shape
+
+    def best(about: Vector, width: float, many: int) -> tuple[float, Vector]:
+        near = about + width * random.normal(size=(many, count, n))
+        tried = np.linalg.qr(near.transpose(0, 2, 1))[0].transpose(0, 2, 1)
+        on = tried[:, None] @ spans
+        least = np.linalg.svd(on, compute_uv=False)[..., -1].min(axis=1)
+        signs = np.sign(np.linalg.det(on)).sum(axis=1)
+        score = np.where(np.abs(signs) == len(spans), least, -1.0)
+        return float(score.max()), tried[int(np.argmax(score))]
+
+    score, found = best(np.zeros((count, n)), 1.0, TRIED)
+    width = 0.3
+    for _ in range(REFINED):
+        more, better = best(found, width, TRIED // 10)
+        if more > score:
+            score, found = more, better
+        else:
+            width /= 2
+    return score, found
 
 
 def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
@@ -152,6 +218,23 @@ def walk(manifold: Manifold, start: Place, positions: int = POSITIONS) -> Iterat
             if held:
                 place = manifold.place(np.array([float(x) for x in q]), place.t) or place
             yield place
+
+
+def along(manifold: Manifold, start: Place) -> Iterator[Place]:
+    """Places on one way along the rows, each a small step from the last: round a linkage."""
+    free, place, step = np.ones(len(start.q), dtype=bool), start, FIRST
+    way = np.random.default_rng(17).normal(size=len(start.q)) / np.sqrt(np.diag(start.metric))
+    while step > 1e-9:
+        way = Frame(place, free, manifold.holonomic).along(way)
+        size = float(np.max(np.abs(way), initial=0))
+        if size == 0:
+            return
+        there = _moved(manifold, place, way * (step / size), 0.0, free)
+        if there is None:
+            step /= 2
+            continue
+        place, step = there, min(LONGEST, 1.5 * step)
+        yield place
 
 
 def _moved(

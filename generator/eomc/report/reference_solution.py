@@ -322,12 +322,16 @@ class _Plain:
         r = symbolic.derive(core)
         symbols = (*system.q, *system.qd, time_symbol, *system.u)
         symbols += tuple(p.symbol for p in system.parameters)
-        rows = [k for k, c in enumerate(system.constraints) if not c.redundant]
-        A, gamma = r.constraint_jacobian, r.gamma
-        # D qdd - A^T lambda = tau - bias, A qdd = -gamma
-        whole = sympy.BlockMatrix([[r.D, -A[rows, :].T], [A[rows, :], sympy.zeros(len(rows))]])
-        matrix = whole.as_explicit() if rows else r.D
-        parts = [*matrix, *(r.tau - r.bias), *(-gamma[k] for k in rows)]
+        rows, matrix, level = system.solved, r.D, []
+        if rows:  # D qdd - A^T lambda = tau - bias, A qdd = -gamma
+            sums = sympy.zeros(len(rows), len(system.constraints))
+            for k, row in enumerate(rows):
+                for at, weight in row:
+                    sums[k, at] = sympy.Rational(weight)
+            A, level = sums * r.constraint_jacobian, [*(-sums * sympy.Matrix([*r.gamma]))]
+            whole = sympy.BlockMatrix([[r.D, -A.T], [A, sympy.zeros(len(rows))]])
+            matrix = whole.as_explicit()
+        parts = [*matrix, *(r.tau - r.bias), *level]
         self.size = len(core.coordinates) + len(rows)
         names = [c.name for c in system.coordinates]
         self.own = [names.index(c.name) for c in core.coordinates]

@@ -72,10 +72,11 @@ class Closing:
     """What a joint between two bodies of a tree, which closes a loop, keeps at zero.
 
     plane, space: its rows, empty where there is no such joint. x, y, z: from the first body's point
-    to the second's, along the world's axes; u, v: along two directions across the first axis;
-    ru, rv: the second axis out of the first, about u and v; rx, ry, rz: the second frame out of the
-    first; cross: the cosine between two axes; all others are the whole of it. axes: how many it has
-    in space; in the plane one, where u is a row. defaults: those of a scene that gives none.
+    to the second's, along the axes of what both hang from; u, v: along two directions across the
+    first axis; ru, rv: the second axis out of the first, about u and v; rx, ry, rz: the second
+    frame out of the first; cross: the cosine between two axes; all others are the whole of it.
+    axes: how many it has in space; in the plane one, where u is a row. defaults: those of a scene
+    that gives none.
     """
 
     plane: tuple[str, ...] = ()

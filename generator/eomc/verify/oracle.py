@@ -104,9 +104,7 @@ class Answer(ABC):
         """Those of the m constraints, (m,); 0 of rows that are redundant."""
         q, qd = np.asarray(q, float), np.asarray(qd, float)
         _, found = self._constrained(q, qd, t, u, self._values(params))
-        whole = np.zeros((*q.shape[:-1], len(self.system.constraints)))
-        whole[..., self.solved] = found
-        return whole
+        return np.asarray(found @ self.solved)
 
     def project(
         self,
@@ -191,15 +189,29 @@ class Answer(ABC):
         return tuple((values | dict(params)).values())
 
     @cached_property
-    def solved(self) -> list[int]:
-        """The constraints that accelerations are solved for."""
-        return [k for k, c in enumerate(self.system.constraints) if not c.redundant]
+    def solved(self) -> Vector:
+        """What accelerations are solved for, (r, m): sums of the m constraints, by their weights.
+
+        Of most systems one constraint each.
+        """
+        rows = self.system.solved
+        sums = np.zeros((len(rows), len(self.system.constraints)))
+        for k, row in enumerate(rows):
+            for at, weight in row:
+                sums[k, at] = weight
+        return sums
+
+    @cached_property
+    def switched(self) -> Vector:
+        """(r,): of `solved`, whether it holds in some modes only."""
+        rows = self.system.constraints
+        return np.array([any(rows[k].switched for k, _ in row) for row in self.system.solved])
 
     @cached_property
     def _holonomic(self) -> Vector:
         """1 for rows of positions, 0 for those of rates, of the constraints solved for."""
         rows = self.system.constraints
-        return np.array([float(rows[k].holonomic) for k in self.solved])
+        return np.array([float(rows[row[0][0]].holonomic) for row in self.system.solved])
 
     def _acceleration(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
@@ -224,7 +236,7 @@ class Answer(ABC):
         A, gamma = (
             self._value(name, q, qd, t, u, values) for name in ("constraint_jacobian", "gamma")
         )
-        return kkt.solve(D, A[..., self.solved, :], force, -gamma[..., self.solved])
+        return kkt.solve(D, self.solved @ A, force, -gamma @ self.solved.T)
 
     def _each(
         self, of: Callable[..., tuple[Vector, Vector]], q: Vector, qd: Vector, t: Any,
@@ -242,7 +254,7 @@ class Answer(ABC):
         """D, or what is asked of the rows that are solved for."""
         u = np.zeros(len(self.system.inputs))
         found = np.asarray(self._value(name, q, qd, t, u, values))
-        return found if name == "D" else found[self.solved]
+        return found if name == "D" else np.asarray(self.solved @ found)
 
     def _onto(
         self, q: Vector, qd: Vector, t: Any, values: Values, held: tuple[int, ...] = ()

@@ -304,7 +304,7 @@ class Sampler:
     def rows(self, name: str, s: State) -> Vector:
         """Of the constraints that are solved for."""
         found = self.reference.evaluate(name, s.q, s.qd, s.t, s.u, s.params)
-        return np.asarray(found)[self.reference.solved]
+        return np.asarray(self.reference.solved @ found)
 
     def regular(self, s: State) -> bool:
         """D finite and far from singular, and positive definite where we chose the parameters.
@@ -314,9 +314,8 @@ class Sampler:
         D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
         if self.system.constraints:
             A = self.rows("constraint_jacobian", s)
-            rows = [self.system.constraints[k] for k in self.reference.solved]
-            off = [row.switched and not np.any(a) for row, a in zip(rows, A, strict=True)]
-            return kkt.regular(D, A[~np.array(off)], REGULAR)
+            off = self.reference.switched & ~np.any(A, axis=1)
+            return kkt.regular(D, A[~off], REGULAR)
         diagonal = np.abs(np.diag(D))
         if not (np.all(np.isfinite(D)) and np.all(diagonal > 0)):
             return False
@@ -386,20 +385,19 @@ class Sampler:
         pushed = value["multipliers"] @ value["constraint_jacobian"] @ s.qd
         value["power"] = value["power"] + pushed
         size["power"] = size["power"] + np.abs(value["multipliers"]) @ A @ np.abs(s.qd)
-        solved = self.reference.solved
-        spread = kkt.inverse(value["D"], value["constraint_jacobian"][solved])
-        rounded = [size["motion"], (size["gamma"] + whole(a))[solved]]
+        solved, A_s = self.reference.solved, self.reference.solved @ value["constraint_jacobian"]
+        spread = kkt.inverse(value["D"], A_s)
+        rounded = [size["motion"], np.abs(solved) @ (size["gamma"] + whole(a))]
         both = spread @ np.concatenate(rounded)
         size["acceleration"] = both[:n]
         if self.system.modes:  # what sticks is held by forces that cancel what else moves it
-            slides = [self.system.constraints[k].switched for k in solved]
-            A = np.where(np.array(slides)[:, None], 0.0, value["constraint_jacobian"][solved])
-            size["acceleration"] += kkt.inverse(value["D"], A)[:n, :n] @ size["motion"]
-        size["multipliers"] = np.zeros(len(A))
-        size["multipliers"][solved] = both[n:]
+            held = np.where(self.reference.switched[:, None], 0.0, A_s)
+            size["acceleration"] += kkt.inverse(value["D"], held)[:n, :n] @ size["motion"]
+        size["multipliers"] = both[n:] @ np.abs(solved)
         # what rounding of the rows makes of a state that is put onto them
         size["place"] = np.array([
-            spread[:n, n:] @ size[name][solved] for name in ("constraints", "constraint_rates")
+            spread[:n, n:] @ np.abs(solved) @ size[name]
+            for name in ("constraints", "constraint_rates")
         ])  # fmt: skip
 
     def energy(self, s: State) -> tuple[Vector, Vector]:

@@ -54,7 +54,8 @@ class Project(Named):
     dependent: the part of a row's square below which it depends on others; small: of the square of
     q, where a change is rounding; enough: where what rows lack is; loose: of the terms of a rate;
     rounded: the same of rows and rates, where a state is left as it is; redundant: rows that the
-    others imply; weights: of rows, an initializer, where D alone is singular.
+    others imply; weights: of rows, an initializer, where D alone is singular; sums: initializers of
+    sums of rows, which stand in the places of the rows `sum_places`.
     """
 
     TEMPLATE: ClassVar[str] = "c/project.c"
@@ -74,4 +75,6 @@ class Project(Named):
     rounded: str
     redundant: tuple[int, ...]
     weights: str
+    sums: tuple[str, ...]
+    sum_places: tuple[int, ...]
     tiny: str

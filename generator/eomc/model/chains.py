@@ -1,0 +1,82 @@
+"""Bodies that hang from one another by joints, seen from a body that they all hang from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import sympy
+from sympy import Expr, S
+
+from eomc.base import spatial
+from eomc.base.spatial import apply, plus, product, scaled, transposed
+from eomc.model import exact
+from eomc.model.exact import ONE, ZERO, Matrix, Vector
+from eomc.scene.assembly import WORLD
+
+Named = Callable[[str, Vector, Matrix], tuple[Vector, Matrix]]  # a body's place, by names
+
+
+@dataclass(frozen=True)
+class Step:
+    """From a parent's frame to a body's: where the joint is, and what it moves by.
+
+    angle: of the rotation, in the plane. motions: of each what it is, its axis, by how much.
+    """
+
+    parent: str
+    offset: Vector
+    rotation: Matrix
+    angle: Expr
+    motions: tuple[tuple[str, Sequence[float], Expr], ...]
+
+
+@dataclass
+class Chains:
+    """The steps to all bodies that are held by joints."""
+
+    plane: bool
+    steps: dict[str, Step] = field(default_factory=dict)
+
+    def path(self, name: str) -> list[str]:
+        """The body, its parent and so on, as far as they are held by joints, and the world."""
+        path = [name]
+        while path[-1] in self.steps:
+            path.append(self.steps[path[-1]].parent)
+        return path if path[-1] == WORLD else [*path, WORLD]
+
+    def common(self, one: str, other: str) -> str:
+        """The nearest body from which both hang, or the world where that does not move.
+
+        What is between them, seen from there, is the same however it moves.
+        """
+        others = self.path(other)
+        found = next(name for name in self.path(one) if name in others)
+        moves = any(self.steps[name].motions for name in self.path(found) if name in self.steps)
+        return found if moves else WORLD
+
+    def seen(self, name: str, base: str, named: Named) -> tuple[Vector, Matrix]:
+        """Where a body is, and how it is turned, in the frame of one that it hangs from."""
+        at, R, angle, path = ZERO, ONE, S.Zero, self.path(name)
+        for body in reversed(path[: path.index(base)]):
+            step = self.steps[body]
+            at = plus(at, apply(R, step.offset))
+            R, angle = product(R, step.rotation), angle + step.angle
+            for motion, axis, by in step.motions:
+                k, aligned = exact.aligned_with(axis)
+                if motion == "t":
+                    x, y, z = map(S, exact.unit(axis))
+                    at = plus(at, scaled(apply(R, (x, y, z)), by))
+                elif self.plane:
+                    angle = angle + by
+                    R = rotation_about(2, angle)
+                else:
+                    turn = product(product(aligned, rotation_about(k, by)), transposed(aligned))
+                    R = product(R, turn)
+            at, R = named(body, at, R)
+        return at, R
+
+
+def rotation_about(axis: int, angle: Expr) -> Matrix:
+    """The rotation about a coordinate axis: takes vectors of the rotated frame to the old one."""
+    return spatial.about_axis(axis, sympy.cos(angle), sympy.sin(angle))

@@ -1,0 +1,175 @@
+"""Loops in space with more rows than they need: Bennett's linkage; a four-bar on a turntable."""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.program.assembly import assembled
+from eomc.scene.read import parse
+from eomc.verify.check import check
+
+# four hinges; sin(alpha)/a = sin(beta)/b makes it move, tan(q1/2) tan(q2/2) = const, q3 = -q1
+A, B, ALPHA = 1.0, 1.4, 0.7
+BETA = math.asin(B * math.sin(ALPHA) / A)
+LINK = """
+[[body]]
+name = "{name}"
+parent = "{parent}"
+joint = "revolute"
+coordinates = "{q}"
+axis = [{axis}]
+offset = {offset}
+rotation = {turns}
+mass = 1
+center = {center}
+inertia = {inertia}
+"""
+
+
+def link(
+    name: str, parent: str, q: str, axis: str, offset: object, center: object, turn: float = 0.0
+) -> str:
+    turns = f'[["x", "{turn!r}"]]' if turn else "[]"
+    text = LINK.format(
+        name=name, parent=parent, q=q, axis=axis, offset=offset, turns=turns, center=center,
+        inertia=[0.01, 0.1, 0.1],
+    )  # fmt: skip
+    lines = [x for x in text.splitlines() if x not in ("rotation = []", 'parent = ""')]
+    return "\n".join(lines) + "\n"
+
+
+def scene(name: str, coordinates: str, bodies: str, loop: str) -> str:
+    return (
+        f'eomc = 1\nname = "{name}"\ngravity = [0, 0, -9.81]\n[coordinates]\n{coordinates}{bodies}'
+        f'[[loop]]\nname = "pin"\njoint = "revolute"\n{loop}\n[run]\nh = 0.002\nduration = 3.0\n'
+        'tolerance = 1e-10\nmethod = ["rk4", "gauss8"]\n'
+    )
+
+
+BENNETT = scene(
+    "bennett",
+    'q1 = { unit = "rad", start = 1.0, rate = 1.0 }\n'
+    'q2 = { unit = "rad", start = 2.0, guess = true }\n'
+    'q3 = { unit = "rad", start = -0.8, guess = true }\n',
+    link("one", "", "q1", "0, 0, 1", [0, 0, 0], [A / 2, 0, 0])
+    + link("two", "one", "q2", "0, 0, 1", [A, 0, 0], [B / 2, 0, 0], ALPHA)
+    + link("three", "two", "q3", "0, 0, 1", [B, 0, 0], [A / 2, 0, 0], BETA),
+    f'bodies = ["world", "three"]\npoints = [[{-B}, 0, 0], [{A}, 0, 0]]\n'
+    f"axis = [[0, {math.sin(BETA)!r}, {math.cos(BETA)!r}], "
+    f"[0, {-math.sin(ALPHA)!r}, {math.cos(ALPHA)!r}]]",
+)
+FOUR_BAR = (
+    'q1 = { unit = "rad", start = 1.0, rate = 2.0 }\n'
+    'q2 = { unit = "rad", start = -0.5, guess = true }\n'
+    'q3 = { unit = "rad", start = 1.5, guess = true }\n'
+)
+PINNED = 'bodies = ["coupler", "rocker"]\npoints = [[1, 0, 0], [0.8, 0, 0]]\naxis = [0, 1, 0]'
+
+
+def four_bar(parent: str) -> str:
+    return (
+        link("crank", parent, "q1", "0, -1, 0", [0.1, 0, 0.5], [0.15, 0, 0])
+        + link("coupler", "crank", "q2", "0, -1, 0", [0.3, 0, 0], [0.5, 0, 0])
+        + link("rocker", parent, "q3", "0, -1, 0", [1.1, 0, 0.5], [0.4, 0, 0])
+    )
+
+
+TURNTABLE = scene(
+    "turntable",
+    's = { unit = "rad", start = 0, rate = 1 }\n' + FOUR_BAR,
+    link("table", "", "s", "0, 0, 1", [0, 0, 0], [0, 0, 0]) + four_bar("table"),
+    PINNED,
+)
+STANDING = scene("standing", FOUR_BAR, four_bar(""), PINNED)
+
+
+def read(text: str) -> System:
+    return assembled(from_scene(parse(text, "linkage.toml")))
+
+
+@pytest.fixture(scope="module")
+def bennett(modules: Modules) -> ModuleType:
+    return modules.unoptimised(BENNETT)
+
+
+def constant(q: np.ndarray) -> np.ndarray:
+    """What Bennett's linkage keeps, as an angle's sine and cosine that have no infinity."""
+    one, two = q[:, 0] / 2, q[:, 1] / 2
+    return np.arctan2(np.sin(one) * np.sin(two), np.cos(one) * np.cos(two))
+
+
+def test_sums_of_rows_stand_for_rows_that_depend_on_one_another() -> None:
+    """No two of Bennett's five rows hold it everywhere; two sums of them do."""
+    closure = read(BENNETT).closure
+    assert closure is not None and closure.rank == 2 and closure.freedoms == 1
+    assert closure.redundant == () and len(closure.sums) == 2 and len(closure.shared) == 5
+    assert "2 sums of them stand for these" in closure.ranks
+
+
+@pytest.mark.parametrize("how", [{"tol": 1e-10}, {"method": "rk4"}, {"method": "gauss8"}])
+def test_bennett_s_linkage_turns(bennett: ModuleType, how: dict[str, object]) -> None:
+    """Through positions in which all its bars are in a line."""
+    run = bennett.simulate(**how)
+    assert run.status == "ok" and run.singular_steps == 0
+    assert run.q[:, 0].min() < -3.2 and run.q[0, 0] == 1
+    keeps = np.exp(1j * 2 * constant(run.q))
+    assert np.abs(keeps - keeps[0]).max() < 1e-11
+    assert np.abs(run.q[:, 2] + run.q[:, 0]).max() < 1e-11
+    assert np.abs(run.energy - run.energy[0]).max() < 2e-8
+    for x in run.constraints.values():
+        assert np.abs(x).max() < 1e-13
+
+
+def test_multipliers_are_of_the_rows_as_they_are_written(bennett: ModuleType) -> None:
+    run = bennett.simulate(tol=1e-10, times=[0.0, 0.4, 1.1, 2.0])
+    for q, qd in zip(run.q, run.qd, strict=True):
+        x = bennett.multipliers(q, qd)
+        force = bennett.D(q) @ bennett.acceleration(q, qd) + bennett.bias(q, qd)
+        along = bennett.constraint_jacobian(q).T @ x
+        assert along == pytest.approx(force, abs=1e-11 * np.abs(force).max())
+
+
+def test_a_state_is_put_onto_such_rows(bennett: ModuleType) -> None:
+    q, qd = bennett.project([1.0, 2.7, -0.9], [1.0, 0.0, -1.0], held=["q1", "q1_dot"])
+    assert q[0] == 1 and qd[0] == 1 and q[2] == pytest.approx(-1, abs=1e-14)
+    assert qd[2] == pytest.approx(-1, abs=1e-14)
+
+
+@pytest.mark.slow
+def test_the_check_passes_of_sums(modules: Modules) -> None:
+    text = BENNETT.replace(', "gauss8"', "")  # whose starts far out are not on all rows
+    report = check(read(text), modules.unoptimised(text))
+    assert report.passed, report.table()
+
+
+def test_rows_do_not_know_how_what_both_bodies_hang_from_moves(modules: Modules) -> None:
+    """A four-bar on a table: hinges across it are zero, however the table is turned."""
+    system = read(TURNTABLE)
+    assert [c.name for c in system.constraints] == ["pin_x", "pin_z"]
+    assert system.closure is not None and system.closure.rank == 2
+    turning, standing = (modules.unoptimised(x) for x in (TURNTABLE, STANDING))
+    run = turning.simulate(tol=1e-11)
+    assert run.status == "ok" and np.abs(run.energy - run.energy[0]).max() < 1e-8
+    momentum = np.array([turning.D(q) @ qd for q, qd in zip(run.q, run.qd, strict=True)])[:, 0]
+    assert momentum == pytest.approx(momentum[0], rel=1e-9)
+    # at rest it is as if it stood, and its pin's force turns with it
+    times = [0.1, 0.5]
+    still = standing.simulate(tol=1e-11, times=times)
+    for angle in (0.0, 0.7, math.pi / 2):
+        heavy = turning.simulate(
+            [angle, *standing.start[0]], [0.0, *standing.start[1]], tol=1e-11, times=times
+        )
+        if angle == 0:
+            assert heavy.q[:, 0] == pytest.approx(0, abs=1e-12)
+        assert heavy.q[:, 1:] == pytest.approx(still.q, abs=1e-9)
+        force = still.reactions["pin"][:, :3]
+        c, s = math.cos(angle), math.sin(angle)
+        turned = np.stack([c * force[:, 0], s * force[:, 0], force[:, 2]], axis=1)
+        assert heavy.reactions["pin"][:, :3] == pytest.approx(turned, abs=1e-7)
