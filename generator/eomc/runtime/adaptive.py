@@ -5,7 +5,6 @@ The method of Gauss and Legendre with eight stages; how its steps are chosen is 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
@@ -195,12 +194,8 @@ class AdaptiveRun(Run):
         times = np.linspace(self.t[0], self.t[-1], _EVEN * (self.steps + 1))
         return self._at(times, np.array(self(times)))
 
-    def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
-        self._repeated()
-        self.error = error_of(self, run, progress)
-        if words := self.error.warning:
-            warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
-        return self.error
+    def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
+        return error_of(self, run, progress)
 
     def _again(self, parts: int, every: int, nudge: Array | None, progress: Any) -> Run:
         raise ValueError("an adaptive run has no steps of one size")

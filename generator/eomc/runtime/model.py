@@ -6,7 +6,6 @@ NumPy and cffi only. Angles in rad, everything in SI units.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from math import ceil, isfinite
 from time import perf_counter
@@ -32,7 +31,7 @@ from .constrained import Constrained, Rows
 from .discretize import discretize
 from .estimate import advice, beyond_end
 from .laws import Law, Sampled
-from .package import reduced
+from .package import reduced, warn
 from .shown import with_events
 from .slices import longer
 from .trajectory import PASSED_OVER, SAID, STATUS, Interrupted, MotionError, Run, state_text
@@ -84,11 +83,9 @@ class Model(Constrained):
     def _again(self, digest: str, what: str = "this was pickled") -> Model:
         """Itself, found by a value that was kept; a warning where the scene was another then."""
         if digest != self.digest:
-            warnings.warn(
+            warn(
                 f"{self.name}: {what} from another version of the scene; what is "
-                "computed from it now is of the present version",
-                RuntimeWarning,
-                stacklevel=2,
+                "computed from it now is of the present version"
             )
         return self
 
@@ -197,7 +194,7 @@ class Model(Constrained):
             return count
         time = self.duration if duration is None else as_number(duration, "duration")
         if words := beyond_end(h, time):
-            warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=3)
+            warn(f"{self.name}: {words}")
         if time < 0:
             raise ValueError(f"duration: {duration} is not a time in s")
         if time / h > _MOST:
@@ -293,12 +290,12 @@ class Model(Constrained):
         if run.status == "interrupted":
             raise Interrupted(run)
         if words := run.message if run.status != "ok" else run._remark:
-            warnings.warn(f"{self.name}: {words}", RuntimeWarning, stacklevel=3)
+            warn(f"{self.name}: {words}")
         if estimate:
             try:
-                run._judged(None, 4)
+                run.estimate()
             except ValueError as fault:  # of what can't be done again; the run is there
-                warnings.warn(f"{self.name}: {fault}", RuntimeWarning, stacklevel=3)
+                warn(f"{self.name}: {fault}")
         return run
 
     def _look(
@@ -309,9 +306,9 @@ class Model(Constrained):
         self._warned.add((method, h))
         if self.events and "events" not in self._warned:
             self._warned.add("events")
-            warnings.warn(f"{self.name}: {PASSED_OVER}", RuntimeWarning, stacklevel=3)
+            warn(f"{self.name}: {PASSED_OVER}")
         if words := advice(self, q, qd, h, t, u, p, method):
-            warnings.warn(f"{self.name}: {whose}{words}", RuntimeWarning, stacklevel=3)
+            warn(f"{self.name}: {whose}{words}")
 
     def advice(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
@@ -417,11 +414,9 @@ class Model(Constrained):
         if callable(u):
             if "u" not in self._warned and hold == 1:
                 self._warned.add("u")
-                warnings.warn(
+                warn(
                     f"{self.name}: u is a Python function, called before each step: some hundred "
-                    "times slower than a table (steps, nu) or the scene's own signal",
-                    RuntimeWarning,
-                    stacklevel=4,
+                    "times slower than a table (steps, nu) or the scene's own signal"
                 )
             return Law(u, self._inputs, every, hold), None, 0
         if isinstance(u, Mapping):

@@ -8,6 +8,8 @@ means to, as a test may, writes to its dictionary: `vars(module)["simulate"] = .
 from __future__ import annotations
 
 import functools
+import sys
+import warnings
 from collections.abc import Callable, Iterable
 from importlib import import_module
 from types import ModuleType
@@ -40,6 +42,22 @@ def meant(name: str, known: Iterable[str]) -> str:
     near = [k for k in known if k.lower() == str(name).lower()]
     near = near or difflib.get_close_matches(str(name), known, n=1)
     return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def warn(words: str) -> None:
+    """A RuntimeWarning at the line that called into built packages, through however many calls."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and _of_eomc(str(frame.f_globals.get("__package__"))):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(words, RuntimeWarning, stacklevel=level)
+
+
+def _of_eomc(package: str) -> bool:
+    """Whether a module of the package is a built one's, or eomc's own."""
+    whole = sys.modules.get(package)
+    return package.split(".")[0] == "eomc" or (
+        type(whole).__name__ == Package.__name__ and "_model" in vars(whole)
+    )
 
 
 # what only scenes with constraints have: functions, and what else

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -21,7 +20,7 @@ from .dense import states
 from .estimate import Estimate, estimate
 from .laws import asked
 from .notebook import html
-from .package import reduced
+from .package import reduced, warn
 from .plot import plot
 from .section import crossings
 from .shown import by_eomc
@@ -290,17 +289,13 @@ class Run(ConstrainedRun, Columns):
         Warns where the motion is not resolved. Raises ValueError where the run was pickled and lost
         that function, or where this gives other values at the start than it gave: noise.
         """
-        return self._judged(progress, 3)
-
-    def _judged(self, progress: Callable[[int, int], None] | None, level: int) -> Estimate:
-        """`estimate`, its warning given to whoever called so many levels above."""
         self._repeated()
         try:
             self.error = self._estimated(progress)
         except KeyboardInterrupt:
             raise Interrupted(self) from None
         if words := self.error.warning:
-            warnings.warn(f"{self._model.name}: {words}", RuntimeWarning, stacklevel=level)
+            warn(f"{self._model.name}: {words}")
         return self.error
 
     def _repeated(self) -> None:
