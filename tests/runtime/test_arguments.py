@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from types import ModuleType
@@ -189,3 +190,21 @@ def test_masks_may_be_in_the_middle_of_their_import(
     """By another thread: NumPy imports them when they are first asked for."""
     monkeypatch.setitem(sys.modules, "numpy.ma", ModuleType("numpy.ma"))
     assert driven.D(np.array(Q)).shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"tols": 1e-9}, "simulate has no argument 'tols'; did you mean 'tol'?"),
+        ({"step": 0.01, "steps": 3}, "simulate has no argument 'step'; did you mean 'h'?"),
+        ({"Duration": 1.0}, "simulate has no argument 'Duration'; did you mean 'duration'?"),
+        ({"g": 1.6}, "simulate has no argument 'g': write params={'g': ...}"),
+        ({"force": 1.0}, "simulate has no argument 'force': write u={'force': ...}"),
+        ({"zzz": 1, "events": {"a": "x"}}, "'zzz': it has q0, qd0, h, "),
+    ],
+)
+def test_an_argument_that_is_not_there_is_told_with_what_is_meant(
+    driven: ModuleType, given: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(TypeError, match=re.escape(words)):
+        driven.simulate(**given)

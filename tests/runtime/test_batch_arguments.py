@@ -116,3 +116,8 @@ def test_masked_numbers_are_refused_by_name() -> None:
             call()
     plain = many.simulate_batch(np.ma.array(q), qd, steps=3)
     assert np.array_equal(plain.q, many.simulate_batch(q, qd, steps=3).q)
+
+
+def test_an_argument_that_is_not_there_is_told_with_what_is_meant() -> None:
+    with pytest.raises(TypeError, match=r"^simulate_batch has no argument 'thread'.*'threads'\?$"):
+        module("cartpole").simulate_batch(thread=2, steps=3)

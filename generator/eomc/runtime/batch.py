@@ -7,7 +7,7 @@ vector registers and in threads; no result depends on either.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any, Never, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,7 +60,7 @@ class BatchModel(Model):
         method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
         progress: Callable[[int, int], None] | None = None, tol: float | None = None,
         times: ArrayLike | None = None, h_most: float | None = None, stiff: bool = False,
-        events: Mapping[str, Any] | None = None,
+        events: Mapping[str, Any] | None = None, **unknown: Never,
     ) -> BatchRun:  # fmt: skip
         """Trajectories of many instances; see `simulate` for what is not here.
 
@@ -74,8 +74,8 @@ class BatchModel(Model):
         of duration; without them those of adaptive steps are start and end. events: as in
         `simulate`.
         """
-        if events is not None:
-            other, given = with_events(dict(locals()))
+        if events is not None or unknown:
+            other, given = with_events(self.simulate_batch, dict(locals()))
             return cast(BatchRun, other.simulate_batch(**given))
         if fits(self, h, steps, method, tol, h_most, stiff):
             fitted, whole = batch_adaptive.simulate(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from math import ceil, isfinite
 from time import perf_counter
-from typing import Any, cast
+from typing import Any, Never, cast
 
 import numpy as np
 from numpy import empty
@@ -212,7 +212,7 @@ class Model(Constrained):
         control_period: float | None = None, out: tuple[Array, Array] | None = None,
         progress: Callable[[int, int], None] | None = None, estimate: bool = False,
         tol: float | None = None, times: ArrayLike | None = None, h_most: float | None = None,
-        stiff: bool = False, events: Mapping[str, Any] | None = None,
+        stiff: bool = False, events: Mapping[str, Any] | None = None, **unknown: Never,
     ) -> Run:  # fmt: skip
         """A trajectory by fixed steps of size h, or by steps that fit a tolerance; the loop in C.
 
@@ -230,8 +230,8 @@ class Model(Constrained):
         by Newton's method. events: more, by name a formula or a dict as [[event]] has it; built
         once. A run that can't go on keeps what it has and warns; Ctrl-C raises Interrupted.
         """
-        if events is not None:
-            other, given = with_events(dict(locals()))
+        if events is not None or unknown:
+            other, given = with_events(self.simulate, dict(locals()))
             return cast(Run, other.simulate(**given))
         usual = (
             out is None and progress is None and control_period is None and not estimate

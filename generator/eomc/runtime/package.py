@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import sys
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from types import ModuleType
 from typing import Any, NoReturn
@@ -42,6 +42,25 @@ def meant(name: str, known: Iterable[str]) -> str:
     near = [k for k in known if k.lower() == str(name).lower()]
     near = near or difflib.get_close_matches(str(name), known, n=1)
     return f"; did you mean '{near[0]}'?" if near else ""
+
+
+# what newcomers call the arguments of a run
+_CALLED = {
+    "dt": "h", "step": "h", "step_size": "h", "stepsize": "h", "timestep": "h", "rtol": "tol",
+    "atol": "tol", "eps": "tol", "max_step": "h_most", "t_eval": "times", "tmax": "duration",
+    "t_end": "duration", "t_final": "duration", "t_span": "duration", "x0": "q0", "v0": "qd0",
+}  # fmt: skip
+
+
+def no_argument(model: Any, call: Callable[..., Any], unknown: Mapping[str, Any]) -> TypeError:
+    """That a function of a model has no such argument, and what may be meant."""
+    from inspect import signature  # of use here alone
+
+    name, known = next(iter(unknown)), [*signature(call).parameters][:-1]  # all but **unknown
+    table = "params" if name in model.parameters else "u" if name in model.inputs else ""
+    near = f": write {table}={{'{name}': ...}}" if table else meant(_CALLED.get(name, name), known)
+    near = near or f": it has {', '.join(known)}"
+    return TypeError(f"{call.__name__} has no argument '{name}'{near}")
 
 
 def warn(words: str) -> None:

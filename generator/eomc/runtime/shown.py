@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+from .package import no_argument
 
 
 def by_eomc(room: str, what: str = "runs are drawn") -> Any:
@@ -20,12 +23,15 @@ def by_eomc(room: str, what: str = "runs are drawn") -> Any:
         raise ImportError(f"{what} by eomc, which is not here: pip install eomc") from None
 
 
-def with_events(given: dict[str, Any]) -> Any:
-    """The model in `given` with the events there besides its own, and the other arguments.
+def with_events(call: Callable[..., Any], given: dict[str, Any]) -> Any:
+    """The model in `given` with the events there besides its own, and the call's other arguments.
 
     Of parameters the other has fewer where a jump sets some: what differs from the scene is given.
+    Raises TypeError of arguments that the call has not.
     """
-    model, events = given.pop("self"), given.pop("events")
+    model, events, unknown = (given.pop(name) for name in ("self", "events", "unknown"))
+    if unknown:
+        raise no_argument(model, call, unknown)
     known = vars(model).setdefault("_eventful", {})
     if (key := repr(events)) not in known:
         build = by_eomc("pipeline", "events of a run are compiled").with_events
