@@ -437,11 +437,11 @@ def broken(text: str, width: int = 100) -> Sequence[str]:
     """A statement or a prototype over several lines, each at most `width` long where it can be."""
     lines = []
     while len(text) > width:
-        marks = (", ", " + ", " - ", " || ", "*")
+        marks = (", ", " + ", " - ", " || ", "*", " | ", "; ", " = ", "(")
         at = next((k for m in marks if (k := text.rfind(m, 12, width)) > 0), 0)
         if not at:
             break
-        at += 1 if text[at] == "," else 0
+        at += 1 if text[at] in ",;(" else 0
         lines.append(text[:at])
         text = "    " + text[at:].lstrip()
     return [*lines, text]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 
 from eomc.base.texts import FreeText
 from eomc.emit import adaptive
@@ -31,6 +32,7 @@ TIMED = (
     "energy jacobi tau power outputs constraints constraint_rates multipliers reactions"
 ).split()  # what runs ask for at each of their rows
 ROWS = 200  # of main.c, about
+LINE = 88  # of the columns' names there
 FUNCTIONS = (
     "C D acceleration advice applied bias discretize energy equilibrium g jacobi kinetic_energy "
     "linearize load_run output potential_energy power rhs sensitivity signal simulate "
@@ -49,6 +51,7 @@ def main(target: Target) -> Main:
     steps = max(1, math.ceil(s.run.duration / s.run.h * (1 - 1e-12)))
     names = [target.as_written(c.name) for c in s.coordinates]
     method, asked = s.run.methods[0], [o.name for o in s.outputs]
+    columns = ", ".join(("t", *names, *(f"{n}_dot" for n in names), *asked, "energy"))
     outputs = public.evaluation("outputs").call(u="NULL") if asked else ""
     solved = asked and takes_qdd(target, "outputs")
     rows = {"q_rows": "NULL", "qd_rows": "NULL", "memory": "&memory", "status": "&status"}
@@ -78,7 +81,7 @@ def main(target: Target) -> Main:
         h=target.literal(s.run.h),
         steps=steps,
         every=max(1, steps // ROWS),
-        columns=("t", *names, *(f"{n}_dot" for n in names), *asked, "energy"),
+        columns=tuple(line.replace(" ", "") for line in textwrap.wrap(columns, LINE)),
         run=run,
         energy=public.evaluation("energy").call(),
         outputs=outputs,

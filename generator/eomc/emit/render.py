@@ -20,6 +20,7 @@ from eomc.base.texts import docstring
 from eomc.base.texts import name as plain
 from eomc.emit import embedding, package, selftest, views
 from eomc.emit.c_expression import REALS, indent
+from eomc.emit.c_function import narrowed
 from eomc.emit.c_names import Target
 from eomc.emit.c_safe_names import borne
 from eomc.emit.fast import files as fast
@@ -117,8 +118,8 @@ def render(program: Program, extension: str) -> Sources:
         files={
             **steppers.files(program, show, rooms=fast.rooms(made)),
             **{f"{FAST}/{file}": text for file, text in fast.files(made, show).items()},
-            "main.c": show(package.main(target)),
-            "selftest.c": show(selftest.view(target)),
+            "main.c": narrowed(show(package.main(target))),
+            "selftest.c": narrowed(show(selftest.view(target))),
             "CMakeLists.txt": show(embedding.cmake(target)),
             f"{name}.pc.in": show(embedding.pkg_config(target)),
             "costs.txt": show(embedding.costs(target)),
