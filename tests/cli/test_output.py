@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -69,6 +70,18 @@ def test_a_step_longer_than_the_run_is_said(there: Path) -> None:
     assert "  h = 0.3 s is longer than the duration, 0.1 s: the run is one step of" in done.output
     said = json.loads(eomc("run", "p.toml", "--h", "0.3", "--duration", "0.1", "--json").output)
     assert said["beyond_duration"].startswith("h = 0.3 s") and said["beyond_stability"] is None
+
+
+def test_no_number_is_minus_zero(here: Path) -> None:
+    """Friction at rest, -b*theta_dot, and a start below zero."""
+    text = Path("p.toml").read_text(encoding="utf-8")
+    outputs = '[outputs]\ntau = { formula = "-0.1*theta_dot" }\n'
+    Path("p.toml").write_text(f"{text}\n{outputs}", encoding="utf-8")
+    words = ["run", "p.toml", "--start", "theta=0", "--start", "theta_dot=-0.0", "--duration", "0"]
+    made = eomc(*words, "--out", "p.csv").output, eomc(*words, "--json").output
+    html = pipeline.load("p.toml").simulate([-0.0], [-0.0], steps=0)._repr_html_()
+    for shown in (*made, Path("p.csv").read_text(encoding="utf-8"), html):
+        assert "theta" in shown and not re.search(r"-0(\.0)?\b", shown), shown
 
 
 def test_a_run_of_no_step_has_no_speed(there: Path) -> None:

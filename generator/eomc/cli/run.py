@@ -225,6 +225,7 @@ def _summary(
     import numpy as np
 
     energy, jacobi = done.energy, done.jacobi
+    q, qd = done.q[-1] + 0.0, done.qd[-1] + 0.0  # no -0
     return {
         "scene": module._model.name,
         "status": done.status,
@@ -234,8 +235,8 @@ def _summary(
         "tolerance": getattr(done, "tol", None),
         "steps": done.steps,
         "t": float(done.t[-1]),
-        "q": dict(zip(module.coordinates, map(float, done.q[-1]), strict=True)),
-        "qd": dict(zip(module.coordinates, map(float, done.qd[-1]), strict=True)),
+        "q": dict(zip(module.coordinates, map(float, q), strict=True)),
+        "qd": dict(zip(module.coordinates, map(float, qd), strict=True)),
         "energy": {
             "start": float(energy[0]),
             "end": float(energy[-1]),
@@ -272,7 +273,8 @@ def _print_summary(
         f"to t = {done.t[-1]:g} s"
     )
     wide = max(map(len, module.coordinates))
-    for name, q, qd in zip(module.coordinates, done.q[-1], done.qd[-1], strict=True):
+    ends = zip(module.coordinates, summary["q"].values(), summary["qd"].values(), strict=True)
+    for name, q, qd in ends:
         unit = texts.line(module.units.get(name, ""))
         rate = f"{unit}/s" if unit else ""
         going = "" if name in module._model.still else f"   {name}_dot {qd: .9g} {rate}"

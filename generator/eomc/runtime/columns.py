@@ -120,7 +120,8 @@ class Columns:
         with replacing(path) as new, new.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
-            for row in zip(*(c.astype(float).tolist() for c in columns.values()), strict=True):
+            numbers = (c.astype(float) + 0.0 for c in columns.values())  # no -0, as of rest
+            for row in zip(*(c.tolist() for c in numbers), strict=True):
                 writer.writerow(map(repr, row))
 
     def to_pandas(self) -> Any:

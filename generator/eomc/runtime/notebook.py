@@ -28,7 +28,7 @@ def html(run: Any) -> str:
     rows = ["<tr><td>at the end</td></tr>"] if len(run) else []
     for k, name in enumerate(model.coordinates[:SHOWN] if len(run) else ()):
         unit = plain(model.units.get(name, ""))
-        q, qd = f"{run.q[-1, k]:.9g}", f"{run.qd[-1, k]:.9g}"
+        q, qd = (f"{x[-1, k] + 0.0:.9g}" for x in (run.q, run.qd))  # no -0
         cells = (name, f"{q} {unit}", f"{name}_dot", f"{qd} {unit and unit + '/s'}")
         rows.append("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in cells) + "</tr>")
     if (more := len(model.coordinates) - SHOWN) > 0:

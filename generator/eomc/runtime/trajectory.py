@@ -427,6 +427,6 @@ def state_text(q: Array, qd: Array) -> str:
     """A state in a message."""
 
     def text(x: Array) -> str:
-        return np.array2string(x, precision=6, threshold=12)
+        return np.array2string(x + 0.0, precision=6, threshold=12)  # no -0
 
     return f"q = {text(q)}, qd = {text(qd)}"
