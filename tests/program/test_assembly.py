@@ -282,7 +282,7 @@ def test_a_row_with_a_corner_is_refused_by_its_name(formula: str) -> None:
     [
         ("(x - y)**2", "write x - y for (x - y)**2"),
         pytest.param("(x**2 - y)**3", "write x**2 - y for (x**2 - y)**3", marks=pytest.mark.slow),
-        ("x**2 - 2*x*y + y**2", "write each thing that is zero by itself"),
+        ("x**2 - 2*x*y + y**2", "write x - y for x**2 - 2*x*y + y**2"),
     ],
 )
 def test_a_row_without_a_slope_where_it_holds_is_refused(
@@ -301,6 +301,9 @@ def test_a_row_without_a_slope_where_it_holds_is_refused(
         ("-3*(x - y)**2", "write x - y for -3*(x - y)**2"),
         ("(x - y)**2 + (z - 1)**4", "write each thing that is zero by itself"),
         ("gap", "write each thing that is zero by itself"),
+        ("x*x - 2*x*y + y*y", "write x - y for x**2 - 2*x*y + y**2"),
+        ("sin(x)**2 + 2*x*sin(y) - 2*x*sin(x) + x**2 - 2*sin(x)*sin(y) + sin(y)**2", "write "),
+        ("x**3 - 3*x**2*y + 3*x*y**2 - y**3", "write x - y for x**3"),
     ],
 )
 def test_a_row_without_a_slope_is_refused_where_the_held_start_obeys_it(

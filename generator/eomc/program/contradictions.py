@@ -7,12 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from sympy import Add
+from sympy import Add, Integer, sqf_part
 
 from eomc.base.errors import Problem
 from eomc.base.texts import listed
 from eomc.model.symbols import Constraint
 from eomc.model.system import System
+from eomc.program.factors import powers_alone
 from eomc.program.manifold import RANK_TOLERANCE, Flags, Frame, Manifold, Place, Vector
 
 PART = 0.01  # of the row that is furthest from zero: a row contradicts
@@ -190,16 +191,16 @@ def _alike(manifold: Manifold, rows: Sequence[int], place: Place) -> bool:
 def powers(system: System) -> list[int]:
     """Rows that their formulas alone show to have no slope where they hold.
 
-    A power above 1, or a sum of even ones, with numbers before them.
+    A power above 1, or a sum of even ones, with numbers before them; a power that is written out.
     """
-    found = []
+    found, moving = [], {*system.q}
     for k, c in enumerate(system.constraints):
         terms = [term.as_coeff_Mul() for term in Add.make_args(c.formula)]
         exponents = [power.as_base_exp()[1] for _, power in terms]
         signs = {bool(factor > 0) for factor, _ in terms}
         alike = len(signs) == 1 and all(e.is_even and e > 0 for e in exponents)
         alone = len(terms) == 1 and exponents[0].is_number and exponents[0] > 1
-        if c.holonomic and (alone or alike):
+        if c.holonomic and (alone or alike or (not c.loop and powers_alone(c.formula, moving))):
             found.append(k)
     return found
 
@@ -208,6 +209,8 @@ def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
     """What is wrong with rows that have no slope where they hold: with all, where none is told."""
     for row in [system.constraints[k] for k in flat]:
         base, power = row.formula.as_coeff_Mul()[1].as_base_exp()
+        if power == 1 and powers_alone(row.formula, {*system.q}):  # of one that is written out
+            base, power = sqf_part(row.formula), Integer(2)
         simple = power.is_number and power != 1 and not base.is_Number and len(str(base)) < LONGEST
         instead = f"{base} for {row.formula}" if simple else BY_ITSELF
         why = f"has no slope where it holds, and so no force: write {instead}"

@@ -1,0 +1,41 @@
+"""Rows that are powers written out, seen without factoring them."""
+
+from __future__ import annotations
+
+import pytest
+from sympy import Expr, cos, expand, sin, symbols
+
+from eomc.program.factors import powers_alone
+
+x, y, length = symbols("x y l")
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        (x - y) ** 2,
+        -3 * length * (x - y) ** 2,
+        (x - y) ** 2 * (x + length) ** 3,
+        (x**2 + y**2 - length**2) ** 2,
+        (sin(x) - cos(y)) ** 2,
+    ],
+)
+def test_a_product_of_powers_is_seen_written_out(formula: Expr) -> None:
+    assert powers_alone(expand(formula), {x, y})
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        length**2 * (x - y),
+        (x - y) ** 2 * (x + length),
+        (x - y) ** 2 - length**2,
+        x**2 + y**2,
+        x - x,
+        x**100000 - y,
+        (x**50 + y) ** 50,
+    ],
+)
+def test_others_are_left_alone(formula: Expr) -> None:
+    """Where one factor is there once, or a parameter is squared; what is long is not looked at."""
+    assert not powers_alone(formula, {x, y})
