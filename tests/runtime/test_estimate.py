@@ -167,6 +167,52 @@ def test_estimates_of_the_library() -> None:
 # --- what is not resolved -------------------------------------------------------------------------
 
 
+BESIDE = """
+eomc = 1
+name = "beside"
+[coordinates]
+x = { start = 0.0 }
+y = { start = 1.0 }
+[inputs]
+u = {}
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "2*y**2"
+[forces]
+x = "u"
+"""
+
+
+@pytest.mark.parametrize("how", [{}, {"control_period": 0.1}, {"control_period": 0.1, "pushed": 1}])
+def test_a_law_that_jumps_at_rest_is_not_called_chaotic(modules: Modules, how: dict) -> None:
+    """x is at rest, exactly; moved by a rounding it would chatter, a million times its scale."""
+    how, q = dict(how), [0.0, 1.0]
+    qd = [0.5, 0.0] if how.pop("pushed", 0) else [0.0, 0.0]
+    run = quiet(
+        modules.unoptimised(BESIDE),
+        q0=q,
+        qd0=qd,
+        h=0.01,
+        steps=1000,
+        u=lambda t, q, qd: -np.sign(qd[0]),
+        **how,
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        error = run.estimate()
+    assert error.resolved and error.amplification > 1e9
+    exact = abs(run.q[-1, 1] - math.cos(2 * run.t[-1]))
+    assert error.q[-1, 1] == pytest.approx(exact, rel=0.3)
+
+
+def test_an_unstable_equilibrium_is_called_chaotic_still(modules: Modules) -> None:
+    """An inverted pendulum that rounding never moves: differences grow smoothly."""
+    text = BESIDE.replace("2*y**2", "2*y**2 - 8*x**2")
+    run = quiet(modules.unoptimised(text), h=0.01, steps=1000, u=[0.0])
+    with pytest.warns(RuntimeWarning, match="chaotic: a difference at the start grows"):
+        assert not run.estimate().resolved
+
+
 def test_a_motion_beyond_doubles_is_reported() -> None:
     """Errors grow by 1.7e11 in 15 s."""
     words = "^double_pendulum_chaotic: this motion is not resolved: the error of .* exceeds a tenth"

@@ -104,6 +104,8 @@ def estimate(run: Run, progress: Callable[[int, int], None] | None = None) -> Es
     names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
     with np.errstate(divide="ignore"):
         digits = np.clip(-np.log10(error[-1] / scale), 0.0, -math.log10(eps)) + 0.0  # no -0
+    if (walk[-1] > _TENTH * scale).any() and _leaps(run, scale, eps, again):
+        walk *= 0.0
     words = _verdict(
         run, names, error / scale, walk / scale, observed, order, amplification, stopped
     )
@@ -170,6 +172,24 @@ def _growth(run: Run, own: Array, eps: float, again: _Again) -> tuple[Array, Arr
     counts, times = _counts(run, run.every, len(run)), _counts(run, every, len(grown))
     rows = np.stack([np.interp(counts, times, column) for column in grown.T], axis=1)
     return scale, rows, amplification
+
+
+def _leaps(run: Run, scale: Array, eps: float, again: _Again) -> bool:
+    """Whether differences at the start are as large as they become however small they were.
+
+    Forces jump there, as by -sign(qd) at rest: what is moved chatters by what a step brings. That
+    says nothing of a run that comes to rest and stays; where a motion is chaotic a difference a
+    hundredth as large is, while it fills no scale, a hundredth as large.
+    """
+    every = run.every if len(run) >= _ROWS else max(1, run.steps // _ROWS)
+    size = max(20 * eps * math.sqrt(run.steps), 1e4 * eps)
+    nudges = (part * size * scale for part in (0.0, 1.0, 0.01))
+    base, *moved = (again(1, every, nudge).x.astype(float) for nudge in nudges)
+    rows = min(len(base), *map(len, moved))
+    with np.errstate(over="ignore", invalid="ignore"):
+        large, small = (np.max(np.abs(x[:rows] - base[:rows]) / scale, axis=1) for x in moved)
+    row = int(np.argmax(large > _FULL))
+    return bool(small[row] > large[row] / 3)
 
 
 def _finer(
