@@ -54,6 +54,18 @@ def test_all_agree_in_forty_digits(scene: str) -> None:
             np.testing.assert_allclose(ours, right, rtol=1e-15, atol=1e-25, err_msg=name)
 
 
+def test_rotations_there_and_back_cancel_in_c() -> None:
+    """Of a box that tumbles; another entry than by Newton and Euler, and the same number."""
+    material = Material(derive(scene_system("tumbling_box")))
+    plain, short = (ROUTES[name].functions(material) for name in ("newton-euler", "rotated"))
+    assert plain is not None and short is not None
+    made = [lower("C", f.tape, f.outputs["C"], (), ()) for f in (plain, short)]
+    assert made[0].cost.multiplications > 60 and made[1].cost.multiplications < 50
+    for k in range(3):
+        one, other = (evaluate(f, nearby(material.derived.system, k), exact=True)[0] for f in made)
+        np.testing.assert_allclose(other, one, rtol=1e-15, atol=1e-25)
+
+
 @pytest.mark.parametrize("name", ROUTES)
 def test_a_comment_says_how_d_is_solved(name: str) -> None:
     route = ROUTES[name]

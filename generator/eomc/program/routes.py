@@ -21,6 +21,8 @@ from eomc.derive.tape import Tape
 from eomc.model.system import System
 from eomc.program.polynomial import Expander
 
+SHORT = 120  # names on a tape that C depends on: it is worth multiplying out
+
 
 class Material:
     """What routes are made of: a derivation, and Lagrange's equations multiplied out."""
@@ -119,6 +121,17 @@ def _expanded_functions(material: Material) -> Functions | None:
     return replace(plain, outputs=outputs)
 
 
+def _rotated(material: Material) -> Functions | None:
+    """C along a short tree, where rotations there and back cancel by sin^2 + cos^2 = 1."""
+    plain = _functions(material.derived.newton_euler)
+    if plain is None or "C" not in plain.outputs:
+        return None
+    C, tape = plain.outputs["C"], plain.tape
+    names = [x for entry in C for x in entry.free_symbols]
+    short = Expander(tape).expand(C) if len(tape.live(names)) <= SHORT else None
+    return short and replace(plain, outputs={"C": short})
+
+
 def _expanded(material: Material) -> Way:
     if material.expanded is None:
         return None
@@ -184,6 +197,7 @@ ROUTES: Mapping[str, Route] = {
             "Newton and Euler along the tree",
             functions=lambda m: _functions(m.derived.newton_euler),
         ),
+        Route("rotated", "the same, multiplied out", functions=_rotated),
         Route(
             "multipliers",
             "link multipliers: the tensions of links between point masses",
