@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import sys
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -25,10 +26,18 @@ from eomc.cli.main import main
 from eomc.emit.render import Sources
 from eomc.integrators.tableaux import METHODS
 from eomc.model.system import Event, System
-from eomc.report import cost_of_digits, linearised, page
+from eomc.report import cost_of_digits, linearised, mathml, page
 from eomc.report.cost_of_digits import Point, Report
 
 REPORTS = ROOT / "build" / "tests" / "reports"
+OSCILLATING = """eomc = 1
+name = "oscillating"
+[coordinates]
+x = { start = 1.0 }
+[energy]
+kinetic = "x_dot**2/2"
+potential = "9*x**2/2"
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -196,6 +205,26 @@ def test_the_page_is_one_file_with_its_pictures() -> None:
     for words in page.recommendations(measured()):
         assert words in text
     assert text == page.page(measured())
+
+
+def test_without_what_draws_and_typesets_the_page_is_there_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("matplotlib", "matplotlib.figure", "latex2mathml", "latex2mathml.converter"):
+        monkeypatch.setitem(sys.modules, name, None)
+    mathml._made.cache_clear()
+    monkeypatch.setattr(cost_of_digits, "measure", lambda *_, **__: measured())
+    scene = tmp_path / "oscillating.toml"
+    scene.write_text(OSCILLATING)
+    (tmp_path / "oscillating").mkdir()
+    done = CliRunner().invoke(main, ["report", str(scene), "--build", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert "the page has no pictures, which need matplotlib: pip install matplotlib" in done.output
+    text = (tmp_path / "oscillating" / "report.html").read_text()
+    assert "The page has no pictures, which need matplotlib" in text
+    assert "K, kinetic energy:" in text  # the equations as text
+    assert "<figure" not in text and "Motion</h2>" not in text
+    assert all(words in text for words in page.recommendations(measured()))
 
 
 @pytest.mark.slow

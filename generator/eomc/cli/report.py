@@ -34,6 +34,7 @@ def command(
     """
     from eomc.report import cost_of_digits, presented
     from eomc.report import page as pages
+    from eomc.report.plot import without_pictures
 
     measured = []
     for scene in scenes:
@@ -56,5 +57,7 @@ def command(
         files.write_text(page, pages.page(made, presented.of(system, made, root)))
         if not quiet:
             say(f"\nwrote {shown(page)}\n")
+            if lacking := without_pictures():
+                say(f"{lacking}\n")
     if file is not None:
         files.write_text(file, json.dumps(measured, indent=1) + "\n")

@@ -12,9 +12,9 @@ import numpy as np
 from markupsafe import Markup
 
 from eomc.base import texts
-from eomc.base.errors import EomcError
 from eomc.emit.render import environment
 from eomc.report.cost_of_digits import CONDITION, DIGITS, LOST, Point, Report
+from eomc.report.plot import svg, without_pictures
 from eomc.report.presented import Presented
 
 EXPLAINED = """\
@@ -177,7 +177,7 @@ def _for_json(value: Any) -> Any:
 def page(report: Report, about: Presented | None = None) -> str:
     """The report as one HTML page with its pictures in it; about: what the scene is.
 
-    Raises EomcError without matplotlib.
+    Without matplotlib it has no pictures, and says so.
     """
     shown = report.best(6) or report.finest
     runs = [
@@ -190,6 +190,7 @@ def page(report: Report, about: Presented | None = None) -> str:
         for p in report.points
     ]  # fmt: skip
     asked = [p for p in report.points if p.adaptive and p.along < LOST]
+    lacking = without_pictures()
     tolerances = _svg(lambda axes: _tolerances(axes, asked), (8.6, 3.6)) if asked else ""
     template = environment().get_template("report/report.html.jinja")
     return template.render(
@@ -202,6 +203,7 @@ def page(report: Report, about: Presented | None = None) -> str:
         remarks=remarks(report),
         explained=EXPLAINED,
         runs=runs,
+        lacking=lacking,
         work=_svg(lambda axes: _work(axes, report), (8.6, 5.0)),
         energy=_svg(lambda axes: _energy(axes, report, shown), (8.6, 3.6)),
         tolerances=tolerances,
@@ -213,14 +215,12 @@ def page(report: Report, about: Presented | None = None) -> str:
 
 
 def _svg(draw: Callable[[Any], None], size: tuple[float, float]) -> Markup:
-    """A picture as text of SVG, the same for the same report."""
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
+    """A picture as text of SVG, the same for the same report; empty without matplotlib."""
+    if without_pictures():
+        return Markup("")
+    import matplotlib
+    from matplotlib.figure import Figure
 
-        from eomc.report.plot import svg
-    except ImportError:
-        raise EomcError("the page of a report needs matplotlib: pip install matplotlib") from None
     with matplotlib.rc_context({"font.size": 10, "text.usetex": False}):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.add_subplot()

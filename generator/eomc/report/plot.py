@@ -64,6 +64,15 @@ def draw(
         raise EomcError(f"{path}: can't be written ({fault.strerror or fault})") from None
 
 
+def without_pictures() -> str:
+    """Why a page has no pictures, and how it gets them; empty where matplotlib is there."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError:
+        return "the page has no pictures, which need matplotlib: pip install matplotlib"
+    return ""
+
+
 def svg(made: Figure) -> Markup:
     """A figure as text of SVG, for a page; the same for the same figure."""
     import matplotlib

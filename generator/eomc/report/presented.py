@@ -12,7 +12,7 @@ from markupsafe import Markup
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import Coordinate, Input, Output, Parameter, System
-from eomc.report import equations, large_system, mathml
+from eomc.report import equations, equations_text, large_system, mathml
 from eomc.report.cost_of_digits import Report, variant
 from eomc.report.labels import html_name
 
@@ -24,7 +24,8 @@ Row = tuple[Markup, str, Markup, Markup]  # name, number, unit, note
 class Presented:
     """The parts of a page, made harmless. equations, rest: lines, and which go on with the last.
 
-    text: what stands for equations that are too long to write out. motion: a picture, SVG.
+    text: what stands for equations that are too long to write out, or that nothing sets. motion: a
+    picture, SVG, empty without matplotlib.
     """
 
     note: Markup
@@ -41,11 +42,7 @@ class Presented:
 
 def of(system: System, report: Report, root: Path) -> Presented:
     """A scene as it is presented, its motion by the stepper that was found best for six digits."""
-    try:
-        first, rest = mathml.lines(equations.of(system))
-        text = ""
-    except EomcError:
-        first, rest, text = [], [], large_system.text(system)
+    first, rest, text = _equations(system)
     motion, said = _motion(system, report, root)
     return Presented(
         note=Markup(texts.html(texts.flat(system.note))),
@@ -61,6 +58,21 @@ def of(system: System, report: Report, root: Path) -> Presented:
     )
 
 
+Lines = Sequence[tuple[bool, Markup]]
+
+
+def _equations(system: System) -> tuple[Lines, Lines, str]:
+    """Those of motion and the rest as MathML; else as text: without latex2mathml, or too long."""
+    try:
+        found = equations.of(system)
+    except EomcError:
+        return [], [], large_system.text(system)
+    try:
+        return *mathml.lines(found), ""
+    except EomcError:
+        return [], [], equations_text.text(found)
+
+
 def _row(what: Coordinate | Parameter | Input | Output, *numbers: str) -> Row:
     name = Markup(html_name(what.name))
     unit, note = (Markup(texts.html(texts.flat(x))) for x in (what.unit, what.note))
@@ -70,6 +82,8 @@ def _row(what: Coordinate | Parameter | Input | Output, *numbers: str) -> Row:
 def _motion(system: System, report: Report, root: Path) -> tuple[Markup, str]:
     from eomc.report import plot
 
+    if plot.without_pictures():
+        return Markup(""), ""
     best = report.best(6) or report.finest
     module, _ = variant(system, [p.method for p in report.lines], root / system.name / "report")
     finer = max(1, math.ceil(ROWS / best.steps))  # enough rows for smooth curves
