@@ -115,6 +115,31 @@ def test_rows_behind_a_failure_are_nan(linkage: ModuleType) -> None:
     assert np.isnan(runs.reactions["pin"][1, 1:]).all()
 
 
+@pytest.mark.parametrize("how", [{"steps": 20, "h": 1e-3}, {"tol": 1e-9}], ids=["fixed", "tol"])
+def test_a_start_that_can_not_be_assembled_is_locked_and_leaves_the_others_alone(
+    linkage: ModuleType, how: dict[str, Any]
+) -> None:
+    at, lengths = starts(linkage), np.array([0.4, 3.0, 0.3])  # 3 m are out of reach
+    how = how if "h" in how else {**how, "duration": 0.02}
+    runs = linkage.simulate_batch(**at, **how, params={"a": lengths})
+    assert runs.status.tolist() == ["ok", "locked", "ok"] and "1 locked" in runs.message
+    assert runs.steps[1] == 0
+    assert np.array_equal(runs.q[1, 0], at["q0"][1]) and np.isnan(runs.q[1, 1:]).all()
+    both = {name: x[[0, 2]] for name, x in at.items()}
+    others = linkage.simulate_batch(**both, **how, params={"a": lengths[[0, 2]]})
+    assert np.array_equal(runs.q[[0, 2]], others.q)
+    how = {name: x for name, x in how.items() if name in ("h", "tol")}
+    timed = linkage.simulate_batch(**at, **how, times=[0.0, 0.02], params={"a": lengths})
+    assert timed.status.tolist() == ["ok", "locked", "ok"]
+    for run in (runs, timed):
+        q, qd = run([0.0, 0.01])
+        assert np.array_equal(q[1, 0], at["q0"][1])
+        assert np.isnan(q[1, 1]).all() and np.isnan(qd[1, 1]).all()
+        assert np.isfinite(q[[0, 2]]).all()
+    alike = linkage.simulate_batch(**at, **how, duration=0.1, params={"a": 3.0})
+    assert alike.status.tolist() == ["locked"] * 3
+
+
 def test_of_unknown_names_those_that_there_are_are_told(linkage: ModuleType) -> None:
     runs = linkage.simulate_batch(steps=1)
     with pytest.raises(KeyError, match=r"multipliers: 'pin' is not one of pin_x, pin_y"):

@@ -68,11 +68,11 @@ class BatchModel(Model):
         arrays, Params, or an array (batch, np). u: None, the scene's signals; (nu,) or
         (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step; a
         dict of all inputs by name, numbers, (batch,), (batch, steps) or (1, steps).
-        threads: as many as there are processors where None. An instance that can't go on has its
-        own status and leaves the others alone. Ctrl-C raises Interrupted with the run so far.
-        tol: by steps that fit a tolerance, each instance its own. times: (n,), the rows, instead
-        of duration; without them those of adaptive steps are start and end. events: as in
-        `simulate`.
+        threads: as many as there are processors where None. An instance that can't go on, or whose
+        start can't be assembled, has its own status and leaves the others alone. Ctrl-C raises
+        Interrupted with the run so far. tol: by steps that fit a tolerance, each instance its own.
+        times: (n,), the rows, instead of duration; without them those of adaptive steps are start
+        and end. events: as in `simulate`.
         """
         if events is not None or unknown:
             other, given = with_events(self.simulate_batch, dict(locals()))
@@ -97,14 +97,14 @@ class BatchModel(Model):
         hold = min(as_period(control_period, h), max(steps, 2))
         if u is None and control_period is not None and self.nu:
             raise ValueError("control_period: a batch follows the signals: give u, a row a period")
-        starts, table, held, _ = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
+        starts, table, held, codes = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
         if held is not None and hold > 1 and held.shape[1] > 1:
             held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])
         method = self._method(method)
         if steps >= SOME and (method, h) not in self._warned:
             first, u0 = (starts[0][0], starts[1][0]), None if held is None else held[0, 0]
             self._look(*first, h, t0, u0, table[0], method, "the first instance: ")
-        asked = batch_fixed.Asked(step, h, t0, steps, every, at, method, threads, progress)
+        asked = batch_fixed.Asked(step, h, t0, steps, every, at, method, threads, progress, codes)
         run, whole = batch_fixed.simulate(self, starts, held, table, asked)
         if not whole:
             raise Interrupted(run)
@@ -164,11 +164,12 @@ class BatchModel(Model):
     def _instances(
         self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int,
         t0: float | None = None,
-    ) -> tuple[tuple[Array, Array], Array, Array | None, int]:  # fmt: skip
-        """((q, qd), parameters, inputs, batch), one row an instance; a single one serves for all.
+    ) -> tuple[tuple[Array, Array], Array, Array | None, Array | None]:  # fmt: skip
+        """((q, qd), parameters, inputs), one row an instance; a single one serves for all.
 
         q and qd may be what was given: they are to be read only, and not known to be finite. t0:
-        when they start, on the constraints.
+        when they start, on the constraints. Behind them the status of each, (batch,), where one
+        can't be assembled there, else None.
         """
         start = self._start
         q = self._rows_of(start[0] if q0 is None else self._completed(q0, 0), "q0")
@@ -191,9 +192,10 @@ class BatchModel(Model):
 
         whole = (count, self.nq)  # broadcast_to takes a while even where nothing is to be done
         q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
+        codes = None
         if t0 is not None:
-            q, qd = self._assembled_rows(q, qd, table, t0)
-        return (q, qd), table, held, count
+            q, qd, codes = self._assembled_rows(q, qd, table, t0)
+        return (q, qd), table, held, codes
 
     def _rows_of(self, given: ArrayLike, name: str) -> Array:
         """(nq,) or (n, nq); an array that is that already need not be contiguous, nor finite."""

@@ -15,7 +15,7 @@ from .adaptive_arguments import BOTH, as_end, as_limits, as_times
 from .adaptive_memory import FULL, room_for
 from .arguments import Array, as_number
 from .batch_run import BatchRun
-from .batch_work import all_of, as_threads
+from .batch_work import all_of, as_threads, stuck
 from .happened import FoundInBatch, HappenedInBatch
 from .package import reduced
 from .slices import longer
@@ -88,6 +88,7 @@ class AdaptiveBatchRun(BatchRun):
             model, self._begin.copy(), self.t0, times.astype(model.dtype), limits,
             self._held, p, self._stiff,
         )  # fmt: skip
+        work.leave(stuck(self))
         if len(times) and not work.run(None, None):
             raise KeyboardInterrupt
         return work.rows
@@ -155,10 +156,11 @@ def simulate(
     elif duration is not None:
         raise ValueError(BOTH)
     rows = as_times(times, t0, model.dtype)
-    starts, table, held, _ = model._instances(q0, qd0, params, u, 1, t0)
+    starts, table, held, codes = model._instances(q0, qd0, params, u, 1, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
     begin = np.array([q, qd])
     work = _Work(model, begin.copy(), t0, rows, (float(rows[-1]), tol, most), held, table, stiff)
+    work.leave(codes)
     whole = work.run(threads, progress)
     counts = work.counts
     cut = len(STATUS) + int(work.full)
@@ -200,6 +202,11 @@ class _Work:
         if times[0] == t0:
             self.kept[:] = 1
             self.rows[:, :, 0] = begin
+
+    def leave(self, codes: Array | None) -> None:
+        """Those whose status is not 0 where they are: they make no step."""
+        if codes is not None:
+            self.status[:] = codes
 
     @property
     def counts(self) -> dict[str, Array]:

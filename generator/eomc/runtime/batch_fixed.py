@@ -69,7 +69,10 @@ class TimedBatchRun(BatchRun):
 
 
 class Asked(NamedTuple):
-    """What a run by fixed steps was asked for; times (n,): rows there."""
+    """What a run by fixed steps was asked for; times (n,): rows there.
+
+    codes: the status of each at its start, (batch,), where one can't be assembled.
+    """
 
     step: Any  # of C
     h: float
@@ -80,6 +83,7 @@ class Asked(NamedTuple):
     method: str
     threads: int | None
     progress: Callable[[int, int], None] | None
+    codes: Array | None
 
 
 def simulate(
@@ -94,10 +98,11 @@ def _by_steps(
     model: BatchModel, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
 ) -> tuple[BatchRun, bool]:
     """Rows after every so many steps, and the last."""
-    step, h, t0, steps, every, _, method, threads, progress = asked
+    step, h, t0, steps, every, _, method, threads, progress, codes = asked
     rows = 1 + steps // every + (steps % every > 0)
     (q, qd), (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), rows)
     work = Work(model, step, q, qd, h, t0, steps, every, held, table, q_rows, qd_rows, starts)
+    work.leave(codes)
     whole = work.run(threads, progress)
     if steps % every:
         q_rows[:, -1], qd_rows[:, -1] = q, qd
@@ -128,6 +133,7 @@ def _at_times(
     places = parts(times, t0, h, asked.steps)
     both, (q_rows, qd_rows) = _ends_and_rows(model, len(starts[0]), len(times))
     way = Way(model, method, both, t0, h, held, table, starts)
+    way.work.leave(asked.codes)
     whole = way.rows(places, (q_rows, qd_rows), asked.threads, asked.progress)
     work, last = way.work, int(places[0][-1])
     if not whole:

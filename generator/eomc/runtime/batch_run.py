@@ -28,9 +28,10 @@ _KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as th
 class BatchRun(Values, Fans, Columns):
     """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
 
-    status: "ok", "singular", "not finite", "no convergence" or "interrupted", one an instance; the
-    rows behind the last good one of an instance that could not go on are nan. steps: how many each
-    has made. By name, run["theta_dot"], (batch, n). Equal where scene, settings and rows are, bit
+    status: "ok", "singular", "not finite", "no convergence", "locked" or "interrupted", one an
+    instance; the rows behind the last good one of an instance that could not go on are nan. Where
+    a start can't be assembled, "locked", it is the last good one. steps: how many each has made.
+    By name, run["theta_dot"], (batch, n). Equal where scene, settings and rows are, bit
     by bit; a pickled one keeps all of them.
     """
 

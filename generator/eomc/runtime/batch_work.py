@@ -12,6 +12,7 @@ import numpy as np
 
 from .arguments import Array, as_count
 from .slices import longer
+from .trajectory import STATUS
 
 if TYPE_CHECKING:
     from .batch import BatchModel
@@ -54,6 +55,11 @@ class Work:
             return q + first, qd + first, q_rows, qd_rows
         row = first * self.rows
         return q + first, qd + first, q_rows + row, qd_rows + row
+
+    def leave(self, codes: Array | None) -> None:
+        """Those whose status is not 0 where they are: they make no step."""
+        if codes is not None:
+            self.status[codes != 0], self.failed = codes[codes != 0], True
 
     def run(self, threads: int | None, progress: Callable[[int, int], None] | None) -> bool:
         """All of it; False where Ctrl-C came in between."""
@@ -145,7 +151,9 @@ class Way:
     def of(cls, run: BatchRun, both: Array, held: Array | None, first: int = 0) -> Way:
         """That of a run again, from its states behind so many steps."""
         model: Any = run._model
-        return cls(model, run.method, both, run.t0, run.h, held, run._params, None, first)
+        way = cls(model, run.method, both, run.t0, run.h, held, run._params, None, first)
+        way.work.leave(stuck(run))
+        return way
 
     def rows(
         self, places: tuple[Array, Array], into: Any, threads: int | None = None,
@@ -168,6 +176,8 @@ class Way:
         """The states so many seconds behind the last step, nan of who can't go on."""
         work, (q, qd) = self.work, np.array(self.state)
         good, held = work.status == 0, work.held
+        if not rest and not work.steps:
+            return q, qd  # as they were given, also where they can't be assembled
         if rest:
             n = work.steps
             u = None if held is None else held[:, min(n, held.shape[1] - 1)]
@@ -175,6 +185,11 @@ class Way:
             good &= self.model.step_batch(q, qd, rest, t, u, p, method=method) == 0
         q[~good] = qd[~good] = np.nan
         return q, qd
+
+
+def stuck(run: BatchRun) -> Array:
+    """The status of those that made no step, (batch,), and 0 of the others."""
+    return np.where((run.steps == 0) & (run._codes < len(STATUS)), run._codes, 0)
 
 
 class Grouped(Protocol):

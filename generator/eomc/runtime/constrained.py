@@ -7,6 +7,7 @@ of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -247,18 +248,29 @@ class Constrained(Frames):
         held = self._inputs(u)
         return equilibrium(self, at, moving, held, found, as_number(t, "t"), params)
 
-    def _assembled_rows(self, q: Array, qd: Array, table: Array, t0: float) -> tuple[Array, Array]:
-        """The starts of many, (n, nq); table: their parameters, a row each or one for all."""
+    def _assembled_rows(
+        self, q: Array, qd: Array, table: Array, t0: float
+    ) -> tuple[Array, Array, Array | None]:
+        """The starts of many, (n, nq), and their status, (n,), None where all are assembled.
+
+        table: their parameters, a row each or one for all. A start that can't be assembled stays
+        as it is given.
+        """
         if not self._rows.names:
-            return q, qd
+            return q, qd, None
         held = self._rows.held
         q, qd = self._in_modes(q, qd)
         if len(table) == 1:
-            return self._projected(q, qd, t0, table[0], held)
-        both = [
-            self._projected(*row[:2], t0, row[2], held) for row in zip(q, qd, table, strict=True)
-        ]
-        return np.array([x for x, _ in both]), np.array([x for _, x in both])
+            with suppress(MotionError):  # else each by itself
+                return *self._projected(q, qd, t0, table[0], held), None
+        q, qd = np.array(q, self.dtype), np.array(qd, self.dtype)
+        codes = np.zeros(len(q), "i")
+        for k, p in enumerate(np.broadcast_to(table, (len(q), table.shape[1]))):
+            try:
+                q[k], qd[k] = self._projected(q[k], qd[k], t0, p, held)
+            except MotionError as fault:
+                codes[k] = STATUS.index(fault.status)
+        return q, qd, codes if codes.any() else None
 
     def _tell(self, run: Any, method: str, work: Any) -> None:
         """A run what its steps met, as their work in C has it."""
