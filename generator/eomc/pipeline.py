@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, NoCompilerError
 
 if TYPE_CHECKING:
     from eomc.base.errors import Problem, SceneError
@@ -141,9 +141,9 @@ def build(
 ) -> Built:
     """The compiled module of a scene file or a System, in `root`/<name>/.
 
-    Nothing is derived or compiled where nothing has changed. form: of the C that it is compiled
-    from; that from "plain" is for comparison and lies in `root`/<name>/.plain/. warn is called with
-    each warning.
+    Nothing is derived or compiled where nothing has changed; then no compiler is needed. form: of
+    the C that it is compiled from; that from "plain" is for comparison and lies in
+    `root`/<name>/.plain/. warn is called with each warning.
     Raises SceneError for a faulty scene, EomcError for what else fails.
     """
     from eomc.toolchain import cache
@@ -156,8 +156,14 @@ def build(
     else:
         made = None
         name, digest = name_and_digest(Path(scene))
-    wanted = cache.key(digest, form)
-    if name and cache.found(folder := cache.place(name, Path(root), form), wanted):
+    folder = cache.place(name, Path(root), form)
+    try:
+        wanted = cache.key(digest, form)
+    except NoCompilerError:
+        if name and (there := cache.key_there(folder, digest, form)):
+            return cache.Built(name, folder, False, there)
+        raise
+    if name and cache.found(folder, wanted):
         return cache.Built(name, folder, False, wanted)
     if made is None:
         assert isinstance(scene, (str, os.PathLike))

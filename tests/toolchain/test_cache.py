@@ -6,6 +6,7 @@ import contextlib
 import errno
 import gc
 import importlib.util
+import json
 import os
 import shutil
 import signal
@@ -22,12 +23,14 @@ from typing import Any
 
 import pytest
 from builds import CHANGED, TEXT, gravity, leftovers, script
+from click.testing import CliRunner
 from conftest import needs, tiers
 from instrument import in_a_fork
 
 import eomc
 from eomc import pipeline
 from eomc.base import resources
+from eomc.cli.main import main
 from eomc.emit import render
 from eomc.toolchain import cache, compiler
 
@@ -466,12 +469,36 @@ def test_a_read_only_place(scene: Path, root: Path) -> None:
         eomc.build(scene, root)
 
 
-def test_no_compiler_at_all(scene: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One sentence, and the one thing that pip can install."""
+@pytest.fixture
+def no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     real = compiler.importlib.util.find_spec
     hidden = lambda name, *a: None if name == "ziglang" else real(name, *a)  # noqa: E731 - a stub
     monkeypatch.setattr(compiler.importlib.util, "find_spec", hidden)
+
+
+def test_what_is_built_and_unchanged_needs_no_compiler(
+    scene: Path, root: Path, found: None, no_compiler: None
+) -> None:
+    """Of any compiler; not where anything else has changed."""
+    built = cache.Built("simple_pendulum", root / "simple_pendulum", False)
+    before = marks(built.folder)
+    assert not eomc.build(scene, root).fresh and marks(built.folder) == before
+    assert eomc.load(scene, root).simulate(steps=10).status == "ok"
+    listed = CliRunner().invoke(main, ["list", str(scene.parent), "--build", str(root), "--json"])
+    assert [row["built"] for row in json.loads(listed.output)] == [True]
+    scene.write_text(CHANGED, encoding="utf-8")
+    with pytest.raises(eomc.EomcError, match="no C compiler found"):
+        eomc.build(scene, root)
+    scene.write_text(TEXT, encoding="utf-8")
+    (built.folder / "slices.py").write_text("", encoding="utf-8")  # no longer whole
+    with pytest.raises(eomc.EomcError, match="no C compiler found"):
+        eomc.build(scene, root)
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_no_compiler_at_all(scene: Path, root: Path) -> None:
+    """One sentence, and the one thing that pip can install."""
     with pytest.raises(eomc.EomcError) as fault:
         eomc.build(scene, root)
     assert "\n" not in str(fault.value)

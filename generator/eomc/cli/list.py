@@ -11,7 +11,7 @@ import click
 
 from eomc import pipeline
 from eomc.base import resources
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, NoCompilerError
 from eomc.cli import options
 from eomc.cli.terminal import say, shown
 
@@ -69,7 +69,10 @@ def _row(path: Path, root: Path) -> Row | None:
     if "eomc" not in text or not isinstance(text.get("name"), str):
         return None
     name, digest = pipeline.name_and_digest(path)
-    built = bool(name) and cache.found(root / name, cache.key(digest))
+    try:
+        built = bool(name) and cache.found(root / name, cache.key(digest))
+    except NoCompilerError:
+        built = bool(cache.key_there(root / name, digest))
     return {
         "scene": str(path), "name": text["name"], "title": str(text.get("title", "")),
         "coordinates": _keys(text, "coordinates"), "inputs": _keys(text, "inputs"),

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from eomc.emit.render import Sources
 
 MANIFEST = "build.json"
+HALF = 32  # letters of a key
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,38 @@ def generator_digest() -> str:
 
 
 def key(scene_digest: str, form: str = "fast") -> str:
-    """The digest of all that a build depends on: scene, generator, flags, compiler, processor."""
+    """What a build depends on: scene, generator, flags, processor, and with these the compiler.
+
+    Half is the digest of all of it, half that of all but the compiler. Raises EomcError where
+    there is none.
+    """
     small, large = compiler_for(0), compiler_for(MANY + 1)
-    parts = (
-        scene_digest, form, generator_digest(), small.identity, large.identity,
-        STANDARD, *flags(form), processor(), sys.version,
+    parts = _parts(scene_digest, form)
+    return _total(*parts, small.identity, large.identity)[:HALF] + _total(*parts)[:HALF]
+
+
+def key_there(folder: Path, scene_digest: str, form: str = "fast") -> str:
+    """The key of the build in `folder` where it is whole and of this scene; else "".
+
+    It may be another compiler's: for where there is none now.
+    """
+    try:
+        there = _key(folder)
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    same = there[HALF:] == _total(*_parts(scene_digest, form))[:HALF]
+    return there if same and found(folder, there) else ""
+
+
+def _parts(scene_digest: str, form: str) -> tuple[str, ...]:
+    """All that a build depends on but the compiler."""
+    return (
+        scene_digest, form, generator_digest(), STANDARD, *flags(form), processor(), sys.version,
         str(sysconfig.get_config_var("EXT_SUFFIX")),
     )  # fmt: skip
+
+
+def _total(*parts: str) -> str:
     # a variable of the environment may hold bytes that are no text
     return hashlib.sha256("\0".join(parts).encode(errors="surrogateescape")).hexdigest()
 
