@@ -222,6 +222,32 @@ def test_a_control_period_is_its_steps(modules: Modules, method: str, given: str
         assert Gamma[:, k] == pytest.approx(sum(w * d for w, d in ends) / width, abs=1e-9)
 
 
+@pytest.mark.parametrize("period", [None, 0.04])
+def test_inputs_and_parameters_of_each_state(modules: Modules, period: float | None) -> None:
+    m = modules.unoptimised(EXPLICIT)
+    q, qd = np.array([Q, 2 * Q, -Q]), np.array([QD, -QD, QD])
+    u, k = np.array([[0.0, 0.1], [1.0, 0.2], [-2.0, 0.3]]), np.array([4.0, 5.0, 6.0])
+    named, t = {"force": u[:, 0], "push": 0.2}, np.array([0.0, 0.1, 0.2])
+    more: dict[str, Any] = {"discretize": {"control_period": period}, "linearize": {}}
+    for held, params in ((u, None), (u.tolist(), {"k": k}), (named, k[:, None]), (None, {"k": k})):
+        for name, how in more.items():
+            found = getattr(m, name)(q, qd, u=held, t=t, params=params, **how)
+            for j in range(3):
+                own = [u[j, 0], 0.2] if held is named else None if held is None else u[j]
+                p = None if params is None else {"k": k[j]}
+                one = getattr(m, name)(q[j], qd[j], u=own, t=t[j], params=p, **how)
+                assert all(np.array_equal(a[j], b) for a, b in zip(found, one, strict=True))
+    A, B = m.linearize(np.empty((0, 2)), np.empty((0, 2)), u=np.empty((0, 2)))
+    assert A.shape == (0, 4, 4) and B.shape == (0, 4, 2)
+    for name in ("discretize", "linearize"):
+        with pytest.raises(ValueError, match=r"u: shape \(2, 2\), expected \(3, 2\) for 3 states"):
+            getattr(m, name)(q, qd, u=u[:2])
+        with pytest.raises(ValueError, match=r"params: k: shape \(2,\), expected \(3,\) for 3 st"):
+            getattr(m, name)(q, qd, params={"k": k[:2]})
+        with pytest.raises(ValueError, match="one value an input"):
+            getattr(m, name)(Q, QD, u=u)
+
+
 def test_what_it_refuses(modules: Modules, cartpole: ModuleType) -> None:
     m = modules.unoptimised(EXPLICIT)
     with pytest.raises(ValueError, match=r"cartpole was built without it.*discretize = true"):

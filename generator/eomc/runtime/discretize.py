@@ -8,7 +8,7 @@ import numpy as np
 from numpy import empty
 
 from .arguments import Array, as_number
-from .functions import row_times
+from .functions import for_each, row_times
 from .trajectory import SAID, STATUS, MotionError, state_text
 
 if TYPE_CHECKING:
@@ -21,7 +21,8 @@ def discretize(
 ) -> tuple[Array, Array]:  # fmt: skip
     """(Phi, Gamma) of a step, or where `hold` is given of so many under inputs that are held.
 
-    q, qd: (nq,) or (n, nq), checked. Raises MotionError, ValueError.
+    q, qd: (nq,) or (n, nq), checked; u, params: of all, or a row for each state.
+    Raises MotionError, ValueError.
     """
     if not hasattr(model._lib, f"{method}_derivative"):
         raise ValueError(
@@ -32,12 +33,13 @@ def discretize(
     Phi = empty((*rows, 2 * n, 2 * n), model.dtype)
     Gamma = empty((*rows, 2 * n, model.nu), model.dtype)
     times = row_times(t, rows)
-    if times is None and hold is None:
+    each = for_each(model, len(q), u, params) if rows else None
+    if times is None and hold is None and each is None:
         _step(model, method, (Phi, Gamma), q, qd, h, as_number(t, "t"), u, params)
         return Phi, Gamma
     for k in np.ndindex(rows):
         now = as_number(t if times is None else times[k], "t")
-        out = Phi[k], Gamma[k]
+        out, (u, params) = (Phi[k], Gamma[k]), (u, params) if each is None else each[k[0]]
         if hold is None:
             _step(model, method, out, q[k], qd[k], h, now, u, params)
         else:

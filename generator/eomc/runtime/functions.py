@@ -5,7 +5,7 @@ Shapes: q, qd (nq,) or (n, nq); then results have a leading n as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,37 @@ def row_times(t: Any, rows: tuple[int, ...]) -> Array | None:
     if np.shape(t) != rows:
         raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
     return np.asarray(t)
+
+
+def for_each(model: Arguments, count: int, u: Any, params: Any) -> list[tuple[Any, Any]] | None:
+    """(u, params) of each of so many states where one has a row for each; None where none has.
+
+    u: (count, nu), or a dict with (count,). params: a dict with (count,), or (count, np).
+    Raises ValueError.
+    """
+    held = given = None
+    if u is not None and model.nu:
+        rows = model._by_name(u) if isinstance(u, Mapping) else model._numbers(u, "u")
+        held = model._array(rows, "u", model.nu) if rows.ndim == 2 else None
+    if isinstance(params, Mapping):
+        if many := {name for name, value in params.items() if np.ndim(value)}:
+            for name in many:
+                unmasked(params[name], f"params: {name}")
+                _one_each(f"params: {name}", np.shape(params[name]), (count,))
+            given = [{n: x[k] if n in many else x for n, x in params.items()} for k in range(count)]
+    elif isinstance(params, np.ndarray) and params.ndim == 2:
+        _one_each("params", params.shape, (count, len(model.parameters)))
+        given = list(unmasked(params, "params"))
+    if held is not None:
+        _one_each("u", held.shape, (count, model.nu))
+    if held is None and given is None:
+        return None
+    return [(u if held is None else held[k], given[k] if given else params) for k in range(count)]
+
+
+def _one_each(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if shape != expected:
+        raise ValueError(f"{name}: shape {shape}, expected {expected} for {expected[0]} states")
 
 
 class Functions(Arguments):
@@ -244,13 +275,13 @@ class Functions(Arguments):
         return hasattr(self._lib, "linearization")
 
     def linearize(
-        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0,
-        params: Parameters = None, *, outputs: bool = False, closed: bool = False,
+        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Any = None, *,
+        outputs: bool = False, closed: bool = False,
     ) -> tuple[Array, ...]:  # fmt: skip
         """d[q; qd]/dt = A dx + B du near a state, x = [q; qd]: A (2 nq, 2 nq), B (2 nq, nu).
 
         With outputs=True also C (ny, 2 nq) and D (ny, nu) of the outputs, dy = C dx + D du. Many
-        states, (n, nq), give each of them a leading n.
+        states, (n, nq), give each of them a leading n; u may be (n, nu) then, and a parameter (n,).
 
         Upper rows of A: [0, 1]; lower ones [dqdd/dq, dqdd/dqd], in rad or m per s^2 and per rad,
         m or their rates; of B: 0, then dqdd/du. Exact derivatives, to rounding. u None: held at
@@ -271,6 +302,15 @@ class Functions(Arguments):
                 "asks with [run] linearize = true"
             )
         at, moving = self._state(q, qd)
+        each = for_each(self, len(at), u, params) if at.ndim == 2 else None
+        if each:
+            times, how = row_times(t, at.shape[:1]), {"outputs": outputs, "closed": closed}
+            found = [
+                self.linearize(at[k], moving[k], own, t if times is None else times[k], p, **how)
+                for k, (own, p) in enumerate(each)
+            ]
+            return tuple(map(np.array, zip(*found, strict=True)))
+        u, params = (u, params) if each is None else (None, None)  # of no states
         A, B = self._slopes(at, moving, u, t, params)
         both = [(A, B)]
         if outputs:

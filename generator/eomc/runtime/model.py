@@ -152,16 +152,15 @@ class Model(Constrained):
 
     def discretize(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
-        params: Parameters = None, method: str | None = None, *,
-        control_period: float | None = None,
+        params: Any = None, method: str | None = None, *, control_period: float | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
         """(Phi, Gamma): dx' = Phi dx + Gamma du of `step`, x = [q; qd], x' one step later.
 
-        Phi (2 nq, 2 nq), Gamma (2 nq, nu), with a leading n for many states (n, nq); the step's
-        own derivatives, exact to rounding. u None: Phi follows the scene's signals, as steps do,
-        and Gamma is along what is added to them. control_period: over so many steps, in s, u held
-        or the signals read at their start. Raises MotionError as `step` does, ValueError where the
-        module lacks them.
+        Phi (2 nq, 2 nq), Gamma (2 nq, nu), with a leading n for many states (n, nq), for which u
+        may be (n, nu) and a parameter (n,); the step's own derivatives, exact to rounding. u None:
+        Phi follows the scene's signals, as steps do, and Gamma is along what is added to them.
+        control_period: over so many steps, in s, u held or the signals read at their start. Raises
+        MotionError as `step` does, ValueError where the module lacks them.
         """
         at, moving = self._state(q, qd)
         h = self.h if h is None else as_step_size(h, self.dtype)
