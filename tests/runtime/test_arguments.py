@@ -159,6 +159,16 @@ def test_a_scene_without_inputs_takes_none(cartpole: ModuleType, u: Any) -> None
         cartpole.simulate(u=u)
 
 
+def test_a_scene_without_parameters_says_so(modules: Modules) -> None:
+    text = 'eomc = 1\nname = "bare"\n[coordinates]\nx = { start = 1 }\n[energy]\n'
+    m: Any = modules.unoptimised(text + 'kinetic = "x_dot**2"\n[run]\nbatch = true\n')
+    for simulate in (m.simulate, m.simulate_batch):
+        with pytest.raises(ValueError, match="^params: there is no 'm': this scene has none$"):
+            simulate(steps=1, params={"m": 1})
+        with pytest.raises(ValueError, match="^params: this scene has no parameters$"):
+            simulate(steps=1, params=[1, 2])
+
+
 def test_another_scenes_params_are_refused(cartpole: ModuleType, modules: Modules) -> None:
     with pytest.raises(ValueError, match=r"^params: these are another scene's: m, l, g"):
         cartpole.D(Q, params=modules("simple_pendulum").Params())

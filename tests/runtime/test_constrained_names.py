@@ -78,7 +78,7 @@ def test_what_a_scene_has_to_ask_for_is_told(quickly_compiled: None, tmp_path: P
         module.tangent(*module.start)
     with pytest.raises(AttributeError, match=r"reactions: rod_named has no \[\[loop\]\]"):
         module.reactions(*module.start)
-    with pytest.raises(KeyError, match="'rod' is not one of none"):
+    with pytest.raises(KeyError, match="reactions: there is no 'rod': this scene has none"):
         module.simulate().reactions["rod"]
 
 

@@ -238,6 +238,8 @@ class Arguments:
         except (TypeError, ValueError, OverflowError):
             array = empty(0, self.dtype)
         if array.shape != self._p0.shape or not np.isfinite(array).all():
+            if not self.parameters:
+                raise ValueError("params: this scene has no parameters")
             raise ValueError(
                 f"params: expected a dict, Params or {len(self._p0)} finite numbers in the order "
                 f"{', '.join(self.parameters)}"
@@ -406,7 +408,9 @@ def machine_memory() -> float:
 
 def not_one_of(argument: str, name: str, known: Sequence[str]) -> str:
     """What is wrong with a name, what there is, and what may be meant."""
-    return f"{argument}: '{name}' is not one of {', '.join(known) or 'none'}{meant(name, known)}"
+    if not known:
+        return f"{argument}: there is no '{name}': this scene has none"
+    return f"{argument}: '{name}' is not one of {', '.join(known)}{meant(name, known)}"
 
 
 def in_a_line(start: str, parts: Sequence[str], end: str, width: int = 80) -> str:
