@@ -90,6 +90,35 @@ def test_a_run_of_no_step_has_no_speed(there: Path) -> None:
     assert done.output.endswith(" ms, 0 steps a second\n")
 
 
+def test_what_is_not_finite_at_the_start_is_named(here: Path) -> None:
+    scene = """eomc = 1
+name = "poles"
+[coordinates]
+x = { start = 0.1 }
+[parameters]
+b = 9
+c = 9
+d = 9
+[energy]
+kinetic = "x_dot**2/2 + x_dot**2/(x - b)**2"
+potential = "1/(x - c)"
+[forces]
+x = "1/(x - d)"
+"""
+    (here / "poles.toml").write_text(scene)
+    for name, what in (
+        ("b", "the kinetic energy"), ("c", "the potential energy"), ("d", "an acceleration")
+    ):  # fmt: skip
+        for way in ([], ["--json"]):
+            done = eomc("run", "poles.toml", "--set", f"{name}=0.1", *way)
+            assert done.exit_code == 1
+            assert f"{what} is not finite at the start" in done.output
+            assert "step may be too long" not in done.output, name
+        assert " nan" not in done.output.lower() and "inf " not in done.output.lower()
+        figures = json.loads(done.stdout, parse_constant=pytest.fail)
+        assert (figures["energy"]["start"] is None) == (name != "d")
+
+
 @pytest.mark.parametrize("words", ["", "rows of 4 numbers don't fit in memory"])
 def test_memory_that_does_not_suffice_is_said(
     words: str, here: Path, monkeypatch: pytest.MonkeyPatch

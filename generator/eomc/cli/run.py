@@ -197,23 +197,31 @@ def _there_are(known: Iterable[str]) -> str:
     return f"; there are {texts.listed([*known])}"
 
 
+def _finite(x: float) -> float | None:
+    return x if abs(x) < float("inf") else None
+
+
+def _change(energy: Any) -> float | None:
+    """The largest from the start; None where one is not finite."""
+    import numpy as np
+
+    return float(np.max(np.abs(energy - energy[0]))) if np.isfinite(energy).all() else None
+
+
 def _error(done: Run) -> dict[str, Any] | None:
     """A run's own error for JSON, which has no inf and no nan."""
     error = done.error
     if error is None:
         return None
 
-    def said(x: float) -> float | None:
-        return x if abs(x) < float("inf") else None
-
     return {
-        "q": said(float(error.q[-1].max())),
-        "qd": said(float(error.qd[-1].max())),
-        "end": {name: said(x) for name, x in error.end.items()},
+        "q": _finite(float(error.q[-1].max())),
+        "qd": _finite(float(error.qd[-1].max())),
+        "end": {name: _finite(x) for name, x in error.end.items()},
         "digits": error.digits,
         "order": error.order,
-        "observed_order": said(error.observed),
-        "amplification": said(error.amplification),
+        "observed_order": _finite(error.observed),
+        "amplification": _finite(error.amplification),
         "verdict": error.verdict,
     }
 
@@ -238,17 +246,15 @@ def _summary(
         "q": dict(zip(module.coordinates, map(float, q), strict=True)),
         "qd": dict(zip(module.coordinates, map(float, qd), strict=True)),
         "energy": {
-            "start": float(energy[0]),
-            "end": float(energy[-1]),
-            "largest_change": float(np.max(np.abs(energy - energy[0]))),
+            "start": _finite(float(energy[0])),
+            "end": _finite(float(energy[-1])),
+            "largest_change": _change(energy),
             "balance": dataclasses.asdict(balance) if balance else None,
         },
         "events": {name: e.t.tolist() for name, e in done.events.items()},
         "stopped_by": getattr(done, "stopped", "") or None,
         "saturated": _saturated(module, done),
-        "jacobi_change": None
-        if np.array_equal(energy, jacobi)
-        else float(np.max(np.abs(jacobi - jacobi[0]))),
+        "jacobi_change": None if np.array_equal(energy, jacobi) else _change(jacobi),
         "error_estimate": _error(done),
         "beyond_stability": unstable,
         "beyond_duration": ends,
@@ -301,6 +307,9 @@ def _print_summary(
 def _print_energy(done: Run, balance: Balance | None, summary: Mapping[str, Any]) -> None:
     """What is conserved, or what was put in and lost of it; K + P apart where it is another."""
     energy, jacobi = summary["energy"], summary["jacobi_change"]
+    if energy["largest_change"] is None:
+        say("  the energy is not finite")
+        return
     end, change = energy["end"], energy["largest_change"]
     if jacobi is not None:
         say(f"  energy K + P {end:.9g} J, changed by at most {change:.2g} J; it is not conserved")

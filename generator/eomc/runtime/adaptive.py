@@ -19,6 +19,7 @@ from .adaptive_arguments import BOTH, as_end, as_limits, as_times, as_tolerance
 from .adaptive_error import error_of
 from .adaptive_memory import FULL, Kept, rows_for
 from .arguments import Array, as_number
+from .begun import infinite_at_start
 from .dense import within
 from .estimate import Estimate
 from .happened import Found, Happened
@@ -87,6 +88,7 @@ class AdaptiveRun(Run):
                 f"run ends, after {done}"
             )
         said = STOPPED if self.status == "no convergence" else SAID[self.status]
+        said = infinite_at_start(self) or said
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
         return f"stopped at t = {end:.9g} after {done}, {where}: {said}"

@@ -68,7 +68,10 @@ class Balance:
 
 
 def balance(run: Run) -> Balance | None:
-    """The balance of a run; None where inputs change from step to step, unseen."""
+    """The balance of a run; None where inputs change from step to step, unseen, or one is infinite.
+
+    That may be an energy or a force, at a start from which no step is made.
+    """
     if run._u is not None and np.ndim(run._u) != 1:
         return None
     if not np.isfinite(run.jacobi).all():
@@ -82,6 +85,8 @@ def balance(run: Run) -> Balance | None:
         run._values("tau", lambda q, qd, way=way, **held: model.tau(*way(q, qd), **held), u=none)
         for way in (lambda q, qd: (q, qd), back)
     )
+    if not all(np.isfinite(x).all() for x in (power, rest, ahead, behind)):
+        return None
     braking = np.sum((behind - ahead) / 2 * run.qd, axis=1).astype(float)
     jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # the rows behind them
     (work, off), (other, _), (lost, blur) = (

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from .adaptive_memory import FULL, REMEDY
 from .arguments import Array
 from .balance import Balance, balance
+from .begun import infinite_at_start
 from .columns import Columns, File
 from .constrained_run import ConstrainedRun
 from .dense import states
@@ -402,7 +403,7 @@ class Run(ConstrainedRun, Columns):
             return f"{self.steps} steps of {self.h:g} s"
         return (
             f"stopped at t = {self.t[-1]:.9g} after {self.steps} steps of {self.h:g} s, "
-            f"{state_text(self.q[-1], self.qd[-1])}: {SAID[self.status]}"
+            f"{state_text(self.q[-1], self.qd[-1])}: {infinite_at_start(self) or SAID[self.status]}"
         )
 
     @property
