@@ -90,6 +90,14 @@ def test_a_run_of_no_step_has_no_speed(there: Path) -> None:
     assert done.output.endswith(" ms, 0 steps a second\n")
 
 
+def test_of_a_run_without_a_right_digit_no_growth_is_told(there: Path) -> None:
+    """It would be that of the wrong motion, 1 where a linear one blows up."""
+    lost = eomc("run", "p.toml", "--h", "0.9", "--duration", "100").output
+    assert "  right digits: theta 0\n" in lost
+    good = eomc("run", "p.toml", "--h", "0.01", "--duration", "1").output
+    assert "; a difference at the start has become " in good
+
+
 def test_what_is_not_finite_at_the_start_is_named(here: Path) -> None:
     scene = """eomc = 1
 name = "poles"

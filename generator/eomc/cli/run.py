@@ -329,10 +329,10 @@ def _print_error(module: Any, error: Estimate, adaptive: bool) -> None:
         how = "with a hundredth of the tolerance"
     say(f"  error at the end about {q:.1g} in q, {qd:.1g} in qd (from the same run {how})")
     digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
-    say(
-        f"  right digits: {digits}; a difference at the start has become "
-        f"{error.amplification:.2g} times as large"
-    )
+    grown = f"; a difference at the start has become {error.amplification:.2g} times as large"
+    if max(error.digits.values()) < 0.5 or not math.isfinite(error.amplification):
+        grown = ""  # of a motion that is not this one
+    say(f"  right digits: {digits}{grown}")
     if error.warning:
         say(f"  {error.warning}")
 
