@@ -66,13 +66,36 @@ def test_a_stop_gives_back_less_the_harder_it_is_hit(side: int, tmp_path: Path) 
 
 def test_without_an_effort_the_weight_stands_for_it(tmp_path: Path) -> None:
     """Of 3 kg at 10 m/s^2, stretched out by 1 m: a bob at v goes in by v sqrt(I/k)."""
-    _, scene = imported(tmp_path, MJCF, "--stops")
+    motor = '<actuator><motor joint="q" gear="50"/></actuator></mujoco>'  # without limits
+    _, scene = imported(tmp_path, MJCF.replace("</mujoco>", motor), "--stops")
     assert 'q = "30/stop_depth_turn*(max(0, -0.5 - q)' in scene and "max(0, q - 0.7)" in scene
     m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
-    run = m.simulate(q0=[0.6], qd0=[3.0], h=1e-4, duration=3.0)
+    run = m.simulate(q0=[0.6], qd0=[3.0], h=1e-4, duration=3.0, u=0.0)
     assert run.status == "ok" and run.q.min() < -0.5
     inertia = float(np.squeeze(m.D([0.0])))
     assert 0.7 < run.q.max() < 0.7 + 3 * np.sqrt(inertia * 0.01 / 30)
+
+
+@pytest.mark.parametrize(
+    ("actuators", "of_joint", "effort"),
+    [
+        ('<motor joint="q" gear="50" ctrlrange="-1 1" ctrllimited="true"/>', "", 50),
+        ('<motor joint="q" gear="-50" ctrlrange="-2 1" ctrllimited="true"/>' * 2, "", 200),
+        (
+            '<motor joint="q" gear="50" ctrlrange="-1 1" ctrllimited="true"/>',
+            'actuatorfrcrange="-20 20" actuatorfrclimited="true"', 20,
+        ),
+    ],
+    ids=["one", "two", "joint"],
+)  # fmt: skip
+@pytest.mark.parametrize("more", [[], ["--limits"]], ids=["notes", "acting"])
+def test_what_motors_give_is_the_effort(
+    actuators: str, of_joint: str, effort: float, more: list[str], tmp_path: Path
+) -> None:
+    text = MJCF.replace("<joint ", f"<joint {of_joint} ")
+    text = text.replace("</mujoco>", f"<actuator>{actuators}</actuator></mujoco>")
+    _, scene = imported(tmp_path, text, "--stops", *more)
+    assert f"{effort}/stop_depth_turn*(max(0, -0.5 - q)" in scene
 
 
 def test_stops_need_limits(tmp_path: Path) -> None:

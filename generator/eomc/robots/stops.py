@@ -2,8 +2,9 @@
 
 The force beyond a limit is that of Hunt and Crossley (1975), k x (1 + d v), which never pulls: x is
 how far the joint is beyond it, v how fast it goes on. k is the joint's effort over `depth`, so that
-a joint driven as hard as it may be rests that far in its stop. Where the file tells no effort, what
-holds all that the joint carries, stretched out against gravity, stands for it.
+a joint driven as hard as it may be rests that far in its stop: what the joint takes, or its drives
+together give, the lesser of these. Where the file tells neither, what holds all that the joint
+carries, stretched out against gravity, stands for it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from eomc.robots.robot import Robot
+from eomc.robots.robot import Motion, Robot
 
 DEPTHS = {"rad": 0.01, "m": 0.001}  # by a coordinate's unit
 DAMPING = {"rad": 1.0, "m": 10.0}  # s/rad, s/m
@@ -39,12 +40,17 @@ def stops(robot: Robot) -> list[Stop]:
         more = mass, moment + mass * math.hypot(*body.offset)
         one, other = carried.get(body.parent, (0.0, 0.0)), more
         carried[body.parent] = one[0] + other[0], one[1] + other[1]
+    given: dict[str, float] = {}  # by a coordinate: what its drives give together
+    for d in robot.drives:
+        most = abs(d.gear) * max(map(abs, d.limits)) if d.gear else 0.0
+        given[d.coordinate] = given.get(d.coordinate, 0.0) + most
+
+    def effort(m: Motion) -> float:
+        told = min(max(map(abs, m.driven)), given.get(m.name, math.inf))
+        return told if 0 < told < math.inf else float(f"{held[m.name]:.3g}") or 1.0
+
     return [
-        Stop(m.name, m.unit, m.limits, _effort(max(map(abs, m.driven)), held[m.name]))
+        Stop(m.name, m.unit, m.limits, effort(m))
         for m in robot.motions
         if m.limits[0] < m.limits[1] and all(map(math.isfinite, m.limits))
     ]
-
-
-def _effort(told: float, held: float) -> float:
-    return told if 0 < told < math.inf else float(f"{held:.3g}") or 1.0
