@@ -61,6 +61,13 @@ def test_a_new_scene_runs_as_it_is_written(here: Path) -> None:
     assert again.exit_code == 2 and "is there already" in again.output
 
 
+def test_a_new_scene_says_how_it_gets_a_tolerance(here: Path) -> None:
+    assert eomc("new", "crane").exit_code == 0
+    text = (here / "crane.toml").read_text(encoding="utf-8")
+    (here / "crane.toml").write_text(text.replace("# tolerance", "tolerance"), encoding="utf-8")
+    assert pipeline.read("crane.toml").run.tolerance == 1e-9
+
+
 def test_scenes_that_come_with_eomc_are_listed_and_copied(here: Path) -> None:
     shipped = {file.stem for file in SCENES.glob("*.toml")}
     own, others = eomc("list").output.split("with eomc come")

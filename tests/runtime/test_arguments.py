@@ -163,9 +163,9 @@ def test_a_scene_without_parameters_says_so(modules: Modules) -> None:
     text = 'eomc = 1\nname = "bare"\n[coordinates]\nx = { start = 1 }\n[energy]\n'
     m: Any = modules.unoptimised(text + 'kinetic = "x_dot**2"\n[run]\nbatch = true\n')
     for simulate in (m.simulate, m.simulate_batch):
-        with pytest.raises(ValueError, match="^params: there is no 'm': this scene has none$"):
+        with pytest.raises(ValueError, match=r"^params: there is no 'm': this scene has none$"):
             simulate(steps=1, params={"m": 1})
-        with pytest.raises(ValueError, match="^params: this scene has no parameters$"):
+        with pytest.raises(ValueError, match=r"^params: this scene has no parameters$"):
             simulate(steps=1, params=[1, 2])
 
 

@@ -106,3 +106,25 @@ def test_parameters_that_leave_no_inertia(cartpole: ModuleType) -> None:
         cartpole.acceleration(Q, QD, params={"m_c": 0.0, "m_p": 0.0})
     with pytest.warns(RuntimeWarning, match="stopped at t = 0"):
         assert cartpole.simulate(steps=3, params={"m_p": -5.0}).steps == 0
+
+
+def test_in_c_a_step_less_than_zero_goes_back(cartpole: ModuleType) -> None:
+    """As docs/c.md says; Python refuses it."""
+    model = cartpole._model
+    step, pointer, null = model._loops["rk4"][0], model._pointer, model._c[2]
+    q, qd = np.array(Q[:2]), np.array(QD[:2])
+
+    def stepped(h: float) -> int:
+        at, moving = q.copy(), qd.copy()
+        parts = pointer(q), pointer(qd), pointer(at), pointer(moving)
+        return int(step(*parts, 0.0, h, null, model._at[2]))
+
+    begun = np.hstack([q, qd])
+    assert stepped(-0.01) == 0 and np.abs(np.hstack([q, qd]) - begun).max() > 1e-4
+    assert stepped(0.01) == 0
+    np.testing.assert_allclose(np.hstack([q, qd]), begun, atol=1e-9)
+    there = np.hstack([q, qd])
+    assert stepped(0.0) == 0 and stepped(float("nan")) == stepped(float("inf")) == 2
+    assert np.array_equal(np.hstack([q, qd]), there)
+    with pytest.raises(ValueError, match="h: -1 is not a step size"):
+        cartpole.step(q, qd, -1.0)
