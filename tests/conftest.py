@@ -71,7 +71,7 @@ def _binding_flags() -> tuple[str, ...]:
 
 
 extension.binding_flags = _binding_flags
-_run, _build = extension.run, extension.build
+_run, _build, _try = extension.run, extension.build, extension._try
 _libraries: dict[str, bytes] = {}
 
 
@@ -99,7 +99,13 @@ def _link(name: str, folder: Path, *commands: Sequence[str]) -> None:
     _run(name, folder, *commands if plain else [[*commands[0], "-nostdlib"]])
 
 
-extension.build, extension.run = _build_once, _link
+def _trial(*what: Any) -> None:
+    """What the compiler here makes is loaded right after; that of others is tried before."""
+    if os.environ.get("CC"):
+        _try(*what)
+
+
+extension.build, extension.run, extension._try = _build_once, _link, _trial
 
 # kept from one run of the tests to the next
 MODULES = ROOT / "build" / "tests" / "modules"
