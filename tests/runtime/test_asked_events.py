@@ -18,17 +18,29 @@ from eomc.base.errors import EomcError
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 TOL = 1e-9  # of a scene with events that names none
-BESIDE = {"section": {"when": "x", "direction": "rising"}, "through": "x - 0.5"}
+# compiled once for all tests: two that record, and one each that stops and jumps where it is told
+BESIDE = {
+    "section": {"when": "x", "direction": "rising"},
+    "through": "x - 0.5",
+    "wall": {"when": "x - at_wall", "action": "stop"},
+    "drop": {
+        "when": "x - at_drop", "direction": "falling", "action": "jump", "m": np.float64(4),
+        "c": "4*c",
+    },
+}  # fmt: skip
 TEXT = """eomc = 1
 name = "oscillator"
 [coordinates]
 x = { unit = "m", start = 1 }
 [parameters]
-k = 4
+k = 3
+c = 1
 m = 1
+at_wall = 9
+at_drop = 9
 [energy]
 kinetic = "m*x_dot**2/2"
-potential = "k*x**2/2"
+potential = "(k + c)*x**2/2"
 [[event]]
 name = "turns"
 when = "x_dot"
@@ -77,31 +89,22 @@ def test_a_warning_points_to_the_caller_s_line(oscillator: ModuleType) -> None:
 def test_a_formula_alone_records_both_ways(oscillator: ModuleType) -> None:
     run = oscillator.simulate(duration=math.pi, events=BESIDE)
     assert run.events["through"].t == pytest.approx([math.pi / 6, 5 * math.pi / 6], abs=TOL)
-    ways = (oscillator.Params(k=16), {"k": 16})  # parameters of the module serve
+    ways = (oscillator.Params(k=15), {"k": 15})  # parameters of the module serve
     for params in ways:
         run = oscillator.simulate(duration=0.5, params=params, events=BESIDE)
         assert run.events["through"].t == pytest.approx([math.pi / 12], abs=TOL)
 
 
 def test_they_stop_and_jump(oscillator: ModuleType) -> None:
-    stop = {"wall": {"when": "x + 0.5", "action": "stop"}}
-    run = oscillator.simulate(events=stop)
+    stop = {"params": {"at_wall": -0.5}, "events": BESIDE}
+    run = oscillator.simulate(**stop)
     assert run.stopped == "wall" and run.t[-1] == pytest.approx(math.pi / 3, abs=TOL)
-    both = oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, events=stop)
+    both = oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, **stop)
     assert both.reached == pytest.approx([math.pi / 3, 10], abs=TOL)
     assert both.stopped.tolist() == ["wall", ""] and both.events["wall"].instance.tolist() == [0]
     assert both.events["turns"].of(1).t == pytest.approx((np.arange(3) + 0.5) * math.pi, abs=TOL)
-    heavier = {
-        "drop": {
-            "when": "x",
-            "direction": "falling",
-            "action": "jump",
-            "m": np.float64(4),
-            "k": "4*k",
-        }
-    }
-    run = oscillator.simulate(duration=3.0, params=oscillator.Params(), events=heavier)
-    assert run["m"][-1] == 4 and run["k"][-1] == 16
+    run = oscillator.simulate(duration=3.0, params=oscillator.Params(at_drop=0), events=BESIDE)
+    assert run["m"][-1] == 4 and run["c"][-1] == 4
 
 
 def test_they_are_compiled_once(oscillator: ModuleType, scene: Path) -> None:
@@ -141,7 +144,7 @@ def test_a_scene_that_is_not_there_or_another_is_told(
     oscillator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = tmp_path / "oscillator.toml"
-    other.write_text(TEXT.replace("k = 4", "k = 5"))
+    other.write_text(TEXT.replace("k = 3", "k = 5"))
     for source, words in (
         (tmp_path / "gone.toml", r"gone\.toml: can't be read \(No such file"),
         (other, "has changed since it was built: load it again"),
@@ -163,41 +166,54 @@ def test_a_folder_that_can_t_be_written_is_named(
         oscillator.simulate(events={"later": "x - 0.125"})
 
 
-def swinging(name: str = "swinging") -> eomc.System:
+def swinging() -> eomc.System:
     """A pendulum of dynamicsymbols, whose own event is its turning."""
-    theta, (w, d) = dynamicsymbols("theta"), sympy.symbols("w d")
+    theta, (w, d, low, brake) = dynamicsymbols("theta"), sympy.symbols("w d low brake")
     return eomc.System.make(
-        name, {theta: 0.5}, theta.diff() ** 2 / 2, w**2 * theta**2 / 2,
-        parameters={w: 2.0, d: 0.0}, forces={theta: -d * theta.diff()}, batch=True,
+        "swinging", {theta: 0.5}, theta.diff() ** 2 / 2, w**2 * theta**2 / 2,
+        parameters={w: 2.0, d: 0.0, low: -9.0, brake: 9.0}, forces={theta: -d * theta.diff()}, batch=True,
         events={"turns": {"when": theta.diff(), "direction": "rising"}},
     )  # fmt: skip
 
 
-def test_a_system_has_them_beside_its_own(tmp_path: Path) -> None:
-    theta, d = dynamicsymbols("theta"), sympy.Symbol("d")
-    made = swinging()
-    m = eomc.load(made, tmp_path)
+def beside_its_own() -> dict:
+    """Two that record, and one each that stops and jumps where it is told."""
+    theta, d, brake = dynamicsymbols("theta"), sympy.Symbol("d"), sympy.Symbol("brake")
+    return {
+        "down": {"when": theta, "direction": "rising"},
+        "half": "theta - 1/4",
+        "stops": {"when": "theta - low", "action": "stop"},
+        "brakes": {"when": theta - brake, "action": "jump", theta.diff(): 0, d: "d + 1"},
+    }
+
+
+@pytest.fixture(scope="module")
+def systems(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where modules of Systems are built."""
+    return tmp_path_factory.mktemp("systems")
+
+
+def test_a_system_has_them_beside_its_own(systems: Path) -> None:
+    made, beside = swinging(), beside_its_own()
+    m = eomc.load(made, systems)
     assert made == swinging() and pickle.loads(pickle.dumps(made)) == made
-    run = m.simulate(events={"down": {"when": theta, "direction": "rising"}, "half": "theta - 1/4"})
+    run = m.simulate(events=beside)
     assert run.events["down"].t == pytest.approx((np.arange(3) + 0.75) * math.pi, abs=TOL)
     assert run.events["turns"].t == pytest.approx((np.arange(3) + 0.5) * math.pi, abs=TOL)
     assert run.events["half"].t[0] == pytest.approx(math.pi / 6, abs=TOL)
-    jump = {"brake": {"when": theta, "action": "jump", theta.diff(): 0, d: "d + 1"}}
-    run = m.simulate(duration=2.0, events=jump)
+    run = m.simulate(duration=2.0, params={"brake": 0.0}, events=beside)
     assert abs(run.q[-1, 0]) < TOL and run["d"][-1] == 1
-    both = m.simulate_batch(
-        [[0.5], [0.1]], tol=1e-9, events={"low": {"when": "theta - 0.2", "action": "stop"}}
-    )
+    both = m.simulate_batch([[0.5], [0.1]], tol=1e-9, params={"low": 0.2}, events=beside)
     assert both.reached == pytest.approx([math.acos(0.4) / 2, 10], abs=TOL)
 
 
-def test_of_a_system_they_are_compiled_once(tmp_path: Path) -> None:
+def test_of_a_system_they_are_compiled_once(systems: Path) -> None:
     dates = []
     for _ in range(2):  # as in another process
-        m = eomc.load(swinging("again"), tmp_path)
+        m = eomc.load(swinging(), systems)
         vars(m._model).pop("_eventful", None)
-        m.simulate(duration=1.0, events={"once": "theta"})
-        (extension,) = tmp_path.glob("again/.events/*/again/_again_*")
+        m.simulate(duration=1.0, events=beside_its_own())
+        (extension,) = systems.glob("swinging/.events/*/swinging/_swinging_*")
         dates.append(extension.stat().st_mtime_ns)
     assert dates[0] == dates[1]
 
