@@ -51,11 +51,13 @@ RUBBED = """eomc = 1
 name = "rubbed_spring"
 [coordinates]
 x = { start = 1.0 }
+[parameters]
+mu = 0.3
 [energy]
 kinetic = "x_dot**2/2"
 potential = "8*x**2"
 [forces]
-x = "-0.3*sign(x_dot)"
+x = "-mu*sign(x_dot)"
 [run]
 tolerance = 1e-9
 duration = 3
@@ -70,6 +72,7 @@ potential = "9.81*x"
 [forces]
 x = "1000*max(0, -x)"
 [run]
+batch = true
 tolerance = 1e-9
 duration = 5
 """
