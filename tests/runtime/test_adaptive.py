@@ -21,6 +21,7 @@ from eomc.runtime.trajectory import STATUS
 from eomc.scene.read import parse
 from eomc.verify.check import check
 
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "adaptive"
 PERIOD = 2 * math.pi
 KEPLER = """eomc = 1
@@ -40,6 +41,26 @@ x = "push"
 [run]
 tolerance = 1e-9
 """
+
+
+SINGLE = """eomc = 1
+name = "single"
+[coordinates]
+a = { start = 1.0 }
+[energy]
+kinetic = "a_dot**2/2"
+potential = "-cos(a)"
+[run]
+real = "float"
+tolerance = 1e-4
+duration = 5
+"""
+
+
+@pytest.fixture(scope="module")
+def single() -> ModuleType:
+    """A pendulum in single precision."""
+    return eomc.load(from_scene(parse(SINGLE, "single.toml")), BUILDS)
 
 
 @pytest.fixture(scope="module")
@@ -179,14 +200,12 @@ def test_a_run_in_one_call_refuses_the_same(kepler: ModuleType) -> None:
         assert kepler.simulate(q0=[0.0, 0.0], qd0=[0.0, 0.0], duration=1).status != "ok"
 
 
-def test_a_run_ends_at_a_time_that_single_precision_rounds() -> None:
+def test_a_run_ends_at_a_time_that_single_precision_rounds(single: ModuleType) -> None:
     """0.7 s is later than the float next to it, 0.3 s earlier."""
-    text = KEPLER.replace("eccentric", "single_end").replace("1e-9", '1e-4\nreal = "float"')
-    module = eomc.load(from_scene(parse(text, "single.toml")), BUILDS)
     for room in (0, 48):
         for t0, duration in ((0.0, 0.7), (0.0, 0.3), (0.7, 0.0), (0.1, 0.6)):
-            module._model._room = room
-            run = module.simulate(duration=duration, t0=t0)
+            single._model._room = room
+            run = single.simulate(duration=duration, t0=t0)
             assert run.status == "ok" and run.t[-1] == np.float32(t0 + duration)
 
 
@@ -392,16 +411,8 @@ def test_the_plain_form_has_the_method_by_fixed_steps_beside(tmp_path: Path) -> 
     np.testing.assert_allclose(fitted.q[-1], fixed.q[-1], atol=1e-8)
 
 
-def test_the_error_of_a_run_in_single_precision_is_found(tmp_path: Path) -> None:
-    scene = tmp_path / "swing.toml"
-    scene.write_text(
-        'eomc = 1\nname = "single"\n[coordinates]\na = { start = 1.0 }\n'
-        '[energy]\nkinetic = "a_dot**2/2"\npotential = "-cos(a)"\n'
-        '[run]\nreal = "float"\ntolerance = 1e-4\nduration = 5\n',
-        encoding="utf-8",
-    )
-    run = eomc.load(scene, tmp_path).simulate()
-    finer = eomc.load(scene, tmp_path).simulate(tol=1e-6)
+def test_the_error_of_a_run_in_single_precision_is_found(single: ModuleType) -> None:
+    run, finer = single.simulate(), single.simulate(tol=1e-6)
     assert not run.estimate().verdict
     assert 1e-8 < run.estimate().end["a"] < 1e-3
     assert abs(run.q[-1, 0] - finer.q[-1, 0]) < 1e-3

@@ -21,7 +21,7 @@ MANY = "[run]\nbatch = true\n"
 
 
 @pytest.fixture(scope="module")
-def orbits() -> ModuleType:
+def orbits(unoptimised_file: None) -> ModuleType:
     """Orbits about the origin."""
     text = KEPLER.replace("eccentric", "many_orbits").replace("[run]\n", MANY)
     return eomc.load(from_scene(parse(text, "orbits.toml")), BUILDS)

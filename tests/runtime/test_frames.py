@@ -240,14 +240,13 @@ def test_wrong_arguments(plane: ModuleType, call, words: str) -> None:
         call(plane)
 
 
-def test_what_was_not_asked_for_is_told(modules: Modules) -> None:
-    module = modules.unoptimised(PLANE.partition("[run]")[0])
+def test_what_was_not_asked_for_is_told(cartpole: ModuleType) -> None:
     with pytest.raises(
         AttributeError, match=r"pose: not built; a scene asks for it with \[run\] frames"
     ):
-        _ = module.pose
+        _ = cartpole.pose
     with pytest.raises(AttributeError, match=r"\[run\] inverse_dynamics = true"):
-        _ = module.inverse_dynamics
+        _ = cartpole.inverse_dynamics
 
 
 def test_a_rounding_of_a_sum_is_no_wrong_sine(space: ModuleType, monkeypatch) -> None:
