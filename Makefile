@@ -10,8 +10,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Python compiles what it imports; to compile all there is takes as long as to install it
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile
-# a half of the tests each, in their order: neighbours share what they derive and compile
-PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
+# a half of the tests each, in their order: neighbours share what they derive and compile;
+# SymPy keeps more of what it has worked out than its thousand values
+PYTEST := SYMPY_CACHE_SIZE=200000 $(BIN)/python -m pytest -n 2 --dist worksteal
 DEMO := scenes/cartpole.toml scenes/cartpole_driven.toml scenes/cartpole_tutorial.toml
 # what a test run writes, it writes under build/
 export PYTHONPYCACHEPREFIX := $(CURDIR)/build/pycache
