@@ -171,7 +171,8 @@ def swinging() -> eomc.System:
     theta, (w, d, low, brake) = dynamicsymbols("theta"), sympy.symbols("w d low brake")
     return eomc.System.make(
         "swinging", {theta: 0.5}, theta.diff() ** 2 / 2, w**2 * theta**2 / 2,
-        parameters={w: 2.0, d: 0.0, low: -9.0, brake: 9.0}, forces={theta: -d * theta.diff()}, batch=True,
+        parameters={w: 2.0, d: 0.0, low: -9.0, brake: 9.0}, forces={theta: -d * theta.diff()},
+        batch=True,
         events={"turns": {"when": theta.diff(), "direction": "rising"}},
     )  # fmt: skip
 
