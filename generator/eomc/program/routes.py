@@ -129,7 +129,7 @@ def _rotated(material: Material) -> Functions | None:
     C, tape = plain.outputs["C"], plain.tape
     names = [x for entry in C for x in entry.free_symbols]
     short = Expander(tape).expand(C) if len(tape.live(names)) <= SHORT else None
-    return short and replace(plain, outputs={"C": short})
+    return None if short is None else replace(plain, outputs={"C": short})
 
 
 def _expanded(material: Material) -> Way:
