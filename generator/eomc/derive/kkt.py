@@ -36,7 +36,8 @@ class Factors:
     steps: in their order what is eliminated, the inverse of its pivot, and L below it. pivots: of
     coordinates, all positive, paired with the entries they were. inverses: of the rows' pivots, 0
     where one is dropped. switched: of rows that modes switch the pivot, where it is dropped a part
-    of what coordinates alone make of it, and the entries under it, before L.
+    of what coordinates alone make of it, and the entries under it, before L. slides: of coordinates
+    that such a row holds 0 where it does, 1 where it is none.
     """
 
     tape: Tape
@@ -45,13 +46,15 @@ class Factors:
     pivots: Pairs
     inverses: Vector
     switched: Mapping[int, tuple[Expr, Mapping[int, Expr]]]
+    slides: Mapping[int, Expr]
 
     def solve(
         self, b: Sequence[Expr], c: Sequence[Expr], short: Callable[[Expr], Expr]
     ) -> tuple[Vector, Vector, Vector]:
         """a and lambda, and of switched rows lambda times the pivot, dropped or not.
 
-        short: rewrites what elimination makes.
+        What such a row holds has the acceleration 0 to the last bit: where nothing else moves,
+        steps would follow rounding. short: rewrites what elimination makes.
         """
         tape, y = self.tape, [*b, *c]
         for k, _, factors in self.steps:
@@ -61,6 +64,8 @@ class Factors:
         for k, inverse, factors in reversed(self.steps):
             rest = [tape.define(-factor * x[i]) for i, factor in factors.items()]
             x[k] = tape.define(sympy.Add(tape.define(y[k] * inverse), *rest))
+            if k in self.slides:
+                x[k] = tape.times(self.slides[k], x[k])
         n, m = self.count, len(self.steps) - self.count
         lacks = (
             tape.total([y[n + r], *(tape.define(-a * x[i]) for i, a in below.items())])
@@ -95,6 +100,7 @@ def factors(
     alone: dict[int, list[Expr]] = {}  # of rows: what coordinates alone make of the pivot
     left, steps, pivots = set(order), [], []
     inverses, told = dict[int, Expr](), dict[int, tuple[Expr, Mapping[int, Expr]]]()
+    slides = dict[int, Expr]()
 
     def read(i: int, j: int) -> Expr:
         """An entry, i >= j, as one sum: what pivots of many coordinates have in common leads it."""
@@ -121,6 +127,8 @@ def factors(
                 kept = tape.define(pivot * inverses[k])  # 1, or 0
                 spare = tape.times(tape.define(UNHELD * (kept - 1)), whole)
                 told[k - n] = tape.total([pivot, spare]), below
+                (of,) = (j for j, entry in enumerate(A[k - n]) if entry != 0)
+                slides[of] = tape.define(1 - sympy.sign(inverses[k]))
         found = {i: tape.define(a * inverse) for i, a in below.items()}
         for i, factor in found.items():
             for j, a in below.items():
@@ -134,7 +142,7 @@ def factors(
                         parts.setdefault((i, j), []).append(part)
         steps.append((k, inverse, found))
     rows = tuple(inverses[n + r] for r in range(len(A)))
-    return Factors(tape, n, tuple(steps), tuple(pivots), rows, told)
+    return Factors(tape, n, tuple(steps), tuple(pivots), rows, told, slides)
 
 
 def _pattern(M: Mapping[tuple[int, int], Expr], size: int) -> Pattern:
