@@ -39,6 +39,24 @@ INPUT = '[inputs]\nu = { signal = "0.05*sin(3*t)", limits = [-0.04, 0.04] }\n[en
 LIMITED = (JOINT.replace("[energy]", INPUT).replace('phi = "0.05*sin(3*t)"', 'phi = "u"')
            .replace("stuck_joint", "stuck_limited"))  # fmt: skip
 
+# the drive psi turns phi by a gear: what holds one holds the other by a row that rounds
+GEAR = """eomc = 1
+name = "stuck_gear"
+[coordinates]
+phi = { unit = "rad" FRICTION }
+psi = { unit = "rad", friction = 0.02 }
+[energy]
+kinetic = "0.003*phi_dot**2/2 + 0.0007*psi_dot**2/2"
+[forces]
+psi = "0.05*sin(3*t)"
+[constraints]
+gear = "psi - 0.3*phi"
+[run]
+friction = "stick"
+tolerance = 1e-10
+duration = 1
+"""
+
 BESIDE = JOINT.replace("[parameters]", "y = { unit = 'm' }\n[parameters]").replace(
     "J*phi_dot**2/2", "J*phi_dot**2/2 + y_dot**2/2"
 ).replace("phi = \"0.05*sin(3*t)\"", 'phi = "0.05*sin(3*t)"\ny = "1e-3*cos(2*t)"').replace(
@@ -104,6 +122,27 @@ def test_forces_with_corners_hold_it_too(modules: Modules, text: str) -> None:
             held(run)
             assert run.status == "ok" and run.steps < 120
             assert run.q[-1, 0] == pytest.approx(end, rel=max(10 * tol, 1e-12))
+
+
+@pytest.mark.parametrize("friction", ["", ", friction = 0.02"], ids=["one", "both"])
+@pytest.mark.parametrize("bounded", [False, True], ids=["smooth", "bounded"])
+def test_what_hangs_on_it_rests_too(modules: Modules, friction: str, bounded: bool) -> None:
+    """psi turns phi/0.3: J = 0.0007 + 0.003/0.09, and the friction of phi counts 1/0.3."""
+    text = GEAR.replace(" FRICTION", friction)
+    if bounded:
+        text = text.replace("0.05*sin(3*t)", "min(max(0.05*sin(3*t), -0.04), 0.04)")
+    made = modules.unoptimised(text)
+    for q0 in ([0.0, 0.0], [0.5, 0.15]):
+        for tol in (1e-4, 1e-7, 1e-10, 1e-13):
+            run = made.simulate(q0, tol=tol)
+            assert run.status == "ok" and run.steps < 250
+            rest = run.t < (2 if friction else SLIPS)
+            np.testing.assert_allclose(run.q[rest, :2], [q0] * np.sum(rest), rtol=0, atol=1e-14)
+            if not friction:
+                assert run.events["psi_slips"].t.tolist() == [pytest.approx(SLIPS, abs=1e-11)]
+            if not friction and not bounded:
+                end = turned(1.0, 0.0007 + 0.003 / 0.09)
+                assert run["psi"][-1] - q0[1] == pytest.approx(end, rel=max(tol, 1e-11))
 
 
 def test_one_rests_while_another_moves(modules: Modules) -> None:

@@ -106,7 +106,22 @@ class Stepping:
         by = c.given(f"{self.method}_newton", "m")
         given = (*self.form.around, self.number("tol"), self.number("most"), by)
         told = (*measured, c.filled("int", "sweeps"))
-        return CFunction(f"{self.method}_settled", "int", (out, *given, *told), qualifier="static")
+        arguments = (out, *given, *([c.given(real, "cap")] if self.held_at_rest else []), *told)
+        return CFunction(f"{self.method}_settled", "int", arguments, qualifier="static")
+
+    @property
+    def held_at_rest(self) -> bool:
+        """Whether forces that change in time may hold all at rest, so that rounding is left."""
+        target = self.functions.target
+        return bool(target.system.modes) and target.driven
+
+    @cached_property
+    def capped(self) -> CFunction:
+        """What rounding makes of the accelerations over a step."""
+        real = self.functions.real
+        given = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
+        arguments = (c.filled(real, "cap"), *given, *self.form.around, self.number("tol"))
+        return CFunction(f"{self.method}_capped", "int", arguments, qualifier="static")
 
     @cached_property
     def forces(self) -> CFunction:
@@ -180,6 +195,9 @@ def steps(made: Stepping) -> Adaptive:
         top=c.in_braces(numbers(row, real) for row in zip(*last, strict=True)),
         weights=c.in_braces(zip(numbers(m.b_a, real), numbers(b, real), strict=True)),
         timed=target.driven,
+        held=made.held_at_rest,
+        capped=made.capped,
+        capped_now=made.capped.call(a="&a"),
         events=bool(target.system.events),
         project=form.project,
         whole=form.whole,
@@ -187,7 +205,9 @@ def steps(made: Stepping) -> Adaptive:
         sweep=form.sweep,
         step=made.step,
         start=form.start,
-        settled=made.settle.call(most=f"{target.literal(ROUGHEST)}*aim", **known),
+        settled=made.settle.call(
+            most=f"{target.literal(ROUGHEST)}*aim", cap="capped ? cap : 0", **known
+        ),
         within=made.within,
         corners=steep(target.system),
         longest=target.literal(LONGEST),
@@ -204,7 +224,7 @@ def steps(made: Stepping) -> Adaptive:
         to_parts=c.in_braces(numbers(row, real) for row in to_parts),
         from_parts=c.in_braces(numbers(row, real) for row in from_parts),
         forces_there=made.forces.call(f="there", q="to_q", qd="to_qd", t="t + h"),
-        settled_within=made.settle.call(most=target.literal(1e30), **known),
+        settled_within=made.settle.call(most=target.literal(1e30), cap="0", **known),
     )
 
 

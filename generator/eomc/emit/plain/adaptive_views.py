@@ -39,6 +39,7 @@ class Adaptive(Tableau):
     from accelerations at the stages, one a row, to their polynomial's parts in the last four of
     Legendre's; weights: to what a step adds to a position and a velocity.
     project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
+    held: whether forces that change in time may hold all at rest; capped: what rounding makes then.
     corners: whether forces jump or bend; share: of the tolerance, for a step in which they do;
     ends: from accelerations at the stages to the ends of the polynomial through them; forces: the
     accelerations at a state; slopes: their derivatives, by differences over `nudge`. eigenvalues,
@@ -52,6 +53,9 @@ class Adaptive(Tableau):
     top: tuple[str, ...]
     weights: tuple[str, ...]
     timed: bool
+    held: bool
+    capped: CFunction
+    capped_now: str
     events: bool
     project: str
     whole: bool
