@@ -163,3 +163,13 @@ def test_the_plain_form_does_the_same(modules: Modules, text: str, tmp_path: Pat
         held(other)
         assert other.status == "ok" and other.steps < 80
         np.testing.assert_allclose(other.q[-1], run.q[-1], rtol=max(10 * tol, 1e-12))
+
+
+def test_a_force_by_sign_is_told_what_to_be(modules: Modules) -> None:
+    """Where the scene says \"stick\" already, that is no remedy."""
+    text = BESIDE.replace("y = {", "y = { rate = 0.01,").replace(
+        "1e-3*cos(2*t)", "-0.1*sign(y_dot)"
+    )
+    with pytest.warns(RuntimeWarning, match="give its coordinate friction = in place of"):
+        run = modules.unoptimised(text.replace("stuck_beside", "stuck_by_sign")).simulate()
+    assert run.status == "no convergence" and 'take friction = "stick"' not in run.message

@@ -39,8 +39,12 @@ _EVEN = 8  # rows a step, as equally spaced ones need them
 _NONE = (np.empty(0, np.intc), np.empty((0, 1)))  # events
 STOPPED = (
     "no step is short enough to go on: forces grow without end there, as in a fall into a centre, "
-    "or keep jumping: for friction by sign(x_dot) that sticks take friction = "
-    '"stick" in [run], or let events switch it; else a looser tolerance'
+    "or keep jumping: for friction by sign(x_dot) that sticks {}, or let events switch it; else a "
+    "looser tolerance"
+)
+REMEDIES = (
+    'take friction = "stick" in [run]',
+    "give its coordinate friction = in place of the force",  # where the scene has that
 )
 
 
@@ -87,7 +91,8 @@ class AdaptiveRun(Run):
                 f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
                 f"run ends, after {done}"
             )
-        said = STOPPED if self.status == "no convergence" else SAID[self.status]
+        remedy = REMEDIES[bool(self._model._rows.modes)]
+        said = STOPPED.format(remedy) if self.status == "no convergence" else SAID[self.status]
         said = infinite_at_start(self) or said
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
