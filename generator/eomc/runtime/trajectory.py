@@ -35,8 +35,9 @@ SAID = {
     "not finite": "the state would no longer be finite: the step may be too long, "
     "or the motion runs into a singularity",
     "no convergence": "the iteration for the step does not converge: take a smaller h",
-    "locked": "no state near obeys the constraints: they contradict one another there, or the step "
-    "is far too long",
+    "locked": "no state near obeys the constraints: they contradict one another there, the "
+    "position is singular, as that of a stretched leg is (eomc dof tells; guess a bent one), or "
+    "the step is far too long",
     "interrupted": "interrupted",
     FULL: REMEDY,
 }
