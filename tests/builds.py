@@ -89,6 +89,7 @@ def gravity(root: Path) -> float:
         sys.path.insert(0, str(root))
         for name in [m for m in sys.modules if m.split(".")[0] == "simple_pendulum"]:
             del sys.modules[name]
+        importlib.invalidate_caches()  # listed by the parent, in the same tick of the clock
         return float(importlib.import_module("simple_pendulum").g([1.0])[0])
 
     how, value = in_a_fork(ask, 20)

@@ -164,7 +164,7 @@ def test_type_checkers_know_its_functions(python: Path, tmp_path: Path) -> None:
     how = {**os.environ, "MYPYPATH": str(site)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=how)
     assert 'use.py:2: note: Revealed type is "numpy.ndarray' in done.stdout
-    assert 'did you mean "duration"?' in done.stdout
+    assert 'use.py:3: error: Argument "duraton"' in done.stdout
     assert 'Module has no attribute "nothing"' in done.stdout
 
 

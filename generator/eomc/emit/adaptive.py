@@ -42,7 +42,7 @@ def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
     vectors, few = (8, 25) if steep(system) else (6, 21)
     stages = METHOD.stages * len(system.coordinates)
-    return vectors * width + stages + few + 2 * len(system.events)
+    return vectors * width + stages + few + 2 * len(system.events) + 3 * bool(system.events)
 
 
 @dataclass(frozen=True)

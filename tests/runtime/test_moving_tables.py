@@ -1,0 +1,89 @@
+"""Jumps that follow soon behind a jump: tables that move, walls with corners."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import eomc
+
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
+BUILDS = Path(__file__).parents[2] / "build" / "tests" / "tables"
+TABLE = """eomc = 1
+name = "table"
+[coordinates]
+y = { unit = "m", start = 1 }
+[parameters]
+A = 0.005
+w = 30
+e = 0.5
+[energy]
+kinetic = "y_dot**2/2"
+potential = "9.81*y"
+[[event]]
+name = "impact"
+when = "y - A*sin(w*t)"
+direction = "falling"
+action = "jump"
+y_dot = "-e*y_dot + (1 + e)*A*w*cos(w*t)"
+[run]
+duration = 20
+batch = true
+"""
+STADIUM = """eomc = 1
+name = "stadium"
+[coordinates]
+x = { unit = "m", start = 0.1, rate = 0.7 }
+y = { unit = "m", start = 0.2, rate = 0.4 }
+[definitions]
+xs = "x - min(max(x, -1), 1)"
+r2 = "xs**2 + y**2"
+vn = "(xs*x_dot + y*y_dot)/r2"
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+[[event]]
+name = "wall"
+when = "1 - r2"
+direction = "falling"
+action = "jump"
+x_dot = "x_dot - 2*vn*xs"
+y_dot = "y_dot - 2*vn*y"
+[run]
+duration = 100
+batch = true
+"""
+
+
+@pytest.mark.parametrize("e", [0.3, 0.5, 0.9])
+def test_a_ball_does_not_fall_through_a_table_that_moves(tmp_path: Path, e: float) -> None:
+    """It comes to rest on it, or is thrown up again for ever."""
+    file = tmp_path / "table.toml"
+    file.write_text(TABLE, encoding="utf-8")
+    A = np.linspace(0.002, 0.05, 100)
+    runs = eomc.load(file, BUILDS).simulate_batch(params={"A": A, "e": e})
+    assert not (runs.q[:, :, 0] < -1.001 * A[:, None]).any()  # NaN behind an end
+    assert set(runs.status) <= {"ok", "accumulated"}
+    flights = runs.events["impact"].of(90)
+    assert len(flights) > 10
+    # free flight from the first impact to the second, in closed form
+    t, v = flights.t[:2], -e * flights.qd[0, 0] + (1 + e) * A[90] * 30 * np.cos(30 * flights.t[0])
+    there = A[90] * np.sin(30 * t[0]) + v * (t[1] - t[0]) - 9.81 * (t[1] - t[0]) ** 2 / 2
+    assert abs(there - A[90] * np.sin(30 * t[1])) < 1e-10
+
+
+def test_a_ball_stays_inside_of_walls_with_corners_in_their_formula(tmp_path: Path) -> None:
+    """Where straight and round meet, a chord may be as short as rounding allows."""
+    file = tmp_path / "stadium.toml"
+    file.write_text(STADIUM, encoding="utf-8")
+    y = np.linspace(-0.9, 0.9, 100)
+    runs = eomc.load(file, BUILDS).simulate_batch(np.column_stack([0.1 + 0 * y, y]))
+    x, y = np.moveaxis(runs.q, 2, 0)
+    off = x - np.clip(x, -1, 1)
+    assert not (off**2 + y**2 > 1 + 1e-9).any()  # NaN behind an end
+    assert set(runs.status) <= {"ok", "accumulated"}
+    ended = np.array(runs.status) == "ok"
+    speed = np.hypot(*runs.qd[ended, -1].T)
+    np.testing.assert_allclose(speed, np.hypot(0.7, 0.4), rtol=1e-9)
+    assert ended.mean() > 0.9
