@@ -11,24 +11,27 @@ if TYPE_CHECKING:
 
 
 def infinite_at_start(run: Run) -> str:
-    """Which energy is, or that an acceleration is, in a sentence; "" where none, or it moved."""
+    """Why no acceleration is finite there, in a sentence; "" where each is, or the run moved.
+
+    An energy that alone overflows stops no motion.
+    """
     from .trajectory import MotionError
 
     if run.status != "not finite" or run.steps or not len(run):
         return ""
     model, q, qd, held = run._model, run.q[0], run.qd[0], run._u
     at: dict[str, Any] = {"t": run.t0, "params": run._params}
-    for what, value in (
-        ("potential", model.potential_energy(q, **at)),
-        ("kinetic", model.kinetic_energy(q, qd, **at)),
-    ):
-        if not np.isfinite(value):
-            return f"the {what} energy is not finite at the start: start elsewhere"
     try:
         model.acceleration(q, qd, u=None if held is None or not model.nu else run.u[0], **at)
+        return ""
     except MotionError as lacking:
-        if lacking.status == "not finite":
-            return "an acceleration is not finite at the start: start elsewhere"
-    except ValueError:
-        pass  # inputs of a saved run, which are not known
-    return ""
+        if lacking.status != "not finite":
+            return ""
+    except ValueError:  # inputs of a saved run, which are not known
+        return ""
+    what = "an acceleration"
+    if not np.isfinite(model.potential_energy(q, **at)):
+        what = "the potential energy"
+    elif not np.isfinite(model.kinetic_energy(q, qd, **at)):
+        what = "the kinetic energy"
+    return f"{what} is not finite at the start: start elsewhere"
