@@ -2,11 +2,14 @@
 
 import base64
 import dataclasses
+import importlib.util
 import io
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,14 +19,19 @@ from eomc.runtime.labels import mathtext, rate_unit
 from eomc.runtime.notebook import html
 from eomc.runtime.plot import Curve, broken, grouped, wrapped
 
-matplotlib = pytest.importorskip("matplotlib")
-matplotlib.use("Agg")
-from matplotlib import pyplot  # noqa: E402 - where it is there
+if importlib.util.find_spec("matplotlib") is None:
+    pytest.skip("matplotlib is not installed", allow_module_level=True)
 
 
 @pytest.fixture(autouse=True)
-def _closed():
-    yield
+def pyplot() -> Iterator[Any]:
+    """Imported by who runs these tests, not by all who collect them."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    yield pyplot
     pyplot.close("all")
 
 
@@ -51,7 +59,7 @@ def test_names_of_words_are_words(name: str, shown: str) -> None:
     assert mathtext(name) == shown
 
 
-def test_a_picture_is_written(run, tmp_path: Path) -> None:
+def test_a_picture_is_written(run, tmp_path: Path, pyplot: Any) -> None:
     for k, how in enumerate(({}, {"phase": "theta"}, {"phase": ("x", "theta")})):
         run.plot("theta", file=tmp_path / f"{k}.png", **how)
         assert pyplot.imread(tmp_path / f"{k}.png").shape[1] >= 600
@@ -97,7 +105,7 @@ def test_phase_portraits_stand_beside_the_curves(run) -> None:
         run.plot(phase="force")
 
 
-def test_axes_can_be_given_and_are_returned(run) -> None:
+def test_axes_can_be_given_and_are_returned(run, pyplot: Any) -> None:
     _, mine = pyplot.subplots(2)
     assert all(a is b for a, b in zip(run.plot("x", "theta", axes=mine), mine, strict=True))
     assert run.plot("x", "theta", ax=mine[0], color="red", linewidth=3) is mine[0]
@@ -110,7 +118,7 @@ def test_axes_can_be_given_and_are_returned(run) -> None:
     assert len(pyplot.get_fignums()) == before
 
 
-def test_the_style_is_the_users(run) -> None:
+def test_the_style_is_the_users(run, pyplot: Any) -> None:
     with pyplot.rc_context({"lines.linewidth": 4.5, "axes.prop_cycle": pyplot.cycler(color=["k"])}):
         (line,) = run.plot("x").get_lines()
     assert line.get_linewidth() == 4.5 and line.get_color() == "k"
@@ -240,7 +248,9 @@ def test_ends_of_instances_that_stopped_are_their_last_good_rows(modules: Module
 
 
 @pytest.mark.slow
-def test_a_notebook_shows_the_end_the_verdict_and_a_picture(driven: ModuleType) -> None:
+def test_a_notebook_shows_the_end_the_verdict_and_a_picture(
+    driven: ModuleType, pyplot: Any
+) -> None:
     run = driven.simulate(duration=0.5)
     page = run._repr_html_()
     assert "status: ok" in page and f"{run.q[-1, 1]:.9g} rad" in page
@@ -253,6 +263,8 @@ def test_a_notebook_shows_the_end_the_verdict_and_a_picture(driven: ModuleType) 
 
 
 def image(page: str) -> np.ndarray:
+    from matplotlib import pyplot
+
     """The picture of a run in a notebook."""
     data = page.split("data:image/png;base64,")[1].split('"')[0]
     return np.asarray(pyplot.imread(io.BytesIO(base64.b64decode(data)), format="png"))
