@@ -65,7 +65,6 @@ def with_slopes(scene: str) -> ModuleType:
     tiers(
         ("cartpole_driven", "kapitza_pendulum", "chain", "tumbling_box", "suspension", "acrobot"),
         "cartpole_driven",
-        "tumbling_box",
     ),
 )
 @pytest.mark.usefixtures("quickly_compiled")

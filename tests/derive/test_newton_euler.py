@@ -188,7 +188,10 @@ SPACE = ((-1, 0, 1), (-1, 0, 0), (-1, -1, -1))
     "shape, plane",
     [
         *(pytest.param(shape, True, id=f"plane-{shape}") for shape in trees.SHAPES),
-        *(pytest.param(shape, False, id=f"space-{shape}") for shape in SPACE),
+        *(
+            pytest.param(shape, False, id=f"space-{shape}", marks=() if k else pytest.mark.slow)
+            for k, shape in enumerate(SPACE)
+        ),
     ],
 )
 @FEW

@@ -99,6 +99,7 @@ def test_dp8_comes_down_to_eleven_digits(name: str) -> None:
     assert constrained.error_of(name, run.q[-1]) <= 1e-11 + 30 * floor
 
 
+@pytest.mark.slow
 def test_steps_that_end_where_a_four_bar_lies_flat() -> None:
     """Thirty step sizes: right behind the singular position, and told."""
     name = "iftomm_A02_four_bar_N1"

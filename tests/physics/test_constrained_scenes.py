@@ -31,9 +31,7 @@ SHIPPED: list[tuple[str, str, Callable, list[int], float]] = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("name", "case", "of", "which", "h"), tiers(SHIPPED, "pendulum_xy", "slider_crank")
-)
+@pytest.mark.parametrize(("name", "case", "of", "which", "h"), tiers(SHIPPED, "pendulum_xy"))
 def test_runs_end_where_they_should(name, case, of, which, h, modules):
     module = modules.unoptimised(eomc.read(SCENES / f"{name}.toml"))
     known = CASES[case]

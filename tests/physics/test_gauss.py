@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import sympy
 from cases import cases, fast_kit, scene_text, variant
-from conftest import MODULES, Modules
+from conftest import MODULES, Modules, tiers
 
 import eomc
 from eomc.integrators import tableaux
@@ -212,7 +212,7 @@ def test_no_convergence_is_told_and_the_last_state_kept() -> None:
 
 
 @pytest.mark.parametrize(
-    ("form", "method", "h"), [("fast", "gauss8", 20.0), ("plain", "gauss6", 40.0)]
+    ("form", "method", "h"), tiers([("fast", "gauss8", 20.0), ("plain", "gauss6", 40.0)], "fast")
 )
 def test_stages_are_sought_anew_where_derivatives_in_the_middle_lead_astray(
     form: str, method: str, h: float

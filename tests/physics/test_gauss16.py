@@ -205,6 +205,7 @@ def test_sweeps_go_on_where_the_last_one_moved_by_more_than_a_millionth(turn: fl
     assert np.max(np.abs(run.q[:, 0] - np.cos(run.t))) < 2e-8
 
 
+@pytest.mark.slow
 def test_the_energy_of_a_pendulum_does_not_drift() -> None:
     """1,000 periods in 40,000 steps: less than a rounding of the largest energy each."""
     m = eomc.load(variant("simple_pendulum", "g16_pendulum", method='"gauss16"'), MODULES)
@@ -291,7 +292,8 @@ def test_a_blow_up_is_told() -> None:
     assert 1.0 < run.t[-1] < 2.0
 
 
-@pytest.mark.parametrize("links", [5, pytest.param(25, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("links", [5, 25])
 def test_chains(links: int) -> None:
     """Side by side, and of 25 links, where accelerations come in pieces, in turns; beside dp8."""
     text = Path("scenes/chain.toml").read_text(encoding="utf-8")

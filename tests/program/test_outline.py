@@ -423,6 +423,7 @@ def test_parameters_may_be_called_like_directions(root: Path) -> None:
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_parameters_may_be_called_like_values(root: Path, modules: Modules) -> None:
     """w1 is a name of ours inside a function that does not read the parameter."""
     text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")

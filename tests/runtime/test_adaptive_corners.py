@@ -96,6 +96,7 @@ def test_a_run_is_the_same_in_pieces(bouncing: ModuleType, monkeypatch: pytest.M
     assert bouncing.simulate() == run
 
 
+@pytest.mark.slow
 def test_single_precision(modules: Modules) -> None:
     text = PENDULUM.replace("limited", "single").replace("1e-9", '1e-5\nreal = "float"')
     module, end = modules.unoptimised(text), CASES["limits"].end(1.0)
@@ -103,7 +104,9 @@ def test_single_precision(modules: Modules) -> None:
         assert abs(module.simulate(tol=tol).q[-1, 0] - end) < 10 * tol
 
 
-@pytest.mark.parametrize(("text", "mu"), [(RUBBED, 3), (SLIDING, 0)], ids=["sticks", "slides"])
+@pytest.mark.parametrize(
+    ("text", "mu"), tiers([(RUBBED, 3), (SLIDING, 0)], RUBBED), ids=["sticks", "slides"]
+)
 def test_forces_that_keep_jumping_end_the_run_soon(text: str, mu: float, modules: Modules) -> None:
     module = modules.unoptimised(text)
     for tol in (1e-3, 1e-6, 1e-12):
@@ -115,9 +118,10 @@ def test_forces_that_keep_jumping_end_the_run_soon(text: str, mu: float, modules
 STRIBECK = "-(1 + exp(-(x_dot/0.05)**2))*x_dot/(1 + 20*x_dot**2)/2"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "friction",
-    tiers(["-atan(x_dot/0.02)/3", "-x_dot/sqrt(x_dot**2 + 4e-4)/2", STRIBECK], STRIBECK),
+    ["-atan(x_dot/0.02)/3", "-x_dot/sqrt(x_dot**2 + 4e-4)/2", STRIBECK],
 )
 def test_friction_smoothed_otherwise_is_seen(friction: str, modules: Modules) -> None:
     """Steep in a velocity: the end erred by 1e-3 and more, whatever the tolerance."""
@@ -134,7 +138,7 @@ def test_friction_smoothed_otherwise_is_seen(friction: str, modules: Modules) ->
     ("potential", "force"),
     [
         pytest.param("sqrt(x**2 + 1e-6)", "0", marks=pytest.mark.slow),
-        ("9.81*x + exp(-x/5e-4)/1000", "0"),
+        pytest.param("9.81*x + exp(-x/5e-4)/1000", "0", marks=pytest.mark.slow),
         pytest.param("x**2/2", "0.1/(1 + exp(-x/0.001))", marks=pytest.mark.slow),
         ("x**2/2", "0.1/(1 + exp(-(t - 2)/0.001))"),
     ],

@@ -246,6 +246,7 @@ def test_what_a_jump_sheds_is_its_own_energy(falling: ModuleType) -> None:
     assert resting.left < 1e-8
 
 
+@pytest.mark.slow
 def test_friction_that_sticks_loses_all_and_its_jumps_take_nothing(modules: Modules) -> None:
     """Amplitudes fall by 2 F/k, 0.2, each half swing, and F goes all the way: 1, .8, ..., 0."""
     run = modules.unoptimised(STICKS).simulate()

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 from batches import STEPS, module, starts
-from conftest import Modules
+from conftest import Modules, tiers
 
 
 def test_a_bad_instance_leaves_the_others_alone() -> None:
@@ -49,7 +49,7 @@ def test_a_singular_instance_is_reported_though_its_numbers_are_finite(m_c: floa
     assert m_c > -2 or (set(shared.status), shared.steps.any()) == ({"singular"}, False)
 
 
-@pytest.mark.parametrize("method", ["rk4", "dp8"])
+@pytest.mark.parametrize("method", tiers(["rk4", "dp8"], "dp8"))
 def test_positions_and_velocities_overflow_each_alone(method: str, modules: Modules) -> None:
     """Under a force, near the largest double; what the other makes of it is finite."""
     m = modules.unoptimised(
@@ -106,7 +106,7 @@ def test_ctrl_c_stops_within_a_second_and_keeps_what_was_done() -> None:
     assert stop.value.run.steps.sum() > 0 and "interrupted" in stop.value.run.message
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", tiers([1, 2], 2))
 def test_instances_that_ctrl_c_came_before_are_at_their_start(threads: int) -> None:
     m = module("kepler_orbit")
     count = 30_000  # more than a thread takes at once

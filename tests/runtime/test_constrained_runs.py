@@ -261,6 +261,7 @@ across = "sin(a + 1) + sin(b + 2) - sin(c + 1/2) - sin(1) - sin(2) + sin(1/2)"
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-10, 1e-7, 1e-4])
 def test_a_projection_near_zero_asks_for_no_less_than_rounding(
     modules: Modules, size: float
@@ -369,6 +370,7 @@ def test_a_row_that_what_is_held_makes_depend_on_others_is_left_out(
         np.testing.assert_allclose(q, alone, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly_compiled")
 def test_a_row_that_was_left_out_and_is_broken_later_is_told(tmp_path: Path) -> None:
     """At first it says what the others say: steps end on these."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Modules
+from conftest import Modules, tiers
 
 SCENE = """eomc = 1
 name = "balanced"
@@ -44,7 +44,7 @@ def law(t: float, q: Any, qd: Any) -> list[float]:
 
 
 @pytest.mark.parametrize(("steps", "every"), [(40, 1), (41, 3), (43, 7), (2, 5)])
-@pytest.mark.parametrize("text", [SCENE, PLAIN])
+@pytest.mark.parametrize("text", tiers([SCENE, PLAIN], SCENE))
 def test_a_function_is_called_once_a_period(
     modules: Modules, text: str, steps: int, every: int
 ) -> None:

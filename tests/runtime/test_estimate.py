@@ -126,7 +126,7 @@ QUICK = (
     "coulomb_friction",
     "slider_crank_near_changepoint",
 )
-FIRST = ("pendulum_large_swing", "coulomb_friction")
+FIRST = ("pendulum_large_swing",)
 
 
 def judged(name: str, most: int) -> list[tuple[float, bool]]:

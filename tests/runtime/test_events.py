@@ -331,6 +331,7 @@ def test_fixed_steps_have_no_events(ball: ModuleType) -> None:
         ball.simulate(h=0.01, h_most=0.1)
 
 
+@pytest.mark.slow
 def test_single_precision_has_a_tolerance_that_it_can_keep() -> None:
     text = BALL.replace("bouncing", "float_ball").replace("[run]", '[run]\nreal = "float"')
     text = text.replace("batch = true", "")
@@ -388,7 +389,7 @@ int main(void)
             assert times == pytest.approx(run.events[named].t, rel=near)
 
 
-@pytest.mark.parametrize("action", ["record", "stop"])
+@pytest.mark.parametrize("action", tiers(["record", "stop"], "record"))
 def test_c_without_jumps_gives_no_warning(tmp_path: Path, action: str) -> None:
     events = event("top", "x", f'action = "{action}"')
     text = FREE.format(name="no_jumps", events=events)

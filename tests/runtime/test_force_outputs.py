@@ -56,6 +56,7 @@ def with_outputs(scene: str, outputs: str, run: str = "") -> str:
     return text.replace("\n[parameters]\n", f"\n[outputs]\n{outputs}\n\n[parameters]\n", 1)
 
 
+@pytest.mark.slow
 def test_a_tension_is_that_of_the_multiplier(modules: Modules) -> None:
     m = modules.unoptimised(BALL.replace("[run]", "[run]\nbatch = true"))
     run = m.simulate(h=0.001)

@@ -283,6 +283,7 @@ def test_both_references_have_them_as_constants(text: str) -> None:
     assert one.terms(state) >= abs(one.evaluate("kinetic", q[0], qd[0])) * (1 - 1e-12)
 
 
+@pytest.mark.slow
 def test_a_rod_that_is_reeled_in_stays_tight(modules: Modules) -> None:
     run = modules.unoptimised(ROD).simulate()
     far = np.hypot(run["x"], run["y"])
@@ -290,6 +291,7 @@ def test_a_rod_that_is_reeled_in_stays_tight(modules: Modules) -> None:
     assert run["l"][-1] == 0.9 * 0.8 and run.status == "ok"
 
 
+@pytest.mark.slow
 def test_friction_that_sticks_eases_where_it_is_greased(modules: Modules) -> None:
     module = modules.unoptimised(GREASED)
     run = module.simulate(q0=[0, 0.5], qd0=[1, 0])

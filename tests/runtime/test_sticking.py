@@ -162,6 +162,7 @@ def reference(F: float, duration: float) -> tuple[list[float], list[tuple[str, f
     return y.tolist(), found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("F", [0.15, 0.4, 0.6])
 def test_a_cart_beside_scipy(modules: Modules, F: float) -> None:
     run = modules.unoptimised(CART).simulate(params={"F": F})

@@ -248,8 +248,16 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     return {str(f): (f.read_bytes(), f.stat().st_mtime_ns) for f in files}
 
 
-@pytest.mark.parametrize("links", [True, False], ids=["links", "copies"])
-@pytest.mark.parametrize("fault", [OSError(errno.EDQUOT, "no"), KeyboardInterrupt()], ids=repr)
+@pytest.mark.parametrize(
+    ("fault", "links"),
+    [
+        (OSError(errno.EDQUOT, "no"), True),
+        pytest.param(OSError(errno.EDQUOT, "no"), False, marks=pytest.mark.slow),
+        pytest.param(KeyboardInterrupt(), True, marks=pytest.mark.slow),
+        (KeyboardInterrupt(), False),
+    ],
+    ids=["full-links", "full-copies", "ctrl_c-links", "ctrl_c-copies"],
+)
 def test_a_build_that_cant_be_moved_leaves_all_as_it_was(
     fault: BaseException, links: bool, scene: Path, root: Path, built: float,
     monkeypatch: pytest.MonkeyPatch,

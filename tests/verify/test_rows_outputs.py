@@ -90,7 +90,11 @@ linearize = true
 
 @pytest.mark.parametrize(
     ("wrong", "failed"),
-    [({}, []), ({"output": 1e-11}, ["outputs"]), ({"C": 1e-4}, ["outputs: C, D"])],
+    [
+        pytest.param({}, [], marks=pytest.mark.slow),
+        ({"output": 1e-11}, ["outputs"]),
+        pytest.param({"C": 1e-4}, ["outputs: C, D"], marks=pytest.mark.slow),
+    ],
 )
 def test_wrong_ones_of_multipliers_fail(
     modules: Modules, wrong: dict[str, float], failed: list[str]
