@@ -42,7 +42,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 pytest_plugins = ["builds"]
 
-gc.set_threshold(20_000, 20, 100)  # SymPy makes many values and few cycles
+gc.set_threshold(100_000, 20, 100)  # SymPy makes many values and few cycles
 
 ROOT = Path(__file__).parent.parent
 os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", str(ROOT / "build" / ".hypothesis"))
@@ -270,6 +270,10 @@ def pytest_collection(session: pytest.Session) -> None:
         sys.path.insert(0, str(file.parent))  # as pytest does
         with contextlib.suppress(Exception, pytest.skip.Exception):  # told when it is collected
             importlib.import_module(file.stem)
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # what is imported and collected stays
 
 
 def tiers(values: Iterable[Any], *quick: Any) -> list[Any]:

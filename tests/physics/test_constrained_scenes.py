@@ -45,6 +45,7 @@ def test_runs_end_where_they_should(name, case, of, which, h, modules):
     assert error <= (2 if others else 1.5) * measured["err_q"]
 
 
+@pytest.mark.slow
 def test_the_reaction_of_a_pin_in_the_plane_is_its_multipliers(modules):
     module = modules.unoptimised(eomc.read(SCENES / "slider_crank.toml"))
     run = module.simulate(duration=0.5)

@@ -164,4 +164,5 @@ def test_it_is_compiled_for_corners_alone(tmp_path: Path) -> None:
             assert ("gauss16_bent" in files[name]) == there
         for name in ("limited_pendulum.h", "limited_pendulum.c"):
             (tmp_path / name).write_text(files[name], encoding="utf-8")
-        compiled(needs("gcc"), *STRICT, "-O1", "-c", "limited_pendulum.c", cwd=tmp_path)
+        if there:  # without corners: tests/c
+            compiled(needs("gcc"), *STRICT, "-O1", "-c", "limited_pendulum.c", cwd=tmp_path)

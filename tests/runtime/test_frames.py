@@ -109,7 +109,7 @@ def plane(modules: Modules) -> ModuleType:
 
 @pytest.fixture(scope="module")
 def space(modules: Modules) -> ModuleType:
-    return modules.of_text(SPACE)
+    return modules.unoptimised(SPACE)
 
 
 def tip(q: np.ndarray, length: float = 0.7) -> np.ndarray:
@@ -249,10 +249,14 @@ def test_what_was_not_asked_for_is_told(cartpole: ModuleType) -> None:
         _ = cartpole.inverse_dynamics
 
 
-def test_a_rounding_of_a_sum_is_no_wrong_sine(space: ModuleType, monkeypatch) -> None:
-    """Of a body placed by formulas entries cancel; other states tell that from a sine."""
+@pytest.mark.slow
+def test_a_rounding_of_a_sum_is_no_wrong_sine(modules: Modules, monkeypatch) -> None:
+    """Of a body placed by formulas entries cancel; other states tell that from a sine.
+
+    Without optimisation they cancel exactly.
+    """
     made = from_scene(parse(SPACE, "crane3.toml"))
-    of = Comparison(made, space, np.random.default_rng(0), None)
+    of = Comparison(made, modules.of_text(SPACE), np.random.default_rng(0), None)
     assert rows_sines.vanishing(of) <= rows_sines.LIMIT
     monkeypatch.setattr(rows_sines, "MOVES", ())
     monkeypatch.setattr(rows_sines, "NEIGHBOURS", range(-2, 3))

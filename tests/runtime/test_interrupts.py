@@ -71,7 +71,7 @@ def ctrl_c_after(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("every", [1, 7, 100_003])
+@pytest.mark.parametrize("every", tiers([1, 7, 100_003], 7, 100_003))
 @pytest.mark.parametrize("after", tiers([0.13, 0.17], 0.13))
 def test_ctrl_c_gives_the_run_so_far(cartpole: ModuleType, every: int, after: float) -> None:
     """What was done until then is right: it equals a run of that many steps."""

@@ -71,6 +71,7 @@ def test_a_block_on_a_belt_sticks_and_slides(modules: Modules) -> None:
     np.testing.assert_allclose(np.diff(starts), slides + 2 * (far - middle) / speed, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_ball_lies_after_its_last_bounce(modules: Modules, tmp_path: Path) -> None:
     """The scenes and the session of the page."""
     section = re.search(r"### After the last bounce\n(.*?)\n## ", PAGE.read_text(), re.S)

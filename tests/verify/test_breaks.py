@@ -179,7 +179,8 @@ OF_RUNS = {"order of rk4", "power balance"}  # of several step sizes, which take
 QUICK = ("what Python asks for",)
 
 
-@pytest.mark.parametrize("scene", tiers((SCENE, "kapitza_pendulum"), SCENE))
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", (SCENE, "kapitza_pendulum"))
 def test_unbroken_it_passes(scene: str) -> None:
     report = checked(KEPT / "unbroken", scene)
     assert report.passed, report.table()
