@@ -8,12 +8,18 @@ import stat
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from cases import SCENES
 from instrument import in_a_fork
 
 import eomc
+from eomc import pipeline
+
+if TYPE_CHECKING:
+    from eomc.emit.render import Sources
+    from eomc.model.system import System
 
 KEPT = SCENES.parent / "build" / "tests" / "kept"  # builds to be copied, from run to run
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
@@ -39,9 +45,21 @@ def quickly_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CC", raising=False)
 
 
+_made: dict[tuple[str, str, str], Sources] = {}
+
+
+def _sources_once(system: System, extension: str, **how: Any) -> Sources:
+    """The files of a pendulum: what tests of builds change is where they go, and its text."""
+    key = (system.digest, Path(system.file).name, extension)
+    if key not in _made:
+        _made[key] = eomc.sources(system, extension, **how)
+    return _made[key]
+
+
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    """A scene file that a test may change."""
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A scene file that a test may change; of one text `eomc.build` derives the C once."""
+    monkeypatch.setattr(pipeline, "sources", _sources_once)
     file = tmp_path / "simple_pendulum.toml"
     file.write_text(TEXT, encoding="utf-8")
     return file

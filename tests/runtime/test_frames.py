@@ -253,7 +253,7 @@ def test_what_was_not_asked_for_is_told(cartpole: ModuleType) -> None:
 def test_a_rounding_of_a_sum_is_no_wrong_sine(modules: Modules, monkeypatch) -> None:
     """Of a body placed by formulas entries cancel; other states tell that from a sine.
 
-    Without optimisation they cancel exactly.
+    Of a module that is not optimised they cancel better.
     """
     made = from_scene(parse(SPACE, "crane3.toml"))
     of = Comparison(made, modules.of_text(SPACE), np.random.default_rng(0), None)
