@@ -33,6 +33,7 @@ def view(
     functions: Functions, projection: Computed, function: CFunction, call: str,
     rate_terms: Computed | None = None, state: Mapping[str, str] | None = None, *,
     lane: str = "", L: str = "", mask: str = "", extent: str = "", increments: bool = False,
+    sines: str = "", sines_call: str = "",
 ) -> Projection:  # fmt: skip
     """The view for one form and lane. state: where it is, for `rate_terms`."""
     target = functions.target
@@ -48,6 +49,8 @@ def view(
         extent=extent or functions.NQ,
         size=width(target),
         increments=increments,
+        sines=sines,
+        sines_call=sines_call,
         projection=projection,
         function=function,
         call=call,

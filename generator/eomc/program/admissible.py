@@ -44,7 +44,7 @@ def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Func
     }
 
     def rank(route: str) -> tuple[float, int]:
-        return _weight(made[route].cost) * ROUTES[route].penalty, len(made[route].early)
+        return weight(made[route].cost) * ROUTES[route].penalty, len(made[route].early)
 
     by_weight = sorted(made, key=rank)
     best, first = by_weight[0], next(iter(made))
@@ -89,5 +89,6 @@ def _errors(function: Function, system: System, states: Iterable[int]) -> list[f
     return out
 
 
-def _weight(cost: Cost) -> int:
+def weight(cost: Cost) -> int:
+    """What a call costs, in additions."""
     return cost.adds + cost.multiplications + 8 * cost.divisions + 25 * (cost.sincos + cost.calls)

@@ -11,10 +11,11 @@ from eomc.derive import kkt, outputs
 from eomc.derive.constraints import rate_terms
 from eomc.derive.equations import Equations
 from eomc.derive.lagrange import Derivation
+from eomc.derive.ldl import Pairs, Vector
 from eomc.derive.linearize import along
 from eomc.model.symbols import Output
 from eomc.model.system import System
-from eomc.program.admissible import Candidate
+from eomc.program.admissible import Candidate, weight
 from eomc.program.interpret import evaluator
 from eomc.program.ir import Function
 from eomc.program.lower import lower
@@ -28,10 +29,11 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
     yield from of_rows(derived)
     names = [f"lambda_{c.name}" for c in system.constraints]
     yield lower("multipliers", taken.tape, taken.multipliers, (), names, system.names)
-    e = _equations(derived)
+    e, values, pivots, correction = min(
+        (_correction(system, e) for e in _both(derived)), key=lambda found: weight(found[-1].cost)
+    )
     assert e.rows is not None
-    values, pivots = kkt.projection(e.tape, e.D, e.rows, system.q)
-    yield lower("projection", e.tape, values, pivots, (), system.names)
+    yield correction
     if terms := rate_terms(e.tape, e.rows, system.qd):
         yield lower("rate_terms", e.tape, terms, (), (), system.names)
     if system.run.discretize:
@@ -59,8 +61,18 @@ def of_rows(derived: Derivation) -> Iterator[Function]:
 
 def _equations(derived: Derivation) -> Equations:
     """The equations that the rows stand beside: the shorter ones, where there are two."""
-    both = [e for e in (derived.lagrange, derived.newton_euler) if e is not None]
-    return min(both, key=lambda e: len(e.tape.live([x for row in e.D for x in row])))
+    return min(_both(derived), key=lambda e: len(e.tape.live([x for row in e.D for x in row])))
+
+
+def _both(derived: Derivation) -> list[Equations]:
+    return [e for e in (derived.lagrange, derived.newton_euler) if e is not None]
+
+
+def _correction(system: System, e: Equations) -> tuple[Equations, Vector, Pairs, Function]:
+    """What steps lack for the rows to hold, by these equations; the pivots; the function of it."""
+    assert e.rows is not None
+    values, pivots = kkt.projection(e.tape, e.D, e.rows, system.q)
+    return e, values, pivots, lower("projection", e.tape, values, pivots, (), system.names)
 
 
 def _reactions(system: System) -> Function:

@@ -10,7 +10,7 @@ from sympy import S
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_names import Target
 from eomc.program import outline, trig, two_point
-from eomc.program.ir import Function, Operand
+from eomc.program.ir import Function, Operand, rename
 from eomc.program.trig import Angle
 
 SHORT = 300  # operations of accelerations that are inlined into every stage
@@ -40,15 +40,45 @@ class Accelerations:
     def staged(self) -> tuple[Function, Function]:
         """What parameters alone decide, as a function of its own; and the rest."""
         first, rest = outline.staged(self.whole, self.own)
-        kept = [o.name for o in first.outputs]
-        others = ("signal", "projection", "rate_terms")  # what else steps read parameters for
-        there = [f for n in others if (f := self.target.program.functions.get(n))]
-        if there:
-            read = frozenset[str]().union(*(f.uses for f in there))
-            kept = [n for n in self.own if n in kept or n in read] + [
-                n for n in kept if n not in self.own
-            ]
-        return replace(first, outputs=tuple(Operand(S.One, n) for n in kept)), rest
+        more = [self._corrected[0]] if self._corrected else []
+        names = [o.name for f in (first, *more) for o in f.outputs]
+        others = ("signal", "rate_terms")  # what else steps read parameters for
+        read = {n for name in others if (f := self.target.program.functions.get(name))
+                for n in f.uses}  # fmt: skip
+        kept = [n for n in self.own if n in names or n in read]
+        kept += [n for n in names if n not in self.own]
+        return replace(
+            first,
+            early=tuple(a for f in (first, *more) for a in f.early),
+            outputs=tuple(Operand(S.One, n) for n in kept),
+            checks=tuple(pair for f in (first, *more) for pair in f.checks),
+        ), rest
+
+    @cached_property
+    def _corrected(self) -> tuple[Function, Function] | None:
+        """The correction onto the constraints in the same two parts."""
+        whole = self.target.program.functions.get("projection")
+        if whole is None:
+            return None
+        first, rest = outline.staged(whole, self.own)
+        own = {a.name: f"rows_{a.name}" for a in first.early}
+        return rename(first, own), rename(rest, own)
+
+    @cached_property
+    def correction(self) -> tuple[Function, bool]:
+        """The correction onto the constraints; whether its sines are those of the accelerations."""
+        assert self._corrected is not None
+        rest = self._corrected[1]
+        angles, apart = trig.apart(rest, self.target.names)
+        known = {(frozenset(a.terms), a.offset): a for a in self.angles}
+        pairs = [(a, known.get((frozenset(a.terms), a.offset))) for a in angles]
+        names = {
+            old: new for a, b in pairs if b for old, new in ((a.sine, b.sine), (a.cosine, b.cosine))
+        }
+        made = {a.name for a in apart.body}
+        if not angles or not all(b for _, b in pairs) or made & {*names.values()}:
+            return rest, False
+        return rename(apart, names), True
 
     @property
     def constants(self) -> tuple[str, ...]:

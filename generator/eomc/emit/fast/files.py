@@ -179,7 +179,6 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
     parts = s.parts if not lane.name else None
     rates = lane.rates.text if parts is None else show(_two_points(made)).rstrip("\n")
     computed = lane.compute_constants.text if not lane.name and runs.constants_call(made) else ""
-    swept = target.system.run.tolerance is not None
     text = show(
         views.LaneText(
             prefix=target.prefix,
@@ -205,7 +204,7 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             accelerations=lane.all_in_one,
             two_point=parts is not None,
             takes_c=bool(s.constants),
-            alone=not lane.name or swept or any(m is not RK4 for m in made.methods),
+            alone=lane.alone,
         )
     )
     return text
@@ -306,7 +305,9 @@ def _adaptive(made: Steppers) -> adaptive.Form:
         made.stepping(one), sweep, made.accelerate(one, a="f"), one.extent,
         bool(made.accelerations.constants), runs.constants_call(made),
         f"{one.target.PREFIX}_LANES",
-        projection.projected(one).call(t=f"{c.member('x', 't')} + h", singular="&singular")
+        projection.projected(one).call(
+            s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"
+        )
         if made.functions.projection
         else "",
     )  # fmt: skip

@@ -97,6 +97,12 @@ class Lane:
         return f"{self.target.PREFIX}_{'ROLLED' if self.padded else 'UNROLL'}"
 
     @property
+    def alone(self) -> bool:
+        """Whether something computes all of its sines anew."""
+        run = self.target.system.run
+        return not self.name or run.tolerance is not None or {*run.methods} != {"rk4"}
+
+    @property
     def padded(self) -> bool:
         """Whether vectors of coordinates are multiples of four numbers, with zeros behind."""
         return not self.name and self.accelerations.parts is not None

@@ -18,9 +18,12 @@ def view(functions: Functions, lane: Lane) -> Projection:
     made, state = _correction(lane), {"q": "at", "qd": "moving"}
     call = made.function.call(**state)
     terms = None if lane.name else _rate_terms(lane)
+    sines = lane.accelerations.correction[1]
     return projection.view(
         functions, made, projected(lane), call, terms, state, lane=lane.real.name, L=lane.end,
         mask=lane.mask, extent=lane.extent, increments=True,
+        sines=f"{lane.prefix}_sines{lane.end}" if sines else "",
+        sines_call=f"{lane.prefix}_sines_at{lane.end}(&own, at)" if sines and lane.alone else "",
     )  # fmt: skip
 
 
@@ -31,19 +34,18 @@ def projected(lane: Lane) -> CFunction:
     return CFunction(
         f"{lane.prefix}_projected{lane.end}",
         lane.mask if lane.name else f"{lane.prefix}_status",
-        (*out, *map(lane.argument, _placed(lane)), *told),
+        (*out, *map(lane.argument, _placed(lane, "q", "qd", "s", "t", "c")), *told),
         qualifier=lane.qualifiers[NOINLINE],
     )
 
 
 def _correction(lane: Lane) -> Computed:
     """What q and qd lack for the constraints to hold."""
-    function = lane.target.program["projection"]
-    own = {n: c.member("c", n) for n in lane.accelerations.own}
+    function = lane.accelerations.correction[0]
     places = [f"d[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
         function, "projection", c.filled(lane.real.name, "d"), places, doc=sentence(function),
-        takes=_placed(lane), constants=own,
+        takes=_placed(lane, "q", "qd", "s", "t", "c"),
     )  # fmt: skip
 
 
@@ -56,12 +58,14 @@ def _rate_terms(lane: Lane) -> Computed | None:
     places = [f"rates[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
         function, "rate_terms", c.filled(lane.real.name, "rates"), places, doc=RATE_TERMS,
-        takes=_placed(lane), constants=own, inline=False,
+        takes=_placed(lane, "q", "qd", "t", "c"), constants=own, inline=False,
     )  # fmt: skip
 
 
-def _placed(lane: Lane) -> tuple[str, ...]:
-    """What constraints are read from: q, qd, t, c, as far as they are."""
-    timed = TIME in lane.target.program["projection"].uses
-    names = ("q", "qd", *(["t"] if timed else []), "c")
-    return tuple(n for n in lane.there if n in names)
+def _placed(lane: Lane, *names: str) -> tuple[str, ...]:
+    """What constraints are read from, of these names, as far as it is there."""
+    absent = {
+        *(["t"] if TIME not in lane.target.program["projection"].uses else []),
+        *(["s"] if not lane.accelerations.correction[1] else []),
+    }
+    return tuple(n for n in lane.there if n in names and n not in absent)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from eomc.emit import c_function as c
 from eomc.emit.fast import views
 from eomc.emit.fast.lanes import NOINLINE
 from eomc.emit.fast.projection import projected
@@ -57,9 +58,12 @@ def loop(made: Steppers, m: Method) -> views.Loop:
     """A method's step and run."""
     lane, s, public = made.one, made.accelerations, made.functions.public
     run = public.run(m.name)
-    here = {"q": "x.q", "qd": "x.qd", "u": "given", "m": "&x"}
-    advance = made.implicit(m) if m.implicit else made.advanced(lane, m.name)
+    corrected = made.corrected(m)
+    here = {"q": "x.q", "qd": "x.qd", "u": "given", "m": "&x", "end": "&sines"}
+    end = [c.filled(f"{lane.prefix}_sines", "end")] if corrected else []
+    advance = made.implicit(m) if m.implicit else made.advanced(lane, m.name, *end)
     alone = made.advanced(lane, f"{m.name}_alone")
+    behind = {"q": "x.q", "qd": "x.qd", "t": "t + h", "singular": "&singular"}
     first = {"q": "x.q", "qd": "x.qd", "s": "&x.s", "u": "given", "a": "x.a"}
     zeros = dict.fromkeys(("first", "every", "q_rows", "qd_rows", "memory", "u_stride"), "0")
     predicted = ["&x", *(["t0"] if lane.target.driven else []), "h", "first", "n", "steps"]
@@ -85,9 +89,11 @@ def loop(made: Steppers, m: Method) -> views.Loop:
         predicted_call=f"{lane.prefix}_rk4_predicted({', '.join(predicted)})",
         advance=advance.call(**here),
         otherwise=alone.call(**here) if m is RK4 and s.angles else "",
-        project=projected(lane).call(q="x.q", qd="x.qd", t="t + h", singular="&singular")
+        corrected=corrected,
+        project=projected(lane).call(**behind, s="&sines" if corrected else "NULL")
         if made.functions.projection
         else "",
+        project_anew=projected(lane).call(**behind, s="NULL") if made.functions.projection else "",
     )
 
 
@@ -114,10 +120,19 @@ def batch(made: Steppers, m: Method) -> views.Batch:
         compute_constants=constants_call(made),
         compute_own=lane.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
         alone=alone.call(q="at", qd="moving", u="given"),
-        project=projected(made.wide).call(q="from[b].q", qd="from[b].qd", t="t + h", c="&from[b].c")
+        corrected=made.corrected(m),
+        project=projected(made.wide).call(
+            q="from[b].q",
+            qd="from[b].qd",
+            t="t + h",
+            c="&from[b].c",
+            s="&w[b].end" if made.corrected(m) else "NULL",
+        )
         if made.functions.projection
         else "",
-        project_alone=projected(lane).call(q="at", qd="moving", t="t + h", singular="&singular")
+        project_alone=projected(lane).call(
+            q="at", qd="moving", t="t + h", singular="&singular", s="NULL"
+        )
         if made.functions.projection
         else "",
     )

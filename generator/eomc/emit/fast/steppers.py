@@ -52,6 +52,11 @@ class Steppers:
         free = not (self.two_point or s.target.system.constraints)
         return few and s.target.real is DOUBLE and free
 
+    def corrected(self, method: Method) -> bool:
+        """Whether a method hands its last sines on to the correction onto constraints."""
+        s = self.accelerations
+        return method is RK4 and self.functions.projection is not None and s.correction[1]
+
     @property
     def methods(self) -> tuple[Method, ...]:
         """Those that the scene asks for."""
@@ -134,6 +139,7 @@ class Steppers:
             if two_point
             else "",
             stage_call=lane.all_in_one.call(**here),
+            corrected=self.corrected(RK4),
         )
 
     def predictions(self) -> views.Predictions:

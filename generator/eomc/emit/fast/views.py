@@ -158,6 +158,7 @@ class RungeKutta4(Named):
     two_point: bool
     velocity_call: str
     stage_call: str
+    corrected: bool
 
 
 @dataclass(frozen=True)
@@ -365,6 +366,8 @@ class Loop(Named):
     advance: str
     otherwise: str
     project: str
+    project_anew: str
+    corrected: bool
 
 
 @dataclass(frozen=True)
@@ -389,6 +392,7 @@ class Batch(Named):
     compute_own: str
     alone: str
     project: str
+    corrected: bool
     project_alone: str
 
 
