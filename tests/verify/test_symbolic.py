@@ -228,8 +228,20 @@ def test_terms_multiplied_out() -> None:
     answer = derive(s)
     at = {"q": np.array([1e-3]), "qd": np.array([0.5]), "t": 0.0, "u": None, "params": None}
     terms = 2e4 * (1 + math.cos(1e-3)) + 1e-3 / 7 + 0.125 + 0.5 * math.sin(1e-3)
-    assert answer.terms(at) == pytest.approx(terms, rel=1e-14)
+    assert answer.terms("energy", at) == pytest.approx(terms, rel=1e-14)
     assert abs(answer.evaluate("potential", at["q"])) < 1e-6 * terms
+
+
+def test_power_that_cancels_has_terms() -> None:
+    """A bead on a hoop that turns by what is written: its energy doesn't know the time."""
+    q, qd, w = symbol("q"), symbol("q_dot"), 6.0
+    at = (sin(q) * cos(w * t), sin(q) * sin(w * t), -cos(q))
+    K = sum((x.diff(q) * qd + x.diff(t)) ** 2 for x in at) / 2
+    answer = derive(System.make("hoop", {q: 0.3}, K, at[2]))
+    s = {"q": np.array([1.0]), "qd": np.array([0.0]), "t": 200.0, "u": None, "params": None}
+    terms = w**3 * math.sin(1.0) ** 2 * abs(math.sin(w * 200) * math.cos(w * 200))
+    assert abs(answer.evaluate("power", s["q"], s["qd"], 200.0)) < 1e-12 * terms
+    assert answer.terms("power", s) > terms
 
 
 def test_where_D_is_singular_there_is_no_acceleration() -> None:

@@ -27,13 +27,14 @@ class Discrete(Answer):
         self.own = [k for k, name in enumerate(names) if name not in system.discrete]
         self.more = [k for k, name in enumerate(names) if name in system.discrete]
 
-    def terms(self, s: Mapping[str, Any]) -> float:
+    def terms(self, name: str, s: Mapping[str, Any]) -> float:
         """As `Answer.terms`."""
         q, qd = np.asarray(s["q"]), np.asarray(s["qd"])
         values = {self.system.coordinates[k].name: float(q[k]) for k in self.more}
         params = {**(s.get("params") or {}), **values}
         own = {**s, "q": q[self.own], "qd": qd[self.own], "params": params}
-        return self.core.terms(own) + float(np.sum(qd[self.more] ** 2)) / 2
+        more = float(np.sum(qd[self.more] ** 2)) / 2 if name == "energy" else 0.0
+        return self.core.terms(name, own) + more
 
     def _value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values

@@ -31,7 +31,7 @@ Vector = NDArray[np.float64]
 Values = tuple[Any, ...]  # of the parameters, in the system's order: floats, or one a row
 
 MATRICES = ("D", "C", "constraint_jacobian")
-SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "magnitude")
+SCALARS = ("kinetic", "potential", "energy", "jacobi", "power", "energy_terms", "power_terms")
 
 
 class Answer(ABC):
@@ -43,8 +43,8 @@ class Answer(ABC):
 
     system: System
 
-    def terms(self, s: Mapping[str, Any]) -> float:
-        """The sizes of the terms of K and P multiplied out, added up, at the arguments `s`.
+    def terms(self, name: str, s: Mapping[str, Any]) -> float:
+        """The sizes of the terms of "energy" or "power" multiplied out, added up, at `s`.
 
         0 where they are not written out.
         """

@@ -348,14 +348,17 @@ class Sampler:
         force = reach["bias"] + reach["g"] + reach["tau"] + rate * inertia @ qd
         # a force that is zero along one coordinate may be the sum of what others have whole
         force = np.maximum(force, diagonal * np.max(force / diagonal))
-        terms = self.reference.terms(vars(s))
-        energy = np.maximum(reach["kinetic_energy"] + reach["potential_energy"], terms)
+        energy = np.maximum(
+            reach["kinetic_energy"] + reach["potential_energy"],
+            self.reference.terms("energy", vars(s)),
+        )
+        power = np.maximum(reach["power"] + force @ qd, self.reference.terms("power", vars(s)))
         size = {
             "D": inertia,
             "C": reach["C"] + rate * inertia,
             **dict.fromkeys(("g", "bias", "tau"), force),
             **dict.fromkeys(("kinetic_energy", "potential_energy", "energy", "jacobi"), energy),
-            "power": reach["power"] + force @ qd,
+            "power": power,
             "motion": inertia @ np.abs(qdd) + force,
         }
         if self.system.constraints:
@@ -404,7 +407,7 @@ class Sampler:
         """K + P and its size."""
         names = ("kinetic", "potential")
         K, P = (self.reach(partial(self.reference.evaluate, name), s)[1] for name in names)
-        size = np.maximum(K + P, self.reference.terms(vars(s)))
+        size = np.maximum(K + P, self.reference.terms("energy", vars(s)))
         return self.reference.evaluate("energy", s.q, s.qd, s.t, s.u, s.params), size
 
     def reach(self, of: Callable[..., Any], s: State) -> tuple[Vector, Vector]:

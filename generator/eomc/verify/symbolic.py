@@ -236,13 +236,18 @@ class Reference(Answer):
         return ImmutableMatrix([*self.D, *self.bias, *self.tau])
 
     @cached_property
-    def magnitude(self) -> Expr:
+    def energy_terms(self) -> Expr:
         """The sizes of the terms of K and P, added up."""
         return _magnitude(self.kinetic) + _magnitude(self.potential)
 
-    def terms(self, s: Mapping[str, Any]) -> float:
+    @cached_property
+    def power_terms(self) -> Expr:
+        """The sizes of the terms of the power, added up."""
+        return _magnitude(self.power)
+
+    def terms(self, name: str, s: Mapping[str, Any]) -> float:
         """As `Answer.terms`."""
-        return float(self.evaluate("magnitude", **s))
+        return float(self.evaluate(f"{name}_terms", **s))
 
     def _value(
         self, name: str, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
