@@ -118,3 +118,32 @@ def test_a_force_that_only_fades_is_no_equilibrium(modules: Modules) -> None:
 def test_what_is_wrong_is_named(driven: ModuleType, how: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         driven.equilibrium(**{"q": [0.0, 0.1], "qd": [0.0, 0.0]} | how)
+
+
+INTEGRAL = """eomc = 1
+name = "integral_action"
+[coordinates]
+x = { unit = "m" }
+z = { unit = "m s" }
+[parameters]
+r = 1.0
+[inputs]
+force = { unit = "N", signal = "4*(r - x) + 2*z - 3*x_dot" }
+[energy]
+kinetic = "x_dot**2/2"
+[forces]
+x = "force - 1"
+[constraints]
+integral = "z_dot - (r - x)"
+"""
+
+
+def test_rows_of_rates_hold_there_too(modules: Modules) -> None:
+    """A controller's integral rests where its error is zero, and ramps where that is asked for."""
+    loop = modules.unoptimised(INTEGRAL)
+    q, u = loop.equilibrium()
+    assert q == pytest.approx([1.0, 0.5], abs=1e-14) and u == pytest.approx([1.0], abs=1e-14)
+    q, u = loop.equilibrium(qd=[0.0, 0.25], u=[0.0], free=["x", "force"])
+    assert q == pytest.approx([0.75, 0.0], abs=1e-14) and u == pytest.approx([1.0], abs=1e-14)
+    with pytest.raises(loop.MotionError, match=r"where the rates break integral by -0\.5; start"):
+        loop.equilibrium([0.5, 0.0], free="z")
