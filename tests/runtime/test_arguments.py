@@ -130,6 +130,7 @@ BAD_RUNS = [
     ({"every": None}, r"every: None"),
     ({"t0": NAN}, r"t0: nan is not a finite number"),
     ({"t0": "a"}, r"t0: "),
+    ({"estimate": "no"}, r"estimate: 'no' is not True or False"),
     ({"method": "euler"}, r"method: 'euler' is not in this module"),
     ({"params": {"x": 1}}, r"params: 'x' is a coordinate: give it in q0"),
     ({"u": [1, 2, 3], "steps": 2}, r"u: 3 rows for 2 steps: give one row a step"),

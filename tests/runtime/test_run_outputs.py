@@ -164,6 +164,12 @@ def test_their_linearization_is_that_of_the_motion(crane: ModuleType) -> None:
     )
 
 
+@pytest.mark.parametrize("how", [{"outputs": "tip_x"}, {"outputs": ["E"]}, {"closed": "no"}])
+def test_a_name_is_not_taken_for_true(crane: ModuleType, how: Any) -> None:
+    with pytest.raises(ValueError, match=r"(outputs|closed): .* is not True or False"):
+        crane.linearize(*crane.start, **how)
+
+
 def test_a_scene_without_has_nothing_of_it(cartpole: ModuleType, crane: ModuleType) -> None:
     assert cartpole.outputs == () and cartpole.simulate(steps=3).outputs == {}
     assert not hasattr(cartpole._model._lib, "outputs") and hasattr(crane._model._lib, "outputs")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .adaptive_error import LEAST
-from .arguments import Array, as_number, as_step_size, unmasked
+from .arguments import Array, as_flag, as_number, as_step_size, unmasked
 
 if TYPE_CHECKING:
     from .model import Model
@@ -33,8 +33,7 @@ def as_limits(
     model: Model, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
 ) -> tuple[float, float]:
     """(tolerance, longest step or 0); fixed: the values of FIXED, which belongs to fixed steps."""
-    if stiff is not False and not isinstance(stiff, (bool, np.bool_)):
-        raise ValueError(f"stiff: {stiff!r} is not True or False")
+    as_flag(stiff, "stiff")
     if model.tolerance is None:
         raise ValueError(
             f"tol: {model.name} was built without adaptive steps, to which tol, h_most and stiff "

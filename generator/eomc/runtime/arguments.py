@@ -386,6 +386,13 @@ def aligned(array: Array) -> Array:
     return array if array.flags.aligned else array.copy()
 
 
+def as_flag(value: Any, name: str) -> bool:
+    """Whether something is asked for, or a ValueError: texts and lists are not taken for True."""
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    raise ValueError(f"{name}: {value!r} is not True or False")
+
+
 def as_count(value: Any, name: str, least: int) -> int:
     """A whole number, `least` or more, or a ValueError that names the argument."""
     if type(value) is int and value >= least:

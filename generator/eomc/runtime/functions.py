@@ -12,7 +12,7 @@ import numpy as np
 from numpy import empty
 from numpy.typing import ArrayLike
 
-from .arguments import Arguments, Array, Parameters, as_number, unmasked
+from .arguments import Arguments, Array, Parameters, as_flag, as_number, unmasked
 from .slices import slices
 from .trajectory import SAID, STATUS, MotionError, state_text
 
@@ -294,6 +294,7 @@ class Functions(Arguments):
                 f"linearize: {self.name} was built without it: a scene asks with [run] "
                 "linearize = true"
             )
+        outputs, closed = as_flag(outputs, "outputs"), as_flag(closed, "closed")
         if outputs and not self.outputs:
             raise ValueError(f"linearize: {self.name} has no outputs: name them in [outputs]")
         if outputs and not hasattr(self._lib, "output_slopes"):

@@ -21,6 +21,7 @@ from .arguments import (
     Array,
     Parameters,
     as_count,
+    as_flag,
     as_number,
     as_period,
     as_step_size,
@@ -242,6 +243,7 @@ class Model(Constrained):
             and (r := adaptive.plain(self, q0, qd0, duration, u, params, t0, tol, room)) is not None
         ):  # fmt: skip
             return r
+        estimate = as_flag(estimate, "estimate")
         q0, qd0 = self._assembled(q0, qd0, t0, params)
         if fits(self, h, steps, method, tol, h_most, stiff):
             fitted = adaptive.simulate(
