@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -181,6 +182,23 @@ def test_jumps_and_stops_act_in_each() -> None:
     assert np.isnan(run.q[1:, 1]).all() and np.array_equal(
         run.q[0, -1], balls.simulate(duration=2.0).q[-1]
     )
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"u": np.ones((1, 5, 1)), "control_period": 0.1}, "run: give h, for fixed steps$"),
+        ({"control_period": 0.1, "tol": 1e-6}, "give h, for fixed steps, in place of tol"),
+        ({"u": np.ones((1, 5, 1))}, r"u: shape \(1, 5, 1\).*held over the run; tables take h"),
+        ({"u": {"push": np.ones((4, 5))}}, r"u: shape \(4, 5, 1\), .*tables take h"),
+        ({"every": 5}, "many_orbits goes by its tolerance, 1e-09, .*give h too, such as h=0.001"),
+    ],
+)
+def test_what_takes_fixed_steps_is_told_how_to_have_them(
+    orbits: ModuleType, how: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        orbits.simulate_batch(*starts(4), **how)
 
 
 def test_a_saved_batch_is_read_again(orbits: ModuleType, tmp_path: Path) -> None:

@@ -42,12 +42,26 @@ def as_limits(
     if not all(map(is_, fixed, FIXED.values())):
         for name, value in zip(FIXED, fixed, strict=False):  # the last is asked of batches alone
             if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
-                raise ValueError(
-                    f"{name}: belongs to fixed steps; tol, h_most and stiff to adaptive ones: give "
-                    "one or the other"
-                )
+                asked = tol is not None or h_most is not None or stiff or "auto" in fixed
+                raise ValueError(f"{name}: {_why_not(model, name, bool(asked))}")
     most = 0.0 if h_most is None else as_step_size(h_most, model.dtype, "h_most")
     return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most
+
+
+def _why_not(model: Model, name: str, asked: bool) -> str:
+    """Why a run by a tolerance takes no such argument; asked: whether the call asks for one."""
+    if name == "control_period":
+        return "a batch by a tolerance holds inputs over the run: give h, for fixed steps" + (
+            ", in place of tol" if asked else ""
+        )
+    if asked:
+        return (
+            "belongs to fixed steps; tol, h_most and stiff to adaptive ones: give one or the other"
+        )
+    return (
+        f"belongs to fixed steps, and {model.name} goes by its tolerance, {model.tolerance:g}, "
+        f"where nothing is said: give h too, such as h={model.h:g}"
+    )
 
 
 def as_end(model: Model, t0: float, duration: float | None) -> float:

@@ -162,8 +162,8 @@ class BatchModel(Model):
         return status
 
     def _instances(
-        self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any, steps: int,
-        t0: float | None = None,
+        self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any,
+        steps: int | None, t0: float | None = None,
     ) -> tuple[tuple[Array, Array], Array, Array | None, Array | None]:  # fmt: skip
         """((q, qd), parameters, inputs), one row an instance; a single one serves for all.
 
@@ -229,8 +229,8 @@ class BatchModel(Model):
             table[:, self.parameters.index(name)] = column
         return table
 
-    def _input_rows(self, u: Any, steps: int) -> Array | None:
-        """(batch or 1, steps or 1, nu)."""
+    def _input_rows(self, u: Any, steps: int | None) -> Array | None:
+        """(batch or 1, steps or 1, nu); steps None: by a tolerance, which hold inputs."""
         if u is None:
             return None
         if not self.nu:
@@ -246,10 +246,9 @@ class BatchModel(Model):
         if array.ndim < 3:
             array = array[:, None] if array.ndim == 2 else array.reshape(1, 1, -1)
         if array.ndim != 3 or array.shape[2] != self.nu or array.shape[1] not in (1, steps):
-            raise ValueError(
-                f"u: shape {np.shape(u)}, expected ({self.nu},), (batch, {self.nu}) or "
-                f"(batch, {steps}, {self.nu})"
-            )
+            shapes, wide = f"({self.nu},), (batch, {self.nu})", f"(batch, {steps}, {self.nu})"
+            over = f" or {wide}" if steps else ": by a tolerance held over the run; tables take h"
+            raise ValueError(f"u: shape {np.shape(u)}, expected {shapes}{over}")
         at = self._pointer(array)
         for k in range(0, array.size, LARGE):
             if not self._lib.all_finite(min(LARGE, array.size - k), at + k):

@@ -156,7 +156,7 @@ def simulate(
     elif duration is not None:
         raise ValueError(BOTH)
     rows = as_times(times, t0, model.dtype)
-    starts, table, held, codes = model._instances(q0, qd0, params, u, 1, t0)
+    starts, table, held, codes = model._instances(q0, qd0, params, u, None, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
     begin = np.array([q, qd])
     work = _Work(model, begin.copy(), t0, rows, (float(rows[-1]), tol, most), held, table, stiff)
