@@ -200,7 +200,7 @@ def test_rates_of_words_and_of_units() -> None:
     assert [rate_unit(u, True) for u in ("m", "", "N m")] == ["m/s", "", "(N m)/s"]
 
 
-def test_batches_are_fans_lines_or_ends(modules: Modules) -> None:
+def test_batches_are_fans_lines_or_ends(modules: Modules, tmp_path: Path, pyplot: Any) -> None:
     module = modules.unoptimised(BATCH)
     masses = np.linspace(1, 2, 21)
     runs = module.simulate_batch(np.full((21, 1), 1.0), params={"m": masses}, steps=40)
@@ -221,6 +221,10 @@ def test_batches_are_fans_lines_or_ends(modules: Modules) -> None:
         runs.plot("x", over="M")
     with pytest.raises(ValueError, match=r"shape \(2,\), expected \(21,\)"):
         runs.plot("x", over=[1, 2])
+    runs.plot(file=tmp_path / "many.png")
+    assert pyplot.imread(tmp_path / "many.png").shape[1] >= 600
+    with pytest.raises(ValueError, match=r"'p\.pdf' is no column: give file='p\.pdf'"):
+        runs.plot("p.pdf")
 
 
 BATCH = """

@@ -11,7 +11,7 @@ import numpy as np
 from .arguments import Array, not_one_of
 from .columns import File
 from .labels import mathtext, with_unit
-from .plot import Curve, Source, against, given_axes, new_axes
+from .plot import Curve, Source, against, finished, given_axes, new_axes, no_files
 from .shown import by_eomc
 
 
@@ -21,7 +21,7 @@ class Fans:
     def plot(
         self, *names: str, quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),
         lines: int | None = None, over: Any = None, wrap: bool | str | Sequence[str] = False,
-        ax: Any = None, axes: Any = None, **style: Any,
+        ax: Any = None, axes: Any = None, file: File | None = None, **style: Any,
     ) -> Any:  # fmt: skip
         """A panel for each name, the coordinates where none is given: fans over time.
 
@@ -29,7 +29,7 @@ class Fans:
         instances as lines instead. over: "instance", a parameter or numbers (batch,), over which
         the last value of each is drawn instead. Else as `Run.plot`.
         """
-        return fan(self, names, quantiles, lines, over, wrap, ax, axes, style)
+        return fan(self, names, quantiles, lines, over, wrap, ax, axes, file, style)
 
     def animate(
         self, file: File | None = None, *, names: Sequence[str] = (),
@@ -47,9 +47,10 @@ class Fans:
 
 def fan(
     run: Any, names: Sequence[str], quantiles: Iterable[float], lines: int | None, over: Any,
-    wrap: bool | Collection[str], ax: Any, axes: Any, style: Mapping[str, Any],
+    wrap: bool | Collection[str], ax: Any, axes: Any, file: File | None, style: Mapping[str, Any],
 ) -> Any:  # fmt: skip
     """See `Fans.plot`."""
+    no_files(names)
     source = Source(run, wrap)
     curves = [source.curve(name) for name in ([*names] or source.coordinates)]
     if ax is None and axes is None:
@@ -69,7 +70,7 @@ def fan(
             place.set_ylabel(with_unit(curve.text, curve.unit))
     if over is None:
         made[-1].set_xlabel(with_unit(mathtext("t"), "s"))
-    return made[0] if len(made) == 1 else np.array(made)
+    return finished(made, file)
 
 
 def _bands(axes: Any, t: Array, curve: Curve, quantiles: Sequence[float], style: Any) -> None:

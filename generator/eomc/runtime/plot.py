@@ -140,9 +140,7 @@ def plot(
     file: File | None, style: Mapping[str, Any],
 ) -> Any:  # fmt: skip
     """See `Run.plot`."""
-    for name in names:
-        if str(name).endswith((".png", ".pdf", ".svg")):
-            raise ValueError(f"plot: '{name}' is no column: give file='{name}' to write a picture")
+    no_files(names)
     others = [other] if hasattr(other, "_model") else [*(other or ())]
     sources = [Source(each, wrap) for each in (run, *others)]
     suffixes = _suffixes(len(sources), labels)
@@ -160,10 +158,22 @@ def plot(
         _panel(place, sources, [c.name for c in panel], suffixes, style)
     for place, (x, y) in zip(made[len(panels) :], pairs, strict=True):
         _portrait(place, sources, x, y, suffixes, section, style)
+    return finished(made, file)
+
+
+def no_files(names: Sequence[str]) -> None:
+    """A ValueError where a name is a file's."""
+    for name in names:
+        if str(name).endswith((".png", ".pdf", ".svg")):
+            raise ValueError(f"plot: '{name}' is no column: give file='{name}' to write a picture")
+
+
+def finished(made: Sequence[Any], file: File | None) -> Any:
+    """The Axes, or an array of several; their figure is written to the file, if there is one."""
     if file is not None:
         figure = made[0].figure
         getattr(figure, "figure", figure).savefig(file)  # of a part of a figure the whole
-    return made[0] if count == 1 else np.array(made)
+    return made[0] if len(made) == 1 else np.array(made)
 
 
 def _suffixes(count: int, labels: Sequence[str] | None) -> list[str]:
