@@ -175,3 +175,26 @@ def test_a_scene_without_has_nothing_of_it(cartpole: ModuleType, crane: ModuleTy
     assert not hasattr(cartpole._model._lib, "outputs") and hasattr(crane._model._lib, "outputs")
     with pytest.raises(ValueError, match=r"names them in \[outputs\]"):
         cartpole.output(*cartpole.start)
+
+
+def test_along_a_run_each_state_has_its_own_time_inputs_and_parameters(crane: ModuleType) -> None:
+    run = crane.simulate(u=TABLE)
+    at = (run.q, run.qd, run.t, run.u)
+    values = crane.output(*at)
+    assert np.array_equal(values, np.column_stack([*run.outputs.values()]))
+    assert np.array_equal(crane.acceleration(*at)[:, 0], run["cart"])
+    assert np.array_equal(crane.tau(*at)[:, 0], run["F"])
+    assert np.array_equal(crane.power(*at), run["F"] * run["x_dot"])
+    assert np.array_equal(crane.applied(*at), run.u)
+    lengths = np.linspace(0.5, 1.0, len(run))
+    each = crane.output(run.q, run.qd, run.t, {"F": run["F"]}, params={"l": lengths})
+    last = crane.output(*(x[-1] for x in at), params={"l": lengths[-1]})
+    assert np.array_equal(each[-1], last) and not np.array_equal(each[0], values[0])
+    np.testing.assert_allclose(
+        crane.potential_energy(run.q, params={"l": lengths}),
+        -9.81 * lengths * np.cos(run["theta"]),
+        rtol=1e-15,
+    )
+    assert crane.output(*(x[:0] for x in at)).shape == (0, 6)
+    with pytest.raises(ValueError, match=r"u: shape \(100, 1\), expected \(101, 1\) for 101 st"):
+        crane.power(run.q, run.qd, run.t, TABLE)

@@ -1,6 +1,7 @@
 """D, C, g, accelerations and the other functions of a state: arrays in, arrays out.
 
-Shapes: q, qd (nq,) or (n, nq); then results have a leading n as well.
+Shapes: q, qd (nq,) or (n, nq); then results have a leading n as well, and t (n,), u (n, nu) and
+parameters (n,) may be those of each state.
 """
 
 from __future__ import annotations
@@ -84,11 +85,11 @@ class Functions(Arguments):
             from_q, from_qd, at, moving = self._read(q, qd)
         rows = at.shape[:-1]
         result = self._out(out, rows + shape)
-        if (times := row_times(t, rows)) is not None:
-            for k, now in enumerate(times):
+        if rows and (one := self._one_by_one(rows[0], t, u, params)) is not None:
+            for k, (now, held, given) in enumerate(one):
                 row_qd = None if moving is None else moving[k]
                 own = None if each is None else each[k]
-                result[k] = self._evaluate(name, shape, at[k], row_qd, now, u, params, None, own)
+                result[k] = self._evaluate(name, shape, at[k], row_qd, now, held, given, None, own)
             return result
         time, (inputs, p) = as_number(t, "t"), self._given(u, params)
         width = 0
@@ -109,6 +110,16 @@ class Functions(Arguments):
                 rows[0] if rows else 1, address(real, result), from_q, from_qd, time, inputs, p
             )
         return result if result.ndim else result[()]
+
+    def _one_by_one(self, count: int, t: Any, u: Any, params: Any) -> list[Any] | None:
+        """(t, u, params) of each of so many states; None where one of each is for all."""
+        times = row_times(t, (count,))
+        own = None if u is params is None else for_each(self, count, u, params)
+        if times is None and own is None:
+            return None
+        each = [(u, params)] * count if own is None else own
+        whens = [t] * count if times is None else times
+        return [(now, *x) for now, x in zip(whens, each, strict=True)]
 
     def _by_time(
         self, name: str, t: Array, q: Array, qd: Array
@@ -207,6 +218,11 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
         """The inputs as they act at a state, (nu,): u, or the scene's signals, within limits."""
+        rows = np.shape(q)[:-1]
+        if rows and (one := self._one_by_one(rows[0], t, u, params)) is not None:
+            at, moving = self._state(q, qd)
+            each = [self.applied(at[k], moving[k], *own) for k, own in enumerate(one)]
+            return np.reshape(each, (*rows, self.nu)).astype(self.dtype)
         held = self._inputs(u)
         given = self.signal(q, qd, t, params) if held is None else held
         return self._within(np.broadcast_to(given, (*np.shape(q)[:-1], self.nu)), params)
@@ -247,6 +263,11 @@ class Functions(Arguments):
         made = result = empty(at.shape, self.dtype)
         if out is not None:
             result = self._out(out, at.shape)
+        if at.ndim == 2 and (one := self._one_by_one(len(at), t, u, params)) is not None:
+            for k, (now, held, given) in enumerate(one):
+                made[k] = self.acceleration(at[k], moving[k], now, held, given)
+            result[...] = made
+            return result
         inputs, p = self._given(u, params)
         to, time, first = self._pointer(made), as_number(t, "t"), 0
         count = 1 if at.ndim == 1 else len(at)

@@ -220,8 +220,7 @@ class Run(ConstrainedRun, Columns):
         """What a function of the state and the inputs gives at each row."""
         if self._u is None or (self._applied is None and self._u.ndim == 1):
             return self._values(name, function, u=self._u)
-        each = zip(self.q, self.qd, self.t.tolist(), self.u, strict=True)
-        return np.array([function(*row, self._params) for row in each])
+        return np.asarray(function(self.q, self.qd, self.t, self.u, self._params))
 
     def _values(self, name: str, function: Callable[..., Any] | None = None, **held: Any) -> Array:
         function = function or getattr(self._model, name)
