@@ -195,6 +195,21 @@ def test_a_saved_batch_comes_back(batch: ModuleType, driven: ModuleType, tmp_pat
         runs.save("runs.csv")
 
 
+def test_parameters_come_back_by_name(
+    batch: ModuleType, driven: ModuleType, tmp_path: Path
+) -> None:
+    run = driven.simulate(Q, QD, steps=2, params={"m_c": 3.0})
+    run.save(tmp_path / "run.npz")
+    for each in (run, driven.load_run(tmp_path / "run.npz")):
+        assert each.params == {**driven.defaults, "m_c": 3.0}
+    assert np.array_equal(driven.simulate(Q, QD, steps=2, params=run.params).q, run.q)
+    masses = np.array([1.0, 2.0, 3.0])
+    given = batch.simulate_batch(steps=1, params={"m_c": masses}).params
+    assert np.array_equal(given["m_c"], masses) and given["l"].tolist() == [2.0] * 3
+    alike = batch.simulate_batch(np.tile(Q, (2, 1)), steps=1).params
+    assert alike["m_c"].tolist() == [driven.defaults["m_c"]] * 2
+
+
 def test_a_csv_file_has_the_columns(run: Any, tmp_path: Path) -> None:
     file = tmp_path / "run.csv"
     run.save(str(file))

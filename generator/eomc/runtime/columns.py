@@ -14,6 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
+import numpy as np
+
 from .arguments import Array, not_one_of
 from .written import replacing
 
@@ -42,6 +44,7 @@ class Columns:
 
     _model: Model
     outputs: Any  # by name
+    _params: Array
     __len__: Callable[[], int]
     _axes: ClassVar[tuple[str, ...]] = ("t",)
     __iter__ = None  # `for name in run` would ask for run[0]
@@ -92,6 +95,15 @@ class Columns:
 
     def __dir__(self) -> Iterable[str]:
         return [*super().__dir__(), *self._named()]
+
+    @property
+    def params(self) -> dict[str, Any]:
+        """Its parameters by name, as `simulate` takes them; of a batch (batch,)."""
+        names, table = self._model.parameters, self._params
+        if table.ndim == 1:
+            return dict(zip(names, table.tolist(), strict=True))
+        columns = np.broadcast_to(table, (len(self), len(names))).T.copy()
+        return dict(zip(names, columns, strict=True))
 
     def to_dict(self) -> dict[str, Array]:
         """All columns by name, in this order; jacobi where it is not the energy."""
