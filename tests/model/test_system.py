@@ -216,8 +216,9 @@ def test_pieces_that_meet_are_sums_of_max(pieces: Any) -> None:
     [
         (
             ((1, x > 0), (0, True)),
-            r"jumps where x = 0, .* write Heaviside\(x\), which is 1/2",
+            r"jumps where x = 0, .* write Heaviside\(x\), whose Heaviside is 1/2",
         ),
+        (((0, x < 1), (2, True)), r"write 2 - 2\*Heaviside\(1 - x\), whose Heaviside is 1/2"),
         (((sympy.sqrt(x), x > 0), (0, True)), "jumps where x = 0"),
         (((1 / x, x > 1), (x, True)), "can't be seen not to"),
         (((x, x > 0),), "has no last piece"),

@@ -45,6 +45,7 @@ def _continuous(given: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Expr:
     *pieces, (made, last) = given.args
     if last != sympy.true:
         raise JumpError(f"{given} has no last piece: give one for all else, (0, True)")
+    last_piece = made
     for k in reversed(range(len(pieces))):
         piece, condition = pieces[k]
         if not isinstance(condition, _ORDERS):
@@ -55,9 +56,12 @@ def _continuous(given: sympy.Piecewise, fixed: Mapping[Symbol, bool]) -> Expr:
         if q.has(sympy.zoo, sympy.nan) or not sympy.fraction(q)[1].free_symbols <= fixed.keys():
             unknown = [str(s) for s in fixed if s in condition.free_symbols and not fixed[s]]
             order = f"; Symbol('{unknown[0]}', positive=True) tells an order" if unknown else ""
+            jump = sympy.Heaviside(d)
+            if len(pieces) == 1:
+                jump = last_piece + (piece - last_piece) * jump
             raise JumpError(
-                f"{given} jumps where {d} = 0, or can't be seen not to: write Heaviside({d}), "
-                f"which is 1/2 there, or Max, Min or a smooth tanh{order}"
+                f"{given} jumps where {d} = 0, or can't be seen not to: write {jump}, whose "
+                f"Heaviside is 1/2 there, or Max, Min or a smooth tanh{order}"
             )
         made += q * sympy.Max(d, 0)
     return made
