@@ -117,6 +117,7 @@ x, x_dot, u = sympy.symbols("x x_dot u")
         (("a", [x], x_dot**2), {"methods": x}, "methods: known are rk4"),
         (("a", [x], x_dot**2), {"forces": {x: sympy.Heaviside(x, 1)}}, "Heaviside.x. is 1/2 at 0"),
         (("a", [x], x_dot**2), {"forces": {"y": 1}}, "forces: y not among the coordinates"),
+        (("a", [x], x_dot**2), {"units": {"X": "m"}}, "units: X is no coord.*did you mean 'x'"),
         (("a", [x], x_dot**2), {"h": -0.1}, "h: must be greater than zero"),
         (("a", [x], x_dot**2), {"methods": ["ode45"]}, "methods: known are rk4"),
         (("a", [x], x_dot**2), {"real": "quad"}, "real: known are double, float"),
@@ -149,6 +150,20 @@ def test_what_is_wrong_is_said(
 ) -> None:
     with pytest.raises(EomcError, match=said):
         System.make(*arguments, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("method", "did you mean 'methods'"),
+        ("V", "did you mean 'potential'"),
+        ("input", "did you mean 'inputs'"),
+        ("gravity", "it has name, coordinates, kinetic, potential, parameters, .*, friction$"),
+    ],
+)
+def test_an_argument_that_is_not_there_is_told_with_what_is_meant(name: str, said: str) -> None:
+    with pytest.raises(TypeError, match=f"^System.make has no argument '{name}'.*{said}"):
+        System.make("a", [x], x_dot**2, **{name: 1})  # type: ignore[arg-type]
 
 
 def test_names_and_formulas_as_text() -> None:

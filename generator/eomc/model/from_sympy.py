@@ -135,6 +135,8 @@ class Maker:
         made = self._held(made, [*starts], guess, bool(rows))
         declared = [self._parameter(p, v, units) for p, v in parameters.items()]
         pending = given.symbols(inputs, "inputs", 0)
+        named = map(given.name_of, (*starts, *parameters, *pending, *definitions))
+        given.check_units(units, (*named, *map(str, (*rows, *outputs))))
         given_inputs = {i: self._declare(i, "input") for i in pending}
         ends = self._limits(limits, pending, declared)
         self.known = {c.q for c in made} | {c.qd for c in made} | {t}

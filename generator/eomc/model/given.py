@@ -40,6 +40,36 @@ def fault(role: str, message: str) -> EomcError:
     return EomcError(f"System.make: {role}: {message}")
 
 
+# what scenes, runs and newcomers call the arguments of System.make
+_CALLED = {
+    "method": "methods", "start": "coordinates", "L": "kinetic", "lagrangian": "kinetic",
+    "Lagrangian": "kinetic", "K": "kinetic", "T": "kinetic", "P": "potential", "V": "potential",
+    "params": "parameters", "loads": "forces", "tol": "tolerance", "event": "events",
+}  # fmt: skip
+
+
+def check_arguments(unknown: Iterable[str], known: Iterable[str]) -> None:
+    """A TypeError where System.make has not such an argument, with what may be meant."""
+    for name in unknown:
+        known = [*known]
+        near = formulas.suggest(_CALLED.get(name, name), known)
+        raise TypeError(
+            f"System.make has no argument '{name}'{near or ': it has ' + ', '.join(known)}"
+        )
+
+
+def check_units(units: Iterable[str], known: Iterable[str]) -> None:
+    """An EomcError where a unit is of nothing that there is."""
+    known = [*known]
+    for name in units:
+        if name not in known:
+            raise fault(
+                "units",
+                f"{name} is no coordinate, parameter, input, constraint or output"
+                f"{formulas.suggest(name, known)}",
+            )
+
+
 def from_text(text: str, role: str, known: Mapping[str, Symbol]) -> Expr:
     """A formula as scenes have it. Raises EomcError."""
     try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Never
 
 import sympy
 from sympy import Expr, Symbol
@@ -206,6 +206,7 @@ class System:
         tolerance: float | None = None,
         picture: Mapping[str, Any] | None = None,
         friction: Mapping[Any, Any] | None = None,
+        **unknown: Never,
     ) -> System:
         r"""A system from SymPy expressions.
 
@@ -232,7 +233,8 @@ class System:
         ...             -m*g*l*sympy.cos(theta), parameters={m: 1, l: 1, g: 9.81}).qd
         (theta_dot,)
         """
-        asked = {key: x for key, x in locals().items() if key != "cls"}
+        asked = {key: x for key, x in locals().items() if key not in ("cls", "unknown")}
+        given.check_arguments(unknown, asked)
         run = given.run(
             h, duration, methods, real, batch, linearize, discretize, tolerance,
             bool(events or friction),
