@@ -59,6 +59,15 @@ def limited(modules: Modules) -> ModuleType:
     return modules.unoptimised(BATCH)
 
 
+def test_an_equilibrium_that_limits_forbid_is_told_with_them(limited: ModuleType) -> None:
+    """The pole leans against what the force can't give; one that it can is found."""
+    for how in ({"u": [0.0, 4.0, 0.0], "free": "force"}, {"u": [9.0, 0.0, 0.0], "free": "free"}):
+        with pytest.raises(limited.MotionError, match=r"left on x, with force beyond its limits;"):
+            limited.equilibrium([0.0, 0.0], **how)
+    _, u = limited.equilibrium([0.0, 0.0], u=[0.0, 1.0, 0.0], free=["theta", "force"])
+    assert u == pytest.approx([-1.0, 1.0, 0.0], abs=1e-12)
+
+
 @pytest.mark.parametrize("form", tiers(["fast", "plain"], "plain"))
 @pytest.mark.parametrize("text", tiers([BATCH, IMPLICIT], BATCH), ids=lambda t: t[-30:-1])
 def test_what_is_beyond_acts_as_the_limit(text: str, form: str, tmp_path: Path) -> None:

@@ -43,9 +43,11 @@ def equilibrium(
     moved = moved[: len(z)]
     rows = _Rows(model, moved, qd, t, params) if model.constraint_names else None
 
+    def held(z: Array) -> Array | None:
+        return None if u is None else z[n:]
+
     def whole(z: Array) -> Array:
-        held = None if u is None else z[n:]
-        tau = model.tau(z[:n], qd, t, held, params)
+        tau = model.tau(z[:n], qd, t, held(z), params)
         found: Array = tau.astype(float) - model.bias(z[:n], qd, t=t, params=params)
         return found
 
@@ -88,8 +90,8 @@ def equilibrium(
         raise MotionError(
             f"no equilibrium found from {state_text(q, qd)}: the search ends at "
             f"q = {np.array2string(z[:n], precision=6, threshold=12)}, where "
-            f"{_too_much(model, now * much)}; start elsewhere, or let another coordinate or input "
-            "be free",
+            f"{_too_much(model, now * much)}{_beyond(model, z[:n], qd, held(z), t, params)}; start "
+            "elsewhere, or let another coordinate or input be free",
             "no convergence",
         )
     at = z[:n].astype(model.dtype)
@@ -106,6 +108,18 @@ def _too_much(model: Constrained, left: Array) -> str:
         return f"a force of {left[worst]:.3g} is left on {model.coordinates[worst]}"
     worst = int(np.argmax(np.abs(left[n:])))
     return f"the rates break {rows.names[rows.holonomic + worst]} by {left[n + worst]:.3g}"
+
+
+def _beyond(model: Constrained, q: Array, qd: Array, u: Array | None, t: float, params: Any) -> str:
+    """Which inputs ask for more than their limits let act, in words."""
+    if not model.has_limits:
+        return ""
+    asked = model.signal(q, qd, t, params) if u is None else u
+    cut = asked != model.applied(q, qd, t, u, params)
+    names = [name for name, far in zip(model.inputs, cut, strict=True) if far]
+    return f", with {', '.join(names)} beyond {'their' if names[1:] else 'its'} limits" * bool(
+        names
+    )
 
 
 def _tried(onto: Callable[[Array], Array], z: Array) -> Array | None:
