@@ -84,7 +84,7 @@ def test_tables_that_do_not_fit_are_refused_by_name() -> None:
         ({"q0": np.zeros((0, 2)), "qd0": np.zeros((0, 2))}, "q0: no instances"),
         ({"q0": np.zeros((3, 2)), "qd0": np.zeros((4, 2))}, "qd0: 4 instances where q0 has 3"),
         ({"params": {"m_c": "1"}}, "params: m_c: '1' is not an array of numbers"),
-        ({"params": [{"m_c": 1}] * 2}, "params: [{'m_c': 1}, {'m_c': 1}] is not an array"),
+        ({"params": [{"m_c": 1}] * 2}, 'params: give one dict of arrays, {"m": [1, 2]}'),
         ({"every": 0}, "every"),
         ({"threads": 0}, "threads: 0 is not a whole number, 1 or more"),
         ({"threads": 1.5}, "threads: 1.5 is not"),

@@ -106,7 +106,10 @@ def remarks(report: Report) -> list[str]:
             f"{math.log10(condition):.0f} digits of the accelerations are lost there."
         )
     else:
-        said.append(f"D is regular: its condition number is at most {condition:.2g}, {place}.")
+        said.append(
+            f"D is regular: its condition number, once scaled to a diagonal of ones, is at most "
+            f"{condition:.2g}, {place}."
+        )
     if report.events:
         said.append(
             f"The scene has events ({report.events}); all figures here are of runs that "

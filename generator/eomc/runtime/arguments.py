@@ -41,6 +41,11 @@ class Params:
     def _set(self, name: str, value: float) -> None:
         if name not in self._names:
             raise ValueError(not_one_of("params", name, self._names))
+        if not isinstance(value, str) and np.ndim(value) == 1:
+            raise ValueError(
+                f"params: {name}: {value!r} is not a number: one each is for many states, as in "
+                "simulate_batch"
+            )
         self._array[self._names.index(name)] = as_number(value, f"params: {name}")
 
     def __getattr__(self, name: str) -> float:
@@ -169,6 +174,8 @@ class Arguments:
         except (TypeError, ValueError, OverflowError):
             order = f": give them in order, {', '.join(self.coordinates)}"
             remedy = order if isinstance(value, Mapping) else ""
+            if any(map(callable, value if isinstance(value, (list, tuple)) else [value])):
+                remedy = ": one function u(t, q, qd) gives all inputs, in order or as a dict"
             raise ValueError(f"{name}: {value!r} is not an array of numbers{remedy}") from None
 
     def _array(self, value: ArrayLike, name: str, width: int) -> Array:

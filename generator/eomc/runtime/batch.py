@@ -208,6 +208,8 @@ class BatchModel(Model):
     def _parameter_rows(self, params: Any) -> Array:
         if params is None or isinstance(params, Params):
             return self._parameters(params)[None]
+        if isinstance(params, (list, tuple)) and any(isinstance(p, Mapping) for p in params):
+            raise ValueError('params: give one dict of arrays, {"m": [1, 2]}, no list of dicts')
         if not isinstance(params, Mapping):
             array = self._numbers(params, "params")
             if array.ndim == 2 and array.shape[1] == len(self.parameters):
