@@ -6,6 +6,7 @@ import math
 import pickle
 from itertools import pairwise
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -174,11 +175,47 @@ def test_where_jacobis_integral_is_conserved_its_balance_is_told(modules: Module
     assert balance.told and balance.left < 1e-7 and balance.lost == 0
 
 
-def test_inputs_that_change_from_step_to_step_have_none(pushed: ModuleType) -> None:
-    assert pushed.simulate(steps=20, u=np.ones((20, 1))).balance() is None
-    with pytest.warns(RuntimeWarning, match="a Python function"):
-        run = pushed.simulate(steps=20, u=lambda t, q, qd: [-qd[0]])
-    assert run.balance() is None
+def law(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
+    return [2.0 - q[0] - math.copysign(0.3, qd[0])]
+
+
+@pytest.mark.filterwarnings("ignore:.*a Python function")
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"u": np.sin(np.arange(20.0) ** 2)[:, None]},
+        {"u": np.sin(np.arange(20.0) ** 2)[:, None], "times": np.linspace(0, 0.4, 11)},
+        {"u": np.cos(np.arange(4.0))[:, None], "control_period": 0.1, "every": 3},
+        {"u": law},
+        {"u": law, "control_period": 0.06},
+    ],
+)
+def test_work_of_inputs_that_are_held_is_told(pushed: ModuleType, how: dict[str, Any]) -> None:
+    """Over a step an input does u (x' - x), but for the method's error in x."""
+    run = pushed.simulate(**{"steps": 20} if "times" not in how else {"h": 0.02}, **how)
+    balance, ends = run.balance(), run(0.02 * np.arange(21))[0][:, 0]
+    u = run.u[:-1, 0] if how["u"] is law else np.repeat(how["u"], 20 // len(how["u"]))
+    assert balance.told and balance.left < 1e-7
+    assert balance.inputs == pytest.approx(np.sum(u * np.diff(ends)), abs=2 * balance.left)
+    assert 0 < balance.lost < 1 and balance.unsure < 1e-3 * balance.left
+
+
+def test_work_of_inputs_that_a_period_holds_is_told_by_a_tolerance(falling: ModuleType) -> None:
+    periods = np.array([0.0, 0.15, 0.3, 0.4])
+    for rows in ({"duration": 0.4}, {"times": periods}):
+        run = falling.simulate(u=law, control_period=0.15, params={"c": 0.2}, **rows)
+        u = run.u[np.searchsorted(run.t, periods[:-1]), 0]
+        work = np.sum(u * np.diff(run(periods)[0][:, 0]))
+        balance, gained = run.balance(), run.energy[-1] - run.energy[0]
+        assert balance.told and balance.inputs == pytest.approx(work, abs=1e-11)
+        assert balance.inputs - balance.lost == pytest.approx(gained, abs=1e-11)
+    bounced = falling.simulate(u=law, control_period=0.15, duration=0.6)
+    assert len(bounced.events["impact"].t) and bounced.balance() is None
+
+
+@pytest.mark.filterwarnings("ignore:.*a Python function")
+def test_inputs_that_rows_do_not_tell_have_none(pushed: ModuleType) -> None:
+    assert pushed.simulate(steps=20, u=law, every=2).balance() is None
 
 
 @pytest.mark.parametrize("steps", [0, 1, 2, 3, 9])

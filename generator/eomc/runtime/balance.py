@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from itertools import pairwise
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,30 +69,52 @@ class Balance:
         return reduced("balance.Balance", *self.__dict__.values())
 
 
+@dataclass(frozen=True)
+class _Rows:
+    """Rows t (n,), q, qd (n, nq) that tell a run's power, and the inputs in each piece of them."""
+
+    model: Model
+    params: Array
+    t: Array
+    q: Array
+    qd: Array
+    pieces: list[tuple[slice, Any]]
+
+    def values(self, name: str, function: Callable[..., Any], **held: Any) -> Array:
+        """What a function of the states gives, (n, ...); u: its own in each piece unless given."""
+        found = []
+        for rows, u in self.pieces:
+            given = held or ({"u": u} if name == "power" else {})
+            t = self.t[rows]
+            for k, q, qd in self.model._by_time(name, t, self.q[rows], self.qd[rows]):
+                found.append(function(q, qd, t=float(t[k]), params=self.params, **given))
+        return np.concatenate(found).astype(float)
+
+
 def balance(run: Run) -> Balance | None:
-    """The balance of a run; None where inputs change from step to step, unseen, or one is infinite.
+    """The balance of a run; None where its rows don't tell its inputs, or something is infinite.
 
     That may be an energy or a force, at a start from which no step is made.
     """
-    if run._u is not None and np.ndim(run._u) != 1:
-        return None
     if not np.isfinite(run.jacobi).all():
         return None
-    run = _between_jumps(run)  # all its rows: few may look smooth and not be
-    model, energy = run._model, run.jacobi.astype(float)
+    rows = _rows(run)
+    if rows is None:
+        return None
+    model, energy = run._model, rows.values("jacobi", run._model.jacobi)
     none = np.zeros(model.nu) if model.nu else None
-    power, rest = (run._values("power", u=u).astype(float) for u in (run._u, none))
+    power, rest = (rows.values("power", model.power, **how) for how in ({}, {"u": none}))
     back = _turned_back(model)
     ahead, behind = (
-        run._values("tau", lambda q, qd, way=way, **held: model.tau(*way(q, qd), **held), u=none)
+        rows.values("tau", lambda q, qd, way=way, **held: model.tau(*way(q, qd), **held), u=none)
         for way in (lambda q, qd: (q, qd), back)
     )
     if not all(np.isfinite(x).all() for x in (power, rest, ahead, behind)):
         return None
-    braking = np.sum((behind - ahead) / 2 * run.qd, axis=1).astype(float)
-    jumps = 1 + np.flatnonzero(np.diff(run.t) == 0)  # the rows behind them
+    braking = np.sum((behind - ahead) / 2 * rows.qd, axis=1).astype(float)
+    jumps = 1 + np.flatnonzero(np.diff(rows.t) == 0)  # the rows behind them
     (work, off), (other, _), (lost, blur) = (
-        _in_pieces(run.t, y, jumps) for y in (power, rest, braking)
+        _in_pieces(rows.t, y, jumps) for y in (power, rest, braking)
     )
     leaps = np.zeros(len(energy))
     leaps[jumps] = energy[jumps] - energy[jumps - 1]
@@ -111,6 +135,47 @@ def _turned_back(model: Model) -> Callable[[Array, Array], tuple[Array, Array]]:
     signs = np.ones(model.nq, model.dtype)
     signs[[at for at, _ in model._rows.modes]] = -1
     return lambda q, qd: (signs * q, -qd)
+
+
+def _rows(run: Run) -> _Rows | None:
+    """Rows that tell a run's power, which is smooth between jumps of its state or its inputs."""
+    model, u = run._model, run._u
+    if u is None or np.ndim(u) == 1:
+        run = _between_jumps(run)  # all its rows: few may look smooth and not be
+        return _Rows(model, run._params, run.t, run.q, run.qd, [(slice(None), u)])
+    ends, values = _held(run)
+    if not len(values):
+        return None
+    each = (_EVEN if hasattr(run, "tol") else 1) * ceil(run.steps / len(values)) + 1
+    count = min(max(each, _FEWEST), max(_MOST // len(values), 2))
+    t = np.concatenate([np.linspace(a, b, count) for a, b in pairwise(ends.tolist())])
+    try:
+        q, qd = run(t)
+    except ValueError:  # of what a function gave rows tell nothing
+        return None
+    pieces = [(slice(k * count, (k + 1) * count), x) for k, x in enumerate(values)]
+    return _Rows(model, run._params, t, q, qd, pieces)
+
+
+def _held(run: Any) -> tuple[Array, Array]:
+    """The times (n + 1,) between which a run's inputs are held, and these, (n, nu); none: unknown.
+
+    Of one with events too, whose states may jump in between.
+    """
+    unknown, last = (np.zeros(1), np.zeros((0, run._model.nu))), float(run.t[-1])
+    if hasattr(run, "tol"):
+        values = run._held
+        if values is None or len(run._happened[0]):
+            return unknown
+        starts = run.t0 + run._period * np.arange(len(values))
+    else:
+        values = run._u if np.ndim(run._u) == 2 else run._applied
+        if values is None or (np.ndim(run._u) != 2 and run.every > 1):
+            return unknown
+        first = np.arange(0, min(run.steps, len(values)), run._hold)
+        starts, values = run.t0 + run.h * first, values[first]
+    begun = starts < last
+    return np.append(starts[begun], last), values[begun]
 
 
 def _between_jumps(run: Run) -> Run:

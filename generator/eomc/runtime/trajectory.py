@@ -199,8 +199,8 @@ class Run(ConstrainedRun, Columns):
     def balance(self) -> Balance | None:
         """What inputs and forces put in and what was lost, J, and the error that this leaves.
 
-        What jumps of events put in or took stands apart. None where inputs are a table or a
-        function, which change from step to step.
+        What jumps of events put in or took stands apart. None where rows don't tell the inputs: of
+        a function with `every` or times of fixed steps, or held where events happen in its periods.
         """
         return balance(self)
 
