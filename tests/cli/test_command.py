@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from builds import KEPT
 from click.testing import CliRunner, Result
 
 from eomc import pipeline
+from eomc.base.errors import EomcError
+from eomc.cli import run
 from eomc.cli.main import main
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -139,6 +142,21 @@ def test_parameters_and_start_on_the_command_line(there: Path) -> None:
     summary = json.loads(eomc("run", "cartpole.toml", "--duration", "0", *words).output)
     assert summary["q"] == {"x": 0.0, "theta": pytest.approx(np.pi / 3)}
     assert summary["qd"] == {"x": -2.0, "theta": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("force=30", "but an input: its value is the signal that the scene gives it"),
+        ("theta=1", "but a coordinate: --start theta=1"),
+        ("theta_dot=2", "but a velocity: --start theta_dot=2"),
+    ],
+)
+def test_what_is_no_parameter_is_told_where_it_belongs(
+    driven: ModuleType, given: str, said: str
+) -> None:
+    with pytest.raises(EomcError, match=f"is not a parameter, {said}"):
+        run._overrides(Path("driven.toml"), driven, [given], [])
 
 
 @pytest.mark.parametrize(

@@ -172,8 +172,12 @@ def _overrides(
     for name, value in pairs(parameters, "--set", module.defaults):
         if name not in module.defaults:
             remedy = suggest(name, module.defaults) or _there_are(module.defaults)
-            if name in module.coordinates:
-                remedy = f", but a coordinate: --start {name}={value:g}"
+            if name in module.inputs:
+                remedy = ", but an input: its value is the signal that the scene gives it"
+            for kind, of in (("coordinate", name), ("velocity", name.removesuffix("_dot"))):
+                if of in module.coordinates:
+                    remedy = f", but a {kind}: --start {name}={value:g}"
+                    break
             raise EomcError(f"--set: '{name}' is not a parameter{remedy}")
         values[name] = value
     q0, qd0 = module.start
