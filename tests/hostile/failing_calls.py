@@ -126,6 +126,7 @@ class Failing:
 
     def __init__(self, folder: Path) -> None:
         os.environ["EOMC_CFLAGS"] = "-O0"
+        sys.pycache_prefix = None  # bytecode goes with the module that `renew` removes
         self.folder = folder.resolve()
         self.root, self.kept = self.folder / "build", self.folder / "kept"
         self.scene, self.log = self.folder / "simple_pendulum.toml", self.folder / "log"

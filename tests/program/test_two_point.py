@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -11,10 +12,12 @@ from types import ModuleType
 import mpmath
 import numpy as np
 import pytest
-from cases import FMA, SCENES, scene_system
-from conftest import Modules, tiers
+from cases import FMA, SCENES, fast_kit, scene_system
+from compilers import compiled
+from conftest import Modules, needs, tiers
 from sympy import S
 
+import eomc
 from eomc.derive import lagrange
 from eomc.derive.tape import Stage
 from eomc.emit.c_expression import DOUBLE
@@ -338,3 +341,37 @@ def test_weights_add_up_to_one_in_the_two_point_form(modules: Modules) -> None:
         found = run.q[-1, -1], run.qd[-1, -1]
         off = max(abs(mpmath.mpf(float(x)) - y) for x, y in zip(found, exact, strict=True))
     assert off < (1e-14 if FMA else 2e-13)  # for what h/6 lacks
+
+
+DIRT = """#include "dirt_odd.h"
+#include <string.h>
+static double q[DIRT_ODD_NQ], qd[DIRT_ODD_NQ];
+static void dirt(void)
+{
+    volatile unsigned char stack[65536];
+
+    memset((void *)stack, 0xff, sizeof stack);
+    memcpy(q, dirt_odd_q0, sizeof q);
+    memcpy(qd, dirt_odd_qd0, sizeof qd);
+}
+#define LOST(method) (dirt(), dirt_odd_##method##_run(q, qd, 0, 0.005, 0, 9, 0, 0, 0, 0, 0, \\
+    &dirt_odd_defaults, 0, &status) != 9)
+int main(void)
+{
+    dirt_odd_status status;
+
+    return LOST(rk4) | LOST(dp8) << 1 | LOST(gauss8) << 2 | LOST(gauss16) << 3;
+}
+"""
+
+
+def test_no_step_reads_what_none_has_written(tmp_path: Path) -> None:
+    """Vectors are as long as registers: gauss8 left what is behind the coordinates as it was."""
+    needs("gcc")
+    run = 'method = ["rk4", "dp8", "gauss8", "gauss16"]'
+    made = system.from_scene(scene.parse(with_run(ODD, "dirt_", run), "dirt_odd.toml"))
+    for name, text in {**fast_kit(eomc.sources(made)), "dirt.c": DIRT}.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    command = "gcc -std=gnu99 -O0 -march=native dirt.c dirt_odd.c -lm -o dirt"
+    compiled(*command.split(), cwd=tmp_path)
+    assert subprocess.run([tmp_path / "dirt"]).returncode == 0

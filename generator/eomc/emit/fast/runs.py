@@ -84,6 +84,7 @@ def loop(made: Steppers, m: Method) -> views.Loop:
         compute_constants=constants_call(made),
         newton=m.newton,
         implicit=m.implicit,
+        padded=m.implicit and lane.padded,
         predicted=predicts(made, m),
         start_call=lane.all_in_one.call(**first),
         predicted_call=f"{lane.prefix}_rk4_predicted({', '.join(predicted)})",

@@ -360,6 +360,7 @@ class Loop(Named):
     compute_constants: str
     newton: bool
     implicit: bool
+    padded: bool
     predicted: bool
     start_call: str
     predicted_call: str
