@@ -354,13 +354,20 @@ static void dirt(void)
     memcpy(q, dirt_odd_q0, sizeof q);
     memcpy(qd, dirt_odd_qd0, sizeof qd);
 }
-#define LOST(method) (dirt(), dirt_odd_##method##_run(q, qd, 0, 0.005, 0, 9, 0, 0, 0, 0, 0, \\
-    &dirt_odd_defaults, 0, &status) != 9)
+#define TRY(method) \\
+    dirt(); \\
+    ended |= dirt_odd_##method##_run(q, qd, 0, 0.005, 0, 9, 0, 0, 0, 0, 0, &dirt_odd_defaults, 0, \\
+        &status) != 9
 int main(void)
 {
     dirt_odd_status status;
+    int ended = 0;
 
-    return LOST(rk4) | LOST(dp8) << 1 | LOST(gauss8) << 2 | LOST(gauss16) << 3;
+    TRY(rk4);
+    TRY(dp8);
+    TRY(gauss8);
+    TRY(gauss16);
+    return ended;
 }
 """
 
