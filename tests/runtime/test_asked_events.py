@@ -121,6 +121,36 @@ def test_they_are_compiled_once(oscillator: ModuleType, scene: Path) -> None:
     assert pickle.loads(pickle.dumps(run)).events["through"].t == run.events["through"].t
 
 
+@pytest.mark.usefixtures("no_warnings")
+def test_a_saved_run_is_loaded_with_them(oscillator: ModuleType, tmp_path: Path) -> None:
+    """Here, and as in another process; between rows its state jumps."""
+    how = {"params": {"at_drop": 0}, "events": BESIDE}
+    runs = oscillator.simulate(**how), oscillator.simulate_batch([[1.0], [0.4]], tol=1e-9, **how)
+    times = [1.0, 2.0, 3.0]
+    for k, run in enumerate(runs):
+        run.save(tmp_path / f"{k}.npz")
+    for _ in range(2):
+        for k, run in enumerate(runs):
+            again = oscillator.load_run(tmp_path / f"{k}.npz")
+            assert again == run and list(again.events) == ["turns", *BESIDE]
+            np.testing.assert_array_equal(again.events["drop"].t, run.events["drop"].t)
+            if not k:
+                assert np.array_equal(again(times), run(times)) and again(2.0)[0][2] == 4
+        vars(oscillator._model).pop("_eventful")
+
+
+def test_a_saved_run_without_the_scene_is_told_how(
+    oscillator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "run.npz"
+    oscillator.simulate(duration=1.0, events=BESIDE).save(file)
+    vars(oscillator._model).pop("_eventful")
+    monkeypatch.setattr(oscillator._model, "source", None)
+    with pytest.raises(EomcError, match=r"load it with eomc\.load") as fault:
+        oscillator.load_run(file)
+    assert "numpy.load reads its rows" in fault.value.__notes__[0]
+
+
 @pytest.mark.parametrize(
     ("events", "words"),
     [
@@ -206,6 +236,18 @@ def test_a_system_has_them_beside_its_own(systems: Path) -> None:
     assert abs(run.q[-1, 0]) < TOL and run["d"][-1] == 1
     both = m.simulate_batch([[0.5], [0.1]], tol=1e-9, params={"low": 0.2}, events=beside)
     assert both.reached == pytest.approx([math.acos(0.4) / 2, 10], abs=TOL)
+
+
+@pytest.mark.usefixtures("no_warnings")
+def test_of_a_system_a_saved_run_finds_them(systems: Path, tmp_path: Path) -> None:
+    m, file = eomc.load(swinging(), systems), tmp_path / "run.npz"
+    run = m.simulate(duration=1.0, events=beside_its_own())
+    run.save(file)
+    again = m.load_run(file)
+    assert again == run and again.events["half"].t == run.events["half"].t
+    vars(m._model).pop("_eventful")
+    with pytest.raises(ValueError, match=r"which files don't keep: call swinging\.simulate\(ev"):
+        m.load_run(file)
 
 
 def test_of_a_system_they_are_compiled_once(systems: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any, Never, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import batch_adaptive, batch_fixed, saved
+from . import batch_adaptive, batch_fixed
 from .adaptive_arguments import fits
 from .arguments import (
     Array,
@@ -25,7 +25,6 @@ from .arguments import (
 )
 from .batch_run import BatchRun
 from .batch_work import WORTH, Work
-from .columns import File
 from .model import LARGE, RARELY, SOME, Model
 from .shown import with_events
 from .timed import as_asked
@@ -44,14 +43,10 @@ class BatchModel(Model):
         # power of two (few fill no register); they only cut work up
         self._paces: dict[Any, float] = {}
 
-    def load_run(self, file: File) -> Any:
-        """A run or batch that `save` has written to an .npz file; see `Model.load_run`."""
-        kind, kept = saved.read(self, file)
-        if kind == "AdaptiveBatchRun":
-            return batch_adaptive.AdaptiveBatchRun._of_kept(self, kept)
-        if kind == "TimedBatchRun":
-            return batch_fixed.TimedBatchRun._of_kept(self, kept)
-        return BatchRun._of_kept(self, kept) if kind == "BatchRun" else self._single(kind, kept)
+    @property
+    def _kinds(self) -> dict[str, Any]:
+        own = (BatchRun, batch_fixed.TimedBatchRun, batch_adaptive.AdaptiveBatchRun)
+        return super()._kinds | {x.__name__: x for x in own}
 
     def simulate_batch(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,

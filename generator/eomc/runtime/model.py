@@ -90,27 +90,24 @@ class Model(Constrained):
             )
         return self
 
-    def load_run(self, file: File) -> Run:
+    def load_run(self, file: File) -> Any:
         """A run, or a batch, that `save` has written to an .npz file; its columns are the same.
 
         Raises ValueError where the file is none of this scene's, OSError where it can't be read;
-        warns where it is of another version of the scene.
+        warns where it is of another version of the scene. Events that its call asked for are
+        compiled where they are not there yet.
         """
-        kind, kept = saved.read(self, file)
-        if kind.endswith("BatchRun"):
+        model, kind, kept = saved.read(self, file)
+        if (of := model._kinds.get(kind)) is None:
             raise ValueError(
                 f"{file}: is a run of many at once, which a scene has by [run] batch = true"
             )
-        return self._single(kind, kept)
+        return of._of_kept(model, kept)
 
-    def _single(self, kind: str, kept: Mapping[str, Any]) -> Run:
-        """A run of one, by its kind and what was kept of it."""
-        kinds: dict[str, type[Run]] = {
-            "Run": Run,
-            "TimedRun": timed.TimedRun,
-            "AdaptiveRun": adaptive.AdaptiveRun,
-        }
-        return kinds[kind]._of_kept(self, kept)
+    @property
+    def _kinds(self) -> dict[str, Any]:
+        """The classes of its runs by their names."""
+        return {x.__name__: x for x in (Run, timed.TimedRun, adaptive.AdaptiveRun)}
 
     def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
         """A method's step and loop in C, steps at once, stages; what is kept and counted."""

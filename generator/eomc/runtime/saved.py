@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import zipfile
 import zlib
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .arguments import Array
+from .shown import eventful
 from .written import replacing
 
 if TYPE_CHECKING:
@@ -30,6 +32,8 @@ def write(run: Columns, path: Path) -> None:
         "coordinates": model.coordinates, "parameters": model.parameters, "inputs": model.inputs,
         "t": run["t"], "energy": run.energy, "u": run.u,
     }  # fmt: skip
+    if asked := vars(model).get("_asked"):
+        arrays |= {"own": asked[0].digest, "asked": _text(asked[1])}
     if model.has_jacobi:
         arrays["jacobi"] = run.jacobi
     arrays |= {name: value for name, value in run._kept().items() if value is not None}
@@ -38,8 +42,18 @@ def write(run: Columns, path: Path) -> None:
         np.savez(file, **made)
 
 
-def read(model: Model, file: File) -> tuple[str, dict[str, Any]]:
-    """The kind of a saved run, one of KINDS, and what it kept.
+def _text(events: Any) -> str:
+    """Events that a call asked for; "" where formulas are SymPy's, which are no text."""
+    try:
+        return json.dumps(events)
+    except TypeError:
+        return ""
+
+
+def read(model: Model, file: File) -> tuple[Model, str, dict[str, Any]]:
+    """The model of a saved run, its kind, one of KINDS, and what it kept.
+
+    The model is another than was given where a call had asked for events.
 
     Raises ValueError where the file is none, or of another scene; warns where it is of another
     version of the scene.
@@ -50,6 +64,9 @@ def read(model: Model, file: File) -> tuple[str, dict[str, Any]]:
         raise ValueError(f"{file}: was not written by run.save in this version of eomc")
     if found["scene"] != model.name:
         raise ValueError(f"{file}: is a run of {found['scene']}, not of {model.name}")
+    model._again(str(found.get("own", found["digest"])), f"{file}: was saved")
+    if "asked" in found:
+        model = _asked(model, found, file)
     for what in ("coordinates", "parameters", "inputs"):
         saved, own = tuple(found[what].tolist()), getattr(model, what)
         if saved != own:
@@ -59,8 +76,27 @@ def read(model: Model, file: File) -> tuple[str, dict[str, Any]]:
             )
     if found["q"].dtype != model.dtype:
         raise ValueError(f"{file}: has numbers of {found['q'].dtype}, {model.name} {model.dtype}")
-    model._again(str(found["digest"]), f"{file}: was saved")
-    return kind, {name: x.item() if x.ndim == 0 else x for name, x in found.items()}
+    return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in found.items()}
+
+
+def _asked(model: Model, found: dict[str, Array], file: File) -> Model:
+    """The model with the events that a saved run's call asked for."""
+    known = vars(model).get("_eventful", {}).values()
+    if same := [other for other in known if other.digest == found["digest"]]:
+        return same[0]  # type: ignore[no-any-return]
+    if not (text := str(found["asked"])):
+        raise ValueError(
+            f"{file}: its events= had formulas of SymPy, which files don't keep: call "
+            f"{model.name}.simulate(events=...) with the same ones first; numpy.load reads its rows"
+        )
+    try:
+        return eventful(model, json.loads(text))  # type: ignore[no-any-return]
+    except Exception as fault:
+        fault.add_note(
+            f"{file}: was made with events=, which are compiled to load it; numpy.load reads its "
+            "rows without"
+        )
+        raise
 
 
 def _arrays(file: File) -> dict[str, Array]:

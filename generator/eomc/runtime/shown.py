@@ -32,11 +32,18 @@ def with_events(call: Callable[..., Any], given: dict[str, Any]) -> Any:
     model, events, unknown = (given.pop(name) for name in ("self", "events", "unknown"))
     if unknown:
         raise no_argument(model, call, unknown)
+    other = eventful(model, events)
+    if hasattr(params := given["params"], "_names"):
+        values = {name: getattr(params, name) for name in params._names}
+        given["params"] = {k: x for k, x in values.items() if x != model.defaults[k]}
+    return other, given
+
+
+def eventful(model: Any, events: Any) -> Any:
+    """The model with events besides its own, built where it is not there yet."""
     known = vars(model).setdefault("_eventful", {})
     if (key := repr(events)) not in known:
         build = by_eomc("pipeline", "events of a run are compiled").with_events
         known[key] = build(model, events, Path(__file__).parent)._model
-    if hasattr(params := given["params"], "_names"):
-        values = {name: getattr(params, name) for name in params._names}
-        given["params"] = {k: x for k, x in values.items() if x != model.defaults[k]}
-    return known[key], given
+        vars(known[key])["_asked"] = model, events  # for files of its runs
+    return known[key]
