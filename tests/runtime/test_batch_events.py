@@ -61,6 +61,30 @@ def test_impacts_are_where_the_closed_form_has_them(balls: ModuleType) -> None:
     assert "3 ok" in run.message and "1 stopped by 'away'" in run.message
 
 
+def test_an_instance_that_there_is_not_is_refused(balls: ModuleType) -> None:
+    """Also by a name, or as an array; -1 is the last, as of a list."""
+    impacts = balls.simulate_batch(**HOW).events["impact"]
+    assert np.array_equal(impacts.of(-1).t, impacts.of(np.int64(3)).t)
+    for k in (4, -5):
+        with pytest.raises(IndexError, match=f"there is no instance {k}: they are 0 to 3"):
+            impacts.of(k)
+    for k in ("impact", 1.0, None):
+        with pytest.raises(TypeError, match=r"of: .* is no number of an instance"):
+            impacts.of(k)
+
+
+def test_events_are_told_in_words_and_by_their_names(balls: ModuleType) -> None:
+    runs, run = balls.simulate_batch(**HOW), balls.simulate(duration=2.0, params={"far": 0.7})
+    told = "'impact': <once, at 0.451524 s>, 'top': <never>, 'corner': <never>"
+    assert repr(run.events).startswith(f"{{{told}")
+    impacts = runs.events["impact"]
+    told = f"{len(impacts)} times, 0.451524 s to {impacts.t.max():.6g} s, in 4 of 4 instances"
+    assert repr(impacts) == f"<{told}>" and repr(runs.events["corner"]) == "<never>"
+    for found in (run.events, runs.events):
+        with pytest.raises(KeyError, match=r"'impat' is not one of .*; did you mean 'impact'"):
+            found["impat"]
+
+
 def test_they_are_the_same_in_pieces(balls: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """However little room a call has for them, and however instances go to threads."""
     many = np.linspace(0.3, 0.9, 40)

@@ -20,6 +20,7 @@ from .adaptive_error import error_of
 from .adaptive_memory import FULL, Kept, rows_for
 from .arguments import Array, as_number
 from .begun import infinite_at_start
+from .columns import ByName
 from .dense import within
 from .estimate import Estimate
 from .happened import Found, Happened
@@ -124,11 +125,10 @@ class AdaptiveRun(Run):
     def events(self) -> dict[str, Happened]:
         """Where and when each of the scene's events happened."""
         which, rows = self._happened
-        nq, found = self._model.nq, {}
-        for k, name in enumerate(self._model.events):
-            own = rows[which == k]
-            found[name] = Happened(own[:, 0], own[:, 1 : 1 + nq], own[:, 1 + nq :])
-        return found
+        nq, names = self._model.nq, self._model.events
+        each = (rows[which == k] for k in range(len(names)))
+        found = (Happened(x[:, 0], x[:, 1 : 1 + nq], x[:, 1 + nq :]) for x in each)
+        return ByName("events", names, found)
 
     @property
     def told(self) -> str:

@@ -16,6 +16,7 @@ from .adaptive_memory import FULL, room_for
 from .arguments import Array, as_number
 from .batch_run import BatchRun
 from .batch_work import all_of, as_threads, stuck
+from .columns import ByName
 from .happened import FoundInBatch, HappenedInBatch
 from .package import reduced
 from .slices import longer
@@ -72,14 +73,14 @@ class AdaptiveBatchRun(BatchRun):
     def events(self) -> dict[str, HappenedInBatch]:
         """Where and when each of the scene's events happened, and in which instances."""
         if self._happened is None:
-            return {}
+            return ByName("events", (), ())
         nq, (instances, which, rows) = self._model.nq, self._happened
-        found = {}
-        for k, name in enumerate(self._model.events):
+        found = []
+        for k in range(len(self._model.events)):
             own = which == k
             t, q, qd = np.split(rows[own], [1, 1 + nq], axis=1)
-            found[name] = HappenedInBatch(t[:, 0], q, qd, instances[own])
-        return found
+            found.append(HappenedInBatch(t[:, 0], q, qd, instances[own], len(self)))
+        return ByName("events", self._model.events, found)
 
     def _states(self, times: Array) -> Array:
         model: Any = self._model

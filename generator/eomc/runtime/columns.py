@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 File = str | os.PathLike[str]
 
 
-class ByName(dict[str, Array]):
-    """What each constraint or loop has, by name."""
+class ByName(dict[str, Any]):
+    """What each constraint, loop or event has, by name."""
 
-    def __init__(self, what: str, names: Sequence[str], values: Iterable[Array]) -> None:
+    def __init__(self, what: str, names: Sequence[str], values: Iterable[Any]) -> None:
         super().__init__(zip(names, values, strict=True))
         self.what = what
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import index
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 _EVENTS, _EVENTS_EACH = 1024, 64  # of one call, beside those of a step: of one, of each of many
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Happened:
     """Where an event happened: t (n,), s; q and qd (n, nq), before a jump."""
 
@@ -26,17 +27,38 @@ class Happened:
     def __len__(self) -> int:
         return len(self.t)
 
+    def __repr__(self) -> str:
+        return f"<{self._times}>"
 
-@dataclass(frozen=True)
+    @property
+    def _times(self) -> str:
+        """How often and when, in words."""
+        if len(self) < 2:
+            return f"once, at {self.t[0]:.6g} s" if len(self) else "never"
+        return f"{len(self)} times, {self.t.min():.6g} s to {self.t.max():.6g} s"
+
+
+@dataclass(frozen=True, repr=False)
 class HappenedInBatch(Happened):
     """The same of many: instance (n,) tells which; they follow one another, each in its order."""
 
     instance: Array
+    _batch: int
 
     def of(self, k: int) -> Happened:
-        """Those of instance k."""
-        own = self.instance == k
+        """Those of instance k, of the last where k is -1. Raises IndexError where there is none."""
+        try:
+            at = index(k)
+        except TypeError:
+            raise TypeError(f"of: {k!r} is no number of an instance") from None
+        if not -self._batch <= at < self._batch:
+            raise IndexError(f"of: there is no instance {at}: they are 0 to {self._batch - 1}")
+        own = self.instance == at % self._batch
         return Happened(self.t[own], self.q[own], self.qd[own])
+
+    def __repr__(self) -> str:
+        many = f", in {len(np.unique(self.instance))} of {self._batch} instances"
+        return f"<{self._times}{many if len(self) else ''}>"
 
 
 class FoundInBatch:
