@@ -26,6 +26,7 @@ from eomc.emit.views import (
 )
 from eomc.integrators.tableaux import METHODS
 from eomc.runtime.package import CONSTRAINED
+from eomc.scene.formulas import folded, parse
 
 _OF_STEPS = ("Phi", "Gamma")
 TIMED = (
@@ -212,6 +213,18 @@ def stub(target: Target) -> Stub:
     return Stub(tuple(stamp(target)), target.system.run.batch, _functions(target))
 
 
+def _follows(target: Target) -> dict[str, str]:
+    """Formulas of starts and rates over parameters, of those that have some."""
+    s, written = target.system, target.as_written
+    set_by_jumps = {written(c.name): c.start for c in s.coordinates if c.name in s.discrete}
+    return {
+        f"{written(c.name)}{end}": folded(parse(text), set_by_jumps)
+        for c in s.coordinates
+        for end, text in (("", c.follows), ("_dot", c.rate_follows))
+        if text
+    }
+
+
 def face(target: Target, extension: str) -> Face:
     """The Python package's __init__."""
     s, written = target.system, target.as_written
@@ -238,6 +251,7 @@ def face(target: Target, extension: str) -> Face:
         plane=bool(s.plane and (s.asked or s.run.momentum or s.reactions)),
         units=FreeText({written(name): unit for name, unit in units.items() if unit}),
         start=([c.start for c in s.coordinates], [c.rate for c in s.coordinates]),
+        follows=FreeText(_follows(target)),
         h=s.run.h,
         duration=s.run.duration,
         tolerance=s.run.tolerance,

@@ -224,6 +224,7 @@ class Face:
     plane: bool
     units: FreeText
     start: tuple[list[float], list[float]]
+    follows: FreeText
     h: float
     duration: float
     tolerance: float | None

@@ -26,7 +26,8 @@ from eomc.model.symbols import (
     t,
 )
 from eomc.model.system import System
-from eomc.scene.formulas import Formula, FormulaError
+from eomc.scene.formulas import Formula, FormulaError, folded
+from eomc.scene.scene import Coordinate as Written
 from eomc.scene.scene import Scene
 from eomc.scene.scope import ENERGIES
 
@@ -207,7 +208,7 @@ def from_scene(scene: Scene) -> System:
     potential_energy = sympy.Add(potential, more.potential, *more.tree_potential)
     rubs, sticks = made.frictions(more)
     coordinates = tuple(
-        Coordinate(c.name, c.unit, q, qd, c.note, c.held, c.held_rate)
+        Coordinate(c.name, c.unit, q, qd, c.note, c.held, c.held_rate, *_follows(scene, c))
         for c, q, qd in zip(scene.coordinates, start, rate, strict=True)
     )
     rows, reactions = made.constraints(coordinates, definitions, more.closed)
@@ -245,6 +246,14 @@ def from_scene(scene: Scene) -> System:
     if faults := made.problems or system.beyond_float():
         raise SceneError(faults)
     return sticking(discrete(limits.within(system)), sticks)
+
+
+def _follows(scene: Scene, c: Written) -> Iterator[str]:
+    """The formulas of start and rate over parameters, each "" where it has none of them."""
+    constants = {one.name: one.value for one in scene.constants}
+    for formula in (c.start, c.rate):
+        free = {name.id for name in formula.names()}.isdisjoint(p.name for p in scene.parameters)
+        yield "" if free else folded(formula, constants)
 
 
 def _at_the_start(scene: Scene) -> list[Problem]:

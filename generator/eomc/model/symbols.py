@@ -63,6 +63,7 @@ class Coordinate:
     """A generalized coordinate `q` and its velocity `qd`; `start` in `unit`, `rate` in unit/s.
 
     held, held_rate: whether constraints leave them as they are when a start is assembled.
+    follows, rate_follows: the formulas of start and rate where these are of parameters, else "".
     """
 
     name: str
@@ -72,6 +73,8 @@ class Coordinate:
     note: str = ""
     held: bool = True
     held_rate: bool = True
+    follows: str = ""
+    rate_follows: str = ""
 
     @property
     def q(self) -> Symbol:

@@ -82,12 +82,14 @@ class Params:
 class Arguments:
     """A compiled scene: its names and numbers, and what it is called with as C takes it."""
 
+    _follows: Mapping[str, str] = {}  # formulas of starts over parameters
+
     def __init__(
         self, extension: Any, *, name: str, title: str, dtype: str,
         coordinates: Mapping[str, str], parameters: Mapping[str, float],
         inputs: Mapping[str, str], outputs: Sequence[str], units: Mapping[str, str],
         start: tuple[Sequence[float], Sequence[float]], timed: Sequence[str], digest: str,
-        frames: Sequence[str] = (), plane: bool = False,
+        frames: Sequence[str] = (), plane: bool = False, follows: Mapping[str, str] | None = None,
     ) -> None:  # fmt: skip
         # thirty attributes at most with those of Model: with more CPython 3.11 looks up each slowly
         self._ffi, self._lib = extension.ffi, extension.lib
@@ -107,6 +109,8 @@ class Arguments:
         self._p0 = self._constant(tuple(parameters.values()))
         self._at = tuple(self._pointer(x) for x in (*self._start, self._p0))
         self._timed = frozenset(timed)
+        if follows:
+            self._follows = follows
         names = {
             "_names": self.parameters,
             "_defaults": tuple(parameters.values()),

@@ -27,6 +27,7 @@ from .batch_run import BatchRun
 from .batch_work import WORTH, Work
 from .model import LARGE, RARELY, SOME, Model
 from .shown import with_events
+from .starts import started
 from .timed import as_asked
 from .trajectory import Interrupted
 
@@ -166,10 +167,11 @@ class BatchModel(Model):
         when they start, on the constraints. Behind them the status of each, (batch,), where one
         can't be assembled there, else None.
         """
-        start = self._start
+        start, table = self._start, self._parameter_rows(params)
+        if params is not None and self._follows:
+            q0, qd0 = started(self, q0, qd0, table)
         q = self._rows_of(start[0] if q0 is None else self._completed(q0, 0), "q0")
         qd = self._rows_of(start[1] if qd0 is None else self._completed(qd0, 1), "qd0")
-        table = self._parameter_rows(params)
         held = self._input_rows(u, steps)
         sizes = {
             "q0": 1 if q.ndim == 1 else len(q),

@@ -19,6 +19,7 @@ from .drives import drive_forces, driven
 from .equilibrium import equilibrium
 from .frames import Frames
 from .functions import row_times
+from .starts import started
 from .trajectory import SAID, STATUS, MotionError, state_text
 
 AT_REST, SLOWEST = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
@@ -243,7 +244,7 @@ class Constrained(Frames):
         if isinstance(free, str):
             free = (free,)
         moving = qd if np.ndim(qd) else np.full(self.nq, as_number(qd, "qd"))
-        at, moving = self._one(self._start[0] if q is None else q, moving)
+        at, moving = self._one(*started(self, q, moving, self._parameters(params)))
         found = self.coordinates if free is None else tuple(free)
         held = self._inputs(u)
         return equilibrium(self, at, moving, held, found, as_number(t, "t"), params)

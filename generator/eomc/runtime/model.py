@@ -35,6 +35,7 @@ from .laws import Law, Sampled
 from .package import reduced, warn
 from .shown import with_events
 from .slices import longer
+from .starts import started
 from .trajectory import PASSED_OVER, SAID, STATUS, Interrupted, MotionError, Run, state_text
 
 Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
@@ -215,21 +216,21 @@ class Model(Constrained):
 
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration. method:
         one of `methods`, the first where None; "auto": by a tolerance. every: a row is kept of
-        every so many steps, and the ends. u: None, the scene's signals; (nu,), constant; (steps,
-        nu), held over a step each; a dict of all inputs by name, numbers or (steps,); or a function
-        u(t, q, qd) called before each step, and slow. control_period: in s, of fixed steps a whole
-        number: the function is called, a row taken, or the signals are read, once in it. out: (q,
-        qd), arrays for the rows. progress: called with (done, steps). estimate: whether to find the
-        run's own error, `run.error`, by shorter steps, nine times as long. tol: of adaptive steps,
-        each of which errs by about tol of how far it moves; [run] tolerance, where h, steps and
-        method are not given. times: (n,) ascending, instead of duration: the rows, between fixed
-        steps by a shorter one. h_most: the longest adaptive step, in s. stiff: whether they begin
-        by Newton's method. events: more, by name a formula or a dict as [[event]] has it; built
-        once. A run that can't go on keeps what it has and warns; Ctrl-C raises Interrupted.
+        every so many steps. u: None, the scene's signals; (nu,), constant; (steps, nu), held over a
+        step each; a dict of all inputs by name, numbers or (steps,); or a function u(t, q, qd)
+        called before each step, and slow. control_period: in s, of fixed steps a whole number: the
+        function is called, a row taken, or the signals are read, once in it. out: (q, qd), arrays
+        for the rows. progress: called with (done, steps). estimate: find the run's own error,
+        `run.error`, in nine times the time. tol: what adaptive steps err by, of their way; [run]
+        tolerance, where h, steps and method are not given. times: (n,) ascending, for duration: the
+        rows. h_most: the longest adaptive step, s. stiff: begin by Newton's method. events: more,
+        by name a formula or an [[event]]. A run that can't go on warns; Ctrl-C raises Interrupted.
         """
         if events is not None or unknown:
             other, given = with_events(self.simulate, dict(locals()))
             return cast(Run, other.simulate(**given))
+        if params is not None and self._follows:
+            q0, qd0 = started(self, q0, qd0, self._parameters(params))
         usual = (
             out is None and progress is None and control_period is None and not estimate
             and times is None and type(t0) is float and isfinite(t0)
@@ -314,10 +315,8 @@ class Model(Constrained):
         t0: float = 0.0,
     ) -> str | None:  # fmt: skip
         """Where h is beyond the stability limit of the method at a start: that, in a sentence."""
-        q, qd = self.start
-        if q0 is not None or qd0 is not None:
-            q, qd = self._state(q if q0 is None else q0, qd if qd0 is None else qd0)
         given, method = self._parameters(params), self._method(method)
+        q, qd = self._state(*started(self, q0, qd0, given))
         h = self.h if h is None else as_step_size(h, self.dtype)
         return advice(self, q, qd, h, as_number(t0, "t0"), u, given, method)
 

@@ -15,6 +15,7 @@ import operator
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -362,6 +363,19 @@ def evaluate(formula: Formula, algebra: Mapping[str, Any], lookup: Callable[[str
     values; `lookup` gives the value of every other name. Raises what these raise.
     """
     return _walk(formula, formula.tree, algebra, lookup)
+
+
+def folded(formula: Formula, values: Mapping[str, float]) -> str:
+    """The formula as text, with these values in place of their names."""
+
+    class Folded(ast.NodeTransformer):
+        def visit_Name(self, node: ast.Name) -> ast.expr:
+            if node.id not in values:
+                return node
+            number = ast.Constant(abs(values[node.id]))
+            return ast.UnaryOp(ast.USub(), number) if values[node.id] < 0 else number
+
+    return ast.unparse(Folded().visit(deepcopy(formula.tree)))
 
 
 def _walk(

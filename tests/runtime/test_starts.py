@@ -1,0 +1,98 @@
+"""Starts that are formulas of parameters follow those that a run is given."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+from eomc.base.errors import EomcError
+from eomc.scene.read import parse
+from eomc.scene.scene import Scene
+
+TEXT = """eomc = 1
+name = "hangs"
+[coordinates]
+r = { start = "l0 - sag*m*g/k + below", rate = "min(v, 2, 1 + v)*heaviside(k)/abs(below)" }
+theta = { start = "atan2(v, k) + max(sin(pi*v), -l0)**2", rate = 0.2 }
+x = { start = "2*l0" }
+[constants]
+below = -0.25
+sag = "-1"
+[parameters]
+m = 1
+k = 30
+l0 = 1
+g = 9.81
+v = 0.5
+load = 2
+[energy]
+kinetic = "(m + load)*(r_dot**2 + r**2*theta_dot**2 + x_dot**2)/2"
+potential = "k*(r - l0)**2/2 - m*g*r*cos(theta) + x**2"
+[[event]]
+name = "drops"
+when = "t - 5"
+action = "jump"
+load = "m"
+[run]
+h = 0.01
+duration = 0.1
+tolerance = 1e-9
+batch = true
+"""
+MANY = {"k": np.array([30.0, 20.0, 50.0]), "v": np.array([0.5, 0.0, -1.0])}
+
+
+@pytest.fixture(scope="module")
+def hangs(modules: Modules) -> ModuleType:
+    return modules.unoptimised(TEXT)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return parse(TEXT, "hangs.toml")
+
+
+@pytest.mark.filterwarnings("ignore:.*pass over")
+@pytest.mark.parametrize("how", [{}, {"h": 0.01}])
+def test_a_run_starts_where_its_parameters_say(hangs: ModuleType, scene: Scene, how: dict) -> None:
+    for params in ({"k": 60.0}, {"v": -3.0, "l0": 2.0}, {"m": 2.0, "load": 3.0}, {}):
+        given = {k: x for k, x in params.items() if k != "load"}  # which a jump sets: it is in q0
+        q, qd = scene.start(params)
+        for values in (given, hangs.Params(**given)):
+            run = hangs.simulate(params=values, **how)
+            np.testing.assert_allclose(run.q[0, :3], q, rtol=1e-15)
+            np.testing.assert_allclose(run.qd[0, :3], qd, rtol=1e-15)
+    start = [0.1, 0.2, 0.3, 2]
+    run = hangs.simulate(start, params={"k": 60.0, "v": 1.0}, **how)
+    assert run.q[0].tolist() == start and run.qd[0, 0] == scene.start({"v": 1.0})[1][0]
+
+
+@pytest.mark.filterwarnings("ignore:.*pass over")
+@pytest.mark.parametrize("how", [{}, {"h": 0.01}])
+def test_each_of_a_batch_starts_where_its_own_say(
+    hangs: ModuleType, scene: Scene, how: dict
+) -> None:
+    runs = hangs.simulate_batch(params=MANY, **how)
+    for k in range(3):
+        q, qd = scene.start({name: float(values[k]) for name, values in MANY.items()})
+        np.testing.assert_allclose(runs.q[k, 0, :3], q, rtol=1e-15)
+        np.testing.assert_allclose(runs.qd[k, 0, :3], qd, rtol=1e-15)
+    assert (runs.q[0, 0] == hangs.start[0]).all()  # its parameters are the scene's: to the last bit
+
+
+def test_a_start_without_a_value_is_refused(hangs: ModuleType, scene: Scene) -> None:
+    with pytest.raises(EomcError):
+        scene.start({"k": 0.0})
+    for simulate in (hangs.simulate, hangs.simulate_batch):
+        with pytest.raises(ValueError, match=r"the start of r, .*, is not finite there: give q0"):
+            simulate(params={"k": 0.0})
+        assert simulate([1.0, 0.0, 0.0], params={"k": 0.0}).qd.flat[0] == 1.0
+
+
+def test_one_under_constraints_is_assembled(modules: Modules) -> None:
+    bob = modules("pendulum_xy")
+    run = bob.simulate(params={"l": 1.5}, steps=2)
+    assert run["y"][0] == -1.5 and bob.simulate(steps=2)["y"][0] == -0.8
