@@ -31,6 +31,7 @@ _NAMES = ("name", "parent", "joint", "coordinate", "bodies", "body", "frame")
 _ARRAYS_MEANT = {
     "bodies": "body", "Body": "body", "link": "body", "links": "body", "springs": "spring",
     "Spring": "spring", "dampers": "damper", "Damper": "damper", "loops": "loop", "Loop": "loop",
+    "points": "point", "Point": "point", "events": "event", "Event": "event", "Events": "event",
 }  # fmt: skip
 
 _INDEXED = re.compile(r"(?<!\w)([A-Za-z_]\w*)\s*\[([^\[\]]*)\]", re.ASCII)
