@@ -8,7 +8,9 @@ from typing import Any
 import batches
 import numpy as np
 import pytest
+import sympy
 from states import QD, Q, same
+from sympy.physics.mechanics import dynamicsymbols
 
 S, SD = [0.3, 0.4, 0.5], [0.2, -0.1, 0.3]
 
@@ -50,6 +52,18 @@ def test_a_batch_takes_inputs_by_name(shape: tuple[int, ...]) -> None:
         m.step_batch(q, qd, u={"force": force})
         m.step_batch(q_too, qd_too, u=np.atleast_1d(force)[..., None] if shape else [force])
         assert np.array_equal(q, q_too) and np.array_equal(qd, qd_too)
+
+
+def test_symbols_of_sympy_are_names_too(driven: ModuleType) -> None:
+    """Of parameters and inputs, of one and of many; also as functions of time."""
+    m_c, force = sympy.Symbol("m_c", positive=True), dynamicsymbols("force")
+    run = driven.simulate(params={m_c: 3.0}, u={force: 0.5}, steps=5)
+    assert same(run, driven.simulate(params={"m_c": 3.0}, u={"force": 0.5}, steps=5))
+    m, how = batches.module("cartpole_driven"), {"q0": [Q, Q], "steps": 5}
+    named = m.simulate_batch(params={m_c: [2.0, 3.0]}, u={force: [0.5, 1.0]}, **how)
+    assert named == m.simulate_batch(params={"m_c": [2, 3]}, u={"force": [0.5, 1.0]}, **how)
+    with pytest.raises(ValueError, match="params: 'm_d' is not one of m_c"):
+        driven.D(Q, params={sympy.Symbol("m_d"): 1.0})
 
 
 def test_numbers_of_instances_and_tables_go_together(everything: ModuleType) -> None:

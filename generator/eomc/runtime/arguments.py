@@ -238,7 +238,7 @@ class Arguments:
             raise ValueError(f"params: these are another scene's: {', '.join(params._names)}")
         if isinstance(params, Mapping):
             given = self.Params()
-            for name, value in params.items():
+            for name, value in named(params).items():
                 if name in self.coordinates:
                     raise ValueError(f"params: '{name}' is a coordinate: give it in q0")
                 given._set(name, value)
@@ -269,11 +269,12 @@ class Arguments:
             raise ValueError(f"u: shape {array.shape}, expected ({self.nu},): one value an input")
         return array
 
-    def _by_name(self, u: Mapping[str, Any]) -> Array:
+    def _by_name(self, u: Mapping[Any, Any]) -> Array:
         """Inputs by name as arrays have them, (..., nu).
 
         All are to be given: held inputs and signals, which go on through a step, can't be mixed.
         """
+        u = named(u)
         for name in u:
             if name not in self.inputs:
                 raise ValueError(not_one_of("u", name, self.inputs))
@@ -334,6 +335,11 @@ class Arguments:
         if not isinstance(out, (tuple, list)) or len(out) != 2:
             raise ValueError("out: expected a pair of arrays, (q, qd)")
         return self._out(out[0], shape, "out[0]"), self._out(out[1], shape, "out[1]")
+
+
+def named(given: Mapping[Any, Any]) -> dict[str, Any]:
+    """By names: keys may be symbols of SymPy too, or its functions of time."""
+    return {k if type(k) is str else str(getattr(k, "name", k)): x for k, x in given.items()}
 
 
 def unmasked(value: Any, name: str) -> Any:

@@ -21,6 +21,7 @@ from .arguments import (
     as_number,
     as_period,
     as_step_size,
+    named,
     unmasked,
 )
 from .batch_run import BatchRun
@@ -214,6 +215,7 @@ class BatchModel(Model):
                     raise ValueError("params: not all numbers are finite")
                 return array
             return self._parameters(params)[None]
+        params = named(params)
         sizes = {name: np.size(value) for name, value in params.items() if np.ndim(value)}
         count = max(sizes.values(), default=1)
         table = np.tile(self._p0, (count, 1))
