@@ -133,7 +133,7 @@ class Loop:
         self.made = {name: eomc.read(self.scene(name, 0)) for name in BUILT}
         self.loaded = {name: eomc.load(made, folder / "own") for name, made in self.made.items()}
         self.samples: list[Sample] = []
-        warnings.filterwarnings("ignore", message=".* pass over the scene's events")
+        warnings.filterwarnings("ignore", message=".* pass over events")
 
     def scene(self, name: str, number: int) -> Path:
         """The file of a scene, another one for each number."""

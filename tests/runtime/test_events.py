@@ -166,10 +166,18 @@ def test_what_is_at_zero_at_the_start_has_not_happened(ball: ModuleType) -> None
 
 
 def test_fixed_steps_say_that_they_pass_over_events(ball: ModuleType) -> None:
+    words = "bouncing: fixed steps pass over events, impact, top, corner, away: give tol=, not h, "
     for simulate in (ball.simulate, ball.simulate_batch):
-        ball._model._warned.clear()
-        with pytest.warns(RuntimeWarning, match="fixed steps pass over the scene's events"):
-            assert np.all(simulate(h=0.01, duration=1.0).q[..., -1, 1] < 0)
+        for steps in (100, 2):  # however few they are
+            ball._model._warned.clear()
+            with pytest.warns(RuntimeWarning) as said:
+                run = simulate(h=0.01, steps=steps)
+            assert [str(one.message) for one in said] == [f"{words}steps or method"]
+        assert run.events == {} and np.all(simulate(h=0.01, duration=1.0).q[..., -1, 1] < 0)
+        with pytest.raises(KeyError, match="fixed steps pass over 'top': give tol=, not h"):
+            run.events["top"]
+        with pytest.raises(KeyError, match="did you mean 'impact'"):
+            run.events["impakt"]
 
 
 def test_crossings_close_together_in_one_long_step_are_seen(free: ModuleType) -> None:

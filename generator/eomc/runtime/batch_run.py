@@ -16,6 +16,7 @@ from .batch_values import Values
 from .batch_work import Way
 from .columns import Columns
 from .dense import parts, within
+from .happened import PassedOver
 from .model import Model
 from .package import reduced
 from .trajectory import STATUS
@@ -124,6 +125,11 @@ class BatchRun(Values, Fans, Columns):
             here = slice(own[0], own[-1] + 1)
             way.rows((whole[own], rest[own]), found[:, :, here])
         return found
+
+    @property
+    def events(self) -> Mapping[str, Any]:
+        """What adaptive steps find by the scene's events; fixed steps pass over them: empty."""
+        return PassedOver(self._model.events)
 
     def _kept(self) -> dict[str, Any]:
         """What a saved run keeps of it besides its columns; None: nothing."""

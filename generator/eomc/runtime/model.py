@@ -31,12 +31,13 @@ from .columns import File
 from .constrained import Constrained, Rows
 from .discretize import discretize
 from .estimate import advice, beyond_end
+from .happened import passed_over
 from .laws import Law, Sampled
 from .package import reduced, warn
 from .shown import with_events
 from .slices import longer
 from .starts import started
-from .trajectory import PASSED_OVER, SAID, STATUS, Interrupted, MotionError, Run, state_text
+from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
 
 Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
@@ -115,7 +116,9 @@ class Model(Constrained):
         step, run = (getattr(self._lib, f"{name}_{what}") for what in ("step", "run"))
         work = self._ffi.typeof(f"{name}_work *")
         counted = getattr(self._lib, f"{name}_evaluations", None)
-        short = -1 if counted or self._rows.names else min(_MANY - 1, _CHUNK // self.nq)
+        short = (
+            -1 if counted or self._rows.names or self.events else min(_MANY - 1, _CHUNK // self.nq)
+        )
         return step, run, short, stages, work, counted
 
     def step(
@@ -182,6 +185,10 @@ class Model(Constrained):
         return getattr(self._lib, f"{self._method(method)}_{what}")
 
     def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
+        """So many fixed steps; warns, once, that they pass over events."""
+        if self.events and steps != 0 and "events" not in self._warned:
+            self._warned.add("events")
+            warn(f"{self.name}: {passed_over(self)}")
         if steps is not None:
             if duration is not None:
                 raise ValueError("steps: give steps or duration, not both")
@@ -301,11 +308,8 @@ class Model(Constrained):
         self, q: Array, qd: Array, h: float, t: float, u: Array | None, p: Array, method: str,
         whose: str = "",
     ) -> None:  # fmt: skip
-        """Warn, once a method and step size, of h beyond the stability limit, and of events."""
+        """Warn, once a method and step size, of h beyond the stability limit."""
         self._warned.add((method, h))
-        if self.events and "events" not in self._warned:
-            self._warned.add("events")
-            warn(f"{self.name}: {PASSED_OVER}")
         if words := advice(self, q, qd, h, t, u, p, method):
             warn(f"{self.name}: {whose}{words}")
 

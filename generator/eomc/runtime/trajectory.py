@@ -19,6 +19,7 @@ from .columns import Columns, File
 from .constrained_run import ConstrainedRun
 from .dense import states
 from .estimate import Estimate, estimate
+from .happened import PassedOver
 from .laws import asked
 from .notebook import html
 from .package import reduced, warn
@@ -41,10 +42,6 @@ SAID = {
     "interrupted": "interrupted",
     FULL: REMEDY,
 }
-PASSED_OVER = (
-    "fixed steps pass over the scene's events, friction that sticks among them: give tol=, not h, "
-    "steps or method; a function as u then takes control_period="
-)
 LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
 
 
@@ -190,7 +187,7 @@ class Run(ConstrainedRun, Columns):
     @property
     def events(self) -> Mapping[str, Any]:
         """What adaptive steps find by the scene's events; fixed steps pass over them: empty."""
-        return {}
+        return PassedOver(self._model.events)
 
     def _even(self) -> Run:
         """With rows equally far apart, as many as there are steps, or enough to draw it."""
