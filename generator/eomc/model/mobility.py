@@ -91,8 +91,10 @@ def count(scene: Scene) -> Mobility:
     """The mobility of a scene. Raises EomcError for one without bodies."""
     assembly = scene.assembly
     if not assembly or not assembly.bodies:
+        names = [c.name for c in scene.coordinates]
         raise EomcError(
-            f"{scene.file}: the scene has no [[body]]: mobility is counted from bodies and joints"
+            f"{scene.file}: there is no [[body]], [[loop]] or [constraints] to count from: "
+            f"each coordinate is a freedom, {listed(names)}"
         )
     d = 3 if assembly.plane else 6
     placed = [body for body in assembly.bodies if not body.joint]
