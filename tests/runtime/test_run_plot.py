@@ -225,6 +225,12 @@ def test_batches_are_fans_lines_or_ends(modules: Modules, tmp_path: Path, pyplot
     assert pyplot.imread(tmp_path / "many.png").shape[1] >= 600
     with pytest.raises(ValueError, match=r"'p\.pdf' is no column: give file='p\.pdf'"):
         runs.plot("p.pdf")
+    way = r" is of one run: many\.simulate\(runs\.q\[k, 0\], runs\.qd\[k, 0\], params=\.\.\.\)\."
+    with pytest.raises(TypeError, match=rf"plot: phase={way}plot\(phase=\.\.\.\)"):
+        runs.plot(phase="x")
+    for name in ("estimate", "balance", "section", "error"):
+        with pytest.raises(AttributeError, match=f"{name}{way}[bes]"):
+            getattr(runs, name)
 
 
 BATCH = """

@@ -14,6 +14,14 @@ from .labels import mathtext, with_unit
 from .plot import Curve, Source, against, finished, given_axes, new_axes, no_files
 from .shown import by_eomc
 
+_OF_ONE = {"phase", "section", "other", "labels"}
+
+
+def alone(runs: Any) -> str:
+    """Where to find what single runs have and batches have not."""
+    name = runs._model.name
+    return f"is of one run: {name}.simulate(runs.q[k, 0], runs.qd[k, 0], params=...)"
+
 
 class Fans:
     """What draws a batch."""
@@ -29,6 +37,8 @@ class Fans:
         instances as lines instead. over: "instance", a parameter or numbers (batch,), over which
         the last value of each is drawn instead. Else as `Run.plot`.
         """
+        for name in _OF_ONE & style.keys():
+            raise TypeError(f"plot: {name}= {alone(self)}.plot({name}=...)")
         return fan(self, names, quantiles, lines, over, wrap, ax, axes, file, style)
 
     def animate(

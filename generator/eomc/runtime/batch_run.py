@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array
-from .batch_plot import Fans
+from .batch_plot import Fans, alone
 from .batch_values import Values
 from .batch_work import Way
 from .columns import Columns
@@ -23,6 +23,10 @@ from .trajectory import STATUS
 
 _ENDS = np.array([*STATUS, "interrupted"])
 _KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as the fields go
+_OF_ONE = {
+    "balance": "balance()", "estimate": "estimate()", "error": "estimate()",
+    "section": "section(...)",
+}  # fmt: skip
 
 
 @dataclass(eq=False, repr=False)
@@ -125,6 +129,12 @@ class BatchRun(Values, Fans, Columns):
             here = slice(own[0], own[-1] + 1)
             way.rows((whole[own], rest[own]), found[:, :, here])
         return found
+
+    def __getattr__(self, name: str) -> Any:
+        """A column that the scene names; of what one run alone has, where to find it."""
+        if name in _OF_ONE and name not in self._named():
+            raise AttributeError(f"{name} {alone(self)}.{_OF_ONE[name]}")
+        return super().__getattr__(name)
 
     @property
     def events(self) -> Mapping[str, Any]:
