@@ -87,3 +87,19 @@ def test_a_ball_stays_inside_of_walls_with_corners_in_their_formula(tmp_path: Pa
     speed = np.hypot(*runs.qd[ended, -1].T)
     np.testing.assert_allclose(speed, np.hypot(0.7, 0.4), rtol=1e-9)
     assert ended.mean() > 0.9
+
+
+def test_an_estimate_tells_what_jumps_make_of_rounding(tmp_path: Path) -> None:
+    """Flights are exact by any tolerance, so finer steps alone show no error at all."""
+    file = tmp_path / "stadium.toml"
+    file.write_text(STADIUM, encoding="utf-8")
+    stadium = eomc.load(file, BUILDS)
+    for how in ({}, {"times": [50.0]}):
+        run = stadium.simulate(**how or {"duration": 50.0}, estimate=True)
+        near = stadium.simulate([0.1 + 1e-15, 0.2], duration=50.0)  # some 7 digits are left
+        moved = np.abs(near.q[-1] - run.q[-1])
+        assert run.error.resolved and (run.error.q[-1] > 0.1 * moved).all()
+        assert (run.error.q[-1] < 10 * moved).all() and max(run.error.digits.values()) < 10
+    with pytest.warns(RuntimeWarning, match="chaotic: a difference at the start grows"):
+        chaotic = stadium.simulate(estimate=True)
+    assert chaotic.error.amplification > 1e14 and max(chaotic.error.digits.values()) < 3

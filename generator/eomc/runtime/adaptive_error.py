@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 LEAST = {8: 1e-15, 4: 5e-7}  # tolerances, by bytes of a number
 ORDER = 16
 _TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
+_FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
+_LITTLE = 4.0  # roundings, by which a start is moved where more fills the scale
+_TAIL = 40  # a part of the rows, over which a difference does not vanish
 _FINER = 100.0  # the tolerance over that of the run by which an error is found
 
 
@@ -27,6 +30,8 @@ def error_of(
 ) -> Estimate:  # fmt: skip
     """The error of a run, beside one of a hundredth of its tolerance, and from a moved start.
 
+    With events, at least what the motion makes of a rounding; where differences fill the scales,
+    that is seen from a start moved by some roundings, by the least tolerance.
     Raises MemoryError where its own rows are as many as there is room for.
     """
     if own.status == FULL:
@@ -66,29 +71,63 @@ def error_of(
     for at, of in modes:  # which are not moved, nor what sticks, and have no error
         moves[[at, model.nq + at]] = 0
         moves[model.nq + of] = begin[at] != 0
-    moved = again(own.tol, begin + moves * size * scale * signs)
     x = x[beside]
-    error = np.maximum(np.abs(x - finer), eps * np.abs(x))
-    error[:, modes[:, 0]] = error[:, model.nq + modes[:, 0]] = 0.0
-    error[own.t == own.t0] = 0.0
-    error[~np.isfinite(error)] = np.inf
-    with np.errstate(invalid="ignore", divide="ignore"):
-        grown = float(np.nanmax(np.abs(moved[-1] - x[-1]) / scale)) / size
+
+    def grown(base: Array, size: float, tol: float) -> Array:
+        """What a start moved by one scale would become at each row, if that were little."""
+        return _filled(np.abs(again(tol, begin + moves * size * scale * signs) - base)) / size
+
+    rows = grown(x, size, own.tol)
+    left, rounding = np.abs(x - finer), eps * np.abs(x)
+    left[~np.isfinite(left)] = np.inf
+    if len(own._happened[0]) or (left > _TENTH * scale).any():
+        # flights between jumps may be exact by any tolerance: what rounding makes of them tells
+        full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _FULL)
+        if full.any():  # where so little fills the scale, rounding fills a quarter of it
+            near = grown(again(least, begin), _LITTLE * eps, least)
+            rows = np.where(full[:, None], np.maximum(rows, near), rows)
+        rounding = np.maximum(rounding, eps * rows)
+    still = [*modes[:, 0], *(model.nq + modes[:, 0])]
+    for some in (left, rounding):
+        some[:, still] = some[own.t == own.t0] = 0.0
+    error = np.maximum(left, rounding)
+    amplification = float(np.max(rows[-1] / scale))
+    with np.errstate(divide="ignore"):
         digits = np.clip(-np.log10(error[-1] / scale), 0.0, -np.log10(eps)) + 0.0
     names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
     end, right = (dict(zip(names, map(float, x), strict=True)) for x in (error[-1], digits))
+    return Estimate(
+        error[:, : model.nq], error[:, model.nq :], end, right, ORDER, float("nan"),
+        amplification, _verdict(own, left / scale, rounding / scale, amplification),
+    )  # fmt: skip
+
+
+def _filled(rows: Array) -> Array:
+    """Differences at rows; behind those that a run came to the last of them."""
+    there = np.isfinite(rows).all(axis=1)
+    found: Array = np.nan_to_num(
+        rows[np.maximum.accumulate(np.where(there, np.arange(len(rows)), 0))]
+    )
+    found[-1] = found[-1 - len(rows) // _TAIL :].max(axis=0)  # it may vanish for a moment
+    return found
+
+
+def _verdict(own: AdaptiveRun, left: Array, rounding: Array, amplification: float) -> str:
+    """What speaks against the run; its differences, and rounding, relative to the scales."""
     words = []
     if own.status not in ("ok", "accumulated"):
         words.append(f"the run stopped at t = {own.t[-1]:.6g} s")
-    if grown * eps > _TENTH:
-        words.append(f"chaotic: a difference at the start grows {grown:.1g} times or more")
-    if (error > _TENTH * scale).any():
-        row = int(np.argmax((error > _TENTH * scale).any(axis=1)))
+    lost, wrong = (np.asarray((x > _TENTH).any(axis=1)) for x in (rounding, left))
+    if lost[-1]:
+        words.append(
+            f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "
+            f"rounding with it; no run in {own._model.dtype} means anything from "
+            f"t = {own.t[int(np.argmax(lost))]:.4g} s on"
+        )
+    if wrong.any():
+        row = int(np.argmax(wrong))
         words.append(
             f"the error exceeds a tenth of the motion from t = {own.t[row]:.4g} s on: take a "
             "tighter tolerance, or a shorter duration"
         )
-    return Estimate(
-        error[:, : model.nq], error[:, model.nq :], end, right, ORDER, float("nan"), grown,
-        "; ".join(words),
-    )  # fmt: skip
+    return "; ".join(words)
