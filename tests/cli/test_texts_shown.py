@@ -19,6 +19,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pytest
+from cases import SCENES
 from click.testing import CliRunner
 from conftest import tiers
 from markupsafe import Markup
@@ -221,10 +222,28 @@ with terminal.progress_bar({given!r}, False) as progress:
 def test_what_is_going_on_is_shown_as_it_is(name: str) -> None:
     """Rich's own markup and controls are its business; those of a file's name are text."""
     given = PAYLOADS[name][:40]
+    shown = watched("-c", TERMINAL.format(given=given))
+    assert shown.count(texts.line(given).encode()) >= 2
+    assert b"\x1b]0" not in shown and b"\x1b]8" not in shown
+
+
+def test_a_build_says_what_is_going_on(tmp_path: Path) -> None:
+    """Deriving a robot's equations takes a minute."""
+    for name in ("one", "two"):
+        text = (SCENES / "mass_spring.toml").read_text(encoding="utf-8")
+        (tmp_path / f"{name}.toml").write_text(text.replace("mass_spring", name), encoding="utf-8")
+    files = [str(tmp_path / "one.toml"), str(tmp_path / "two.toml")]
+    shown = watched("-m", "eomc", "build", *files, "--build", str(tmp_path / "b"))
+    assert b"building one, 1 of 2" in shown and b"building two, 2 of 2" in shown
+    shown = watched("-m", "eomc", "build", files[0], "--c", str(tmp_path / "c"))
+    assert b"building one ..." in shown
+
+
+def watched(*words: str) -> bytes:
+    """What Python shows where a person is watching."""
     ours, theirs = pty.openpty()
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "200"}
-    script = TERMINAL.format(given=given)
-    process = subprocess.Popen([sys.executable, "-c", script], stderr=theirs, env=environment)
+    process = subprocess.Popen([sys.executable, *words], stderr=theirs, env=environment)
     os.close(theirs)
     shown = b""
     while True:
@@ -233,8 +252,7 @@ def test_what_is_going_on_is_shown_as_it_is(name: str) -> None:
         except OSError:
             break
     assert process.wait() == 0, shown
-    assert shown.count(texts.line(given).encode()) >= 2
-    assert b"\x1b]0" not in shown and b"\x1b]8" not in shown
+    return shown
 
 
 # --- robot files ----------------------------------------------------------------------------------

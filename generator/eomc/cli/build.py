@@ -12,7 +12,7 @@ import click
 from eomc import pipeline
 from eomc.base.errors import EomcError
 from eomc.cli import options
-from eomc.cli.terminal import progress_bar, say, shown, warn
+from eomc.cli.terminal import say, shown, status_line, warn
 
 
 @click.command("build")
@@ -62,21 +62,26 @@ def command(
         _write_wheels(scenes, quiet, as_json)
         return
     done = []
-    with progress_bar("building", quiet or as_json) as progress:
-        for k, scene in enumerate(scenes):
+    for k, scene in enumerate(scenes):
+        with status_line(_building(scenes, k), quiet or as_json):
             begun = time.perf_counter()
             built = pipeline.build(scene, root, warn=warn)
             spent = time.perf_counter() - begun
-            progress(k + 1, len(scenes))
-            done.append(
-                {"scene": str(scene), "name": built.name, "folder": str(built.folder),
-                 "fresh": built.fresh, "seconds": round(spent, 3)}
-            )  # fmt: skip
-            if not quiet and not as_json:
-                said = f"built in {spent:.1f} s" if built.fresh else "is up to date"
-                say(f"{shown(built.folder)}/: {said}")
+        done.append(
+            {"scene": str(scene), "name": built.name, "folder": str(built.folder),
+             "fresh": built.fresh, "seconds": round(spent, 3)}
+        )  # fmt: skip
+        if not quiet and not as_json:
+            said = f"built in {spent:.1f} s" if built.fresh else "is up to date"
+            say(f"{shown(built.folder)}/: {said}")
     if as_json:
         say(json.dumps(done, indent=1))
+
+
+def _building(scenes: Sequence[Path], k: int) -> str:
+    """What is going on at the k-th, where a person is watching: a robot takes a minute."""
+    which = f", {k + 1} of {len(scenes)}" if len(scenes) > 1 else ""
+    return f"building {scenes[k].stem}{which}"
 
 
 def _refuse_twins(scenes: Sequence[Path]) -> None:
@@ -94,13 +99,12 @@ def _refuse_twins(scenes: Sequence[Path]) -> None:
 def _write_wheels(scenes: Sequence[Path], quiet: bool, as_json: bool) -> None:
     """A wheel of each scene, in the current folder."""
     done = []
-    with progress_bar("building", quiet or as_json) as progress:
-        for k, scene in enumerate(scenes):
+    for k, scene in enumerate(scenes):
+        with status_line(_building(scenes, k), quiet or as_json):
             wheel = pipeline.write_wheel(scene, Path(), warn=warn)
-            progress(k + 1, len(scenes))
-            done.append({"scene": str(scene), "wheel": str(wheel)})
-            if not quiet and not as_json:
-                say(f"wrote {shown(wheel)}")
+        done.append({"scene": str(scene), "wheel": str(wheel)})
+        if not quiet and not as_json:
+            say(f"wrote {shown(wheel)}")
     if as_json:
         say(json.dumps(done, indent=1))
 
@@ -111,7 +115,8 @@ def _write_c(
     """The C of one scene, in a folder of its own."""
     if len(scenes) > 1:
         raise EomcError(f"--c: takes one scene, since {shown(folder)} holds the C of one")
-    files = pipeline.write_c(scenes[0], folder, prefix, warn=warn)
+    with status_line(_building(scenes, 0), quiet or as_json):
+        files = pipeline.write_c(scenes[0], folder, prefix, warn=warn)
     if as_json:
         say(
             json.dumps(
