@@ -76,6 +76,7 @@ def test_a_heavier_pole_is_caught_less_far() -> None:
 
 
 @needs_gymnasium
+@pytest.mark.slow
 def test_many_poles_are_kept_up() -> None:
     text = said("vector_env.py")
     assert text.startswith("observed: cart tip_x tip_y speed turn swing")

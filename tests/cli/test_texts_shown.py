@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -37,10 +38,11 @@ from payloads import (
 
 import eomc
 from eomc.base import texts
-from eomc.cli import terminal
+from eomc.cli import build, terminal
 from eomc.cli.main import main
 from eomc.report import cost_of_digits, page, plot
 from eomc.scene import read as scene
+from eomc.toolchain.cache import Built
 
 
 @pytest.fixture(autouse=True)
@@ -227,16 +229,22 @@ def test_what_is_going_on_is_shown_as_it_is(name: str) -> None:
     assert b"\x1b]0" not in shown and b"\x1b]8" not in shown
 
 
-def test_a_build_says_what_is_going_on(tmp_path: Path) -> None:
+def test_a_build_says_what_is_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Deriving a robot's equations takes a minute."""
-    for name in ("one", "two"):
+    files = [tmp_path / "one.toml", tmp_path / "two.toml"]
+    for file in files:
         text = (SCENES / "mass_spring.toml").read_text(encoding="utf-8")
-        (tmp_path / f"{name}.toml").write_text(text.replace("mass_spring", name), encoding="utf-8")
-    files = [str(tmp_path / "one.toml"), str(tmp_path / "two.toml")]
-    shown = watched("-m", "eomc", "build", *files, "--build", str(tmp_path / "b"))
-    assert b"building one, 1 of 2" in shown and b"building two, 2 of 2" in shown
-    shown = watched("-m", "eomc", "build", files[0], "--c", str(tmp_path / "c"))
-    assert b"building one ..." in shown
+        file.write_text(text.replace("mass_spring", file.stem), encoding="utf-8")
+    said: list[str] = []
+
+    def built(scene: Path, root: Path, **_: Any) -> Built:
+        return Built(scene.stem, root / scene.stem, False, "")
+
+    monkeypatch.setattr(build.pipeline, "build", built)
+    monkeypatch.setattr(build, "status_line", lambda what, _: said.append(what) or nullcontext())
+    for names in (files, files[:1]):
+        assert CliRunner().invoke(main, ["build", *map(str, names)]).exit_code == 0
+    assert said == ["building one, 1 of 2", "building two, 2 of 2", "building one"]
 
 
 def watched(*words: str) -> bytes:
