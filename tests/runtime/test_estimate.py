@@ -365,11 +365,12 @@ def test_linearize_says_how_to_get_it(cartpole: ModuleType) -> None:
         ([2.0, 0.0, -1e76, 3.0], [2.0, 2e-6, 1e76, 1e70]),
         ([0.0, 0.0, 4.0, 0.0], [4e-6, 4e-6, 4.0, 4e-6]),
         ([0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]),
+        ([0.0, 4.0, 1e-17, 2e-17], [4e-6, 4.0, 2.0, 2.0]),
     ],
 )
 def test_velocities_that_run_away_are_no_scale_of_positions(
     ends: list[float], scale: list[float]
 ) -> None:
     """Where positions are 1e40 times smaller their errors would look like nothing."""
-    found = estimate.scales(np.array([[0.0, 0.0, 0.0, 0.0], ends]))
+    found = estimate.scales(np.array([[0.0, 0.0, 0.0, 0.0], ends]), 2.0, 2.0**-53)
     np.testing.assert_allclose(found, scale, rtol=1e-15)

@@ -40,7 +40,7 @@ def error_of(
     u = Periods(own._u, own._period) if own._period else own._u
     eps = float(np.finfo(model.dtype).eps) / 2
     least = LEAST[model.dtype.itemsize]
-    scale = scales(x)
+    scale = scales(x, float(np.ptp(own.t)), eps)
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
 

@@ -24,6 +24,7 @@ _ROWS = 200  # from which on a run's own rows show how large each coordinate bec
 _TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
 _FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
 _SMOOTH = 1e6  # growth beyond which a difference may as well have met a jump of the forces
+_REST = 64.0  # roundings of a position: velocities that move it by less are none
 _WALK = 0.3  # rms of the rounding of a sum, in units of eps/2 times its size (1/sqrt(12) to 1/2)
 
 
@@ -149,7 +150,7 @@ def _growth(run: Run, own: Array, eps: float, again: _Again) -> tuple[Array, Arr
     if len(run) < _ROWS:
         every = max(1, run.steps // _ROWS)
         base = again(1, every).x.astype(float)
-    scale = scales(base)
+    scale = scales(base, float(np.ptp(run.t)), eps)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
 
     def moved(size: float) -> Array:
@@ -239,11 +240,18 @@ def _counts(run: Run, every: int, rows: int) -> Array:
     return np.minimum(np.arange(rows) * every, run.steps)
 
 
-def scales(x: Array) -> Array:
+def scales(x: Array, duration: float, eps: float) -> Array:
     """The largest value of each column; those that only rounding moves count as a millionth of the
-    largest position, or velocity, or of the state where all of these are 0."""
+    largest position, or velocity, or of the state where all of these are 0.
+
+    At rest, where velocities move no position beyond its rounding in that time, theirs is the one
+    that would move the largest by its own size.
+    """
     largest = np.max(np.abs(x), axis=0)
-    halves = np.repeat(np.max(largest.reshape(2, -1), axis=1), len(largest) // 2)
+    most = np.max(largest.reshape(2, -1), axis=1)
+    if 0 < most[1] * duration <= _REST * eps * most[0]:
+        largest[len(largest) // 2 :] = most[1] = most[0] / duration
+    halves = np.repeat(most, len(largest) // 2)
     whole = np.where(halves > 0, halves, np.max(largest))
     scale: Array = np.maximum(largest, np.where(whole > 0, 1e-6 * whole, 1.0))
     return scale
