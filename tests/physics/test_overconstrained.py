@@ -149,6 +149,7 @@ def test_the_check_passes_of_sums(modules: Modules) -> None:
     assert report.passed, report.table()
 
 
+@pytest.mark.slow
 def test_rows_do_not_know_how_what_both_bodies_hang_from_moves(modules: Modules) -> None:
     """A four-bar on a table: hinges across it are zero, however the table is turned."""
     system = read(TURNTABLE)

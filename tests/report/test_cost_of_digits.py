@@ -72,6 +72,7 @@ def test_errors_of_rk4_are_those_of_theory() -> None:
             assert p.evaluations == 4 * p.steps
 
 
+@pytest.mark.slow
 def test_no_number_of_digits_is_left_out() -> None:
     r = measured()
     rows = page.digit_rows(r)

@@ -108,6 +108,7 @@ def test_wrong_ones_of_multipliers_fail(
     assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
 
 
+@pytest.mark.slow
 def test_slopes_along_what_jumps_set_are_right(modules: Modules) -> None:
     text = ON_A_ROD.replace('"x_dot**2 + y_dot**2"', '"m*(x_dot**2 + y_dot**2)"')
     text = text.replace("[inputs]", "[parameters]\nm = 1.5\n[inputs]").replace(
