@@ -298,7 +298,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert done.exit_code == 0, done.output
     assert "smallest error" in done.output
     assert re.search(r"(?m)^wrote .*report\.html$", done.output)
-    assert re.search(r"(?m)^for \d+ digits up to t = 20 s: (rk4|dp8) with h = ", done.output)
+    best = r"(?m)^for \d+(?: to \d+)? digits up to t = 20 s: ((rk4|dp8) with h|adaptive .*tol) = "
+    assert re.search(best, done.output)
     assert (tmp_path / "mass_spring" / "report.html").read_text().startswith("<!DOCTYPE html>")
     assert json.loads(file.read_text())[0]["scene"] == "mass_spring"
     short = CliRunner().invoke(main, [*words, "--digits", "8"])
