@@ -40,7 +40,7 @@ class Accelerations:
     def staged(self) -> tuple[Function, Function]:
         """What parameters alone decide, as a function of its own; and the rest."""
         first, rest = outline.staged(self.whole, self.own)
-        more = [self._corrected[0]] if self._corrected else []
+        more = [self._correction_parts[0]] if self._correction_parts else []
         names = [o.name for f in (first, *more) for o in f.outputs]
         others = ("signal", "rate_terms")  # what else steps read parameters for
         read = {n for name in others if (f := self.target.program.functions.get(name))
@@ -55,7 +55,7 @@ class Accelerations:
         ), rest
 
     @cached_property
-    def _corrected(self) -> tuple[Function, Function] | None:
+    def _correction_parts(self) -> tuple[Function, Function] | None:
         """The correction onto the constraints in the same two parts."""
         whole = self.target.program.functions.get("projection")
         if whole is None:
@@ -67,8 +67,8 @@ class Accelerations:
     @cached_property
     def correction(self) -> tuple[Function, bool]:
         """The correction onto the constraints; whether its sines are those of the accelerations."""
-        assert self._corrected is not None
-        rest = self._corrected[1]
+        assert self._correction_parts is not None
+        rest = self._correction_parts[1]
         angles, apart = trig.apart(rest, self.target.names)
         known = {(frozenset(a.terms), a.offset): a for a in self.angles}
         pairs = [(a, known.get((frozenset(a.terms), a.offset))) for a in angles]

@@ -34,7 +34,7 @@ def projected(lane: Lane) -> CFunction:
     return CFunction(
         f"{lane.prefix}_projected{lane.end}",
         lane.mask if lane.name else f"{lane.prefix}_status",
-        (*out, *map(lane.argument, _placed(lane, "q", "qd", "s", "t", "c")), *told),
+        (*out, *map(lane.argument, _placed(lane)), *told),
         qualifier=lane.qualifiers[NOINLINE],
     )
 
@@ -45,7 +45,7 @@ def _correction(lane: Lane) -> Computed:
     places = [f"d[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
         function, "projection", c.filled(lane.real.name, "d"), places, doc=sentence(function),
-        takes=_placed(lane, "q", "qd", "s", "t", "c"),
+        takes=_placed(lane),
     )  # fmt: skip
 
 
@@ -58,14 +58,13 @@ def _rate_terms(lane: Lane) -> Computed | None:
     places = [f"rates[{k}]" for k in range(len(function.outputs))]
     return lane.computed(
         function, "rate_terms", c.filled(lane.real.name, "rates"), places, doc=RATE_TERMS,
-        takes=_placed(lane, "q", "qd", "t", "c"), constants=own, inline=False,
+        takes=_placed(lane, sines=False), constants=own, inline=False,
     )  # fmt: skip
 
 
-def _placed(lane: Lane, *names: str) -> tuple[str, ...]:
-    """What constraints are read from, of these names, as far as it is there."""
-    absent = {
-        *(["t"] if TIME not in lane.target.program["projection"].uses else []),
-        *(["s"] if not lane.accelerations.correction[1] else []),
-    }
-    return tuple(n for n in lane.there if n in names and n not in absent)
+def _placed(lane: Lane, sines: bool = True) -> tuple[str, ...]:
+    """What constraints are read from: q, qd, s, t, c, as far as they are."""
+    timed = TIME in lane.target.program["projection"].uses
+    known = sines and lane.accelerations.correction[1]
+    names = ("q", "qd", *(["s"] if known else []), *(["t"] if timed else []), "c")
+    return tuple(n for n in lane.there if n in names)
