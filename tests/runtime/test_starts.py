@@ -9,6 +9,8 @@ import pytest
 from conftest import Modules
 
 from eomc.base.errors import EomcError
+from eomc.runtime import starts
+from eomc.scene import formulas
 from eomc.scene.read import parse
 from eomc.scene.scene import Scene
 
@@ -96,3 +98,8 @@ def test_one_under_constraints_is_assembled(modules: Modules) -> None:
     bob = modules("pendulum_xy")
     run = bob.simulate(params={"l": 1.5}, steps=2)
     assert run["y"][0] == -1.5 and bob.simulate(steps=2)["y"][0] == -0.8
+
+
+def test_starts_know_every_function_of_formulas() -> None:
+    """A built module imports nothing of eomc, so it has a table of its own."""
+    assert {*starts._FUNCTIONS} == {*formulas.FUNCTIONS} - {"dot"}
