@@ -64,13 +64,13 @@ class AdaptiveRun(Run):
     rejected: int = field(kw_only=True)
     stiff_steps: int = field(kw_only=True)
     _times: Array = field(kw_only=True)
-    _h_most: float = field(kw_only=True)
-    _stiff: bool = field(kw_only=True)
-    _begin: Array = field(kw_only=True)  # q and qd at t0, (2, nq)
     _t_end: float = field(kw_only=True)
-    _happened: tuple[Array, Array] = field(default=_NONE, kw_only=True)  # which, rows of t, q, qd
-    stopped: str = field(default="", kw_only=True)
-    limit: float = field(default=float("nan"), kw_only=True)
+    # what few runs have is set behind: a run of few steps takes no longer than its making
+    _h_most: float = field(default=0.0, init=False)
+    _stiff: bool = field(default=False, init=False)
+    _happened: tuple[Array, Array] = field(default=_NONE, init=False)  # which, rows of t, q, qd
+    stopped: str = field(default="", init=False)
+    limit: float = field(default=float("nan"), init=False)
     _period: float = field(default=0.0, init=False)  # over which inputs are held, if any are,
     _held: Array | None = field(default=None, init=False)  # and these, (n, nu)
 
@@ -78,6 +78,11 @@ class AdaptiveRun(Run):
     def t(self) -> Array:
         """The times of the rows, (n,), s."""
         return self._times
+
+    @cached_property
+    def _begin(self) -> Array:
+        """q and qd at t0, (2, nq): its first row, where nobody said otherwise."""
+        return np.array([self._rows[0][0], self._rows[1][0]])
 
     @property
     def message(self) -> str:
@@ -161,6 +166,7 @@ class AdaptiveRun(Run):
     def _at(self, times: Array, rows: Array) -> AdaptiveRun:
         """Itself with other rows, (2, n, nq)."""
         made = copy(self)
+        made._begin = self._begin
         for name in ("q", "qd", "outputs"):  # which are kept once they were made
             made.__dict__.pop(name, None)
         made._rows, made._times, made._energy = rows, times, None
@@ -225,11 +231,11 @@ class AdaptiveRun(Run):
             kept["params"], 1, held if values is None or held is not None else LEFT_OUT,
             kept["method"], kept["evaluations"],
             tol=kept["tol"], rejected=kept["rejected"], stiff_steps=kept.get("stiff_steps", 0),
-            _times=kept["times"], _h_most=kept["h_most"], _stiff=bool(kept.get("stiff", False)),
-            _begin=kept["begin"], _t_end=kept["t_end"],
-            _happened=(kept["which"], kept["event_rows"]), stopped=kept["stopped"],
-            limit=kept["limit"],
+            _times=kept["times"], _t_end=kept["t_end"],
         )  # fmt: skip
+        made._h_most, made._stiff = kept["h_most"], bool(kept.get("stiff", False))
+        made._begin, made._happened = kept["begin"], (kept["which"], kept["event_rows"])
+        made.stopped, made.limit = kept["stopped"], kept["limit"]
         made._period, made._held = kept.get("period", 0.0), values
         made._told_inputs()
         return made
@@ -284,10 +290,10 @@ def plain(
     (from_q, from_qd, at_p), p, (address, real, null) = model._at, model._p0, model._c
     held, at_u = None, null
     if u is not None:
-        if not (type(u) is float or (type(u) is np.ndarray and u.ndim == 1 and len(u) == model.nu)):
+        held = np.array([u], model.dtype) if type(u) is float else u
+        if (at_u := model._listed(held, (model.nu or None,))) is None:
             return None
-        held = model._inputs([u] if type(u) is float else u).copy()  # type: ignore[union-attr]
-        at_u = address(real, held)
+        held = held.copy()
     if q0 is not None:
         from_q = model._from(q0, "q0")[1]
     if qd0 is not None:
@@ -313,7 +319,7 @@ def plain(
     return AdaptiveRun(
         model, t0, both, (end - t0) / steps if steps else 0.0, steps, "ok", p, 1, held, "gauss16",
         work.evaluations, tol=tol, rejected=work.rejected, stiff_steps=work.stiff_steps,
-        _times=whole[:filled], _h_most=0.0, _stiff=False, _begin=both[:, 0], _t_end=end,
+        _times=whole[:filled], _t_end=end,
     )  # fmt: skip
 
 
@@ -382,9 +388,11 @@ def run(
     made = AdaptiveRun(
         model, t0, both, (work.t - t0) / steps if steps else t_end - t0, steps, said, p, 1,
         acting.u, "gauss16", work.evaluations, tol=tol,
-        rejected=work.rejected, stiff_steps=work.stiff_steps, _times=stamps, _h_most=h_most,
-        _stiff=bool(stiff), _begin=both[:, 0] if own else np.array([q, qd]), _t_end=t_end,
+        rejected=work.rejected, stiff_steps=work.stiff_steps, _times=stamps, _t_end=t_end,
     )  # fmt: skip
+    made._h_most, made._stiff = h_most, bool(stiff)
+    if not own:
+        made._begin = np.array([q, qd])
     if acting.periods:
         made._period, made._held = acting.periods.period, np.array(acting.values)
         made._told_inputs()

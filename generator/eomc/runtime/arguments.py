@@ -146,9 +146,9 @@ class Arguments:
         held = self._c[2] if u is None else self._pointer(self._inputs(u))
         return held, self._at[2] if params is None else self._pointer(self._parameters(params))
 
-    def _listed(self, x: Any) -> Any:
-        """A state (nq,) as a list, which C takes soonest; None for all that needs a closer look."""
-        if type(x) is ndarray and x.dtype is self.dtype and x.shape == self._shape:
+    def _listed(self, x: Any, shape: tuple[int | None, ...] | None) -> Any:
+        """Such numbers as a list, which C takes soonest; None for all that needs a closer look."""
+        if type(x) is ndarray and x.dtype is self.dtype and x.shape == shape:
             numbers = x.tolist()
             if isfinite(sum(numbers)):  # is quickest; it may overflow all the same
                 return numbers
@@ -212,7 +212,7 @@ class Arguments:
 
     def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
         """A start, (nq,), and what C reads it from."""
-        if (numbers := self._listed(x0)) is not None:
+        if (numbers := self._listed(x0, self._shape)) is not None:
             return x0, numbers  # type: ignore[return-value]  # an array, as was seen
         x = self._array(x0, name, self.nq)
         if x.ndim != 1:

@@ -77,7 +77,7 @@ class Functions(Arguments):
         at: Any
         moving: Array | None
         if name in _OF_POSITION:
-            at, moving, from_q, from_qd = q, None, self._listed(q), null
+            at, moving, from_q, from_qd = q, None, self._listed(q, self._shape), null
             if from_q is None:
                 at = self._array(q, "q", self.nq)
                 from_q = address(real, at)
