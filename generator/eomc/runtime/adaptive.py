@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from .adaptive_arguments import BOTH, as_end, as_limits, as_times, as_tolerance
 from .adaptive_error import error_of
-from .adaptive_memory import FULL, Kept, rows_for
+from .adaptive_memory import FULL, Kept, Rows
 from .arguments import Array, as_number
 from .begun import infinite_at_start
 from .columns import ByName
@@ -329,34 +329,29 @@ def run(
     progress: Callable[[int, int], None] | None, stiff: bool = False,
 ) -> AdaptiveRun:  # fmt: skip
     """A run from checked arguments, whatever its status; times (n,) later than t0."""
-    (address, real, null), nq = model._c, model.nq
+    (address, real, _), nq = model._c, model.nq
     work = model._ffi.new("adaptive_work *")
     if stiff:
         work.stiff = 1
     acting = Acting(model, u, t0, t_end, q, qd)
     at_p = model._at[2] if p is model._p0 else address(real, p)
     events = Found(model) if model.events else None
-    own, each = times is None, 2 if events else 1  # rows of a step, beside a jump
+    each = 2 if events else 1  # rows of a step, beside a jump
     room = max(_ROOM, min(model._room, _AT_ONCE // nq))
-    pieces: list[tuple[Array, Array]] = []  # times and rows
-    whole, to, count = _rows(model, 1 + each * room if times is None else len(times))
-    stamps = None if times is None else np.ascontiguousarray(times, model.dtype)
-    to_t = to if stamps is None else address(real, stamps)
+    rows = Rows(model, times, 1 + each * room)
     call = model._lib.adaptive_begin
     place: tuple[Any, ...] = address(real, q), address(real, qd), t0
-    filled, said, kept = 0, "ok", Kept(model)
+    said, kept = "ok", Kept(model)
     try:
         while True:
-            left, to_q, begun = count - filled, to + (count + nq * filled), perf_counter()
-            most = (left - (not filled)) // each if own else room
+            begun = perf_counter()
+            most, *to = rows.taken(room, each)
             found = call(
-                *place, acting.stop, tol, h_most, acting.at, most,
-                null if own else to_t + filled, 0 if own else left,
-                to_t + filled if own else null, to_q, to_q + nq * count,
+                *place, acting.stop, tol, h_most, acting.at, most, *to,
                 *(events.room() if events else ()), at_p, work,
             )  # fmt: skip
             kept.count(work, bool(events))
-            filled += _kept(work, events)
+            rows.filled += _kept(work, events)
             said = STATUS[found]
             ended, cut = found or (events and work.stopped), work.t < acting.stop
             if ended or not acting.on(work):
@@ -368,20 +363,13 @@ def run(
             if not (room := kept.at_most(room, each)):
                 said = FULL
                 break
-            if own and count - filled < each:
-                pieces.append(_parts(whole, count, filled, nq))
-                whole, to, count = _rows(model, 1 + each * room)
-                to_t, filled = to, 0
+            rows.more(room, each)
         if progress is not None and said == "ok":
             progress(1000, 1000)
     except KeyboardInterrupt:
-        filled += _kept(work, events)
+        rows.filled += _kept(work, events)
         said = "interrupted"
-    own_stamps, both = _parts(whole, count, filled, nq)
-    stamps = own_stamps if stamps is None else stamps[:filled]
-    if pieces:
-        stamps = np.concatenate([*(t for t, _ in pieces), stamps])
-        both = np.concatenate([*(rows for _, rows in pieces), both], axis=1)
+    stamps, both = rows.all()
     steps = work.steps
     odd = events or model.constraint_names or nq * steps > _AT_ONCE
     model._room = 0 if odd else steps + _ROOM
@@ -391,7 +379,7 @@ def run(
         rejected=work.rejected, stiff_steps=work.stiff_steps, _times=stamps, _t_end=t_end,
     )  # fmt: skip
     made._h_most, made._stiff = h_most, bool(stiff)
-    if not own:
+    if times is not None:
         made._begin = np.array([q, qd])
     if acting.periods:
         made._period, made._held = acting.periods.period, np.array(acting.values)
@@ -404,18 +392,6 @@ def run(
         made.singular_steps = work.singular
         made.first_singular = work.first if work.singular else made.first_singular
     return made
-
-
-def _rows(model: Model, count: int) -> tuple[Array, Any, int]:
-    """Room for so many times and rows, one behind the other, its address, and how many."""
-    whole = rows_for(model, count)
-    address, real, _ = model._c
-    return whole, address(real, whole), count
-
-
-def _parts(whole: Array, count: int, filled: int, nq: int) -> tuple[Array, Array]:
-    """The times (n,) and rows (2, n, nq) that fill such room."""
-    return whole[:filled], whole[count:].reshape(2, count, nq)[:, :filled]
 
 
 def _kept(work: Any, events: Found | None) -> int:

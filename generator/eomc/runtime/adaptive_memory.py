@@ -34,6 +34,51 @@ class Kept:
         return int(min(steps, max(0.0, self.most - self.rows) // each))
 
 
+class Rows:
+    """Times and rows as C fills them, in pieces: one after each step, or at `times` (n,)."""
+
+    def __init__(self, model: Model, times: Array | None, count: int) -> None:
+        self.model, self.own = model, times is None
+        self.times = None if times is None else np.ascontiguousarray(times, model.dtype)
+        self.pieces: list[tuple[Array, Array]] = []
+        self._piece(count if times is None else len(times))
+
+    def _piece(self, count: int) -> None:
+        address, real, _ = self.model._c
+        self.whole, self.count, self.filled = rows_for(self.model, count), count, 0
+        self.to = address(real, self.whole)
+        self.to_t = self.to if self.times is None else address(real, self.times)
+
+    def more(self, steps: int, each: int) -> None:
+        """Have room for a step of `each` rows at least: where there is none, for so many steps."""
+        if self.own and self.count - self.filled < each:
+            self.pieces.append(self._filled())
+            self._piece(1 + each * steps)
+
+    def taken(self, steps: int, each: int) -> tuple[Any, ...]:
+        """What C takes: steps at most, times and how many, room for times, for q and for qd."""
+        null, nq, left = self.model._c[2], self.model.nq, self.count - self.filled
+        to_q = self.to + (self.count + nq * self.filled)
+        at = to_q, to_q + nq * self.count
+        if self.own:
+            return (left - (not self.filled)) // each, null, 0, self.to_t + self.filled, *at
+        return steps, self.to_t + self.filled, left, null, *at
+
+    def all(self) -> tuple[Array, Array]:
+        """The times (n,) and rows (2, n, nq)."""
+        times, rows = self._filled()
+        if self.pieces:
+            times = np.concatenate([*(t for t, _ in self.pieces), times])
+            rows = np.concatenate([*(rows for _, rows in self.pieces), rows], axis=1)
+        return times, rows
+
+    def _filled(self) -> tuple[Array, Array]:
+        """Those of the last piece."""
+        times = self.whole if self.times is None else self.times
+        rows = self.whole[self.count :].reshape(2, self.count, self.model.nq)
+        return times[: self.filled], rows[:, : self.filled]
+
+
 def room_for(model: Model) -> float:
     """How many rows and events a run may keep."""
     return PART * machine_memory() / _row(model)
