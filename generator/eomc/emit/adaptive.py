@@ -29,6 +29,7 @@ ROUGHEST = 2 * 0.8**-8  # of the root of tol/2: a step that is refused after two
 LONGEST = 1e4  # times of the motion at the start: by no longer a time the least step is measured
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
+NEAR = 8  # steps near a singular position, before stages are left as they are again
 SMALL = 300  # operations of accelerations, up to which many instances go side by side
 BUSY = 32  # events in one step, without those that happen at once
 
@@ -42,7 +43,8 @@ def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
     vectors, few = (8, 25) if steep(system) else (6, 21)
     stages = METHOD.stages * len(system.coordinates)
-    return vectors * width + stages + few + 2 * len(system.events) + 3 * bool(system.events)
+    more = 2 * len(system.events) + 3 * bool(system.events) + bool(system.constraints)
+    return vectors * width + stages + few + more
 
 
 @dataclass(frozen=True)
@@ -104,10 +106,15 @@ class Stepping:
         out = c.filled(f"{self.method}_stages", "a")
         measured = (c.filled(real, name) for name in ("scale", "rough", "beyond"))
         by = c.given(f"{self.method}_newton", "m")
-        given = (*self.form.around, self.number("tol"), self.number("most"), by)
+        given = (*self.form.around, *self.onto, self.number("tol"), self.number("most"), by)
         told = (*measured, c.filled("int", "sweeps"))
         arguments = (out, *given, *([c.given(real, "cap")] if self.held_at_rest else []), *told)
         return CFunction(f"{self.method}_settled", "int", arguments, qualifier="static")
+
+    @property
+    def onto(self) -> tuple[CArgument, ...]:
+        """Whether stages are moved onto the constraints, where there are."""
+        return (CArgument("int", "onto"),) if self.form.project else ()
 
     @property
     def held_at_rest(self) -> bool:
@@ -120,7 +127,8 @@ class Stepping:
         """What rounding makes of the accelerations over a step."""
         real = self.functions.real
         given = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
-        arguments = (c.filled(real, "cap"), *given, *self.form.around, self.number("tol"))
+        around = (*self.form.around, *self.onto)
+        arguments = (c.filled(real, "cap"), *given, *around, self.number("tol"))
         return CFunction(f"{self.method}_capped", "int", arguments, qualifier="static")
 
     @cached_property
@@ -201,6 +209,7 @@ def steps(made: Stepping) -> Adaptive:
         events=bool(target.system.events),
         project=form.project,
         whole=form.whole,
+        near=NEAR,
         settle=made.settle,
         sweep=form.sweep,
         step=made.step,

@@ -334,13 +334,23 @@ class Functions:
     @cached_property
     def projected(self) -> CFunction:
         """A state behind a step, moved onto the constraints; of the plain form."""
-        state = (*(c.filled(self.real, n) for n in "rv"), self.argument("q"))
-        read = self.read(self.target.program["projection"]) if self.projection else frozenset()
-        more = self.usual(*(n for n in ("t", "p") if n in read))
+        moved, more = self._moved
         far = CArgument("int *", "singular")
-        return CFunction(
-            f"{self.prefix}_projected", self.status, (*state, *more, far), qualifier="static"
-        )
+        arguments = (*moved, self.argument("q"), *more, far)
+        return CFunction(f"{self.prefix}_projected", self.status, arguments, qualifier="static")
+
+    @cached_property
+    def onto(self) -> CFunction:
+        """A stage moved onto them, to first order."""
+        moved, more = self._moved
+        return CFunction(f"{self.prefix}_onto", "int", (*moved, *more), qualifier="static")
+
+    @property
+    def _moved(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:
+        """The state that is moved onto constraints, and what else they are read from."""
+        read = self.read(self.target.program["projection"]) if self.projection else frozenset()
+        state = tuple(c.filled(self.real, n) for n in "rv")
+        return state, self.usual(*(n for n in ("t", "p") if n in read))
 
     @cached_property
     def acceleration(self) -> Computed:

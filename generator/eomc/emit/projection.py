@@ -9,6 +9,7 @@ from eomc.emit.c_names import Target
 from eomc.emit.functions import Functions
 from eomc.emit.plain.constraint_views import Project, Projection
 from eomc.emit.plain.parts import Computed
+from eomc.integrators.tableaux import METHODS
 
 # beside singular positions: squares of what corrections may change; how much more rounding is
 SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
@@ -33,7 +34,7 @@ def view(
     functions: Functions, projection: Computed, function: CFunction, call: str,
     rate_terms: Computed | None = None, state: Mapping[str, str] | None = None, *,
     lane: str = "", L: str = "", mask: str = "", extent: str = "", increments: bool = False,
-    sines: str = "", sines_call: str = "",
+    sines: str = "", sines_call: str = "", onto: CFunction | None = None,
 ) -> Projection:  # fmt: skip
     """The view for one form and lane. state: where it is, for `rate_terms`."""
     target = functions.target
@@ -51,6 +52,7 @@ def view(
         increments=increments,
         sines=sines,
         sines_call=sines_call,
+        onto=onto,
         projection=projection,
         function=function,
         call=call,
@@ -76,7 +78,12 @@ def plain(functions: Functions) -> Projection | None:
         return None
     state = {"q": "r", "qd": "v"}
     call = projection.function.call(**state)
-    return view(functions, projection, functions.projected, call, functions.rate_terms, state)
+    run = functions.target.system.run
+    swept = run.tolerance is not None or any(METHODS[name].sweeps for name in run.methods)
+    return view(
+        functions, projection, functions.projected, call, functions.rate_terms, state,
+        onto=functions.onto if swept else None,
+    )  # fmt: skip
 
 
 def project(functions: Functions) -> Project:

@@ -13,8 +13,8 @@ from eomc.emit.plain.parts import Computed
 from eomc.program.program import TIME
 
 
-def view(functions: Functions, lane: Lane) -> Projection:
-    """The view of a lane."""
+def view(functions: Functions, lane: Lane, swept: bool) -> Projection:
+    """The view of a lane. swept: whether sweeps may take stages that are moved."""
     made, state = _correction(lane), {"q": "at", "qd": "moving"}
     call = made.function.call(**state)
     terms = None if lane.name else _rate_terms(lane)
@@ -24,6 +24,7 @@ def view(functions: Functions, lane: Lane) -> Projection:
         mask=lane.mask, extent=lane.extent, increments=True,
         sines=f"{lane.prefix}_sines{lane.end}" if sines else "",
         sines_call=f"{lane.prefix}_sines_at{lane.end}(&own, at)" if sines and lane.alone else "",
+        onto=None if lane.name or not swept else onto(lane),
     )  # fmt: skip
 
 
@@ -37,6 +38,16 @@ def projected(lane: Lane) -> CFunction:
         (*out, *map(lane.argument, _placed(lane)), *told),
         qualifier=lane.qualifiers[NOINLINE],
     )
+
+
+def onto(lane: Lane) -> CFunction:
+    """A stage moved onto the constraints, to first order."""
+    moved = tuple(c.filled(lane.real.name, n) for n in ("at", "moving"))
+    more = (n for n in _placed(lane, sines=False) if n in "tc")
+    return CFunction(
+        f"{lane.prefix}_onto", "int", (*moved, *map(lane.argument, more)),
+        qualifier=lane.qualifiers[NOINLINE],
+    )  # fmt: skip
 
 
 def _correction(lane: Lane) -> Computed:

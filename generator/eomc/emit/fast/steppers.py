@@ -15,6 +15,7 @@ from eomc.emit.coefficients import literal, matrix, numbers, rounded, tableau
 from eomc.emit.fast import views
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, NOINLINE, Lane
+from eomc.emit.fast.projection import onto
 from eomc.emit.functions import Functions
 from eomc.emit.plain.views import Slopes
 from eomc.integrators.tableaux import METHODS, RK4, Method, Row
@@ -305,7 +306,8 @@ class Steppers:
         P = f"{self.one.prefix}_{m.name}"
         out = c.filled(f"{P}_stages", "b")
         given = (c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"))
-        arguments = (out, *given, *self.stepping(self.one))
+        onto = (CArgument("int", "onto"),) if self.functions.projection else ()
+        arguments = (out, *given, *self.stepping(self.one), *onto)
         return CFunction(f"{P}_sweep", "int", arguments, qualifier="static")
 
     def stages(self, m: Method) -> views.Stages:
@@ -333,6 +335,9 @@ class Steppers:
                 wide, a="f", q="at", qd="moving", t="t + nodes", u="u ? given : NULL", c="&wide"
             ),
             alone=self.accelerate(lane, a="one", q="x", qd="v", t="t + c_[i + j]*h"),
+            onto=onto(lane).call(at="x", moving="v", t="t + c_[i + j]*h")
+            if self.functions.projection
+            else "",
         )
 
     def sweeps(self, m: Method) -> views.Sweeps:
@@ -364,10 +369,11 @@ class Steppers:
             bA=numbers(m.b_a, real),
             settle=settle,
             settle_call=settle.call(a="&a", fresh="!smooth"),
+            constrained=bool(self.functions.projection),
             sweep_settling=sweep.call(b="&b", a="a", w=within),
-            sweep_first=sweep.call(b="&a", a="&b", w=before),
-            sweep_back=sweep.call(b="&b", a="&a", w=within),
-            sweep_forth=sweep.call(b="&a", a="&b", w=within),
+            sweep_first=sweep.call(b="&a", a="&b", w=before, onto="0"),
+            sweep_back=sweep.call(b="&b", a="&a", w=within, onto="0"),
+            sweep_forth=sweep.call(b="&a", a="&b", w=within, onto="0"),
             start=self.accelerate(lane, a="f"),
             solve=self.implicit(m),
         )

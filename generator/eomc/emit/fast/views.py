@@ -273,7 +273,8 @@ class Gauss(Named):
 class Stages(Named):
     """c/fast/stages.c.jinja: tableau, functions, calls. padded: stages, to whole registers.
 
-    extrapolated: A and A A over the accelerations of the step before, where a method takes them.
+    onto: the call that moves a stage onto constraints, where there are. extrapolated: A and A A
+    over the accelerations of the step before, where a method takes them.
     """
 
     TEMPLATE: ClassVar[str] = "c/fast/stages.c"
@@ -290,6 +291,7 @@ class Stages(Named):
     sweep: CFunction
     together: str
     alone: str
+    onto: str
 
 
 @dataclass(frozen=True)
@@ -321,6 +323,7 @@ class Sweeps(Named):
     sweep_forth: str
     start: str
     solve: CFunction
+    constrained: bool
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ class Projection:
     loose, part: of the largest of their terms, and of a row's own, what its rate may be then.
     little, slight: squares of parts of all coordinates and of all velocities, which corrections
     near a singular position are below; rounded: of coordinates, where one may be rounding there.
-    sines, sines_call: their type where a caller may know them, and how they are had at `at`.
+    sines, sines_call: their type where a caller may know them, and how they are had at `at`. onto:
+    of a stage, where sweeps may take it.
     """
 
     TEMPLATE: ClassVar[str] = "c/projection.c"
@@ -48,6 +49,7 @@ class Projection:
     rounded: str
     sines: str
     sines_call: str
+    onto: CFunction | None
 
 
 @dataclass(frozen=True)

@@ -280,12 +280,13 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     method = f"{plain.prefix}_{m.name}"
     around = plain.usual(*plain.state, "h", "u", "p")
     shared = implicit(plain, [m])
+    onto = (CArgument("int", "onto"),) if m.sweeps and plain.projection else ()
     stages = CFunction(
         f"{method}_evaluated",
         plain.status,
         (
             *(c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid")),
-            c.given(plain.real, "a"), *around,
+            c.given(plain.real, "a"), *around, *onto,
         ),
         qualifier="static",
     )  # fmt: skip
@@ -316,6 +317,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
         solve=solve,
         step=one,
         stage=accelerate(qdd="f + NQ*i", q="r", qd="v", t=f"t + {method}_c[i]*h"),
+        onto=plain.onto.call(t=f"t + {method}_c[i]*h") if onto else "",
         slopes_call=shared.slopes.call(),
         start=accelerate(qdd="a"),
         sweep=stages.call(),
@@ -333,7 +335,8 @@ def _adaptive(plain: Functions) -> list[View]:
     m, method = adaptive.METHOD, f"{plain.prefix}_{adaptive.METHOD.name}"
     around = plain.usual(*plain.state, "h", "u", "p")
     values = (c.filled(f"{method}_stages", "b"), c.given(f"{method}_stages", "a"))
-    sweep = CFunction(f"{method}_sweep", "int", (*values, *around), qualifier="static")
+    onto = (CArgument("int", "onto"),) if plain.projection else ()
+    sweep = CFunction(f"{method}_sweep", "int", (*values, *around, *onto), qualifier="static")
     accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
     nodes = Nodes(
         **plain.names,
@@ -345,12 +348,13 @@ def _adaptive(plain: Functions) -> list[View]:
         AA=coefficients["AA"],
         sweep=sweep,
         stage=accelerate(qdd="f", q="r", qd="v", t="t + c[i]*h"),
+        onto=plain.onto.call(t="t + c[i]*h") if onto else "",
     )
     end = f"{c.member('x', 't')} + h"
-    onto = plain.projected.call(r="at", v="moving", t=end, singular="&singular")
+    ended = plain.projected.call(r="at", v="moving", t=end, singular="&singular")
     form = adaptive.Form(
         around, sweep.call(b="to", a="from"), accelerate(qdd="f"), plain.NQ,
-        project=onto if plain.projection else "", whole=True,
+        project=ended if plain.projection else "", whole=True,
     )  # fmt: skip
     many = [adaptive.batch(plain)] if plain.target.system.run.batch else []
     return [nodes, *events.views(plain, form), *many]

@@ -232,7 +232,10 @@ class Implicit(Named):
 
 @dataclass(frozen=True)
 class Gauss(Named):
-    """c/plain/gauss.c.jinja: a tableau, functions, calls. method: what its C names begin with."""
+    """c/plain/gauss.c.jinja: a tableau, functions, calls. method: what its C names begin with.
+
+    onto: the call that moves a stage onto constraints, of methods that find stages by sweeps alone.
+    """
 
     TEMPLATE: ClassVar[str] = "c/plain/gauss.c"
     title: str
@@ -254,6 +257,7 @@ class Gauss(Named):
     solve: CFunction
     step: CFunction
     stage: str
+    onto: str
     slopes_call: str
     start: str
     sweep: str
@@ -265,7 +269,10 @@ class Gauss(Named):
 
 @dataclass(frozen=True)
 class Nodes(Named):
-    """c/plain/nodes.c.jinja: a sweep over the stages of a method, as adaptive steps take it."""
+    """c/plain/nodes.c.jinja: a sweep over the stages of a method, as adaptive steps take it.
+
+    onto: the call that moves a stage onto constraints, where there are.
+    """
 
     TEMPLATE: ClassVar[str] = "c/plain/nodes.c"
     title: str
@@ -276,6 +283,7 @@ class Nodes(Named):
     AA: tuple[str, ...]
     sweep: CFunction
     stage: str
+    onto: str
 
 
 @dataclass(frozen=True)
