@@ -233,21 +233,23 @@ class Constrained(Frames):
     def equilibrium(
         self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, u: Any = None,
         free: Collection[str] | None = None, *, t: float = 0.0, params: Parameters = None,
-    ) -> tuple[Array, Array | None]:  # fmt: skip
+    ) -> tuple[Any, ...]:  # fmt: skip
         """(q, u) where no force is left, so that q̈ = 0: by Newton's method from the guess q, u.
 
-        q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates and
-        inputs that are found, all coordinates where None; the others stay. u None: the scene's
-        signals. u comes back as (nu,), None where the scene has no inputs.
-        Raises MotionError, status "no convergence", where none is found.
+        q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates,
+        rates and inputs that are found, all coordinates where None; the others stay. Where a rate,
+        "charge_dot", is among them, (q, qd, u) comes back: a steady motion, if no force changes
+        along it. u None: the scene's signals. u comes back as (nu,), None where the scene has no
+        inputs. Raises MotionError, status "no convergence", where none is found.
         """
         if isinstance(free, str):
             free = (free,)
         moving = qd if np.ndim(qd) else np.full(self.nq, as_number(qd, "qd"))
         at, moving = self._one(*started(self, q, moving, self._parameters(params)))
-        found = self.coordinates if free is None else tuple(free)
+        names = self.coordinates if free is None else tuple(free)
         held = self._inputs(u)
-        return equilibrium(self, at, moving, held, found, as_number(t, "t"), params)
+        found = equilibrium(self, at, moving, held, names, as_number(t, "t"), params)
+        return found if set(names) & set(self._states[self.nq :]) else found[::2]
 
     def _assembled_rows(
         self, q: Array, qd: Array, table: Array, t0: float

@@ -1,6 +1,6 @@
-"""Where a motion rests: Newton's method on the forces, over coordinates and inputs.
+"""Where a motion rests, or goes on steadily: Newton's method on the forces.
 
-Constraints bear forces: what their multipliers can't is what has to vanish, and rows of rates too.
+Constraints bear forces: what their multipliers can't is what has to vanish, and rates of rows too.
 """
 
 from __future__ import annotations
@@ -25,34 +25,36 @@ _SHORTEST = 2.0**-20  # part of a step that is tried
 def equilibrium(
     model: Constrained, q: Array, qd: Array, u: Array | None, free: Collection[str], t: float,
     params: Any,
-) -> tuple[Array, Array | None]:  # fmt: skip
-    """(q, u) near a guess where tau + A^T lambda = C qd + g, what is not `free` as it was.
+) -> tuple[Array, Array, Array | None]:  # fmt: skip
+    """(q, qd, u) near a guess where tau + A^T lambda = C qd + g, what is not `free` as it was.
 
     Forces, not accelerations: D couples these, and may be singular. Their slopes are differences,
     which cost a step some digits and the result none. Where more is free than they determine, each
-    step is the shortest. u None: the signals, also where they depend on q. Under constraints what
-    multipliers can't bear counts, steps are along rows of positions, and rows of rates hold at qd.
+    step is the shortest. u None: the signals, also where they depend on the state. Under
+    constraints what multipliers can't bear counts, and so do rates that rows don't allow; steps
+    are along rows of positions.
     """
-    n, known = model.nq, (*model.coordinates, *model.inputs)
+    n, known = model.nq, (*model._states, *model.inputs)
     if strange := [name for name in free if name not in known]:
         raise ValueError(not_one_of("free", strange[0], known))
     moved = np.array([name in free for name in known])
-    if u is None and np.any(moved[n:]):
+    if u is None and np.any(moved[2 * n :]):
         u = np.asarray(model.signal(q, qd, t, params))
-    z = np.concatenate([q, np.empty(0) if u is None else u]).astype(float)
+    z = np.concatenate([q, qd, np.empty(0) if u is None else u]).astype(float)
     moved = moved[: len(z)]
-    rows = _Rows(model, moved, qd, t, params) if model.constraint_names else None
+    rows = _Rows(model, moved, t, params) if model.constraint_names else None
 
     def held(z: Array) -> Array | None:
-        return None if u is None else z[n:]
+        return None if u is None else z[2 * n :]
 
     def whole(z: Array) -> Array:
-        tau = model.tau(z[:n], qd, t, held(z), params)
-        found: Array = tau.astype(float) - model.bias(z[:n], qd, t=t, params=params)
+        at, moving = z[:n], z[n : 2 * n]
+        tau = model.tau(at, moving, t, held(z), params)
+        found: Array = tau.astype(float) - model.bias(at, moving, t=t, params=params)
         return found
 
     def rest(z: Array) -> Array:
-        return rows.left(z[:n], whole(z)) if rows else whole(z)
+        return rows.left(z, whole(z)) if rows else whole(z)
 
     eps = float(np.finfo(model.dtype).eps)
     onto = rows.onto if rows else lambda z: z
@@ -84,30 +86,39 @@ def equilibrium(
         z, now = there, left
     sizes[:n] = np.max(sizes[:n], initial=0) + (np.max(np.abs(whole(z))) if rows else 0.0)
     if rows:
-        sizes[n:] += rows.of_rates(z[:n])
-    much = ~(np.abs(now) <= np.sqrt(eps) * sizes)  # rounding leaves less
-    if much.any():
-        raise MotionError(
-            f"no equilibrium found from {state_text(q, qd)}: the search ends at "
-            f"q = {np.array2string(z[:n], precision=6, threshold=12)}, where "
-            f"{_too_much(model, now * much)}{_beyond(model, z[:n], qd, held(z), t, params)}; start "
-            "elsewhere, or let another coordinate or input be free",
-            "no convergence",
-        )
-    at = z[:n].astype(model.dtype)
+        sizes[n:] += rows.of_rates(z)
+    much = now * ~(np.abs(now) <= np.sqrt(eps) * sizes)  # rounding leaves less
+    _refuse(model, z, much, state_text(q, qd), held(z), t, params)
+    at, moving = (x.astype(model.dtype) for x in (z[:n], z[n : 2 * n]))
     if u is None:
-        return at, np.asarray(model.signal(at, qd, t, params)) if model.nu else None
-    return at, z[n:].astype(model.dtype)
+        return at, moving, np.asarray(model.signal(at, moving, t, params)) if model.nu else None
+    return at, moving, z[2 * n :].astype(model.dtype)
+
+
+def _refuse(
+    model: Constrained, z: Array, much: Array, begun: str, u: Array | None, t: float, params: Any
+) -> None:  # fmt: skip
+    """Raise MotionError where a search ends with too much left."""
+    if not much.any():
+        return
+    q, qd = z[: model.nq], z[model.nq : 2 * model.nq]
+    raise MotionError(
+        f"no equilibrium found from {begun}: the search ends at "
+        f"q = {np.array2string(q, precision=6, threshold=12)}, where "
+        f"{_too_much(model, much)}{_beyond(model, q, qd, u, t, params)}; start elsewhere, or let "
+        f"another coordinate, rate (free=[..., '{model._states[model.nq]}']) or input be free",
+        "no convergence",
+    )
 
 
 def _too_much(model: Constrained, left: Array) -> str:
-    """What keeps a state from being an equilibrium: the largest force, or a row of rates."""
-    n, rows = model.nq, model._rows
+    """What keeps a state from being an equilibrium: rates that rows don't allow, or a force."""
+    n = model.nq
+    if left[n:].any():
+        worst = int(np.argmax(np.abs(left[n:])))
+        return f"the rates break {model.constraint_names[worst]} by {left[n + worst]:.3g}"
     worst = int(np.argmax(np.abs(left[:n])))
-    if left[worst] != 0 or len(left) == n:
-        return f"a force of {left[worst]:.3g} is left on {model.coordinates[worst]}"
-    worst = int(np.argmax(np.abs(left[n:])))
-    return f"the rates break {rows.names[rows.holonomic + worst]} by {left[n + worst]:.3g}"
+    return f"a force of {left[worst]:.3g} is left on {model.coordinates[worst]}"
 
 
 def _beyond(model: Constrained, q: Array, qd: Array, u: Array | None, t: float, params: Any) -> str:
@@ -132,11 +143,10 @@ def _tried(onto: Callable[[Array], Array], z: Array) -> Array | None:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Constraints of a model around coordinates and inputs z, of which `moved` (len(z),) may."""
+    """Constraints of a model around z = [q; qd; u], (len(z),), of which `moved` may be changed."""
 
     model: Constrained
     moved: Array
-    qd: Array
     t: float
     params: Any
 
@@ -150,24 +160,26 @@ class _Rows:
     def along(self, z: Array) -> Array:
         """(k, len(z)): the ways that rows of positions leave to what is free, orthonormal."""
         n, moved = self.model.nq, np.flatnonzero(self.moved[: self.model.nq])
-        _, s, V = np.linalg.svd(self._slopes(z[:n])[: self.model._rows.holonomic, moved])
+        _, s, V = np.linalg.svd(self._slopes(z)[: self.model._rows.holonomic, moved])
         rank = int(np.sum(s > _RANK_TOLERANCE * np.max(s, initial=0)))
         ways = np.zeros((len(moved) - rank, len(z)))
         ways[:, moved] = V[rank:]
         return np.concatenate([ways, np.eye(len(z))[n:][self.moved[n:]]])
 
-    def left(self, q: Array, forces: Array) -> Array:
-        """What no multipliers can bear of the forces (nq,), then what rows of rates lack."""
-        A = self._slopes(q)
+    def left(self, z: Array, forces: Array) -> Array:
+        """What no multipliers can bear of the forces (nq,), then what the rates of rows lack."""
+        n, A = self.model.nq, self._slopes(z)
         forces = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
-        lacking = self.model.constraint_rates(q, self.qd, self.t, self.params)
-        return np.concatenate([forces, lacking[self.model._rows.holonomic :]]).astype(float)
+        lacking = self.model.constraint_rates(z[:n], z[n : 2 * n], self.t, self.params)
+        return np.concatenate([forces, lacking]).astype(float)
 
-    def of_rates(self, q: Array) -> Array:
-        """The terms of each row of rates, in size, that are linear in them."""
-        sizes: Array = (np.abs(self._slopes(q)) @ np.abs(self.qd))[self.model._rows.holonomic :]
+    def of_rates(self, z: Array) -> Array:
+        """The terms of each row's rate, in size, that are linear in the velocities."""
+        n = self.model.nq
+        sizes: Array = np.abs(self._slopes(z)) @ np.abs(z[n : 2 * n])
         return sizes
 
-    def _slopes(self, q: Array) -> Array:
-        A: Array = self.model.constraint_jacobian(q, t=self.t, params=self.params).astype(float)
+    def _slopes(self, z: Array) -> Array:
+        q, t = z[: self.model.nq], self.t
+        A: Array = self.model.constraint_jacobian(q, t=t, params=self.params).astype(float)
         return A
