@@ -39,6 +39,7 @@ h = 0.0025
 method = "dp8"
 tolerance = 1e-10
 duration = 2.0
+batch = true
 """
 
 
@@ -123,6 +124,18 @@ def test_its_own_error_is_that_of_the_closed_loop(sampled: ModuleType) -> None:
     fine = sampled.simulate(u=law, control_period=0.1, tol=1e-13)
     error = abs(run["theta"][-1] - fine["theta"][-1])
     assert 0.5 * error < run.estimate().end["theta"] < 2 * error + 1e-15
+
+
+def test_a_batch_by_tables_is_each_alone_with_its_events(sampled: ModuleType) -> None:
+    tables = 12 * np.cos(np.arange(40) * np.array([[0.3], [0.7], [1.1]]))[..., None]
+    starts = [[0, 0.1], [0, 0.2], [0, 0.3]]
+    run = sampled.simulate_batch(starts, u=tables, control_period=0.05)
+    for k, table in enumerate(tables):
+        alone = sampled.simulate(starts[k], u=table, control_period=0.05)
+        assert (run.q[k, -1] == alone.q[-1]).all() and (run.u[k] == alone.u[[0, -1]]).all()
+        assert (run.saturated[k] == alone.saturated[[0, -1]]).all()
+        for name in ("upright", "noon"):
+            assert run.events[name].of(k).t.tolist() == alone.events[name].t.tolist()
 
 
 def test_events_at_and_between_the_periods_happen_once(sampled: ModuleType) -> None:

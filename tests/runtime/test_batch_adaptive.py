@@ -187,14 +187,15 @@ def test_jumps_and_stops_act_in_each() -> None:
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"u": np.ones((1, 5, 1)), "control_period": 0.1}, "run: give h, for fixed steps$"),
-        ({"control_period": 0.1, "tol": 1e-6}, "give h, for fixed steps, in place of tol"),
-        ({"u": np.ones((1, 5, 1))}, r"u: shape \(1, 5, 1\).*held over the run; tables take h"),
-        ({"u": {"push": np.ones((4, 5))}}, r"u: shape \(4, 5, 1\), .*tables take h"),
+        ({"u": np.ones((1, 5, 1)), "control_period": 0.1}, r"or \(batch, [0-9]{3}, 1\)$"),
+        ({"control_period": 0.1, "tol": 1e-6}, "a batch follows the signals: give u, a row a"),
+        ({"control_period": 0.0, "u": 1.0}, "control_period: 0 is not a period"),
+        ({"u": np.ones((1, 5, 1))}, r"u: shape \(1, 5, 1\).*take control_period=, in s"),
+        ({"u": {"push": np.ones((4, 5))}}, r"u: shape \(4, 5, 1\), .*take control_period="),
         ({"every": 5}, "many_orbits goes by its tolerance, 1e-09, .*give h too, such as h=0.001"),
     ],
 )
-def test_what_takes_fixed_steps_is_told_how_to_have_them(
+def test_what_does_not_fit_a_tolerance_is_told_how_to_have_them(
     orbits: ModuleType, how: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
@@ -208,3 +209,26 @@ def test_a_saved_batch_is_read_again(orbits: ModuleType, tmp_path: Path) -> None
     assert again == run and again.tol == run.tol
     with pytest.raises(ValueError, match="h: belongs to fixed steps"):
         orbits.simulate_batch(*starts(4), h=0.1, tol=1e-6)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_tables_are_held_over_control_periods_as_alone(
+    orbits: ModuleType, shared: bool, tmp_path: Path
+) -> None:
+    """Also by a period that the run cuts off, in one thread or two, and between its rows."""
+    rows, times = (
+        np.random.default_rng(1).normal(0, 0.1, (1 if shared else 20, 8, 1)),
+        [0, 0.5, 2.0],
+    )
+    how: dict[str, Any] = {"times": times, "control_period": 0.27, "tol": 1e-10}
+    q0, qd0 = starts(20)
+    run = orbits.simulate_batch(q0, qd0, u=rows, threads=2, **how)
+    assert same(orbits.simulate_batch(q0, qd0, u={"push": rows[..., 0]}, threads=1, **how), run)
+    for k in (0, 9, 19):
+        alone = orbits.simulate(q0[k], qd0[k], u=rows[0 if shared else k], **how)
+        assert alone.steps == run.steps[k] and np.abs(run.q[k] - alone.q).max() < 1e-9
+        assert np.array_equal(run.u[k], alone.u)
+    run.save(tmp_path / "orbits.npz")
+    for again in (orbits.load_run(tmp_path / "orbits.npz"), pickle.loads(pickle.dumps(run))):
+        assert again == run and np.array_equal(again.u, run.u)
+        assert np.array_equal(again([0.5, 2.0])[0], run.q[:, 1:])

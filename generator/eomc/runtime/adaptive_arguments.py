@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 LOOSEST = 1e-2
 FIXED = {  # what belongs to fixed steps, where nothing is said of it
-    "h": None, "steps": None, "method": None, "every": 1, "out": None, "control_period": None,
+    "h": None, "steps": None, "method": None, "every": 1, "out": None,
 }  # fmt: skip
 BOTH = "times: say where the run ends; give times or duration, not both"
 
@@ -40,7 +40,7 @@ def as_limits(
             "belong: add tolerance = 1e-9 under [run] of its scene"
         )
     if not all(map(is_, fixed, FIXED.values())):
-        for name, value in zip(FIXED, fixed, strict=False):  # the last is asked of batches alone
+        for name, value in zip(FIXED, fixed, strict=True):
             if value is not None and (name, value) not in (("every", 1), ("method", "auto")):
                 asked = tol is not None or h_most is not None or stiff or "auto" in fixed
                 raise ValueError(f"{name}: {_why_not(model, name, bool(asked))}")
@@ -50,10 +50,6 @@ def as_limits(
 
 def _why_not(model: Model, name: str, asked: bool) -> str:
     """Why a run by a tolerance takes no such argument; asked: whether the call asks for one."""
-    if name == "control_period":
-        return "a batch by a tolerance holds inputs over the run: give h, for fixed steps" + (
-            ", in place of tol" if asked else ""
-        )
     if asked:
         return (
             "belongs to fixed steps; tol, h_most and stiff to adaptive ones: give one or the other"

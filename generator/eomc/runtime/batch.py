@@ -63,8 +63,9 @@ class BatchModel(Model):
 
         q0, qd0: (batch, nq), or (nq,) for all alike. params: a dict of numbers or (batch,)
         arrays, Params, or an array (batch, np). u: None, the scene's signals; (nu,) or
-        (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step; a
-        dict of all inputs by name, numbers, (batch,), (batch, steps) or (1, steps).
+        (batch, nu), constant; (batch, steps, nu) or (1, steps, nu), a row held over each step, or
+        over each control_period; a dict of all inputs by name, numbers, (batch,), (batch, steps)
+        or (1, steps).
         threads: as many as there are processors where None. An instance that can't go on, or whose
         start can't be assembled, has its own status and leaves the others alone. Ctrl-C raises
         Interrupted with the run so far. tol: by steps that fit a tolerance, each instance its own.
@@ -77,7 +78,7 @@ class BatchModel(Model):
         if fits(self, h, steps, method, tol, h_most, stiff):
             fitted, whole = batch_adaptive.simulate(
                 self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
-                stiff, (h, steps, method, every, None, control_period),
+                stiff, control_period, (h, steps, method, every, None),
             )  # fmt: skip
             if not whole:
                 raise Interrupted(fitted)
@@ -92,8 +93,7 @@ class BatchModel(Model):
         steps = self._steps(h, duration, steps)
         every = min(as_count(every, "every", 1), RARELY)
         hold = min(as_period(control_period, h), max(steps, 2))
-        if u is None and control_period is not None and self.nu:
-            raise ValueError("control_period: a batch follows the signals: give u, a row a period")
+        batch_adaptive.no_signals(self, u, control_period)
         starts, table, held, codes = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
         if held is not None and hold > 1 and held.shape[1] > 1:
             held = np.ascontiguousarray(np.repeat(held, hold, axis=1)[:, :steps])
@@ -231,7 +231,7 @@ class BatchModel(Model):
         return table
 
     def _input_rows(self, u: Any, steps: int | None) -> Array | None:
-        """(batch or 1, steps or 1, nu); steps None: by a tolerance, which hold inputs."""
+        """(batch or 1, steps or 1, nu); steps None: inputs are held over the run."""
         if u is None:
             return None
         if not self.nu:
@@ -248,7 +248,8 @@ class BatchModel(Model):
             array = array[:, None] if array.ndim == 2 else array.reshape(1, 1, -1)
         if array.ndim != 3 or array.shape[2] != self.nu or array.shape[1] not in (1, steps):
             shapes, wide = f"({self.nu},), (batch, {self.nu})", f"(batch, {steps}, {self.nu})"
-            over = f" or {wide}" if steps else ": by a tolerance held over the run; tables take h"
+            table = ": rows, each held over a control period, take control_period=, in s"
+            over = f" or {wide}" if steps else table
             raise ValueError(f"u: shape {np.shape(u)}, expected {shapes}{over}")
         at = self._pointer(array)
         for k in range(0, array.size, LARGE):

@@ -13,12 +13,13 @@ from numpy.typing import ArrayLike
 
 from .adaptive_arguments import BOTH, as_end, as_limits, as_times
 from .adaptive_memory import FULL, room_for
-from .arguments import Array, as_number
+from .arguments import Array, as_number, as_step_size
 from .batch_run import BatchRun
 from .batch_work import all_of, as_threads, stuck
 from .columns import ByName
 from .happened import FoundInBatch, HappenedInBatch
 from .package import reduced
+from .periods import end_of, held_at, periods_in
 from .slices import longer
 from .trajectory import STATUS
 
@@ -30,7 +31,7 @@ _COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
 _FEW = 64  # steps of an instance before the first look at Ctrl-C
 _NAMES = (
     "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "_begin", "_h_most",
-    "_stiff",
+    "_stiff", "_period",
 )  # fmt: skip
 _HAPPENED = ("event_instances", "which", "event_rows")  # in what is kept of a run
 _ENDS = np.array([*STATUS, "interrupted", FULL])
@@ -55,6 +56,7 @@ class AdaptiveBatchRun(BatchRun):
     _begin: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
     _h_most: float = field(kw_only=True)
     _stiff: bool = field(kw_only=True)
+    _period: float = field(default=0.0, kw_only=True)  # over which a row of _u is held, if any is
     _happened: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
     _stopped: Array | None = field(default=None, kw_only=True)  # 1 + which event, or 0
     _limit: Array | None = field(default=None, kw_only=True)
@@ -85,9 +87,10 @@ class AdaptiveBatchRun(BatchRun):
     def _states(self, times: Array) -> Array:
         model: Any = self._model
         p, limits = self._params, (float(self._times[-1]), self.tol, self._h_most)
+        held = self._held if self._u is None else self._u
         work = _Work(
             model, self._begin.copy(), self.t0, times.astype(model.dtype), limits,
-            self._held, p, self._stiff,
+            (held, self._period), p, self._stiff,
         )  # fmt: skip
         work.leave(stuck(self))
         if len(times) and not work.run(None, None):
@@ -132,7 +135,7 @@ class AdaptiveBatchRun(BatchRun):
     @classmethod
     def _of_kept(cls, model: Any, kept: Mapping[str, Any]) -> AdaptiveBatchRun:
         made = BatchRun._of_kept(model, kept)._all()
-        found = cls(*made, **{name: kept[name] for name in _NAMES})
+        found = cls(*made, **{name: kept[name] for name in _NAMES if name in kept})
         if "which" in kept:
             found._happened = tuple(kept[name] for name in _HAPPENED)
             found._stopped, found._limit = kept["stopped"], kept["limit"]
@@ -146,7 +149,7 @@ def simulate(
     model: BatchModel, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
     params: Any, u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float | None, times: ArrayLike | None,
-    h_most: float | None, stiff: bool, fixed: tuple[Any, ...],
+    h_most: float | None, stiff: bool, control_period: float | None, fixed: tuple[Any, ...],
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
     """`simulate_batch` by a tolerance, and whether it is whole, not cut off by Ctrl-C."""
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
@@ -157,22 +160,30 @@ def simulate(
     elif duration is not None:
         raise ValueError(BOTH)
     rows = as_times(times, t0, model.dtype)
-    starts, table, held, codes = model._instances(q0, qd0, params, u, None, t0)
+    no_signals(model, u, control_period)
+    span, period, count = float(rows[-1]) - t0, 0.0, None
+    if control_period is not None:
+        period = as_step_size(control_period, model.dtype, "control_period")
+        count = periods_in(span, period)
+    starts, table, held, codes = model._instances(q0, qd0, params, u, count, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
     begin = np.array([q, qd])
-    work = _Work(model, begin.copy(), t0, rows, (float(rows[-1]), tol, most), held, table, stiff)
+    limits, over = (float(rows[-1]), tol, most), held is not None and held.shape[1] > 1
+    work = _Work(model, begin.copy(), t0, rows, limits, (held, period), table, stiff)
     work.leave(codes)
     whole = work.run(threads, progress)
     counts = work.counts
     cut = len(STATUS) + int(work.full)
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
-    span = float(rows[-1]) - t0
+    given = held_at(rows, t0, period, held) if held is not None and over else held
     made = AdaptiveBatchRun(
         model, t0, work.rows[0], work.rows[1], span / max(1.0, float(counts["steps"].mean())),
-        counts["steps"], codes, 1, 0, table.copy(), held, "gauss16", tol=tol,
+        counts["steps"], codes, 1, 0, table.copy(), given, "gauss16",
+        held.copy() if held is not None and over else None, tol=tol,
         evaluations=counts["evaluations"], rejected=counts["rejected"],
         stiff_steps=counts["stiff_steps"],
         reached=work.t, _times=rows, _begin=begin, _h_most=most, _stiff=bool(stiff),
+        _period=period,
     )  # fmt: skip
     if work.events:
         made._happened = work.events.all()
@@ -182,17 +193,25 @@ def simulate(
     return made, whole
 
 
+def no_signals(model: BatchModel, u: Any, control_period: Any) -> None:
+    """A ValueError where signals were to be held over control periods: batches follow them."""
+    if u is None and control_period is not None and model.nu:
+        raise ValueError("control_period: a batch follows the signals: give u, a row a period")
+
+
 class _Work:
     """Instances on their way: where each is, its memory, and the rows of all."""
 
     def __init__(
         self, model: BatchModel, begin: Array, t0: float, times: Array,
-        limits: tuple[float, float, float], held: Array | None, table: Array, stiff: bool,
+        limits: tuple[float, float, float], inputs: tuple[Array | None, float], table: Array,
+        stiff: bool,
     ) -> None:  # fmt: skip
+        """limits: the end, tolerance, h_most; inputs: (batch or 1, periods or 1, nu), a period."""
         self.model, (self.q, self.qd), self.times = model, begin, times
-        self.held, self.table, self.limits = held, table, limits  # the end, tolerance, h_most
+        (self.held, self.period), self.table, self.limits = inputs, table, limits
         (count, _), n = self.q.shape, len(times)
-        self.t = np.full(count, t0, model.dtype)
+        self.t0, self.t = t0, np.full(count, t0, model.dtype)
         self.rows = np.empty((2, count, n, model.nq), model.dtype)
         self.kept, self.status = np.zeros(count, "l"), np.zeros(count, "i")
         self.memory = model._ffi.new("adaptive_memory[]", count)
@@ -240,13 +259,32 @@ class _Work:
         return whole
 
     def _group(self, at: int, count: int, look: Callable[[], object] = lambda: None) -> None:
-        """Instances at, ..., at + count - 1 to the end, some steps of each at once."""
+        """Instances at, ..., at + count - 1 to the end, one control period after the other."""
+        model, held = self.model, self.held
+        u, periods, each = model._c[2], 1, 0
+        if held is not None:
+            many, periods, _ = held.shape
+            u, each = model._pointer(held), periods * model.nu if many > 1 else 0
+            u += at * each
+        for k in range(periods):
+            end = self.limits[0]
+            if k + 1 < periods:
+                end = end_of(k, self.t0, self.period, model.dtype)
+            if self._on(at, count, end, u + k * model.nu if k else u, each, look):
+                return  # it was stopped
+        self.open[at : at + count] = False
+        self.ended += count  # a figure for the bar; threads may lose one another's
+        look()
+
+    def _on(
+        self, at: int, count: int, t_end: float, u: Any, u_instance: int,
+        look: Callable[[], object],
+    ) -> bool:  # fmt: skip
+        """These instances to a time, some steps of each at once; whether there is more to do."""
         end = at + count
         model, pointer = self.model, self.model._pointer
-        null, n, many = model._c[2], len(self.times), _FEW
-        u_each = self.held is not None and len(self.held) > 1
+        n, many = len(self.times), _FEW
         p_each = len(self.table) > 1
-        u = null if self.held is None else pointer(self.held[at:end] if u_each else self.held)
         address, (long, integer) = model._c[0], model._whole
         events = self.events.room(count) if self.events else None
         more = True
@@ -254,8 +292,7 @@ class _Work:
             begun = perf_counter()
             more = model._lib.adaptive_batch(
                 count, pointer(self.q[at:end]), pointer(self.qd[at:end]), pointer(self.t[at:end]),
-                *self.limits, u,
-                model.nu if u_each else 0, many, pointer(self.times), n,
+                t_end, *self.limits[1:], u, u_instance, many, pointer(self.times), n,
                 pointer(self.rows[0, at:end]), pointer(self.rows[1, at:end]),
                 *(events.given if events else ()),
                 pointer(self.table[at:end] if p_each else self.table), int(p_each),
@@ -266,7 +303,4 @@ class _Work:
                 self.events.keep(events, at)
             many = min(longer(many, perf_counter() - begun), 2**40)
             look()
-        if not more:
-            self.open[at:end] = False
-            self.ended += count  # a figure for the bar; threads may lose one another's
-            look()
+        return bool(more)

@@ -22,7 +22,7 @@ from .trajectory import STATUS
 if TYPE_CHECKING:
     from .batch import BatchModel
 
-_NAMES = ("_times", "_begin", "_u")
+_NAMES = ("_times", "_begin")
 _CUT = len(STATUS)  # interrupted
 
 
@@ -36,7 +36,6 @@ class TimedBatchRun(BatchRun):
 
     _times: Array = field(kw_only=True)
     _begin: Array = field(kw_only=True)  # q and qd at t0, (2, batch, nq)
-    _u: Array | None = field(kw_only=True)  # over all steps, (batch or 1, steps or 1, nu)
 
     @property
     def t(self) -> Array:
@@ -115,11 +114,13 @@ def _by_steps(
             q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
         if not whole:
             work.status[(work.status == 0) & short] = _CUT
+    given = held
     if held is not None and held.shape[1] > 1:
-        held = _at_rows(held, np.arange(rows) * every, steps)
+        given = _at_rows(held, np.arange(rows) * every, steps)
+    kept = None if every == 1 or held is given else held
     run = BatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
-        held, method,
+        given, method, None if kept is None else kept.copy(),
     )  # fmt: skip
     return run, whole
 
@@ -143,8 +144,8 @@ def _at_times(
         given = _at_rows(held, places[0], asked.steps)
     run = TimedBatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, 1, last, table.copy(),
-        given, method, _times=times,
-        _begin=np.array(starts, model.dtype), _u=None if held is None else held.copy(),
+        given, method, None if held is None else held.copy(), _times=times,
+        _begin=np.array(starts, model.dtype),
     )  # fmt: skip
     return run, whole
 

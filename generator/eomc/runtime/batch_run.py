@@ -22,7 +22,7 @@ from .package import reduced
 from .trajectory import STATUS
 
 _ENDS = np.array([*STATUS, "interrupted"])
-_KEPT = "t0 q qd h steps codes every wanted params held method".split()  # as the fields go
+_KEPT = "t0 q qd h steps codes every wanted params held method _u".split()  # as the fields go
 _OF_ONE = {
     "balance": "balance()", "estimate": "estimate()", "error": "estimate()",
     "section": "section(...)",
@@ -53,6 +53,7 @@ class BatchRun(Values, Fans, Columns):
     _params: Array  # (batch or 1, np)
     _held: Array | None  # at the rows, (batch or 1, n or 1, nu)
     method: str
+    _u: Array | None = None  # (batch or 1, steps or 1, nu), where rows tell some of it only
 
     @cached_property
     def t(self) -> Array:
@@ -104,8 +105,7 @@ class BatchRun(Values, Fans, Columns):
         """(q, qd) of all at any time within the run, t (...,): each (batch, ..., nq).
 
         By steps of the method from the last row before, or by the same steps again, so as exact as
-        the run; nan where an instance did not come so far. Raises ValueError outside of the run, or
-        where rows don't tell the inputs.
+        the run; nan where an instance did not come so far. Raises ValueError outside of the run.
         """
         times = within(self, t)
         asked, place = np.unique(times, return_inverse=True)
@@ -115,9 +115,7 @@ class BatchRun(Values, Fans, Columns):
 
     def _states(self, times: Array) -> Array:
         """(2, batch, n, nq) at ascending times within the run, from the last row before each."""
-        held, every = self._held, self.every
-        if held is not None and held.shape[1] > 1 and every > 1:
-            raise ValueError("u was a table, of which rows tell some values only: take every=1")
+        held, every = self._held if self._u is None else self._u, self.every
         whole, rest = parts(times, self.t0, self.h, self._wanted)
         found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
         for row in np.unique(whole // every):

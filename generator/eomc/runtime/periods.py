@@ -32,10 +32,10 @@ class Periods:
 
 
 def held_at(times: Array, t0: float, period: float, values: Array) -> Array:
-    """Which of values (n, nu) are held at some times, (m, nu): at a start what it begins with."""
-    starts = np.asarray(t0 + period * np.arange(len(values)), times.dtype)
+    """Which of values (..., n, nu) are held at times (m,), (..., m, nu): at a start its own."""
+    starts = np.asarray(t0 + period * np.arange(values.shape[-2]), times.dtype)
     begun = np.searchsorted(starts, times, side="right") - 1
-    return np.asarray(values[np.maximum(begun, 0)])
+    return np.asarray(values[..., np.maximum(begun, 0), :])
 
 
 def as_acting(
@@ -65,7 +65,7 @@ def as_acting(
                 f"u: shape {np.shape(u)}, expected ({model.nu},): one value an input; rows, each "
                 "held over a control period, take control_period=, in s"
             )
-        if len(rows) != (count := _count(span, period)):
+        if len(rows) != (count := periods_in(span, period)):
             raise ValueError(
                 f"u: {len(rows)} rows for {count} control periods of {period:g} s: give a row each"
             )
@@ -77,7 +77,7 @@ def as_acting(
 
 def _few(model: Model, made: Periods, span: float) -> Periods:
     """The same, or a MemoryError where a run can't keep its rows."""
-    count = _count(span, made.period)
+    count = periods_in(span, made.period)
     if count * (model._bytes(1) + _VALUE) > PART * machine_memory():
         raise MemoryError(
             f"control_period: the rows of {count:.3g} periods of {made.period:g} s don't fit in "
@@ -86,9 +86,14 @@ def _few(model: Model, made: Periods, span: float) -> Periods:
     return made
 
 
-def _count(span: float, period: float) -> int:
+def periods_in(span: float, period: float) -> int:
     """Periods in a span, the last of which may be shorter."""
     return max(ceil(span / period * (1 - 1e-12)), 1)
+
+
+def end_of(k: int, t0: float, period: float, dtype: np.dtype[Any]) -> float:
+    """Where the k-th period of a run ends, as the module's numbers hold it."""
+    return float(dtype.type(t0 + (k + 1) * period))
 
 
 class Acting:
@@ -102,7 +107,7 @@ class Acting:
         self.held: Any = None if self.periods else u
         self.values: list[Array] = []  # of each period
         if self.periods:
-            self.count = _count(t_end - t0, self.periods.period)
+            self.count = periods_in(t_end - t0, self.periods.period)
             self._next(t0, q, qd)
 
     @property
@@ -131,7 +136,7 @@ class Acting:
         self.values.append(self.held)
         self.stop = self.t_end
         if done + 1 < self.count:
-            self.stop = float(model.dtype.type(self.t0 + (done + 1) * self.periods.period))
+            self.stop = end_of(done, self.t0, self.periods.period, model.dtype)
 
     @property
     def u(self) -> Any:
