@@ -158,7 +158,7 @@ def test_events_at_and_between_the_periods_happen_once(sampled: ModuleType) -> N
         ({"u": law, "control_period": 0.0}, "control_period: 0 is not a period"),
         ({"u": law, "control_period": math.nan}, "control_period: nan is not a finite number"),
         ({"u": lambda t, q, qd: None, "control_period": 0.1}, "the function returned None"),
-        ({"u": lambda t, q, qd: [1, 2], "control_period": 0.1}, r"u: shape \(2,\)"),
+        ({"u": lambda t, q, qd: [1, 2], "control_period": 0.1}, r"returned: shape \(2,\)"),
         ({"u": np.full((20, 1), math.inf), "control_period": 0.1}, r"u\[0, 0\]: inf"),
     ],
 )

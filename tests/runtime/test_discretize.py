@@ -244,7 +244,7 @@ def test_inputs_and_parameters_of_each_state(modules: Modules, period: float | N
             getattr(m, name)(q, qd, u=u[:2])
         with pytest.raises(ValueError, match=r"params: k: shape \(2,\), expected \(3,\) for 3 st"):
             getattr(m, name)(q, qd, params={"k": k[:2]})
-        with pytest.raises(ValueError, match="one value an input"):
+        with pytest.raises(ValueError, match=r"u: shape \(3, 2\), expected \(2,\): force"):
             getattr(m, name)(Q, QD, u=u)
 
 

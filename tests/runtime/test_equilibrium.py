@@ -109,7 +109,7 @@ def test_a_force_that_only_fades_is_no_equilibrium(modules: Modules) -> None:
     [
         ({"free": ["Theta"]}, r"free: 'Theta' is not one of x, .*force; did you mean 'theta'"),
         ({"q": [1.0]}, r"q: shape \(1,\), expected \(2,\)"),
-        ({"q": [[1.0, 2.0]]}, r"with q of shape \(1, 2\)"),
+        ({"q": [[1.0, 2.0]]}, r"q: shape \(1, 2\), expected \(2,\)"),
         ({"qd": "x"}, "qd: 'x' is not a number"),
         ({"u": {"Force": 1}}, "u: 'Force' is not one of force"),
         ({"params": {"M": 1}}, "params: 'M' is not one of"),

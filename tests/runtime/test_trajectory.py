@@ -254,7 +254,7 @@ def test_an_error_in_a_function_comes_through(driven: ModuleType) -> None:
 @pytest.mark.parametrize(
     ("result", "words"),
     [
-        ([1, 2], r"^u: shape \(2,\), expected \(1,\)"),
+        ([1, 2], r"^u: what the function returned: shape \(2,\), expected \(1,\): force"),
         (math.nan, "^u: .*nan.* not finite"),
         (None, "^u: "),  # a forgotten return is no wish for the scene's signal
     ],

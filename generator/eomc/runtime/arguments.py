@@ -154,7 +154,7 @@ class Arguments:
                 return numbers
         return None
 
-    def _read(self, q: Any, qd: Any) -> tuple[Any, Any, Array, Array]:
+    def _read(self, q: Any, qd: Any, many: bool = True) -> tuple[Any, Any, Array, Array]:
         """What C reads a state, or many, from, and these as arrays."""
         if (
             type(q) is type(qd) is ndarray and q.shape == qd.shape == self._shape
@@ -163,7 +163,7 @@ class Arguments:
             from_q, from_qd = q.tolist(), qd.tolist()
             if isfinite(sum(from_q) + sum(from_qd)):
                 return from_q, from_qd, q, qd
-        at, moving = self._state(q, qd)
+        at, moving = self._state(q, qd, many)
         return self._pointer(at), self._pointer(moving), at, moving
 
     def _numbers(self, value: ArrayLike, name: str) -> Array:
@@ -178,21 +178,25 @@ class Arguments:
         except (TypeError, ValueError, OverflowError):
             order = f": give them in order, {', '.join(self.coordinates)}"
             remedy = order if isinstance(value, Mapping) else ""
-            if any(map(callable, value if isinstance(value, (list, tuple)) else [value])):
+            parts = value if isinstance(value, (list, tuple)) else [value]
+            if callable(value) and name == "u":
+                remedy = ": give what it returns, u(t, q, qd); runs alone call functions"
+            elif name[0] == "u" and any(map(callable, parts)):
                 remedy = ": one function u(t, q, qd) gives all inputs, in order or as a dict"
             raise ValueError(f"{name}: {value!r} is not an array of numbers{remedy}") from None
 
-    def _array(self, value: ArrayLike, name: str, width: int) -> Array:
-        """Finite numbers, (width,) or (n, width)."""
+    def _array(self, value: ArrayLike, name: str, width: int, many: bool = True) -> Array:
+        """Finite numbers, (width,), or (n, width) too where there may be many."""
         if type(value) is ndarray and value.dtype is self.dtype and value.flags.carray:
             array = value  # C-contiguous, aligned and, which need not be, writeable
         else:
             array = self._numbers(value, name)
         if array.ndim == 1 and array.size == width <= _FEW and isfinite(sum(array.tolist())):
             return array  # of few numbers the sum is quickest; it may overflow all the same
-        if array.shape[-1:] != (width,) or array.ndim > 2:
+        if array.shape[-1:] != (width,) or array.ndim > 1 + many:
+            found = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
             raise ValueError(
-                f"{name}: shape {np.shape(value)}, expected ({width},) or (n, {width}): "
+                f"{name}: {found}, expected ({width},){f' or (n, {width})' * many}: "
                 f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
             )
         if array.size <= _FEW and isfinite(sum(array.ravel().tolist())):
@@ -204,8 +208,8 @@ class Arguments:
             raise ValueError(f"{name}{place}: {array[tuple(place)]} in {self.dtype} is not finite")
         return array
 
-    def _state(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
-        at, moving = self._array(q, "q", self.nq), self._array(qd, "qd", self.nq)
+    def _state(self, q: ArrayLike, qd: ArrayLike, many: bool = True) -> tuple[Array, Array]:
+        at, moving = (self._array(x, n, self.nq, many) for x, n in ((q, "q"), (qd, "qd")))
         if at.shape != moving.shape:
             raise ValueError(f"qd: shape {moving.shape} with q of shape {at.shape}")
         return at, moving
@@ -214,19 +218,17 @@ class Arguments:
         """A start, (nq,), and what C reads it from."""
         if (numbers := self._listed(x0, self._shape)) is not None:
             return x0, numbers  # type: ignore[return-value]  # an array, as was seen
-        x = self._array(x0, name, self.nq)
-        if x.ndim != 1:
+        x = self._numbers(x0, name)
+        if x.ndim == 2 and x.shape[1] == self.nq:
             raise ValueError(
                 f"{name}: shape {x.shape}, expected one state, ({self.nq},): "
                 f"{', '.join(self.coordinates)}; simulate_batch takes many"
             )
+        x = self._array(x0, name, self.nq, many=False)
         return x, self._pointer(x)
 
     def _one(self, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
-        at, moving = self._state(q, qd)
-        if at.ndim != 1:
-            raise ValueError(f"q: shape {at.shape}, expected ({self.nq},)")
-        return at, moving
+        return self._state(q, qd, many=False)
 
     def _parameters(self, params: Any) -> Array:
         if params is None:
@@ -245,8 +247,8 @@ class Arguments:
             return np.asarray(given._array)
         unmasked(params, "params")
         try:
-            array = aligned(np.ascontiguousarray(params, self.dtype))
-        except (TypeError, ValueError, OverflowError):
+            array = self._numbers(params, "params")
+        except ValueError:
             array = empty(0, self.dtype)
         if array.shape != self._p0.shape or not np.isfinite(array).all():
             if not self.parameters:
@@ -264,10 +266,8 @@ class Arguments:
             raise ValueError("u: this scene has no inputs")
         if type(u) is not ndarray and isinstance(u, Mapping):
             u = self._by_name(u)
-        array = self._array(u.reshape(1) if type(u) is ndarray and not u.ndim else u, "u", self.nu)
-        if array.ndim != 1:
-            raise ValueError(f"u: shape {array.shape}, expected ({self.nu},): one value an input")
-        return array
+        u = u.reshape(1) if type(u) is ndarray and not u.ndim else u
+        return self._array(u, "u", self.nu, many=False)
 
     def _by_name(self, u: Mapping[Any, Any]) -> Array:
         """Inputs by name as arrays have them, (..., nu).

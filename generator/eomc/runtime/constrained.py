@@ -244,7 +244,12 @@ class Constrained(Frames):
         """
         if isinstance(free, str):
             free = (free,)
-        moving = qd if np.ndim(qd) else np.full(self.nq, as_number(qd, "qd"))
+        if not (free is None or isinstance(free, Iterable)):
+            raise ValueError(
+                f"free: {free!r} is no list of names: {', '.join((*self._states, *self.inputs))}"
+            )
+        lone = not isinstance(qd, (list, tuple)) and not np.ndim(qd)
+        moving = np.full(self.nq, as_number(qd, "qd")) if lone else qd
         at, moving = self._one(*started(self, q, moving, self._parameters(params)))
         names = self.coordinates if free is None else tuple(free)
         held = self._inputs(u)

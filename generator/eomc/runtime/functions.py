@@ -218,14 +218,14 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
         """The inputs as they act at a state, (nu,): u, or the scene's signals, within limits."""
-        rows = np.shape(q)[:-1]
+        at, moving = self._state(q, qd)
+        rows = at.shape[:-1]
         if rows and (one := self._one_by_one(rows[0], t, u, params)) is not None:
-            at, moving = self._state(q, qd)
             each = [self.applied(at[k], moving[k], *own) for k, own in enumerate(one)]
             return np.reshape(each, (*rows, self.nu)).astype(self.dtype)
         held = self._inputs(u)
-        given = self.signal(q, qd, t, params) if held is None else held
-        return self._within(np.broadcast_to(given, (*np.shape(q)[:-1], self.nu)), params)
+        given = self.signal(at, moving, t, params) if held is None else held
+        return self._within(np.broadcast_to(given, (*rows, self.nu)), params)
 
     def _within(self, u: Array, params: Any) -> Array:
         """Inputs (..., nu) within their limits: what becomes of the largest and least numbers."""
@@ -404,10 +404,7 @@ class Functions(Arguments):
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""
-        try:
-            n, state = self.nq, np.asarray(unmasked(x, "x"), self.dtype)
-        except OverflowError:
-            n, state = self.nq, self._numbers(x, "x")
+        n, state = self.nq, self._numbers(x, "x")
         if state.shape != (2 * n,):
             raise ValueError(f"x: shape {state.shape}, expected ({2 * n},): q, then qd")
         out = empty(2 * n, self.dtype)

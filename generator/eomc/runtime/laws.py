@@ -18,7 +18,12 @@ def asked(
 ) -> Array:
     """What a function gives at a state, as the inputs are; what it raises says when."""
     try:
-        found = inputs(law(t, q.copy(), qd.copy()))
+        given = law(t, q.copy(), qd.copy())
+        try:
+            found = inputs(given)
+        except ValueError as fault:
+            wrong = str(fault).removeprefix("u: ")
+            raise ValueError(f"u: what the function returned: {wrong}") from None
     except Exception as fault:
         fault.add_note(f"u was asked at t = {t:.9g} s, q = {q}, qd = {qd}")
         raise
