@@ -188,13 +188,16 @@ def law(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
         {"u": np.cos(np.arange(4.0))[:, None], "control_period": 0.1, "every": 3},
         {"u": law},
         {"u": law, "control_period": 0.06},
+        {"u": law, "control_period": 0.06, "times": np.linspace(0, 0.4, 8)},
     ],
 )
 def test_work_of_inputs_that_are_held_is_told(pushed: ModuleType, how: dict[str, Any]) -> None:
     """Over a step an input does u (x' - x), but for the method's error in x."""
     run = pushed.simulate(**{"steps": 20} if "times" not in how else {"h": 0.02}, **how)
     balance, ends = run.balance(), run(0.02 * np.arange(21))[0][:, 0]
-    u = run.u[:-1, 0] if how["u"] is law else np.repeat(how["u"], 20 // len(how["u"]))
+    u = np.repeat(how["u"], 20 // len(how["u"])) if how["u"] is not law else run.u[:-1, 0]
+    if how["u"] is law and "times" in how:
+        u = pushed.simulate(steps=20, **how | {"times": None}).u[:-1, 0]
     assert balance.told and balance.left < 1e-7
     assert balance.inputs == pytest.approx(np.sum(u * np.diff(ends)), abs=2 * balance.left)
     assert 0 < balance.lost < 1 and balance.unsure < 1e-3 * balance.left
@@ -209,8 +212,21 @@ def test_work_of_inputs_that_a_period_holds_is_told_by_a_tolerance(falling: Modu
         balance, gained = run.balance(), run.energy[-1] - run.energy[0]
         assert balance.told and balance.inputs == pytest.approx(work, abs=1e-11)
         assert balance.inputs - balance.lost == pytest.approx(gained, abs=1e-11)
-    bounced = falling.simulate(u=law, control_period=0.15, duration=0.6)
-    assert len(bounced.events["impact"].t) and bounced.balance() is None
+
+
+@pytest.mark.parametrize("times", [None, [0.0, 0.3, 1.5]])
+def test_impacts_within_periods_are_told_too(
+    falling: ModuleType, times: list[float] | None
+) -> None:
+    """A force that is held does F (y' - y) also where it bounces; impacts take their part of K."""
+    run = falling.simulate(u=law, control_period=0.15, duration=1.5, times=times)
+    balance, impacts = run.balance(), run.events["impact"]
+    periods = np.array([*(0.15 * np.arange(10)), 1.5])
+    u = np.array([law(t, q, qd)[0] for t, q, qd in zip(periods, *run(periods), strict=True)])
+    jumps = np.sum((0.8**2 - 1) * impacts.qd[:, 0] ** 2 / 2)
+    assert len(impacts.t) > 1 and balance.told and balance.left < 1e-9
+    assert balance.inputs == pytest.approx(np.sum(u[:-1] * np.diff(run(periods)[0][:, 0])))
+    assert balance.jumps == pytest.approx(jumps, abs=1e-11)
 
 
 @pytest.mark.filterwarnings("ignore:.*a Python function")

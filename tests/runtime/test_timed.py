@@ -82,8 +82,10 @@ def test_a_law_is_called_as_in_any_run(driven: ModuleType, period: float) -> Non
     assert found == calls
     assert np.array_equal(run.q[[0, 2, 4]], whole.q[[0, 20, 100]])
     assert np.array_equal(run.u, whole.u[[0, 2, 20, 20, 100, 200]])
-    with pytest.raises(ValueError, match="u was a function"):
-        run(0.3)
+    for kept in (run, pickle.loads(pickle.dumps(run))):  # what it gave, not the function again
+        assert np.array_equal(kept(TIMES)[0], run.q)
+        assert np.array_equal(kept([0.0, 0.3, 0.3001])[0], whole([0.0, 0.3, 0.3001])[0])
+    assert found == calls
     sampled = driven.simulate(h=0.005, times=TIMES, control_period=0.02)
     exact = driven.simulate(h=0.005, steps=201, control_period=0.02)
     assert np.array_equal(sampled.u, exact.u[[0, 2, 20, 20, 100, 200]])
@@ -176,10 +178,11 @@ def test_many_steps_take_no_memory(cartpole: ModuleType) -> None:
         ({"times": [[1], [2, 3]]}, "times: .* is not an array of numbers"),
         ({"times": np.ma.masked_equal([1, 2], 2)}, "times: 1 of 2 numbers are masked"),
         ({"times": [1e30]}, "steps: .* are more than a run can count"),
+        ({"times": [1], "duration": 0.9}, "times: 1 s is behind the end of the duration, 0.9 s"),
+        ({"times": [1], "duration": "x"}, "duration: 'x' is not a number"),
         ({"times": [1], "steps": 3}, "steps: times say where rows are"),
         ({"times": [1], "every": 2}, "every: times say where rows are"),
         ({"times": [1], "out": (1, 2)}, "out: times say where rows are"),
-        ({"times": [1], "duration": 2.0}, "give times or duration, not both"),
         ({"times": [1], "tol": 1e-9}, "was built without adaptive steps"),
         ({"times": [1], "h": 0}, "h: 0 is not a step size"),
     ],
@@ -187,3 +190,11 @@ def test_many_steps_take_no_memory(cartpole: ModuleType) -> None:
 def test_what_contradicts_is_told(driven: ModuleType, given: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         driven.simulate(**given)
+
+
+def test_a_duration_beside_them_may_be_longer(modules: Modules) -> None:
+    """Also by sums of its steps that rounding has made longer."""
+    kepler = modules("kepler_orbit")
+    run = kepler.simulate(times=[0, 0.3], duration=1.0, h=0.01)
+    assert run == kepler.simulate(times=[0, 0.3], h=0.01)
+    assert kepler.simulate(times=[0.1 + 0.2], duration=0.3, h=0.01).t[-1] == 0.1 + 0.2

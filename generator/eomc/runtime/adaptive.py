@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .adaptive_arguments import BOTH, as_end, as_limits, as_times, as_tolerance
+from .adaptive_arguments import as_end, as_limits, as_times, as_tolerance
 from .adaptive_error import error_of
 from .adaptive_memory import FULL, Kept, Rows
 from .arguments import Array, as_number
@@ -117,14 +117,18 @@ class AdaptiveRun(Run):
         first = int(bool(len(asked)) and asked[0] <= self.t0)
         rows[:, :first] = [[q], [qd]]
         if len(asked) > first:
-            made = run(
-                self._model, q, qd, self.t0, self._t_end, self.tol, asked[first:],
-                self._u if self._held is None else Periods(self._held, self._period),
-                self._params, self._h_most, None, self._stiff,
-            )  # fmt: skip
-            rows[:, first:] = made._rows
+            rows[:, first:] = self._made(asked[first:])._rows
         both = rows[:, place.ravel()].reshape(2, *times.shape, len(q))
         return both[0], both[1]
+
+    def _made(self, times: Array | None) -> AdaptiveRun:
+        """The same run with rows at times, or after each step and on both sides of each jump."""
+        q, qd = self._begin
+        return run(
+            self._model, q, qd, self.t0, self._t_end, self.tol, times,
+            self._u if self._held is None else Periods(self._held, self._period),
+            self._params, self._h_most, None, self._stiff,
+        )  # fmt: skip
 
     @cached_property
     def events(self) -> dict[str, Happened]:
@@ -266,9 +270,7 @@ def simulate(
     if times is None:
         end = as_end(model, t0, duration)
     else:
-        if duration is not None:
-            raise ValueError(BOTH)
-        rows = as_times(times, t0, model.dtype)
+        rows = as_times(times, t0, model.dtype, duration)
         first, end = int(rows[0] == t0), float(rows[-1])
     held = as_acting(model, u, control_period, end - t0, params)
     asked = None if rows is None else rows[first:]

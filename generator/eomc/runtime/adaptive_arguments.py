@@ -19,7 +19,6 @@ LOOSEST = 1e-2
 FIXED = {  # what belongs to fixed steps, where nothing is said of it
     "h": None, "steps": None, "method": None, "every": 1, "out": None,
 }  # fmt: skip
-BOTH = "times: say where the run ends; give times or duration, not both"
 
 
 def fits(model: Model, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any) -> bool:
@@ -60,6 +59,13 @@ def _why_not(model: Model, name: str, asked: bool) -> str:
     )
 
 
+def as_progress(progress: Any) -> Any:
+    """The same, or a ValueError where it can't be called."""
+    if progress is not None and not callable(progress):
+        raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
+    return progress
+
+
 def as_end(model: Model, t0: float, duration: float | None) -> float:
     """The time at which a run ends, as the module's numbers hold it."""
     span = model.duration if duration is None else as_number(duration, "duration")
@@ -78,8 +84,10 @@ def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
     return number
 
 
-def as_times(times: ArrayLike, t0: float, dtype: np.dtype[Any]) -> Array:
-    """Times in ascending order, not before t0, or a ValueError."""
+def as_times(
+    times: ArrayLike, t0: float, dtype: np.dtype[Any], duration: float | None = None
+) -> Array:
+    """Times in ascending order from t0 on, within the duration if there is one, or a ValueError."""
     unmasked(times, "times")
     try:
         given = np.asarray(times)
@@ -92,4 +100,11 @@ def as_times(times: ArrayLike, t0: float, dtype: np.dtype[Any]) -> Array:
         raise ValueError("times: expected a row of finite numbers, in s")
     if found[0] < t0 or not (found[1:] > found[:-1]).all():
         raise ValueError(f"times: expected ascending times from t0 = {t0:g} s on")
+    if duration is not None:
+        end = t0 + as_number(duration, "duration")
+        if found[-1] > end + 4 * np.finfo(dtype).eps * abs(end):  # sums of steps are rounded
+            raise ValueError(
+                f"times: {found[-1]:g} s is behind the end of the duration, {end:g} s: leave out "
+                "such times, or duration, as a run ends with the last of its times"
+            )
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil
@@ -143,31 +142,43 @@ def _rows(run: Run) -> _Rows | None:
     if u is None or np.ndim(u) == 1:
         run = _between_jumps(run)  # all its rows: few may look smooth and not be
         return _Rows(model, run._params, run.t, run.q, run.qd, [(slice(None), u)])
+    run = _with_jumps(run)
     ends, values = _held(run)
     if not len(values):
         return None
-    each = (_EVEN if hasattr(run, "tol") else 1) * ceil(run.steps / len(values)) + 1
+    behind = 1 + np.flatnonzero(np.diff(run.t) == 0)  # a jump
+    begun, (ends, values) = ends, _cut(ends, values, run.t[behind])
+    each = (_EVEN if hasattr(run, "tol") else 1) * ceil(run.steps / (len(begun) - 1)) + 1
     count = min(max(each, _FEWEST), max(_MOST // len(values), 2))
     t = np.concatenate([np.linspace(a, b, count) for a, b in pairwise(ends.tolist())])
-    try:
-        q, qd = run(t)
-    except ValueError:  # of what a function gave rows tell nothing
-        return None
+    q, qd = run(t)
+    for row in behind.tolist():
+        first = count * int(np.searchsorted(ends, run.t[row]))
+        if first == len(t):  # it jumps at its end
+            t, q, qd = (
+                np.append(x, y[row : row + 1], 0) for x, y in ((t, run.t), (q, q), (qd, qd))
+            )
+        q[first], qd[first] = run.q[row], run.qd[row]
     pieces = [(slice(k * count, (k + 1) * count), x) for k, x in enumerate(values)]
     return _Rows(model, run._params, t, q, qd, pieces)
 
 
-def _held(run: Any) -> tuple[Array, Array]:
-    """The times (n + 1,) between which a run's inputs are held, and these, (n, nu); none: unknown.
+def _cut(ends: Array, values: Array, at: Array) -> tuple[Array, Array]:
+    """Pieces between times (n + 1,), with a value each, cut at other times too."""
+    both = np.unique([*ends, *at])
+    return both, values[np.searchsorted(ends, both[:-1], side="right") - 1]
 
-    Of one with events too, whose states may jump in between.
-    """
+
+def _held(run: Any) -> tuple[Array, Array]:
+    """Times (n + 1,) between which a run holds its inputs, and these, (n, nu); none: unknown."""
     unknown, last = (np.zeros(1), np.zeros((0, run._model.nu))), float(run.t[-1])
     if hasattr(run, "tol"):
         values = run._held
-        if values is None or len(run._happened[0]):
+        if values is None:
             return unknown
         starts = run.t0 + run._period * np.arange(len(values))
+    elif (values := getattr(run, "_gave", None)) is not None:
+        starts = run.t0 + run.h * run._hold * np.arange(len(values))
     else:
         values = run._u if np.ndim(run._u) == 2 else run._applied
         if values is None or (np.ndim(run._u) != 2 and run.every > 1):
@@ -180,9 +191,7 @@ def _held(run: Any) -> tuple[Array, Array]:
 
 def _between_jumps(run: Run) -> Run:
     """With rows equally far apart, in each piece between jumps, which stand on two rows each."""
-    happened = getattr(run, "_happened", ((),))[0]
-    if len(happened) and not (np.diff(run.t) == 0).any():
-        run = _of_steps(run)  # rows that were asked for pass jumps over
+    run = _with_jumps(run)
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
     if not len(jumps):
         return run._even()
@@ -202,23 +211,10 @@ def _between_jumps(run: Run) -> Run:
     return made
 
 
-def _of_steps(run: Any) -> Run:
-    """The same run with a row after each step, and both of each jump."""
-    q, qd = run._begin
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        made: Run = run._model.simulate(
-            q,
-            qd,
-            duration=run._t_end - run.t0,
-            u=run._u,
-            params=run._params,
-            t0=run.t0,
-            tol=run.tol,
-            h_most=run._h_most or None,
-            stiff=run._stiff,
-        )
-    return made
+def _with_jumps(run: Any) -> Any:
+    """The same run with both rows of each jump, also where others were asked for."""
+    happened = getattr(run, "_happened", ((),))[0]
+    return run._made(None) if len(happened) and not (np.diff(run.t) == 0).any() else run
 
 
 def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:

@@ -7,13 +7,14 @@ vector registers and in threads; no result depends on either.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import NoneType
 from typing import Any, Never, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import batch_adaptive, batch_fixed
-from .adaptive_arguments import fits
+from .adaptive_arguments import as_progress, fits
 from .arguments import (
     Array,
     Params,
@@ -69,12 +70,13 @@ class BatchModel(Model):
         threads: as many as there are processors where None. An instance that can't go on, or whose
         start can't be assembled, has its own status and leaves the others alone. Ctrl-C raises
         Interrupted with the run so far. tol: by steps that fit a tolerance, each instance its own.
-        times: (n,), the rows, instead of duration; without them those of adaptive steps are start
+        times: (n,), the rows, within duration; without them those of adaptive steps are start
         and end. events: as in `simulate`.
         """
         if events is not None or unknown:
             other, given = with_events(self.simulate_batch, dict(locals()))
             return cast(BatchRun, other.simulate_batch(**given))
+        progress = as_progress(progress)
         if fits(self, h, steps, method, tol, h_most, stiff):
             fitted, whole = batch_adaptive.simulate(
                 self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
@@ -84,13 +86,11 @@ class BatchModel(Model):
                 raise Interrupted(fitted)
             return fitted
         step = self._stepper(method, "batch")
-        if progress is not None and not callable(progress):
-            raise ValueError(f"progress: {progress!r} is not a function of steps done and in all")
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         at = None
         if times is not None:
             at, steps = as_asked(self, times, t0, h, duration, steps, every, None)
-        steps = self._steps(h, duration, steps)
+        steps = self._steps(h, duration if at is None else None, steps)
         every = min(as_count(every, "every", 1), RARELY)
         hold = min(as_period(control_period, h), max(steps, 2))
         batch_adaptive.no_signals(self, u, control_period)
@@ -119,7 +119,7 @@ class BatchModel(Model):
         STATUS[number] says why it was not, and the state is as it was. u, params: as in
         `simulate_batch`.
         """
-        if method not in self._batch_steps:
+        if not isinstance(method, (str, NoneType)) or method not in self._batch_steps:
             self._method(method)  # raises, with those there are
         if out is not None:
             into = self._pair(out, np.shape(q))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .adaptive_arguments import BOTH, as_end, as_limits, as_times
+from .adaptive_arguments import as_end, as_limits, as_times
 from .adaptive_memory import FULL, room_for
 from .arguments import Array, as_number, as_step_size
 from .batch_run import BatchRun
@@ -156,10 +156,8 @@ def simulate(
     t0 = as_number(t0, "t0")
     if times is None:
         end = as_end(model, t0, duration)
-        times = [t0, end] if end > t0 else [t0]
-    elif duration is not None:
-        raise ValueError(BOTH)
-    rows = as_times(times, t0, model.dtype)
+        times, duration = [t0, end] if end > t0 else [t0], None
+    rows = as_times(times, t0, model.dtype, duration)
     no_signals(model, u, control_period)
     span, period, count = float(rows[-1]) - t0, 0.0, None
     if control_period is not None:

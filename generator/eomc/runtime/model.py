@@ -16,7 +16,7 @@ from numpy import empty
 from numpy.typing import ArrayLike
 
 from . import adaptive, saved, timed
-from .adaptive_arguments import fits
+from .adaptive_arguments import as_progress, fits
 from .arguments import (
     Array,
     Parameters,
@@ -131,9 +131,7 @@ class Model(Constrained):
         u None: the scene's signals, followed through the step. Raises MotionError where the step
         can't be made; `out` is untouched then.
         """
-        from_q, from_qd, at, moving = self._read(q, qd)
-        if at.ndim != 1:
-            self._one(q, qd)
+        from_q, from_qd, at, moving = self._read(q, qd, many=False)
         h = self.h if h is None else as_step_size(h, self.dtype)
         inputs, p = self._given(u, params)
         address, real, null = self._c
@@ -173,7 +171,7 @@ class Model(Constrained):
         """The name of a method that the module has."""
         if method is None:
             return self.methods[0]
-        if method not in self.methods:
+        if not isinstance(method, str) or method not in self.methods:
             raise ValueError(
                 f"method: {method!r} is not in this module, which has {', '.join(self.methods)}: "
                 "a scene asks for several with a list, [run] method = [...]"
@@ -186,17 +184,17 @@ class Model(Constrained):
 
     def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
         """So many fixed steps; warns, once, that they pass over events."""
+        steps = None if steps is None else as_count(steps, "steps", 0)
         if self.events and steps != 0 and "events" not in self._warned:
             self._warned.add("events")
             warn(f"{self.name}: {passed_over(self)}")
         if steps is not None:
             if duration is not None:
                 raise ValueError("steps: give steps or duration, not both")
-            count = as_count(steps, "steps", 0)
-            if count > _MOST:
-                shown = f"{count:.3g}" if count < 10**300 else "so many"
+            if steps > _MOST:
+                shown = f"{steps:.3g}" if steps < 10**300 else "so many"
                 raise ValueError(f"steps: {shown} are more than a run can count, {_MOST:.3g}")
-            return count
+            return steps
         time = self.duration if duration is None else as_number(duration, "duration")
         if words := beyond_end(h, time):
             warn(f"{self.name}: {words}")
@@ -222,16 +220,16 @@ class Model(Constrained):
         """A trajectory by fixed steps of size h, or by steps that fit a tolerance; the loop in C.
 
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration. method:
-        one of `methods`, the first where None; "auto": by a tolerance. every: a row is kept of
-        every so many steps. u: None, the scene's signals; (nu,), constant; (steps, nu), held over a
-        step each; a dict of all inputs by name, numbers or (steps,); or a function u(t, q, qd)
-        called before each step, and slow. control_period: in s, of fixed steps a whole number: the
-        function is called, a row taken, or the signals are read, once in it. out: (q, qd), arrays
-        for the rows. progress: called with (done, steps). estimate: find the run's own error,
-        `run.error`, in nine times the time. tol: what adaptive steps err by, of their way; [run]
-        tolerance, where h, steps and method are not given. times: (n,) ascending, for duration: the
-        rows. h_most: the longest adaptive step, s. stiff: begin by Newton's method. events: more,
-        by name a formula or an [[event]]. A run that can't go on warns; Ctrl-C raises Interrupted.
+        of `methods`, the first where None; "auto": by a tolerance. every: rows are after every so
+        many steps, and the ends. u: None, the scene's signals; (nu,), constant; (steps, nu), held
+        over a step each; a dict of all inputs by name, numbers or (steps,); a function u(t, q, qd),
+        asked before each step, slow. control_period: in s, of fixed steps a whole number: once in
+        it the function is asked, a row taken, or the signals read. out: (q, qd), arrays for rows.
+        progress: called with (done, steps). estimate: find `run.error`, in nine times the time.
+        tol: what adaptive steps err by, of their way; [run] tolerance, where h, steps and method
+        are not given. times: (n,) ascending: the rows, within duration. h_most: of adaptive steps,
+        s. stiff: begin by Newton's method. events: more, by name a formula or an [[event]]. A run
+        that can't go on warns; Ctrl-C raises Interrupted.
         """
         if events is not None or unknown:
             other, given = with_events(self.simulate, dict(locals()))
@@ -248,7 +246,7 @@ class Model(Constrained):
             and (r := adaptive.plain(self, q0, qd0, duration, u, params, t0, tol, room)) is not None
         ):  # fmt: skip
             return r
-        estimate = as_flag(estimate, "estimate")
+        estimate, progress = as_flag(estimate, "estimate"), as_progress(progress)
         q0, qd0 = self._assembled(q0, qd0, t0, params)
         if fits(self, h, steps, method, tol, h_most, stiff):
             fitted = adaptive.simulate(

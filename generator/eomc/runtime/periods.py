@@ -132,7 +132,7 @@ class Acting:
         if callable(of):
             self.held = asked(of, model._inputs, t, q, qd)
         else:
-            self.held = of[done]
+            self.held = of[min(done, len(of) - 1)]  # of a run that was interrupted
         self.values.append(self.held)
         self.stop = self.t_end
         if done + 1 < self.count:

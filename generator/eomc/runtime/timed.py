@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .adaptive_arguments import BOTH, as_times
+from .adaptive_arguments import as_times
 from .arguments import Array
 from .dense import parts, within
 from .estimate import Estimate, estimate
@@ -37,6 +37,7 @@ class TimedRun(Run):
 
     _times: Array = field(kw_only=True)
     _begin: Array = field(kw_only=True)  # q and qd at t0, (2, nq)
+    _gave: Array | None = field(default=None, init=False)  # of a function, a row for each call
 
     @property
     def t(self) -> Array:
@@ -46,11 +47,9 @@ class TimedRun(Run):
     def __call__(self, t: ArrayLike) -> tuple[Array, Array]:
         """(q, qd) at any time within the run, t (...,): each (..., nq), by the same steps again.
 
-        Raises ValueError outside of the run, or where u was a function.
+        Raises ValueError outside of the run.
         """
         times = within(self, t)
-        if callable(self._u) or isinstance(self._u, str):
-            raise ValueError("u was a function, which rows don't tell: ask for these times too")
         asked, place = np.unique(times, return_inverse=True)
         made = self._whole(1, asked)
         q, qd = (x[place.ravel()].reshape(*times.shape, -1) for x in (made.q, made.qd))
@@ -69,11 +68,12 @@ class TimedRun(Run):
         model, (q, qd), pointer = self._model, self._begin, self._model._pointer
         whole = self.status == "ok" or at is not None
         steps = _count(self._times if at is None else at, self.t0, self.h) if whole else self.steps
-        held = isinstance(self._u, np.ndarray) and self._u.ndim == 2
+        u = self._u if at is None or self._gave is None else self._gave
+        if isinstance(u, np.ndarray) and u.ndim == 2:
+            u = u[: -(-steps // self._hold)]
         return model._trajectory(
-            q, qd, pointer(q), pointer(qd), self.h, steps, every,
-            self._u[:steps] if held else self._u, self._params, pointer(self._params), self.method,
-            self.t0, None, None, self._hold, at,
+            q, qd, pointer(q), pointer(qd), self.h, steps, every, u, self._params,
+            pointer(self._params), self.method, self.t0, None, None, self._hold, at,
         )  # fmt: skip
 
     def _even(self) -> Run:
@@ -91,11 +91,14 @@ class TimedRun(Run):
         return replace(found, q=at_rows(found.q), qd=at_rows(found.qd))
 
     def _kept(self) -> dict[str, Any]:
-        return super()._kept() | {"times": self._times, "begin": self._begin}
+        own = {"times": self._times, "begin": self._begin, "values": self._gave}
+        return super()._kept() | own
 
     @classmethod
     def _of_kept(cls, model: Model, kept: Mapping[str, Any], **own: Any) -> Run:
-        return super()._of_kept(model, kept, _times=kept["times"], _begin=kept["begin"])
+        made: Any = super()._of_kept(model, kept, _times=kept["times"], _begin=kept["begin"])
+        made._gave = kept.get("values")
+        return made  # type: ignore[no-any-return]
 
     def _settings(self) -> tuple[Any, ...]:
         return (*super()._settings(), self._times.tolist())
@@ -111,13 +114,11 @@ def as_asked(
     """
     if times is None:
         return None, steps
-    if duration is not None:
-        raise ValueError(BOTH)
     named = {"steps": steps is not None, "every": every != 1, "out": out is not None}
     for name, given in named.items():
         if given:
             raise ValueError(f"{name}: times say where rows are; give one or the other")
-    found = as_times(times, t0, np.dtype(float))
+    found = as_times(times, t0, np.dtype(float), duration)
     return found, _count(found, t0, h)
 
 
@@ -159,6 +160,7 @@ def run(
     model._tell(made, method, way.work)
     if way.law:
         made._hold, made._applied = way.hold, applied[: len(stamps)]
+        made._gave = np.reshape(way.values, (-1, model.nu)).astype(model.dtype)
     return made
 
 
@@ -182,6 +184,7 @@ class _Way:
         self.p, self.work = p, model._ffi.new(self.work_type)
         self.pair = np.array([[q, q], [qd, qd]], model.dtype)  # of C: where it starts, where it is
         self.asked, self.between_them = -1, 0  # the step a law was called before; evaluations
+        self.values: list[Array] = []  # what it gave
         self.chunk = max(1, _FIRST // (model.nq**3 if self.counted else model.nq))
 
     @property
@@ -241,6 +244,7 @@ class _Way:
         period = self.done // self.hold
         if self.law and self.asked != period:
             self.held = self.law(self.t0 + self.done * self.h, *self.state)
+            self.values.append(self.held)
             self.asked = period
         return self.model._pointer(self.held)
 

@@ -196,8 +196,8 @@ class Run(ConstrainedRun, Columns):
     def balance(self) -> Balance | None:
         """What inputs and forces put in and what was lost, J, and the error that this leaves.
 
-        What jumps of events put in or took stands apart. None where rows don't tell the inputs: of
-        a function with `every` or times of fixed steps, or held where events happen in its periods.
+        What jumps of events put in or took stands apart. None where rows don't tell the inputs, of
+        a function with `every`, or where an energy or a force is not finite.
         """
         return balance(self)
 
