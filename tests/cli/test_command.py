@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -147,7 +147,7 @@ def test_parameters_and_start_on_the_command_line(there: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ("force=30", "but an input: its value is the signal that the scene gives it"),
+        ("force=30", "but an input: --input force=30"),
         ("theta=1", "but a coordinate: --start theta=1"),
         ("theta_dot=2", "but a velocity: --start theta_dot=2"),
     ],
@@ -157,6 +157,27 @@ def test_what_is_no_parameter_is_told_where_it_belongs(
 ) -> None:
     with pytest.raises(EomcError, match=f"is not a parameter, {said}"):
         run._overrides(Path("driven.toml"), driven, [given], [])
+
+
+def test_inputs_are_held_on_the_command_line(there: Path, driven: ModuleType) -> None:
+    built(there, "cartpole_driven")
+    shutil.copy(SCENES / "cartpole_driven.toml", there)
+    words = ["--input", "force=m_c/4", "--set", "m_c=4", "--duration", "0.5", "--json"]
+    done = json.loads(eomc("run", "cartpole_driven.toml", *words).output)
+    alone = driven.simulate(u=1.0, duration=0.5, params={"m_c": 4.0})
+    assert [*done["q"].values()] == pytest.approx(alone.q[-1], rel=1e-12)
+    for given, said in (
+        ("Force=1", "--input: 'Force' is not an input; did you mean 'force'"),
+        ("push=1", "--input: 'push' is not an input; there are force"),
+        ("force", "write --input NAME=VALUE"),
+    ):
+        assert said in eomc("run", "cartpole_driven.toml", "--input", given).output
+    assert (
+        "'x' is not an input: there are none"
+        in eomc("run", "cartpole.toml", "--input", "x=1").output
+    )
+    with pytest.raises(EomcError, match="no value for push: hold all inputs, or none"):
+        run._held(SimpleNamespace(inputs=("force", "push"), defaults={}), ["force=1"], {})
 
 
 @pytest.mark.parametrize(

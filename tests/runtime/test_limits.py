@@ -59,6 +59,15 @@ def limited(modules: Modules) -> ModuleType:
     return modules.unoptimised(BATCH)
 
 
+def test_they_are_told_by_name(limited: ModuleType, cartpole: ModuleType) -> None:
+    ends = {"force": (-2.0, 3.0), "push": (0.0, np.inf), "free": (-np.inf, np.inf)}
+    assert limited.limits() == ends and cartpole.limits() == {}
+    assert limited.limits({"most": 4.0}) == ends | {"force": (-4.0, 6.0)}
+    assert all(type(x) is float for pair in limited.limits().values() for x in pair)
+    with pytest.raises(ValueError, match="params: 'least' is not one of most"):
+        limited.limits({"least": 1.0})
+
+
 def test_an_equilibrium_that_limits_forbid_is_told_with_them(limited: ModuleType) -> None:
     """The pole leans against what the force can't give; one that it can is found."""
     for how in ({"u": [0.0, 4.0, 0.0], "free": "force"}, {"u": [9.0, 0.0, 0.0], "free": "free"}):

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 @options.BUILD
 @click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE", help="A parameter.")
 @click.option("--start", multiple=True, metavar="NAME=VALUE", help="A coordinate, or its velocity.")
+@click.option("--input", "inputs", multiple=True, metavar="NAME=VALUE", help="An input, held.")
 @click.option("--h", "h", type=float, help="Step size in s, instead of the scene's.")
 @click.option("--duration", type=float, help="In s, instead of the scene's.")
 @click.option("--method", help="A stepper that the scene asks for, its first by default, or auto.")
@@ -54,10 +55,10 @@ if TYPE_CHECKING:
 @options.QUIET
 @options.JSON
 def command(
-    scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str], h: float | None,
-    duration: float | None, method: str | None, tol: float | None, event: Sequence[str],
-    every: int, out: Path | None, plot: Path | None, wrap: bool, animate: Path | None,
-    quiet: bool, as_json: bool,
+    scene: Path, root: Path, parameters: Sequence[str], start: Sequence[str],
+    inputs: Sequence[str], h: float | None, duration: float | None, method: str | None,
+    tol: float | None, event: Sequence[str], every: int, out: Path | None, plot: Path | None,
+    wrap: bool, animate: Path | None, quiet: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Simulate a scene; print the end, the error and the speed.
 
@@ -76,14 +77,15 @@ def command(
     with status_line(f"building {scene.stem}", quiet or as_json):
         module = _with_events(pipeline.load(scene, root, warn=warn), event)
     values, q0, qd0 = _overrides(scene, module, parameters, start)
+    u = _held(module, inputs, values)
     options: dict[str, Any] = {
-        "h": h, "duration": duration, "params": values, "method": method, "tol": tol,
+        "h": h, "duration": duration, "u": u, "params": values, "method": method, "tol": tol,
     }  # fmt: skip
     own, unstable, ends = module._model, None, None
     try:
         fits = own.tolerance and h is None and method is None
         if tol is None and method != "auto" and not fits:
-            unstable = module.advice(q0, qd0, h, params=values, method=method)
+            unstable = module.advice(q0, qd0, h, u, values, method)
             span = own.duration if duration is None else duration
             ends = beyond_end(own.h if h is None else h, span)
         with progress_bar("running", quiet or as_json) as progress:
@@ -112,9 +114,9 @@ def command(
         jacobi = drawn.jacobi if own.has_jacobi else None
         system, rows = pipeline.read(scene).at(values), (drawn.t, drawn.q, drawn.qd, drawn.energy)
         words = balance.words if balance else ""
-        inputs = dict(zip(module.inputs, drawn.u.T, strict=True)) if module.inputs else {}
+        acted = dict(zip(module.inputs, drawn.u.T, strict=True)) if module.inputs else {}
         plots.draw(
-            system, *rows, plot, jacobi=jacobi, outputs=drawn.outputs, words=words, inputs=inputs,
+            system, *rows, plot, jacobi=jacobi, outputs=drawn.outputs, words=words, inputs=acted,
             wrap=wrap,
         )  # fmt: skip
     if animate:
@@ -173,7 +175,7 @@ def _overrides(
         if name not in module.defaults:
             remedy = suggest(name, module.defaults) or _there_are(module.defaults)
             if name in module.inputs:
-                remedy = ", but an input: its value is the signal that the scene gives it"
+                remedy = f", but an input: --input {name}={value:g}"
             for kind, of in (("coordinate", name), ("velocity", name.removesuffix("_dot"))):
                 if of in module.coordinates:
                     remedy = f", but a {kind}: --start {name}={value:g}"
@@ -195,6 +197,26 @@ def _overrides(
         array, k = states[name]
         array[k] = value
     return values, q0, qd0
+
+
+def _held(
+    module: Any, given: Sequence[str], parameters: Mapping[str, float]
+) -> dict[str, float] | None:
+    """The inputs that are held over the run, all of them; None where signals are followed."""
+    from eomc.scene.formulas import suggest
+
+    values = dict(pairs(given, "--input", {**module.defaults, **parameters}))
+    for name in values:
+        if name not in module.inputs:
+            remedy = suggest(name, module.inputs)
+            remedy = remedy or (_there_are(module.inputs) if module.inputs else ": there are none")
+            raise EomcError(f"--input: '{name}' is not an input{remedy}")
+    if values and (missing := [name for name in module.inputs if name not in values]):
+        raise EomcError(
+            f"--input: no value for {', '.join(missing)}: hold all inputs, or none, for the "
+            "scene's signals"
+        )
+    return values or None
 
 
 def _there_are(known: Iterable[str]) -> str:

@@ -36,7 +36,7 @@ ROWS = 200  # of main.c, about
 LINE = 88  # of the columns' names there
 FUNCTIONS = (
     "C D acceleration advice applied bias discretize energy equilibrium g jacobi kinetic_energy "
-    "linearize load_run output potential_energy power rhs sensitivity signal simulate "
+    "limits linearize load_run output potential_energy power rhs sensitivity signal simulate "
     "simulate_batch step step_batch tau"
 ).split()
 ASKED = {  # what only scenes have that ask for it in [run]

@@ -7,6 +7,7 @@ parameters (n,) may be those of each state.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from math import copysign, inf
 from typing import Any
 
 import numpy as np
@@ -213,6 +214,13 @@ class Functions(Arguments):
     def has_limits(self) -> bool:
         """Whether an input has limits."""
         return hasattr(self._lib, "applied")
+
+    def limits(self, params: Parameters = None) -> dict[str, tuple[float, float]]:
+        """The limits of each input, (least, largest), by name; -inf and inf where it has none."""
+        far = float(np.finfo(self.dtype).max)
+        both = [self._within(np.full(self.nu, x, self.dtype), params).tolist() for x in (-far, far)]
+        ends = [[x if abs(x) < far else copysign(inf, x) for x in some] for some in both]
+        return dict(zip(self.inputs, zip(*ends, strict=True), strict=True))
 
     def applied(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
