@@ -59,8 +59,12 @@ class _Expansion:
     def run(self) -> bool:
         for given, meant in _ARRAYS_MEANT.items():
             if isinstance(self.tree.get(given), (dict, list)) and meant not in self.tree:
-                self.check.say((given,), f"unknown table '{given}': write [[{meant}]]")
-                self.tree[meant] = self.tree.pop(given)
+                entries, unknown = self.tree.pop(given), f"unknown table '{given}': "
+                if not _is_array(entries):
+                    self._fault((given,), unknown + _of_its_own(meant, entries))
+                    continue
+                self.check.say((given,), f"{unknown}write [[{meant}]]")
+                self.tree[meant] = entries
                 self.check.places.rename((given,), (meant,))
         for table in _TABLES:
             if isinstance(self.tree.get(table), dict):
@@ -117,14 +121,7 @@ class _Expansion:
 
     def _array(self, array: str, entries: Any) -> dict[str, Any]:
         if not _is_array(entries):
-            inner = isinstance(entries, dict) and all(isinstance(e, dict) for e in entries.values())
-            named = (
-                f' and name = "{next(iter(entries))}"'
-                if inner and entries and array in _NAMED
-                else ""
-            )
-            message = f"each {array} has a table of its own: write [[{array}]]{named}"
-            self._fault((array,), message)
+            self._fault((array,), _of_its_own(array, entries))
             return {}
         out: dict[str, Any] = {}
         places = self.check.places
@@ -305,6 +302,17 @@ class _Expansion:
         if term != "n" and len(term) == 1 and not index:
             remedy += f', or add repeat = "{term} = 1..n" to the entry'
         raise FormulaError(f"'{term}' is not known in an index{near or remedy}")
+
+
+def _of_its_own(array: str, entries: Any) -> str:
+    """What to say of [array], in single brackets."""
+    inner = isinstance(entries, dict) and all(isinstance(e, dict) for e in entries.values())
+    named = (
+        f' and name = "{next(iter(entries))}"'
+        if inner and entries and array in (*_NAMED, "event")
+        else ""
+    )
+    return f"each {array} has a table of its own: write [[{array}]]{named}"
 
 
 def _is_array(value: Any) -> bool:
