@@ -195,9 +195,11 @@ class Arguments:
             return array  # of few numbers the sum is quickest; it may overflow all the same
         if array.shape[-1:] != (width,) or array.ndim > 1 + many:
             found = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
+            rates = array.shape == (2 * self.nq,) and name in ("q", "q0")
             raise ValueError(
                 f"{name}: {found}, expected ({width},){f' or (n, {width})' * many}: "
                 f"{', '.join(self.inputs if name == 'u' else self.coordinates)}"
+                f"{'; velocities go to qd' + name[1:] if rates else ''}"
             )
         if array.size <= _FEW and isfinite(sum(array.ravel().tolist())):
             return array

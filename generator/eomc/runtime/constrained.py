@@ -237,7 +237,8 @@ class Constrained(Frames):
         """(q, u) where no force is left, so that q̈ = 0: by Newton's method from the guess q, u.
 
         q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates,
-        rates and inputs that are found, all coordinates where None; the others stay. Where a rate,
+        rates and inputs that are found, all coordinates that move where None; the others stay, as
+        what jumps set does. Where a rate,
         "charge_dot", is among them, (q, qd, u) comes back: a steady motion, if no force changes
         along it. u None: the scene's signals. u comes back as (nu,), None where the scene has no
         inputs. Raises MotionError, status "no convergence", where none is found.
@@ -249,9 +250,11 @@ class Constrained(Frames):
                 f"free: {free!r} is no list of names: {', '.join((*self._states, *self.inputs))}"
             )
         lone = not isinstance(qd, (list, tuple)) and not np.ndim(qd)
-        moving = np.full(self.nq, as_number(qd, "qd")) if lone else qd
+        moving = np.full(self.nq, as_number(qd, "qd")) if lone else self._completed(qd, 1)
+        q = self._completed(q, 0)
         at, moving = self._one(*started(self, q, moving, self._parameters(params)))
-        names = self.coordinates if free is None else tuple(free)
+        moves = [name for name in self.coordinates if name not in self.still]
+        names = moves if free is None else tuple(free)
         held = self._inputs(u)
         found = equilibrium(self, at, moving, held, names, as_number(t, "t"), params)
         return found if set(names) & set(self._states[self.nq :]) else found[::2]

@@ -88,7 +88,7 @@ def equilibrium(
     if rows:
         sizes[n:] += rows.of_rates(z)
     much = now * ~(np.abs(now) <= np.sqrt(eps) * sizes)  # rounding leaves less
-    _refuse(model, z, much, state_text(q, qd), held(z), t, params)
+    _refuse(model, z, much, (q, qd), held(z), t, params)
     at, moving = (x.astype(model.dtype) for x in (z[:n], z[n : 2 * n]))
     if u is None:
         return at, moving, np.asarray(model.signal(at, moving, t, params)) if model.nu else None
@@ -96,15 +96,18 @@ def equilibrium(
 
 
 def _refuse(
-    model: Constrained, z: Array, much: Array, begun: str, u: Array | None, t: float, params: Any
+    model: Constrained, z: Array, much: Array, begun: tuple[Array, Array], u: Array | None,
+    t: float, params: Any,
 ) -> None:  # fmt: skip
     """Raise MotionError where a search ends with too much left."""
     if not much.any():
         return
     q, qd = z[: model.nq], z[model.nq : 2 * model.nq]
+    found = f"q = {np.array2string(q, precision=6, threshold=12)}"
+    if np.any(qd != begun[1]):
+        found = state_text(q, qd)
     raise MotionError(
-        f"no equilibrium found from {begun}: the search ends at "
-        f"q = {np.array2string(q, precision=6, threshold=12)}, where "
+        f"no equilibrium found from {state_text(*begun)}: the search ends at {found}, where "
         f"{_too_much(model, much)}{_beyond(model, q, qd, u, t, params)}; start elsewhere, or let "
         f"another coordinate, rate (free=[..., '{model._states[model.nq]}']) or input be free",
         "no convergence",
