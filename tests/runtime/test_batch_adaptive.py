@@ -232,3 +232,13 @@ def test_tables_are_held_over_control_periods_as_alone(
     for again in (orbits.load_run(tmp_path / "orbits.npz"), pickle.loads(pickle.dumps(run))):
         assert again == run and np.array_equal(again.u, run.u)
         assert np.array_equal(again([0.5, 2.0])[0], run.q[:, 1:])
+
+
+def test_rows_that_may_be_times_or_instances_are_asked_about(orbits: ModuleType) -> None:
+    u, words = np.ones((4, 1)), r"u: shape \(4, 1\) may be .*: give \(1, 4, 1\) for a table, \(4, 1"
+    for how in ({"control_period": 0.25, "duration": 1.0}, {"h": 0.01, "steps": 4}):
+        with pytest.raises(ValueError, match=words):
+            orbits.simulate_batch(u=u, **how)
+        assert len(orbits.simulate_batch(u=u[None], **how)) == 1
+        assert len(orbits.simulate_batch(u=u[:, None], **how)) == 4
+        assert len(orbits.simulate_batch(*starts(4), u=u, **how)) == 4

@@ -188,6 +188,13 @@ class BatchModel(Model):
                 hint = ": a table over time for all is (1, steps, nu)" if name == "u" else ""
                 raise ValueError(f"{name}: {size} instances where {whose} has {count}{hint}")
 
+        if whose == "u" and held is not None and np.ndim(u) == 2 and len(held) == steps:
+            one, each = f"(1, {steps}, {self.nu})", f"({steps}, 1, {self.nu})"
+            raise ValueError(
+                f"u: shape {np.shape(u)} may be a table over time or one row an instance: give "
+                f"{one} for a table, {each} for as many instances"
+            )
+
         whole = (count, self.nq)  # broadcast_to takes a while even where nothing is to be done
         q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
         codes = None

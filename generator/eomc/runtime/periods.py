@@ -58,7 +58,7 @@ def as_acting(
         if rows.ndim == 1 and model.nu == 1 < rows.size:
             rows = rows[:, None]
         if rows.ndim < 2:
-            return model._inputs(u)
+            return model._array(rows.reshape(-1), "u", model.nu).copy()
         rows = model._array(rows, "u", model.nu)
         if period is None:
             raise ValueError(
