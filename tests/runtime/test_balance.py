@@ -229,6 +229,24 @@ def test_impacts_within_periods_are_told_too(
     assert balance.jumps == pytest.approx(jumps, abs=1e-11)
 
 
+@pytest.mark.filterwarnings("ignore:.*ever sooner")
+@pytest.mark.parametrize(
+    ("how", "status"),
+    [
+        ({"params": {"at": 0.3}, "duration": 0.4}, "ok"),  # where a period ends
+        ({"params": {"e": 0.5, "at": 1.0}, "duration": 3.0}, "accumulated"),  # and the run
+    ],
+)
+def test_jumps_where_a_period_or_the_run_ends_count(
+    falling: ModuleType, how: dict[str, Any], status: str
+) -> None:
+    run = falling.simulate(u=law, control_period=0.15, **how)
+    balance, gained = run.balance(), run.energy[-1] - run.energy[0]
+    assert run.status == status and len(run.events["sheds"].t) == 1 and run["m"][-1] == 0.5
+    assert balance.inputs + balance.jumps == pytest.approx(gained, abs=1e-11)
+    assert balance.told and balance.left < 1e-11 and balance.jumps < -1
+
+
 @pytest.mark.filterwarnings("ignore:.*a Python function")
 def test_inputs_that_rows_do_not_tell_have_none(pushed: ModuleType) -> None:
     assert pushed.simulate(steps=20, u=law, every=2).balance() is None

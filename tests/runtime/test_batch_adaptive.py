@@ -234,6 +234,14 @@ def test_tables_are_held_over_control_periods_as_alone(
         assert np.array_equal(again([0.5, 2.0])[0], run.q[:, 1:])
 
 
+def test_a_batch_keeps_inputs_of_its_own(orbits: ModuleType) -> None:
+    u = np.full((4, 1), 0.1)
+    runs = [orbits.simulate_batch(*starts(4), u=u, **h) for h in ({"h": 0.1}, {"tol": 1e-6})]
+    runs.append(orbits.simulate_batch(*starts(4), u=u, h=0.1, times=[0.5]))
+    u[:] = 3.0
+    assert all((run.u == 0.1).all() for run in runs)
+
+
 def test_rows_that_may_be_times_or_instances_are_asked_about(orbits: ModuleType) -> None:
     u, words = np.ones((4, 1)), r"u: shape \(4, 1\) may be .*: give \(1, 4, 1\) for a table, \(4, 1"
     for how in ({"control_period": 0.25, "duration": 1.0}, {"h": 0.01, "steps": 4}):

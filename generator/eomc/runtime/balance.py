@@ -155,11 +155,10 @@ def _rows(run: Run) -> _Rows | None:
     for row in behind.tolist():
         first = count * int(np.searchsorted(ends, run.t[row]))
         if first == len(t):  # it jumps at its end
-            t, q, qd = (
-                np.append(x, y[row : row + 1], 0) for x, y in ((t, run.t), (q, q), (qd, qd))
-            )
+            t, q, qd = np.append(t, t[-1:]), np.append(q, q[-1:], 0), np.append(qd, qd[-1:], 0)
         q[first], qd[first] = run.q[row], run.qd[row]
-    pieces = [(slice(k * count, (k + 1) * count), x) for k, x in enumerate(values)]
+    firsts = [*range(0, count * len(values), count), len(t)]
+    pieces = [(slice(*rows), x) for rows, x in zip(pairwise(firsts), values, strict=True)]
     return _Rows(model, run._params, t, q, qd, pieces)
 
 

@@ -173,7 +173,7 @@ def simulate(
     counts = work.counts
     cut = len(STATUS) + int(work.full)
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
-    given = held_at(rows, t0, period, held) if held is not None and over else held
+    given = None if held is None else held_at(rows, t0, period, held) if over else held.copy()
     made = AdaptiveBatchRun(
         model, t0, work.rows[0], work.rows[1], span / max(1.0, float(counts["steps"].mean())),
         counts["steps"], codes, 1, 0, table.copy(), given, "gauss16",

@@ -114,10 +114,8 @@ def _by_steps(
             q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
         if not whole:
             work.status[(work.status == 0) & short] = _CUT
-    given = held
-    if held is not None and held.shape[1] > 1:
-        given = _at_rows(held, np.arange(rows) * every, steps)
-    kept = None if every == 1 or held is given else held
+    given = None if held is None else _at_rows(held, np.arange(rows) * every, steps)
+    kept = held if held is not None and held.shape[1] > 1 and every > 1 else None
     run = BatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, every, steps, table.copy(),
         given, method, None if kept is None else kept.copy(),
@@ -139,9 +137,7 @@ def _at_times(
     work, last = way.work, int(places[0][-1])
     if not whole:
         work.status[(work.status == 0) & (work.done < last)] = _CUT
-    given = held
-    if held is not None and held.shape[1] > 1:
-        given = _at_rows(held, places[0], asked.steps)
+    given = None if held is None else _at_rows(held, places[0], asked.steps)
     run = TimedBatchRun(
         model, t0, q_rows, qd_rows, h, work.done, work.status, 1, last, table.copy(),
         given, method, None if held is None else held.copy(), _times=times,
@@ -152,6 +148,8 @@ def _at_times(
 
 def _at_rows(held: Array, begun: Array, steps: int) -> Array:
     """What is held from so many steps on; a copy, as the caller's table may change."""
+    if held.shape[1] == 1:
+        return held.copy()
     return np.ascontiguousarray(held[:, np.minimum(begun, steps - 1)])
 
 
