@@ -232,6 +232,29 @@ def test_run_tells_events_that_it_is_asked_for(there: Path) -> None:
     assert eomc("run", "cartpole.toml", "--event", "level").exit_code == 2
 
 
+@pytest.mark.slow
+def test_the_event_that_ends_a_run_is_told(here: Path) -> None:
+    scene = """eomc = 1
+name = "dropped"
+[coordinates]
+y = { unit = "m", start = 1.0 }
+[energy]
+kinetic = "y_dot**2/2"
+potential = "9.81*y"
+[[event]]
+name = "half"
+when = "y - 0.5"
+[[event]]
+name = "ground"
+when = "y"
+action = "stop"
+"""
+    (here / "dropped.toml").write_text(scene, encoding="utf-8")
+    told = eomc("run", "dropped.toml").output
+    assert re.search(r"event half: 1 time, at t = 0.319\d* s\n", told), told
+    assert re.search(r"event ground: 1 time, at t = 0.4515\d* s, which ends the run\n", told), told
+
+
 def test_two_scenes_of_one_name_do_not_replace_each_other(here: Path) -> None:
     shutil.copy("cartpole.toml", "copy.toml")
     done = eomc("build", "cartpole.toml", "copy.toml")

@@ -156,9 +156,9 @@ def test_rates_are_found_where_they_are_free(modules: Modules) -> None:
     assert q == pytest.approx([1.0, 0.0, 0.3 / 0.5 * 2 / 4], abs=1e-12)
     assert qd == pytest.approx([0.0, 0.6, 0.0], abs=1e-12) and u == pytest.approx([1.2])
     assert np.abs(motor.acceleration(q, qd, u=u)).max() < 1e-9
-    # at 6 V it turns where k i = load, R i + k phi_dot = 6; the sum goes on as its row says
-    q, qd, u = motor.equilibrium(u=6.0, free=["phi_dot", "charge_dot", "sum_dot"])
-    assert qd == pytest.approx([9.6, 0.6, 0.8], abs=1e-12) and q[0] == 0.2 and u == [6.0]
+    # turning at 6 V where R i + k phi_dot = 6 its sum would grow ever faster
+    with pytest.raises(motor.MotionError, match=r"the rates break error, by 9\.6 a second; start"):
+        motor.equilibrium(u=6.0, free=["charge_dot", "sum_dot"], qd=[9.6, 0.0, 0.0])
 
 
 MOTOR = """eomc = 1
@@ -186,3 +186,28 @@ def test_rates_that_rows_of_positions_do_not_allow_are_told(modules: Modules) ->
     with pytest.raises(bob.MotionError, match=r"the rates break \w+ by .*rate \(free="):
         bob.equilibrium(qd=[1.0, -2.0])
     assert q[1] < 0
+    with pytest.raises(bob.MotionError, match=r"the rates break rod, by 2 a second"):
+        bob.equilibrium(qd=[1.0, 0.0], free=[])  # it would leave along the tangent
+
+
+def test_of_many_free_rates_those_are_found_that_last(modules: Modules) -> None:
+    """L di/dt + R i + k w = 6 V as a row: all currents are steady where w is 6 V/k and i is 0."""
+    motor = modules.unoptimised(CIRCUIT)
+    q, qd, u = motor.equilibrium(free=["i", "phi_dot", "i_dot"])
+    assert q == pytest.approx([0.0, 0.0], abs=1e-7) and u is None
+    assert qd == pytest.approx([60.0, 0.0], abs=1e-7)
+    assert np.abs(motor.acceleration(q, qd)).max() < 1e-6
+
+
+CIRCUIT = """eomc = 1
+name = "circuit_row"
+[coordinates]
+phi = { unit = "rad" }
+i   = { unit = "A" }
+[energy]
+kinetic = "0.01*phi_dot**2/2"
+[forces]
+phi = "0.1*i"
+[constraints]
+circuit = "0.5*i_dot + i + 0.1*phi_dot - 6"
+"""

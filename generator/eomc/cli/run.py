@@ -314,7 +314,8 @@ def _print_summary(
     _print_energy(done, balance, summary)
     for name, times in summary["events"].items():
         last = f", at t = {times[-1]:.9g} s{' at last' if len(times) > 1 else ''}" if times else ""
-        say(f"  event {name}: {len(times)} {'time' if len(times) == 1 else 'times'}{last}")
+        over = ", which ends the run" if name == summary["stopped_by"] else ""
+        say(f"  event {name}: {len(times)} {'time' if len(times) == 1 else 'times'}{last}{over}")
     for name, part in summary["saturated"].items():
         say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
     if module._model.events and summary["tolerance"] is None:

@@ -31,8 +31,8 @@ def equilibrium(
     Forces, not accelerations: D couples these, and may be singular. Their slopes are differences,
     which cost a step some digits and the result none. Where more is free than they determine, each
     step is the shortest. u None: the signals, also where they depend on the state. Under
-    constraints what multipliers can't bear counts, and so do rates that rows don't allow; steps
-    are along rows of positions.
+    constraints what multipliers can't bear counts, and so do rates that rows don't allow, or don't
+    as the motion goes on; steps are along rows of positions.
     """
     n, known = model.nq, (*model._states, *model.inputs)
     if strange := [name for name in free if name not in known]:
@@ -86,7 +86,7 @@ def equilibrium(
         z, now = there, left
     sizes[:n] = np.max(sizes[:n], initial=0) + (np.max(np.abs(whole(z))) if rows else 0.0)
     if rows:
-        sizes[n:] += rows.of_rates(z)
+        sizes[n:] += rows.sizes(z)
     much = now * ~(np.abs(now) <= np.sqrt(eps) * sizes)  # rounding leaves less
     _refuse(model, z, much, (q, qd), held(z), t, params)
     at, moving = (x.astype(model.dtype) for x in (z[:n], z[n : 2 * n]))
@@ -117,9 +117,11 @@ def _refuse(
 def _too_much(model: Constrained, left: Array) -> str:
     """What keeps a state from being an equilibrium: rates that rows don't allow, or a force."""
     n = model.nq
-    if left[n:].any():
-        worst = int(np.argmax(np.abs(left[n:])))
-        return f"the rates break {model.constraint_names[worst]} by {left[n + worst]:.3g}"
+    rates, changes = np.split(left[n:], 2)
+    for found, words in ((rates, "break {} by {:.3g}"), (changes, "break {}, by {:.3g} a second")):
+        if found.any():
+            worst = int(np.argmax(np.abs(found)))
+            return f"the rates {words.format(model.constraint_names[worst], found[worst])}"
     worst = int(np.argmax(np.abs(left[:n])))
     return f"a force of {left[worst]:.3g} is left on {model.coordinates[worst]}"
 
@@ -170,17 +172,32 @@ class _Rows:
         return np.concatenate([ways, np.eye(len(z))[n:][self.moved[n:]]])
 
     def left(self, z: Array, forces: Array) -> Array:
-        """What no multipliers can bear of the forces (nq,), then what the rates of rows lack."""
-        n, A = self.model.nq, self._slopes(z)
-        forces = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
-        lacking = self.model.constraint_rates(z[:n], z[n : 2 * n], self.t, self.params)
-        return np.concatenate([forces, lacking]).astype(float)
+        """What no multipliers can bear of the forces (nq,), what the rates of rows lack, (nc,).
 
-    def of_rates(self, z: Array) -> Array:
-        """The terms of each row's rate, in size, that are linear in the velocities."""
+        Then how fast that would change if the velocities did not, (nc,), by a difference.
+        """
+        A, (q, qd) = self._slopes(z), self._halves(z)
+        forces = forces - A.T @ np.linalg.lstsq(A.T, forces, rcond=_RANK_TOLERANCE)[0]
+        short = np.cbrt(np.finfo(self.model.dtype).eps) / self._pace(z)
+        before, now, then = (
+            self.model.constraint_rates(q + e * qd, qd, self.t + e, self.params).astype(float)
+            for e in (-short, 0.0, short)
+        )
+        return np.concatenate([forces, now, (then - before) / (2 * short)])
+
+    def sizes(self, z: Array) -> Array:
+        """Of what `left` has of rows, (2 nc,): terms that are linear in the velocities."""
+        sizes = np.abs(self._slopes(z)) @ np.abs(self._halves(z)[1])
+        return np.concatenate([sizes, sizes * self._pace(z)])
+
+    def _halves(self, z: Array) -> tuple[Array, Array]:
         n = self.model.nq
-        sizes: Array = np.abs(self._slopes(z)) @ np.abs(z[n : 2 * n])
-        return sizes
+        return z[:n], z[n : 2 * n]
+
+    def _pace(self, z: Array) -> float:
+        """How fast a state changes, 1/s."""
+        q, qd = self._halves(z)
+        return float(np.max(np.abs(qd) / np.maximum(1.0, np.abs(q)), initial=1.0))
 
     def _slopes(self, z: Array) -> Array:
         q, t = z[: self.model.nq], self.t
