@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Modules
+from test_balance import STICKS
 
 
 @pytest.mark.parametrize(("guess", "found"), [(0.4, 0.0), (1.5, 0.0), (2.5, math.pi)])
@@ -211,3 +212,12 @@ phi = "0.1*i"
 [constraints]
 circuit = "0.5*i_dot + i + 0.1*phi_dot - 6"
 """
+
+
+def test_friction_that_sticks_holds_what_it_can(modules: Modules) -> None:
+    """10 x against 1 N, and against 2 N."""
+    block = modules.unoptimised(STICKS)
+    assert block.equilibrium([0.09])[0].tolist() == [0.09, 0.0]
+    with pytest.raises(block.MotionError, match=r"x slips, as 1\.5 is more than its friction hold"):
+        block.equilibrium([0.15])
+    assert block.equilibrium([0.15], params={"F": 2.0})[0].tolist() == [0.15, 0.0]

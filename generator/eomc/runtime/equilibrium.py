@@ -100,15 +100,16 @@ def _refuse(
     t: float, params: Any,
 ) -> None:  # fmt: skip
     """Raise MotionError where a search ends with too much left."""
-    if not much.any():
-        return
     q, qd = z[: model.nq], z[model.nq : 2 * model.nq]
+    why = _too_much(model, much) if much.any() else _slips(model, q, qd, u, t, params)
+    if not why:
+        return
     found = f"q = {np.array2string(q, precision=6, threshold=12)}"
     if np.any(qd != begun[1]):
         found = state_text(q, qd)
     raise MotionError(
         f"no equilibrium found from {state_text(*begun)}: the search ends at {found}, where "
-        f"{_too_much(model, much)}{_beyond(model, q, qd, u, t, params)}; start elsewhere, or let "
+        f"{why}{_beyond(model, q, qd, u, t, params)}; start elsewhere, or let "
         f"another coordinate, rate (free=[..., '{model._states[model.nq]}']) or input be free",
         "no convergence",
     )
@@ -124,6 +125,21 @@ def _too_much(model: Constrained, left: Array) -> str:
             return f"the rates {words.format(model.constraint_names[worst], found[worst])}"
     worst = int(np.argmax(np.abs(left[:n])))
     return f"a force of {left[worst]:.3g} is left on {model.coordinates[worst]}"
+
+
+def _slips(model: Constrained, q: Array, qd: Array, u: Array | None, t: float, params: Any) -> str:
+    """What friction that sticks can't hold, in words; "" where all holds."""
+    if not model._rows.modes:
+        return ""
+    holds = dict(zip(model.constraint_names, model.multipliers(q, qd, t, u, params), strict=True))
+    for at, of in model._rows.modes:
+        name, sliding = model.coordinates[of], q.copy()
+        sliding[at] = 1.0
+        friction, rest = (model.tau(x, qd, t, u, params)[of] for x in (sliding, q))
+        most, force = abs(friction - rest), abs(holds[f"{name}_sticks"])
+        if not q[at] and force > most * (1 + 1e-6):
+            return f"{name} slips, as {force:.3g} is more than its friction holds, {most:.3g}"
+    return ""
 
 
 def _beyond(model: Constrained, q: Array, qd: Array, u: Array | None, t: float, params: Any) -> str:
