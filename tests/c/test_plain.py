@@ -193,8 +193,8 @@ def test_header_and_source_of_the_two_forms_do_not_go_together(tmp_path: Path) -
 
 def compared(name: str, fast: ModuleType, plain: ModuleType, states: int) -> list[Row]:
     """The rows of the plain form that a check has."""
-    comparison = Comparison(made(name), fast, np.random.default_rng(0), states)
-    rows_plain.rows(comparison, plain)
+    comparison = Comparison(made(name), fast, np.random.default_rng(0), states, plain)
+    rows_plain.rows(comparison)
     return comparison.rows
 
 

@@ -261,5 +261,5 @@ def test_a_wrong_loop_fails_the_check(modules: Modules) -> None:
     m, made = modules.unoptimised(LOOP), from_scene(parse(LOOP, "test.toml"))
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
-        rows_signals.report(of, None)
+        rows_signals.report(of)
         assert [(row.name, row.passed) for row in of.rows] == [("closed loop", passed)], of.rows

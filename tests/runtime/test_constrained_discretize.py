@@ -197,5 +197,5 @@ def test_a_wrong_one_fails_the_check(modules: Modules) -> None:
     m, made = modules.unoptimised(SLEIGH), from_scene(parse(SLEIGH, "test.toml"))
     for module, passed in ((m, True), (Wrong(), False)):
         of = Comparison(made, module, np.random.default_rng(0), 4)
-        rows_discretize.report(of, None)
+        rows_discretize.report(of)
         assert [row.passed for row in of.rows] == [passed], of.rows

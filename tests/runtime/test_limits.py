@@ -211,7 +211,7 @@ class Wrong:
 def test_the_check_finds_what_does_not_hold_them(limited: ModuleType, wrong: bool) -> None:
     module: Any = Wrong(limited) if wrong else limited
     of = Comparison(from_scene(parse(BATCH, "test.toml")), module, np.random.default_rng(0), 4)
-    rows_limits.report(of, None)
+    rows_limits.report(of)
     (row,) = of.rows
     assert row.name == "limits of inputs" and row.passed is not wrong, row
 

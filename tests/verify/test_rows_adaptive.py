@@ -60,7 +60,7 @@ def bounded() -> Iterator[None]:
 @pytest.mark.usefixtures("bounded")
 def test_events_without_end_are_left_after_what_is_compared(of: Comparison) -> None:
     """Of a run of 5 s, which would take memory as long as it went on."""
-    rows_adaptive.report(of, None)
+    rows_adaptive.report(of)
     assert [row.passed for row in of.rows] == [True] * 3, of.rows
 
 

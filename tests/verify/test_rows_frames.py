@@ -62,8 +62,8 @@ def test_wrong_ones_fail(comparison: Comparison, name: str) -> None:
     made = Wrong(module, name)
     comparison.module = made
     try:
-        rows_frames.report(comparison, None, system.scene)
-        rows_frames.inverse_dynamics(comparison, None)
+        rows_frames.report(comparison, system.scene)
+        rows_frames.inverse_dynamics(comparison)
     finally:
         comparison.module = module
     assert sorted(row.name for row in comparison.rows) == sorted(ROWS.values())
@@ -82,7 +82,7 @@ def test_joints_that_move_together(modules: Modules) -> None:
     module = modules.unoptimised(text.replace("crane3", "crane4"))
     made = from_scene(parse(text.replace("crane3", "crane4"), "test.toml"))
     comparison = Comparison(made, module, np.random.default_rng(0), 6)
-    rows_frames.report(comparison, None, made.scene)
-    rows_frames.inverse_dynamics(comparison, None)
+    rows_frames.report(comparison, made.scene)
+    rows_frames.inverse_dynamics(comparison)
     assert len(comparison.rows) == len(ROWS)
     assert all(row.passed for row in comparison.rows), comparison.rows

@@ -61,7 +61,7 @@ class Wrong:
 def test_wrong_ones_fail(modules: Modules, wrong: dict[str, float], failed: list[str]) -> None:
     made, module = from_scene(parse(SCENE, "test.toml")), modules.unoptimised(SCENE)
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
-    rows_outputs.report(comparison, None)
+    rows_outputs.report(comparison)
     assert [row.name for row in comparison.rows] == ["outputs", "outputs: C, D"]
     assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
 
@@ -104,7 +104,7 @@ def test_wrong_ones_of_multipliers_fail(
         modules.unoptimised(ON_A_ROD),
     )
     comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
-    rows_outputs.report(comparison, None)
+    rows_outputs.report(comparison)
     assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
 
 
@@ -117,5 +117,5 @@ def test_slopes_along_what_jumps_set_are_right(modules: Modules) -> None:
     text += '[[event]]\nname = "sheds"\nwhen = "t - 1"\naction = "jump"\nm = "m/2"\n'
     made, module = assembled(from_scene(parse(text, "test.toml"))), modules.unoptimised(text)
     comparison = Comparison(made, module, np.random.default_rng(0), None)
-    rows_outputs.report(comparison, None)
+    rows_outputs.report(comparison)
     assert [row.passed for row in comparison.rows] == [True, True], comparison.rows

@@ -16,7 +16,7 @@ import numpy as np
 from eomc.integrators.tableaux import METHODS
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import FARTHEST
+from eomc.verify.sampling import FARTHEST, along
 
 if TYPE_CHECKING:
     from eomc.verify.convergence import Convergence
@@ -86,8 +86,7 @@ class Advice:
         every = max(1, steps * max(1, len(start.q) // 8) // PLACES)
         found, longest = start, 1e3 * self.duration
         run = self.runs.run(start, method, steps=steps, every=every)
-        for t, q, qd in zip(run.t, run.q, run.qd, strict=True):
-            s = replace(start, q=np.array(q), qd=np.array(qd), t=float(t))
+        for s in along(run, start):
             if not np.all(np.abs([s.q - start.q, s.qd - start.qd]) < FARTHEST * self.scale):
                 break
             if (here := self._longest(method, s, longest)) < longest:

@@ -50,33 +50,32 @@ def check(
     seed. A module that raises fails the row, which shows its words. Raises EomcError where
     `symbolic.of` does.
     """
-    made = Comparison(system, module, np.random.default_rng(seed), states)
+    made = Comparison(system, module, np.random.default_rng(seed), states, plain)
     made.row("names, defaults, start", 0, "that differ", made.faces)
     if made.expected:
         value_rows(made)
         property_rows(made)
         if system.constraints:
-            rows_constraints.report(made, plain)
+            rows_constraints.report(made)
         compiled = hasattr(module, "_model")
         if compiled:  # what is compiled has several ways to one answer
             module._model._warned.add("events")  # which fixed steps are to pass over here
-            compiled_rows(made, plain)
+            compiled_rows(made)
         scene = system.scene
         if scene is not None and scene.assembly is not None:
             Bodies(made, scene).report()
             if compiled:
-                rows_frames.report(made, plain, scene)
+                rows_frames.report(made, scene)
         if compiled and system.run.inverse_dynamics:
-            rows_frames.inverse_dynamics(made, plain)
+            rows_frames.inverse_dynamics(made)
         if system.outputs and hasattr(module, "output"):
-            rows_outputs.report(made, plain)
+            rows_outputs.report(made)
         if hasattr(module, "applied"):
-            rows_limits.report(made, plain)
-            rows_signals.report(made, plain)
-            rows_discretize.report(made, plain)
-            rows_adaptive.report(made, plain)
-        if plain is not None:
-            rows_plain.rows(made, plain)
+            rows_limits.report(made)
+            rows_signals.report(made)
+            rows_discretize.report(made)
+            rows_adaptive.report(made)
+        rows_plain.rows(made)
     else:
         made.row("states", 1, "states with a regular D", lambda: 0.0, least=True)
     kind = "Taylor arithmetic" if made.large else "equations written out"
@@ -112,7 +111,7 @@ def property_rows(made: Comparison) -> None:
         made.convergence_rows()
 
 
-def compiled_rows(made: Comparison, plain: Any) -> None:
+def compiled_rows(made: Comparison) -> None:
     """Add the rows about runs, refusals and, where the module has them, batches."""
     runs, refusals = Runs(made), Refusals(made)
     runs.report()
@@ -124,4 +123,4 @@ def compiled_rows(made: Comparison, plain: Any) -> None:
         rows_projection.of_inertia(made, refusals)
     if hasattr(made.module, "simulate_batch"):
         Batches(runs, refusals.singular).report()
-        rows_adaptive_batch.report(made, refusals.singular, plain)
+        rows_adaptive_batch.report(made, refusals.singular)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
@@ -28,7 +27,9 @@ from eomc.verify.sampling import (
     Expected,
     Sampler,
     State,
+    along,
     ask,
+    simulate,
     started,
     units,
 )
@@ -45,19 +46,14 @@ def _corrected(e: Expected) -> Vector | float:
     return e.size.get("place", 0.0)
 
 
-def _rows(run: Any, s: State) -> list[State]:
-    """The states that a run from `s` went through."""
-    rows = zip(run.t, run.q, run.qd, strict=True)
-    return [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
-
-
 class Comparison:
-    """All rows of one report."""
+    """All rows of one report. plain: the module of the plain form of C, or None."""
 
     def __init__(
-        self, system: System, module: Any, random: np.random.Generator, states: int | None
-    ) -> None:
-        self.system, self.module = system, module
+        self, system: System, module: Any, random: np.random.Generator, states: int | None,
+        plain: Any = None,
+    ) -> None:  # fmt: skip
+        self.system, self.module, self.plain = system, module, plain
         self.dtype = np.dtype(getattr(module, "dtype", "float64"))
         self.eps = float(np.finfo(self.dtype).eps)
         self.methods: tuple[str, ...] = getattr(module, "methods", ("rk4",))
@@ -147,7 +143,7 @@ class Comparison:
                 for e in usual
             ],
             self.expected[0].state,
-            np.array([self.sampler.spread, self.sampler.speed]),
+            self.sampler.scale,
             self.system.run.h,
             self.system.run.duration,
         )
@@ -162,9 +158,15 @@ class Comparison:
         """The functions in the scene that jump or bend."""
         return corners(self.system)
 
-    def largest(self, of: Callable[[Expected], float]) -> float:
-        """The largest error over all states; nan wins."""
-        return float(np.max([of(e) for e in self.expected]))
+    @property
+    def forms(self) -> list[tuple[Any, str]]:
+        """The modules of both forms of C, as far as there are, with what their rows begin with."""
+        plain = [] if self.plain is None else [(self.plain, "plain C: ")]
+        return [(self.module, ""), *plain]
+
+    def largest(self, of: Callable[[Expected], float], few: int | None = None) -> float:
+        """The largest error over all states, or a few; nan wins."""
+        return float(np.max([of(e) for e in (self.few(few) if few else self.expected)]))
 
     # against the reference
 
@@ -196,7 +198,7 @@ class Comparison:
 
     def steps(self) -> float | Finding:
         """One step of the scene's h from a few states."""
-        h, far = self.system.run.h, FARTHEST * np.array([self.sampler.spread, self.sampler.speed])
+        h, far = self.system.run.h, FARTHEST * self.sampler.scale
 
         def reference(**rows: Any) -> Vector:
             return np.stack(self.reference.step(h=h, **rows), axis=1)
@@ -233,7 +235,6 @@ class Comparison:
         That is, its shortest; or two in a row whose stages the module does not find.
         """
         s, gain, lost, refused = e.state, e.size["acceleration"], 0, False
-        spread = np.array([self.sampler.spread, self.sampler.speed])
         for h in (part * longest for part in SHORTER):
             refused = False
 
@@ -250,7 +251,7 @@ class Comparison:
 
             with np.errstate(all="ignore"):
                 expected, size = self.sampler.reach(reference, s)
-            most = spread * (1 if h > self.system.run.h else FARTHEST)
+            most = self.sampler.scale * (1 if h > self.system.run.h else FARTHEST)
             if not np.all(np.abs(expected - [s.q, s.qd]) < most):
                 continue
             run = self.simulate(s, method=method, h=h, steps=1, t0=s.t)
@@ -292,7 +293,7 @@ class Comparison:
     def _motion(self, s: State, h: float, steps: int) -> tuple[Vector, Vector, Vector]:
         """The reference's run as far as it is sure: t (n,), states (n, 2, nq), growth (n, 1, 1)."""
         own = self.system.run.h
-        spread = np.array([self.sampler.spread, self.sampler.speed])
+        spread = self.sampler.scale
 
         # of alternating signs, as what is rounded excites the fastest modes too
         by = NUDGE * spread * (np.where(np.arange(len(s.q)) % 2, -1, 1) if h > own else 1)
@@ -317,18 +318,15 @@ class Comparison:
         """The module's run from a state."""
         if begin := self.begin(s):
             how.setdefault("t0", begin)
-        s = started(self.module, s)
-        with warnings.catch_warnings():  # a run that stops early is looked at here
-            warnings.simplefilter("ignore", RuntimeWarning)
-            return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
+        return simulate(self.module, started(self.module, s), **how)
 
     def run_energy(self) -> float:
         """The energy that a run reports, at the states that it reports."""
         s = self.few(2)[-1].state
         run = self.simulate(s, steps=2)
-        far = FARTHEST * np.array([self.sampler.spread, self.sampler.speed])
+        far = FARTHEST * self.sampler.scale
         errors = []
-        for row, found in zip(_rows(run, s), run.energy, strict=True):
+        for row, found in zip(along(run, s), run.energy, strict=True):
             if np.all(np.abs(np.subtract([row.q, row.qd], [s.q, s.qd])) < far):
                 energy, size = self.sampler.energy(row)
                 errors += [self.units(found, energy, size)] if np.isfinite(energy) else []

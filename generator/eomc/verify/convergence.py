@@ -14,7 +14,6 @@ seen, and a wrong one is wherever it can be:
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,7 +26,7 @@ from eomc.integrators.tableaux import METHODS, RK4
 from eomc.verify import one_step
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import started
+from eomc.verify.sampling import along, ask, simulate, started
 
 if TYPE_CHECKING:
     from eomc.verify.sampling import State
@@ -123,9 +122,7 @@ class Convergence:
         if getattr(self.module, "constraint_names", ()):  # rows may stand in time
             how.setdefault("t0", s.t)
             s = started(self.module, s)
-        with warnings.catch_warnings():  # a run that stops early is looked at here
-            warnings.simplefilter("ignore", RuntimeWarning)
-            return self.module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
+        return simulate(self.module, s, **how)
 
     def end(self, s: State, method: str, span: float, steps: int) -> Vector | None:
         """The scaled end of a run, (2, nq); None where it does not get there."""
@@ -325,8 +322,7 @@ class Convergence:
             run = self.run(s, self._best_method, h=span / n, steps=n)
             if str(run.status) != "ok":
                 return [], False
-            rows = zip(run.t, run.q, run.qd, strict=True)
-            states = [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
+            states = along(run, s)
             power = np.array([self.ask("power", row) for row in states])
             simpson = np.array([1, *(4, 2) * (n // 2 - 1), 4, 1]) * span / n / 3
             after, before = (self.ask("jacobi", states[i]) for i in (-1, 0))
@@ -340,9 +336,7 @@ class Convergence:
 
     def ask(self, name: str, s: State) -> Vector:
         """The module's value of that name."""
-        place = (s.q,) if name == "potential_energy" else (s.q, s.qd)
-        inputs = {"u": s.u} if name in ("power", "acceleration") else {}
-        return np.asarray(getattr(self.module, name)(*place, t=s.t, params=s.params, **inputs))
+        return ask(self.module, name, s)
 
 
 def _judged(found: Iterable[float], pick: Callable[[Iterable[float]], float], why: str) -> Finding:

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from eomc.verify.oracle import Answer, Vector
+from eomc.verify.oracle import STENCIL, Answer, Vector
 
 if TYPE_CHECKING:
     from eomc.verify.sampling import State
 
-STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of the scale of each variable
 
 

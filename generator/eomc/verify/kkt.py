@@ -50,7 +50,7 @@ def _solve(D: Vector, A: Vector, force: Vector, level: Vector) -> tuple[Vector, 
     A, level = A[on], level[on]
     n, m = len(D), len(A)
     scale = scales(D, A)
-    matrix = scale[:, None] * np.block([[D, -A.T], [A, np.zeros((m, m))]]) * scale
+    matrix = _scaled(D, A, np.zeros((m, m)), scale)
     right = scale * np.concatenate([force, level])
     sizes = np.linalg.svd(matrix, compute_uv=False)
     if sizes[-1] > RANK_TOLERANCE * sizes[0]:
@@ -78,7 +78,7 @@ def inverse(D: Vector, A: Vector) -> Vector:
     A row of zeros has the multiplier 0.
     """
     scale, none = scales(D, A), np.diag((~A.any(axis=1)).astype(float))
-    matrix = scale[:, None] * np.block([[D, -A.T], [A, none]]) * scale
+    matrix = _scaled(D, A, none, scale)
     return np.asarray(np.abs(scale[:, None] * np.linalg.inv(matrix) * scale))
 
 
@@ -87,12 +87,15 @@ def regular(D: Vector, A: Vector, least: float) -> bool:
 
     Those of rows are squares of A's.
     """
-    m, scale = len(A), scales(D, A)
-    matrix = scale[:, None] * np.block([[D, -A.T], [A, np.zeros((m, m))]]) * scale
+    matrix = _scaled(D, A, np.zeros((len(A), len(A))), scales(D, A))
     if not np.all(np.isfinite(matrix)):
         return False
     sizes = np.linalg.svd(matrix, compute_uv=False)
     return bool(sizes[-1] > least * sizes[0])
+
+
+def _scaled(D: Vector, A: Vector, corner: Vector, scale: Vector) -> Vector:
+    return np.asarray(scale[:, None] * np.block([[D, -A.T], [A, corner]]) * scale)
 
 
 def scales(D: Vector, A: Vector) -> Vector:

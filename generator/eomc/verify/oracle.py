@@ -24,10 +24,12 @@ from eomc.verify import kkt
 ROWS, RATES = ("D", "constraint_jacobian", "constraints"), "constraint_rates"
 CORRECTIONS = 12  # of a step, at most
 CORRECTED = 1e-8  # of a coordinate: a correction whose square is rounding
-SLOPE = (4 / 5, -1 / 5, 4 / 105, -1 / 280)  # central differences of order 8 (Fornberg, 1988)
+# central differences of order 8 (Fornberg, 1988): at which multiples of a width, and their weights
+STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 LEAP = 0.02  # of a coordinate, in the differences of one
 
 Vector = NDArray[np.float64]
+Params = Mapping[str, Any] | None  # values in place of defaults
 Values = tuple[Any, ...]  # of the parameters, in the system's order: floats, or one a row
 
 MATRICES = ("D", "C", "constraint_jacobian")
@@ -63,7 +65,7 @@ class Answer(ABC):
         qd: ArrayLike | None = None,
         t: ArrayLike = 0.0,
         u: ArrayLike | None = None,
-        params: Mapping[str, Any] | None = None,
+        params: Params = None,
     ) -> Any:
         """The value of `name`: a float, an (nq,) or (nu,) vector or an (nq, nq) matrix.
 
@@ -84,7 +86,7 @@ class Answer(ABC):
         qd: ArrayLike,
         t: ArrayLike = 0.0,
         u: ArrayLike | None = None,
-        params: Mapping[str, Any] | None = None,
+        params: Params = None,
     ) -> Vector:
         """Solve D qdd = tau - bias, under constraints D qdd = tau - bias + A^T lambda: (nq,).
 
@@ -99,7 +101,7 @@ class Answer(ABC):
         qd: ArrayLike,
         t: ArrayLike = 0.0,
         u: ArrayLike | None = None,
-        params: Mapping[str, Any] | None = None,
+        params: Params = None,
     ) -> Vector:
         """Those of the m constraints, (m,); 0 of rows that are redundant."""
         q, qd = np.asarray(q, float), np.asarray(qd, float)
@@ -111,7 +113,7 @@ class Answer(ABC):
         q: ArrayLike,
         qd: ArrayLike,
         t: ArrayLike = 0.0,
-        params: Mapping[str, Any] | None = None,
+        params: Params = None,
         held: tuple[int, ...] = (),
     ) -> tuple[Vector, Vector]:
         """q and qd put onto the constraints, by Newton's method in the metric of D, to rounding.
@@ -124,7 +126,7 @@ class Answer(ABC):
         return self._each(onto, q, qd, np.asarray(t, float), self._values(params))
 
     def corrected(
-        self, q: Vector, qd: Vector, t: ArrayLike, params: Mapping[str, Any] | None = None
+        self, q: Vector, qd: Vector, t: ArrayLike, params: Params = None
     ) -> tuple[Vector, Vector]:
         """q and qd behind a step, corrected as a step is."""
         return self._each(self._corrected, q, qd, np.asarray(t, float), self._values(params))
@@ -136,7 +138,7 @@ class Answer(ABC):
         h: float,
         t: ArrayLike = 0.0,
         u: ArrayLike | None = None,
-        params: Mapping[str, Any] | None = None,
+        params: Params = None,
     ) -> tuple[Vector, Vector]:
         """One step of the classical Runge-Kutta method of order 4: q and qd at t + h, corrected.
 
@@ -153,7 +155,7 @@ class Answer(ABC):
         steps: int | None = None,
         every: int = 1,
         u: ArrayLike | None = None,
-        params: Mapping[str, Any] | None = None,
+        params: Params = None,
         t0: float = 0.0,
     ) -> tuple[Vector, Vector, Vector]:
         """Run from the start: t (n,) and q, qd (n, nq), rows every `every` steps and the last.
@@ -178,7 +180,7 @@ class Answer(ABC):
     def _defaults(self) -> Values:
         return tuple(p.value for p in self.system.parameters)
 
-    def _values(self, params: Mapping[str, Any] | None) -> Values:
+    def _values(self, params: Params) -> Values:
         """Parameters in the system's order."""
         if not params:
             return self._defaults
@@ -289,7 +291,7 @@ class Answer(ABC):
             dq, _ = kkt.solve(D, A, rest, -self._holonomic * off)
             part = min(1 / 16, LEAP / max(float(np.max(np.abs(dq))), LEAP))
             slope = np.zeros_like(off)
-            for k, weight in enumerate(SLOPE, start=1):
+            for k, weight in STENCIL:
                 ends = [self._row(RATES, q + x * dq, qd, t, values) for x in (-k * part, k * part)]
                 slope += weight / part * (ends[1] - ends[0])
             moved = self._row(RATES, q, qd, t, values) + slope

@@ -8,7 +8,6 @@ times what a difference at the start grows to.
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,7 @@ from eomc.verify import one_step
 from eomc.verify.comparison import GROWTH_LIMIT
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import NUDGE, State
+from eomc.verify.sampling import NUDGE, State, simulate
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
@@ -32,17 +31,16 @@ TICKS = 4  # roundings of a time
 ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 
-def report(of: Comparison, plain: Any) -> None:
-    """Add the rows of a scene that asks for them. plain: the module of the plain form, or None."""
+def report(of: Comparison) -> None:
+    """Add the rows of a scene that asks for them."""
     if of.system.run.tolerance is None:
         return
     tight = 1e-13 if of.dtype == np.float64 else 1e-6
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
+    for module, form in of.forms:
         for tol, stiff in ((10 * tight**0.5, False), (tight, False), (tight**0.5, True)):
-            if module is not None:
-                measure = partial(_worst, of, module, tol, stiff)
-                how = "stiff" if stiff else f"{tol:g}"
-                of.row(f"{form}adaptive steps, {how}", LIMIT, UNIT, measure)
+            measure = partial(_worst, of, module, tol, stiff)
+            how = "stiff" if stiff else f"{tol:g}"
+            of.row(f"{form}adaptive steps, {how}", LIMIT, UNIT, measure)
 
 
 def _worst(of: Comparison, module: Any, tol: float, stiff: bool) -> float | Finding:
@@ -52,10 +50,8 @@ def _worst(of: Comparison, module: Any, tol: float, stiff: bool) -> float | Find
 
 def _adaptive(module: Any, s: State, x: Vector, T: float, tol: float, **how: Any) -> Any:
     n = len(s.q)
-    with warnings.catch_warnings():  # a run that stops is seen by its rows
-        warnings.simplefilter("ignore", RuntimeWarning)
-        span = how if "times" in how else {"duration": T, **how}
-        return module.simulate(x[:n], x[n:], tol=tol, t0=s.t, u=s.u, params=s.params, **span)
+    span = how if "times" in how else {"duration": T, **how}
+    return simulate(module, replace(s, q=x[:n], qd=x[n:]), tol=tol, t0=s.t, **span)
 
 
 def _begun(module: Any, s: State, x: Vector, T: float, tol: float, stiff: bool) -> Any:
@@ -77,7 +73,7 @@ def _begun(module: Any, s: State, x: Vector, T: float, tol: float, stiff: bool) 
 def _error(of: Comparison, module: Any, tol: float, stiff: bool, s: State) -> float | None:
     """At the end and at times within steps, from one state; None where nothing can be compared."""
     x = np.concatenate([s.q, s.qd])
-    spread = np.concatenate([of.sampler.spread, of.sampler.speed])
+    spread = of.sampler.scale.ravel()
     first = _begun(module, s, x, of.system.run.duration, tol, stiff)
     if len(first) < 2:  # not a single step
         begins = np.isfinite(of.reference.acceleration(s.q, s.qd, s.t, s.u, s.params)).all()

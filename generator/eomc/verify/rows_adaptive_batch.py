@@ -18,10 +18,10 @@ from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_refusals import NOT_FINITE, SINGULAR
 from eomc.verify.rows_runs import parameters
+from eomc.verify.sampling import State, simulate
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import State
 
 COUNT = 19  # instances: more than twice what any register holds
 FEW = 4  # singular states
@@ -46,17 +46,16 @@ class Left:
         return [x[which] for x in (self.x, self.t, self.rows, self.counts, self.status)]
 
 
-def report(of: Comparison, singular: list[State], plain: Any) -> None:
-    """Add the rows of a scene that asks for both. plain: the module of the plain form, or None."""
+def report(of: Comparison, singular: list[State]) -> None:
+    """Add the rows of a scene that asks for both."""
     if of.system.run.tolerance is None or not of.system.run.batch:
         return
     made = Many(of, singular)
     of.row("adaptive steps of many", LIMIT, UNIT, made.beside)
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
-        if module is not None:
-            many = Many(of, singular, module)
-            of.row(f"{form}adaptive steps of many: bits", 0, "instances", many.alike)
-            of.row(f"{form}adaptive steps of many: refusals", 0, "instances", many.refused)
+    for module, form in of.forms:
+        many = Many(of, singular, module)
+        of.row(f"{form}adaptive steps of many: bits", 0, "instances", many.alike)
+        of.row(f"{form}adaptive steps of many: refusals", 0, "instances", many.refused)
 
 
 class Found:
@@ -92,8 +91,7 @@ class Many:
         self.state = s = of.few(2)[-1].state
         random, sampler = np.random.default_rng(3), of.sampler
         self.starts = [
-            sampler.onto(replace(s, q=s.q + dq, qd=s.qd + dv)) if of.system.constraints
-            else replace(s, q=s.q + dq, qd=s.qd + dv)
+            sampler.onto(replace(s, q=s.q + dq, qd=s.qd + dv))
             for dq, dv in zip(
                 1e-2 * sampler.spread * random.standard_normal((COUNT, len(s.q))),
                 1e-2 * sampler.speed * random.standard_normal((COUNT, len(s.q))), strict=True,
@@ -103,10 +101,7 @@ class Many:
 
     def alone(self, s: State, **span: Any) -> Any:
         """A run of one from there."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
-            how = {"tol": self.tol, "t0": s.t, "u": s.u, "params": s.params}
-            return self.module.simulate(s.q, s.qd, **how, **span)
+        return simulate(self.module, s, tol=self.tol, t0=s.t, **span)
 
     def span(self) -> float:
         """How long some steps take; 0 where there is none."""
@@ -117,8 +112,7 @@ class Many:
         """The ends and rows of some steps of each, beside those of its run alone."""
         s, T = self.state, self.span()
         times = s.t + T * np.array([0.4, 1.0])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
             q, qd = (np.array([getattr(x, name) for x in self.starts]) for name in ("q", "qd"))
             many = self.module.simulate_batch(
                 q, qd, times=times, tol=self.tol, t0=s.t, params=s.params,
@@ -132,8 +126,7 @@ class Many:
         if one.status != "ok" or len(one) < len(times):
             return None
         x = np.hstack([many.q[k], many.qd[k]]).astype(float)
-        sampler = self.of.sampler
-        scale = np.abs(one.x).max(axis=0) + np.concatenate([sampler.spread, sampler.speed])
+        scale = np.abs(one.x).max(axis=0) + self.of.sampler.scale.ravel()
         allowed = (self.tol + ROUNDING * self.of.eps) * (one.steps + 1)
         return float(np.nan_to_num(np.max(np.abs(x - one.x) / scale) / allowed, nan=math.inf))
 

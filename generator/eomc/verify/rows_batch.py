@@ -92,8 +92,8 @@ class Batches:
         params: Any = states[0].params
         if own:
             params = {x: np.array([(s.params or names)[x] for s in states]) for x in names}
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
+        quiet = warnings.catch_warnings(action="ignore", category=RuntimeWarning)
+        with np.errstate(all="ignore"), quiet:
             return self.module.simulate_batch(
                 np.array([s.q for s in states]), np.array([s.qd for s in states]), h or self.h,
                 steps=STEPS, every=every, params=params, u=u, threads=1, method=method,
@@ -128,7 +128,7 @@ class Batches:
     def step_off(self, method: str, s: State, found: Vector) -> float | None:
         """The end of a step beside that of a single one, in units; None where it has no digits."""
         x, nudge = np.array([s.q, s.qd], float), self.check.eps ** (1 / 3)
-        spread = np.array([self.runs.sampler.spread, self.runs.sampler.speed])
+        spread = self.runs.sampler.scale
         wide = float(np.max(1 + np.abs(x) / spread))  # the last digit, of what would be 1 elsewhere
         if wide * self.check.eps > nudge:
             return None
@@ -173,9 +173,8 @@ class Batches:
         """The states with each number a rounding off."""
         eps, n = self.check.eps, len(states[0].q)
         signs = self.random.choice([-eps, eps], (len(states), 2, n))
-        spread = np.array([self.runs.sampler.spread, self.runs.sampler.speed])
         moved = [
-            np.array([s.q, s.qd]) + by * (np.abs([s.q, s.qd]) + spread)
+            np.array([s.q, s.qd]) + by * (np.abs([s.q, s.qd]) + self.runs.sampler.scale)
             for s, by in zip(states, signs, strict=True)
         ]
         return [replace(s, q=x[0], qd=x[1]) for s, x in zip(states, moved, strict=True)]
@@ -186,7 +185,7 @@ class Batches:
         A compiler takes products of shared parameters out of its loop, and rounds them there.
         rounded: the batch from starts that are a rounding off.
         """
-        spread = np.array([self.runs.sampler.spread, self.runs.sampler.speed])[:, None, None]
+        spread = self.runs.sampler.scale[:, None, None]
         rows, others, *near = (np.array([x.q, x.qd], float) for x in (one, other, *rounded))
         with np.errstate(all="ignore"):
             noise = np.max([np.abs(x - others) for x in near], axis=0)

@@ -21,7 +21,7 @@ from numpy.polynomial import chebyshev
 from eomc.scene import formulas
 from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Spring
 from eomc.scene.formulas import Formula
-from eomc.verify.oracle import Vector
+from eomc.verify.oracle import STENCIL, Vector
 
 if TYPE_CHECKING:
     from eomc.scene.scene import Scene
@@ -66,7 +66,7 @@ class Bodies:
 
     def compare(self, name: str) -> float:
         """The largest difference over the states, of each with the line that suits it best."""
-        return float(np.max([self.off(name, e) for e in self.check.few(STATES)]))
+        return self.check.largest(partial(self.off, name), STATES)
 
     def off(self, name: str, e: Expected) -> float:
         """The difference at one state, in parts of its size; nan where nothing can be compared."""
@@ -352,7 +352,7 @@ class Line:
         total = 0.0
         if not self.loses():
             return total
-        for n, weight in ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280)):
+        for n, weight in STENCIL:
             for sign in (1, -1):
                 by = 0.01 * n * sign
                 line = Line(self.scene, self.state, self.width, 1 + by)

@@ -20,10 +20,10 @@ from eomc.model.symbols import t as time
 from eomc.scene.assembly import Loop
 from eomc.verify import rows_projection
 from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
+from eomc.verify.oracle import STENCIL, Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.rows_bodies import Line
-from eomc.verify.sampling import Expected, State, ask
+from eomc.verify.sampling import Expected, State, along, ask, simulate
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
@@ -38,12 +38,11 @@ SHARE = 0.02  # of how far things go, in a step of it
 HELD = 450.0  # units: what rows may be along it, 1e-13 of their terms
 SLOPE = 1e-7  # of A: differences of order 8, in 16 digits; a wrong sign makes 1
 SLIGHT = 1e-4  # of how far things go: a difference for the size of a slope
-STENCIL = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
 UNITS = "units of rounding"
 
 
-def report(of: Comparison, plain: Any) -> None:
-    """Add the rows of a scene with constraints. plain: the module of the plain form, or None."""
+def report(of: Comparison) -> None:
+    """Add the rows of a scene with constraints."""
     rows = Rows(of, of.module)
     for name in VALUES:
         of.row(name, LIMIT, UNITS, partial(of.value, name))
@@ -53,9 +52,7 @@ def report(of: Comparison, plain: Any) -> None:
     if of.system.reactions:
         limit = max(WORK, ROUNDED * of.eps)
         of.row("reactions: virtual work", limit, "of its size", rows.reactions)
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
-        if module is None:
-            continue
+    for module, form in of.forms:
         own = Rows(of, module)
         if form:
             find = partial(_values, of, module)
@@ -154,7 +151,7 @@ class Rows:
         The force acts at the second body's point, on it and against the first one; so does the
         moment. Velocities are those of rows_bodies.py, from the scene's own tables.
         """
-        return float(np.max([self._work(e) for e in self.of.few(STATES)]))
+        return self.of.largest(self._work, STATES)
 
     def _work(self, e: Expected) -> float:
         s, scene = e.state, self.system.scene
@@ -205,9 +202,9 @@ class Rows:
             s = replace(e.state, u=None)
             with np.errstate(divide="ignore"):  # no longer than a stepper follows
                 longest = SHARE * float(np.min(of.sampler.spread / np.abs(s.qd)))
-            run = _quiet(self.module, s, method, min(of.system.run.h, longest))
-            for q, qd, t in zip(run.q[1:], run.qd[1:], run.t[1:], strict=True):
-                at = replace(s, q=np.array(q, float), qd=np.array(qd, float), t=float(t))
+            how = {"h": min(of.system.run.h, longest), "steps": STEPS, "every": STEPS // 40}
+            run = simulate(self.module, s, t0=s.t, method=method, **how)
+            for at in along(run, s)[1:]:  # of a run that stops early the rows up to there
                 errors += [self._off(at, "constraints"), self._off(at, "constraint_rates")]
         return largest(errors, "no step is taken")
 
@@ -237,15 +234,3 @@ class Rows:
             change = change - ask(self.module, "constraint_rates", s)
             total += np.abs(change) / step * abs(q)
         return total
-
-
-def _quiet(module: Any, s: State, method: str, h: float) -> Any:
-    """A run; where it stops early its rows up to there count."""
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return module.simulate(
-            q0=s.q, qd0=s.qd, params=s.params, t0=s.t, method=method, h=h, steps=STEPS,
-            every=STEPS // 40,
-        )  # fmt: skip

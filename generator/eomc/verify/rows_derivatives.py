@@ -43,7 +43,7 @@ def slopes(check: Comparison, name: str) -> float | Finding:
 
     The best of some widths counts for each entry, as of skewness.
     """
-    scale = np.array([check.sampler.spread, check.sampler.speed])
+    scale = check.sampler.scale
     n, nu = len(check.system.q), len(check.system.inputs)
     known: list[float | None] = []
     farther = [e for e in check.sampler.farther() if check.moves(e.state)]

@@ -15,9 +15,9 @@ import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
-from eomc.verify.derivatives import STENCIL, WIDTHS, apart
+from eomc.verify.derivatives import WIDTHS, apart
 from eomc.verify.finding import Finding, largest
-from eomc.verify.oracle import Vector
+from eomc.verify.oracle import STENCIL, Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.sampling import FARTHEST, State
 
@@ -32,8 +32,8 @@ SHORTER = (1.0, 0.1, 0.01)  # of the scene's h, until the stages of an implicit 
 Differences = Callable[[str, int, float], list[Vector]]  # of a method, state and step
 
 
-def report(of: Comparison, plain: Any) -> None:
-    """Add the rows of a scene that asks for them. plain: the module of the plain form, or None."""
+def report(of: Comparison) -> None:
+    """Add the rows of a scene that asks for them."""
     if not of.system.run.discretize:
         return
     limit = max(SLOPE_LIMIT, LIMIT * of.eps)
@@ -48,8 +48,8 @@ def report(of: Comparison, plain: Any) -> None:
                 scales[2 * len(few[k].q) :] *= WIDER
             return [_differences(of, method, few[k], h, width * scales) for width in widths]
 
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
-        for method in of.methods if module is not None else ():
+    for module, form in of.forms:
+        for method in of.methods:
             measure = partial(_worst, of, module, method, few, exact)
             of.row(f"{form}discretize by {method}", limit, "of the largest derivative", measure)
 
@@ -96,7 +96,7 @@ def _thrown(of: Comparison, method: str, s: State, h: float) -> bool:
     """Whether a step throws the state so far that no width of differences fits."""
     run = of.simulate(s, method=method, h=h, steps=1, t0=s.t)
     moved = np.abs(np.subtract([run.q[-1], run.qd[-1]], [s.q, s.qd]))
-    return not bool(np.all(moved < FARTHEST * np.array([of.sampler.spread, of.sampler.speed])))
+    return not bool(np.all(moved < FARTHEST * of.sampler.scale))
 
 
 def _differences(of: Comparison, method: str, s: State, h: float, by: Vector) -> Vector:

@@ -27,16 +27,14 @@ STATES = 4
 TWICE = 1e-8  # of accelerations: two derivatives are good to 1e-10
 
 
-def report(of: Comparison, plain: Any, scene: Scene) -> None:
-    """Add the rows of what the scene asks for. plain: the module of the plain form, or None."""
+def report(of: Comparison, scene: Scene) -> None:
+    """Add the rows of what the scene asks for."""
     run, eps = of.system.run, of.eps
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
-        if module is None:
-            continue
+    for module, form in of.forms:
         frames = _Frames(of, module, scene)
 
         def row(name: str, limit: float, measure: Callable[[Expected], float]) -> None:
-            largest = partial(_largest, of, measure)
+            largest = partial(of.largest, measure, STATES)
             of.row(f"{form}{name}", max(limit, UNITS * eps), "of their size", largest)  # noqa: B023
 
         if of.system.asked:
@@ -49,16 +47,11 @@ def report(of: Comparison, plain: Any, scene: Scene) -> None:
             row("momentum", LIMIT, frames.momentum)
 
 
-def inverse_dynamics(of: Comparison, plain: Any) -> None:
+def inverse_dynamics(of: Comparison) -> None:
     """Add the rows of D qdd + bias, against the reference."""
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
-        if module is not None:
-            measure = partial(_largest, of, partial(_inverse, of, module))
-            of.row(f"{form}inverse dynamics", ROUNDINGS, "units of rounding", measure)
-
-
-def _largest(of: Comparison, measure: Callable[[Expected], float]) -> float:
-    return float(np.max([measure(e) for e in of.few(STATES)]))
+    for module, form in of.forms:
+        measure = partial(of.largest, partial(_inverse, of, module), STATES)
+        of.row(f"{form}inverse dynamics", ROUNDINGS, "units of rounding", measure)
 
 
 def _inverse(of: Comparison, module: Any, e: Expected) -> float:

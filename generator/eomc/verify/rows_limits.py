@@ -20,13 +20,12 @@ STATES = 4
 FAR = 3.0  # times what lies between limits
 
 
-def report(of: Comparison, plain: Any) -> None:
-    """Add the rows of a scene with limits. plain: the module of the plain form, or None."""
+def report(of: Comparison) -> None:
+    """Add the rows of a scene with limits."""
     if all(x is None for i in of.system.inputs for x in i.limits):
         return
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
-        if module is not None:
-            of.row(f"{form}limits of inputs", 0, "that differ", partial(_differ, of, module))
+    for module, form in of.forms:
+        of.row(f"{form}limits of inputs", 0, "that differ", partial(_differ, of, module))
 
 
 def _differ(of: Comparison, module: Any) -> float:

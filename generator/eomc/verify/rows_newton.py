@@ -71,7 +71,7 @@ class Newton:
 
     def __init__(self, check: Comparison) -> None:
         self.check = check
-        self.scale = np.array([check.sampler.spread, check.sampler.speed])
+        self.scale = check.sampler.scale
 
     def beyond(self, method: str) -> float | Finding:
         """The most sweeps that the module needs beyond the reference's; inf where it ends wrong."""

@@ -37,13 +37,11 @@ _NONE: Vector = np.zeros(0)
 _NAMES = {"Min": min, "Max": max, "Heaviside": lambda x, middle=0.5: middle if x == 0 else +(x > 0)}
 
 
-def report(of: Comparison, plain: Any) -> None:
-    """Add the rows of a scene that has outputs. plain: the module of the plain form, or None."""
+def report(of: Comparison) -> None:
+    """Add the rows of a scene that has outputs."""
     formulas = Formulas(of.system)
     limit = max(OF_MULTIPLIERS if formulas.multipliers else SLOPE_LIMIT, LIMIT * of.eps)
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
-        if module is None:
-            continue
+    for module, form in of.forms:
         of.row(f"{form}outputs", LIMIT, "units of rounding", partial(_values, of, module, formulas))
         if of.system.run.linearize:
             unit, slopes = "of the largest derivative", partial(_slopes, of, module, formulas)
@@ -63,7 +61,7 @@ def _values(of: Comparison, module: Any, formulas: Formulas) -> float:
         size = np.abs(value) + sum(np.abs(x - value) / NUDGE for x in near)
         return of.units(value, formulas.at(s, *_solved(module, s)), size)
 
-    return float(np.max([error(e) for e in of.few(STATES)]))
+    return of.largest(error, STATES)
 
 
 def _slopes(of: Comparison, module: Any, formulas: Formulas) -> float:
@@ -87,13 +85,13 @@ def _slopes(of: Comparison, module: Any, formulas: Formulas) -> float:
             least = np.fmin(least, off)
         return float(np.max(least, initial=0))
 
-    return float(np.max([error(e) for e in of.few(2)]))
+    return of.largest(error, 2)
 
 
 def _of_multipliers(of: Comparison, s: State) -> Iterator[Vector]:
     """Their slopes along q, qd and u, (nc, 2 nq + nu), by differences of several widths."""
-    n, scale = len(s.q), np.array([of.sampler.spread, of.sampler.speed])
-    given = (of.reference, s, scale, of.sampler.defaults, "multipliers")
+    n = len(s.q)
+    given = (of.reference, s, of.sampler.scale, of.sampler.defaults, "multipliers")
     for slopes, _ in derivatives.by_differences(*given):
         yield slopes[:, : 2 * n + len(of.system.inputs)]
 

@@ -7,7 +7,6 @@ compute, one against the other. In units of rounding, as in `check`, whose rows 
 from __future__ import annotations
 
 import copy
-import warnings
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,7 @@ from eomc.verify.comparison import GROWTH_LIMIT
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.sampling import NUDGE, VALUES, State, ask, nudged, started
+from eomc.verify.sampling import NUDGE, VALUES, State, ask, nudged, simulate, started
 
 if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
@@ -33,9 +32,11 @@ CLEAR = 7  # sweeps of Newton's method with derivatives at the start, which any 
 BOTH = (*VALUES, "acceleration")
 
 
-def rows(of: Comparison, plain: Any) -> None:
-    """Add the rows of the plain form. of: the comparison of the fast one; plain: its module."""
-    unit = "units of rounding"
+def rows(of: Comparison) -> None:
+    """Add the rows of the plain form, where there is one."""
+    if of.plain is None:
+        return
+    unit, plain = "units of rounding", of.plain
     twin = copy.copy(of)
     twin.module = plain
     of.row("plain C", LIMIT, unit, lambda: float(np.max([twin.value(name) for name in BOTH])))
@@ -87,7 +88,7 @@ def _linearization(of: Comparison, plain: Any) -> float:
         size = np.maximum(size, e.size["acceleration"][:, None] / scale)
         return of.units(other, one, np.maximum(size, 1e-6 * np.max(size)))
 
-    return float(np.max([error(e) for e in of.few(of.effort.few)]))
+    return of.largest(error, of.effort.few)
 
 
 def _inputs(of: Comparison, s: State) -> Vector:
@@ -119,17 +120,11 @@ def _run_off(of: Comparison, plain: Any, method: str, e: Expected, h: float) -> 
 
     Raises RuntimeError where one form ends before the other though the step can be made.
     """
-    spread = np.array([of.sampler.spread, of.sampler.speed])
-    s = e.state
+    s, spread = e.state, of.sampler.scale
 
     def run(module: Any, by: Vector) -> Any:
         at = started(module, replace(s, q=s.q + by[0], qd=s.qd + by[1]))
-        with warnings.catch_warnings():  # a run that stops early is looked at below
-            warnings.simplefilter("ignore", RuntimeWarning)
-            return module.simulate(
-                q0=at.q, qd0=at.qd, u=s.u, params=s.params, h=h, steps=STEPS,
-                method=method, t0=s.t,
-            )  # fmt: skip
+        return simulate(module, at, h=h, steps=STEPS, method=method, t0=s.t)
 
     one, other = run(of.module, 0 * spread), run(plain, 0 * spread)
     both = min(len(one), len(other))

@@ -60,7 +60,7 @@ class Projection:
     def projected(self, some: bool) -> float | Finding:
         """A state moved away is put back where the reference puts it. some: one is held."""
         of = self.of
-        scale = np.array([of.sampler.spread, of.sampler.speed])
+        scale = of.sampler.scale
         random = np.random.default_rng(11)
 
         def error(e: Expected, part: float) -> float | None:
@@ -113,7 +113,7 @@ class Projection:
     def refusals(self) -> float:
         """How often what can't be put anywhere is not refused, or is written."""
         random = np.random.default_rng(13)
-        scale = np.array([self.of.sampler.spread, self.of.sampler.speed])
+        scale = self.of.sampler.scale
         wrong = 0
         for e in self.of.few(4):
             wrong += sum(self._refused(s, held) for s, held in self._lost(e.state, scale))

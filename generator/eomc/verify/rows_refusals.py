@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE, _, LOCKED = range(6)
 REFUSED = (SINGULAR, NOT_FINITE, NO_CONVERGENCE, LOCKED)
-WORDS = ("ok", "singular", "not finite", "no convergence")
 CLEAR = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
 FACTORS = (0.0, -3.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
 MIXED = 60  # changes of all parameters at random
@@ -33,12 +32,8 @@ SPREAD = 3.0  # of their logarithms
 MOST, FEWER = 1200, 240  # states that the reference is asked for; where it takes long
 LOST = 1e-6  # of the size of its entries: where D is so far from the reference's, rounding decides
 ABSORBED = 2.0**30  # times another: beyond, a sum of parameters may lose one of them
-AWAY = (
-    -0.1,
-    0.1,
-    -0.4,
-    0.4,
-)  # of how far a coordinate goes: from a singular state to a regular one
+# of how far a coordinate goes: from a singular state to a regular one
+AWAY = (-0.1, 0.1, -0.4, 0.4)
 ALONG = np.linspace(0, 1, 9)  # of a step: where its stages may lie
 MARK = -7.0  # what is to be left alone
 

@@ -273,7 +273,7 @@ class Runs:
         The accelerations of all coordinates follow such velocities.
         """
         s, n, rounded = e.state, len(e.state.q), np.abs(e.state.q) / self.h
-        scale = np.array([self.sampler.spread, self.sampler.speed])
+        scale = self.sampler.scale
         with np.errstate(all="ignore"):
             by = derivatives.by_differences(self.sampler.reference, s, scale, self.sampler.defaults)
             slopes = np.fmax.reduce([np.abs(J[:, n : 2 * n]) for J, _ in by])
@@ -283,11 +283,10 @@ class Runs:
     def far_steps(self, s: State, acceleration: Vector) -> float:
         """Some steps from there; acceleration: the size of what is rounded in one."""
         h, x = self.h, (s.q, s.qd)
-        spread = np.array([self.sampler.spread, self.sampler.speed])
         with np.errstate(all="ignore"):
             for n in range(self.few):
                 x = self.sampler.reference.step(*x, h=h, t=s.t + n * h, u=s.u, params=s.params)
-            if not np.all(np.abs(np.subtract(x, (s.q, s.qd))) < FARTHEST * spread):
+            if not np.all(np.abs(np.subtract(x, (s.q, s.qd))) < FARTHEST * self.sampler.scale):
                 return 0.0  # as where a force that is wound up throws another coordinate
         gain = self.few * h * acceleration
         size = np.abs([s.q, s.qd]) + np.array([self.few * h * (np.abs(s.qd) + gain), gain])
@@ -297,7 +296,7 @@ class Runs:
 
     def inputs(self) -> float:
         """A row of inputs each step beside the reference, and cut as one."""
-        errors, spread = [], np.array([self.sampler.spread, self.sampler.speed])
+        errors, spread = [], self.sampler.scale
         for s in self.states:
             signals = np.abs(self.sampler.reference.evaluate("signals", s.q, s.qd, s.t))
             scale = np.where(signals > 0, signals, 1)

@@ -19,16 +19,15 @@ if TYPE_CHECKING:
     from eomc.verify.comparison import Comparison
 
 
-def report(of: Comparison, plain: Any) -> None:
-    """Add the rows of a scene with a smooth feedback. plain: the module of the plain form."""
+def report(of: Comparison) -> None:
+    """Add the rows of a scene with a smooth feedback."""
     if not of.system.run.linearize or not _is_feedback(of.system):
         return
     signals = tuple(Output(i.name, i.signal) for i in of.system.inputs)
     formulas = Formulas(replace(of.system, outputs=signals, inputs=()))
-    for module, form in ((of.module, ""), (plain, "plain C: ")):
-        if module is not None:
-            limit, unit = max(SLOPE_LIMIT, LIMIT * of.eps), "of the largest derivative"
-            of.row(f"{form}closed loop", limit, unit, partial(_loop, of, module, formulas))
+    limit, unit = max(SLOPE_LIMIT, LIMIT * of.eps), "of the largest derivative"
+    for module, form in of.forms:
+        of.row(f"{form}closed loop", limit, unit, partial(_loop, of, module, formulas))
 
 
 def _is_feedback(system: System) -> bool:
@@ -59,4 +58,4 @@ def _loop(of: Comparison, module: Any, formulas: Formulas) -> float:
         size = np.max(abs(A) + abs(B) @ abs(K), axis=1, keepdims=True)
         return float(np.max(abs(closed - A - B @ K) / (size + 1e-300)))
 
-    return float(np.max([error(e) for e in of.few(2)]))
+    return of.largest(error, 2)

@@ -9,6 +9,7 @@ that f is made of: sqrt(D_ii D_jj) for D_ij, D qd times a rate for forces, K and
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -99,6 +100,18 @@ def started(module: Any, s: State) -> State:
     return replace(s, q=np.asarray(q, float), qd=np.asarray(qd, float))
 
 
+def simulate(module: Any, s: State, **how: Any) -> Any:
+    """The module's run from a state; one that stops early does so without a warning."""
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
+        return module.simulate(q0=s.q, qd0=s.qd, u=s.u, params=s.params, **how)
+
+
+def along(run: Any, s: State) -> list[State]:
+    """The states that a run from `s` went through."""
+    rows = zip(run.t, run.q, run.qd, strict=True)
+    return [replace(s, q=np.array(q), qd=np.array(qd), t=float(t)) for t, q, qd in rows]
+
+
 def nudged(s: State, defaults: Mapping[str, float]) -> list[State]:
     """The state with one input after the other changed by a small part of itself."""
     found = []
@@ -168,6 +181,7 @@ class Sampler:
         far, fast = self._ahead(effort)
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
         self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
+        self.scale = np.array([self.spread, self.speed])
 
     def _ahead(self, effort: Effort) -> Vector:
         """(2, nq): how far coordinates and velocities get, 0 where it is not finite.
@@ -198,8 +212,7 @@ class Sampler:
                 break
             usual = len(found) < count // 4
             state = self.start if attempt == 0 else self.draw(nearness, usual, len(found) % 2 == 1)
-            with np.errstate(all="ignore"):
-                expected = self.expected(state) if self.regular(state) else None
+            expected = self.known(state)
             if expected is None:
                 self.rejected += 1
                 nearness *= 0.7
@@ -214,24 +227,17 @@ class Sampler:
         """
         usual = [self.draw(1.0, True, False) for _ in range(1 + slow)]
         way = np.array([usual[0].q - self.start.q, usual[0].qd - self.start.qd])
-        reach = np.array([self.spread, self.speed])
-        q, qd = [self.start.q, self.start.qd] + way * np.maximum(1, 1 / reach)
+        q, qd = [self.start.q, self.start.qd] + way * np.maximum(1, 1 / self.scale)
         q[self.discrete] = usual[0].q[self.discrete]
         states = [replace(usual[0], q=q, qd=qd)]
         states += [replace(s, qd=p * s.qd) for s, p in zip(usual[1:], SLOWER, strict=False)]
-        found = []
-        for state in map(self.onto, states):
-            with np.errstate(all="ignore"):
-                expected = self.expected(state) if self.regular(state) else None
-            found += [] if expected is None else [expected]
-        return found
+        return [e for state in states if (e := self.known(self.onto(state)))]
 
     def farther(self) -> list[Expected]:
         """A state FARTHER times as far from the start as the others; none where it is no state."""
         drawn = [self.draw(FARTHER, True, False) for _ in range(4)]
         state = max(drawn, key=lambda s: float(np.min(np.abs(s.q - self.start.q) / self.spread)))
-        with np.errstate(all="ignore"):
-            expected = self.expected(state) if self.regular(state) else None
+        expected = self.known(state)
         return [] if expected is None else [expected]
 
     def draw(self, nearness: float, usual: bool, given: bool) -> State:
@@ -322,6 +328,11 @@ class Sampler:
         eigenvalues = np.linalg.eigvalsh(D / np.sqrt(np.outer(diagonal, diagonal)))
         least, most = np.min(np.abs(eigenvalues)), np.max(np.abs(eigenvalues))
         return bool(least * CONDITION_LIMIT > most and (s.params is None or eigenvalues[0] > 0))
+
+    def known(self, s: State) -> Expected | None:
+        """As `expected`; None where D is not regular, too."""
+        with np.errstate(all="ignore"):
+            return self.expected(s) if self.regular(s) else None
 
     def expected(self, s: State) -> Expected | None:
         """The reference's values and their sizes; None where something is not finite."""

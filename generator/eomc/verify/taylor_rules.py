@@ -208,7 +208,7 @@ def _power(op: Op, args: list[Jet], want: Fields, at: Point) -> Jet:
         slope = _falling(y, x, y - 1)
         return _chain((value, slope, _falling(y * (y - 1), x, y - 2)), a, want)
     inside = frozenset(f for name in want for f in FEEDS["product"][name].split())
-    exponent = _times(b, _chain(_log(x), a, inside), inside)
+    exponent = _times(b, _chain(FUNCTIONS[sympy.log](x), a, inside), inside)
     return _chain((value, value, value), exponent, want)
 
 
@@ -280,67 +280,9 @@ def _corner(x: Any) -> Any:
     return np.where(np.asarray(x) == 0, math.nan, 0.0)
 
 
-def _sin(x: Any) -> Three:
-    s = np.sin(x)
-    return s, np.cos(x), -s
-
-
-def _cos(x: Any) -> Three:
-    c = np.cos(x)
-    return c, -np.sin(x), -c
-
-
-def _tan(x: Any) -> Three:
-    f = np.tan(x)
-    slope = 1 + f**2
-    return f, slope, 2 * f * slope
-
-
 def _asin(x: Any) -> Three:
     slope = 1 / np.sqrt((1 - x) * (1 + x))
     return np.arcsin(x), slope, x * slope**3
-
-
-def _acos(x: Any) -> Three:
-    _, slope, bend = _asin(x)
-    return np.arccos(x), -slope, -bend
-
-
-def _atan(x: Any) -> Three:
-    slope = 1 / (1 + x**2)
-    return np.arctan(x), slope, -2 * x * slope**2
-
-
-def _sinh(x: Any) -> Three:
-    s = np.sinh(x)
-    return s, np.cosh(x), s
-
-
-def _cosh(x: Any) -> Three:
-    c = np.cosh(x)
-    return c, np.sinh(x), c
-
-
-def _tanh(x: Any) -> Three:
-    f, slope = np.tanh(x), 1 / np.cosh(x) ** 2
-    return f, slope, -2 * f * slope
-
-
-def _exp(x: Any) -> Three:
-    e = np.exp(x)
-    return e, e, e
-
-
-def _log(x: Any) -> Three:
-    return np.log(x), 1 / x, -1 / x**2
-
-
-def _abs(x: Any) -> Three:
-    return np.abs(x), np.sign(x), _corner(x)
-
-
-def _sign(x: Any) -> Three:
-    return np.sign(x), _corner(x), _corner(x)
 
 
 def step_at(at_zero: float) -> Callable[[Any], Three]:
@@ -349,17 +291,17 @@ def step_at(at_zero: float) -> Callable[[Any], Three]:
 
 
 FUNCTIONS: Mapping[Any, Callable[[Any], Three]] = {
-    sympy.sin: _sin,
-    sympy.cos: _cos,
-    sympy.tan: _tan,
+    sympy.sin: lambda x: (f := np.sin(x), np.cos(x), -f),
+    sympy.cos: lambda x: (f := np.cos(x), -np.sin(x), -f),
+    sympy.tan: lambda x: (f := np.tan(x), g := 1 + f**2, 2 * f * g),
     sympy.asin: _asin,
-    sympy.acos: _acos,
-    sympy.atan: _atan,
-    sympy.sinh: _sinh,
-    sympy.cosh: _cosh,
-    sympy.tanh: _tanh,
-    sympy.exp: _exp,
-    sympy.log: _log,
-    sympy.Abs: _abs,
-    sympy.sign: _sign,
+    sympy.acos: lambda x: (np.arccos(x), *(-g for g in _asin(x)[1:])),
+    sympy.atan: lambda x: (np.arctan(x), g := 1 / (1 + x**2), -2 * x * g**2),
+    sympy.sinh: lambda x: (f := np.sinh(x), np.cosh(x), f),
+    sympy.cosh: lambda x: (f := np.cosh(x), np.sinh(x), f),
+    sympy.tanh: lambda x: (f := np.tanh(x), g := 1 / np.cosh(x) ** 2, -2 * f * g),
+    sympy.exp: lambda x: (f := np.exp(x), f, f),
+    sympy.log: lambda x: (np.log(x), 1 / x, -1 / x**2),
+    sympy.Abs: lambda x: (np.abs(x), np.sign(x), _corner(x)),
+    sympy.sign: lambda x: (np.sign(x), _corner(x), _corner(x)),
 }
