@@ -12,148 +12,83 @@ from eomc.program.program import TIME
 
 @dataclass(frozen=True)
 class Kind:
-    """What is known of a function before it is looked at: results, arguments, meaning."""
+    """What is known of a function before it is looked at: results, arguments, meaning.
+
+    out: "" where it returns a number. shape: one that `extent` knows. takes: besides q and what it
+    reads of t: qd, u, qdd, wrenches, lambda; "qdd?" where it depends on the scene.
+    """
 
     out: str
-    shape: str  # one that `extent` knows; "" of a number
-    qd: bool
-    u: bool
+    shape: str
+    takes: str
     doc: str
     symmetric: bool = False
-    qdd: bool = False  # whether it may read accelerations
-    given: str = ""  # what it takes besides: "qdd" or "wrenches"
+
+    @property
+    def takes_u(self) -> bool:
+        """Whether it may read inputs."""
+        return "u" in self.takes.split()
+
+    @property
+    def given(self) -> str:
+        """What else it is given in any scene: qdd, wrenches or lambda."""
+        return next((n for n in ("qdd", "wrenches", "lambda") if n in self.takes.split()), "")
 
 
 KINDS: Mapping[str, Kind] = {
-    "D": Kind("D", "n*n", False, False, "D(q): mass matrix, nq x nq, symmetric.", True),
-    "C": Kind("C", "n*n", True, False, "C(q, qd): Coriolis matrix, nq x nq, Christoffel form."),
-    "g": Kind("g", "n", False, False, "g(q): dP/dq, the forces of the potential energy."),
-    "bias": Kind("bias", "n", True, False, "bias = C(q, qd) qd + g(q), without forming C."),
-    "tau": Kind("tau", "n", True, True, "tau = Q - dR/dqd: inputs, friction and other forces."),
-    "kinetic_energy": Kind("", "", True, False, "K(q, qd), J."),
-    "potential_energy": Kind("", "", False, False, "P(q), J."),
-    "energy": Kind("", "", True, False, "K + P, J."),
-    "jacobi": Kind(
-        "", "", True, False, "qd.dK/dqd - K + P, J: what is conserved here in place of K + P."
-    ),
-    "power": Kind(
-        "",
-        "",
-        True,
-        True,
-        "Power into the system, W: d(energy)/dt, or d(jacobi)/dt if there is one.",
-    ),
-    "sensitivity": Kind(
-        "E",
-        "n*p",
-        True,
-        True,
-        "E = dqdd/dp at held inputs, nq rows, a column for each parameter in its order.",
-    ),
-    "outputs": Kind(
-        "outputs", "y", True, True, "What the scene asks for, in the order above.", qdd=True
-    ),
-    "output_slopes": Kind(
-        "slopes",
-        "y*x",
-        True,
-        True,
-        "[dy/dq, dy/dqd, dy/du, dy/dqdd] of the outputs y, by rows, each at the others held.",
-        qdd=True,
-    ),
-    "events": Kind("events", "e", True, True, "Of each event what is zero where it happens."),
-    "begins": Kind(
-        "begins",
-        "e",
-        True,
-        True,
-        "Of each event what is above zero where it happens as motion begins; -1 of others.",
-    ),
-    "jumps": Kind(
-        "after", "e*2*n", True, True, "[q; qd] behind each event, where it is one that jumps."
-    ),
-    "frame_poses": Kind("poses", "f*pose", False, False, "Where each frame is: {pose}."),
-    "frame_velocities": Kind(
-        "velocities", "f*twist", True, False, "Of each frame: {twist}, along the world's axes."
-    ),
-    "frame_accelerations": Kind(
-        "accelerations",
-        "f*twist",
-        True,
-        False,
-        "d(velocities)/dt at the accelerations qdd; at qdd = 0 that is dJ/dt qd of the Jacobians.",
-        given="qdd",
-    ),
-    "frame_jacobians": Kind(
-        "jacobians", "f*twist*n", False, False, "J of each frame: velocities = J qd, by rows."
-    ),
-    "frame_forces": Kind(
-        "forces",
-        "n",
-        False,
-        False,
-        "The sum of J^T w: what forces and moments w do that act on the frames, ordered as "
-        "velocities.",
-        given="wrenches",
-    ),
-    "inverse_dynamics": Kind(
-        "tau",
-        "n",
-        True,
-        False,
-        "tau = D qdd + C qd + g: the generalized forces of a motion, without forming D.",
-        given="qdd",
-    ),
-    "momentum": Kind(
-        "momentum", "momentum", True, False, "Of all bodies that move, rotors aside: {momentum}."
-    ),
-    "constraints": Kind(
-        "phi", "c", True, False, "What is zero along every motion: the constraints, in their order."
-    ),
-    "constraint_rates": Kind(
-        "rates",
-        "c",
-        True,
-        False,
-        "A qd + dphi/dt of holonomic constraints, psi of others: zero along every motion too.",
-    ),
-    "constraint_jacobian": Kind(
-        "A",
-        "c*n",
-        False,
-        False,
-        "A = dphi/dq of holonomic constraints, dpsi/dqd of others, by rows.",
-    ),
-    "constraint_slopes": Kind(
-        "slopes",
-        "c*n",
-        True,
-        False,
-        "Of what constraint_rates gives, the derivatives along q, by rows; those along qd are A.",
-    ),
-    "multipliers": Kind(
-        "lambda",
-        "c",
-        True,
-        True,
-        "lambda in D qdd + C qd + g = tau + A^T lambda, one a constraint as it is written.",
-    ),
-    "reactions": Kind(
-        "reactions",
-        "l*6",
-        True,
-        False,
-        "Of each loop {reaction} on its second body, by the multipliers lambda.",
-        given="lambda",
-    ),
-    "applied": Kind(
-        "applied", "m", True, True, "The inputs as they act: u, or the signals, within limits."
-    ),
-    "signal_slopes": Kind(
-        "slopes", "m*x", True, False, "[du/dq, du/dqd] of the scene's signals u, by rows."
-    ),
-    "signal": Kind("u", "m", True, False, "u: the scene's own signals for the inputs."),
-}
+    "D": Kind("D", "n*n", "", "D(q): mass matrix, nq x nq, symmetric.", symmetric=True),
+    "C": Kind("C", "n*n", "qd", "C(q, qd): Coriolis matrix, nq x nq, Christoffel form."),
+    "g": Kind("g", "n", "", "g(q): dP/dq, the forces of the potential energy."),
+    "bias": Kind("bias", "n", "qd", "bias = C(q, qd) qd + g(q), without forming C."),
+    "tau": Kind("tau", "n", "qd u", "tau = Q - dR/dqd: inputs, friction and other forces."),
+    "kinetic_energy": Kind("", "", "qd", "K(q, qd), J."),
+    "potential_energy": Kind("", "", "", "P(q), J."),
+    "energy": Kind("", "", "qd", "K + P, J."),
+    "jacobi": Kind("", "", "qd", "qd.dK/dqd - K + P, J: what is conserved here in place of K + P."),
+    "power": Kind("", "", "qd u",
+        "Power into the system, W: d(energy)/dt, or d(jacobi)/dt if there is one."),
+    "sensitivity": Kind("E", "n*p", "qd u",
+        "E = dqdd/dp at held inputs, nq rows, a column for each parameter in its order."),
+    "outputs": Kind("outputs", "y", "qd u qdd?", "What the scene asks for, in the order above."),
+    "output_slopes": Kind("slopes", "y*x", "qd u qdd?",
+        "[dy/dq, dy/dqd, dy/du, dy/dqdd] of the outputs y, by rows, each at the others held."),
+    "events": Kind("events", "e", "qd u", "Of each event what is zero where it happens."),
+    "begins": Kind("begins", "e", "qd u",
+        "Of each event what is above zero where it happens as motion begins; -1 of others."),
+    "jumps": Kind("after", "e*2*n", "qd u",
+        "[q; qd] behind each event, where it is one that jumps."),
+    "frame_poses": Kind("poses", "f*pose", "", "Where each frame is: {pose}."),
+    "frame_velocities": Kind("velocities", "f*twist", "qd",
+        "Of each frame: {twist}, along the world's axes."),
+    "frame_accelerations": Kind("accelerations", "f*twist", "qd qdd",
+        "d(velocities)/dt at the accelerations qdd; at qdd = 0 that is dJ/dt qd of the Jacobians."),
+    "frame_jacobians": Kind("jacobians", "f*twist*n", "",
+        "J of each frame: velocities = J qd, by rows."),
+    "frame_forces": Kind("forces", "n", "wrenches",
+        "The sum of J^T w: what forces and moments w do that act on the frames, ordered "
+        "as velocities."),
+    "inverse_dynamics": Kind("tau", "n", "qd qdd",
+        "tau = D qdd + C qd + g: the generalized forces of a motion, without forming D."),
+    "momentum": Kind("momentum", "momentum", "qd",
+        "Of all bodies that move, rotors aside: {momentum}."),
+    "constraints": Kind("phi", "c", "qd",
+        "What is zero along every motion: the constraints, in their order."),
+    "constraint_rates": Kind("rates", "c", "qd",
+        "A qd + dphi/dt of holonomic constraints, psi of others: zero along every motion too."),
+    "constraint_jacobian": Kind("A", "c*n", "",
+        "A = dphi/dq of holonomic constraints, dpsi/dqd of others, by rows."),
+    "constraint_slopes": Kind("slopes", "c*n", "qd",
+        "Of what constraint_rates gives, the derivatives along q, by rows; those along qd are A."),
+    "multipliers": Kind("lambda", "c", "qd u",
+        "lambda in D qdd + C qd + g = tau + A^T lambda, one a constraint as it is written."),
+    "reactions": Kind("reactions", "l*6", "qd lambda",
+        "Of each loop {reaction} on its second body, by the multipliers lambda."),
+    "applied": Kind("applied", "m", "qd u",
+        "The inputs as they act: u, or the signals, within limits."),
+    "signal_slopes": Kind("slopes", "m*x", "qd",
+        "[du/dq, du/dqd] of the scene's signals u, by rows."),
+    "signal": Kind("u", "m", "qd", "u: the scene's own signals for the inputs."),
+}  # fmt: skip
 
 
 _PLANE = {
@@ -212,12 +147,13 @@ def source(target: Target, name: str) -> Function | None:
 def takes_qdd(target: Target, name: str) -> bool:
     """Whether a function reads accelerations."""
     function = source(target, name)
-    return bool(KINDS[name].qdd and function and function.uses & target.groups()["qdd"])
+    may = "qdd?" in KINDS[name].takes
+    return bool(may and function and function.uses & target.groups()["qdd"])
 
 
 def takes_t(target: Target, name: str) -> bool:
     """Whether a function's result depends on time, by itself or by the signals."""
     function = source(target, name)
     assert function is not None
-    takes_u = KINDS[name].u and target.system.inputs
+    takes_u = KINDS[name].takes_u and target.system.inputs
     return TIME in function.uses or bool(takes_u and target.signal_t)

@@ -243,7 +243,7 @@ class Functions:
         told = sentence(function)
         by_columns = name not in target.program
         said = [doc(target, name)]
-        if kind.u and target.system.inputs:
+        if kind.takes_u and target.system.inputs:
             said.append("u: the inputs; NULL for the scene's signals.")
         if by_columns:
             told = f"By {len(target.names)} columns, each: {told[0].lower()}{told[1:]}"

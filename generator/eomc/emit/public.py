@@ -43,7 +43,7 @@ class Public:
         kind, target, real = KINDS[name], self.target, self.target.real.name
         signal = name == "signal"
         t = (CArgument(real, "t"),) if takes_t(target, name) else ()
-        moving = STATE if kind.qd else STATE[:1]
+        moving = STATE if "qd" in kind.takes.split() else STATE[:1]
         return CFunction(
             f"{target.prefix}_{name}",
             "void" if kind.out else real,
@@ -54,7 +54,7 @@ class Public:
                 *(self.usual("qdd") if takes_qdd(target, name) else ()),
                 *(self.usual(kind.given) if kind.given else ()),
                 *(() if signal else t),
-                *self.usual(*(["u"] if kind.u else []), "p"),
+                *self.usual(*(["u"] if kind.takes_u else []), "p"),
             ),
         )
 
