@@ -108,8 +108,8 @@ class Stepping:
         by = c.given(f"{self.method}_newton", "m")
         given = (*self.form.around, *self.onto, self.number("tol"), self.number("most"), by)
         told = (*measured, c.filled("int", "sweeps"))
-        arguments = (out, *given, *([c.given(real, "cap")] if self.held_at_rest else []), *told)
-        return CFunction(f"{self.method}_settled", "int", arguments, qualifier="static")
+        cap = [c.given(real, "cap")] if self.held_at_rest else []
+        return c.static(f"{self.method}_settled", "int", out, *given, *cap, *told)
 
     @property
     def onto(self) -> tuple[CArgument, ...]:
@@ -129,31 +129,27 @@ class Stepping:
         given = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
         around = (*self.form.around, *self.onto)
         arguments = (c.filled(real, "cap"), *given, *around, self.number("tol"))
-        return CFunction(f"{self.method}_capped", "int", arguments, qualifier="static")
+        return c.static(f"{self.method}_capped", "int", *arguments)
 
     @cached_property
     def forces(self) -> CFunction:
         """The accelerations at a state."""
         out = c.filled(self.functions.real, "f")
         given = (a for a in self.form.around if a.name != "h")
-        return CFunction(f"{self.method}_forces", "int", (out, *given), qualifier="static")
+        return c.static(f"{self.method}_forces", "int", out, *given)
 
     @cached_property
     def slopes(self) -> CFunction:
         """Their derivatives."""
         out = c.filled(f"{self.method}_newton", "m")
-        return CFunction(
-            f"{self.method}_slopes", "int", (out, *self.form.around), qualifier="static"
-        )
+        return c.static(f"{self.method}_slopes", "int", out, *self.form.around)
 
     @cached_property
     def step(self) -> CFunction:
         """The next step."""
         given = (*map(self.number, ("t_end", "tol", "h_most")), *self.rest)
-        arguments = (self.state, *given, self.held)
-        return CFunction(
-            f"{self.method}_adapted", self.functions.status, arguments, qualifier="static"
-        )
+        status = self.functions.status
+        return c.static(f"{self.method}_adapted", status, self.state, *given, self.held)
 
     @cached_property
     def within(self) -> CFunction:
@@ -161,9 +157,7 @@ class Stepping:
         out = tuple(c.filled(self.functions.real, name) for name in ("q_at", "qd_at"))
         state = c.given(f"{self.method}_adaptive_state", "x")
         given = (state, self.number("z"), self.number("tol"), *self.rest)
-        return CFunction(
-            f"{self.method}_inside", "void", (*out, *given, self.held), qualifier="static"
-        )
+        return c.static(f"{self.method}_inside", "void", *out, *given, self.held)
 
 
 def tableau(made: Stepping) -> dict[str, Any]:

@@ -93,6 +93,11 @@ class CFunction:
         return f"{self.name}({', '.join(passed.get(a.name, a.name) for a in self.arguments)})"
 
 
+def static(name: str, result: str, *arguments: CArgument) -> CFunction:
+    """A function of the file's own, whose body a template has."""
+    return CFunction(name, result, arguments, qualifier="static")
+
+
 def block_text(block: Block) -> str:
     """The statements of a block, indented, under its comment."""
     lines = [f"/* {block.comment} */"] if block.comment else []

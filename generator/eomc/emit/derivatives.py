@@ -23,10 +23,8 @@ def derivatives(plain: Functions) -> Iterator[Derivative]:
         return
     inputs, end = bool(target.system.inputs), real.function_suffix
     state = plain.usual("q", "qd", *plain.state[2:], "u", "p")
-    rates = CFunction(
-        f"{plain.prefix}_stage_slopes", plain.status, (c.filled(plain.real, "J"), *state),
-        qualifier="static",
-    )  # fmt: skip
+    J = c.filled(plain.real, "J")
+    rates = c.static(f"{plain.prefix}_stage_slopes", plain.status, J, *state)
     feedback = ""
     if "signal_slopes" in target.program:
         feedback = plain.public.evaluation("signal_slopes").call(slopes="K")
@@ -73,6 +71,4 @@ def _moved(plain: Functions) -> CFunction:
     state = (c.filled(plain.real, "X"), *(c.filled(plain.real, n) for n in "rv"))
     read = plain.read(plain.target.program["projection_along"])
     more = (plain.argument("q"), *plain.usual(*(n for n in ("t", "p") if n in read)))
-    return CFunction(
-        f"{plain.prefix}_derivative_projected", plain.status, (*state, *more), qualifier="static"
-    )
+    return c.static(f"{plain.prefix}_derivative_projected", plain.status, *state, *more)

@@ -83,9 +83,7 @@ def _begun(made: Stepping, restart: CFunction) -> Begun:
     state = {name: c.member(x, name) for name in ("t", "q", "qd")}
     return Begun(
         **functions.names,
-        function=CFunction(
-            f"{made.method}_begun", functions.status, arguments, qualifier="static"
-        ),
+        function=c.static(f"{made.method}_begun", functions.status, *arguments),
         values=values.call(begins="value", **state),
         method=made.method,
         restart=restart.call(reached=state["t"]),
@@ -105,22 +103,18 @@ def _events(made: Stepping) -> Events:
     own = [a for a in functions.usual("u", "p") if a.name in needed]
     rest = [*made.rest, *(a for a in own if a.name not in {b.name for b in made.rest})]
 
-    def static(name: str, result: str, *arguments: CArgument) -> CFunction:
-        return CFunction(f"{method}_{name}", result, arguments, qualifier="static")
-
-    looked = static("looked", "void", c.filled(real, "g"), read, number("z"), *own)
+    looked = c.static(f"{method}_looked", "void", c.filled(real, "g"), read, number("z"), *own)
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
-    bracketed = static("bracketed", real, read, k, *ends, *own)
-    crossing = static(
-        "crossing", real, made.state, k, number("from"), c.given(real, "g"), *own
-    )  # fmt: skip
+    bracketed = c.static(f"{method}_bracketed", real, read, k, *ends, *own)
+    crossing = c.static(
+        f"{method}_crossing", real, made.state, k, number("from"), c.given(real, "g"), *own
+    )
     there = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
     record = public.adaptive_events
-    happened = static(
-        "happened", "int", made.state, *there, number("tol"), *rest, *record, made.held
-    )
-    restart = static(
-        "restarted", functions.status, made.state, number("reached"), *there[1:],
+    arguments = (made.state, *there, number("tol"), *rest, *record, made.held)
+    happened = c.static(f"{method}_happened", "int", *arguments)
+    restart = c.static(
+        f"{method}_restarted", functions.status, made.state, number("reached"), *there[1:],
         *(own if jumps else ()), *([made.held] if jumps else []),
     )  # fmt: skip
     at = {"q": "q_at", "qd": "qd_at"}

@@ -335,15 +335,14 @@ class Functions:
     def projected(self) -> CFunction:
         """A state behind a step, moved onto the constraints; of the plain form."""
         moved, more = self._moved
-        far = CArgument("int *", "singular")
-        arguments = (*moved, self.argument("q"), *more, far)
-        return CFunction(f"{self.prefix}_projected", self.status, arguments, qualifier="static")
+        q, far = self.argument("q"), CArgument("int *", "singular")
+        return c.static(f"{self.prefix}_projected", self.status, *moved, q, *more, far)
 
     @cached_property
     def onto(self) -> CFunction:
         """A stage moved onto them, to first order."""
         moved, more = self._moved
-        return CFunction(f"{self.prefix}_onto", "int", (*moved, *more), qualifier="static")
+        return c.static(f"{self.prefix}_onto", "int", *moved, *more)
 
     @property
     def _moved(self) -> tuple[tuple[CArgument, ...], tuple[CArgument, ...]]:

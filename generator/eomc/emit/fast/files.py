@@ -185,7 +185,7 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
     parts = s.parts if not lane.name else None
     rates = lane.rates.text if parts is None else show(_two_points(made)).rstrip("\n")
     computed = lane.compute_constants.text if not lane.name and runs.constants_call(made) else ""
-    text = show(
+    return show(
         views.LaneText(
             prefix=target.prefix,
             PREFIX=target.PREFIX,
@@ -213,7 +213,6 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             alone=lane.alone,
         )
     )
-    return text
 
 
 def _library_text(lane: Lane, show: Show) -> str:
@@ -311,9 +310,7 @@ def _adaptive(made: Steppers) -> adaptive.Form:
         made.stepping(one), sweep, made.accelerate(one, a="f"), one.extent,
         bool(made.accelerations.constants), runs.constants_call(made),
         f"{one.target.PREFIX}_LANES",
-        projection.projected(one).call(
-            s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"
-        )
-        if made.functions.projection
-        else "",
+        projection.ending(
+            made.functions, one, s="NULL", t=f"{c.member('x', 't')} + h", singular="&singular"
+        ),
     )  # fmt: skip

@@ -40,6 +40,11 @@ def projected(lane: Lane) -> CFunction:
     )
 
 
+def ending(functions: Functions, lane: Lane, **passed: str) -> str:
+    """The call that ends a step on the constraints; "" where there are none."""
+    return projected(lane).call(**passed) if functions.projection else ""
+
+
 def onto(lane: Lane) -> CFunction:
     """A stage moved onto the constraints, to first order."""
     moved = tuple(c.filled(lane.real.name, n) for n in ("at", "moving"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from eomc.emit import c_function as c
 from eomc.emit.fast import views
 from eomc.emit.fast.lanes import NOINLINE
-from eomc.emit.fast.projection import projected
+from eomc.emit.fast.projection import ending
 from eomc.emit.fast.steppers import Steppers
 from eomc.integrators.tableaux import RK4, Method
 
@@ -91,10 +91,8 @@ def loop(made: Steppers, m: Method) -> views.Loop:
         advance=advance.call(**here),
         otherwise=alone.call(**here) if m is RK4 and s.angles else "",
         corrected=corrected,
-        project=projected(lane).call(**behind, s="&sines" if corrected else "NULL")
-        if made.functions.projection
-        else "",
-        project_anew=projected(lane).call(**behind, s="NULL") if made.functions.projection else "",
+        project=ending(made.functions, lane, **behind, s="&sines" if corrected else "NULL"),
+        project_anew=ending(made.functions, lane, **behind, s="NULL"),
     )
 
 
@@ -122,21 +120,14 @@ def batch(made: Steppers, m: Method) -> views.Batch:
         compute_own=lane.compute_constants.function.call(c="&constants", p="p + k*p_instance"),
         alone=alone.call(q="at", qd="moving", u="given"),
         corrected=made.corrected(m),
-        project=projected(made.wide).call(
-            q="from[b].q",
-            qd="from[b].qd",
-            t="t + h",
-            c="&from[b].c",
+        project=ending(
+            made.functions, made.wide, q="from[b].q", qd="from[b].qd", t="t + h", c="&from[b].c",
             s="&w[b].end" if made.corrected(m) else "NULL",
-        )
-        if made.functions.projection
-        else "",
-        project_alone=projected(lane).call(
-            q="at", qd="moving", t="t + h", singular="&singular", s="NULL"
-        )
-        if made.functions.projection
-        else "",
-    )
+        ),
+        project_alone=ending(
+            made.functions, lane, q="at", qd="moving", t="t + h", singular="&singular", s="NULL"
+        ),
+    )  # fmt: skip
 
 
 def ahead_count(angles: int) -> int:

@@ -229,7 +229,7 @@ class Steppers:
         state = c.filled(f"{lane.prefix}_{m.name}_state", "m")
         more = (self.functions.argument("p"),) if self.newton_p and m.newton else ()
         made = self.advanced(lane, m.name, *more, state)
-        return CFunction(made.name, f"{lane.prefix}_status", made.arguments, qualifier="static")
+        return c.static(made.name, f"{lane.prefix}_status", *made.arguments)
 
     @property
     def newton_p(self) -> bool:
@@ -253,15 +253,11 @@ class Steppers:
         signal = f.signal if slopes.signal_call or self.follows else None
         state = lane.argument
         taken = [n for n in ("t", "u") if n in lane.there]
-        factor = CFunction(
-            f"{lane.prefix}_{m.name}_factor",
-            "void",
-            (
-                c.filled(f"{lane.prefix}_{m.name}_state", "m"), CArgument(real.name, "h"),
-                *map(state, ("q", "qd")), *map(state, taken),
-                *([f.argument("p")] if self.newton_p else []),
-            ),
-            qualifier="static",
+        factor = c.static(
+            f"{lane.prefix}_{m.name}_factor", "void",
+            c.filled(f"{lane.prefix}_{m.name}_state", "m"), CArgument(real.name, "h"),
+            *map(state, ("q", "qd")), *map(state, taken),
+            *([f.argument("p")] if self.newton_p else []),
         )  # fmt: skip
         read = {a.name for a in slopes.slopes.function.arguments}
         read |= {a.name for a in signal.arguments} | {"u"} if signal else set()
@@ -307,8 +303,7 @@ class Steppers:
         out = c.filled(f"{P}_stages", "b")
         given = (c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"))
         onto = (CArgument("int", "onto"),) if self.functions.projection else ()
-        arguments = (out, *given, *self.stepping(self.one), *onto)
-        return CFunction(f"{P}_sweep", "int", arguments, qualifier="static")
+        return c.static(f"{P}_sweep", "int", out, *given, *self.stepping(self.one), *onto)
 
     def stages(self, m: Method) -> views.Stages:
         """The accelerations at the stages of a method, and a sweep over them."""
@@ -346,10 +341,8 @@ class Steppers:
         P = f"{lane.prefix}_{m.name}"
         state = c.filled(f"{P}_state", "m")
         values = c.filled(f"{P}_stages", "a")
-        settle = CFunction(
-            f"{P}_settle", f"{lane.prefix}_status",
-            (values, CArgument("int", "fresh"), *self.stepping(lane), state), qualifier="static",
-        )  # fmt: skip
+        arguments = (values, CArgument("int", "fresh"), *self.stepping(lane), state)
+        settle = c.static(f"{P}_settle", f"{lane.prefix}_status", *arguments)
         sweep, within, before = self.sweep(m), f"&{P}_within", f"&{P}_extrapolated"
         return views.Sweeps(
             **self.extended(lane),

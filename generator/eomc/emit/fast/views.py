@@ -7,12 +7,8 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.adaptive_views import Tableau
-from eomc.emit.plain.parts import (
-    Computed,
-    Named,
-    Prefixed,
-)
+from eomc.emit.plain.adaptive_views import AdaptiveTableau
+from eomc.emit.plain.parts import Computed, Named, Prefixed, Tableau
 from eomc.emit.plain.views import Parameter
 
 
@@ -236,7 +232,7 @@ class Factors(Prefixed):
 
 
 @dataclass(frozen=True)
-class Gauss(Named):
+class Gauss(Tableau):
     """c/fast/gauss.c.jinja: tableau, functions, calls. f: the suffix of literals."""
 
     TEMPLATE: ClassVar[str] = "c/fast/gauss.c"
@@ -250,11 +246,6 @@ class Gauss(Named):
     order: int
     notes: tuple[str, ...]
     stages: int
-    c: tuple[str, ...]
-    A: tuple[str, ...]
-    AA: tuple[str, ...]
-    b: tuple[str, ...]
-    bA: tuple[str, ...]
     extrapolation: tuple[str, ...]
     width: str
     factor: CFunction
@@ -401,7 +392,7 @@ class Batch(Named):
 
 
 @dataclass(frozen=True)
-class AdaptiveLanes(Tableau):
+class AdaptiveLanes(AdaptiveTableau):
     """c/fast/adaptive_lanes.c.jinja: adaptive steps of many instances side by side.
 
     roughest: of the root of tol/2, what refuses a step after two sweeps. accelerate: of each at a

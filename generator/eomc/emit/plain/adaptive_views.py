@@ -10,7 +10,7 @@ from eomc.emit.plain.parts import Named
 
 
 @dataclass(frozen=True)
-class Tableau(Named):
+class AdaptiveTableau(Named):
     """The numbers that both texts of adaptive steps have.
 
     method: what C names begin with. powers: from accelerations at the stages, one a row, to their
@@ -32,7 +32,7 @@ class Tableau(Named):
 
 
 @dataclass(frozen=True)
-class Adaptive(Tableau):
+class Adaptive(AdaptiveTableau):
     """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
 
     total: the sum of half[0], ... over half of the stages. lanes: before loops over stages. top:

@@ -23,6 +23,17 @@ class Named(Prefixed):
 
 
 @dataclass(frozen=True)
+class Tableau(Named):
+    """And the coefficients of a method, as `coefficients.tableau` writes them."""
+
+    c: tuple[str, ...]
+    A: tuple[str, ...]
+    AA: tuple[str, ...]
+    b: tuple[str, ...]
+    bA: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Computed:
     """A function that is computed from the program.
 

@@ -245,8 +245,7 @@ def _advance(plain: Functions, m: Method) -> tuple[CFunction, str]:
     if not plain.projection:
         return step, ""
     told = plain.projected.arguments[-1]
-    name = f"{plain.prefix}_{m.name}"
-    inner = CFunction(name, plain.status, (*step.arguments, told), qualifier="static")
+    inner = c.static(f"{plain.prefix}_{m.name}", plain.status, *step.arguments, told)
     return inner, plain.projected.call(t="t + h")
 
 
@@ -263,11 +262,11 @@ def implicit(plain: Functions, methods: Sequence[Method]) -> Implicit:
         corrections=any(m.implicit for m in methods),
         factors=newton or plain.target.system.run.tolerance is not None,
         newton=newton,
-        slopes=CFunction(
+        slopes=c.static(
             f"{plain.prefix}_differences",
             plain.status,
-            (c.filled(plain.real, "slopes"), *plain.usual(*plain.state, "u", "p")),
-            qualifier="static",
+            c.filled(plain.real, "slopes"),
+            *plain.usual(*plain.state, "u", "p"),
         ),
         here=accelerate(qdd="here"),
         near=accelerate(qdd="near", q="x", qd="x + NQ"),
@@ -281,25 +280,15 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     around = plain.usual(*plain.state, "h", "u", "p")
     shared = implicit(plain, [m])
     onto = (CArgument("int", "onto"),) if m.sweeps and plain.projection else ()
-    stages = CFunction(
-        f"{method}_evaluated",
-        plain.status,
-        (
-            *(c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid")),
-            c.given(plain.real, "a"), *around, *onto,
-        ),
-        qualifier="static",
-    )  # fmt: skip
-    matrix_function = CFunction(
-        f"{method}_matrix",
-        plain.status,
-        (c.filled(plain.real, "M"), c.filled("int", "row"), *around),
-        qualifier="static",
-    )
+    out = (c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
+    a = c.given(plain.real, "a")
+    stages = c.static(f"{method}_evaluated", plain.status, *out, a, *around, *onto)
+    matrix_out = (c.filled(plain.real, "M"), c.filled("int", "row"))
+    matrix_function = c.static(f"{method}_matrix", plain.status, *matrix_out, *around)
     one = plain.public.step(m.name)
     count = CArgument("long *", "evaluations")
     told = plain.projected.arguments[-1:] if plain.projection else ()
-    solve = CFunction(method, plain.status, (*one.arguments, count, *told), qualifier="static")
+    solve = c.static(method, plain.status, *one.arguments, count, *told)
     return Gauss(
         **plain.names,
         title=m.title,
@@ -336,7 +325,7 @@ def _adaptive(plain: Functions) -> list[View]:
     around = plain.usual(*plain.state, "h", "u", "p")
     values = (c.filled(f"{method}_stages", "b"), c.given(f"{method}_stages", "a"))
     onto = (CArgument("int", "onto"),) if plain.projection else ()
-    sweep = CFunction(f"{method}_sweep", "int", (*values, *around, *onto), qualifier="static")
+    sweep = c.static(f"{method}_sweep", "int", *values, *around, *onto)
     accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
     nodes = Nodes(
         **plain.names,

@@ -9,7 +9,7 @@ from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
 from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, Begun, Events
 from eomc.emit.plain.constraint_views import Project, Projection
-from eomc.emit.plain.parts import Computed, Named
+from eomc.emit.plain.parts import Computed, Named, Tableau
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Slopes(Named):
 
 
 @dataclass(frozen=True)
-class Derivative(Named):
+class Derivative(Tableau):
     """c/derivative.c.jinja: of a step by a tableau. rates, eliminate: what methods share.
 
     width: of a row along q, qd and u. feedback: the call of the signals' derivatives, if there are.
@@ -150,11 +150,6 @@ class Derivative(Named):
     function: CFunction
     implicit: bool
     stages: int
-    c: tuple[str, ...]
-    A: tuple[str, ...]
-    AA: tuple[str, ...]
-    b: tuple[str, ...]
-    bA: tuple[str, ...]
     step: str
     start: str
     stage: str
@@ -189,7 +184,7 @@ class RungeKutta4(Named):
 
 
 @dataclass(frozen=True)
-class Explicit(Named):
+class Explicit(Tableau):
     """c/plain/explicit.c.jinja: a tableau, and the call of a stage's accelerations.
 
     advance, correct: as of RungeKutta4.
@@ -202,11 +197,6 @@ class Explicit(Named):
     advance_call: str
     correct: str
     stages: int
-    c: tuple[str, ...]
-    A: tuple[str, ...]
-    AA: tuple[str, ...]
-    b: tuple[str, ...]
-    bA: tuple[str, ...]
     stage: str
 
 
@@ -231,7 +221,7 @@ class Implicit(Named):
 
 
 @dataclass(frozen=True)
-class Gauss(Named):
+class Gauss(Tableau):
     """c/plain/gauss.c.jinja: a tableau, functions, calls. method: what its C names begin with.
 
     onto: the call that moves a stage onto constraints, of methods that find stages by sweeps alone.
@@ -243,11 +233,6 @@ class Gauss(Named):
     newton: bool
     sweeps: int
     stages: int
-    c: tuple[str, ...]
-    A: tuple[str, ...]
-    AA: tuple[str, ...]
-    b: tuple[str, ...]
-    bA: tuple[str, ...]
     eps: str
     tenth: str
     half: str
