@@ -30,7 +30,6 @@ QUICK = (
 )
 FLAT = ("iftomm_A02_four_bar_N1", "iftomm_A02_four_bar_N2", "parallelogram_redundant_bar")
 ALIKE = 1.5  # times the error of the independent RK4
-FLAT_AT = 0.70849  # s: where A02 with one window lies flat first, about
 
 
 @cache

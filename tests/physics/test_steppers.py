@@ -19,6 +19,7 @@ from eomc.emit import coefficients
 from eomc.emit.c_expression import DOUBLE, FLOAT, Real
 from eomc.integrators import tableaux
 from eomc.integrators.tableaux import DP8, METHODS, Method
+from eomc.verify import one_step
 from eomc.verify.advice import Advice
 from eomc.verify.comparison import Comparison
 from eomc.verify.convergence import Convergence, Finding
@@ -51,6 +52,20 @@ def test_order_conditions(method: Method) -> None:
     assert abs(dot(method.b, powers[-1]) - Fraction(1, method.order)) < exact
     next_one = tuple(c**method.order for c in method.c)
     assert abs(dot(method.b, next_one) - Fraction(1, method.order + 1)) > exact
+
+
+@pytest.mark.parametrize("method", EXPLICIT, ids=lambda m: m.name)
+def test_stability_ends_at_the_limits(method: Method) -> None:
+    """Those of an undamped oscillation and of a pure decay at the rate 1, to three digits."""
+    undamped, decay = method.limits
+
+    def growth(acceleration: one_step.Acceleration, h: float) -> float:
+        q, qd = np.eye(2)[:, :, None]
+        ends = one_step.step(method, acceleration, q, qd, 0.0, h)[..., 0]
+        return float(np.max(np.abs(np.linalg.eigvals(ends))))
+
+    for limit, force in ((undamped, lambda q, qd, t: -q), (decay, lambda q, qd, t: -qd)):
+        assert growth(force, 0.995 * limit) <= 1 < growth(force, 1.005 * limit)
 
 
 @pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda real: real.name)

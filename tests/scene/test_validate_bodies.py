@@ -49,9 +49,7 @@ def test_each_joint_in_space(kind):
     names = NAMES[: len(JOINTS[kind].motions)]
     assert tuple(formula.text for formula in body.coordinates) == names
     assert len(body.axes) == JOINTS[kind].given
-    x, y, z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
-    default = {"revolute": (z,), "cylindrical": (z,), "universal": (x, y)}
-    assert body.axes == (((0, 0.6, 0.8),) if kind == "prismatic" else default.get(kind, ()))
+    assert body.axes == (((0, 0.6, 0.8),) if kind == "prismatic" else JOINTS[kind].defaults)
     assert body.mass.text == "k"
     assert texts(body.inertia) == ["0"] * 6
 

@@ -20,6 +20,7 @@ from trees import SHAPES, trees
 from eomc.model import limits
 from eomc.model import multibody as building
 from eomc.model.from_scene import from_scene
+from eomc.scene.joints import JOINTS
 from eomc.scene.read import parse, read
 from eomc.verify import rows_bodies
 from eomc.verify.comparison import Comparison
@@ -100,6 +101,10 @@ bodies = ["b0", "placed"]
 points = [[0.1, 0, 0], [0, 0.5, 0.2]]
 damping = 2
 """
+
+
+def test_every_kind_of_joint_is_known_here_too() -> None:
+    assert rows_bodies._MOTIONS.keys() == JOINTS.keys()
 
 
 def kinds(kind: str, coordinates: str) -> str:
