@@ -76,7 +76,7 @@ def _binding_flags() -> tuple[str, ...]:
 
 
 extension.binding_flags = _binding_flags
-_run, _build, _try = extension.run, extension.build, extension._try
+_run, _build, _try = extension.run, extension.build, extension.try_out
 _libraries: dict[str, bytes] = {}
 
 
@@ -115,7 +115,7 @@ def _trial(*what: Any) -> None:
         _try(*what)
 
 
-extension.build, extension.run, extension._try = _build_once, _link, _trial
+extension.build, extension.run, extension.try_out = _build_once, _link, _trial
 
 _ahead = Sampler._ahead
 _seen: dict[tuple[int, Effort], tuple[Answer, Vector]] = {}

@@ -272,7 +272,7 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
     events: by name a formula, or a dict as [[event]] has it; of a System also as System.make.
     Raises SceneError for faulty ones, EomcError where the scene is not there or has changed.
     """
-    from eomc.base.errors import SceneError
+    from eomc.base.errors import SceneError, writing
     from eomc.runtime.written import replacing
     from eomc.scene import read as scenes
     from eomc.scene import toml_text
@@ -299,12 +299,10 @@ def with_events(model: Any, events: Mapping[str, Any], folder: Path) -> ModuleTy
             scenes.parse(text, what)
         except SceneError as wrong:
             raise _by_name(wrong, len(model.events), events) from None
-        try:
+        with writing(f"{what}: {file}"):
             root.mkdir(parents=True, exist_ok=True)
             with replacing(file) as new:
                 new.write_text(text, encoding="utf-8")
-        except OSError as fault:
-            raise EomcError(f"{what}: {file}: can't be written ({fault.strerror})") from None
     return load(file, root)
 
 

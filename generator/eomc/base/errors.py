@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from eomc.base import texts
@@ -33,6 +34,15 @@ class FolderError(EomcError):
 
 class NoCompilerError(EomcError):
     """There is no C compiler."""
+
+
+@contextmanager
+def writing(where: object) -> Iterator[None]:
+    """An EomcError that names `where` in place of an OSError."""
+    try:
+        yield
+    except OSError as fault:
+        raise EomcError(f"{where}: can't be written ({fault.strerror or fault})") from None
 
 
 @dataclass(frozen=True)

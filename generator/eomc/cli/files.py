@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, writing
 from eomc.cli.terminal import shown
 from eomc.runtime.written import replacing
 
@@ -33,8 +33,5 @@ def write_new(path: Path, text: str) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file, whole, over what is there."""
-    try:
-        with replacing(path) as new:
-            new.write_text(text, encoding="utf-8")
-    except OSError as fault:
-        raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None
+    with writing(shown(path)), replacing(path) as new:
+        new.write_text(text, encoding="utf-8")

@@ -7,8 +7,8 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ import click
 
 from eomc import pipeline
 from eomc.base import texts
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, writing
 from eomc.cli import options
 from eomc.cli.pairs import pairs
 from eomc.cli.terminal import progress_bar, say, shown, status_line, warn
@@ -151,12 +151,9 @@ def _with_events(module: ModuleType, given: Sequence[str]) -> ModuleType:
         raise EomcError(str(fault).replace("simulate(events=)", "--event")) from None
 
 
-@contextmanager
-def _reported_below() -> Iterator[None]:
+def _reported_below() -> AbstractContextManager[Any]:
     """No warnings: what they say is part of the summary."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        yield
+    return warnings.catch_warnings(action="ignore", category=RuntimeWarning)
 
 
 def _known_suffix(path: Path | None, known: Sequence[str], option: str) -> None:
@@ -366,7 +363,5 @@ def _print_error(module: Any, error: Estimate, adaptive: bool) -> None:
 
 def _write(path: Path, done: Run) -> None:
     """The rows as CSV (17 digits, so that they read back as they were) or the run as NPZ."""
-    try:
+    with writing(shown(path)):
         done.save(path)
-    except OSError as fault:
-        raise EomcError(f"{shown(path)}: can't be written ({fault.strerror})") from None

@@ -217,6 +217,14 @@ def multiplier_of(row: str) -> Symbol:
     return symbol(f"{row}{MULTIPLIER}")
 
 
+def resolved(definitions: Sequence[tuple[Symbol, Expr]]) -> dict[Expr, Expr]:
+    """Each definition over no other, by its symbol."""
+    known: dict[Expr, Expr] = {}
+    for name, e in definitions:
+        known[name] = e.xreplace(known)
+    return known
+
+
 def needed(
     definitions: Sequence[tuple[Symbol, Expr]], ends: Sequence[Expr]
 ) -> list[tuple[Symbol, Expr]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -147,10 +147,15 @@ def _needed(manifold: Manifold, rows: Sequence[int], stuck: Place) -> list[int]:
         alone = Manifold(replace(system, constraints=tuple(system.constraints[k] for k in some)))
         return _closed(alone, free, stuck) is not None
 
+    return _fewest(rows, closes)
+
+
+def _fewest(rows: Sequence[int], hold: Callable[[Sequence[int]], bool]) -> list[int]:
+    """Rows without those that the others fail to hold without, the last of them first."""
     kept = list(rows)
     for k in reversed(rows):
         fewer = [i for i in kept if i != k]
-        if fewer and not closes(fewer):
+        if fewer and not hold(fewer):
             kept = fewer
     return kept
 
@@ -166,14 +171,7 @@ def _clash(manifold: Manifold, place: Place) -> list[int]:
         left = aim[rows] - within @ (within.T @ aim[rows])
         return bool(np.linalg.norm(left) <= RANK_TOLERANCE * np.linalg.norm(aim))
 
-    rows = list(manifold.rows)
-    if kept(rows):
-        return []
-    for k in reversed(manifold.rows):
-        fewer = [i for i in rows if i != k]
-        if fewer and not kept(fewer):
-            rows = fewer
-    return rows
+    return [] if kept(manifold.rows) else _fewest(manifold.rows, kept)
 
 
 def _alike(manifold: Manifold, rows: Sequence[int], place: Place) -> bool:

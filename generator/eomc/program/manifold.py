@@ -310,36 +310,40 @@ class Manifold:
 
     def polished(self, place: Place, free: Flags) -> tuple[list[Any], bool]:
         """q in forty digits, and whether all rows hold there. From a place good to rounding."""
-        mp, rest = context(), [0] * len(place.q)
-        frame = Frame(place, free, self.holonomic)
-        level = place.levels
-        q, best, last = [mp.mpf(x) for x in place.q.tolist()], None, np.inf
-        for _ in range(EXACT):
-            phi = self.exactly("constraints", q, rest, place.t)
-            off = np.array([float(x) for x in phi])
-            off[len(self.holonomic) :] = 0
-            size = float(np.max(np.abs(off) / level, initial=0))
-            if not size < last:
-                break
-            best, last = q, size
-            if size < DEEP:
-                break
-            q = [x + mp.mpf(d) for x, d in zip(q, frame.exactly_onto(off).tolist(), strict=True)]
-        return best or q, last < DEEP
+        rest = [0] * len(place.q)
+
+        def phi(q: list[Any]) -> list[Any]:
+            found = self.exactly("constraints", q, rest, place.t)
+            return [*found[: len(self.holonomic)], *[0] * (len(found) - len(self.holonomic))]
+
+        return _refined(place.q, phi, Frame(place, free, self.holonomic), place.levels)
 
     def rates(self, place: Place, q: list[Any], qd: Vector, free: Flags) -> tuple[list[Any], bool]:
         """qd in forty digits with the free rates moved least, and whether all rows hold there."""
-        mp = context()
-        frame = Frame(place, free, self.rows)
+
+        def rates(qd: list[Any]) -> list[Any]:
+            return self.exactly("constraint_rates", q, qd, place.t)
+
         level = replace(place, q=qd).levels
-        v, best, last = [mp.mpf(x) for x in qd.tolist()], None, np.inf
-        for _ in range(EXACT):
-            off = np.array([float(x) for x in self.exactly("constraint_rates", q, v, place.t)])
-            size = float(np.max(np.abs(off) / level, initial=0))
-            if not size < last:
-                break
-            best, last = v, size
-            if size < DEEP:
-                break
-            v = [x + mp.mpf(d) for x, d in zip(v, frame.exactly_onto(off).tolist(), strict=True)]
-        return best or v, last < DEEP
+        return _refined(qd, rates, Frame(place, free, self.rows), level)
+
+
+def _refined(
+    start: Vector, of: Callable[[list[Any]], list[Any]], frame: Frame, level: Vector
+) -> tuple[list[Any], bool]:
+    """Numbers that leave rows `of` them at zero in forty digits, and whether all do.
+
+    From doubles, by steps in doubles; level: of each row, what it is compared with.
+    """
+    mp = context()
+    x, best, last = [mp.mpf(value) for value in start.tolist()], None, np.inf
+    for _ in range(EXACT):
+        off = np.array([float(row) for row in of(x)])
+        size = float(np.max(np.abs(off) / level, initial=0))
+        if not size < last:
+            break
+        best, last = x, size
+        if size < DEEP:
+            break
+        x = [a + mp.mpf(d) for a, d in zip(x, frame.exactly_onto(off).tolist(), strict=True)]
+    return best or x, last < DEEP

@@ -17,7 +17,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from eomc.base import texts
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, writing
 from eomc.emit.render import environment
 from eomc.report.labels import html_name
 from eomc.report.marks import Drawing
@@ -44,12 +44,8 @@ class Animation:
 
     def save(self, file: str | os.PathLike[str]) -> None:
         """Write the page. Raises EomcError where it can't be written."""
-        try:
-            with replacing(file) as new:
-                new.write_text(self.page, encoding="utf-8")
-        except OSError as fault:
-            words = fault.strerror or fault
-            raise EomcError(f"{texts.line(str(file))}: can't be written ({words})") from None
+        with writing(texts.line(str(file))), replacing(file) as new:
+            new.write_text(self.page, encoding="utf-8")
 
     def _repr_html_(self) -> str:
         """The page in a frame of its own."""

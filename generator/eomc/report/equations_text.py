@@ -12,6 +12,7 @@ from sympy.printing.str import StrPrinter
 
 from eomc.base import texts
 from eomc.derive import lagrange
+from eomc.model.symbols import resolved
 from eomc.model.system import Constraint, System, t
 from eomc.program import program
 from eomc.program.routes import ROUTES
@@ -169,9 +170,7 @@ def _entries(name: str, value: MatrixBase) -> Iterator[tuple[tuple[str, str], Ex
 
 def _outputs(system: System) -> list[tuple[str, Expr]]:
     """The outputs' formulas over coordinates, without definitions."""
-    known: dict[sympy.Symbol, Expr] = {}
-    for name, formula in system.definitions:
-        known[name] = formula.xreplace(known)
+    known = resolved(system.definitions)
     known |= {c.multiplier: sympy.Symbol(f"lambda_{c.name}", real=True) for c in system.constraints}
     return [(o.name, o.formula.xreplace(known)) for o in system.outputs]
 

@@ -42,10 +42,10 @@ class Growth:
 
 def simulate(module: ModuleType, **how: Any) -> Any:
     """A run of the module, whatever its end, without a word."""
-    with warnings.catch_warnings():  # failures and advice are what is measured here
-        warnings.simplefilter("ignore", RuntimeWarning)
-        with np.errstate(all="ignore"):
-            return module.simulate(**how)
+    # failures and advice are what is measured here
+    quiet = warnings.catch_warnings(action="ignore", category=RuntimeWarning)
+    with quiet, np.errstate(all="ignore"):
+        return module.simulate(**how)
 
 
 def at_rows(function: Any, reference: Reference, *, velocities: bool = True) -> Vector:

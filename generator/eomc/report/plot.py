@@ -15,7 +15,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from eomc.base import texts
-from eomc.base.errors import EomcError
+from eomc.base.errors import EomcError, writing
 from eomc.model.system import Coordinate, System
 from eomc.report import picture as pictures
 from eomc.report.labels import mathtext, rate_unit, with_unit
@@ -57,11 +57,8 @@ def draw(
     drawn = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "eomc", "text.usetex": False}):
         made.savefig(drawn, format=suffix[1:], dpi=150, metadata=undated)
-    try:
-        with replacing(path) as new:
-            new.write_bytes(drawn.getvalue())
-    except OSError as fault:
-        raise EomcError(f"{path}: can't be written ({fault.strerror or fault})") from None
+    with writing(path), replacing(path) as new:
+        new.write_bytes(drawn.getvalue())
 
 
 def without_pictures() -> str:

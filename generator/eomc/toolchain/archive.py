@@ -6,7 +6,7 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from eomc.base.errors import EomcError
+from eomc.base.errors import writing
 from eomc.runtime.written import replacing
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all that is inside, the earliest of a zip
@@ -18,7 +18,7 @@ def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None
     programs: the folder in it whose files are executable. Raises EomcError where it can't be
     written.
     """
-    try:
+    with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as new, zipfile.ZipFile(new, "w") as archive:
             for name, data in contents.items():
@@ -28,5 +28,3 @@ def write(file: Path, contents: Mapping[str, bytes], programs: str = "") -> None
                 runs = programs and name.startswith(f"{programs}/")
                 entry.external_attr = (0o755 if runs else 0o644) << 16
                 archive.writestr(entry, data)
-    except OSError as fault:
-        raise EomcError(f"{file}: can't be written ({fault.strerror})") from None

@@ -176,13 +176,11 @@ def _build(
     form: str,
 ) -> None:
     from eomc.toolchain import extension
+    from eomc.toolchain.running import lay_out
 
     called = f"_{name}_{wanted[:12]}"
     made = sources(called)
-    for file, text in made.files.items():
-        (new / file).parent.mkdir(exist_ok=True)
-        # the name of a scene's file may be no text
-        (new / file).write_text(text, encoding="utf-8", errors="backslashreplace")
+    lay_out(made.files, new)
     library = called + str(sysconfig.get_config_var("EXT_SUFFIX"))
     compiler = compiler_for(made.operations)
     extension.build(made, called, new, library, compiler, form)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import shlex
-import subprocess
 import sys
 import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eomc.base.errors import EomcError
 from eomc.toolchain.compiler import STANDARD, Compiler, binding_flags, flags, standard
-from eomc.toolchain.running import run
+from eomc.toolchain.running import run, try_out
 
 if TYPE_CHECKING:
     from eomc.emit.render import Sources
@@ -46,16 +43,9 @@ def build(
     include = [f"-I{p}" for p in {sysconfig.get_path("include"), sysconfig.get_path("platinclude")}]
     common = [*compiler.command, "-fPIC", "-fvisibility=hidden"]
     bound = [*common, STANDARD, *_UNASSERTED, *binding_flags(), *include]
+    scene_flags = optimised or flags(form)
     jobs = [
-        [
-            *common,
-            standard(form),
-            *(optimised or flags(form)),
-            "-c",
-            f"{at}{name}.c",
-            "-o",
-            "scene.o",
-        ],
+        [*common, standard(form), *scene_flags, "-c", f"{at}{name}.c", "-o", "scene.o"],
         [*bound, "-c", f"{at}binding.c", "-o", "binding.o"],
     ]
     run(name, folder, *jobs)
@@ -66,7 +56,11 @@ def build(
     if sys.platform == "win32":
         link.insert(link.index("-lm"), python_library(library))
     run(name, folder, link)
-    _try(name, extension, folder / library, compiler)
+    backend = importlib.util.find_spec("_cffi_backend")
+    assert backend is not None and backend.origin is not None
+    given = (os.path.dirname(backend.origin), extension, str((folder / library).resolve()))
+    # before it replaces another
+    try_out(name, compiler.command, _TRIAL, given, "; the last build stays")
 
 
 def python_library(library: str) -> str:
@@ -84,24 +78,3 @@ from importlib.machinery import ExtensionFileLoader, ModuleSpec
 loader = ExtensionFileLoader(sys.argv[2], sys.argv[3])
 loader.exec_module(loader.create_module(ModuleSpec(sys.argv[2], loader, origin=sys.argv[3])))
 """
-
-
-def _try(name: str, extension: str, library: Path, compiler: Compiler) -> None:
-    """Load a new extension in a process of its own (some 10 ms), before it replaces another.
-
-    Raises EomcError where it can't be loaded, or ends that process.
-    """
-    backend = importlib.util.find_spec("_cffi_backend")
-    assert backend is not None and backend.origin is not None
-    where = os.path.dirname(backend.origin)
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", _TRIAL, where, extension, str(library.resolve())],
-        stdin=subprocess.DEVNULL, capture_output=True, errors="backslashreplace",
-    )  # fmt: skip
-    if done.returncode:
-        lines = done.stderr.strip().splitlines()
-        said = lines[-1] if lines else f"status {done.returncode}"
-        raise EomcError(
-            f"{name}: the C compiler {shlex.join(compiler.command)} returned 0, but what it made "
-            f"can't be loaded: correct CC and EOMC_CFLAGS; the last build stays\n  {said}"
-        )

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import platform
-import shlex
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -14,7 +12,7 @@ from typing import TYPE_CHECKING
 from eomc.base.errors import EomcError, NoCompilerError
 from eomc.toolchain import archive
 from eomc.toolchain.compiler import Compiler, compiler_for, flags, standard
-from eomc.toolchain.running import run
+from eomc.toolchain.running import lay_out, run, try_out
 
 if TYPE_CHECKING:
     from eomc.emit.fmu.files import Unit
@@ -66,25 +64,12 @@ def _compiled(made: Unit, compiler: Compiler) -> tuple[dict[str, bytes], str]:
     folder = place(made.version)
     with tempfile.TemporaryDirectory(prefix="eomc-fmu-") as at:
         sources = Path(at, "sources")
-        for name, text in made.files.items():
-            if name.endswith((".c", ".h")):
-                to = Path(at, name)
-                to.parent.mkdir(parents=True, exist_ok=True)
-                to.write_text(text, encoding="utf-8", errors="backslashreplace")
+        lay_out({n: text for n, text in made.files.items() if n.endswith((".c", ".h"))}, Path(at))
         command = [
             *compiler.command, standard("plain"), *flags("plain"), "-fPIC", "-fvisibility=hidden",
             "-shared", *made.sources, "-lm", "-o", library,
         ]  # fmt: skip
         run(made.name, sources, command)
         load = f"import ctypes; ctypes.CDLL({str(sources / library)!r}).fmi{made.version}GetVersion"
-        done = subprocess.run(
-            [sys.executable, "-I", "-S", "-c", load], stdin=subprocess.DEVNULL, capture_output=True,
-            errors="backslashreplace",
-        )  # fmt: skip
-        if done.returncode:
-            said = [*done.stderr.strip().splitlines(), f"status {done.returncode}"][-2:][0]
-            raise EomcError(
-                f"{made.name}: the C compiler {shlex.join(compiler.command)} returned 0, but what "
-                f"it made can't be loaded: correct CC and EOMC_CFLAGS, or take --sources\n  {said}"
-            )
+        try_out(made.name, compiler.command, load, (), ", or take --sources")
         return {f"binaries/{folder}/{library}": (sources / library).read_bytes()}, folder

@@ -5,7 +5,8 @@ from __future__ import annotations
 import shlex
 import signal
 import subprocess
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -29,6 +30,32 @@ def run(name: str, folder: Path, *commands: Sequence[str]) -> None:
     finally:
         for process in running:
             _end(process)
+
+
+def lay_out(files: Mapping[str, str], folder: Path) -> None:
+    """Texts by name into a folder; the name of a scene's file in them may be no text."""
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def try_out(
+    name: str, command: Sequence[str], code: str, arguments: Sequence[str], remedy: str
+) -> None:
+    """Python code that loads what `command` has made, in a process of its own (some 10 ms).
+
+    Raises EomcError with the remedy where it fails, or ends that process.
+    """
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", code, *arguments],
+        stdin=subprocess.DEVNULL, capture_output=True, errors="backslashreplace",
+    )  # fmt: skip
+    if done.returncode:
+        said = [f"status {done.returncode}", *done.stderr.strip().splitlines()][-1]
+        raise EomcError(
+            f"{name}: the C compiler {shlex.join(command)} returned 0, but what it made can't be "
+            f"loaded: correct CC and EOMC_CFLAGS{remedy}\n  {said}"
+        )
 
 
 @contextmanager

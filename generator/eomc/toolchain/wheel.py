@@ -23,6 +23,7 @@ from eomc.emit.render import Sources, show
 from eomc.emit.views import Compiled, Form
 from eomc.toolchain import archive, extension
 from eomc.toolchain.compiler import FLAGS, compiler_for, given_flags
+from eomc.toolchain.running import lay_out
 
 COMPILED = "compiled"  # the module that chooses an extension
 OLDEST = 17  # glibc 2.17, below which installers know no wheels
@@ -76,9 +77,7 @@ def build(made: Sources, scene: bytes, digest: str, title: str, folder: Path) ->
     forms = []
     with tempfile.TemporaryDirectory(prefix="eomc-wheel-") as place:
         at = Path(place)
-        for file, text in made.files.items():
-            (at / file).parent.mkdir(exist_ok=True)
-            (at / file).write_text(text, encoding="utf-8", errors="backslashreplace")
+        lay_out(made.files, at)
         for g in generations():
             called = f"_{name}_{g.name}"
             library = called + suffix

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy
 
-from eomc.model.symbols import Output
+from eomc.model.symbols import Output, resolved
 from eomc.model.system import System
 from eomc.verify.report import LIMIT
 from eomc.verify.rows_outputs import SLOPE_LIMIT, Formulas
@@ -32,9 +32,7 @@ def report(of: Comparison) -> None:
 
 def _is_feedback(system: System) -> bool:
     """Whether a signal answers the state, and none jumps."""
-    known: dict[sympy.Symbol, sympy.Expr] = {}
-    for name, e in system.definitions:
-        known[name] = e.xreplace(known)
+    known = resolved(system.definitions)
     signals = sympy.Tuple(*(i.signal.xreplace(known) for i in system.inputs))
     moves = signals.free_symbols & {*system.q, *system.qd}
     return bool(moves) and not signals.has(sympy.sign, sympy.Heaviside)
