@@ -57,8 +57,7 @@ class Row:
 def judged(name: str, module: Any, h: float, steps: int) -> Row:
     """A run and its estimate beside the trusted end state."""
     case = cases()[name]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         run = module.simulate(h=h, steps=steps, every=max(1, steps // 400))
     if run.status != "ok":
         return Row(name, h, steps, run.status, np.nan, np.nan, np.nan, np.nan, run.message)

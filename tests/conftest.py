@@ -252,8 +252,7 @@ def everything(modules: Modules) -> ModuleType:
 @pytest.fixture
 def no_warnings() -> Iterator[None]:
     """A warning is a failure."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         yield
 
 

@@ -42,8 +42,9 @@ def module(name: str) -> ModuleType:
 
 
 def simulate(name: str, **how: Any) -> Any:
-    with warnings.catch_warnings():  # singular steps are looked at below
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(
+        action="ignore", category=RuntimeWarning
+    ):  # singular steps are looked at below
         return module(name).simulate(**how)
 
 

@@ -224,8 +224,7 @@ def test_stages_are_sought_anew_where_derivatives_in_the_middle_lead_astray(
         '[run]\nmethod = ["gauss8", "gauss6"]\n'
     )
     made = from_scene(parse(text, "quartic.toml"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of h beyond what follows the motion
+    with warnings.catch_warnings(action="ignore"):  # of h beyond what follows the motion
         run = eomc.load(made, MODULES, form=form).simulate(h=h, steps=20, method=method)
     assert (run.status, run.steps) == ("ok", 20)
     assert np.ptp(run.energy) < 1e-2 * run.energy[0]
@@ -235,8 +234,7 @@ def test_runs_are_the_same_however_they_are_cut(modules: Modules) -> None:
     """To the last bit, also where C is called for one step at a time."""
     text = Path("scenes/cartpole_driven.toml").read_text(encoding="utf-8")
     m = modules.unoptimised(text.replace("[run]\n", f"[run]\nmethod = {ALL}\n"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         for method in GAUSS:
             whole = m.simulate(h=0.02, steps=700, u=0.5, method=method)
             cut = m.simulate(h=0.02, steps=700, u=lambda t, q, qd: 0.5, method=method)

@@ -64,8 +64,7 @@ def driven() -> Path:
 
 
 def quietly(m: ModuleType, *state: Any, **how: Any) -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         return m.simulate(*state, **how)
 
 

@@ -268,8 +268,7 @@ def test_faults_are_told(modules: Modules) -> None:
     good state."""
     module = modules.unoptimised(chain(5))
     q, qd = module.start
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         singular = module.simulate(h=0.01, steps=3, params={"m": 0.0})
         fast = module.simulate(q, qd + 1e160, h=0.5, steps=20)
         poles = modules.unoptimised(POLES).simulate(h=0.01, steps=3)

@@ -292,8 +292,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cost_of_digits, "METHODS", {n: METHODS[n] for n in ("rk4", "dp8")})
     scene, file = str(SCENES / "mass_spring.toml"), tmp_path / "figures.json"
     words = ["report", scene, "--build", str(tmp_path)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         done = CliRunner().invoke(main, [*words, "--json", str(file)])
     assert done.exit_code == 0, done.output
     assert "smallest error" in done.output

@@ -391,8 +391,7 @@ def test_check_compares_both_forms_with_the_reference(scene: str, real: str) -> 
         scene, name, tolerance=tol, **({"real": '"float"'} if real == "float" else {})
     )
     system = eomc.read(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         plain = eomc.load(system, BUILDS, form="plain")
         report = check(system, eomc.load(system, BUILDS), plain=plain, states=4)
     rows = [row for row in report.rows if "adaptive" in row.name]

@@ -70,8 +70,7 @@ def exact(t: float) -> np.ndarray:
 
 @pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-9, 1e-12])
 def test_the_end_is_the_closed_form(train: ModuleType, tol: float) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         run = train.simulate(tol=tol, duration=20.0)
     assert run.status == "ok" and run.stiff_steps > run.steps / 3 and run.steps < 120
     assert np.abs(run.x[-1] - exact(20.0)).max() < 10 * tol

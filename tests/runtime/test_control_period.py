@@ -102,8 +102,7 @@ def test_batches_take_a_row_a_period(balanced: ModuleType) -> None:
 
 def test_the_error_is_that_of_the_run_with_its_period(balanced: ModuleType) -> None:
     """The finer runs ask as often: what is left is the stepper's error, of order 4."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         run = balanced.simulate(u=law, control_period=0.02, duration=1.0, estimate=True)
     exact = balanced.simulate(u=law, control_period=0.02, duration=1.0, h=0.02 / 64)
     off = np.abs(run.q[-1] - exact.q[-1])
@@ -142,8 +141,7 @@ def test_a_row_too_few_is_told(balanced: ModuleType) -> None:
 
 @pytest.mark.parametrize("period", [1e12, 1e300])
 def test_a_period_may_be_longer_than_the_run(balanced: ModuleType, period: float) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         run = balanced.simulate(steps=7, u=law, control_period=period)
     assert np.all(run.u == run.u[0]) and run.u.shape == (8, 2)
     assert balanced.simulate(steps=7, control_period=period).steps == 7

@@ -69,8 +69,7 @@ def spring(modules: Modules) -> Any:
 
 
 def quiet(module: Any, **how: Any) -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         return module.simulate(**how)
 
 
@@ -197,8 +196,7 @@ def test_a_law_that_jumps_at_rest_is_not_called_chaotic(modules: Modules, how: d
         u=lambda t, q, qd: -np.sign(qd[0]),
         **how,
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         error = run.estimate()
     assert error.resolved and error.amplification > 1e9
     exact = abs(run.q[-1, 1] - math.cos(2 * run.t[-1]))
@@ -301,8 +299,7 @@ def test_a_step_beyond_the_limit_is_reported_once(spring: Any) -> None:
     with pytest.warns(RuntimeWarning, match=words):
         run = module.simulate(h=0.03, steps=1000)
     assert abs(run.q[-1, 0]) > 1e3
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         module.simulate(h=0.03, steps=1000)  # reported
         module.simulate(h=0.031, steps=19)  # short
         run = module.simulate(h=0.028, steps=1000)
@@ -334,8 +331,7 @@ def test_a_step_longer_than_the_run_is_reported(cartpole: ModuleType) -> None:
     with pytest.warns(RuntimeWarning, match=words) as said:
         run = cartpole.simulate(h=0.5, duration=0.2)
     assert run.steps == 1 and said[0].filename == __file__
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         cartpole.simulate(h=0.5, duration=0.5)
         cartpole.simulate(h=0.5, duration=0)
         cartpole.simulate(h=0.5, steps=1)

@@ -121,8 +121,7 @@ def test_ctrl_c_before_anything_was_done_leaves_the_start(driven: ModuleType) ->
     def law(t: float, q: Any, qd: Any) -> float:
         raise KeyboardInterrupt
 
-    with warnings.catch_warnings(), pytest.raises(KeyboardInterrupt) as caught:
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"), pytest.raises(KeyboardInterrupt) as caught:
         driven.simulate(Q, QD, steps=9, u=law)
     run = caught.value.run
     assert (run.status, run.steps, run.evaluations) == ("interrupted", 0, 0)
@@ -135,8 +134,7 @@ def test_ctrl_c_in_an_input(driven: ModuleType) -> None:
             raise KeyboardInterrupt
         return 0.1
 
-    with warnings.catch_warnings(), pytest.raises(KeyboardInterrupt) as caught:
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"), pytest.raises(KeyboardInterrupt) as caught:
         driven.simulate(h=0.01, steps=1000, every=4, u=law)
     run = caught.value.run
     assert run.steps == 51

@@ -180,8 +180,7 @@ def test_looking_up_leaves_no_trace(driven: ModuleType) -> None:
     assert {total for _, total in seen} == {steps}
     assert seen[-1][0] == steps
     values = iter(table)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         one_by_one = driven.simulate(steps=steps, every=7, u=lambda t, q, qd: next(values))
     assert same(run, one_by_one)
 
@@ -194,8 +193,7 @@ def test_an_input_that_is_constant_tabulated_or_called(driven: ModuleType) -> No
     assert same(constant, driven.simulate(h=h, steps=steps, u=np.full(steps, 0.5)))
     assert same(constant, driven.simulate(h=h, steps=steps, u=np.full((steps, 1), 0.5)))
     table = driven.simulate(h=h, steps=steps, u=np.sin(h * np.arange(steps)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         called = driven.simulate(h=h, steps=steps, u=lambda t, q, qd: np.sin(t))
     assert same(table, called)
     assert not np.array_equal(table.q, constant.q)
@@ -222,8 +220,7 @@ def test_a_function_sees_time_and_state_and_may_keep_them(driven: ModuleType, ev
         return given[-1]
 
     how = {"h": 0.01, "steps": 20, "t0": 2.0}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         called = driven.simulate([0.1, 3.0], u=law, every=every, **how)
     run = driven.simulate([0.1, 3.0], u=given, **how)
     assert [at for at, _, _ in seen] == run.t[:-1].tolist()
@@ -237,8 +234,7 @@ def test_a_function_is_said_to_be_slow_once(tmp_path: Path) -> None:
     driven._model._warned.discard("u")
     with pytest.warns(RuntimeWarning, match=r"cartpole_driven: u is a Python function.*slower"):
         driven.simulate(steps=2, u=lambda t, q, qd: 0.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         driven.simulate(steps=2, u=lambda t, q, qd: 0.0)
 
 
@@ -246,8 +242,7 @@ def test_an_error_in_a_function_comes_through(driven: ModuleType) -> None:
     def law(t: float, q: Any, qd: Any) -> float:
         raise ZeroDivisionError("mine")
 
-    with warnings.catch_warnings(), pytest.raises(ZeroDivisionError, match="mine"):
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"), pytest.raises(ZeroDivisionError, match="mine"):
         driven.simulate(steps=5, u=law)
 
 
@@ -260,8 +255,7 @@ def test_an_error_in_a_function_comes_through(driven: ModuleType) -> None:
     ],
 )
 def test_a_functions_result_is_looked_at(driven: ModuleType, result: Any, words: str) -> None:
-    with warnings.catch_warnings(), pytest.raises(ValueError, match=words):
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"), pytest.raises(ValueError, match=words):
         driven.simulate(steps=5, u=lambda t, q, qd: result)
 
 

@@ -140,8 +140,7 @@ def harmless(text):
     _hooked()
     watch = []
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             from_scene(parse(text, "fuzz.toml"))
     except EomcError as fault:
         assert str(fault).startswith("fuzz.toml")

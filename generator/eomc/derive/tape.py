@@ -269,7 +269,7 @@ class Tape:
         terms = [split(term) for term in total.args if not term.is_number]
         return self._of_weights({name: weight for weight, name in terms if name}, Add(*numbers))
 
-    def _of_weights(self, weights: dict[Symbol, Expr], constant: Expr = S.Zero) -> Expr:
+    def _of_weights(self, weights: dict[Symbol, Expr], constant: Expr) -> Expr:
         """What stands for a sum of weighted names; most weights in it are positive."""
         names = self._ordered(weights)
         last = weights[min(reversed(names), key=lambda name: self.stage[name])]

@@ -210,9 +210,9 @@ class Printer:
         x = self.operand(argument, 4)
         return f"({self.real.name})(({x} > 0) - ({x} < 0))"
 
-    def in_lane(self, o: Operand, binding: int = 1) -> str:
+    def in_lane(self, o: Operand) -> str:
         """An operand; a number alone in every lane."""
-        text = self.operand(o, binding)
+        text = self.operand(o, 1)
         if self.real.lane and not o.name:
             return f"{self.prefix}_same_{self.real.lane}({text})"
         return text

@@ -113,7 +113,7 @@ def count(scene: Scene) -> Mobility:
     remarks = [
         *_fixed(assembly),
         *_shared(assembly, {*names}),
-        *_formulas_fix(placed, d, names, rank, tree),
+        *_formulas_fix(placed, d, rank, tree),
         *_moves_nothing(generic, names, scene),
         *_in_a_row(assembly, kinematics),
         *_singular_start(kinematics, generic),
@@ -209,9 +209,7 @@ def _shared(assembly: Assembly, names: set[str]) -> Iterator[str]:
         )
 
 
-def _formulas_fix(
-    placed: Sequence[Body], d: int, names: Sequence[str], rank: int, M: int
-) -> Iterator[str]:
+def _formulas_fix(placed: Sequence[Body], d: int, rank: int, M: int) -> Iterator[str]:
     if placed:
         yield (
             f"{listed([b.name for b in placed])}: M counts {d} freedoms for each body that is "

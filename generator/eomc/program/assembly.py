@@ -48,12 +48,11 @@ def assembled(system: System) -> System:
         return system
     if system.closure is not None and system.closure.made_for == _made_for(system):
         return system
-    if system.modes:
-        made = sticking.beside(system, assembled(sticking.without(system)))
-        assert made.closure is not None
-        return replace(made, closure=replace(made.closure, made_for=_made_for(made)))
-    if system.discrete:
-        made = discrete.beside(system, assembled(discrete.constant(system)))
+    if system.modes or system.discrete:
+        if system.modes:
+            made = sticking.beside(system, assembled(sticking.without(system)))
+        else:
+            made = discrete.beside(system, assembled(discrete.constant(system)))
         assert made.closure is not None
         return replace(made, closure=replace(made.closure, made_for=_made_for(made)))
     manifold = Manifold(system)
@@ -80,7 +79,7 @@ def assembled(system: System) -> System:
         closure=replace(closure, made_for=_made_for(made)),
         warnings=(
             *system.warnings,
-            *_warnings(manifold, start, found, closure),
+            *_warnings(manifold, found, closure),
             *_otherwise(made),
         ),
     )
@@ -247,9 +246,7 @@ def _otherwise(system: System) -> Iterator[Problem]:
         yield system.problem(f"loop.{name}", why, severity="warning")
 
 
-def _warnings(
-    manifold: Manifold, start: Start, found: Ranks, closure: Closure
-) -> Iterator[Problem]:
+def _warnings(manifold: Manifold, found: Ranks, closure: Closure) -> Iterator[Problem]:
     """What a build says of it."""
     system = manifold.system
     if closure.redundant or closure.sums:

@@ -26,11 +26,11 @@ def tidy(d: Draft, ends: list[Operand]) -> None:
     _factor(d, ends, Stage.TIME)
     d.drop(ends)
     _absorb(d, ends)
-    _hoist(d, ends)
+    _hoist(d)
     _factor(d, ends, Stage.NUMBER)
     d.drop(ends)
     _absorb(d, ends)
-    _hoist(d, ends)
+    _hoist(d)
     _share_products(d)
     _share_sums(d)
     d.drop(ends)
@@ -127,7 +127,7 @@ def _factor(d: Draft, ends: Iterable[Operand], least: Stage) -> None:
     d.sort()
 
 
-def _hoist(d: Draft, ends: Iterable[Operand]) -> None:
+def _hoist(d: Draft) -> None:
     """What parameters alone decide inside a later sum or product gets a name of its own."""
     for name, value in list(d.values.items()):
         if d.stages[name] <= Stage.PARAMETER:

@@ -19,7 +19,7 @@ from eomc.scene import formulas
 from eomc.scene.assembly import WORLD, Assembly, Between, Body, Loop, Turn
 from eomc.scene.formulas import Formula
 from eomc.scene.joints import JOINTS
-from eomc.scene.picture import Picture, Shape
+from eomc.scene.picture import Shape
 from eomc.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ class _Sketch:
             self._skeleton(assembly)
         if picture:
             for shape in picture.shapes:
-                self._shape(shape, picture)
+                self._shape(shape)
         if assembly and not self.marks.paths:
             self._paths(assembly)
         plane = assembly.plane if assembly else bool(picture and picture.axes != "xyz")
@@ -158,10 +158,9 @@ class _Sketch:
         for loop in assembly.loops:
             if loop.bodies:
                 self._close(loop)
-        laid: list[tuple[int, ...]] = []
         for kind, some in (("spring", assembly.springs), ("damper", assembly.dampers)):
             for end in some:
-                self._between(kind, end, assembly, laid)
+                self._between(kind, end, assembly)
 
     def _join(self, body: Body) -> None:
         """The joint of a body, and what holds it to the frame of its parent."""
@@ -264,9 +263,7 @@ class _Sketch:
             points = (self.marks.point(center + tip) for tip in tips)
             self.marks.add("inertia", self.marks.point(center), *points)
 
-    def _between(
-        self, kind: str, end: Between, assembly: Assembly, laid: list[tuple[int, ...]]
-    ) -> None:
+    def _between(self, kind: str, end: Between, assembly: Assembly) -> None:
         """A spring or damper where its ends are known."""
         marks = self.marks
         if end.points and end.bodies:
@@ -306,7 +303,7 @@ class _Sketch:
 
     # --- the picture of a scene ------------------------------------------------------------------
 
-    def _shape(self, shape: Shape, picture: Picture) -> None:
+    def _shape(self, shape: Shape) -> None:
         marks = self.marks
         at = [self._at(place.name, place.at) for place in shape.places]
         points = [marks.point(x) for x, _ in at]

@@ -126,7 +126,6 @@ _Axes = Annotated[tuple[tuple[float, ...], ...], pydantic.PlainValidator(spellin
 _Names = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.names)]
 _TwoNames = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.two_names)]
 _TwoCoordinates = Annotated[tuple[str, ...], pydantic.PlainValidator(spelling.two_coordinates)]
-_Torque = Annotated[float | str | tuple[float | str, ...], pydantic.PlainValidator(spelling.each)]
 _Points = Annotated[tuple[tuple[float | str, ...], ...], pydantic.PlainValidator(spelling.points)]
 
 
@@ -191,7 +190,7 @@ class ForceTable(_Table):
     body: pydantic.StrictStr
     point: _Vector | None = None
     force: _Vector | None = None
-    torque: _Torque | None = None
+    torque: _Each | None = None
     frame: Literal["world", "body"] = "world"
     note: _Note = ""
 
