@@ -234,12 +234,6 @@ def needs_fmpy() -> None:
     pytest.importorskip("fmpy", reason="FMPy is not installed: pip install 'eomc[fmu]'")
 
 
-def state_names(module: Any) -> list[str]:
-    """Coordinates and velocities."""
-    names = list(module.COORDINATES) if hasattr(module, "COORDINATES") else []
-    return [*names, *(f"{n}_dot" for n in names)]
-
-
 def rows(host: Host, names: Sequence[str], size: float, count: int) -> np.ndarray:
     """The values at the start and after each of so many steps."""
     found = [host.get(*names)]

@@ -19,6 +19,7 @@ from forks import in_a_fork as in_a_fork
 import eomc
 from eomc.model.system import System
 from eomc.toolchain import compiler as compiling
+from eomc.toolchain.running import lay_out
 
 COVERAGE = ("-O0", "--coverage", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 
@@ -33,8 +34,7 @@ class Shipped:
         made = eomc.sources(system, self.extension)
         folder.mkdir(parents=True, exist_ok=True)
         files = fast_kit(made)
-        for file, text in files.items():
-            (folder / file).write_text(text, encoding="utf-8")
+        lay_out(files, folder)
         self.source = files[f"{self.name}.c"]
         ffi = cffi.FFI()
         ffi.cdef(made.cdef)

@@ -37,12 +37,14 @@ def cheapest(made: System) -> tuple[Function, Mapping[str, str]]:
     return best, passed_over
 
 
-def states(made: System, count: int = 3) -> list[dict[str, float]]:
+def states(
+    made: System, count: int = 3, seed: int = 11, reach: float = 1.5
+) -> list[dict[str, float]]:
     """Coordinates, velocities, parameters, inputs and time by name, at random."""
-    random = np.random.default_rng(11)
+    random = np.random.default_rng(seed)
     out = []
     for _ in range(count):
-        state = {x.name: random.uniform(-1.5, 1.5) for x in made.q}
+        state = {x.name: random.uniform(-reach, reach) for x in made.q}
         state |= {x.name: random.uniform(-2, 2) for x in made.qd}
         state |= {p.name: p.value * random.uniform(0.7, 1.5) for p in made.parameters}
         state |= {x.name: random.uniform(-1, 1) for x in made.u}

@@ -6,8 +6,10 @@ import math
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from eomc.base.errors import SceneError
+from eomc.cli.main import main
 from eomc.robots.mjcf import read
 from eomc.robots.robot import Robot
 
@@ -20,6 +22,15 @@ def model(tmp_path: Path, inside: str, before: str = "", after: str = "") -> Rob
     file = tmp_path / "model.xml"
     file.write_text(f"<mujoco>{before}\n<worldbody>{inside}</worldbody>\n{after}</mujoco>")
     return read.read(file)
+
+
+def imported(folder: Path, text: str, *words: str) -> tuple[str, str]:
+    """What the command says of a robot file, and the scene; "" where there is none."""
+    file, scene = folder / "robot.xml", folder / "robot.toml"
+    file.write_text(text, encoding="utf-8")
+    done = CliRunner().invoke(main, ["import", str(file), "--out", str(scene), *words])
+    assert done.exit_code == (0 if scene.exists() else 2), done.output
+    return done.output, scene.read_text(encoding="utf-8") if scene.exists() else ""
 
 
 def refused(tmp_path: Path, inside: str, before: str = "", after: str = "") -> str:

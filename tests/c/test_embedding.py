@@ -23,6 +23,7 @@ from eomc.emit.fast.files import PLACEHOLDERS
 from eomc.model import from_scene as system
 from eomc.model.system import System
 from eomc.scene import read as scene
+from eomc.toolchain.running import lay_out
 from eomc.verify import symbolic
 
 NAMES = [
@@ -56,8 +57,7 @@ def generated(name: str) -> dict[str, str]:
 @pytest.fixture
 def kit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A folder with the generated files of a scene."""
-    for file, text in generated(request.param).items():
-        (tmp_path / file).write_text(text, encoding="utf-8")
+    lay_out(generated(request.param), tmp_path)
     return tmp_path
 
 
@@ -159,8 +159,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Printed:
     @cache
     def of(name: str, command: str) -> str:
         folder = tmp_path_factory.mktemp(name)
-        for file, text in generated(name).items():
-            (folder / file).write_text(text, encoding="utf-8")
+        lay_out(generated(name), folder)
         compiler, *flags = command.split()
         files = ("-I.", "main.c", f"{name}.c", "-lm")
         compiled(needs(compiler), "-std=c99", *flags, *files, cwd=folder)
@@ -273,8 +272,7 @@ E = { start = 1 }
 [energy]
 kinetic = "E_dot**2/2"
 """
-    for file, content in fast_kit(eomc.sources(system.from_scene(scene.parse(text)))).items():
-        (tmp_path / file).write_text(content, encoding="utf-8")
+    lay_out(fast_kit(eomc.sources(system.from_scene(scene.parse(text)))), tmp_path)
     compiled("cc", "-std=gnu99", "-include", "math.h", "-c", "m.c", cwd=tmp_path)
 
 
@@ -296,8 +294,7 @@ def test_enumerators_are_none_of_our_own_macros() -> None:
 def test_coordinates_may_be_called_like_our_own_macros(name: str, tmp_path: Path) -> None:
     text = (ROOT / "scenes" / "cartpole.toml").read_text(encoding="utf-8")
     text = re.sub(r"\bx(?=\b|_dot)", name, text).replace("[run]\n", "[run]\nbatch = true\n")
-    for file, content in fast_kit(eomc.sources(system.from_scene(scene.parse(text)))).items():
-        (tmp_path / file).write_text(content, encoding="utf-8")
+    lay_out(fast_kit(eomc.sources(system.from_scene(scene.parse(text)))), tmp_path)
     program = f"""
         #include <stdio.h>
         #include "cartpole.h"
@@ -364,8 +361,7 @@ def test_nothing_is_printed_that_could_have_lost_digits(kit: Path, name: str) ->
 
 def test_a_misuse_is_told_by_the_compiler(tmp_path: Path) -> None:
     """-ffast-math breaks the reduction of angles: it is refused, not silently wrong."""
-    for file, text in generated("cartpole").items():
-        (tmp_path / file).write_text(text, encoding="utf-8")
+    lay_out(generated("cartpole"), tmp_path)
     done = run("cc", "-std=c99", "-O2", "-ffast-math", "-c", "cartpole.c", cwd=tmp_path)
     assert done.returncode != 0
     assert "-ffast-math" in done.stderr

@@ -7,9 +7,10 @@ newton_euler.py and articulated_body.py. Programs are evaluated in Python: nothi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
+import links
 import numpy as np
 import pytest
 import trees
@@ -88,17 +89,7 @@ def every_route(
 # --- states and what is asked there ---------------------------------------------------------------
 
 
-def states(made: System, count: int = 2) -> list[dict[str, float]]:
-    """Coordinates, velocities, parameters, inputs and time by name, at random."""
-    random = np.random.default_rng(7)
-    out = []
-    for _ in range(count):
-        state = {x.name: random.uniform(-1.2, 1.2) for x in made.q}
-        state |= {x.name: random.uniform(-2, 2) for x in made.qd}
-        state |= {p.name: p.value * random.uniform(0.7, 1.5) for p in made.parameters}
-        state |= {x.name: random.uniform(-1, 1) for x in made.u}
-        out.append({**state, "t": random.uniform(0, 3)})
-    return out
+states = partial(links.states, count=2, seed=7, reach=1.2)
 
 
 class Asked:
@@ -287,7 +278,7 @@ def test_the_reference_written_out_says_the_same(text: str) -> None:
 def test_where_angles_are_singular_no_acceleration_is_given(joint: str, number: int) -> None:
     made = made_of(held(joint, number))
     pitch = f"q{number - 2}"
-    state = states(made, 1)[0]
+    state = states(made, count=1)[0]
     for (_, route), function in every_route(made, accelerations).items():
         for off, regular in ((0.0, False), (1e-9, False), (1e-3, True)):
             try:

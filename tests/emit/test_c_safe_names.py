@@ -26,6 +26,7 @@ from eomc.emit import c_safe_names
 from eomc.model import from_scene as system
 from eomc.program import program
 from eomc.scene import read as scene
+from eomc.toolchain.running import lay_out
 
 MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
 INCLUDE = f"-I{sysconfig.get_path('include')}"
@@ -138,9 +139,7 @@ def test_no_function_or_macro_of_a_scene_is_one_of_the_library() -> None:
 
 
 def write(folder: Path, files: dict[str, str]) -> None:
-    for file, content in files.items():
-        (folder / file).parent.mkdir(exist_ok=True)
-        (folder / file).write_text(content, encoding="utf-8")
+    lay_out(files, folder)
 
 
 def compiled(folder: Path, name: str, *flags: str) -> None:

@@ -19,6 +19,7 @@ from eomc.emit.c_names import Target
 from eomc.emit.fast.lanes import Accelerations
 from eomc.program import program
 from eomc.program.trig import Angle
+from eomc.toolchain.running import lay_out
 
 
 @cache
@@ -33,8 +34,7 @@ def made_with(
     main: str, name: str, rows: Iterable[Sequence[float]], flags: Sequence[str], folder: Path
 ) -> list[list[float]]:
     """What a main() behind the fast C of a scene tells of rows of numbers."""
-    for file, text in fast(name)[1].items():
-        (folder / file).write_text(text, encoding="utf-8")
+    lay_out(fast(name)[1], folder)
     source = (folder / f"{name}.c").read_text(encoding="utf-8")
     main = "#include <stdio.h>\n" + main.replace("eomc_", f"{name}_")
     main = main.replace("EOMC_", f"{name.upper()}_")

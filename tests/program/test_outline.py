@@ -41,6 +41,7 @@ from eomc.program.ir import (
 from eomc.program.program import Program
 from eomc.scene import read as scene
 from eomc.toolchain import cache
+from eomc.toolchain.running import lay_out
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
@@ -163,8 +164,7 @@ def test_the_cut_is_where_few_values_cross() -> None:
 
 def written(made: Sources, folder: Path) -> str:
     folder.mkdir(exist_ok=True)
-    for file, text in fast_kit(made).items():
-        (folder / file).write_text(text, encoding="utf-8")
+    lay_out(fast_kit(made), folder)
     return f"{made.name}.c"
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
+import mjcf_text
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import eomc
-from eomc.cli.main import main
 from eomc.robots.limits import both, through
 
 INERTIA = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
@@ -54,11 +53,8 @@ def mjcf(*joints: str) -> str:
 
 def imported(folder: Path, text: str, *words: str) -> tuple[str, dict]:
     """What the command says, and the scene."""
-    file, scene = folder / "robot.xml", folder / "robot.toml"
-    file.write_text(text, encoding="utf-8")
-    done = CliRunner().invoke(main, ["import", str(file), "--out", str(scene), *words])
-    assert done.exit_code == (0 if scene.exists() else 2), done.output
-    return done.output, tomllib.loads(scene.read_text(encoding="utf-8")) if scene.exists() else {}
+    said, scene = mjcf_text.imported(folder, text, *words)
+    return said, tomllib.loads(scene)
 
 
 def taken(scene: dict) -> dict:

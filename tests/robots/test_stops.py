@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from conftest import tiers
+from mjcf_text import imported
 
 import eomc
-from eomc.cli.main import main
 
 # a slide that reaches from -0.4 to 0.5 m, driven with 80 N at most, and a hinge without limits
 URDF = """<robot name="pusher"><link name="rail"/>
@@ -27,15 +26,6 @@ MJCF = """<mujoco model="swing"><compiler angle="radian"/><option gravity="0 0 -
 <geom size="0.1" pos="0 0 -1" mass="3"/></body></worldbody></mujoco>"""
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
-def imported(folder: Path, text: str, *words: str) -> tuple[str, str]:
-    """What the command says, and the scene."""
-    file, scene = folder / "robot.xml", folder / "robot.toml"
-    file.write_text(text, encoding="utf-8")
-    done = CliRunner().invoke(main, ["import", str(file), "--out", str(scene), *words])
-    assert done.exit_code == (0 if scene.exists() else 2), done.output
-    return done.output, scene.read_text(encoding="utf-8") if scene.exists() else ""
 
 
 def test_a_joint_rests_in_its_stop_by_its_depth_where_it_is_driven_whole(tmp_path: Path) -> None:

@@ -82,6 +82,16 @@ def interpreter(version: str) -> str:
     pytest.skip(f"there is no Python {version}")
 
 
+def assert_says(python: Path, folder: Path, words: str, said: str) -> None:
+    """The command in a folder, by the eomc beside that Python."""
+    done = subprocess.run(
+        [str(python.parent / "eomc"), *words.split()], capture_output=True, text=True,
+        cwd=folder, env=environment(), stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
+    assert said in done.stdout, f"{words}: {done.stdout}"
+
+
 @pytest.mark.parametrize("version", ["3.12", "3.13", "3.14"])
 def test_other_pythons_build_and_run(
     version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -96,12 +106,7 @@ def test_other_pythons_build_and_run(
     (tmp_path / "work").mkdir()
     for words, said in COMMANDS:
         if words.split()[0] in ("new", "build", "check", "show"):
-            done = subprocess.run(
-                [str(python.parent / "eomc"), *words.split()], capture_output=True, text=True,
-                cwd=tmp_path / "work", env=environment(), stdin=subprocess.DEVNULL,
-            )  # fmt: skip
-            assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
-            assert said in done.stdout, f"{words}: {done.stdout}"
+            assert_says(python, tmp_path / "work", words, said)
     monkeypatch.setenv("EOMC_CFLAGS", "-O1")
     wheel = pipeline.write_wheel(SCENES / "furuta_pendulum.toml", tmp_path)
     assert pip(python, "--no-deps", str(wheel)).returncode == 0
@@ -123,12 +128,7 @@ def test_every_command_works_where_pip_has_installed_it(
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "arm.urdf").write_text(ROBOT, encoding="utf-8")
     for words, said in COMMANDS:
-        done = subprocess.run(
-            [str(python.parent / "eomc"), *words.split()], capture_output=True, text=True,
-            cwd=tmp_path / "work", env=environment(), stdin=subprocess.DEVNULL,
-        )  # fmt: skip
-        assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
-        assert said in done.stdout, f"{words}: {done.stdout}"
+        assert_says(python, tmp_path / "work", words, said)
 
 
 def test_the_version_is_written_in_one_place(python: Path) -> None:
