@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
+import links
 import numpy as np
 import pytest
 import sympy
@@ -122,28 +124,7 @@ def compiled(made: System) -> Program:
     return program.build(derive(made))
 
 
-def states(made: System, count: int = 3) -> list[dict[str, float]]:
-    """Coordinates, velocities, parameters, inputs and time by name, at random."""
-    random = np.random.default_rng(5)
-    return [
-        {
-            **{x.name: float(v) for x, v in zip(made.q, q, strict=True)},
-            **{x.name: float(v) for x, v in zip(made.qd, qd, strict=True)},
-            **{p.name: p.value * float(s) for p, s in zip(made.parameters, scale, strict=False)},
-            **{x.name: float(v) for x, v in zip(made.u, u, strict=True)},
-            "t": float(at),
-        }
-        for q, qd, scale, u, at in (
-            (
-                random.uniform(-1.5, 1.5, len(made.q)),
-                random.uniform(-2, 2, len(made.q)),
-                random.uniform(0.5, 2, len(made.parameters)),
-                random.uniform(-1, 1, len(made.u)),
-                random.uniform(0, 3),
-            )
-            for _ in range(count)
-        )
-    ]
+states = partial(links.states, seed=5)
 
 
 def plain(reference: Reference, name: str, state: Mapping[str, float]) -> np.ndarray:

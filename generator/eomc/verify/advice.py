@@ -9,18 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify.convergence import Convergence
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import FARTHEST, along
-
-if TYPE_CHECKING:
-    from eomc.verify.convergence import Convergence
-    from eomc.verify.sampling import State
+from eomc.verify.sampling import FARTHEST, State, along
 
 NUDGE = 1e-6  # relative change at the start, from which growth is estimated
 # An advised h is compared with runs of SPAN times its length, in steps of these parts of it. The

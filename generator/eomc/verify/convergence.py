@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -26,10 +26,7 @@ from eomc.integrators.tableaux import METHODS, RK4
 from eomc.verify import one_step
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import along, ask, simulate, started
-
-if TYPE_CHECKING:
-    from eomc.verify.sampling import State
+from eomc.verify.sampling import State, along, ask, simulate, started
 
 EPS = 2.0**-52
 SEEN = 8  # higher orders go from errors of a hundredth to rounding in two halvings of h

@@ -6,14 +6,12 @@ What a module's `linearize` and `sensitivity` are compared with.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.verify.oracle import STENCIL, Answer, Vector
-
-if TYPE_CHECKING:
-    from eomc.verify.sampling import State
+from eomc.verify.sampling import State
 
 WIDTHS = (0.03, 0.003, 3e-4, 3e-5, 3e-6)  # of the scale of each variable
 

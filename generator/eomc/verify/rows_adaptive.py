@@ -10,19 +10,16 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.integrators.tableaux import GAUSS16
 from eomc.verify import one_step
-from eomc.verify.comparison import GROWTH_LIMIT
+from eomc.verify.comparison import GROWTH_LIMIT, Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.sampling import NUDGE, State, simulate
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
 
 LIMIT, UNIT = 0.1, "tolerances a step, times growth"
 STEPS = (12, 6, 3)  # of a run that is compared, the first in which a difference grows little

@@ -10,18 +10,16 @@ import math
 import warnings
 import zlib
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_refusals import NOT_FINITE, SINGULAR
 from eomc.verify.rows_runs import parameters
 from eomc.verify.sampling import State, simulate
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
 
 COUNT = 19  # instances: more than twice what any register holds
 FEW = 4  # singular states

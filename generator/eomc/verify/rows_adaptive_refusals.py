@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eomc.verify.comparison import Comparison
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_refusals import OK, REFUSED, SINGULAR, Refusals
 from eomc.verify.rows_runs import parameters
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import State
+from eomc.verify.sampling import State
 
 FEW, ROOM = 8, 40  # states; steps of a run
 PARTS = 7  # steps of a span in which one would do

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,7 @@ from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_refusals import SINGULAR
 from eomc.verify.rows_runs import EVERY, LONG, TURNS, Driven, Runs, drive
-
-if TYPE_CHECKING:
-    from eomc.verify.sampling import State
+from eomc.verify.sampling import State
 
 COUNT = 150  # instances: a whole tile or two, and one that is not full
 FEW = (1, 3, 9)  # the first so many of them, alone

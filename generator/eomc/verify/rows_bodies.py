@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -21,12 +21,10 @@ from numpy.polynomial import chebyshev
 from eomc.scene import formulas
 from eomc.scene.assembly import WORLD, Assembly, Body, Damper, Force, Spring
 from eomc.scene.formulas import Formula
+from eomc.scene.scene import Scene
+from eomc.verify.comparison import Comparison
 from eomc.verify.oracle import STENCIL, Vector
-
-if TYPE_CHECKING:
-    from eomc.scene.scene import Scene
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import Expected, State
+from eomc.verify.sampling import Expected, State
 
 LIMIT = 1e-10  # of the energies or the power: derivatives are good to 1e-13
 UNITS = 1e3  # of rounding, which are more in single precision

@@ -12,21 +12,19 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.model.symbols import t as time
 from eomc.scene.assembly import Loop
 from eomc.verify import rows_projection
+from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import STENCIL, Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.rows_bodies import Line
 from eomc.verify.sampling import Expected, State, along, ask, simulate
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
 
 VALUES = ("constraints", "constraint_rates", "constraint_jacobian", "multipliers")
 WORK = 1e-9  # of what multipliers do: velocities of bodies are good to 1e-12

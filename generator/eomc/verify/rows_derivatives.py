@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import derivatives
+from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.sampling import NUDGE, ask, nudged
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import Expected, State
+from eomc.verify.sampling import NUDGE, Expected, State, ask, nudged
 
 SLOPE_LIMIT = 1e-6  # of the largest derivative, by differences of the reference
 

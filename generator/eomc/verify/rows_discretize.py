@@ -9,20 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
+from eomc.verify.comparison import Comparison
 from eomc.verify.derivatives import WIDTHS, apart
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import STENCIL, Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.sampling import FARTHEST, State
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
 
 SLOPE_LIMIT = 1e-6  # of the largest derivative
 SMALL = 1e-4  # what inputs do to a coordinate in a step may be so little, and less is not seen

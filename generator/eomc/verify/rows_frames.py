@@ -9,19 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.scene.scene import Scene
+from eomc.verify.comparison import Comparison
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT as ROUNDINGS
 from eomc.verify.rows_bodies import LIMIT, UNITS, WIDTHS, Line, rotated
-from eomc.verify.sampling import State
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import Expected
+from eomc.verify.sampling import Expected, State
 
 STATES = 4
 TWICE = 1e-8  # of accelerations: two derivatives are good to 1e-10

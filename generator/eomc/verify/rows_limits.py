@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.model.symbols import symbol
 from eomc.model.system import System
+from eomc.verify.comparison import Comparison
 from eomc.verify.oracle import Vector
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import State
+from eomc.verify.sampling import State
 
 STATES = 4
 FAR = 3.0  # times what lies between limits

@@ -11,19 +11,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
+from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_runs import drive
 from eomc.verify.sampling import State
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
 
 LENGTHS = (1.5, 3.0, 6.0, 15.0)  # steps, in times the fastest mode's own
 STEPS = 3

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mpmath
 import numpy as np
@@ -19,13 +19,10 @@ from sympy import Expr, Symbol
 
 from eomc.model.system import System, dot, symbol, t
 from eomc.verify import derivatives
+from eomc.verify.comparison import Comparison
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.sampling import NUDGE, State, ask, nudged
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import Expected
+from eomc.verify.sampling import NUDGE, Expected, State, ask, nudged
 
 DIGITS = 80  # three differences leave some thirty
 WIDTH = mpmath.mpf(10) ** -15  # of differences

@@ -9,21 +9,17 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import one_step
-from eomc.verify.comparison import GROWTH_LIMIT
+from eomc.verify.comparison import GROWTH_LIMIT, Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.sampling import NUDGE, VALUES, State, ask, nudged, simulate, started
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import Expected
+from eomc.verify.sampling import NUDGE, VALUES, Expected, State, ask, nudged, simulate, started
 
 STEPS = 24  # of a run by each method
 # by how much, where sweeps are few and fixed, until what they leave is rounding

@@ -9,20 +9,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.verify import kkt
+from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.rows_refusals import FACTORS, Refusals
 from eomc.verify.rows_runs import drive, parameters
 from eomc.verify.sampling import Expected, State, ask
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
 
 AWAY = (1e-6, 1e-3, 1e-2)  # of how far things go: from a state to where it is projected from
 FAR = (3.0, 30.0, 300.0)  # times as far as they go: no state may be found

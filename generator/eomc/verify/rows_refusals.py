@@ -10,17 +10,15 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify.comparison import Comparison
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_runs import drive, parameters
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import State
+from eomc.verify.sampling import State
 
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE, _, LOCKED = range(6)
 REFUSED = (SINGULAR, NOT_FINITE, NO_CONVERGENCE, LOCKED)

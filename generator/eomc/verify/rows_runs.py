@@ -12,19 +12,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
 from eomc.verify import derivatives
+from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import FARTHEST, NUDGE
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import Expected, State
+from eomc.verify.sampling import FARTHEST, NUDGE, Expected, State
 
 STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps
 CUTS = (1, 2, 5, 38, 129, 130, 131, 177)

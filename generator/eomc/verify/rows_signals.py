@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import sympy
 
 from eomc.model.symbols import Output, resolved
 from eomc.model.system import System
+from eomc.verify.comparison import Comparison
 from eomc.verify.report import LIMIT
 from eomc.verify.rows_outputs import SLOPE_LIMIT, Formulas
 from eomc.verify.sampling import Expected
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
 
 
 def report(of: Comparison) -> None:

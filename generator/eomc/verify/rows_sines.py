@@ -11,16 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
-
-if TYPE_CHECKING:
-    from eomc.verify.comparison import Comparison
-    from eomc.verify.sampling import Expected
+from eomc.verify.sampling import Expected
 
 LIMIT = 100.0  # units; a constant of the reduction that is off makes 1e9
 QUARTERS = (1, 2, -3, 4, -7, 1024, -99_999, 667_542)  # the last ones near 2^20 rad
