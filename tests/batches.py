@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES
+from cases import SCENES, scene_file
 
 import eomc
 
@@ -24,9 +23,7 @@ def module(name: str, **run: str) -> ModuleType:
     many = "_".join(["many", name, *(value.strip('"') for value in run.values())])
     text = re.sub(r"^name\s*=.*", f'name = "{many}"', text, flags=re.M)
     text = text.replace("[run]\n", "[run]\n" + options)
-    path = Path("build/tests") / f"{many}.toml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    path = scene_file(many, text)
     with pytest.MonkeyPatch.context() as patch:
         if name in UNOPTIMISED and not run:
             patch.setenv("EOMC_CFLAGS", "-O0")

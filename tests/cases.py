@@ -136,16 +136,21 @@ def error_of(name: str, q: Any) -> float:
     return float(np.max(np.abs(np.asarray(q) - np.array(cases()[name]["q_ref"], float))))
 
 
+def scene_file(name: str, text: str) -> Path:
+    """Where the text of a scene lies now."""
+    path = Path("build/tests") / f"{name}.toml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
 def variant(scene: str, name: str, **replaced: str) -> Path:
     """A scene of scenes/ under another name, with lines more under [run]."""
     text = (SCENES / f"{scene}.toml").read_text(encoding="utf-8")
     lines = "\n".join(f"{key} = {value}" for key, value in replaced.items())
     old = next(line for line in text.splitlines() if line.startswith("name "))
     text = text.replace(old, f'name = "{name}"').replace("[run]", f"[run]\n{lines}")
-    path = Path("build/tests") / f"{name}.toml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    return path
+    return scene_file(name, text)
 
 
 def block_at_rest(block: Any, tol: float) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy
-from cases import cases, fast_kit, scene_text, variant
+from cases import cases, fast_kit, scene_file, scene_text, variant
 from conftest import MODULES, Modules, tiers
 
 import eomc
@@ -45,11 +45,8 @@ method = ["gauss8", "gauss4", "gauss6", "rk4"]
 
 
 def oscillator(name: str, k: float, c: float, start: float = 1.0, rate: float = 0.0) -> Path:
-    path = Path("build/tests") / f"{name}.toml"
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = OSCILLATOR.format(name=name, k=float(k), c=float(c), start=start, rate=rate)
-    path.write_text(text, encoding="utf-8")
-    return path
+    return scene_file(name, text)
 
 
 def counted(path: Path, method: str, h: float, steps: int) -> tuple[int, list[float], int]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import cases, scene_text, variant
+from cases import cases, scene_file, scene_text, variant
 from conftest import MODULES, tiers
 
 import eomc
@@ -49,10 +49,7 @@ ENDS = (
 
 
 def scene(name: str, text: str) -> ModuleType:
-    path = Path("build/tests") / f"{name}.toml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    return eomc.load(path, MODULES)
+    return eomc.load(scene_file(name, text), MODULES)
 
 
 def beside_dp8(name: str, **run: str) -> ModuleType:

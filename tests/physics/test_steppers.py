@@ -11,7 +11,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from cases import cases, scene_text
+from cases import cases, scene_file, scene_text, variant
 from conftest import tiers
 
 import eomc
@@ -84,10 +84,8 @@ def test_weights_as_they_are_in_c_add_up_to_one(method: Method, real: Real) -> N
 
 def case_module(name: str) -> tuple[ModuleType, dict]:
     case = cases()[name]
-    path = Path("build/tests") / f"dp8_{name}.toml"
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = scene_text(name).replace("[run]", '[run]\nmethod = ["rk4", "dp8"]')
-    path.write_text(text.replace('name = "', 'name = "dp8_', 1), encoding="utf-8")
+    path = scene_file(f"dp8_{name}", text.replace('name = "', 'name = "dp8_', 1))
     return eomc.load(path, MODULES), case
 
 
@@ -150,15 +148,7 @@ def test_a_method_that_is_not_there_is_refused_by_name(cartpole: ModuleType) -> 
 
 
 def test_inputs_are_held_or_followed_by_each_method() -> None:
-    text = (SCENES / "cartpole_driven.toml").read_text(encoding="utf-8")
-    path = Path("build/tests/driven_dp8.toml")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(
-        text.replace("[run]", '[run]\nmethod = ["dp8", "rk4"]').replace(
-            'name  = "cartpole_driven"', 'name  = "driven_dp8"'
-        ),
-        encoding="utf-8",
-    )
+    path = variant("cartpole_driven", "driven_dp8", method='["dp8", "rk4"]')
     m = eomc.load(path, MODULES)
     assert m.methods == ("dp8", "rk4")
     followed = [m.simulate(h=h, duration=2.0).q[-1] for h in (0.1, 0.05)]
