@@ -10,8 +10,7 @@ import hashlib
 from collections.abc import Callable, Iterator
 
 from eomc.base import resources
-from eomc.base.texts import FreeText
-from eomc.emit import adaptive, events, heading
+from eomc.emit import adaptive, events
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import C_NAMES, DOUBLE, PIVOT
 from eomc.emit.c_names import Target
@@ -21,7 +20,7 @@ from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.lanes import INLINE, Lane
 from eomc.emit.fast.runs import ahead_count
 from eomc.emit.fast.steppers import Steppers
-from eomc.emit.functions import Functions, parameters
+from eomc.emit.functions import Functions
 from eomc.emit.plain import steppers as plain
 from eomc.emit.plain import views as plain_views
 from eomc.emit.projection import project
@@ -55,26 +54,13 @@ def files(made: Steppers, show: Show) -> dict[str, str]:
     header = show(plain.header(functions, slopes, stamp, rooms(made), fast=True))
     source = show(
         views.Source(
-            title=FreeText(target.system.title),
-            stamp=tuple(heading.stamp(target)),
-            prefix=target.prefix,
-            PREFIX=target.PREFIX,
-            real=target.real.name,
+            **plain.source(functions, stamp, slopes, show),
             rolled=made.two_point,
             unroll=made.one.unroll,
             extent=made.one.extent,
             inline=made.one.qualifiers[INLINE],
-            handshake=stamp,
             wide=_wide(made),
             csrc=tuple(_csrc(made)),
-            parameters=parameters(functions),
-            q0=tuple(target.literal(x.start) for x in target.system.coordinates),
-            qd0=tuple(target.literal(x.rate) for x in target.system.coordinates),
-            evaluations=functions.evaluations,
-            acceleration=functions.acceleration,
-            solved=tuple(heading.solved(target)),
-            constrained=bool(target.system.constraints),
-            slopes=show(slopes).rstrip("\n") if slopes else "",
             lanes=tuple(filter(None, _lanes(made, show))),
             steppers=tuple(_steppers(made, show)),
         )
@@ -190,11 +176,8 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             prefix=target.prefix,
             PREFIX=target.PREFIX,
             unroll=lane.unroll,
-            inline=lane.qualifiers[INLINE],
-            lane=lane.real.name,
-            mask=lane.mask,
+            **lane.names,
             clear=lane.clear,
-            L=lane.end,
             constants="\n\n".join(filter(None, (constants, computed))),
             angles=lane.angle_count if s.angles else "",
             count=len(s.angles),
@@ -224,10 +207,7 @@ def _library_text(lane: Lane, show: Show) -> str:
         views.LibraryText(
             prefix=lane.prefix,
             real=lane.accelerations.target.real.name,
-            inline=lane.qualifiers[INLINE],
-            lane=lane.real.name,
-            L=lane.end,
-            mask=lane.mask,
+            **lane.names,
             count=f"{lane.target.PREFIX}_{lane.name.upper()}_COUNT",
             calls=tuple(
                 _library(lane.accelerations, n, lane.end == "_wide") for n in sorted(names)

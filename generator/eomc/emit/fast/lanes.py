@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 from sympy import Expr, S
 
@@ -90,6 +91,14 @@ class Lane:
     def qualifiers(self) -> Mapping[str, str]:
         """Of functions that are to be inlined, and of those that are not."""
         return {kind: f"{self.target.PREFIX}_{kind}" for kind in (INLINE, NOINLINE)}
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """What texts over a lane name."""
+        return {
+            "inline": self.qualifiers[INLINE], "lane": self.real.name, "mask": self.mask,
+            "L": self.end,
+        }  # fmt: skip
 
     @property
     def unroll(self) -> str:

@@ -75,9 +75,7 @@ def loop(made: Steppers, m: Method) -> views.Loop:
         step=public.step(m.name),
         run_once=run.call(**zeros, t0="t", steps="1", status="&status"),
         run=run,
-        timed=lane.target.driven,
-        inputs=bool(lane.target.system.inputs),
-        constants=bool(s.constants),
+        **made.driven,
         unread_p=lane.target.needs_p
         and not constants_call(made)
         and "p" not in {a.name for a in advance.arguments},
@@ -109,10 +107,8 @@ def batch(made: Steppers, m: Method) -> views.Batch:
         batch=made.functions.public.batch(m.name),
         rk4=rk4,
         angles=bool(s.angles),
-        timed=lane.target.driven,
-        inputs=bool(lane.target.system.inputs),
+        **made.driven,
         shared_signals=made.shared_signals,
-        constants=bool(s.constants),
         members=s.constants,
         unread_p=lane.target.needs_p and not own,
         own=own,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from math import isfinite, sqrt
+from typing import Any
 
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import DOUBLE
@@ -75,11 +76,20 @@ class Steppers:
             passed = {"s": "NULL"} | passed
         return lane.all_in_one.call(**passed)
 
-    def looping(self, lane: Lane) -> dict[str, str]:
+    @property
+    def driven(self) -> dict[str, Any]:
+        """Whether steps read the time, inputs, and constants of the parameters."""
+        target = self.accelerations.target
+        return {
+            "timed": target.driven, "inputs": bool(target.system.inputs),
+            "constants": bool(self.accelerations.constants),
+        }  # fmt: skip
+
+    def looping(self, lane: Lane) -> dict[str, Any]:
         """What templates with loops over coordinates name."""
         return self.functions.names | {"unroll": lane.unroll}
 
-    def extended(self, lane: Lane) -> dict[str, str]:
+    def extended(self, lane: Lane) -> dict[str, Any]:
         """And those with vectors of coordinates that accelerations take."""
         return self.functions.names | {"extent": lane.extent}
 
@@ -104,7 +114,7 @@ class Steppers:
 
     def rk4(self, lane: Lane) -> views.RungeKutta4:
         """RK4 over a lane."""
-        s, target = self.accelerations, lane.target
+        s = self.accelerations
         double, one = s.target.real is DOUBLE, not lane.name
         two_point = one and self.two_point
         count = len(s.angles)
@@ -113,15 +123,10 @@ class Steppers:
         here = {"a": c.member("w", "a[k]"), "q": "at", "qd": "moving", "t": "t + node"}
         return views.RungeKutta4(
             **self.looping(lane),
+            **lane.names,
+            **self.driven,
             extent=lane.extent,
-            inline=lane.qualifiers[INLINE],
             noinline=lane.qualifiers[NOINLINE],
-            lane=lane.real.name,
-            mask=lane.mask,
-            L=lane.end,
-            timed=target.driven,
-            inputs=bool(target.system.inputs),
-            constants=bool(s.constants),
             constants_type=lane.constants,
             title=RK4.title,
             source=RK4.source,
@@ -171,9 +176,7 @@ class Steppers:
             **self.looping(lane),
             noinline=lane.qualifiers[NOINLINE],
             angles=len(s.angles),
-            timed=lane.target.driven,
-            inputs=bool(lane.target.system.inputs),
-            constants=bool(s.constants),
+            **self.driven,
             shared_signals=shared,
             signal_first=signalled("w.u[2]", f"t0 + ({real})(first + n)*h"),
             signal_mid=signalled("w.u[1]", "t + h/2"),
@@ -183,7 +186,7 @@ class Steppers:
 
     def explicit(self, lane: Lane, m: Method) -> views.Explicit:
         """An explicit method over a lane; RK4 has a text of its own."""
-        s, target, real = self.accelerations, lane.target, self.accelerations.target.real
+        real = self.accelerations.target.real
 
         def total(row: Row) -> str:
             terms = [f"{literal(x, real)}*a[{k}][i]" for k, x in enumerate(row) if x]
@@ -203,14 +206,9 @@ class Steppers:
             real=real.name,
             unroll=lane.unroll,
             extent=lane.extent,
-            inline=lane.qualifiers[INLINE if m.stages < 4 else NOINLINE],
-            lane=lane.real.name,
-            mask=lane.mask,
+            **lane.names | ({} if m.stages < 4 else {"inline": lane.qualifiers[NOINLINE]}),
+            **self.driven,
             clear=lane.clear,
-            L=lane.end,
-            timed=target.driven,
-            inputs=bool(target.system.inputs),
-            constants=bool(s.constants),
             constants_type=lane.constants,
             name=m.name,
             title=m.title,

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
 from eomc.emit.plain.adaptive_views import AdaptiveTableau
 from eomc.emit.plain.parts import Computed, Named, Prefixed, Tableau
-from eomc.emit.plain.views import Parameter
+from eomc.emit.plain.views import AnySource
 
 
 @dataclass(frozen=True)
@@ -26,59 +25,56 @@ class Library:
 
 
 @dataclass(frozen=True)
-class Source(Named):
-    """c/fast/source.c.jinja. slopes, lanes, steppers: the finished texts of the views below."""
+class Source(AnySource):
+    """c/fast/source.c.jinja. lanes: finished texts of the views below."""
 
     TEMPLATE: ClassVar[str] = "c/fast/source.c"
-    title: FreeText
-    stamp: tuple[FreeText, ...]
     rolled: bool
     unroll: str
     extent: str
     inline: str
-    handshake: str
     wide: bool
     csrc: tuple[str, ...]
-    parameters: tuple[Parameter, ...]
-    q0: tuple[str, ...]
-    qd0: tuple[str, ...]
-    evaluations: tuple[Computed, ...]
-    acceleration: Computed
-    solved: tuple[str, ...]
-    constrained: bool
-    slopes: str
     lanes: tuple[str, ...]
-    steppers: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class LibraryText:
+class Laned:
+    """What is printed over a lane: its type, that of failures, the end of C names."""
+
+    inline: str
+    lane: str
+    mask: str
+    L: str
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Whether steps read the time, inputs, and constants of the parameters."""
+
+    timed: bool
+    inputs: bool
+    constants: bool
+
+
+@dataclass(frozen=True)
+class LibraryText(Prefixed, Laned):
     """c/fast/library.c.jinja: the library's functions over a lane. count: numbers in it, in C."""
 
     TEMPLATE: ClassVar[str] = "c/fast/library.c"
-    prefix: str
-    real: str
-    inline: str
-    lane: str
-    L: str
-    mask: str
     count: str
     calls: tuple[Library, ...]
 
 
 @dataclass(frozen=True)
-class LaneText:
+class LaneText(Laned):
     """c/fast/lane.c.jinja. angles: their number, in C. rates: finished text."""
 
     TEMPLATE: ClassVar[str] = "c/fast/lane.c"
     prefix: str
     PREFIX: str
     unroll: str
-    inline: str
-    lane: str
-    mask: str
     clear: str
-    L: str
     constants: str
     angles: str
     count: int
@@ -124,20 +120,13 @@ class TwoPoints(Prefixed):
 
 
 @dataclass(frozen=True)
-class RungeKutta4(Named):
+class RungeKutta4(Named, Laned, Driven):
     """c/fast/rk4.c.jinja. across: angles go into the registers of the wide lane together."""
 
     TEMPLATE: ClassVar[str] = "c/fast/rk4.c"
     unroll: str
     extent: str
-    inline: str
     noinline: str
-    lane: str
-    mask: str
-    L: str
-    timed: bool
-    inputs: bool
-    constants: bool
     constants_type: str
     title: str
     source: str
@@ -168,16 +157,13 @@ class Predictions(Prefixed):
 
 
 @dataclass(frozen=True)
-class Predicted(Named):
+class Predicted(Named, Driven):
     """c/fast/predicted.c.jinja. stage: the calls of the four stages."""
 
     TEMPLATE: ClassVar[str] = "c/fast/predicted.c"
     unroll: str
     noinline: str
     angles: int
-    timed: bool
-    inputs: bool
-    constants: bool
     shared_signals: bool
     signal_first: str
     signal_mid: str
@@ -196,20 +182,13 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Explicit(Prefixed):
+class Explicit(Prefixed, Laned, Driven):
     """c/fast/explicit.c.jinja."""
 
     TEMPLATE: ClassVar[str] = "c/fast/explicit.c"
     unroll: str
     extent: str
-    inline: str
-    lane: str
-    mask: str
     clear: str
-    L: str
-    timed: bool
-    inputs: bool
-    constants: bool
     constants_type: str
     name: str
     title: str
@@ -335,7 +314,7 @@ class State(Named):
 
 
 @dataclass(frozen=True)
-class Loop(Named):
+class Loop(Named, Driven):
     """c/fast/run.c.jinja. advance: one step; otherwise: where that failed, without shortcuts.
 
     project: the call that ends a step on the constraints, if there are.
@@ -347,9 +326,6 @@ class Loop(Named):
     step: CFunction
     run_once: str
     run: CFunction
-    timed: bool
-    inputs: bool
-    constants: bool
     unread_p: bool
     compute_constants: str
     newton: bool
@@ -366,7 +342,7 @@ class Loop(Named):
 
 
 @dataclass(frozen=True)
-class Batch(Named):
+class Batch(Named, Driven):
     """c/fast/batch.c.jinja. own: whether instances may have constants of their own."""
 
     TEMPLATE: ClassVar[str] = "c/fast/batch.c"
@@ -376,10 +352,7 @@ class Batch(Named):
     batch: CFunction
     rk4: bool
     angles: bool
-    timed: bool
-    inputs: bool
     shared_signals: bool
-    constants: bool
     members: tuple[str, ...]
     unread_p: bool
     own: bool

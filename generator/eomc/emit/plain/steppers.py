@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import isfinite, sqrt
+from typing import Any
 
 from eomc.base.texts import FreeText
-from eomc.emit import adaptive, events, heading, projection
+from eomc.emit import adaptive, evaluations, events, heading, projection
 from eomc.emit import c_function as c
 from eomc.emit.c_expression import Real
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import sentence
 from eomc.emit.coefficients import tableau
 from eomc.emit.derivatives import derivatives
-from eomc.emit.evaluations import source
 from eomc.emit.functions import Functions, handshake, indexed, of, parameters
 from eomc.emit.plain.parts import Computed
 from eomc.emit.plain.views import (
@@ -62,7 +62,13 @@ def files(
     slopes = linearization(plain)
     texts = (
         show(header(plain, slopes, handshake(plain), rooms or [0] * (len(methods) + 1))),
-        show(source_view(plain, show(slopes).rstrip("\n") if slopes else "", steppers)),
+        show(
+            Source(
+                **source(plain, handshake(plain), slopes, show),
+                steppers=tuple(steppers),
+                adaptive=plain.target.system.run.tolerance is not None,
+            )
+        ),
     )
     return {f"{name}.{end}": c.laid_out(text) for end, text in zip("hc", texts, strict=True)}
 
@@ -121,25 +127,23 @@ def header(
     )  # fmt: skip
 
 
-def source_view(plain: Functions, slopes: str, steppers: Sequence[str]) -> Source:
-    """The source's view."""
-    target, s = plain.target, plain.target.system
-    return Source(
-        title=FreeText(s.title),
-        stamp=tuple(heading.stamp(target)),
-        **plain.names,
-        handshake=handshake(plain),
-        parameters=parameters(plain),
-        q0=tuple(target.literal(x.start) for x in s.coordinates),
-        qd0=tuple(target.literal(x.rate) for x in s.coordinates),
-        evaluations=plain.evaluations,
-        acceleration=plain.acceleration,
-        solved=tuple(heading.solved(target)),
-        constrained=bool(s.constraints),
-        slopes=slopes,
-        steppers=tuple(steppers),
-        adaptive=s.run.tolerance is not None,
-    )
+def source(functions: Functions, stamp: str, slopes: Slopes | None, show: Show) -> dict[str, Any]:
+    """What the views of both forms' sources have, but for their steppers."""
+    target, s = functions.target, functions.target.system
+    return {
+        "title": FreeText(s.title),
+        "stamp": tuple(heading.stamp(target)),
+        **functions.names,
+        "handshake": stamp,
+        "parameters": parameters(functions),
+        "q0": tuple(target.literal(x.start) for x in s.coordinates),
+        "qd0": tuple(target.literal(x.rate) for x in s.coordinates),
+        "evaluations": functions.evaluations,
+        "acceleration": functions.acceleration,
+        "solved": tuple(heading.solved(target)),
+        "constrained": bool(s.constraints),
+        "slopes": show(slopes).rstrip("\n") if slopes else "",
+    }
 
 
 # --- the derivatives of the accelerations ---------------------------------------------------------
@@ -148,7 +152,7 @@ def source_view(plain: Functions, slopes: str, steppers: Sequence[str]) -> Sourc
 def linearization(plain: Functions) -> Slopes | None:
     """A_q, A_qd and B, where the program has them."""
     target = plain.target
-    function = source(target, "linearization")
+    function = evaluations.source(target, "linearization")
     if function is None:
         return None
     NQ, inputs = plain.NQ, bool(target.system.inputs)

@@ -90,10 +90,9 @@ class Header(Named):
 
 
 @dataclass(frozen=True)
-class Source(Named):
-    """c/plain/source.c.jinja. slopes, steppers: the finished texts of the views below."""
+class AnySource(Named):
+    """A source of either form. slopes, steppers: the finished texts of other views."""
 
-    TEMPLATE: ClassVar[str] = "c/plain/source.c"
     title: FreeText
     stamp: tuple[FreeText, ...]
     handshake: str
@@ -106,6 +105,13 @@ class Source(Named):
     constrained: bool
     slopes: str
     steppers: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Source(AnySource):
+    """c/plain/source.c.jinja."""
+
+    TEMPLATE: ClassVar[str] = "c/plain/source.c"
     adaptive: bool
 
 
