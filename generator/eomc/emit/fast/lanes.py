@@ -95,10 +95,8 @@ class Lane:
     @property
     def names(self) -> dict[str, Any]:
         """What texts over a lane name."""
-        return {
-            "inline": self.qualifiers[INLINE], "lane": self.real.name, "mask": self.mask,
-            "L": self.end,
-        }  # fmt: skip
+        inline = self.qualifiers[INLINE]
+        return {"inline": inline, "lane": self.real.name, "mask": self.mask, "L": self.end}
 
     @property
     def unroll(self) -> str:
@@ -230,7 +228,8 @@ class Lane:
         if outline.is_large(function):
             return self._in_pieces(whole, function, what, out, places, given, where, in_order)
         body = self.target.body(function, where, pivots=self.pivots, in_order=in_order)
-        reads = {a.name for a in whole.arguments[:1] if a is out} | self._read(function, given)
+        read = {a.name for a, names in given if names & function.uses}
+        reads = read | {a.name for a in whole.arguments[:1] if a is out}
         statements = self._statements(function, body, places)
         return Computed(replace(whole, body=statements, reads=frozenset(reads)))
 
@@ -315,11 +314,6 @@ class Lane:
             c.do(f"{self.prefix}_put({array} + {k}, {', '.join(whole[k : k + FOUR])})")
             for k in range(0, width, FOUR)
         )
-
-    def _read(
-        self, function: Function, given: Iterable[tuple[CArgument, frozenset[str]]]
-    ) -> frozenset[str]:
-        return frozenset(a.name for a, names in given if names & function.uses)
 
     # functions
 
