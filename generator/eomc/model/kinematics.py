@@ -239,8 +239,8 @@ class Kinematics:
 
     def _roots(self, body: Body) -> tuple[float, Array]:
         """The root of the mass, and of the inertia: 2 K = |root_m v|^2 + |root_I omega|^2."""
-        xx, yy, zz, xy, xz, yz = (self._number(entry, self.values) for entry in body.inertia)
-        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        inertia = [self._number(entry, self.values) for entry in body.inertia]
+        moments, axes = np.linalg.eigh(spatial.tensor(inertia))
         root = np.sqrt(np.maximum(moments, 0))[:, None] * axes.T
         return math.sqrt(max(self._number(body.mass, self.values), 0)), root
 

@@ -250,8 +250,8 @@ class _Sketch:
             d, turned = R[0].T @ (own[0] - center[0]), np.eye(3)
             if body is not group[0]:
                 turned = R[0].T @ self.poses[body.name][1][0]
-            xx, yy, zz, xy, xz, yz = (float(self._number(entry)) for entry in body.inertia)
-            whole += turned @ [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]] @ turned.T
+            inertia = [float(self._number(entry)) for entry in body.inertia]
+            whole += turned @ spatial.tensor(inertia) @ turned.T
             whole += m * (d @ d * np.eye(3) - np.outer(d, d))
         if not np.isfinite(whole).all():
             return

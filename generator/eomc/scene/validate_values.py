@@ -8,6 +8,7 @@ from typing import Any
 
 from mpmath import mp
 
+from eomc.base import spatial
 from eomc.scene import formulas
 from eomc.scene.assembly import Turn, Vector
 from eomc.scene.formulas import Formula
@@ -169,8 +170,7 @@ class Values:
         """What no body can have: a negative principal moment, one above the sum of the others."""
         if not all(abs(x) < 1e150 for x in inertia):
             return
-        xx, yy, zz, xy, xz, yz = inertia
-        tensor = mp.matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])  # NumPy takes 0.1 s to load
+        tensor = mp.matrix(spatial.tensor(inertia))  # NumPy takes 0.1 s to load
         small, middle, large = sorted(map(float, mp.eigsy(tensor, eigvals_only=True)))
         tiny = ROUNDING * max(abs(small), abs(large))
         shown = f"{small:.4g}, {middle:.4g} and {large:.4g} kg m^2"

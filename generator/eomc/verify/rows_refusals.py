@@ -7,7 +7,7 @@ Whatever is asked of the module there must say so and leave alone what it was to
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -34,6 +34,16 @@ ABSORBED = 2.0**30  # times another: beyond, a sum of parameters may lose one of
 AWAY = (-0.1, 0.1, -0.4, 0.4)
 ALONG = np.linspace(0, 1, 9)  # of a step: where its stages may lie
 MARK = -7.0  # what is to be left alone
+
+
+def unfinite(s: State) -> Iterator[tuple[str, int, float, State]]:
+    """The state with nan or inf in place of one coordinate or velocity: which, at which place."""
+    for field in ("q", "qd"):
+        for i in range(len(s.q)):
+            for what in (math.nan, math.inf):
+                x = getattr(s, field).copy()
+                x[i] = what
+                yield field, i, what, replace(s, **{field: x})
 
 
 class Refusals:
@@ -269,21 +279,16 @@ class Refusals:
     def odd(self) -> float:
         """How many functions take a number for granted that is none, or infinite."""
         s, wrong = self.check.few(2)[-1].state, 0
-        for field in ("q", "qd"):
-            for i in range(len(s.q)):
-                for what in (math.nan, math.inf):
-                    x = getattr(s, field).copy()
-                    x[i] = what
-                    at = replace(s, **{field: x})
-                    found, clean = self.accelerate(at)
-                    wrong += not clean
-                    # tanh and exp(-x) are finite at infinity, and what they multiply may vanish
-                    silent = math.isnan(what) and not found and self.matters(s, field, i)
-                    wrong += silent and not self.bounded(at)
-                    for method in self.check.methods:
-                        run = drive(self.model, method, at, self.check.system.run.h, 3)
-                        wrong += run.done != 0 or run.status not in REFUSED
-                    wrong += self.model.has_slopes and not self.linearized(at)
+        for field, i, what, at in unfinite(s):
+            found, clean = self.accelerate(at)
+            wrong += not clean
+            # tanh and exp(-x) are finite at infinity, and what they multiply may vanish
+            silent = math.isnan(what) and not found and self.matters(s, field, i)
+            wrong += silent and not self.bounded(at)
+            for method in self.check.methods:
+                run = drive(self.model, method, at, self.check.system.run.h, 3)
+                wrong += run.done != 0 or run.status not in REFUSED
+            wrong += self.model.has_slopes and not self.linearized(at)
         return float(wrong)
 
     def matters(self, s: State, field: str, i: int) -> bool:
