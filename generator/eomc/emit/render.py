@@ -1,6 +1,6 @@
 """A program as files: header, source, example, self-test and Python face, by Jinja templates.
 
-The only file that knows Jinja. What the templates are given is made in context.py.
+The only file that knows Jinja for C. What each template is given is a view.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What is drawn of a mechanism: points that move and marks on them. Geometry only, no matplotlib.
 
 The one value from which pictures, pages and films are made. It holds what a scene declares: bodies,
-joints, points and springs (skeleton.py), what its [picture] says (sketch.py), else the paths of
+joints, points and springs, what its [picture] says (sketch.py has both), else the paths of
 points whose x and y it names. Nothing is guessed: where a scene says none of it, there is no
 drawing.
 """

@@ -1,7 +1,7 @@
 """The reference solution of any scene: its own C in __float128, by a method of order 40.
 
 Computed twice, with other stages and other steps, and trusted as far as both agree. Where the
-plain equations of `reference` are small, they are evaluated with mpmath as well: accelerations
+plain equations of `symbolic` are small, they are evaluated with mpmath as well: accelerations
 along the motion, and the motion itself, by extrapolation, over as much of it as some seconds
 allow. That shares neither program, arithmetic nor method with the first way.
 """

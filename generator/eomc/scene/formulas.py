@@ -2,7 +2,7 @@
 
 Scene text is data: it is parsed with `ast`, every node is compared with a whitelist, and the
 tree is walked by `evaluate`; nothing is ever executed. The same tree gives a float with
-`NUMERIC` and a SymPy expression with the table in `system.py`.
+`NUMERIC` and a SymPy expression with that of `model/algebra.py`.
 """
 
 from __future__ import annotations

@@ -62,11 +62,11 @@ _WANTED: Mapping[str, Mapping[str, str]] = {
 
 
 class Jets(Answer):
-    """The equations of `system`, worked out at each state; the fields of `reference.derive`.
+    """The equations of `system`, worked out at each state; the fields of `symbolic.derive`.
 
     D = K_vv, bias = K_vs - K_q + P_q, and C = (c(qd) + c(0))/2 with c = K_vvs + N: that is
     Christoffel's 1/2 (Ddot + dp2_i/dq_j - dp2_j/dq_i) for p2 = D qd, the gyroscopic part
-    da_i/dq_j - da_j/dq_i and the explicit dD/dt, as in `reference.derive`. No differences are
+    da_i/dq_j - da_j/dq_i and the explicit dD/dt, as in `symbolic.derive`. No differences are
     taken: every value is good to a few roundings of its largest terms.
 
     Raises EomcError where K is not seen to be a polynomial of degree 2 in the velocities, or
