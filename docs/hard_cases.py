@@ -79,7 +79,10 @@ def _runs(module: ModuleType, method: str, case: dict[str, Any]) -> list[Best]:
         steps = 2**power
         power += 1
         begun = time.perf_counter()
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning), np.errstate(all="ignore"):
+        with (
+            warnings.catch_warnings(action="ignore", category=RuntimeWarning),
+            np.errstate(all="ignore"),
+        ):
             run = module.simulate(h=t_end / steps, steps=steps, every=steps, method=method)
         seconds = time.perf_counter() - begun
         error = float(np.max(np.abs(run.q[-1] - exact)) / max(1.0, np.max(np.abs(exact))))
