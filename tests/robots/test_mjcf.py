@@ -220,6 +220,9 @@ def test_the_key_frame_home_is_the_start(tmp_path: Path) -> None:
     )
     assert reported(robot, "key frames", "other")
     assert reported(robot, "singular at the start", "b")
+    assert not reported(robot, "besides positions")
+    moving = HOME.replace('"home"', '"home" qvel="0 1" ctrl="0 0"')
+    assert reported(model(tmp_path, text, after=moving), "home has besides positions", ": qvel")
 
 
 def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:

@@ -106,6 +106,10 @@ def started(root: Tag, joints: Sequence[Found], report: Report) -> list[Found]:
         if a.get("name") != "home" or "qpos" not in a:
             report.leave("key frames", a.get("name"))
             continue
+        others = ("qvel", "act", "ctrl", "mpos", "mquat")
+        for key in others:
+            if any(a.numbers(key, 1_000_000, 0) or ()):
+                report.leave("what the key frame home has besides positions", key)
         values = a.numbers("qpos", 1_000_000, 0) or ()
         if len(values) != size:
             report.leave(f"the start of the key frame home: it has not the {size} numbers of qpos")
