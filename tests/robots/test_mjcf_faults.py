@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from mjcf_text import refused
 
 from eomc.base.errors import EomcError, SceneError
+from eomc.cli.main import main as cli
 from eomc.robots.mjcf import read
 from eomc.robots.robot import Motion
 
@@ -62,6 +64,7 @@ from eomc.robots.robot import Motion
         ("<body><freejoint/><joint/></body>", "", ["no other joints"]),
         ("<joint/>", "", ["the world can't have this"]),
         ("", "", ["no <body>"]),
+        ('<replicate count="2"><body/></replicate>', "", ["no <body>", "<replicate>", "to_xml"]),
         ('<body childclass="no"/>', "", ['no default class "no"']),
         ("<body/>", '<compiler coordinate="global"/>', ["global", "older MuJoCo"]),
         ("<body/>", '<compiler eulerseq="xyw"/>', ["three of x, y, z"]),
@@ -139,6 +142,23 @@ def test_no_file_outside_the_models_folder_is_opened(tmp_path: Path) -> None:
             (folder / name).symlink_to(secret)
         with pytest.raises(SceneError, match="outside the folder"):
             read.read(main, include=True)
+
+
+def test_what_an_include_would_have_brought_is_no_second_fault(tmp_path: Path) -> None:
+    joint = '<actuator><motor joint="of_the_part"/></actuator>'
+    main = write(tmp_path, main=f'<mujoco><include file="../part.xml"/>{joint}</mujoco>')
+    for include, words in ((True, "outside the folder"), (False, "is not opened")):
+        with pytest.raises(SceneError, match=words) as fault:
+            read.read(main, include=include)
+        assert "of_the_part" not in str(fault.value)
+
+
+def test_a_part_of_a_model_is_called_so(tmp_path: Path) -> None:
+    main = write(tmp_path, main="<mujocoinclude><body/></mujocoinclude>")
+    words = "import the file that includes it, with --include"
+    with pytest.raises(SceneError, match=words):
+        read.read(main)
+    assert words in CliRunner().invoke(cli, ["import", str(main)]).output
 
 
 def test_a_file_that_is_missing_or_included_twice_is_reported(tmp_path: Path) -> None:

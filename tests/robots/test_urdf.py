@@ -246,6 +246,7 @@ OUTSIDE = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot name="&a
         ("", "the file is empty"),
         ("<robot", "not XML"),
         ("<robot>\n<link></robot>", "robot.urdf:2:"),
+        ('\n<?xml version="1.0"?><robot/>', "remove what stands before <?xml"),
         ('<?xml version="1.0" encoding="klingon"?><robot/>', "not XML"),
         ("\x00\x01", "not XML"),
         ("<sdf/>", "not a URDF: its root element is <sdf>"),

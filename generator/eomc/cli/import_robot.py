@@ -55,7 +55,7 @@ def command(
     from eomc.scene.toml_text import MAX_BYTES
 
     element = xml.root(file).kind
-    if element == "mujoco":
+    if element.startswith("mujoco"):  # mujocoinclude is a part, which is refused
         robot = read.read(file, include)
     elif include:
         raise EomcError(f"--include is for MJCF files, and {shown(file)} is none")

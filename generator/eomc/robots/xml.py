@@ -95,6 +95,8 @@ def root(file: str | os.PathLike[str]) -> Tag:
             raise EomcError(f"{shown}: {RUN_XACRO}") from None
         line, column = fault.position
         why = re.sub(r": line \d+, column \d+$", "", str(fault))
+        if "declaration not at start" in why:
+            why += ": remove what stands before <?xml ...?>, empty lines too"
         raise EomcError(f"{shown}:{line}:{column + 1}: not XML: {why}") from None
     except DefusedXmlException:
         raise EomcError(

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from eomc.base.errors import Problem
+from eomc.base.errors import Problem, SceneError
 from eomc.robots import xml
 from eomc.robots.rotations import Vector
 from eomc.robots.xml import Tag
@@ -51,6 +51,8 @@ ACTUATORS = set(
 # arrays of which an element may give the first numbers and leave the rest to its class
 PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
 LAW = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}  # an actuator's force
+
+ONE_FILE = "let MuJoCo write the model as one file (MjSpec.to_xml)"  # a remedy
 
 BOOLEAN = ("false", "true")
 
@@ -178,7 +180,10 @@ class Settings:
 
 
 def load(path: Path, include: bool, report: Report) -> Tag:
-    """The file as tags, with what it includes in the place of <include>."""
+    """The file as tags, with what it includes in the place of <include>.
+
+    Raises SceneError where something can't be included: what needs it would seem at fault too.
+    """
     root = xml.root(path)
     folder = path.resolve().parent
     opened = {path.resolve()}
@@ -195,6 +200,8 @@ def load(path: Path, include: bool, report: Report) -> Tag:
                 children.append(child)
         tag.children[:] = children
         waiting += children
+    if report.faults:
+        raise SceneError(report.faults)
     return root
 
 
@@ -212,7 +219,9 @@ def _included(
         return []
     target = (folder / name).resolve()
     if not target.is_relative_to(folder):
-        a.fault(f'"{name}" lies outside the folder of the model; move it into the folder')
+        a.fault(
+            f'"{name}" lies outside the folder of the model; move it into the folder, or {ONE_FILE}'
+        )
     elif target in opened:
         a.fault(f'"{name}" is included a second time; MJCF allows it once')
     elif not target.is_file():

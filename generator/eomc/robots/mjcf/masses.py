@@ -221,8 +221,11 @@ MASSLESS = ("plane", "hfield")
 FORMLESS = ("mesh", "sdf")  # their volume stands in a file of their own
 
 
-def _geom_mass(placed: Placed, reader: Reader) -> Mass | None:
-    """The mass of a geom in its body's frame; None where it has none, or a fault."""
+def _geom_mass(placed: Placed, reader: Reader, still: bool) -> Mass | None:
+    """The mass of a geom in its body's frame; None where it has none, or a fault.
+
+    still: the body doesn't move, so that a mass that isn't known doesn't matter.
+    """
     a = reader.given(placed, "geom")
     kind = a.choice("type", (*SHAPES, *MASSLESS, *FORMLESS))
     mass = a.number("mass") if "mass" in a else None
@@ -237,6 +240,12 @@ def _geom_mass(placed: Placed, reader: Reader) -> Mass | None:
         return None
     shell = a.is_true("shellinertia")
     if kind in FORMLESS or "mesh" in a:
+        if still and reader.settings.totalmass <= 0:
+            reader.report.leave(
+                "masses of meshes (not opened) on bodies that stand still, taken as zero",
+                placed.body,
+            )
+            return None
         remedy = (
             'give the body an <inertial> (MuJoCo\'s compiler writes it with saveinertial="true")'
         )
@@ -332,8 +341,11 @@ def _inertial(placed: Placed, reader: Reader) -> Mass | None:
     return Mass(mass, ORIGIN, inertia).on(placed.pose.of(pose))
 
 
-def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader) -> Mass:
-    """The mass of a body, in its frame, from <inertial> or from its geoms."""
+def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, still: bool) -> Mass:
+    """The mass of a body, in its frame, from <inertial> or from its geoms.
+
+    still: the body stands still.
+    """
     how = reader.settings.inertia
     inertials = [p for p in inner if p.tag.kind == "inertial"]
     geoms = [p for p in inner if p.tag.kind == "geom"]
@@ -344,7 +356,7 @@ def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader) -> Mass:
     elif how == "false":
         mass = Mass()
     else:
-        mass = _sum([m for placed in geoms if (m := _geom_mass(placed, reader)) is not None])
+        mass = _sum([m for p in geoms if (m := _geom_mass(p, reader, still)) is not None])
     return _bounded(mass, reader.own(tag), reader.settings)
 
 

@@ -11,7 +11,15 @@ from eomc.base.spatial import plus, scaled, six
 from eomc.robots.mjcf import masses
 from eomc.robots.mjcf.actuators import actuated, started
 from eomc.robots.mjcf.equality import constrained
-from eomc.robots.mjcf.file import Given, Report, classes_of, load, settings_of, unknown
+from eomc.robots.mjcf.file import (
+    ONE_FILE,
+    Given,
+    Report,
+    classes_of,
+    load,
+    settings_of,
+    unknown,
+)
 from eomc.robots.mjcf.joints import Found, fresh, joint_of, named
 from eomc.robots.mjcf.masses import STILL, Mass, Placed, Pose, Reader
 from eomc.robots.robot import Robot, RobotBody, joined
@@ -34,6 +42,11 @@ SECTIONS = {
     "deformable": "deformables",
 }
 SETTINGS = {"visual", "statistic", "size"}  # of MuJoCo's viewer and memory; never of the motion
+# other files, by their element
+KINDS = {
+    "robot": "URDF",
+    "mujocoinclude": "a part of a model: import the file that includes it, with --include",
+}
 READ = {"compiler", "option", "default", "worldbody", "equality", "actuator", "keyframe"}
 
 
@@ -52,7 +65,7 @@ def read(path: str | Path, include: bool = False) -> Robot:
     report = Report()
     root = load(path, include, report)
     if root.kind != "mujoco":
-        what = "URDF" if root.kind == "robot" else "not MJCF"
+        what = KINDS.get(root.kind, "not MJCF")
         Given({}, root, report).fault(
             f"the file's element is <{root.kind}>, which is {what}; MJCF has <mujoco>"
         )
@@ -115,7 +128,9 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], di
     # a body, and whether its parent stands still
     waiting = [(placed, True) for placed in reversed(inner) if placed.tag.kind == "body"]
     if not waiting:
-        reader.own([*worlds, root][0]).fault("there is no <body> in <worldbody>")
+        made = next((t.kind for t in below if t.kind in GENERATORS), "")
+        more = f"; what <{made}> adds is not read: {ONE_FILE}" if made else ""
+        reader.own([*worlds, root][0]).fault(f"there is no <body> in <worldbody>{more}")
     bodies: list[RobotBody] = []
     joints: list[Found] = []
     anchors: dict[str, Vector] = {}
@@ -155,7 +170,7 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], di
         for p in inner:
             if p.tag.kind == "geom":
                 _geom_left_out(p, reader)
-        mass = masses.body_mass(tag, inner, reader)
+        mass = masses.body_mass(tag, inner, reader, still and not own)
         chain, own, anchor = _chain(name, parent, still, pose, own, mass, names["body"], report)
         seen["body"].update(body.name for body in chain)
         bodies += chain
