@@ -82,6 +82,34 @@ def test_angles_far_out_are_asked_where_gears_still_mesh() -> None:
         assert runs.holds(State(q, np.zeros(2))) == holds
 
 
+THROWN = """eomc = 1
+name = "thrown"
+[coordinates]
+a = {}
+[inputs]
+u = {}
+[energy]
+kinetic = "a_dot**2/2"
+potential = "cos(a)"
+[forces]
+a = "u - 5e4*a_dot"
+"""
+
+
+def test_inputs_are_compared_as_long_as_steps_do_not_throw_the_state_out() -> None:
+    """A step of h times -5e4/s multiplies a velocity by 2.4e5."""
+    system = from_scene(parse(THROWN, "thrown.toml"))
+    module: Any = StandIn(symbolic.derive(system))
+    module._model = None
+    runs = Runs(Comparison(system, module, np.random.default_rng(0), 4))
+    spread, at = np.array([[1.0], [1.0]]), State(np.zeros(1), np.array([1e-5]))
+    steps, x, growth = runs.driven(at, np.zeros((6, 1)), spread)
+    assert steps == 1
+    assert 1 < x[1, 0] < 100 and 1e5 < growth < 1e6
+    steps, x, _ = runs.driven(at, np.full((6, 1), 1e5), spread)
+    assert (steps, x[1, 0]) == (0, 1e-5)
+
+
 @pytest.mark.slow
 def test_steps_of_every_method_are_compared_at_angles_far_out(shipped: Shipped) -> None:
     """There stages of gauss16 are computed one by one, which stands last in its sweep."""

@@ -291,7 +291,7 @@ class Runs:
             drive(self.model, "rk4", s, h, self.few).rows[:, -1], np.array(x), size
         )
 
-    def inputs(self) -> float:
+    def inputs(self) -> float | Finding:
         """A row of inputs each step beside the reference, and cut as one."""
         errors, spread = [], self.sampler.scale
         for s in self.states:
@@ -299,29 +299,38 @@ class Runs:
             scale = np.where(signals > 0, signals, 1)
             u = self.random.normal(size=(FEW, self.model.nu)) * scale
             at = replace(s, u=u)
-            x, growth, p = *self.driven(s, u, spread), s.params
+            n, x, growth = self.driven(s, u, spread)
             run = drive(self.model, self.check.methods[0], at, self.h, FEW)
-            size = np.abs(np.array([s.q, s.qd])) + np.abs(np.array(x))
+            size = np.abs(np.array([s.q, s.qd])) + np.abs(x)
             size = FEW * (size + growth * spread)
-            if np.all(np.isfinite(x)):
-                errors.append(self.check.units(run.rows[:, -1], np.array(x), size))
+            errors.append(self.check.units(run.rows[:, n], x, size) if n else None)
+            if np.all(np.isfinite(run.rows)):
                 again = self.check.module.simulate(
-                    s.q, s.qd, self.h, steps=FEW, u=u.astype(self.model.dtype), params=p, t0=s.t
-                )
+                    s.q, s.qd, self.h, steps=FEW, u=u.astype(self.model.dtype), params=s.params,
+                    t0=s.t,
+                )  # fmt: skip
                 same = np.array_equal([again.q, again.qd], run.rows)
-                errors.append(0.0 if same else np.inf)
-        return float(np.max(errors, initial=0))
+                errors += [] if same else [math.inf]
+        return largest(errors, "the first step leads too far")
 
-    def driven(self, s: State, u: Vector, spread: Vector) -> tuple[Vector, float]:
-        """The reference's end with a row of inputs each step, and how a difference has grown."""
+    def driven(self, s: State, u: Vector, spread: Vector) -> tuple[int, Vector, float]:
+        """The reference with a row of inputs each step, as far as it isn't thrown out.
+
+        The steps, the state after them, (2, nq), and how much a difference has grown until then.
+        """
         x = np.array([s.q, s.qd])[:, None] + [[0.0], [NUDGE]] * spread[:, None]  # (2, 2, nq)
+        start = x[:, 0]
+        sure = 0, start, 1.0
         with np.errstate(all="ignore"):
             for n, row in enumerate(u):
                 t, held = s.t + n * self.h, np.array([row, row])
                 step = self.sampler.reference.step
                 x = np.array(step(x[0], x[1], self.h, t, held, s.params))
-            growth = float(np.max(np.abs(x[:, 1] - x[:, 0]) / spread)) / NUDGE
-        return x[:, 0], max(growth, 1.0)
+                if not np.all(np.abs(x[:, 0] - start) < FARTHEST * spread):
+                    break  # what blows up says nothing
+                growth = float(np.max(np.abs(x[:, 1] - x[:, 0]) / spread)) / NUDGE
+                sure = n + 1, x[:, 0], max(growth, 1.0)
+        return sure
 
     def cut(self, method: str) -> float:
         """How many runs in several calls, or with fewer rows kept, are not the whole to the bit."""
