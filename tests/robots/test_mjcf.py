@@ -170,7 +170,7 @@ def test_an_element_overrides_the_first_numbers_and_any_orientation(tmp_path: Pa
 
 def test_motors_become_drives_with_their_gear(tmp_path: Path) -> None:
     actuators = """<actuator>
-      <motor name="m" joint="j" gear="150" ctrlrange="-1 1"/> <motor joint="j"/>
+      <motor name="m" joint="j" gear="150" ctrlrange="-1 1" forcerange="-9 9"/> <motor joint="j"/>
       <general name="g" joint="j" gear="2" gainprm="3"/>
       <position name="p" joint="j" kp="10" gear="4"/> <motor name="t" tendon="t"/>
     </actuator>"""
@@ -181,7 +181,8 @@ def test_motors_become_drives_with_their_gear(tmp_path: Path) -> None:
         ("g", "j", 6),
         ("p", "j", 4),
     ]
-    assert robot.drives[0].note == "input from -1 to 1"
+    assert robot.drives[0].note == "input from -1 to 1; force from -9 to 9"
+    assert "limits of actuators, kept as notes: m" in robot.left_out
     assert reported(robot, "laws of actuators", "p (position)")
     assert reported(robot, "actuators on tendons", ": t")
 

@@ -80,12 +80,14 @@ class Report:
                 del self.left[kind]
 
     def lines(self) -> tuple[str, ...]:
-        """What is left out, one line a kind."""
+        """What is left out, one line a kind; what has a name counts once."""
         lines = []
         for kind, those in self.left.items():
-            line = f"{kind} ({len(those)})" if len(those) > 1 else kind
-            if named := [*dict.fromkeys(name for name in those if name)][:SHOWN]:
-                more = len(those) - len(named)
+            names = [*dict.fromkeys(name for name in those if name)]
+            count = those.count("") + len(names)
+            line = f"{kind} ({count})" if count > 1 else kind
+            if named := names[:SHOWN]:
+                more = count - len(named)
                 line += f": {', '.join(named)}" + (f" and {more} more" if more else "")
             lines.append(line)
         return tuple(lines)
