@@ -48,3 +48,13 @@ def test_a_stage_where_rows_have_no_slope_throws_nothing_out(
     assert run.status == "ok"
     np.testing.assert_allclose(run.q[:, 0], start - 3 * run.t, rtol=0, atol=1e-9)
     assert np.abs(run.qd[:, 0] + 3.0).max() < 1e-6
+
+
+def test_steps_near_the_flat_position_are_as_long_as_elsewhere(module: ModuleType) -> None:
+    """What leaves the rows there decays by qd/q, and each step puts it back: 200 1/s here."""
+    near = {"q0": [-0.015, 0.0, -0.015], "qd0": [-3.0, 0.0, -3.0]}
+    assert module.advice(**near, h=0.1, params=FLAT["params"]) is None
+    # two bars that turn as one, held by a spring of 2 k: w^2 = k
+    stiff = {"q0": [0.9, 0.0, 0.9], "qd0": [0.0] * 3, "params": {**FLAT["params"], "k": 1e4}}
+    assert "limit of about 0.028 s here (fastest mode 100 rad/s" in module.advice(**stiff, h=0.029)
+    assert module.advice(**stiff, h=0.028) is None

@@ -367,28 +367,51 @@ def _modes(
 ) -> tuple[float, float] | None:
     """(largest |Im|, fastest decay) of the eigenvalues at a state, 1/s; None where there are none.
 
+    Of changes that constraints allow: what leaves them does not last, as every step is put back.
     From the module's own derivatives where they are the motion's, else from differences of the
     acceleration, `wide` times the usual distance apart.
     """
-    n = model.nq
-    try:
-        if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
-            A = model.linearize(q, qd, u, t, params)[0].astype(float)
-        else:
-            A = np.block(
-                [[np.zeros((n, n)), np.eye(n)], [_slopes(model, q, qd, t, u, params, wide)]]
-            )
-        values = np.linalg.eigvals(A)
-    except (ArithmeticError, np.linalg.LinAlgError):  # the run itself reports it
-        return None
-    return float(np.max(np.abs(values.imag))), float(max(0.0, np.max(-values.real)))
-
-
-def _slopes(model: Model, q: Array, qd: Array, t: float, u: Any, params: Any, wide: float) -> Array:
-    """[dqdd/dq, dqdd/dqd], (nq, 2 nq), by 2 nq + 1 accelerations."""
     n, x = model.nq, np.concatenate([q, qd]).astype(float)
     near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
-    states = np.vstack([x, x + np.diag(near)]).astype(model.dtype)
-    a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
-    slopes: Array = ((a[1:] - a[0]) / near[:, None]).T
-    return slopes
+    try:
+        ways = _allowed(model, x, t, params, near)
+        moved = near[:, None] * ways
+        if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
+            rates = model.linearize(q, qd, u, t, params)[0].astype(float) @ moved
+        else:
+            states = np.vstack([x, x + moved.T]).astype(model.dtype)
+            a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
+            rates = np.vstack([moved[n:], (a[1:] - a[0]).T])
+        values = np.linalg.eigvals(ways.T @ (rates / near[:, None]))
+    except (ArithmeticError, np.linalg.LinAlgError):  # the run itself reports it
+        return None
+    turning, decay = np.max(np.abs(values.imag), initial=0), np.max(-values.real, initial=0)
+    return float(turning), float(decay)
+
+
+def _allowed(model: Model, x: Array, t: float, params: Any, near: Array) -> Array:
+    """Changes of x = [q; qd], in units of `near`, that keep constraints: (2 nq, k), orthonormal.
+
+    All where there are no constraints.
+    """
+    n, holonomic = model.nq, model._rows.holonomic
+    if not model.constraint_names:
+        return np.eye(2 * n)
+    least = math.sqrt(float(np.finfo(model.dtype).eps))
+    q, qd = (half.astype(model.dtype) for half in (x[:n], x[n:]))
+    A = model.constraint_jacobian(q, t=t, params=params).astype(float)
+    sizes = np.maximum(np.linalg.norm(A * near[n:], axis=1), 1e-300)  # rows have units of their own
+    back = A * near[n:] / sizes[:, None]
+    of_q = _kernel((A * near[:n] / sizes[:, None])[:holonomic], least)
+    places = np.vstack([q, x[:n] + (near[:n, None] * of_q).T]).astype(model.dtype)
+    rates = model.constraint_rates(places, np.tile(qd, (len(places), 1)), t, params).astype(float)
+    follow = -np.linalg.pinv(back, rcond=least) @ ((rates[1:] - rates[0]) / sizes).T
+    of_qd = _kernel(back, least)
+    whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
+    return np.asarray(np.linalg.qr(whole)[0])
+
+
+def _kernel(A: Array, least: float) -> Array:
+    """What A makes zero, (n, k), orthonormal: to `least` of its largest singular value."""
+    _, sizes, rows = np.linalg.svd(A)
+    return np.asarray(rows[np.sum(sizes > least * np.max(sizes, initial=0)) :].T)

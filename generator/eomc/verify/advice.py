@@ -7,6 +7,7 @@ near rest, with the eigenvalues of differences of the accelerations.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -16,7 +17,7 @@ from eomc.integrators.tableaux import METHODS
 from eomc.verify.convergence import Convergence
 from eomc.verify.finding import Finding
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import FARTHEST, State, along
+from eomc.verify.sampling import FARTHEST, State, along, ask
 
 NUDGE = 1e-6  # relative change at the start, from which growth is estimated
 # An advised h is compared with runs of SPAN times its length, in steps of these parts of it. The
@@ -26,14 +27,20 @@ BLOWN = 1e3  # times what a difference grows by in fine steps: unstable
 OFF = 0.1  # of the motion: the end of a stable run with steps as long as its limit is no answer
 LINEAR = 1e-9  # of the motion: a difference this small grows in proportion, where forces are stiff
 APART = 2.0  # times the limit of the eigenvalues: an advised h further off is wrong
+SLIGHT = 1e-5  # of the motion: differences of rates of rows, which are smooth
+NONE = 1e-9  # of the largest singular value of a constraint's slopes: none
 PLACES = 256  # along the start of the motion at which h is advised, fewer for large scenes
 AHEAD = 2000  # steps of the scene's h in which these lie
 
 
 class Advice:
-    """The rows about h. runs: of the module, with the scale and start of its motion."""
+    """The rows about h. runs: of the module, with the scale and start of its motion.
 
-    def __init__(self, runs: Convergence) -> None:
+    holonomic: whether each constraint is.
+    """
+
+    def __init__(self, runs: Convergence, holonomic: Sequence[bool] = ()) -> None:
+        self.holonomic = np.array(holonomic, bool)
         self.runs, self.start, self.scale, self.h = runs, runs.start, runs.scale, runs.h
         self.duration = runs.duration
 
@@ -122,6 +129,8 @@ class Advice:
         """
         s = self.stiff
         signs = np.random.default_rng(1).choice([-1.0, 1.0], self.scale.shape)
+        along = self._along(s)  # off the constraints there may be no start near singular positions
+        signs = (along @ (along.T @ signs.ravel())).reshape(signs.shape)
         steps, ends = round(SPAN / part), []
         for by in (0.0, NUDGE, LINEAR):
             q, qd = np.array([s.q, s.qd]) + by * signs * self.scale
@@ -134,21 +143,50 @@ class Advice:
         return ends[0], float(max(grown))
 
     def _by_eigenvalues(self, method: str) -> float:
-        """The longest stable h of the motion linearised at `stiff`, by differences; s."""
-        s, n = self.stiff, self.scale.shape[1]
-        x = np.array([s.q, s.qd])
-        A = np.zeros((2 * n, 2 * n))
-        A[:n, n:] = np.eye(n)
-        for k in range(2 * n):
-            by = np.zeros(2 * n)
-            by[k] = LINEAR**0.5 * 1e-2 * self.scale.flat[k]
+        """The longest stable h of the motion linearised at `stiff`, by differences; s.
+
+        Along the constraints: what leaves them is put back after each step.
+        """
+        s, along = self.stiff, self._along(self.stiff)
+        n, x = len(s.q), np.array([s.q, s.qd])
+        rates = np.zeros_like(along)
+        for k, way in enumerate(along.T):
+            by = LINEAR**0.5 * 1e-2 * way.reshape(2, n) * self.scale
             ends = [
                 self.runs.ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
-                for moved in (x + by.reshape(2, n), x - by.reshape(2, n))
+                for moved in (x + by, x - by)
             ]
-            A[n:, k] = (ends[0] - ends[1]) / (2 * by[k])
-        values = np.linalg.eigvals(A)
+            change = np.array([2 * by[1], ends[0] - ends[1]])
+            rates[:, k] = (change / (2 * LINEAR**0.5 * 1e-2 * self.scale)).ravel()
+        values = np.linalg.eigvals(along.T @ rates)
         turning, decay = METHODS[method].limits
-        rates = np.max(np.abs(values.imag)) / turning, np.max(-values.real) / decay
-        fastest = float(max(rates))
+        rate = np.max(np.abs(values.imag)) / turning, np.max(-values.real) / decay
+        fastest = float(max(rate))
         return 1 / fastest if fastest > 0 else math.inf
+
+    def _along(self, s: State) -> Vector:
+        """Changes of [q; qd], in units of the scale, along the constraints: (2 nq, k), orthonormal.
+
+        All without constraints. Velocities follow positions so that rates of rows stay zero.
+        """
+        n, (far, fast) = len(s.q), self.scale
+        if not self.holonomic.size:
+            return np.eye(2 * n)
+        A = ask(self.runs.module, "constraint_jacobian", s)
+        of_q, of_qd = _kernel(A[self.holonomic] * far), _kernel(A * fast)
+        rates = np.zeros((len(A), of_q.shape[1]))
+        for k, way in enumerate(of_q.T):
+            ends = (
+                ask(self.runs.module, "constraint_rates", replace(s, q=s.q + by * far * way))
+                for by in (SLIGHT, -SLIGHT)
+            )
+            rates[:, k] = (next(ends) - next(ends)) / (2 * SLIGHT)
+        follow = -np.linalg.pinv(A * fast, rcond=NONE) @ rates
+        whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
+        return np.asarray(np.linalg.qr(whole)[0])
+
+
+def _kernel(A: Vector) -> Vector:
+    """What A makes zero, (n, k), orthonormal."""
+    _, sizes, rows = np.linalg.svd(A)
+    return np.asarray(rows[np.sum(sizes > NONE * np.max(sizes, initial=0)) :].T)

@@ -20,6 +20,7 @@ from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
 from eomc.verify.report import Row
 from eomc.verify.sampling import (
+    EPS,
     FARTHEST,
     LARGE,
     NUDGE,
@@ -63,7 +64,7 @@ class Comparison:
         self.sampler = Sampler(self.reference, random, self.effort)
         self.expected = self.sampler.states(self.effort.states if states is None else states)
         self.rows: list[Row] = []
-        self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector]] = {}
+        self.motions: dict[tuple[int, float, int], tuple[Vector, Vector, Vector, Vector]] = {}
 
     def convergence_rows(self) -> None:
         """Orders, advised steps, the balance of power: see `convergence`."""
@@ -128,7 +129,7 @@ class Comparison:
     @cached_property
     def advice(self) -> Advice:
         """The rows about the step sizes that the module advises."""
-        return Advice(self.convergence)
+        return Advice(self.convergence, [c.holonomic for c in self.system.constraints])
 
     @cached_property
     def convergence(self) -> Convergence:
@@ -277,38 +278,43 @@ class Comparison:
         key = id(s), h, steps  # the states live as long
         if key not in self.motions:
             self.motions[key] = self._motion(s, h, steps)
-        t, x, growth = self.motions[key]
+        t, x, growth, rounded = self.motions[key]
         if len(t) < 2:
             return None
         kick = h * e.size["acceleration"]  # of whose rounding a step makes a difference
         moved = np.array([self.sampler.spread + h * kick, self.sampler.speed + kick])
         run = self.simulate(s, h=h, steps=len(t) - 1)
-        size = growth * moved + np.abs(x) + _corrected(e)
+        size = growth * moved + np.abs(x) + _corrected(e) + rounded
         size = np.arange(1, len(t) + 1)[:, None, None] * size
         if str(getattr(run.status, "value", run.status)) != "ok":
             raise RuntimeError(f"the run ended with status {run.status}")
         off_time = self.units(run.t, t, np.abs(t) + h)
         return float(np.max([off_time, self.units(np.stack([run.q, run.qd], axis=1), x, size)]))
 
-    def _motion(self, s: State, h: float, steps: int) -> tuple[Vector, Vector, Vector]:
-        """The reference's run as far as it is sure: t (n,), states (n, 2, nq), growth (n, 1, 1)."""
+    def _motion(self, s: State, h: float, steps: int) -> tuple[Vector, Vector, Vector, Vector]:
+        """The reference's run as far as it is sure: t (n,), states (n, 2, nq), growth (n, 1, 1).
+
+        And what its own roundings have grown to, in units, (n, 2, nq).
+        """
         own = self.system.run.h
         spread = self.sampler.scale
 
         # of alternating signs, as what is rounded excites the fastest modes too
         by = NUDGE * spread * (np.where(np.arange(len(s.q)) % 2, -1, 1) if h > own else 1)
-        q, qd = (np.array([x, x + d]) for x, d in zip((s.q, s.qd), by, strict=True))
-        u = None if s.u is None else np.array([s.u, s.u])
+        q, qd = self.sampler.rounded(s, np.add(by, [s.q, s.qd]))
+        u = None if s.u is None else np.array([s.u] * len(q))
         with np.errstate(all="ignore"):
             begin = self.begin(s)
             t, *found = self.reference.simulate(q, qd, h, steps, u=u, params=s.params, t0=begin)
-            x, y = np.moveaxis(np.stack(found, axis=1), 2, 0)
+            x, y, *near = np.moveaxis(np.stack(found, axis=1), 2, 0)
             growth = np.max(np.abs(y - x) / spread, axis=(1, 2)) / NUDGE
             far = np.max(np.abs(x - x[:1]) / spread, axis=(1, 2))
+            off = np.max([0 * x, *(np.abs(z - x) / EPS for z in near)], axis=0)
         growth = np.where(far < FARTHEST, growth, math.inf)  # what blows up says nothing
-        growth = np.maximum.accumulate(growth)
-        sure = int(np.sum(growth < GROWTH_LIMIT))  # nan is not
-        return t[:sure], x[:sure], growth[:sure, None, None]
+        growth, off = (np.maximum.accumulate(each) for each in (growth, off))
+        known = np.isfinite(off).all(axis=(1, 2))
+        sure = int(np.sum(known & (growth < GROWTH_LIMIT)))  # nan is not
+        return t[:sure], x[:sure], growth[:sure, None, None], off[:sure]
 
     def begin(self, s: State) -> float:
         """When runs from a state begin: where rows may stand in time, when it is on them."""

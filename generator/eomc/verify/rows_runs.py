@@ -21,7 +21,7 @@ from eomc.verify import derivatives
 from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
-from eomc.verify.sampling import FARTHEST, NUDGE, Expected, State
+from eomc.verify.sampling import EPS, FARTHEST, NUDGE, Expected, State
 
 STEPS = 200  # of a run that is cut: more than a run of predicted angles pauses after long steps
 CUTS = (1, 2, 5, 38, 129, 130, 131, 177)
@@ -279,17 +279,19 @@ class Runs:
 
     def far_steps(self, s: State, acceleration: Vector) -> float:
         """Some steps from there; acceleration: the size of what is rounded in one."""
-        h, x = self.h, (s.q, s.qd)
+        h, x, scale = self.h, self.sampler.rounded(s), self.sampler.scale
+        u = None if s.u is None else np.array([s.u] * x.shape[1])
+        off = np.zeros_like(scale)
         with np.errstate(all="ignore"):
             for n in range(self.few):
-                x = self.sampler.reference.step(*x, h=h, t=s.t + n * h, u=s.u, params=s.params)
-            if not np.all(np.abs(np.subtract(x, (s.q, s.qd))) < FARTHEST * self.sampler.scale):
+                x = np.array(self.sampler.reference.step(x[0], x[1], h, s.t + n * h, u, s.params))
+                off = np.fmax(off, np.max(np.abs(x - x[:, :1]), axis=1) / EPS)
+            if not np.all(np.abs(x[:, 0] - [s.q, s.qd]) < FARTHEST * scale):
                 return 0.0  # as where a force that is wound up throws another coordinate
         gain = self.few * h * acceleration
-        size = np.abs([s.q, s.qd]) + np.array([self.few * h * (np.abs(s.qd) + gain), gain])
-        return self.check.units(
-            drive(self.model, "rk4", s, h, self.few).rows[:, -1], np.array(x), size
-        )
+        size = np.abs([s.q, s.qd]) + np.array([self.few * h * (np.abs(s.qd) + gain), gain]) + off
+        found = drive(self.model, "rk4", s, h, self.few).rows[:, -1]
+        return self.check.units(found, x[:, 0], size)
 
     def inputs(self) -> float | Finding:
         """A row of inputs each step beside the reference, and cut as one."""

@@ -29,6 +29,7 @@ HOLDS = 1e-9  # of the terms of a row: what it may be at a state, redundant rows
 NUDGE = 1e-6  # relative change of an input from which its influence is estimated
 FARTHEST = 100.0  # of the spread: steps that lead further are not compared
 MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
+LAST = (-2, 1, 3)  # changes of last digits
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 HALVINGS, RESOLVED = 5, 0.1  # of steps ahead, until how far things go changes by so little
 FARTHER = 8.0  # times as far from the start, where a term that is small near it counts
@@ -193,6 +194,9 @@ class Sampler:
         start, h, steps = self.start, effort.stride * self.system.run.h, effort.ahead
         q = np.array([start.q, start.q + self.angles])
         qd = np.array([start.qd, start.qd])
+        if self.system.constraints:  # off these a step's correction throws it
+            with np.errstate(all="ignore"):
+                q[1], qd[1] = self.reference.project(q[1], qd[1])
         found = np.full((2, *q.shape), math.inf)
         for part in (2**k for k in range(HALVINGS + 1)):
             before = found
@@ -413,6 +417,17 @@ class Sampler:
             spread[:n, n:] @ np.abs(solved) @ size[name]
             for name in ("constraints", "constraint_rates")
         ])  # fmt: skip
+
+    def rounded(self, s: State, *others: Vector) -> Vector:
+        """q and qd, others, and under constraints with last digits changed, (2, n, nq).
+
+        Where rows all but depend on each other, what a step rounds grows by more than differences.
+        """
+        x = np.array([s.q, s.qd])
+        digits = EPS * (np.abs(x) + np.stack([self.spread, self.speed]))
+        digits[:, 1::2] *= -1
+        near = [x + k * digits for k in LAST] if self.system.constraints else []
+        return np.stack([x, *others, *near], axis=1)
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
         """K + P and its size."""
