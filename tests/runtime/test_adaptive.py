@@ -11,7 +11,7 @@ from types import ModuleType
 import cases
 import numpy as np
 import pytest
-from conftest import tiers
+from conftest import Modules, tiers
 
 import eomc
 from eomc.base.errors import SceneError
@@ -266,6 +266,39 @@ def test_its_error_is_found(kepler: ModuleType) -> None:
     assert run.error.resolved and run.error.order == 16
     assert np.all(run.error.q[-1] < 3 * true + 1e-12) and np.all(run.error.q[-1] > true / 3)
     assert run.error.amplification > 10
+
+
+def test_the_error_at_the_least_tolerance_is_found(kepler: ModuleType) -> None:
+    """No finer run is there: beside the same steps none was seen, where rounding is 1e-11."""
+    run = kepler.simulate(tol=1e-15, duration=5 * PERIOD)
+    true = abs(run.q[-1] - [0.1, 0.0]).max()
+    assert true / 10 < max(run.estimate().end.values()) < 100 * true + 1e-13
+
+
+def test_a_moved_start_may_be_another_motion(kepler: ModuleType) -> None:
+    """Moved by more than it is away from the centre: it went round there 1e7 times."""
+    made = __import__(f"{kepler.__name__}.adaptive_error", fromlist=["adaptive_error"])
+    q0, speed = 1e-6, math.sqrt((2 - 1e-6) / 1e-6)
+    own, steps = kepler.simulate([q0, 0], [0, speed], duration=6.0, tol=1e-10), []
+
+    def counted(*given: object) -> object:
+        steps.append(run(*given))
+        return steps[-1]
+
+    run = __import__(f"{kepler.__name__}.adaptive", fromlist=["adaptive"]).run
+    made.error_of(own, counted, None)
+    assert max(run.steps for run in steps) < 1_000_000
+
+
+def test_a_pulse_that_steps_miss_is_told(modules: Modules) -> None:
+    text = SINGLE.replace("-cos(a)", "a**2/2").replace('real = "float"', "").replace("= 5", "= 60")
+    text = text.replace("single", "pulsed").replace("a = { start = 1.0 }", "a = {}")
+    text = text.replace("[run]", '[forces]\na = "exp(-((t - 50)/0.01)**2)/0.01"\n[run]')
+    run = modules.unoptimised(text).simulate(tol=1e-9)
+    assert abs(run.q[-1, 0]) == 0  # what comes and goes between two nodes is not seen
+    with pytest.warns(RuntimeWarning, match="exceeds a tenth of the motion"):
+        error = run.estimate().end["a"]
+    assert error == pytest.approx(math.sqrt(math.pi) * abs(math.sin(10)), rel=1e-4)
 
 
 def test_held_inputs_act(kepler: ModuleType) -> None:

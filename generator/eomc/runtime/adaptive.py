@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import inf
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -328,9 +329,12 @@ def plain(
 def run(
     model: Model, q: Array, qd: Array, t0: float, t_end: float, tol: float, times: Array | None,
     u: Array | Periods | None, p: Array, h_most: float,
-    progress: Callable[[int, int], None] | None, stiff: bool = False,
+    progress: Callable[[int, int], None] | None, stiff: bool = False, enough: float = inf,
 ) -> AdaptiveRun:  # fmt: skip
-    """A run from checked arguments, whatever its status; times (n,) later than t0."""
+    """A run from checked arguments, whatever its status; times (n,) later than t0.
+
+    It ends early, and "ok", soon after so many steps are enough.
+    """
     (address, real, _), nq = model._c, model.nq
     work = model._ffi.new("adaptive_work *")
     if stiff:
@@ -356,7 +360,7 @@ def run(
             rows.filled += _kept(work, events)
             said = STATUS[found]
             ended, cut = found or (events and work.stopped), work.t < acting.stop
-            if ended or not acting.on(work):
+            if ended or work.steps >= enough or not acting.on(work):
                 break
             if progress is not None:
                 progress(round(1000 * (work.t - t0) / (t_end - t0)), 1000)

@@ -22,13 +22,16 @@ _FULL = 0.01  # of a scale: a difference that has become so large grows no more 
 _LITTLE = 4.0  # roundings, by which a start is moved where more fills the scale
 _TAIL = 40  # a part of the rows, over which a difference does not vanish
 _FINER = 100.0  # the tolerance over that of the run by which an error is found
+_LEAST = 512  # steps of that, at least
+_LONGER = 100  # times the steps, which a moved start takes at most
 
 
 def error_of(
     own: AdaptiveRun, run: Callable[..., AdaptiveRun],
     progress: Callable[[int, int], None] | None,
 ) -> Estimate:  # fmt: skip
-    """The error of a run, beside one of a hundredth of its tolerance, and from a moved start.
+    """The error of a run, beside one of a hundredth of its tolerance in shorter steps, and from a
+    moved start.
 
     With events, at least what the motion makes of a rounding; where differences fill the scales,
     that is seen from a start moved by some roundings, by the least tolerance.
@@ -49,13 +52,13 @@ def error_of(
     kept = np.flatnonzero(~jumps & (own.t > own.t0))
     beside = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(x))))
 
-    def again(tol: float, start: Array) -> Array:
+    def again(tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
         nq, out, start = model.nq, np.full_like(x, np.nan), start.astype(model.dtype)
         out[own.t == own.t0] = start
         if len(kept):
             made = run(
                 model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], u,
-                own._params, own._h_most, progress, own._stiff,
+                own._params, h_most, progress, own._stiff, steps,
             )  # fmt: skip
             if made.status == "interrupted":
                 raise KeyboardInterrupt
@@ -66,7 +69,11 @@ def error_of(
         return out[beside]
 
     begin = np.ravel(own._begin).astype(float)
-    finer = again(max(own.tol / _FINER, least), begin)
+    # other steps, of the least tolerance too: rounding differs, and what comes and goes between
+    # two nodes shows
+    other = max(own.tol / _FINER, least) if own.tol >= 2 * least else 4 * least
+    shorter = min(h for h in (own.h / 2, float(np.ptp(own.t)) / _LEAST, own._h_most) if h > 0)
+    finer = again(other, begin, shorter)
     modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), np.ones(x.shape[1])
     for at, of in modes:  # which are not moved, nor what sticks, and have no error
         moves[[at, model.nq + at]] = 0
@@ -75,7 +82,9 @@ def error_of(
 
     def grown(base: Array, size: float, tol: float) -> Array:
         """What a start moved by one scale would become at each row, if that were little."""
-        return _filled(np.abs(again(tol, begin + moves * size * scale * signs) - base)) / size
+        moved = begin + moves * size * scale * signs  # where that is another motion, not to its end
+        most = _LONGER * (own.steps + own.rejected) + _LONGER**2
+        return _filled(np.abs(again(tol, moved, own._h_most, most) - base)) / size
 
     rows = grown(x, size, own.tol)
     left, rounding = np.abs(x - finer), eps * np.abs(x)
@@ -84,7 +93,7 @@ def error_of(
         # flights between jumps may be exact by any tolerance: what rounding makes of them tells
         full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _FULL)
         if full.any():  # where so little fills the scale, rounding fills a quarter of it
-            near = grown(again(least, begin), _LITTLE * eps, least)
+            near = grown(again(least, begin, own._h_most), _LITTLE * eps, least)
             rows = np.where(full[:, None], np.maximum(rows, near), rows)
         rounding = np.maximum(rounding, eps * rows)
     still = [*modes[:, 0], *(model.nq + modes[:, 0])]
