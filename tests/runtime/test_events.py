@@ -157,6 +157,19 @@ def test_two_at_once_both_happen(ball: ModuleType) -> None:
     assert run.qd[-1] == pytest.approx([-1, up])
 
 
+def test_several_at_once_happen_in_the_order_of_the_scene(ball: ModuleType) -> None:
+    """A rounding apart: the other came first as often, and here and there one was lost."""
+    rng = np.random.default_rng(3)
+    for height, speed in rng.uniform(0.1, 3.0, (200, 2)):
+        end = math.sqrt(2 * height / G)
+        run = ball.simulate(
+            [0, height], [speed, 0], params={"wall": speed * end}, duration=1.2 * end
+        )
+        which, rows = run._happened
+        assert which.tolist() == [0, 2], (height, speed)
+        assert rows[:, 0] == pytest.approx([end, end], abs=1e-14)
+
+
 def test_what_is_at_zero_at_the_start_has_not_happened(ball: ModuleType) -> None:
     up = ball.simulate(q0=[0, 0], qd0=[0, 2.0], duration=0.5)
     assert up.events["impact"].t == pytest.approx([4 / G], abs=1e-14)
@@ -186,6 +199,15 @@ def test_crossings_close_together_in_one_long_step_are_seen(free: ModuleType) ->
         assert run.events["pair"].t == pytest.approx([1, 1 + w], abs=1e-13)
         assert run.events["three"].t == pytest.approx([2, 3], abs=1e-13)
     assert run.steps < 20
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
+def test_a_dip_between_two_looks_is_seen(springs: ModuleType, tol: float) -> None:
+    """-sin(2 t)/2 + 1/2, less 1e-3; a cubic through two looks is no nearer than some percent."""
+    run = springs.simulate(tol=tol, duration=30.0, params={"k": 1.0, "d": 1e-3 - 0.5})
+    deep = math.asin(1 - 2e-3) / 2
+    exact = [t + math.pi * k for k in range(10) for t in (deep, math.pi / 2 - deep)]
+    assert run.events["curve"].t == pytest.approx(exact, abs=100 * tol)
 
 
 def roots(f, t_end: float) -> list[float]:
