@@ -77,6 +77,16 @@ def test_the_end_is_the_closed_form(train: ModuleType, tol: float) -> None:
     assert "by Newton's method" in run.message
 
 
+@pytest.mark.parametrize("tol", [1e-2, 1e-3, 1e-4])
+def test_what_swings_on_limits_stiff_steps(train: ModuleType, tol: float) -> None:
+    """Steps grew to hundreds of periods: what the step before was continued to was their scale."""
+    how = {"duration": 300.0, "params": {"k": 10.0, "c": 0.0}}
+    for stiff in (False, True):
+        run = train.simulate(tol=tol, stiff=stiff, **how)
+        assert np.abs(run.q[-1] - train.simulate(tol=1e-13, **how).q[-1]).max() < 30 * tol
+        assert np.diff(run.t).max() < 3.0
+
+
 def test_rows_within_stiff_steps_are_exact_too(train: ModuleType) -> None:
     times = np.array([1e-4, 1e-3, 0.5, 3.0, 3.01, 17.7, 20.0])
     run = train.simulate(tol=1e-11, times=times)
