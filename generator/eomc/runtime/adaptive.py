@@ -331,10 +331,8 @@ def run(
     u: Array | Periods | None, p: Array, h_most: float,
     progress: Callable[[int, int], None] | None, stiff: bool = False, enough: float = inf,
 ) -> AdaptiveRun:  # fmt: skip
-    """A run from checked arguments, whatever its status; times (n,) later than t0.
-
-    It ends early, and "ok", soon after so many steps are enough.
-    """
+    """A run from checked arguments, whatever its status, not far beyond `enough` steps; times (n,)
+    later than t0."""
     (address, real, _), nq = model._c, model.nq
     work = model._ffi.new("adaptive_work *")
     if stiff:

@@ -69,11 +69,7 @@ def error_of(
         return out[beside]
 
     begin = np.ravel(own._begin).astype(float)
-    # other steps, of the least tolerance too: rounding differs, and what comes and goes between
-    # two nodes shows
-    other = max(own.tol / _FINER, least) if own.tol >= 2 * least else 4 * least
-    shorter = min(h for h in (own.h / 2, float(np.ptp(own.t)) / _LEAST, own._h_most) if h > 0)
-    finer = again(other, begin, shorter)
+    finer = again(*_finer(own, least, begin))
     modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), np.ones(x.shape[1])
     for at, of in modes:  # which are not moved, nor what sticks, and have no error
         moves[[at, model.nq + at]] = 0
@@ -109,6 +105,14 @@ def error_of(
         error[:, : model.nq], error[:, model.nq :], end, right, ORDER, float("nan"),
         amplification, _verdict(own, left / scale, rounding / scale, amplification),
     )  # fmt: skip
+
+
+def _finer(own: AdaptiveRun, least: float, begin: Array) -> tuple[float, Array, float]:
+    """Tolerance, start and longest step of a run to compare with: in other steps where there is no
+    smaller tolerance too, as rounding differs, and what comes and goes between two nodes shows."""
+    tol = max(own.tol / _FINER, least) if own.tol >= 2 * least else 4 * least
+    longest = (own.h / 2, float(np.ptp(own.t)) / _LEAST, own._h_most)
+    return tol, begin, min((h for h in longest if h > 0), default=0.0)
 
 
 def _filled(rows: Array) -> Array:
