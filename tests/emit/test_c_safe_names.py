@@ -252,3 +252,21 @@ def test_temporaries_of_each_function_get_names_that_c_can_bear() -> None:
         odd = replace(function, body=(first, *function.body[1:]))
         found, _ = c_safe_names.borne(replace(made, functions={**made.functions, name: odd}))
         assert found.functions[name].body[0].name == "NAN_", name
+
+
+def test_coordinates_may_be_called_as_the_arguments_of_constraints_are(tmp_path: Path) -> None:
+    """`A` is their Jacobian."""
+    text = """eomc = 1
+name = "scene"
+[coordinates]
+A = { start = 0.6 }
+phi = { start = 0.8, guess = true }
+lack = { start = 0.1 }
+[energy]
+kinetic = "A_dot**2 + phi_dot**2 + lack_dot**2"
+[constraints]
+rod = "A**2 + phi**2 + lack*A - 1"
+turn = "A*phi_dot - lack_dot"
+"""
+    write(tmp_path, made(text))
+    compiled(tmp_path, "scene", "-Werror=shadow")

@@ -24,7 +24,7 @@ _OURS = frozenset(
     "steps every rows q_rows qd_rows u_stride a1 a2 a3 a4 h_2 h_6 hh_2 hh_4 hh_6 failed held at "
     "moving constants along column slopes outputs applied count failures point E poses velocities "
     "accelerations jacobians forces wrenches momentum events after phi rates lambda reactions "
-    "d far total singular".split()
+    "d far total singular A".split()
 )
 
 # macros and enumerators of the templates and csrc, behind the scene's prefix; a coordinate or input
