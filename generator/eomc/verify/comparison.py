@@ -16,7 +16,7 @@ from eomc.model.system import System
 from eomc.verify import one_step
 from eomc.verify.advice import PARTS, Advice
 from eomc.verify.convergence import ORDER_MARGIN, SEEN, Convergence, Place
-from eomc.verify.finding import Finding, largest
+from eomc.verify.finding import Finding, largest, units
 from eomc.verify.oracle import Vector
 from eomc.verify.report import Row
 from eomc.verify.sampling import (
@@ -32,7 +32,6 @@ from eomc.verify.sampling import (
     ask,
     simulate,
     started,
-    units,
 )
 from eomc.verify.symbolic import of
 from eomc.verify.taylor import Jets

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,3 +27,12 @@ def largest(errors: Iterable[float | None], why: str) -> float | Finding:
     """The largest of those that there are, nan before all; with none, not judged and why."""
     known = [x for x in errors if x is not None]
     return float(np.max(known)) if known else Finding(math.nan, why)
+
+
+def units(found: Any, expected: Any, size: Any, eps: float) -> float:
+    """The largest difference in units of rounding, nan where something is not a number."""
+    off = np.abs(np.asarray(found, float) - expected)
+    if off.shape != np.shape(expected):
+        raise ValueError(f"shape {np.shape(found)} where {np.shape(expected)} is meant")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.max(np.where(off == 0, 0, off / (eps * np.asarray(size))), initial=0))

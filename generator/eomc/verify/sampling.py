@@ -29,7 +29,6 @@ HOLDS = 1e-9  # of the terms of a row: what it may be at a state, redundant rows
 NUDGE = 1e-6  # relative change of an input from which its influence is estimated
 FARTHEST = 100.0  # of the spread: steps that lead further are not compared
 MOST_NUDGES = 32  # inputs that are changed one by one; beyond, all at once
-LAST = (-2, 1, 3)  # changes of last digits
 NOISE = 1e-12  # of a unit: what moves less has been moved by rounding
 HALVINGS, RESOLVED = 5, 0.1  # of steps ahead, until how far things go changes by so little
 FARTHER = 8.0  # times as far from the start, where a term that is small near it counts
@@ -69,7 +68,6 @@ VALUES = {
     "jacobi": "jacobi",
     "power": "power",
 }
-
 
 OF_POSITIONS = ("D", "g", "potential_energy", "constraint_jacobian")  # what takes no rates
 OF_INPUTS = ("tau", "power", "acceleration", "multipliers")
@@ -424,9 +422,9 @@ class Sampler:
         Where rows all but depend on each other, what a step rounds grows by more than differences.
         """
         x = np.array([s.q, s.qd])
-        digits = EPS * (np.abs(x) + np.stack([self.spread, self.speed]))
+        digits = EPS * (np.abs(x) + self.scale)
         digits[:, 1::2] *= -1
-        near = [x + k * digits for k in LAST] if self.system.constraints else []
+        near = [x + k * digits for k in (-2, 1, 3)] if self.system.constraints else []
         return np.stack([x, *others, *near], axis=1)
 
     def energy(self, s: State) -> tuple[Vector, Vector]:
@@ -450,12 +448,3 @@ class Sampler:
         value, off = found[0], np.nan_to_num(np.abs(found[1:] - found[0]) / NUDGE)
         spread = np.sqrt(np.mean(off**2, axis=0)) if many else np.sum(off, axis=0)
         return value, np.abs(value) + spread
-
-
-def units(found: Any, expected: Any, size: Any, eps: float = EPS) -> float:
-    """The largest difference in units of rounding, nan where something is not a number."""
-    off = np.abs(np.asarray(found, float) - expected)
-    if off.shape != np.shape(expected):
-        raise ValueError(f"shape {np.shape(found)} where {np.shape(expected)} is meant")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return float(np.max(np.where(off == 0, 0, off / (eps * np.asarray(size))), initial=0))
