@@ -76,3 +76,11 @@ def test_fifty_steps_of_gauss16_do(case: tuple[str, ModuleType]) -> None:
     run = module.simulate(method="gauss16", h=0.2, duration=10.0)
     assert run.status == "ok"
     assert error_of(name, run.q[-1]) < 1e-7
+
+
+def test_their_error_is_found(case: tuple[str, ModuleType]) -> None:
+    """The run beside it takes shorter steps, and where these find nothing its own."""
+    name, module = case
+    run = module.simulate(tol=1e-8)
+    error = run.estimate()
+    assert error.verdict == "" and error_of(name, run.q[-1]) < 10 * max(error.end.values())

@@ -69,7 +69,9 @@ def error_of(
         return out[beside]
 
     begin = np.ravel(own._begin).astype(float)
-    finer = again(*_finer(own, least, begin))
+    finer = again(*(asked := _finer(own, least, begin)))
+    if own.status == "ok" and not np.isfinite(finer).all():  # short ones near singular positions
+        finer = again(*asked[:2], own._h_most)
     modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), np.ones(x.shape[1])
     for at, of in modes:  # which are not moved, nor what sticks, and have no error
         moves[[at, model.nq + at]] = 0
@@ -83,8 +85,7 @@ def error_of(
         return _filled(np.abs(again(tol, moved, own._h_most, most) - base)) / size
 
     rows = grown(x, size, own.tol)
-    left, rounding = np.abs(x - finer), eps * np.abs(x)
-    left[~np.isfinite(left)] = np.inf
+    left, rounding = np.where(np.isfinite(finer), np.abs(x - finer), np.inf), eps * np.abs(x)
     if len(own._happened[0]) or (left > _TENTH * scale).any():
         # flights between jumps may be exact by any tolerance: what rounding makes of them tells
         full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _FULL)
