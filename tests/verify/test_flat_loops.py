@@ -80,6 +80,7 @@ def comparison(modules: Modules, *of: object, seed: int = 0) -> Comparison:
     return Comparison(system(*of), made, np.random.default_rng(seed), None)
 
 
+@pytest.mark.slow
 def test_an_advised_step_is_tried_from_starts_on_the_rows(modules: Modules) -> None:
     """Near the flat position: a start moved off the rows by 1e-6 has none on them near."""
     advice = comparison(modules, *TURNS).advice
