@@ -49,7 +49,7 @@ IMPLICIT = 'method = "gauss4"\nlinearize = "parameters"'
 
 
 @pytest.mark.parametrize(
-    "run", tiers([BATCH, "", IMPLICIT], BATCH), ids=["batch", "plain", "implicit"]
+    "run", tiers([BATCH, "", IMPLICIT], ""), ids=["batch", "plain", "implicit"]
 )
 @pytest.mark.parametrize(
     "text", tiers([UNUSED, COORDINATES], COORDINATES), ids=["unused", "coordinates"]

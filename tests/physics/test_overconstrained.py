@@ -114,6 +114,7 @@ def test_sums_of_rows_stand_for_rows_that_depend_on_one_another() -> None:
 
 
 @pytest.mark.parametrize("how", [{"tol": 1e-10}, {"method": "rk4"}, {"method": "gauss8"}])
+@pytest.mark.slow
 def test_bennett_s_linkage_turns(bennett: ModuleType, how: dict[str, object]) -> None:
     """Through positions in which all its bars are in a line."""
     run = bennett.simulate(**how)

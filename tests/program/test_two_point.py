@@ -250,7 +250,7 @@ def test_a_wide_angle_leaves_the_others_of_its_register_alone(modules: Modules) 
         np.testing.assert_allclose(module.potential_energy(q), 9.81 * height, rtol=1e-13)
 
 
-@pytest.mark.parametrize("at", [0, 4])
+@pytest.mark.parametrize("at", tiers([0, 4], 4))
 def test_steps_at_an_angle_too_wide_to_move(at: int, modules: Modules) -> None:
     """Of 7e22 rad, where numbers are 8e6 apart; the other links swing about it."""
     module = modules.unoptimised(chain(5))

@@ -94,6 +94,7 @@ def test_no_number_of_digits_is_left_out() -> None:
     assert page.recommendations(worse)[-1].startswith("for 8 to 15 digits up to t = 4 s: out of")
 
 
+@pytest.mark.slow
 def test_order_stability_and_rounding() -> None:
     rk4, dp8 = measured().lines
     assert rk4.observed == pytest.approx(4, abs=0.3)

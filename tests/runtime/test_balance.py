@@ -93,6 +93,7 @@ def pushed(modules: Modules) -> ModuleType:
     return modules.unoptimised(SPRING)
 
 
+@pytest.mark.slow
 def test_a_damped_spring_loses_what_is_exact(pushed: ModuleType) -> None:
     """x = e^(-d t) (cos w t + d/w sin w t), d = c/2: all that is lost is the fall of the energy."""
     d, T = 0.2, 10.0

@@ -33,7 +33,7 @@ def test_a_fast_neighbour_changes_no_bit(name: str, real: str) -> None:
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-@pytest.mark.parametrize("h", [0.005, 0.02, 0.05, 0.2])
+@pytest.mark.parametrize("h", tiers([0.005, 0.02, 0.05, 0.2], 0.2))
 def test_turned_sines_are_as_good_as_computed_ones(h: float, real: str) -> None:
     """On both sides of the bounds: 1/8 for h/2 qd, 1/64 for h^2/2 qdd; for floats 1/4 and 1/16."""
     m = module("cartpole", real=f'"{real}"')

@@ -129,6 +129,7 @@ def test_what_holds_where_it_sticks(modules: Modules) -> None:
         parse(STICKS.replace("lambda_x_sticks", "lambda_z_sticks"), "test.toml")
 
 
+@pytest.mark.slow
 def test_systems_of_python_have_them(modules: Modules) -> None:
     x, y = (symbol(name) for name in "xy")
     for pull in ("-2*lambda_rod", -2 * sympy.Symbol("lambda_rod")):

@@ -8,7 +8,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules
+from conftest import Modules, tiers
 from links import made_of
 
 import eomc
@@ -125,7 +125,7 @@ def test_forces_with_corners_hold_it_too(modules: Modules, text: str) -> None:
 
 
 @pytest.mark.parametrize("friction", ["", ", friction = 0.02"], ids=["one", "both"])
-@pytest.mark.parametrize("bounded", [False, True], ids=["smooth", "bounded"])
+@pytest.mark.parametrize("bounded", tiers([False, True], True), ids=["smooth", "bounded"])
 def test_what_hangs_on_it_rests_too(modules: Modules, friction: str, bounded: bool) -> None:
     """psi turns phi/0.3: J = 0.0007 + 0.003/0.09, and the friction of phi counts 1/0.3."""
     text = GEAR.replace(" FRICTION", friction)

@@ -355,7 +355,7 @@ def test_a_build_that_is_killed_leaves_the_old_module(
         assert gravity(root) == 2 * built
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", tiers([1, 2, 3], 2))
 def test_ctrl_c_while_a_compiler_is_started_ends_it_too(
     n: int, scene: Path, root: Path, built: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

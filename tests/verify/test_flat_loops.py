@@ -90,6 +90,7 @@ def test_an_advised_step_is_tried_from_starts_on_the_rows(modules: Modules) -> N
     assert grown < 10
 
 
+@pytest.mark.slow
 def test_states_are_as_fast_as_the_motion(modules: Modules) -> None:
     """A turned start is assembled: a step's correction would throw it, to 70 rad/s."""
     assert comparison(modules, *TURNS).sampler.speed.max() < 12
