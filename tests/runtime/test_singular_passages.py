@@ -16,9 +16,40 @@ from conftest import MODULES, Modules, tiers
 from constrained import error_of, system
 
 import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 N1, N2 = "iftomm_A02_four_bar_N1", "iftomm_A02_four_bar_N2"
+
+# Sarrus' linkage: two chains of hinges, across one another, that lift a plate; it folds flat
+SARRUS = """
+eomc = 1
+name = "sarrus"
+gravity = [0, 0, -9.81]
+[coordinates]
+a = { start = "-pi/6", rate = 0.5 }
+b = { start = "pi/3", guess = true }
+c = { start = "-pi/6", guess = true }
+d = { start = "pi/6", guess = true }
+e = { start = "-pi/3", guess = true }
+[[loop]]
+name = "hinge"
+joint = "revolute"
+bodies = ["d", "plate"]
+points = [[0, -1, 0], [-1, 1, 0]]
+axis = [1, 0, 0]
+[run]
+duration = 1.0
+tolerance = 1e-10
+"""
+BARS = (  # name, coordinate, parent, offset, axis, centre of mass
+    ("low", "a", "", (0, 0, 0), (0, 1, 0), (0.5, 0, 0)),
+    ("high", "b", "low", (1, 0, 0), (0, 1, 0), (-0.5, 0, 0)),
+    ("plate", "c", "high", (-1, 0, 0), (0, 1, 0), (-0.2, 0, 0)),
+    ("b", "d", "", (-1, 1, 0), (1, 0, 0), (0, 0.5, 0)),
+    ("d", "e", "b", (0, 1, 0), (1, 0, 0), (0, -0.5, 0)),
+)
 
 
 @pytest.fixture(
@@ -84,3 +115,23 @@ def test_their_error_is_found(case: tuple[str, ModuleType]) -> None:
     run = module.simulate(tol=1e-8)
     error = run.estimate()
     assert error.verdict == "" and error_of(name, run.q[-1]) < 10 * max(error.end.values())
+
+
+@pytest.mark.slow
+def test_sarrus_linkage_folds(modules: Modules) -> None:
+    """Its end by RK4, which meets the flat position nowhere; its energy."""
+    text = SARRUS
+    for name, coordinate, parent, *places in BARS:
+        text += f'[[body]]\nname = "{name}"\njoint = "revolute"\ncoordinates = "{coordinate}"\n'
+        text += f'parent = "{parent}"\n' if parent else ""
+        for key, place in zip(("offset", "axis", "center"), places, strict=True):
+            text += f"{key} = {list(place)}\n"
+        text += "mass = 1.0\ninertia = [0.05, 0.05, 0.08]\n"
+    module = modules.unoptimised(from_scene(parse(text)))
+    right = module.simulate(method="rk4", h=2.5e-4, duration=1.0)
+    assert right.status == "ok" and np.sin(right["a"]).max() > 0.1 > -0.1 > np.sin(right["a"]).min()
+    for tol in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
+        run = module.simulate(tol=tol)
+        assert run.status == "ok" and run.steps < 60
+        np.testing.assert_allclose(run.q[-1], right.q[-1], rtol=0, atol=1e-7 + 100 * tol)
+        assert np.ptp(run.energy) < 1e-9 + 100 * tol
