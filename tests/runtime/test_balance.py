@@ -230,6 +230,22 @@ def test_impacts_within_periods_are_told_too(
     assert balance.jumps == pytest.approx(jumps, abs=1e-11)
 
 
+def test_that_of_a_run_that_is_cut_off_goes_no_further(falling: ModuleType) -> None:
+    def until(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
+        if t > 1.0:
+            raise KeyboardInterrupt
+        return law(t, q, qd)
+
+    times = np.linspace(0, 1.5, 16)
+    with pytest.raises(falling.Interrupted) as cut:
+        falling.simulate(u=until, control_period=0.15, times=times)
+    run = cut.value.run
+    whole = falling.simulate(u=law, control_period=0.15, duration=float(run.t[-1]))
+    assert run.t[-1] < 1.1 and len(run.events["impact"].t) > 0
+    assert run.balance().inputs == pytest.approx(whole.balance().inputs, abs=1e-9)
+    assert run.balance().jumps == pytest.approx(whole.balance().jumps, abs=1e-9)
+
+
 @pytest.mark.filterwarnings("ignore:.*ever sooner")
 @pytest.mark.parametrize(
     ("how", "status"),

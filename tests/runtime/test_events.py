@@ -480,3 +480,30 @@ def test_events_and_tolerance_of_a_system_made_in_python() -> None:
     np.testing.assert_allclose(run.events["top"].t[0], fall * 1.8, rtol=1e-12)
     np.testing.assert_allclose(run.events["middle"].t, [0.25], rtol=1e-13)
     assert run.q[-1, 0] == pytest.approx(1.5 + len(run.events["impact"]))
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+@pytest.mark.parametrize(
+    ("real", "w", "t0"), [("float", 1000.0, 300.0), ("double", 1e5, 1.7e9)], ids=["float", "double"]
+)
+def test_steps_of_few_roundings_of_the_time_keep_events_apart(
+    real: str, w: float, t0: float
+) -> None:
+    """One that never happens stands before the others."""
+    text = f"""
+    eomc = 1
+    name = "late_{real}"
+    [coordinates]
+    x = {{ start = 1.0, rate = 0.1 }}
+    [parameters]
+    w = {w}
+    [energy]
+    kinetic = "x_dot**2/2"
+    potential = "w**2*x**2/2"
+    [run]
+    real = "{real}"
+    tolerance = 1e-4
+    """
+    text += event("never", "x + 1000", 'direction = "rising"', "") + event("zero", "x")
+    run = built(text).simulate(t0=t0, duration=60 * math.pi / w)
+    assert {name: len(found.t) for name, found in run.events.items()} == {"never": 0, "zero": 60}

@@ -118,15 +118,15 @@ class AdaptiveRun(Run):
         first = int(bool(len(asked)) and asked[0] <= self.t0)
         rows[:, :first] = [[q], [qd]]
         if len(asked) > first:
-            rows[:, first:] = self._made(asked[first:])._rows
+            rows[:, first:] = self._made(asked[first:], self._t_end)._rows
         both = rows[:, place.ravel()].reshape(2, *times.shape, len(q))
         return both[0], both[1]
 
-    def _made(self, times: Array | None) -> AdaptiveRun:
+    def _made(self, times: Array | None, end: float) -> AdaptiveRun:
         """The same run with rows at times, or after each step and on both sides of each jump."""
         q, qd = self._begin
         return run(
-            self._model, q, qd, self.t0, self._t_end, self.tol, times,
+            self._model, q, qd, self.t0, end, self.tol, times,
             self._u if self._held is None else Periods(self._held, self._period),
             self._params, self._h_most, None, self._stiff,
         )  # fmt: skip

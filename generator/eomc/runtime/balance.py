@@ -213,7 +213,9 @@ def _between_jumps(run: Run) -> Run:
 def _with_jumps(run: Any) -> Any:
     """The same run with both rows of each jump, also where others were asked for."""
     happened = getattr(run, "_happened", ((),))[0]
-    return run._made(None) if len(happened) and not (np.diff(run.t) == 0).any() else run
+    if not len(happened) or (np.diff(run.t) == 0).any():
+        return run
+    return run._made(None, float(run.t[-1]) if run.status == "interrupted" else run._t_end)
 
 
 def _in_pieces(t: Array, power: Array, jumps: Array) -> tuple[Array, float]:

@@ -338,7 +338,7 @@ def advice(
     fastest decay against the method's two limits. A mode that is as fast as the differences are
     short comes from a jump of the forces, and is not counted.
     """
-    undamped, decaying = model.stable_to[method]
+    undamped, decaying = model.stability_limits[method]
     found = _modes(model, q, qd, t, u, params, 1.0)
     if found is None:
         return None

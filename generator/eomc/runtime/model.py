@@ -76,7 +76,7 @@ class Model(Constrained):
         return {name: order for name, (order, *_) in self._facts.items()}
 
     @property
-    def stable_to(self) -> dict[str, tuple[float, float]]:
+    def stability_limits(self) -> dict[str, tuple[float, float]]:
         """The stability limits of each method: h omega undamped, h lambda decaying."""
         return {name: (turn, decay) for name, (_, _, turn, decay) in self._facts.items()}
 

@@ -175,9 +175,8 @@ def parse(text: str) -> Formula:
         if not " " <= c <= "~":
             raise FormulaError(f"'{c}' is not used in formulas: only {_ALLOWED}", at)
     try:
-        with warnings.catch_warnings(
-            action="ignore"
-        ):  # Python's remarks on odd literals, such as 1or 2
+        # Python remarks on odd literals, such as 1or 2
+        with warnings.catch_warnings(action="ignore"):
             tree = ast.parse(line, mode="eval").body
     except SyntaxError as fault:
         raise _explain_syntax(line, fault) from None
