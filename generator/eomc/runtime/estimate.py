@@ -367,26 +367,32 @@ def _modes(
 ) -> tuple[float, float] | None:
     """(largest |Im|, fastest decay) of the eigenvalues at a state, 1/s; None where there are none.
 
-    Of changes that constraints allow: what leaves them does not last, as every step is put back.
     From the module's own derivatives where they are the motion's, else from differences of the
-    acceleration, `wide` times the usual distance apart.
+    acceleration, `wide` times the usual distance apart. Under constraints the slower of two: of
+    all changes, some of which every step takes back, and of those that rows allow, which turn with
+    the motion.
     """
     n, x = model.nq, np.concatenate([q, qd]).astype(float)
     near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
-    try:
-        ways = _allowed(model, x, t, params, near)
-        moved = near[:, None] * ways
-        if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
-            rates = model.linearize(q, qd, u, t, params)[0].astype(float) @ moved
-        else:
-            states = np.vstack([x, x + moved.T]).astype(model.dtype)
-            a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
-            rates = np.vstack([moved[n:], (a[1:] - a[0]).T])
-        values = np.linalg.eigvals(ways.T @ (rates / near[:, None]))
-    except (ArithmeticError, np.linalg.LinAlgError):  # the run itself reports it
-        return None
-    turning, decay = np.max(np.abs(values.imag), initial=0), np.max(-values.real, initial=0)
-    return float(turning), float(decay)
+    found: list[tuple[float, float]] = []
+    for of in (lambda: np.eye(2 * n), lambda: _allowed(model, x, t, params, near)):
+        if found and not model.constraint_names:
+            break
+        try:
+            ways = of()
+            moved = near[:, None] * ways
+            if model.has_slopes and (u is not None or not model.nu):  # signals may read the state
+                rates = model.linearize(q, qd, u, t, params)[0].astype(float) @ moved
+            else:
+                states = np.vstack([x, x + moved.T]).astype(model.dtype)
+                a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
+                rates = np.vstack([moved[n:], (a[1:] - a[0]).T])
+            values = np.linalg.eigvals(ways.T @ (rates / near[:, None]))
+        except (ArithmeticError, np.linalg.LinAlgError):  # the run itself reports it
+            continue
+        turning, decay = np.max(np.abs(values.imag), initial=0), np.max(-values.real, initial=0)
+        found.append((float(turning), float(decay)))
+    return min(found, key=max) if found else None
 
 
 def _allowed(model: Model, x: Array, t: float, params: Any, near: Array) -> Array:

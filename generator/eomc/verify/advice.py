@@ -145,17 +145,28 @@ class Advice:
     def _by_eigenvalues(self, method: str) -> float:
         """The longest stable h of the motion linearised at `stiff`, by differences; s.
 
-        Along the constraints: what leaves them is put back after each step.
+        Under constraints the longer of two: along them, as what leaves them is put back after each
+        step, though they turn with the motion; and of all changes.
         """
-        s, along = self.stiff, self._along(self.stiff)
+        ways = [self._along(self.stiff)]
+        if self.holonomic.size:
+            ways.append(np.eye(2 * len(self.stiff.q)))
+        return max(self._limit(method, along) for along in ways)
+
+    def _limit(self, method: str, along: Vector) -> float:
+        """The same, for changes of [q; qd] in units of the scale, the columns of `along`."""
+        s = self.stiff
         n, x = len(s.q), np.array([s.q, s.qd])
         rates = np.zeros_like(along)
         for k, way in enumerate(along.T):
             by = LINEAR**0.5 * 1e-2 * way.reshape(2, n) * self.scale
-            ends = [
-                self.runs.ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
-                for moved in (x + by, x - by)
-            ]
+            try:
+                ends = [
+                    self.runs.ask("acceleration", replace(s, q=moved[0], qd=moved[1]))
+                    for moved in (x + by, x - by)
+                ]
+            except ArithmeticError:  # off the constraints there may be none
+                return 0.0
             change = np.array([2 * by[1], ends[0] - ends[1]])
             rates[:, k] = (change / (2 * LINEAR**0.5 * 1e-2 * self.scale)).ravel()
         values = np.linalg.eigvals(along.T @ rates)
