@@ -6,7 +6,6 @@ towards it, and sweeps find no stages but where these are moved onto the constra
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from types import ModuleType
 
@@ -75,23 +74,16 @@ def test_steps_that_fit_a_tolerance_end_where_the_reference_does(
     name, module = case
     run = module.simulate(tol=tol)
     assert run.status == "ok" and run.steps < 120
-    assert error_of(name, run.q[-1]) < 30 * tol
+    assert error_of(name, run.q[-1]) < 10 * tol
 
 
 def test_they_get_through_from_anywhere(case: tuple[str, ModuleType]) -> None:
-    """However near to a stage or a step's end the flat position is met.
-
-    But for one in some hundred, which meets it in a last step that the run's end has cut short.
-    """
+    """However near to a stage or a step's end the flat position is met."""
     _, module = case
     q, qd = module.start
-    through = 0
     for part in np.random.default_rng(0).uniform(0.7, 1.3, 60):
-        with warnings.catch_warnings(record=True):
-            run = module.simulate(q0=q, qd0=part * qd, tol=1e-9)
-        assert np.ptp(run.energy) < 1e-7
-        through += run.status == "ok" or run.t[-1] > 9.99
-    assert through == 60
+        run = module.simulate(q0=q, qd0=part * qd, tol=1e-9)
+        assert run.status == "ok" and np.ptp(run.energy) < 3e-8
 
 
 def test_states_between_are_as_exact(case: tuple[str, ModuleType]) -> None:
@@ -99,7 +91,7 @@ def test_states_between_are_as_exact(case: tuple[str, ModuleType]) -> None:
     run, other = module.simulate(tol=1e-8), module.simulate(tol=1e-11)
     times = np.linspace(0, run.t[-1], 400)
     for a, b in zip(run(times), other(times), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=2e-6)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
 def test_fifty_steps_of_gauss16_do(case: tuple[str, ModuleType]) -> None:
@@ -133,5 +125,5 @@ def test_sarrus_linkage_folds(modules: Modules) -> None:
     for tol in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
         run = module.simulate(tol=tol)
         assert run.status == "ok" and run.steps < 60
-        np.testing.assert_allclose(run.q[-1], right.q[-1], rtol=0, atol=1e-7 + 100 * tol)
-        assert np.ptp(run.energy) < 1e-9 + 100 * tol
+        np.testing.assert_allclose(run.q[-1], right.q[-1], rtol=0, atol=1e-7 + 10 * tol)
+        assert np.ptp(run.energy) < 1e-9 + 10 * tol * run.energy[0]

@@ -29,7 +29,6 @@ ROUGHEST = 2 * 0.8**-8  # of the root of tol/2: a step that is refused after two
 LONGEST = 1e4  # times of the motion at the start: by no longer a time the least step is measured
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
-NEAR = 8  # steps near a singular position, before stages are left as they are again
 SMALL = 300  # operations of accelerations, up to which many instances go side by side
 BUSY = 32  # events in one step, without those that happen at once
 
@@ -106,15 +105,11 @@ class Stepping:
         out = c.filled(f"{self.method}_stages", "a")
         measured = (c.filled(real, name) for name in ("scale", "rough", "beyond"))
         by = c.given(f"{self.method}_newton", "m")
-        given = (*self.form.around, *self.onto, self.number("tol"), self.number("most"), by)
+        limits = (self.number("tol"), self.number("most"))
+        given = (*self.form.around, *self.functions.moves_stages, *limits, by)
         told = (*measured, c.filled("int", "sweeps"))
         cap = [c.given(real, "cap")] if self.held_at_rest else []
         return c.static(f"{self.method}_settled", "int", out, *given, *cap, *told)
-
-    @property
-    def onto(self) -> tuple[CArgument, ...]:
-        """Whether stages are moved onto the constraints, where there are."""
-        return (CArgument("int", "onto"),) if self.form.project else ()
 
     @property
     def held_at_rest(self) -> bool:
@@ -127,7 +122,7 @@ class Stepping:
         """What rounding makes of the accelerations over a step."""
         real = self.functions.real
         given = (c.given(f"{self.method}_stages", "a"), c.given(real, "scale"))
-        around = (*self.form.around, *self.onto)
+        around = (*self.form.around, *self.functions.moves_stages)
         arguments = (c.filled(real, "cap"), *given, *around, self.number("tol"))
         return c.static(f"{self.method}_capped", "int", *arguments)
 
@@ -203,7 +198,6 @@ def steps(made: Stepping) -> Adaptive:
         events=bool(target.system.events),
         project=form.project,
         whole=form.whole,
-        near=NEAR,
         settle=made.settle,
         sweep=form.sweep,
         step=made.step,

@@ -22,6 +22,7 @@ from eomc.emit.plain.views import (
     Parameter,
 )
 from eomc.emit.public import Public
+from eomc.integrators.tableaux import METHODS
 from eomc.model.symbols import Constraint, Coordinate, Event, Input, Output
 from eomc.program import outline
 from eomc.program.ir import Function
@@ -121,6 +122,17 @@ class Functions:
         """Those of the usual arguments that this scene has: u where it has inputs, p likewise."""
         there = {"u": bool(self.target.system.inputs), "p": self.target.needs_p}
         return tuple(self.argument(n) for n in names if there.get(n, True))
+
+    @property
+    def swept(self) -> bool:
+        """Whether stages are found by sweeps."""
+        run = self.target.system.run
+        return run.tolerance is not None or any(METHODS[name].sweeps for name in run.methods)
+
+    @property
+    def moves_stages(self) -> tuple[CArgument, ...]:
+        """Of sweeps: whether stages are moved onto the constraints, where there are."""
+        return (CArgument("int", "onto"),) if self.projection else ()
 
     @property
     def state(self) -> tuple[str, ...]:

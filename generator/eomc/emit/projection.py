@@ -9,7 +9,6 @@ from eomc.emit.c_names import Target
 from eomc.emit.functions import Functions
 from eomc.emit.plain.constraint_views import Project, Projection
 from eomc.emit.plain.parts import Computed
-from eomc.integrators.tableaux import METHODS
 
 # beside singular positions: squares of what corrections may change; how much more rounding is
 SINGULAR = {"double": (1e-8, 1e9), "float": (1e-6, 1e5)}
@@ -78,11 +77,9 @@ def plain(functions: Functions) -> Projection | None:
         return None
     state = {"q": "r", "qd": "v"}
     call = projection.function.call(**state)
-    run = functions.target.system.run
-    swept = run.tolerance is not None or any(METHODS[name].sweeps for name in run.methods)
     return view(
         functions, projection, functions.projected, call, functions.rate_terms, state,
-        onto=functions.onto if swept else None,
+        onto=functions.onto if functions.swept else None,
     )  # fmt: skip
 
 

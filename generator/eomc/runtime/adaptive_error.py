@@ -41,8 +41,7 @@ def error_of(
         raise MemoryError(f"estimate: {REMEDY}")
     model, x = own._model, own.x.astype(float)
     u = Periods(own._u, own._period) if own._period else own._u
-    eps = float(np.finfo(model.dtype).eps) / 2
-    least = LEAST[model.dtype.itemsize]
+    eps, least = float(np.finfo(model.dtype).eps) / 2, LEAST[model.dtype.itemsize]
     scale = scales(x, float(np.ptp(own.t)), eps)
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
@@ -69,9 +68,10 @@ def error_of(
         return out[beside]
 
     begin = np.ravel(own._begin).astype(float)
-    finer = again(*(asked := _finer(own, least, begin)))
+    tol, shorter = _finer(own, least)
+    finer = again(tol, begin, shorter)
     if own.status == "ok" and not np.isfinite(finer).all():  # short ones near singular positions
-        finer = again(*asked[:2], own._h_most)
+        finer = again(tol, begin, own._h_most)
     modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), np.ones(x.shape[1])
     for at, of in modes:  # which are not moved, nor what sticks, and have no error
         moves[[at, model.nq + at]] = 0
@@ -108,12 +108,12 @@ def error_of(
     )  # fmt: skip
 
 
-def _finer(own: AdaptiveRun, least: float, begin: Array) -> tuple[float, Array, float]:
-    """Tolerance, start and longest step of a run to compare with: in other steps where there is no
-    smaller tolerance too, as rounding differs, and what comes and goes between two nodes shows."""
+def _finer(own: AdaptiveRun, least: float) -> tuple[float, float]:
+    """Tolerance and longest step of a run to compare with: in other steps where there is no smaller
+    tolerance too, as rounding differs, and what comes and goes between two nodes shows."""
     tol = max(own.tol / _FINER, least) if own.tol >= 2 * least else 4 * least
     longest = (own.h / 2, float(np.ptp(own.t)) / _LEAST, own._h_most)
-    return tol, begin, min((h for h in longest if h > 0), default=0.0)
+    return tol, min((h for h in longest if h > 0), default=0.0)
 
 
 def _filled(rows: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -374,35 +375,31 @@ def _modes(
     """
     n, x = model.nq, np.concatenate([q, qd]).astype(float)
     near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
-    found: list[tuple[float, float]] = []
-    for of in (lambda: np.eye(2 * n), lambda: _allowed(model, x, t, params, near)):
-        if found and not model.constraint_names:
-            break
-        try:
-            ways = of()
-            moved = near[:, None] * ways
-            if model.has_slopes and (u is not None or not model.nu):  # signals may read the state
-                rates = model.linearize(q, qd, u, t, params)[0].astype(float) @ moved
-            else:
-                states = np.vstack([x, x + moved.T]).astype(model.dtype)
-                a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
-                rates = np.vstack([moved[n:], (a[1:] - a[0]).T])
-            values = np.linalg.eigvals(ways.T @ (rates / near[:, None]))
-        except (ArithmeticError, np.linalg.LinAlgError):  # the run itself reports it
-            continue
+
+    def spectrum(ways: Array) -> tuple[float, float]:
+        moved = near[:, None] * ways
+        if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
+            rates = model.linearize(q, qd, u, t, params)[0].astype(float) @ moved
+        else:
+            states = np.vstack([x, x + moved.T]).astype(model.dtype)
+            a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
+            rates = np.vstack([moved[n:], (a[1:] - a[0]).T])
+        values = np.linalg.eigvals(ways.T @ (rates / near[:, None]))
         turning, decay = np.max(np.abs(values.imag), initial=0), np.max(-values.real, initial=0)
-        found.append((float(turning), float(decay)))
-    return min(found, key=max) if found else None
+        return float(turning), float(decay)
+
+    found: list[tuple[float, float]] = []  # where there are none the run itself reports it
+    with suppress(ArithmeticError, np.linalg.LinAlgError):
+        found.append(spectrum(np.eye(2 * n)))
+    if model.constraint_names:
+        with suppress(ArithmeticError, np.linalg.LinAlgError):
+            found.append(spectrum(_allowed(model, x, t, params, near)))
+    return min(found, key=max, default=None)
 
 
 def _allowed(model: Model, x: Array, t: float, params: Any, near: Array) -> Array:
-    """Changes of x = [q; qd], in units of `near`, that keep constraints: (2 nq, k), orthonormal.
-
-    All where there are no constraints.
-    """
+    """Changes of x = [q; qd], in units of `near`, that keep constraints: (2 nq, k), orthonormal."""
     n, holonomic = model.nq, model._rows.holonomic
-    if not model.constraint_names:
-        return np.eye(2 * n)
     least = math.sqrt(float(np.finfo(model.dtype).eps))
     q, qd = (half.astype(model.dtype) for half in (x[:n], x[n:]))
     A = model.constraint_jacobian(q, t=t, params=params).astype(float)

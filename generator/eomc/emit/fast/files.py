@@ -72,13 +72,7 @@ def files(made: Steppers, show: Show) -> dict[str, str]:
 def _wide(made: Steppers) -> bool:
     """Whether the lane of a register is needed."""
     run = made.accelerations.target.system.run
-    return run.batch or _swept(made)
-
-
-def _swept(made: Steppers) -> bool:
-    """Whether stages are found by sweeps."""
-    run = made.accelerations.target.system.run
-    return run.tolerance is not None or any(m.sweeps for m in made.methods)
+    return run.batch or made.functions.swept
 
 
 def _csrc(made: Steppers) -> Iterator[str]:
@@ -149,7 +143,7 @@ def _lanes(made: Steppers, show: Show) -> Iterator[str]:
     if made.functions.projection:
         yield show(project(made.functions))
         for lane in (made.one, *([made.wide] * batch)):
-            yield show(projection.view(made.functions, lane, _swept(made)))
+            yield show(projection.view(made.functions, lane))
     if batch:
         yield show(
             views.Blocks(

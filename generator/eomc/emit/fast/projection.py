@@ -13,8 +13,8 @@ from eomc.emit.plain.parts import Computed
 from eomc.program.program import TIME
 
 
-def view(functions: Functions, lane: Lane, swept: bool) -> Projection:
-    """The view of a lane. swept: whether sweeps may take stages that are moved."""
+def view(functions: Functions, lane: Lane) -> Projection:
+    """The view of a lane."""
     made, state = _correction(lane), {"q": "at", "qd": "moving"}
     call = made.function.call(**state)
     terms = None if lane.name else _rate_terms(lane)
@@ -24,7 +24,7 @@ def view(functions: Functions, lane: Lane, swept: bool) -> Projection:
         mask=lane.mask, extent=lane.extent, increments=True,
         sines=f"{lane.prefix}_sines{lane.end}" if sines else "",
         sines_call=f"{lane.prefix}_sines_at{lane.end}(&own, at)" if sines and lane.alone else "",
-        onto=None if lane.name or not swept else onto(lane),
+        onto=onto(lane) if functions.swept and not lane.name else None,
     )  # fmt: skip
 
 

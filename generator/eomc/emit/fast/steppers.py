@@ -300,8 +300,8 @@ class Steppers:
         P = f"{self.one.prefix}_{m.name}"
         out = c.filled(f"{P}_stages", "b")
         given = (c.given(f"{P}_stages", "a"), c.given(f"{P}_sums", "w"))
-        onto = (CArgument("int", "onto"),) if self.functions.projection else ()
-        return c.static(f"{P}_sweep", "int", out, *given, *self.stepping(self.one), *onto)
+        around = (*self.stepping(self.one), *self.functions.moves_stages)
+        return c.static(f"{P}_sweep", "int", out, *given, *around)
 
     def stages(self, m: Method) -> views.Stages:
         """The accelerations at the stages of a method, and a sweep over them."""

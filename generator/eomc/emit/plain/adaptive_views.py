@@ -38,8 +38,7 @@ class Adaptive(AdaptiveTableau):
     total: the sum of half[0], ... over half of the stages. lanes: before loops over stages. top:
     from accelerations at the stages, one a row, to their polynomial's parts in the last four of
     Legendre's; weights: to what a step adds to a position and a velocity.
-    project: the call that ends a step on constraints, of what it adds, or of its `whole` end; near:
-    steps near a singular position, before stages are left as they are again.
+    project: the call that ends a step on constraints, of what it adds, or of its `whole` end.
     held: whether forces that change in time may hold all at rest; capped: what rounding makes then.
     corners: whether forces jump or bend; share: of the tolerance, for a step in which they do;
     ends: from accelerations at the stages to the ends of the polynomial through them; forces: the
@@ -60,7 +59,6 @@ class Adaptive(AdaptiveTableau):
     events: bool
     project: str
     whole: bool
-    near: int
     settle: CFunction
     sweep: str
     step: CFunction

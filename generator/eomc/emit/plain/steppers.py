@@ -283,7 +283,7 @@ def _gauss(plain: Functions, m: Method) -> Gauss:
     method = f"{plain.prefix}_{m.name}"
     around = plain.usual(*plain.state, "h", "u", "p")
     shared = implicit(plain, [m])
-    onto = (CArgument("int", "onto"),) if m.sweeps and plain.projection else ()
+    onto = plain.moves_stages if m.sweeps else ()
     out = (c.filled(plain.real, name) for name in ("f", "q_mid", "qd_mid"))
     a = c.given(plain.real, "a")
     stages = c.static(f"{method}_evaluated", plain.status, *out, a, *around, *onto)
@@ -328,8 +328,7 @@ def _adaptive(plain: Functions) -> list[View]:
     m, method = adaptive.METHOD, f"{plain.prefix}_{adaptive.METHOD.name}"
     around = plain.usual(*plain.state, "h", "u", "p")
     values = (c.filled(f"{method}_stages", "b"), c.given(f"{method}_stages", "a"))
-    onto = (CArgument("int", "onto"),) if plain.projection else ()
-    sweep = c.static(f"{method}_sweep", "int", *values, *around, *onto)
+    sweep = c.static(f"{method}_sweep", "int", *values, *around, *plain.moves_stages)
     accelerate, coefficients = plain.acceleration.function.call, tableau(m, plain.target.real)
     nodes = Nodes(
         **plain.names,
@@ -341,7 +340,7 @@ def _adaptive(plain: Functions) -> list[View]:
         AA=coefficients["AA"],
         sweep=sweep,
         stage=accelerate(qdd="f", q="r", qd="v", t="t + c[i]*h"),
-        onto=plain.onto.call(t="t + c[i]*h") if onto else "",
+        onto=plain.onto.call(t="t + c[i]*h") if plain.projection else "",
     )
     end = f"{c.member('x', 't')} + h"
     ended = plain.projected.call(r="at", v="moving", t=end, singular="&singular")
