@@ -6,22 +6,22 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import sympy
 from sympy import Expr, ImmutableMatrix, Symbol, cos, sin
 
 from eomc.model.system import System, symbol
+from eomc.report.derived import Derived
 
-if TYPE_CHECKING:
-    from eomc.report.equations import Equations
+Found = TypeVar("Found", bound=Derived)
 
 WORTH = 4  # operations and sines of a sum that gets a name; shorter ones are written out each time
 LETTERS = ("s", "h", "w", "z", "sigma")  # of the names, the first that the scene does not use
 NAMED_ENTRIES = 9  # coordinates, up to which entries of D keep their names in the equations
 
 
-def of(found: Equations) -> Equations:
+def of(found: Found) -> Found:
     """The same equations over `named`: entries of D in the equations, and what formulas share."""
     entries = _entries_of_D(found)
     left = tuple([(rates, entries.get(c, c)) for rates, c in terms] for terms in found.left)
@@ -75,7 +75,7 @@ def _symbols(e: Expr) -> Iterator[Expr]:
     return (part for part in sympy.preorder_traversal(e) if part.is_Symbol)
 
 
-def _entries_of_D(found: Equations) -> dict[Expr, Symbol]:
+def _entries_of_D(found: Derived) -> dict[Expr, Symbol]:
     """Names of entries that are worth one, where the scene leaves them free."""
     n = found.D.rows
     if n > NAMED_ENTRIES:

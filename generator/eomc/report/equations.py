@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache, cached_property
 
 import sympy
@@ -11,9 +10,10 @@ from sympy import Expr, ImmutableMatrix
 from eomc import pipeline
 from eomc.base.errors import EomcError
 from eomc.model.discrete import constant
-from eomc.model.system import System, symbol
+from eomc.model.system import System
 from eomc.pipeline import ScenePath
 from eomc.report import abbreviations, equations_text, large_system
+from eomc.report.derived import Derived, Terms
 from eomc.report.typeset import readable
 from eomc.verify import symbolic
 from eomc.verify.shorter import coefficients, shorter
@@ -22,11 +22,8 @@ EXPANDED = 30_000  # as symbolic.is_small counts: seconds for K without definiti
 DERIVED = 8_000  # operations of D, C and bias as they are derived, up to which they are simplified
 WRITTEN_OUT = 1_000  # operations of what is set out, which then fills a page or two
 
-Terms = list[tuple[Expr, Expr]]  # a product of accelerations or rates, and its coefficient
 
-
-@dataclass(frozen=True)
-class Equations:
+class Equations(Derived):
     """D q̈ + C q̇ + g = tau and what it comes from, as SymPy expressions over the scene's names.
 
     With constraints, zero = 0 (m, 1), it is tau + A^T lambda, A (m, nq) and lambda (m,) symbols.
@@ -40,50 +37,6 @@ class Equations:
     (Eq(g*l*m*sin(theta) + l**2*m*theta_ddot, 0),)
     """
 
-    system: System
-    D: ImmutableMatrix
-    C: ImmutableMatrix
-    g: ImmutableMatrix
-    tau: ImmutableMatrix
-    forces: ImmutableMatrix
-    zero: ImmutableMatrix
-    A: ImmutableMatrix
-    kinetic: Expr
-    potential: Expr
-    jacobi: Expr | None
-    power: Expr | None
-    left: tuple[Terms, ...]  # of each scalar equation
-    named: tuple[tuple[sympy.Symbol, Expr], ...] = ()  # abbreviations, in their order
-
-    @property
-    def multipliers(self) -> tuple[sympy.Symbol, ...]:
-        """Of the constraints."""
-        return tuple(symbol(f"lambda_{c.name}") for c in self.system.constraints)
-
-    @property
-    def right(self) -> ImmutableMatrix:
-        """The right sides of the scalar equations: forces, and A^T lambda."""
-        if not self.multipliers:
-            return self.forces
-        return self.forces + self.A.T * sympy.Matrix(self.multipliers)
-
-    @property
-    def L(self) -> Expr:
-        """K - P, the Lagrangian."""
-        return self.kinetic - self.potential
-
-    @cached_property
-    def scalar(self) -> tuple[sympy.Eq, ...]:
-        """d/dt dL/dqd - dL/dq + friction = forces, one equation a coordinate, unevaluated.
-
-        Under constraints the right side has A^T lambda besides.
-        """
-        sides = zip(self.left, self.right, strict=True)
-        return tuple(
-            sympy.Eq(sympy.Add(*(a * b for a, b in terms)), right, evaluate=False)
-            for terms, right in sides
-        )
-
     @cached_property
     def set_out(self) -> Equations:
         """The same as they are printed: long ones by abbreviations."""
@@ -91,10 +44,10 @@ class Equations:
         return abbreviations.of(self) if long else self
 
     def __str__(self) -> str:
-        return equations_text.text(self)
+        return equations_text.text(self.set_out)
 
     def _repr_latex_(self) -> str:
-        return equations_text.latex(self)
+        return equations_text.latex(self.set_out)
 
 
 def equations(scene: System | ScenePath) -> Equations:
@@ -155,8 +108,9 @@ def written(system: System, form: str = "text") -> str:
             raise
         system = constant(system)
         return large_system.latex(system) if form == "latex" else large_system.text(system)
-    forms = {"text": equations_text.text, "latex": equations_text.latex}
-    return forms.get(form, equations_text.python)(found)
+    if form == "python":
+        return equations_text.python(found)
+    return found._repr_latex_() if form == "latex" else str(found)
 
 
 def too_long(system: System) -> EomcError:

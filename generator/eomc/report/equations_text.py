@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import sympy
 from sympy import Expr, MatrixBase
@@ -16,11 +15,9 @@ from eomc.model.symbols import resolved
 from eomc.model.system import Constraint, System, t
 from eomc.program import program
 from eomc.program.routes import ROUTES
+from eomc.report.derived import Derived, Terms
 from eomc.report.typeset import WIDE, Typesetter, spread
 from eomc.runtime.labels import tex
-
-if TYPE_CHECKING:
-    from eomc.report.equations import Equations, Terms
 
 LENGTH = 3_000  # characters of one environment, about: KaTeX takes no more than a page
 GOES_ON = r"  & \quad "  # how a line begins that goes on with the last
@@ -41,7 +38,7 @@ _SYMBOL = {"kinetic": "K", "potential": "P", "jacobi": "h", "power": "power", "t
 _LATEX = {**_SYMBOL, "tau": r"\tau", "power": r"\dot h"}
 
 
-def _values(found: Equations) -> dict[str, Expr | MatrixBase]:
+def _values(found: Derived) -> dict[str, Expr | MatrixBase]:
     """What is shown, by its name."""
     values = {name: getattr(found, name) for name in _MEANING}
     if found.named:
@@ -56,9 +53,8 @@ def _values(found: Equations) -> dict[str, Expr | MatrixBase]:
 # --- text -----------------------------------------------------------------------------------------
 
 
-def text(found: Equations) -> str:
+def text(found: Derived) -> str:
     """For a terminal, WIDE columns and an indent."""
-    found = found.set_out
     system, write = found.system, Typesetter(found.system)
     values, made = _values(found), list[str]()
     parts = [wrapped(f"{title_of(system)}: {form_of('tau' in values, system)}")]
@@ -178,12 +174,12 @@ def _outputs(system: System) -> list[tuple[str, Expr]]:
 # --- LaTeX ----------------------------------------------------------------------------------------
 
 
-def latex(found: Equations) -> str:
+def latex(found: Derived) -> str:
     """Environments of amsmath: the equations of motion, then what is in them."""
     return "\n".join(r"\begin{align*}" + f"\n{body}\n" + r"\end{align*}" for body in bodies(found))
 
 
-def bodies(found: Equations) -> list[str]:
+def bodies(found: Derived) -> list[str]:
     """What stands in each environment: equations of motion, or of the rest, as many as fit."""
     made: list[str] = []
     for lines in latex_lines(found):
@@ -195,9 +191,8 @@ def bodies(found: Equations) -> list[str]:
     return made
 
 
-def latex_lines(found: Equations) -> tuple[list[str], list[str]]:
+def latex_lines(found: Derived) -> tuple[list[str], list[str]]:
     """The lines of the equations of motion; those of energies, matrices and outputs."""
-    found = found.set_out
     system, write = found.system, Typesetter(found.system)
     motion = []
     for left, force in zip(found.left, found.right, strict=True):
@@ -243,7 +238,7 @@ class _Exact(StrPrinter):  # type: ignore[misc]
     _print_Half = _print_Rational
 
 
-def python(found: Equations) -> str:
+def python(found: Derived) -> str:
     """Source that makes them again, exactly."""
     system = found.system
     symbols = [

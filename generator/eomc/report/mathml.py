@@ -20,7 +20,9 @@ def lines(found: Equations) -> tuple[list[tuple[bool, Markup]], list[tuple[bool,
 
     Raises EomcError without latex2mathml.
     """
-    first, second = ([_line(x) for x in lines] for lines in equations_text.latex_lines(found))
+    first, second = (
+        [_line(x) for x in lines] for lines in equations_text.latex_lines(found.set_out)
+    )
     return first, second
 
 

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.model.system import Coordinate, Input, Output, Parameter, System
-from eomc.report import equations, equations_text, large_system, mathml
+from eomc.report import equations, large_system, mathml
 from eomc.report.cost_of_digits import Report, variant
 from eomc.report.labels import html_name
 
@@ -70,7 +70,7 @@ def _equations(system: System) -> tuple[Lines, Lines, str]:
     try:
         return *mathml.lines(found), ""
     except EomcError:
-        return [], [], equations_text.text(found)
+        return [], [], str(found)
 
 
 def _row(what: Coordinate | Parameter | Input | Output, *numbers: str) -> Row:

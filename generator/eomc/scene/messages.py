@@ -5,10 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from eomc.scene.scope import Checker
+from typing import Any
 
 LONGEST = 60  # characters of a text that may be a number with its unit
 
@@ -22,7 +19,7 @@ _LOSS = (
     'a [[body]] has damping = "b" and friction = "c", and a coordinate friction = "c"'
 )
 _JOINT = 'a joint stands with the body that it moves, in [[body]]: joint = "revolute"'
-_ENERGY = "write [energy] with kinetic and potential, of which it is the difference"
+ENERGY = "write [energy] with kinetic and potential, of which it is the difference"
 
 # by the name of a table that scenes do not have
 TABLES: Mapping[str, str] = {
@@ -33,7 +30,7 @@ TABLES: Mapping[str, str] = {
     **dict.fromkeys(("time", "integrator", "stepper", "simulate"), _RUN),
     **dict.fromkeys(("friction", "damping", "dissipation", "drag"), _LOSS),
     **dict.fromkeys(("joint", "joints"), _JOINT),
-    **dict.fromkeys(("lagrangian", "Lagrangian", "L", "hamiltonian"), _ENERGY),
+    **dict.fromkeys(("lagrangian", "Lagrangian", "L", "hamiltonian"), ENERGY),
 }
 # arrays of tables that are one table here: what an entry of each looks like
 _ONE_TABLE: Mapping[str, str] = {
@@ -71,25 +68,6 @@ def one_table(name: str, meant: str) -> str:
     """What to say of [[name]], which is one table."""
     start = "" if name == meant else f"unknown table '{name}': "
     return f"{start}write [{meant}] once, and a line such as {_ONE_TABLE[meant]} for each entry"
-
-
-def tables(tree: dict[str, Any], check: Checker) -> None:
-    """Report tables that scenes do not have, once each; take them out, or put them in place."""
-    for name in [n for n, entry in tree.items() if isinstance(entry, (dict, list))]:
-        if found := array(name, tree[name]):
-            meant, entries = found
-            check.say((name,), one_table(name, meant))
-            check.mended |= {(meant,), *((meant, key) for key in entries)}
-            del tree[name]
-            there = tree.get(meant)
-            tree[meant] = {**entries, **(there if isinstance(there, dict) else {})}
-            check.places.rename((name,), (meant,))
-        elif name in TABLES:
-            check.say((name,), f"there is no [{name}] in a scene: {TABLES[name]}")
-            del tree[name]
-            if TABLES[name] == _ENERGY:
-                tree.setdefault("energy", {"kinetic": "0"})
-                check.mended.add(("energy",))
 
 
 # --- numbers with units ---------------------------------------------------------------------------

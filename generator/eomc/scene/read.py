@@ -18,6 +18,7 @@ from eomc.scene import (
     messages,
     repeat,
     schema,
+    tables,
     toml_text,
     validate_bodies,
     validate_constraints,
@@ -90,7 +91,7 @@ class _Check(Checker):
     ) -> None:
         super().__init__(places)
         self.values = parameters
-        messages.tables(tree, self)
+        tables.mend(tree, self)
         if not repeat.expand(tree, self):
             raise SceneError(self.problems)
         self.bodies = bool(tree.get("body"))
