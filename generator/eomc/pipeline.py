@@ -321,7 +321,8 @@ def _eventful(system: System, events: Mapping[str, Any], what: str) -> System:
     if double := sorted({*map(str, own)} & {*map(str, events)}):
         raise EomcError(f"{what}: event {double[0]}: '{double[0]}' is an event already: rename it")
     try:
-        return system.again(events={**own, **events})
+        made: System = system.again(events={**own, **events})
+        return made
     except SceneError as wrong:
         told = [replace(p, file=what) for p in _by_name(wrong, len(own), events).problems]
         raise SceneError(told) from None

@@ -8,16 +8,13 @@ x_dot**2/2 in K, which stands beside all else, leaves it at rest.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from eomc.base.errors import Problem, SceneError
+from eomc.model.mechanics import Made, Mechanics
 from eomc.model.symbols import Coordinate, Parameter
 
-if TYPE_CHECKING:
-    from eomc.model.system import System
 
-
-def discrete(system: System) -> System:
+def discrete(system: Made) -> Made:
     """The system whose parameters that jumps set are discrete variables, behind its coordinates.
 
     Raises SceneError where a name that one needs is taken, one is a limit of an input, or an
@@ -43,7 +40,7 @@ def discrete(system: System) -> System:
     )
 
 
-def _taken(system: System, found: list[Parameter]) -> list[Problem]:
+def _taken(system: Mechanics, found: list[Parameter]) -> list[Problem]:
     """Names of the scene's that the rates of discrete variables need."""
     known = {*system.names, *(s.name for s, _ in system.definitions)}
     known |= {o.name for o in system.outputs}
@@ -57,7 +54,7 @@ def _taken(system: System, found: list[Parameter]) -> list[Problem]:
     ]
 
 
-def _limiting(system: System, found: list[Parameter]) -> list[Problem]:
+def _limiting(system: Mechanics, found: list[Parameter]) -> list[Problem]:
     """Inputs whose limits depend on discrete variables."""
     names = {p.name for p in found}
     return [
@@ -71,7 +68,7 @@ def _limiting(system: System, found: list[Parameter]) -> list[Problem]:
     ]
 
 
-def _idle(system: System, found: list[Parameter]) -> list[Problem]:
+def _idle(system: Mechanics, found: list[Parameter]) -> list[Problem]:
     """Events of discrete variables alone, which nothing carries through zero between jumps."""
     jumped, still = {p.name for p in found}, {p.name for p in system.parameters}
     problems = []
@@ -89,7 +86,7 @@ def _idle(system: System, found: list[Parameter]) -> list[Problem]:
     return problems
 
 
-def constant(system: System) -> System:
+def constant(system: Made) -> Made:
     """The system with parameters in place of its discrete variables, which nothing sets."""
     if not system.discrete:
         return system
@@ -113,7 +110,7 @@ def constant(system: System) -> System:
     )
 
 
-def beside(system: System, core: System) -> System:
+def beside(system: Made, core: Made) -> Made:
     """The system with start and rows of its `core`, which has parameters and is assembled."""
     more = [c for c in system.coordinates if c.name in system.discrete]
     return replace(

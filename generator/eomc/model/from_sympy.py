@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import sympy
 from sympy import Expr, Symbol
@@ -15,6 +15,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError, Problem
 from eomc.model import constraints, given
 from eomc.model.algebra import UNDEFINED
+from eomc.model.mechanics import Made
 from eomc.model.pictured import pictured
 from eomc.model.rewrite import JumpError, rewritten
 from eomc.model.sticking import Friction
@@ -33,10 +34,6 @@ from eomc.model.symbols import (
 )
 from eomc.scene.scene import Run
 from eomc.scene.schema import ACTIONS, DIRECTIONS
-
-if TYPE_CHECKING:
-    from eomc.model.system import System
-
 
 Ends = tuple[Expr | None, ...]  # the least and the largest value of an input
 
@@ -113,13 +110,13 @@ class Maker:
         return declared
 
     def make(
-        self, of: type[System], coordinates: Any, kinetic: Any, potential: Any,
+        self, of: type[Made], coordinates: Any, kinetic: Any, potential: Any,
         parameters: Mapping[Any, float], dissipation: Any, forces: Mapping[Any, Any], inputs: Any,
         definitions: Mapping[Any, Any], outputs: Mapping[str, Any],
         rows: Mapping[str, Any], guess: Sequence[Any], units: Mapping[Any, str],
         title: str, run: Run, limits: Mapping[Any, Any], events: Mapping[str, Any],
         picture: Any, friction: Any,
-    ) -> System:  # fmt: skip
+    ) -> Made:  # fmt: skip
         """The system, of the class `of`."""
         starts = given.symbols(coordinates, "coordinates", None)
         parameters = given.mapping(parameters, "parameters", "{m: 2.0}")

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from sympy import Symbol
 
+from eomc.model.mechanics import Made
 from eomc.model.symbols import symbol
 
-if TYPE_CHECKING:
-    from eomc.model.system import System
 
-
-def within(system: System) -> System:
+def within(system: Made) -> Made:
     """The system with a definition for each limited input, `force_limited`, used in its place."""
     names = {s.name for s, _ in system.definitions} | system.names | {system.name}
     made: dict[Symbol, Symbol] = {}

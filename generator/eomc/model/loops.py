@@ -18,18 +18,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 from sympy import Expr, Float, S
 
 from eomc.base.spatial import apply, cross, dot, plus, product, scaled, transposed
 from eomc.model import exact
 from eomc.model.exact import ZERO, Matrix, Vector
+from eomc.model.mechanics import Mechanics
 from eomc.model.symbols import Constraint, Reaction, needed, symbol, t
 from eomc.scene.assembly import Loop
-
-if TYPE_CHECKING:
-    from eomc.model.system import System
 
 
 @dataclass(frozen=True)
@@ -153,7 +150,7 @@ def gear(loop: Loop, ratio: Expr, offset: Expr) -> Closed:
     return Closed([Constraint(loop.name, row, True, "", loop.note, loop.name)])
 
 
-def closed_otherwise(system: System) -> Iterator[str]:
+def closed_otherwise(system: Mechanics) -> Iterator[str]:
     """The loops whose rows hold at the start as they do after some other turn than is meant."""
     values: dict[Expr, Expr] = {c.q: Float(c.start) for c in system.coordinates}
     values |= {p.symbol: Float(p.value) for p in system.parameters}

@@ -11,17 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import sympy
 from sympy import Expr, S
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model.closure import Closure
+from eomc.model.mechanics import Made, Mechanics
 from eomc.model.symbols import Constraint, Coordinate, Event, Mode
-
-if TYPE_CHECKING:
-    from eomc.model.system import System
 
 NOTE = "1 where {name} slides forwards, -1 backwards, 0 where it sticks"
 
@@ -35,7 +32,7 @@ class Friction:
     key: str
 
 
-def sticking(system: System, frictions: Sequence[Friction]) -> System:
+def sticking(system: Made, frictions: Sequence[Friction]) -> Made:
     """The system with friction that sticks, along coordinates; of one coordinate they add up.
 
     Raises SceneError where a name that it needs is taken.
@@ -85,7 +82,7 @@ def _side(rate: float) -> float:
     return float((rate > 0) - (rate < 0))
 
 
-def _taken(system: System, whole: Iterable[str]) -> list[Problem]:
+def _taken(system: Mechanics, whole: Iterable[str]) -> list[Problem]:
     """Names of the scene's that modes need."""
     known = {
         *system.names, *(s.name for s, _ in system.definitions), *(o.name for o in system.outputs),
@@ -122,7 +119,7 @@ def _jumping(event: Event, sliding: Mapping[str, str]) -> Event:
     return replace(event, jump=(*event.jump, *modes))
 
 
-def without(system: System) -> System:
+def without(system: Made) -> Made:
     """The system without its modes, for what rows of constraints leave where all slides."""
     n, m = len(system.coordinates) - len(system.modes), len(system.constraints) - len(system.modes)
     energy = sympy.Add(*(c.qd**2 / 2 for c in system.coordinates[n:]))
@@ -141,7 +138,7 @@ def without(system: System) -> System:
     )
 
 
-def beside(system: System, core: System) -> System:
+def beside(system: Made, core: Made) -> Made:
     """The system with start and rows of its `core`, which has no modes and is assembled."""
     modes = [
         replace(system.coordinates[m.at], start=_side(core.coordinates[m.of].rate))

@@ -1,31 +1,27 @@
-"""A mechanical system in SymPy: symbols, ordered definitions, K, P, dissipation and forces.
+"""A mechanical system in SymPy, as a user makes it.
 
-Made from a checked scene (from_scene.py) or in Python (`System.make`), with symbols or with
-`sympy.physics.mechanics.dynamicsymbols`. Knows nothing of TOML or C.
+From a checked scene (from_scene.py) or in Python (`System.make`), with symbols or with
+`sympy.physics.mechanics.dynamicsymbols`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Never
 
-import sympy
-from sympy import Expr, Symbol
-
-from eomc.base.errors import Problem, SceneError
+from eomc.base.errors import SceneError
 from eomc.model import from_sympy, given
-from eomc.model.closure import Closure
 from eomc.model.discrete import discrete
 from eomc.model.limits import within
+from eomc.model.mechanics import Mechanics
 from eomc.model.sticking import sticking
 from eomc.model.symbols import (
     Constraint,
     Coordinate,
     Event,
     Input,
-    Mode,
     Output,
     Parameter,
     Reaction,
@@ -33,10 +29,6 @@ from eomc.model.symbols import (
     symbol,
     t,
 )
-from eomc.model.tree import Frame, Tree
-from eomc.scene.scene import Run, Scene
-
-LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision, in C
 
 __all__ = [
     "Constraint",
@@ -53,128 +45,11 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class System:
-    """d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, over named definitions.
+class System(Mechanics):
+    """d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, made of a scene or, by `make`, of expressions.
 
-    `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
-    `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate; to it come the forces
-    F that are `applied` at positions y, pairs (y, F), each with F dy/dq. `constraints`: what is
-    zero, holonomic ones first; with A their derivatives along q (along qd, where not holonomic) and
-    multipliers lambda, A^T lambda stands beside Q; `reactions` are of the loops. `tree`: the bodies
-    that are held by joints, whose energies are part of K and P. `frames`: of bodies and points, in
-    space or in the `plane`. `digest` names what the system was
-    made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
-    was read from, where it was. `pictured`: where it was made in Python with a picture, a scene of
-    its names and that alone. `closure`: what its constraints leave, once its start is assembled.
-    `modes`: of friction that sticks, the last coordinates. `discrete`: coordinates before them that
-    jumps alone change, which no derivative is taken along. `again`: `make` with what made it; other
-    arguments take the place of those.
+    Its fields are those of `Mechanics`.
     """
-
-    name: str
-    coordinates: tuple[Coordinate, ...]
-    kinetic: Expr
-    potential: Expr = sympy.S.Zero
-    dissipation: Expr = sympy.S.Zero
-    forces: tuple[Expr, ...] = ()
-    parameters: tuple[Parameter, ...] = ()
-    inputs: tuple[Input, ...] = ()
-    definitions: tuple[tuple[Symbol, Expr], ...] = ()
-    outputs: tuple[Output, ...] = ()
-    events: tuple[Event, ...] = ()
-    constraints: tuple[Constraint, ...] = ()
-    reactions: tuple[Reaction, ...] = ()
-    applied: tuple[tuple[Expr, Expr], ...] = ()
-    tree: Tree | None = None
-    frames: tuple[Frame, ...] = ()
-    plane: bool = False
-    run: Run = field(default_factory=Run)
-    title: str = ""
-    note: str = ""
-    file: str = ""
-    digest: str = ""
-    renamed: tuple[tuple[str, str], ...] = ()
-    warnings: tuple[Problem, ...] = field(default=(), compare=False)
-    place: Callable[..., Problem] | None = field(default=None, compare=False, repr=False)
-    scene: Scene | None = field(default=None, compare=False, repr=False)
-    pictured: Scene | None = field(default=None, compare=False, repr=False)
-    closure: Closure | None = field(default=None, compare=False, repr=False)
-    modes: tuple[Mode, ...] = ()
-    discrete: tuple[str, ...] = ()
-    again: partial[System] | None = field(default=None, compare=False, repr=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without `again`, whose symbols may not bear to be pickled."""
-        return {**self.__dict__, "again": None}
-
-    @property
-    def q(self) -> tuple[Symbol, ...]:
-        """The coordinates' symbols, in scene order."""
-        return tuple(c.q for c in self.coordinates)
-
-    @property
-    def qd(self) -> tuple[Symbol, ...]:
-        """The velocities' symbols, in scene order."""
-        return tuple(c.qd for c in self.coordinates)
-
-    @property
-    def qdd(self) -> tuple[Symbol, ...]:
-        """The accelerations' symbols, in scene order."""
-        return tuple(c.qdd for c in self.coordinates)
-
-    @property
-    def rates(self) -> dict[Symbol, Symbol]:
-        """The velocities of all that moves between events, by their coordinates."""
-        return {c.q: c.qd for c in self.coordinates if c.name not in self.discrete}
-
-    @property
-    def solved(self) -> tuple[tuple[tuple[int, float], ...], ...]:
-        """What accelerations are solved for: sums of constraints, (place, weight) of each.
-
-        One constraint each, but for those of `closure.sums`; these come first of all.
-        """
-        sums = self.closure.sums if self.closure else ()
-        mixed = {k for row in sums for k, w in enumerate(row) if w}
-        own = (k for k, c in enumerate(self.constraints) if not c.redundant and k not in mixed)
-        return (
-            *(tuple((k, w) for k, w in enumerate(row) if w) for row in sums),
-            *(((k, 1.0),) for k in own),
-        )
-
-    def problem(self, key: str, message: str, severity: str = "error") -> Problem:
-        """A problem at a key such as `energy.kinetic`, with its line where there is a scene."""
-        if self.place is None:
-            return Problem(message, key, f"System {self.name}", severity=severity)
-        return self.place(key, message, severity=severity)
-
-    def at(self, parameters: Mapping[str, float]) -> System:
-        """The system with other values for some of its parameters."""
-        changed = tuple(replace(p, value=parameters.get(p.name, p.value)) for p in self.parameters)
-        return replace(self, parameters=changed)
-
-    @property
-    def asked(self) -> tuple[Frame, ...]:
-        """The frames whose poses, velocities and Jacobians are wanted, in the order of [run]."""
-        wanted, known = self.run.frames, {f.name: f for f in self.frames}
-        return self.frames if wanted is True else tuple(known[name] for name in wanted or ())
-
-    @property
-    def reads_qdd(self) -> bool:
-        """Whether functions may read accelerations."""
-        return bool(self.outputs or self.events or self.asked or self.run.inverse_dynamics)
-
-    @property
-    def names(self) -> frozenset[str]:
-        """Those of coordinates, velocities, inputs, parameters, and of accelerations where
-        functions may read them: no value may take one."""
-        given = (*self.q, *self.qd, *self.u, *(self.qdd if self.reads_qdd else ()))
-        return frozenset([*(x.name for x in given), *(p.name for p in self.parameters)])
-
-    @property
-    def u(self) -> tuple[Symbol, ...]:
-        """The inputs' symbols, in scene order."""
-        return tuple(i.symbol for i in self.inputs)
 
     @classmethod
     def make(
@@ -250,37 +125,3 @@ class System:
             raise SceneError(faults)
         system = sticking(discrete(within(system)), maker.frictions)
         return replace(system, again=partial(cls.make, **asked))
-
-    def beyond_float(self) -> list[Problem]:
-        """Faults of numbers that a system in single precision can't have."""
-        if self.run.real != "float":
-            return []
-        faults = []
-        if self.run.h < LEAST_FLOAT:
-            why = f"is {self.run.h:g}, less than a float can be: take a larger step, or real double"
-            faults.append(self.problem("run.h", why))
-        numbers = [(f"parameters.{p.name}", sympy.Float(p.value)) for p in self.parameters]
-        expressions: list[tuple[str, Expr]] = [
-            *((f"definitions.{s}", e) for s, e in self.definitions),
-            ("energy.kinetic", self.kinetic),
-            ("energy.potential", self.potential),
-            ("energy.dissipation", self.dissipation),
-            *((f"forces.{c.name}", e) for c, e in zip(self.coordinates, self.forces, strict=True)),
-            *((f"inputs.{i.name}.signal", i.signal) for i in self.inputs),
-            *(
-                (f"inputs.{i.name}.limits", e)
-                for i in self.inputs
-                for e in i.limits
-                if e is not None
-            ),
-            *(("force", e) for pair in self.applied for e in pair),
-            *((f"outputs.{o.name}", o.formula) for o in self.outputs),
-            *(("event", x) for e in self.events for x in (e.when, *(f for _, f in e.jump))),
-            *((f"constraints.{c.name}", c.formula) for c in self.constraints),
-        ]
-        numbers += [(key, n) for key, e in expressions for n in e.atoms(sympy.Number)]
-        for key, n in numbers:
-            if abs(n) > LARGEST_FLOAT:
-                why = f"{float(n):g} is more than a float can be: use other units, or real double"
-                faults.append(self.problem(key, why))
-        return faults
