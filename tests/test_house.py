@@ -41,27 +41,21 @@ def tree(name: str) -> ast.Module:
     return ast.parse(modules()[name].read_text(encoding="utf-8"))
 
 
-def for_types(node: ast.stmt) -> bool:
-    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-
-
 @cache
-def imports(name: str, types: bool = True) -> frozenset[str]:
-    """The modules of eomc that a module imports anywhere in its text; types: for types too."""
-    body = [node for node in tree(name).body if types or not for_types(node)]
-    return frozenset(_imports(name, ast.Module(body, [])))
+def imports(name: str) -> frozenset[str]:
+    """The modules of eomc that a module imports anywhere in its text, for types too."""
+    return frozenset(_imports(name))
 
 
-def _imports(name: str, text: ast.Module) -> Iterator[str]:
-    known = modules()
-    for node in ast.walk(text):
+def _imports(name: str) -> Iterator[str]:
+    known, runtime = modules(), name.startswith("runtime.")
+    for node in ast.walk(tree(name)):
         if isinstance(node, ast.Import):
             wanted = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            assert not node.level or name.startswith("runtime."), "imports are absolute"
-            if node.level:
-                continue
-            wanted = [f"{node.module}.{alias.name}" for alias in node.names]
+            beside = "eomc.runtime." * node.level + (f"{node.module}." if node.module else "")
+            wanted = [f"{beside}{alias.name}" for alias in node.names]
+            assert node.level == (runtime and wanted[0].startswith("eomc.")), "relative beside"
         else:
             continue
         for whole in wanted:
@@ -91,7 +85,8 @@ def test_imports_go_down() -> None:
 
 
 def test_no_circle() -> None:
-    tops = {n: imports(n, types=False) - {n} for n in modules()}
+    """Not of types either."""
+    tops = {n: imports(n) - {n} for n in modules()}
     assert len(list(TopologicalSorter(tops).static_order())) >= len(tops)
 
 
@@ -111,7 +106,7 @@ def test_the_oracles_share_nothing_with_the_compiled_way() -> None:
 def test_what_lies_beside_a_built_module_needs_no_eomc() -> None:
     for name in modules():
         if room(name) == "runtime":
-            assert not imports(name), name
+            assert {room(other) for other in imports(name)} <= {"runtime"}, name
 
 
 def test_pictures_and_events_alone_are_asked_of_eomc_beside_a_built_module() -> None:

@@ -17,7 +17,7 @@ import eomc
 from eomc.base.errors import SceneError
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
-from eomc.runtime.trajectory import STATUS
+from eomc.runtime.status import STATUS
 from eomc.scene.read import parse
 from eomc.verify.check import check
 

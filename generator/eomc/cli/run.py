@@ -67,7 +67,7 @@ def command(
     eomc run scenes/cartpole.toml --animate cartpole.html
     eomc run scenes/cartpole.toml --set m_c=3 --start theta=pi/3 --out run.csv
     """
-    from eomc.runtime.estimate import beyond_end
+    from eomc.runtime.stability import beyond_end
 
     _known_suffix(out, (".csv", ".npz"), "--out")
     _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")

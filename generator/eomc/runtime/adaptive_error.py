@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .adaptive_memory import FULL, REMEDY
+from .adaptive_arguments import LEAST
 from .arguments import Array
 from .estimate import Estimate, scales
+from .fitted import Fitted
 from .periods import Periods
+from .status import FULL, REMEDY
 
-if TYPE_CHECKING:
-    from .adaptive import AdaptiveRun
-
-LEAST = {8: 1e-15, 4: 5e-7}  # tolerances, by bytes of a number
 ORDER = 16
 _TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
 _FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
@@ -27,7 +24,7 @@ _LONGER = 100  # times the steps, which a moved start takes at most
 
 
 def error_of(
-    own: AdaptiveRun, run: Callable[..., AdaptiveRun],
+    own: Fitted, run: Callable[..., Fitted],
     progress: Callable[[int, int], None] | None,
 ) -> Estimate:  # fmt: skip
     """The error of a run, beside one of a hundredth of its tolerance in shorter steps, and from a
@@ -108,7 +105,7 @@ def error_of(
     )  # fmt: skip
 
 
-def _finer(own: AdaptiveRun, least: float) -> tuple[float, float]:
+def _finer(own: Fitted, least: float) -> tuple[float, float]:
     """Tolerance and longest step of a run to compare with: in other steps where there is no smaller
     tolerance too, as rounding differs, and what comes and goes between two nodes shows."""
     tol = max(own.tol / _FINER, least) if own.tol >= 2 * least else 4 * least
@@ -126,7 +123,7 @@ def _filled(rows: Array) -> Array:
     return found
 
 
-def _verdict(own: AdaptiveRun, left: Array, rounding: Array, amplification: float) -> str:
+def _verdict(own: Fitted, left: Array, rounding: Array, amplification: float) -> str:
     """What speaks against the run; its differences, and rounding, relative to the scales."""
     words = []
     if own.status not in ("ok", "accumulated"):

@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .arguments import Array, machine_memory
-
-if TYPE_CHECKING:
-    from .model import Model
-
-PART = 0.4  # of the machine's memory: where a run ends, what was kept is copied once
-FULL = "out of memory"  # the status of a run that ends since no more can be kept
-REMEDY = (
-    f"rows and events fill {100 * PART:.0f} % of this machine's memory: keep fewer rows with "
-    "times=, or, where events never cease, end sooner with duration="
-)
+from .compiled import Compiled
+from .status import PART
 
 
 class Kept:
     """How many rows and events a run keeps, and how many more there is room for."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Compiled) -> None:
         self.rows, self.most = 0, room_for(model)
 
     def count(self, work: Any, events: bool) -> None:
@@ -37,7 +29,7 @@ class Kept:
 class Rows:
     """Times and rows as C fills them, in pieces: one after each step, or at `times` (n,)."""
 
-    def __init__(self, model: Model, times: Array | None, count: int) -> None:
+    def __init__(self, model: Compiled, times: Array | None, count: int) -> None:
         self.model, self.own = model, times is None
         self.times = None if times is None else np.ascontiguousarray(times, model.dtype)
         self.pieces: list[tuple[Array, Array]] = []
@@ -79,12 +71,12 @@ class Rows:
         return times[: self.filled], rows[:, : self.filled]
 
 
-def room_for(model: Model) -> float:
+def room_for(model: Compiled) -> float:
     """How many rows and events a run may keep."""
     return PART * machine_memory() / _row(model)
 
 
-def rows_for(model: Model, count: int) -> Array:
+def rows_for(model: Compiled, count: int) -> Array:
     """Room for so many times, q and qd. Raises MemoryError where there is none."""
     try:
         if count * _row(model) > machine_memory():
@@ -96,6 +88,6 @@ def rows_for(model: Model, count: int) -> Array:
         ) from None
 
 
-def _row(model: Model) -> int:
+def _row(model: Compiled) -> int:
     """The bytes of a time, q and qd."""
     return (1 + 2 * model.nq) * model.dtype.itemsize

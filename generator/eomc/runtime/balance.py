@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .arguments import Array
 from .package import reduced
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .model import Model
-    from .trajectory import Run
+from .recorded import Recorded
+from .stepping import Stepping
 
 _ROWS = 8  # of an interpolating polynomial, and so the order of an integral, at most
 _FEWEST = 2 * _ROWS + 1  # from which on every fourth shows something; below all may be wrong
@@ -72,7 +69,7 @@ class Balance:
 class _Rows:
     """Rows t (n,), q, qd (n, nq) that tell a run's power, and the inputs in each piece of them."""
 
-    model: Model
+    model: Stepping
     params: Array
     t: Array
     q: Array
@@ -90,7 +87,7 @@ class _Rows:
         return np.concatenate(found).astype(float)
 
 
-def balance(run: Run) -> Balance | None:
+def balance(run: Recorded) -> Balance | None:
     """The balance of a run; None where its rows don't tell its inputs, or something is infinite.
 
     That may be an energy or a force, at a start from which no step is made.
@@ -126,7 +123,7 @@ def balance(run: Run) -> Balance | None:
     return Balance(*parts, left, off + rounding, told=told, jumps=jumped)
 
 
-def _turned_back(model: Model) -> Callable[[Array, Array], tuple[Array, Array]]:
+def _turned_back(model: Stepping) -> Callable[[Array, Array], tuple[Array, Array]]:
     """What takes a state to the one that moves back along the same way.
 
     Friction that sticks has a mode beside each velocity, its sign.
@@ -136,7 +133,7 @@ def _turned_back(model: Model) -> Callable[[Array, Array], tuple[Array, Array]]:
     return lambda q, qd: (signs * q, -qd)
 
 
-def _rows(run: Run) -> _Rows | None:
+def _rows(run: Recorded) -> _Rows | None:
     """Rows that tell a run's power, which is smooth between jumps of its state or its inputs."""
     model, u = run._model, run._u
     if u is None or np.ndim(u) == 1:
@@ -188,7 +185,7 @@ def _held(run: Any) -> tuple[Array, Array]:
     return np.append(starts[begun], last), values[begun]
 
 
-def _between_jumps(run: Run) -> Run:
+def _between_jumps(run: Recorded) -> Recorded:
     """With rows equally far apart, in each piece between jumps, which stand on two rows each."""
     run = _with_jumps(run)
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
@@ -206,7 +203,7 @@ def _between_jumps(run: Run) -> Run:
     ends = np.unique([*firsts, *lasts])
     adaptive: Any = run
     bare = adaptive._at(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
-    made: Run = bare._with(np.concatenate(times)) if times else bare
+    made: Recorded = bare._with(np.concatenate(times)) if times else bare
     return made
 
 

@@ -6,25 +6,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .adaptive_arguments import as_end, as_limits, as_times
-from .adaptive_memory import FULL, room_for
+from .adaptive_memory import room_for
 from .arguments import Array, as_number, as_step_size
-from .batch_run import BatchRun
-from .batch_work import all_of, as_threads, stuck
-from .columns import ByName
+from .batch_instances import Instances
+from .batch_run import BatchRun, stuck
+from .batch_work import all_of, as_threads
+from .by_name import ByName
 from .happened import FoundInBatch, HappenedInBatch
 from .package import reduced
 from .periods import end_of, held_at, periods_in
 from .slices import longer
-from .trajectory import STATUS
-
-if TYPE_CHECKING:
-    from .batch import BatchModel
+from .status import FULL, STATUS
 
 _GROUP, _FEWEST = 128, 16  # instances that a thread takes at once, of many and of few
 _COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
@@ -146,7 +144,7 @@ class AdaptiveBatchRun(BatchRun):
 
 
 def simulate(
-    model: BatchModel, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
+    model: Instances, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
     params: Any, u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float | None, times: ArrayLike | None,
     h_most: float | None, stiff: bool, control_period: float | None, fixed: tuple[Any, ...],
@@ -191,7 +189,7 @@ def simulate(
     return made, whole
 
 
-def no_signals(model: BatchModel, u: Any, control_period: Any) -> None:
+def no_signals(model: Instances, u: Any, control_period: Any) -> None:
     """A ValueError where signals were to be held over control periods: batches follow them."""
     if u is None and control_period is not None and model.nu:
         raise ValueError("control_period: a batch follows the signals: give u, a row a period")
@@ -201,7 +199,7 @@ class _Work:
     """Instances on their way: where each is, its memory, and the rows of all."""
 
     def __init__(
-        self, model: BatchModel, begin: Array, t0: float, times: Array,
+        self, model: Instances, begin: Array, t0: float, times: Array,
         limits: tuple[float, float, float], inputs: tuple[Array | None, float], table: Array,
         stiff: bool,
     ) -> None:  # fmt: skip

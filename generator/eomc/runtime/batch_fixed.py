@@ -7,20 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .arguments import Array, machine_memory
-from .batch_run import BatchRun
+from .batch_instances import Instances
+from .batch_run import BatchRun, way_of
 from .batch_work import Way, Work
 from .dense import parts
 from .model import LARGE
 from .package import reduced
-from .trajectory import STATUS
-
-if TYPE_CHECKING:
-    from .batch import BatchModel
+from .status import STATUS
 
 _NAMES = ("_times", "_begin")
 _CUT = len(STATUS)  # interrupted
@@ -44,7 +42,7 @@ class TimedBatchRun(BatchRun):
 
     def _states(self, times: Array) -> Array:
         found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
-        way = Way.of(self, self._begin.copy(), self._u)
+        way = way_of(self, self._begin.copy(), self._u)
         way.rows(parts(times, self.t0, self.h), found)
         return found
 
@@ -86,7 +84,7 @@ class Asked(NamedTuple):
 
 
 def simulate(
-    model: BatchModel, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+    model: Instances, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
 ) -> tuple[BatchRun, bool]:
     """From checked arguments, and whether it is whole, not cut off by Ctrl-C."""
     made = _by_steps if asked.times is None else _at_times
@@ -94,7 +92,7 @@ def simulate(
 
 
 def _by_steps(
-    model: BatchModel, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+    model: Instances, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
 ) -> tuple[BatchRun, bool]:
     """Rows after every so many steps, and the last."""
     step, h, t0, steps, every, _, method, threads, progress, codes = asked
@@ -124,7 +122,7 @@ def _by_steps(
 
 
 def _at_times(
-    model: BatchModel, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
+    model: Instances, starts: tuple[Array, Array], held: Array | None, table: Array, asked: Asked
 ) -> tuple[BatchRun, bool]:
     """Rows at the times that were asked for."""
     h, t0, method, times = asked.h, asked.t0, asked.method, asked.times
@@ -154,7 +152,7 @@ def _at_rows(held: Array, begun: Array, steps: int) -> Array:
 
 
 def _ends_and_rows(
-    model: BatchModel, count: int, rows: int
+    model: Instances, count: int, rows: int
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Room for q and qd at the ends, (batch, nq), and in the rows, (batch, rows, nq)."""
     nq, dtype = model.nq, model.dtype

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, not_one_of
-from .columns import File
 from .labels import mathtext, with_unit
 from .plot import Curve, Source, against, finished, given_axes, new_axes, no_files
 from .shown import by_eomc
+from .written import File
 
 _OF_ONE = {"phase", "section", "other", "labels"}
 

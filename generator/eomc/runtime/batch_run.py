@@ -19,7 +19,7 @@ from .dense import parts, within
 from .happened import PassedOver
 from .model import Model
 from .package import reduced
-from .trajectory import STATUS
+from .status import STATUS
 
 _ENDS = np.array([*STATUS, "interrupted"])
 _KEPT = "t0 q qd h steps codes every wanted params held method _u".split()  # as the fields go
@@ -120,7 +120,7 @@ class BatchRun(Values, Fans, Columns):
         found = np.empty((2, len(self), len(times), self._model.nq), self._model.dtype)
         for row in np.unique(whole // every):
             own, first = (whole // every == row).nonzero()[0], int(row) * every
-            way = Way.of(self, np.array([self.q[:, row], self.qd[:, row]]), held, first)
+            way = way_of(self, np.array([self.q[:, row], self.qd[:, row]]), held, first)
             way.work.status[self.steps < first] = STATUS.index(
                 "not finite"
             )  # who never came so far
@@ -185,3 +185,16 @@ class BatchRun(Values, Fans, Columns):
 
     def __repr__(self) -> str:
         return f"<BatchRun of {self._model.name}: {self.message}>"
+
+
+def stuck(run: BatchRun) -> Array:
+    """The status of those that made no step, (batch,), and 0 of the others."""
+    return np.where((run.steps == 0) & (run._codes < len(STATUS)), run._codes, 0)
+
+
+def way_of(run: BatchRun, both: Array, held: Array | None, first: int = 0) -> Way:
+    """A run's way again, from its states behind so many steps."""
+    model: Any = run._model
+    way = Way(model, run.method, both, run.t0, run.h, held, run._params, None, first)
+    way.work.leave(stuck(run))
+    return way

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .arguments import Array
-from .columns import ByName
-
-if TYPE_CHECKING:
-    from .model import Model
+from .by_name import ByName
+from .compiled import Compiled
 
 _Rows = tuple[slice, slice]  # of instances and of times
 
@@ -20,7 +18,7 @@ _Rows = tuple[slice, slice]  # of instances and of times
 class Values:
     """A part of `batch_run.BatchRun`: as in a single run, with the instances before all else."""
 
-    _model: Model
+    _model: Compiled
     q: Array
     qd: Array
     _params: Array  # (batch or 1, np)

@@ -6,17 +6,14 @@ import os
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from .arguments import Array, as_count
+from .batch_instances import Instances
 from .slices import longer
-from .trajectory import STATUS
 
-if TYPE_CHECKING:
-    from .batch import BatchModel
-    from .batch_run import BatchRun
 _GROUP = 128  # instances, in the smallest group: some tiles, the last of them not full
 _TILES = 64  # at most in a group: threads ask for the next one seldom
 _SHARES = 8  # groups of a thread, so that all end together
@@ -30,7 +27,7 @@ class Work:
     """One batch: groups of instances, each taken through all its steps in pieces."""
 
     def __init__(
-        self, model: BatchModel, step: Any, q: Array, qd: Array, h: float, t0: float,
+        self, model: Instances, step: Any, q: Array, qd: Array, h: float, t0: float,
         steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None,
         qd_rows: Array | None, starts: tuple[Array, Array] | None = None,
     ) -> None:  # fmt: skip
@@ -139,21 +136,13 @@ class Way:
     """Instances on their way by whole steps, with shorter ones to times between."""
 
     def __init__(
-        self, model: BatchModel, method: str | None, both: Any, t0: float, h: float,
+        self, model: Instances, method: str | None, both: Any, t0: float, h: float,
         held: Array | None, table: Array, starts: tuple[Array, Array] | None = None, first: int = 0,
     ) -> None:  # fmt: skip
         self.model, self.method, self.state = model, method, both
         step = model._stepper(method, "batch")
         q, qd = both
         self.work = Work(model, step, q, qd, h, t0, first, 0, held, table, None, None, starts)
-
-    @classmethod
-    def of(cls, run: BatchRun, both: Array, held: Array | None, first: int = 0) -> Way:
-        """That of a run again, from its states behind so many steps."""
-        model: Any = run._model
-        way = cls(model, run.method, both, run.t0, run.h, held, run._params, None, first)
-        way.work.leave(stuck(run))
-        return way
 
     def rows(
         self, places: tuple[Array, Array], into: Any, threads: int | None = None,
@@ -185,11 +174,6 @@ class Way:
             good &= self.model.step_batch(q, qd, rest, t, u, p, method=method) == 0
         q[~good] = qd[~good] = np.nan
         return q, qd
-
-
-def stuck(run: BatchRun) -> Array:
-    """The status of those that made no step, (batch,), and 0 of the others."""
-    return np.where((run.steps == 0) & (run._codes < len(STATUS)), run._codes, 0)
 
 
 class Grouped(Protocol):

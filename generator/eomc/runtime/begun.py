@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from .trajectory import Run
+from .recorded import Recorded
+from .status import MotionError
 
 
-def infinite_at_start(run: Run) -> str:
+def infinite_at_start(run: Recorded) -> str:
     """Why no acceleration is finite there, in a sentence; "" where each is, or the run moved.
 
     An energy that alone overflows stops no motion.
     """
-    from .trajectory import MotionError
-
     if run.status != "not finite" or run.steps or not len(run):
         return ""
     model, q, qd, held = run._model, run.q[0], run.qd[0], run._u

@@ -7,42 +7,23 @@ and jacobi where that is not the energy.
 from __future__ import annotations
 
 import csv
-import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import Any, ClassVar
 
 import numpy as np
 
 from .arguments import Array, not_one_of
-from .written import replacing
-
-if TYPE_CHECKING:
-    from .model import Model
-
-File = str | os.PathLike[str]
-
-
-class ByName(dict[str, Any]):
-    """What each constraint, loop or event has, by name."""
-
-    def __init__(self, what: str, names: Sequence[str], values: Iterable[Any]) -> None:
-        super().__init__(zip(names, values, strict=True))
-        self.what = what
-
-    def __missing__(self, name: object) -> NoReturn:
-        raise KeyError(not_one_of(self.what, str(name), tuple(self)))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return dict, (dict(self),)
+from .functions import Functions
+from .written import File, replacing
 
 
 class Columns:
     """The columns of a run, (n,), or of a batch, (batch, n); t is (n,) in both."""
 
-    _model: Model
+    _model: Functions
     outputs: Any  # by name
     _params: Array
     __len__: Callable[[], int]

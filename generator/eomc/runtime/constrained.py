@@ -6,7 +6,7 @@ of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -14,13 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, as_number, not_one_of
-from .columns import ByName
-from .drives import drive_forces, driven
-from .equilibrium import equilibrium
+from .by_name import ByName
 from .frames import Frames
-from .functions import row_times
-from .starts import started
-from .trajectory import SAID, STATUS, MotionError, state_text
+from .status import SAID, STATUS, MotionError, state_text
 
 AT_REST, SLOWEST = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
 
@@ -159,32 +155,6 @@ class Constrained(Frames):
         found: Array = self._evaluate(*args)
         return found
 
-    def drive_forces(
-        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, drives: Sequence[str] | None = None,
-        f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, *, t: float = 0.0,
-        params: Parameters = None,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """(tau, lambda): what drives give in a motion, (nq,), and the multipliers, (nc,).
-
-        tau + A^T lambda is `inverse_dynamics` less friction and the scene's other forces at
-        inputs of 0. drives: the coordinates along which they act, all where None; tau is 0 along
-        the others. As many drives as freedoms have one answer; of more the least is taken,
-        tau^T D^-1 tau. Raises ValueError where the drives can't give this motion, or constraints
-        don't allow qdd.
-        """
-        which = driven(self, drives)
-        force = self.inverse_dynamics(q, qd, qdd, f_ext, t=t, params=params)
-        force = force - self.tau(q, qd, t, np.zeros(self.nu) if self.nu else None, params)
-        at, moving = self._state(q, qd)
-        each = self._like(qdd, "qdd", (self.nq,), at)
-        tau, found = np.empty_like(at), np.empty((*at.shape[:-1], len(self._rows.names)), at.dtype)
-        times = row_times(t, at.shape[:-1])
-        for k in np.ndindex(at.shape[:-1]):
-            now = as_number(t if times is None else times[k], "t")
-            state = at[k], moving[k], each[k].astype(float)
-            tau[k], found[k] = drive_forces(self, which, state, force[k].astype(float), now, params)
-        return tau, found
-
     def project(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         held: Sequence[str] | None = None,
@@ -229,35 +199,6 @@ class Constrained(Frames):
     @property
     def _states(self) -> tuple[str, ...]:
         return (*self.coordinates, *(f"{name}_dot" for name in self.coordinates))
-
-    def equilibrium(
-        self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, u: Any = None,
-        free: Collection[str] | None = None, *, t: float = 0.0, params: Parameters = None,
-    ) -> tuple[Any, ...]:  # fmt: skip
-        """(q, u) where no force is left, so that q̈ = 0: by Newton's method from the guess q, u.
-
-        q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates,
-        rates and inputs that are found, all coordinates that move where None; the others stay, as
-        what jumps set does. Where a rate,
-        "charge_dot", is among them, (q, qd, u) comes back: a steady motion, if no force changes
-        along it. u None: the scene's signals. u comes back as (nu,), None where the scene has no
-        inputs. Raises MotionError, status "no convergence", where none is found.
-        """
-        if isinstance(free, str):
-            free = (free,)
-        if not (free is None or isinstance(free, Iterable)):
-            raise ValueError(
-                f"free: {free!r} is no list of names: {', '.join((*self._states, *self.inputs))}"
-            )
-        lone = not isinstance(qd, (list, tuple)) and not np.ndim(qd)
-        moving = np.full(self.nq, as_number(qd, "qd")) if lone else self._completed(qd, 1)
-        q = self._completed(q, 0)
-        at, moving = self._one(*started(self, q, moving, self._parameters(params)))
-        moves = [name for name in self.coordinates if name not in self.still]
-        names = moves if free is None else tuple(free)
-        held = self._inputs(u)
-        found = equilibrium(self, at, moving, held, names, as_number(t, "t"), params)
-        return found if set(names) & set(self._states[self.nq :]) else found[::2]
 
     def _assembled_rows(
         self, q: Array, qd: Array, table: Array, t0: float

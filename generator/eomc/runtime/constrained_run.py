@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .columns import ByName
+from .by_name import ByName
 
 _HOLDS = 2.0**26  # roundings of its terms: more is no rounding
 _LEAST = 1e-9  # of these terms

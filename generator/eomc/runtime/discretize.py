@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy import empty
 
 from .arguments import Array, as_number
 from .functions import for_each, row_times
-from .trajectory import SAID, STATUS, MotionError, state_text
-
-if TYPE_CHECKING:
-    from .model import Model
+from .status import SAID, STATUS, MotionError, state_text
+from .stepping import Stepping
 
 
 def discretize(
-    model: Model, method: str, q: Array, qd: Array, h: float, hold: int | None, t: Any, u: Any,
+    model: Stepping, method: str, q: Array, qd: Array, h: float, hold: int | None, t: Any, u: Any,
     params: Any,
 ) -> tuple[Array, Array]:  # fmt: skip
     """(Phi, Gamma) of a step, or where `hold` is given of so many under inputs that are held.
@@ -48,7 +46,7 @@ def discretize(
 
 
 def _step(
-    model: Model, method: str, out: tuple[Array, Array], q: Array, qd: Array, h: float, t: float,
+    model: Stepping, method: str, out: tuple[Array, Array], q: Array, qd: Array, h: float, t: float,
     u: Any, params: Any,
 ) -> None:  # fmt: skip
     """Fill (Phi, Gamma) of one step from each state."""
@@ -65,7 +63,7 @@ def _step(
 
 
 def _period(
-    model: Model, method: str, q: Array, qd: Array, h: float, hold: int, t: float, u: Any,
+    model: Stepping, method: str, q: Array, qd: Array, h: float, hold: int, t: float, u: Any,
     params: Any,
 ) -> tuple[Array, Array]:  # fmt: skip
     """(Phi, Gamma) of `hold` steps from a state: u, or the signals at their start, held."""

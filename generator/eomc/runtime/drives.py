@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .arguments import Array, Parameters, not_one_of
-from .trajectory import MotionError, state_text
-
-if TYPE_CHECKING:
-    from .constrained import Constrained
+from .constrained import Constrained
+from .status import MotionError, state_text
 
 _DEPENDENT = {"float64": 1e-9, "float32": 1e-4}  # of the largest singular value
 _LEFT = {"float64": 1e-6, "float32": 1e-3}  # of the terms: what drives or rows may leave

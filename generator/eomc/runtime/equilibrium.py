@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .arguments import Array, not_one_of
-from .trajectory import MotionError, state_text
-
-if TYPE_CHECKING:
-    from .constrained import Constrained
+from .constrained import Constrained
+from .status import MotionError, state_text
 
 _MOST = 100  # steps of Newton's method
 _RANK_TOLERANCE = 1e-9  # of the largest singular value of A: a row that is none here

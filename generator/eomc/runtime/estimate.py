@@ -1,21 +1,17 @@
-"""How far a run may be trusted: its error by step doubling, and h against the stability limit."""
+"""How far a run may be trusted: its error by step doubling."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .package import reduced
-
-if TYPE_CHECKING:
-    from .model import Model
-    from .trajectory import Run
+from .recorded import Recorded
 
 Array = NDArray[Any]
 
@@ -74,7 +70,7 @@ class Estimate:
         return reduced("estimate.Estimate", *self.__dict__.values())
 
 
-def estimate(run: Run, progress: Callable[[int, int], None] | None = None) -> Estimate:
+def estimate(run: Recorded, progress: Callable[[int, int], None] | None = None) -> Estimate:
     """The error of a run, from the same run at h/2 and h/4, and finer ones where they differ.
 
     What the finest run leaves is taken from the last difference and the observed order, and
@@ -126,13 +122,13 @@ def estimate(run: Run, progress: Callable[[int, int], None] | None = None) -> Es
 class _Again:
     """The same run in shorter steps or from a moved start, and how far all of them have come."""
 
-    def __init__(self, run: Run, progress: Callable[[int, int], None] | None) -> None:
+    def __init__(self, run: Recorded, progress: Callable[[int, int], None] | None) -> None:
         self.run, self.progress, self.spent = run, progress, 0
 
-    def __call__(self, parts: int, every: int, nudge: Array | None = None) -> Run:
+    def __call__(self, parts: int, every: int, nudge: Array | None = None) -> Recorded:
         """In steps of h/parts, keeping every so many of them."""
         progress = None if self.progress is None else self._report
-        made = self.run._again(parts, every, nudge, progress)
+        made: Recorded = self.run._again(parts, every, nudge, progress)
         self.spent += parts * self.run.steps
         if made.status == "interrupted":
             raise KeyboardInterrupt
@@ -144,7 +140,7 @@ class _Again:
             self.progress(min(self.spent + done, total), total)
 
 
-def _growth(run: Run, own: Array, eps: float, again: _Again) -> tuple[Array, Array, float]:
+def _growth(run: Recorded, own: Array, eps: float, again: _Again) -> tuple[Array, Array, float]:
     """The scales (2 nq,), what a start moved by one scale would become at each row if that were
     little, (n, 2 nq), and by what the largest has grown at the end."""
     nq, every, base = run._model.nq, run.every, own
@@ -176,7 +172,7 @@ def _growth(run: Run, own: Array, eps: float, again: _Again) -> tuple[Array, Arr
     return scale, rows, amplification
 
 
-def _leaps(run: Run, scale: Array, eps: float, again: _Again) -> bool:
+def _leaps(run: Recorded, scale: Array, eps: float, again: _Again) -> bool:
     """Whether differences at the start are as large as they become however small they were.
 
     Forces jump there, as by -sign(qd) at rest: what is moved chatters by what a step brings. That
@@ -195,14 +191,14 @@ def _leaps(run: Run, scale: Array, eps: float, again: _Again) -> bool:
 
 
 def _finer(
-    run: Run, own: Array, scale: Array, one: float, eps: float, again: _Again
-) -> tuple[list[Array], float, Run | None]:
+    run: Recorded, own: Array, scale: Array, one: float, eps: float, again: _Again
+) -> tuple[list[Array], float, Recorded | None]:
     """The rows at h, h/2, h/4 and on until they converge; the order seen; a run that stopped.
 
     one: the rounding of one step relative to the scales.
     """
     found, order = [own], run._model.orders[run.method]
-    stopped: Run | None = None
+    stopped: Recorded | None = None
     parts, last = 1, math.inf
     while True:
         parts *= 2
@@ -226,7 +222,7 @@ def _finer(
         last = now
 
 
-def _nothing(run: Run) -> Estimate:
+def _nothing(run: Recorded) -> Estimate:
     """The start itself has no error."""
     names = [*run._model.coordinates, *(f"{c}_dot" for c in run._model.coordinates)]
     none = np.zeros_like(run.q, dtype=float)
@@ -236,7 +232,7 @@ def _nothing(run: Run) -> Estimate:
     return Estimate(none, none.copy(), zero, digits, order, math.nan, 1.0, "")
 
 
-def _counts(run: Run, every: int, rows: int) -> Array:
+def _counts(run: Recorded, every: int, rows: int) -> Array:
     """The steps done at each row."""
     return np.minimum(np.arange(rows) * every, run.steps)
 
@@ -275,7 +271,7 @@ def _size(x: Array) -> float:
         return float(np.nan_to_num(np.sqrt(np.mean(np.square(x))), nan=np.inf))
 
 
-def _padded(run: Run, rows: int, every: int) -> Array:
+def _padded(run: Recorded, rows: int, every: int) -> Array:
     """The states of a finer run at the run's own rows: nan from where it stopped."""
     out = np.full((rows, 2 * run._model.nq), np.nan)
     kept = rows if run.status == "ok" else min(rows, 1 + run.steps // every)
@@ -284,8 +280,8 @@ def _padded(run: Run, rows: int, every: int) -> Array:
 
 
 def _verdict(
-    run: Run, names: Sequence[str], relative: Array, walk: Array, observed: float, order: int,
-    amplification: float, stopped: Run | None,
+    run: Recorded, names: Sequence[str], relative: Array, walk: Array, observed: float, order: int,
+    amplification: float, stopped: Recorded | None,
 ) -> list[str]:  # fmt: skip
     """What speaks against the run, one reason a string."""
     words = []
@@ -316,105 +312,3 @@ def _verdict(
             f"2^{order}: h is too long yet, forces jump, or rounding decides"
         )
     return words
-
-
-def beyond_end(h: float, duration: float) -> str | None:
-    """A sentence where one step is longer than the whole run is to be."""
-    if not 0 < duration < h * (1 - 1e-12):
-        return None
-    return (
-        f"h = {h:g} s is longer than the duration, {duration:g} s: the run is one step of {h:g} s"
-    )
-
-
-# --- stability ------------------------------------------------------------------------------------
-
-
-def advice(
-    model: Model, q: Array, qd: Array, h: float, t: float, u: Any, params: Any, method: str
-) -> str | None:
-    """A sentence where h is beyond the stability limit of the method at a state, else None.
-
-    The limit is that of the eigenvalues of the linearised motion: largest |imaginary part| and
-    fastest decay against the method's two limits. A mode that is as fast as the differences are
-    short comes from a jump of the forces, and is not counted.
-    """
-    undamped, decaying = model.stability_limits[method]
-    found = _modes(model, q, qd, t, u, params, 1.0)
-    if found is None:
-        return None
-    turning, decay = found
-    longest = min(
-        undamped / turning if turning else math.inf, decaying / decay if decay else math.inf
-    )
-    if not 0 < longest < abs(h):
-        return None
-    if (again := _modes(model, q, qd, t, u, params, 100.0)) is None:
-        return None
-    if max(again) < max(turning, decay) / 2:
-        return None
-    if undamped * decay > decaying * turning:
-        mode = f"fastest decay {decay:.3g} 1/s"
-    else:
-        mode = f"fastest mode {turning:.3g} rad/s"
-    return (
-        f"h = {abs(h):g} s is beyond {method}'s stability limit of about {longest:.2g} s here "
-        f"({mode} at the start)"
-    )
-
-
-def _modes(
-    model: Model, q: Array, qd: Array, t: float, u: Any, params: Any, wide: float
-) -> tuple[float, float] | None:
-    """(largest |Im|, fastest decay) of the eigenvalues at a state, 1/s; None where there are none.
-
-    From the module's own derivatives where they are the motion's, else from differences of the
-    acceleration, `wide` times the usual distance apart. Under constraints the slower of two: of
-    all changes, some of which every step takes back, and of those that rows allow, which turn with
-    the motion.
-    """
-    n, x = model.nq, np.concatenate([q, qd]).astype(float)
-    near = wide * math.sqrt(float(np.finfo(model.dtype).eps)) * np.maximum(1.0, np.abs(x))
-
-    def spectrum(ways: Array) -> tuple[float, float]:
-        moved = near[:, None] * ways
-        if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
-            rates = model.linearize(q, qd, u, t, params)[0].astype(float) @ moved
-        else:
-            states = np.vstack([x, x + moved.T]).astype(model.dtype)
-            a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
-            rates = np.vstack([moved[n:], (a[1:] - a[0]).T])
-        values = np.linalg.eigvals(ways.T @ (rates / near[:, None]))
-        turning, decay = np.max(np.abs(values.imag), initial=0), np.max(-values.real, initial=0)
-        return float(turning), float(decay)
-
-    found: list[tuple[float, float]] = []  # where there are none the run itself reports it
-    with suppress(ArithmeticError, np.linalg.LinAlgError):
-        found.append(spectrum(np.eye(2 * n)))
-    if model.constraint_names:
-        with suppress(ArithmeticError, np.linalg.LinAlgError):
-            found.append(spectrum(_allowed(model, x, t, params, near)))
-    return min(found, key=max, default=None)
-
-
-def _allowed(model: Model, x: Array, t: float, params: Any, near: Array) -> Array:
-    """Changes of x = [q; qd], in units of `near`, that keep constraints: (2 nq, k), orthonormal."""
-    n, holonomic = model.nq, model._rows.holonomic
-    least = math.sqrt(float(np.finfo(model.dtype).eps))
-    q, qd = (half.astype(model.dtype) for half in (x[:n], x[n:]))
-    A = model.constraint_jacobian(q, t=t, params=params).astype(float)
-    sizes = np.maximum(np.linalg.norm(A * near[n:], axis=1), 1e-300)  # rows have units of their own
-    back = A * near[n:] / sizes[:, None]
-    of_q = _kernel((A * near[:n] / sizes[:, None])[:holonomic], least)
-    places = np.vstack([q, x[:n] + (near[:n, None] * of_q).T]).astype(model.dtype)
-    rates = model.constraint_rates(places, np.tile(qd, (len(places), 1)), t, params).astype(float)
-    follow = -np.linalg.pinv(back, rcond=least) @ ((rates[1:] - rates[0]) / sizes).T
-    of_qd = _kernel(back, least)
-    whole = np.block([[of_q, np.zeros((n, of_qd.shape[1]))], [follow, of_qd]])
-    return np.asarray(np.linalg.qr(whole)[0])
-
-
-def _kernel(A: Array, least: float) -> Array:
-    """What A makes zero, (n, k), orthonormal: to `least` of its largest singular value."""
-    _, sizes, rows = np.linalg.svd(A)
-    return np.asarray(rows[np.sum(sizes > least * np.max(sizes, initial=0)) :].T)

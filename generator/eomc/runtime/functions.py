@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from .arguments import Arguments, Array, Parameters, as_flag, as_number, unmasked
 from .slices import slices
-from .trajectory import SAID, STATUS, MotionError, state_text
+from .status import SAID, STATUS, MotionError, state_text
 
 _OF_POSITION = (
     "D", "g", "potential_energy", "frame_poses", "frame_jacobians", "frame_forces",

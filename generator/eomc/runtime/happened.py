@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import index
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
 from .arguments import Array, in_a_line, not_one_of
-
-if TYPE_CHECKING:
-    from .model import Model
+from .compiled import Compiled
 
 INSTEAD = "give tol=, not h, steps or method"
 _EVENTS, _EVENTS_EACH = 1024, 64  # of one call, beside those of a step: of one, of each of many
@@ -79,7 +77,7 @@ class PassedOver(dict[str, Happened]):
         return dict, ()
 
 
-def passed_over(model: Model) -> str:
+def passed_over(model: Compiled) -> str:
     """What to say of fixed steps of a scene with events."""
     sticks = "; friction that sticks is made of them" if model._rows.modes else ""
     law = "; a function as u then takes control_period=" if model.nu else ""
@@ -90,7 +88,7 @@ def passed_over(model: Model) -> str:
 class FoundInBatch:
     """All events of many instances, found in calls by any thread."""
 
-    def __init__(self, model: Model, most: float) -> None:
+    def __init__(self, model: Compiled, most: float) -> None:
         self.model, self.most, self.count = model, most, 0
         self.pieces = list[tuple[Array, Array, Array]]()
 
@@ -122,7 +120,7 @@ class FoundInBatch:
 class GroupRoom:
     """Room for the events of a call of some instances."""
 
-    def __init__(self, model: Model, count: int) -> None:
+    def __init__(self, model: Compiled, count: int) -> None:
         self.counts = np.zeros(count, "l")
         each = _EVENTS_EACH + len(model.events)
         self.which = np.empty((count, each), np.intc)
@@ -137,7 +135,7 @@ class GroupRoom:
 class Found:
     """Room for the events of a call, and all that were found."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Compiled) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
         self.which = np.empty(_EVENTS + len(model.events), np.intc)
         self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)

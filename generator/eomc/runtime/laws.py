@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .arguments import Array
-
-if TYPE_CHECKING:
-    from .functions import Functions
+from .functions import Functions
 
 
 def asked(

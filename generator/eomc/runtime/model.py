@@ -7,7 +7,7 @@ NumPy and cffi only. Angles in rad, everything in SI units.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from math import ceil, isfinite
+from math import isfinite
 from time import perf_counter
 from typing import Any, Never, cast
 
@@ -27,70 +27,28 @@ from .arguments import (
     as_step_size,
     machine_memory,
 )
-from .columns import File
-from .constrained import Constrained, Rows
+from .compiled import CHUNK
 from .discretize import discretize
-from .estimate import advice, beyond_end
-from .happened import passed_over
 from .laws import Law, Sampled
-from .package import reduced, warn
+from .package import warn
 from .shown import with_events
 from .slices import longer
+from .stability import advice
 from .starts import started
-from .trajectory import SAID, STATUS, Interrupted, MotionError, Run, state_text
+from .status import STATUS, Interrupted
+from .stepping import Stepping
+from .trajectory import Run
+from .written import File
 
 Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
-_MANY = 1000  # steps from which a run is not taken in one call
 SOME = 20  # steps from which a look at the stability limit is worth its time, once a method and h
 LARGE = 2**24  # positions from which a look at the memory is worth its time
-_CHUNK = 16_384  # steps times coordinates before the first look, some ms
 RARELY = 2**48  # steps from row to row, more than any run makes
-_MOST = 2**60  # steps, so that C can return four times as many
 
 
-class Model(Constrained):
+class Model(Stepping):
     """The functions of one compiled scene; the package hands them on under their own names."""
-
-    source: Any = None  # what eomc.load made it from, a path or a System; pictures need it
-
-    def __init__(
-        self, extension: Any, *, h: float, duration: float,
-        methods: Mapping[str, tuple[int, int, float, float]], tolerance: float | None = None,
-        events: tuple[str, ...] = (), constrained: tuple[Any, ...] = (), **scene: Any,
-    ) -> None:  # fmt: skip
-        """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
-        super().__init__(extension, **scene)
-        self.h, self.duration, self.tolerance = h, duration, tolerance
-        self.events = events
-        self._rows = Rows(*constrained)
-        self.methods = tuple(methods)
-        self._facts = dict(methods)
-        self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
-        self._warned: set[Any] = set()  # methods with a step size, and u
-        self._room = 0  # for the steps of an adaptive run
-
-    @property
-    def orders(self) -> dict[str, int]:
-        """The order of each method."""
-        return {name: order for name, (order, *_) in self._facts.items()}
-
-    @property
-    def stability_limits(self) -> dict[str, tuple[float, float]]:
-        """The stability limits of each method: h omega undamped, h lambda decaying."""
-        return {name: (turn, decay) for name, (_, _, turn, decay) in self._facts.items()}
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return reduced("_model._again", self.digest)
-
-    def _again(self, digest: str, what: str = "this was pickled") -> Model:
-        """Itself, found by a value that was kept; a warning where the scene was another then."""
-        if digest != self.digest:
-            warn(
-                f"{self.name}: {what} from another version of the scene; what is "
-                "computed from it now is of the present version"
-            )
-        return self
 
     def load_run(self, file: File) -> Any:
         """A run, or a batch, that `save` has written to an .npz file; its columns are the same.
@@ -111,45 +69,6 @@ class Model(Constrained):
         """The classes of its runs by their names."""
         return {x.__name__: x for x in (Run, timed.TimedRun, adaptive.AdaptiveRun)}
 
-    def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
-        """A method's step and loop in C, steps at once, stages; what is kept and counted."""
-        step, run = (getattr(self._lib, f"{name}_{what}") for what in ("step", "run"))
-        work = self._ffi.typeof(f"{name}_work *")
-        counted = getattr(self._lib, f"{name}_evaluations", None)
-        short = (
-            -1 if counted or self._rows.names or self.events else min(_MANY - 1, _CHUNK // self.nq)
-        )
-        return step, run, short, stages, work, counted
-
-    def step(
-        self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
-        params: Parameters = None, method: str | None = None,
-        out: tuple[Array, Array] | None = None,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """(q, qd) one step of size h later; u, (nu,) or a dict, is held over the step.
-
-        u None: the scene's signals, followed through the step. Raises MotionError where the step
-        can't be made; `out` is untouched then.
-        """
-        from_q, from_qd, at, moving = self._read(q, qd, many=False)
-        h = self.h if h is None else as_step_size(h, self.dtype)
-        inputs, p = self._given(u, params)
-        address, real, null = self._c
-        if out is None:
-            both = empty((2, self.nq), self.dtype)
-            ends, to_q, to_qd = (both[0], both[1]), address(real, both), null
-        else:
-            ends = self._pair(out, at.shape)
-            to_q, to_qd = address(real, ends[0]), address(real, ends[1])
-        step = self._loops[self._method(method)][0]
-        found = step(to_q, to_qd, from_q, from_qd, as_number(t, "t"), h, inputs, p)
-        if found:
-            said = STATUS[found]
-            raise MotionError(
-                f"no step from t = {t:.9g}, {state_text(at, moving)}: {SAID[said]}", said
-            )
-        return ends
-
     def discretize(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
         params: Any = None, method: str | None = None, *, control_period: float | None = None,
@@ -166,47 +85,6 @@ class Model(Constrained):
         h = self.h if h is None else as_step_size(h, self.dtype)
         hold = None if control_period is None else as_period(control_period, h)
         return discretize(self, self._method(method), at, moving, h, hold, t, u, params)
-
-    def _method(self, method: str | None) -> str:
-        """The name of a method that the module has."""
-        if method is None:
-            return self.methods[0]
-        if not isinstance(method, str) or method not in self.methods:
-            raise ValueError(
-                f"method: {method!r} is not in this module, which has {', '.join(self.methods)}: "
-                "a scene asks for several with a list, [run] method = [...]"
-            )
-        return method
-
-    def _stepper(self, method: str | None, what: str) -> Any:
-        """The C function of a method: its step, run or batch."""
-        return getattr(self._lib, f"{self._method(method)}_{what}")
-
-    def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
-        """So many fixed steps; warns, once, that they pass over events."""
-        steps = None if steps is None else as_count(steps, "steps", 0)
-        if self.events and steps != 0 and "events" not in self._warned:
-            self._warned.add("events")
-            warn(f"{self.name}: {passed_over(self)}")
-        if steps is not None:
-            if duration is not None:
-                raise ValueError("steps: give steps or duration, not both")
-            if steps > _MOST:
-                shown = f"{steps:.3g}" if steps < 10**300 else "so many"
-                raise ValueError(f"steps: {shown} are more than a run can count, {_MOST:.3g}")
-            return steps
-        time = self.duration if duration is None else as_number(duration, "duration")
-        if words := beyond_end(h, time):
-            warn(f"{self.name}: {words}")
-        if time < 0:
-            raise ValueError(f"duration: {duration} is not a time in s")
-        if time / h > _MOST:
-            raise ValueError(
-                f"duration: {time:g} s are more steps of h = {h:g} s than a run can count, "
-                f"{_MOST:.3g}: take a larger h, or a shorter duration"
-            )
-        # the first multiple of h that is not before the duration, rounding aside
-        return ceil(time / h * (1 - 1e-12))
 
     def simulate(
         self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
@@ -354,7 +232,7 @@ class Model(Constrained):
         to_q, to_qd = address(real, q_rows), address(real, qd_rows)
         at_u = null if held is None else address(real, held)
         # a step of an implicit method may solve for all its stages
-        done, chunk = 0, hold if law else _CHUNK // (nq**3 if counted else nq) or 1
+        done, chunk = 0, hold if law else CHUNK // (nq**3 if counted else nq) or 1
         # what goes from one call to the next, and what is counted; a single call may do without
         single = steps <= chunk and counted is None and not self._rows.names
         work = null if single else self._ffi.new(work_type)

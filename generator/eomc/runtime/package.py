@@ -29,7 +29,7 @@ def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
 
 
 def made(path: str, arguments: tuple[Any, ...]) -> Any:
-    """What lies at a path in this package, such as "trajectory.MotionError", called."""
+    """What lies at a path in this package, such as "status.MotionError", called."""
     package: Any = import_module(str(__package__))
     return functools.reduce(getattr, path.split("."), package)(*arguments)
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import ceil
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from .adaptive_memory import PART
 from .arguments import Array, as_step_size, machine_memory
+from .compiled import Compiled
 from .laws import Sampled, asked
-
-if TYPE_CHECKING:
-    from .model import Model
+from .status import PART
 
 NO_PERIOD = (
     "u: a function is asked once a control period, and steps that fit a tolerance don't tell how "
@@ -39,7 +37,7 @@ def held_at(times: Array, t0: float, period: float, values: Array) -> Array:
 
 
 def as_acting(
-    model: Model, u: Any, control_period: float | None, span: float, params: Any
+    model: Compiled, u: Any, control_period: float | None, span: float, params: Any
 ) -> Array | Periods | None:
     """The inputs of a run by a tolerance as `Acting` takes them, or a ValueError."""
     period = None
@@ -75,7 +73,7 @@ def as_acting(
     return _few(model, Periods(u, period), span)
 
 
-def _few(model: Model, made: Periods, span: float) -> Periods:
+def _few(model: Compiled, made: Periods, span: float) -> Periods:
     """The same, or a MemoryError where a run can't keep its rows."""
     count = periods_in(span, made.period)
     if count * (model._bytes(1) + _VALUE) > PART * machine_memory():
@@ -100,7 +98,13 @@ class Acting:
     """The inputs of a run on its way: what C takes now, and the time until which that holds."""
 
     def __init__(
-        self, model: Model, u: Array | Periods | None, t0: float, t_end: float, q: Array, qd: Array
+        self,
+        model: Compiled,
+        u: Array | Periods | None,
+        t0: float,
+        t_end: float,
+        q: Array,
+        qd: Array,
     ) -> None:
         self.model, self.t0, self.t_end, self.stop = model, t0, t_end, t_end
         self.periods = u if isinstance(u, Periods) else None

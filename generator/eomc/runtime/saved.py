@@ -7,24 +7,21 @@ import os
 import zipfile
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .arguments import Array
+from .compiled import Compiled
 from .shown import eventful
-from .written import replacing
-
-if TYPE_CHECKING:
-    from .columns import Columns, File
-    from .model import Model
+from .written import File, replacing
 
 KINDS = ("Run", "AdaptiveRun", "TimedRun", "BatchRun", "TimedBatchRun", "AdaptiveBatchRun")
 _WRITTEN = 'load_run reads what run.save("NAME.npz") wrote'
 _KIND = "eomc {} 1"  # and the version of what such a file holds
 
 
-def write(run: Columns, path: Path) -> None:
+def write(run: Any, path: Path) -> None:
     """All of a run or batch: its columns q, qd, u, energies and what makes it again."""
     model = run._model
     arrays: dict[str, Any] = {
@@ -50,7 +47,7 @@ def _text(events: Any) -> str:
         return ""
 
 
-def read(model: Model, file: File) -> tuple[Model, str, dict[str, Any]]:
+def read(model: Compiled, file: File) -> tuple[Any, str, dict[str, Any]]:
     """The model of a saved run, its kind, one of KINDS, and what it kept.
 
     The model is another than was given where a call had asked for events.
@@ -79,18 +76,18 @@ def read(model: Model, file: File) -> tuple[Model, str, dict[str, Any]]:
     return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in found.items()}
 
 
-def _asked(model: Model, found: dict[str, Array], file: File) -> Model:
+def _asked(model: Compiled, found: dict[str, Array], file: File) -> Any:
     """The model with the events that a saved run's call asked for."""
     known = vars(model).get("_eventful", {}).values()
     if same := [other for other in known if other.digest == found["digest"]]:
-        return same[0]  # type: ignore[no-any-return]
+        return same[0]
     if not (text := str(found["asked"])):
         raise ValueError(
             f"{file}: its events= had formulas of SymPy, which files don't keep: call "
             f"{model.name}.simulate(events=...) with the same ones first; numpy.load reads its rows"
         )
     try:
-        return eventful(model, json.loads(text))  # type: ignore[no-any-return]
+        return eventful(model, json.loads(text))
     except Exception as fault:
         fault.add_note(
             f"{file}: was made with events=, which are compiled to load it; numpy.load reads its "

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import ceil
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,10 +17,9 @@ from .dense import parts, within
 from .estimate import Estimate, estimate
 from .laws import Law
 from .slices import longer
-from .trajectory import STATUS, Run
-
-if TYPE_CHECKING:
-    from .model import Model
+from .status import STATUS
+from .stepping import Stepping
+from .trajectory import Run
 
 _ROWS = 4096  # of the run whose error is estimated, at least, where it has as many steps
 _FIRST = 16_384  # steps times coordinates before the first look, some ms
@@ -71,10 +70,11 @@ class TimedRun(Run):
         u = self._u if at is None or self._gave is None else self._gave
         if isinstance(u, np.ndarray) and u.ndim == 2:
             u = u[: -(-steps // self._hold)]
-        return model._trajectory(
+        made: Run = model._trajectory(
             q, qd, pointer(q), pointer(qd), self.h, steps, every, u, self._params,
             pointer(self._params), self.method, self.t0, None, None, self._hold, at,
         )  # fmt: skip
+        return made
 
     def _even(self) -> Run:
         return self._whole(1)
@@ -95,17 +95,17 @@ class TimedRun(Run):
         return super()._kept() | own
 
     @classmethod
-    def _of_kept(cls, model: Model, kept: Mapping[str, Any], **own: Any) -> Run:
-        made: Any = super()._of_kept(model, kept, _times=kept["times"], _begin=kept["begin"])
+    def _of_kept(cls, model: Stepping, kept: Mapping[str, Any], **own: Any) -> Self:
+        made = super()._of_kept(model, kept, _times=kept["times"], _begin=kept["begin"])
         made._gave = kept.get("values")
-        return made  # type: ignore[no-any-return]
+        return made
 
     def _settings(self) -> tuple[Any, ...]:
         return (*super()._settings(), self._times.tolist())
 
 
 def as_asked(
-    model: Model, times: ArrayLike | None, t0: float, h: float, duration: float | None,
+    model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
     steps: int | None, every: int, out: Any,
 ) -> tuple[Array | None, int | None]:  # fmt: skip
     """Times (n,), and the steps to the last of them or beyond; where there are none (None, steps).
@@ -123,7 +123,7 @@ def as_asked(
 
 
 def run(
-    model: Model, q: Array, qd: Array, t0: float, h: float, steps: int, times: Array,
+    model: Stepping, q: Array, qd: Array, t0: float, h: float, steps: int, times: Array,
     acts: tuple[Law | None, Array | None, int, int], p: Array, method: str,
     progress: Callable[[int, int], None] | None,
 ) -> TimedRun:  # fmt: skip
@@ -173,7 +173,7 @@ class _Way:
     """A run on its way: the state behind `done` steps, and what goes from call to call of C."""
 
     def __init__(
-        self, model: Model, q: Array, qd: Array, t0: float, h: float, steps: int,
+        self, model: Stepping, q: Array, qd: Array, t0: float, h: float, steps: int,
         acts: tuple[Law | None, Array | None, int, int], p: Array, method: str,
     ) -> None:  # fmt: skip
         self.model, self.t0, self.h, self.steps = model, t0, h, steps

@@ -10,9 +10,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import get_ident
 
+File = str | os.PathLike[str]
+
 
 @contextmanager
-def replacing(file: str | os.PathLike[str]) -> Iterator[Path]:
+def replacing(file: File) -> Iterator[Path]:
     """A name beside `file`, with its suffix, for what takes its place when all is written.
 
     Where that fails or is interrupted the file is as it was, and nothing is beside it. Of a link

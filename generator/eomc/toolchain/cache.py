@@ -299,8 +299,8 @@ def unpickled(name: str, folder: str, alias: str, path: str, arguments: tuple[An
         if alias not in sys.modules:
             alias = load(Built(name, Path(folder), False)).__name__
     except (OSError, ValueError, KeyError, ImportError):
-        if path == "trajectory.MotionError":
-            from eomc.runtime.trajectory import MotionError
+        if path == "status.MotionError":
+            from eomc.runtime.status import MotionError
 
             return MotionError(*arguments)
         raise EomcError(

@@ -1,0 +1,136 @@
+"""What many instances of a scene start with: their states, parameters and inputs, a row each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arguments import Array, Params, named, unmasked
+from .model import LARGE, Model
+from .starts import started
+
+
+class Instances(Model):
+    """A model that takes arguments of many instances, and steps them."""
+
+    def __init__(self, extension: Any, **scene: Any) -> None:
+        super().__init__(extension, **scene)
+        self._whole = (self._ffi.typeof("long[]"), self._ffi.typeof("int[]"))  # done, status
+        # what takes a step of many, by the method
+        self._batch_steps = {x: self._stepper(x, "batch_step") for x in (None, *self.methods)}
+        # seconds a step of an instance, by the function that makes it and how many they are, to a
+        # power of two (few fill no register); they only cut work up
+        self._paces: dict[Any, float] = {}
+
+    def step_batch(self, *_: Any, **__: Any) -> Any:
+        """One step of many instances, as `BatchModel` makes it."""
+        raise NotImplementedError
+
+    def _instances(
+        self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any,
+        steps: int | None, t0: float | None = None,
+    ) -> tuple[tuple[Array, Array], Array, Array | None, Array | None]:  # fmt: skip
+        """((q, qd), parameters, inputs), one row an instance; a single one serves for all.
+
+        q and qd may be what was given: they are to be read only, and not known to be finite. t0:
+        when they start, on the constraints. Behind them the status of each, (batch,), where one
+        can't be assembled there, else None.
+        """
+        start, table = self._start, self._parameter_rows(params)
+        if params is not None and self._follows:
+            q0, qd0 = started(self, q0, qd0, table)
+        q = self._rows_of(start[0] if q0 is None else self._completed(q0, 0), "q0")
+        qd = self._rows_of(start[1] if qd0 is None else self._completed(qd0, 1), "qd0")
+        held = self._input_rows(u, steps)
+        sizes = {
+            "q0": 1 if q.ndim == 1 else len(q),
+            "qd0": 1 if qd.ndim == 1 else len(qd),
+            "params": len(table),
+            "u": 1 if held is None else len(held),
+        }
+        if empty := [name for name, size in sizes.items() if not size]:
+            raise ValueError(f"{empty[0]}: no instances")
+        whose, count = next((x for x in sizes.items() if x[1] > 1), ("q0", 1))
+        for name, size in sizes.items():
+            if size not in (1, count):
+                hint = ": a table over time for all is (1, steps, nu)" if name == "u" else ""
+                raise ValueError(f"{name}: {size} instances where {whose} has {count}{hint}")
+
+        if whose == "u" and held is not None and np.ndim(u) == 2 and len(held) == steps:
+            one, each = f"(1, {steps}, {self.nu})", f"({steps}, 1, {self.nu})"
+            raise ValueError(
+                f"u: shape {np.shape(u)} may be a table over time or one row an instance: give "
+                f"{one} for a table, {each} for as many instances"
+            )
+
+        whole = (count, self.nq)  # broadcast_to takes a while even where nothing is to be done
+        q, qd = (x if x.shape == whole else np.broadcast_to(x, whole) for x in (q, qd))
+        codes = None
+        if t0 is not None:
+            q, qd, codes = self._assembled_rows(q, qd, table, t0)
+        return (q, qd), table, held, codes
+
+    def _rows_of(self, given: ArrayLike, name: str) -> Array:
+        """(nq,) or (n, nq); an array that is that already need not be contiguous, nor finite."""
+        if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == self.nq:
+            unmasked(given, name)
+            if given.dtype in (self.dtype, np.float64) and given.flags.aligned:
+                return given
+        return self._array(given, name, self.nq)
+
+    def _parameter_rows(self, params: Any) -> Array:
+        if params is None or isinstance(params, Params):
+            return self._parameters(params)[None]
+        if isinstance(params, (list, tuple)) and any(isinstance(p, Mapping) for p in params):
+            raise ValueError('params: give one dict of arrays, {"m": [1, 2]}, no list of dicts')
+        if not isinstance(params, Mapping):
+            array = self._numbers(params, "params")
+            if array.ndim == 2 and array.shape[1] == len(self.parameters):
+                if not np.isfinite(array).all():
+                    raise ValueError("params: not all numbers are finite")
+                return array
+            return self._parameters(params)[None]
+        params = named(params)
+        sizes = {name: np.size(value) for name, value in params.items() if np.ndim(value)}
+        count = max(sizes.values(), default=1)
+        table = np.tile(self._p0, (count, 1))
+        for name, value in params.items():
+            if name not in self.parameters:
+                self._parameters({name: 0.0})  # raises, with the names there are
+            column = self._numbers(value, f"params: {name}")
+            if np.ndim(value) > 1 or (np.ndim(value) and len(column) != count):
+                raise ValueError(f"params: {name} has shape {column.shape}, expected ({count},)")
+            if not np.isfinite(column).all():
+                raise ValueError(f"params: {name} is not finite everywhere")
+            table[:, self.parameters.index(name)] = column
+        return table
+
+    def _input_rows(self, u: Any, steps: int | None) -> Array | None:
+        """(batch or 1, steps or 1, nu); steps None: inputs are held over the run."""
+        if u is None:
+            return None
+        if not self.nu:
+            raise ValueError("u: this scene has no inputs")
+        if callable(u):
+            raise ValueError("u: a Python function can't be called for many at once: give a table")
+        if type(u) is not np.ndarray and isinstance(u, Mapping):
+            u = self._by_name(u)
+        if type(u) is np.ndarray and u.dtype is self.dtype and u.flags.carray:
+            array = u
+        else:
+            array = self._numbers(u, "u")
+        if array.ndim < 3:
+            array = array[:, None] if array.ndim == 2 else array.reshape(1, 1, -1)
+        if array.ndim != 3 or array.shape[2] != self.nu or array.shape[1] not in (1, steps):
+            shapes, wide = f"({self.nu},), (batch, {self.nu})", f"(batch, {steps}, {self.nu})"
+            table = ": rows, each held over a control period, take control_period=, in s"
+            over = f" or {wide}" if steps else table
+            raise ValueError(f"u: shape {np.shape(u)}, expected {shapes}{over}")
+        at = self._pointer(array)
+        for k in range(0, array.size, LARGE):
+            if not self._lib.all_finite(min(LARGE, array.size - k), at + k):
+                raise ValueError("u: not all numbers are finite")
+        return array

@@ -1,0 +1,22 @@
+"""What each constraint, loop or event has, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NoReturn
+
+from .arguments import not_one_of
+
+
+class ByName(dict[str, Any]):
+    """Raises KeyError with the names that there are, where one is not among them."""
+
+    def __init__(self, what: str, names: Sequence[str], values: Iterable[Any]) -> None:
+        super().__init__(zip(names, values, strict=True))
+        self.what = what
+
+    def __missing__(self, name: object) -> NoReturn:
+        raise KeyError(not_one_of(self.what, str(name), tuple(self)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (dict(self),)

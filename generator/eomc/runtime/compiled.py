@@ -1,0 +1,82 @@
+"""A compiled scene with the facts of its methods, its tolerance and its events."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+from .constrained import Rows
+from .package import reduced, warn
+from .statics import Statics
+
+MANY = 1000  # steps from which a run is not taken in one call
+CHUNK = 16_384  # steps times coordinates before the first look, some ms
+
+
+class Compiled(Statics):
+    """What runs need to know of a scene."""
+
+    source: Any = None  # what eomc.load made it from, a path or a System; pictures need it
+
+    def __init__(
+        self, extension: Any, *, h: float, duration: float,
+        methods: Mapping[str, tuple[int, int, float, float]], tolerance: float | None = None,
+        events: tuple[str, ...] = (), constrained: tuple[Any, ...] = (), **scene: Any,
+    ) -> None:  # fmt: skip
+        """methods: order, stages and stability limits (h omega undamped, h lambda decaying)."""
+        super().__init__(extension, **scene)
+        self.h, self.duration, self.tolerance = h, duration, tolerance
+        self.events = events
+        self._rows = Rows(*constrained)
+        self.methods = tuple(methods)
+        self._facts = dict(methods)
+        self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
+        self._warned: set[Any] = set()  # methods with a step size, and u
+        self._room = 0  # for the steps of an adaptive run
+
+    @property
+    def orders(self) -> dict[str, int]:
+        """The order of each method."""
+        return {name: order for name, (order, *_) in self._facts.items()}
+
+    @property
+    def stability_limits(self) -> dict[str, tuple[float, float]]:
+        """The stability limits of each method: h omega undamped, h lambda decaying."""
+        return {name: (turn, decay) for name, (_, _, turn, decay) in self._facts.items()}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("_model._again", self.digest)
+
+    def _again(self, digest: str, what: str = "this was pickled") -> Self:
+        """Itself, found by a value that was kept; a warning where the scene was another then."""
+        if digest != self.digest:
+            warn(
+                f"{self.name}: {what} from another version of the scene; what is "
+                "computed from it now is of the present version"
+            )
+        return self
+
+    def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:
+        """A method's step and loop in C, steps at once, stages; what is kept and counted."""
+        step, run = (getattr(self._lib, f"{name}_{what}") for what in ("step", "run"))
+        work = self._ffi.typeof(f"{name}_work *")
+        counted = getattr(self._lib, f"{name}_evaluations", None)
+        short = (
+            -1 if counted or self._rows.names or self.events else min(MANY - 1, CHUNK // self.nq)
+        )
+        return step, run, short, stages, work, counted
+
+    def _method(self, method: str | None) -> str:
+        """The name of a method that the module has."""
+        if method is None:
+            return self.methods[0]
+        if not isinstance(method, str) or method not in self.methods:
+            raise ValueError(
+                f"method: {method!r} is not in this module, which has {', '.join(self.methods)}: "
+                "a scene asks for several with a list, [run] method = [...]"
+            )
+        return method
+
+    def _stepper(self, method: str | None, what: str) -> Any:
+        """The C function of a method: its step, run or batch."""
+        return getattr(self._lib, f"{self._method(method)}_{what}")

@@ -1,0 +1,153 @@
+"""What a run by a tolerance keeps besides its rows: its steps, its events, what it was asked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from .arguments import Array
+from .begun import infinite_at_start
+from .by_name import ByName
+from .happened import Happened
+from .periods import held_at
+from .recorded import LEFT_OUT
+from .status import SAID, state_text
+from .stepping import Stepping
+from .trajectory import Run
+
+_NONE = (np.empty(0, np.intc), np.empty((0, 1)))  # events
+STOPPED = (
+    "no step is short enough to go on: forces grow without end there, as in a fall into a centre, "
+    "or keep jumping: for friction by sign(x_dot) that sticks {}, or let events switch it; else a "
+    "looser tolerance"
+)
+REMEDIES = (
+    'take friction = "stick" in [run]',
+    "give its coordinate friction = in place of the force",  # where the scene has that
+)
+
+
+@dataclass(eq=False, repr=False)
+class Fitted(Run):
+    """What `adaptive.AdaptiveRun` keeps, and what follows from that alone."""
+
+    tol: float = field(kw_only=True)
+    rejected: int = field(kw_only=True)
+    stiff_steps: int = field(kw_only=True)
+    _times: Array = field(kw_only=True)
+    _t_end: float = field(kw_only=True)
+    # what few runs have is set behind: a run of few steps takes no longer than its making
+    _h_most: float = field(default=0.0, init=False)
+    _stiff: bool = field(default=False, init=False)
+    _happened: tuple[Array, Array] = field(default=_NONE, init=False)  # which, rows of t, q, qd
+    stopped: str = field(default="", init=False)
+    limit: float = field(default=float("nan"), init=False)
+    _period: float = field(default=0.0, init=False)  # over which inputs are held, if any are,
+    _held: Array | None = field(default=None, init=False)  # and these, (n, nu)
+
+    @property
+    def t(self) -> Array:
+        """The times of the rows, (n,), s."""
+        return self._times
+
+    @cached_property
+    def _begin(self) -> Array:
+        """q and qd at t0, (2, nq): its first row, where nobody said otherwise."""
+        return np.array([self._rows[0][0], self._rows[1][0]])
+
+    @property
+    def message(self) -> str:
+        """What happened, in a sentence."""
+        done = f"{self.steps} steps, {self.told}"
+        if self.status == "ok":
+            return done
+        if self.status == "not finite" and self.stopped:
+            return f"event '{self.stopped}' jumps to no finite state at t = {self.t[-1]:.9g} s"
+        if self.status == "accumulated":
+            return (
+                f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
+                f"run ends, after {done}"
+            )
+        remedy = REMEDIES[bool(self._model._rows.modes)]
+        said = STOPPED.format(remedy) if self.status == "no convergence" else SAID[self.status]
+        said = infinite_at_start(self) or said
+        where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
+        end = self.t[-1] if len(self) else self.t0
+        return f"stopped at t = {end:.9g} after {done}, {where}: {said}"
+
+    @cached_property
+    def events(self) -> dict[str, Happened]:
+        """Where and when each of the scene's events happened."""
+        which, rows = self._happened
+        nq, names = self._model.nq, self._model.events
+        each = (rows[which == k] for k in range(len(names)))
+        found = (Happened(x[:, 0], x[:, 1 : 1 + nq], x[:, 1 + nq :]) for x in each)
+        return ByName("events", names, found)
+
+    @property
+    def told(self) -> str:
+        """How its steps were chosen, in words."""
+        stiff = f", {self.stiff_steps} by Newton's method" if self.stiff_steps else ""
+        return f"{self.rejected} rejected{stiff}, tolerance {self.tol:g}"
+
+    def __repr__(self) -> str:
+        how = "" if self.status == "ok" else f"{self.status} after "
+        return f"<Run of {self._model.name}: {how}{self.steps} steps, tolerance {self.tol:g}>"
+
+    def _at(self, times: Array, rows: Array) -> Self:
+        """Itself with other rows, (2, n, nq)."""
+        made = copy(self)
+        made._begin = self._begin
+        for name in ("q", "qd", "outputs"):  # which are kept once they were made
+            made.__dict__.pop(name, None)
+        made._rows, made._times, made._energy = rows, times, None
+        made._told_inputs()
+        return made
+
+    def _told_inputs(self) -> None:
+        """Find which of the values that are held over periods acts at each row."""
+        if self._held is not None:
+            self._applied = held_at(self._times, self.t0, self._period, self._held)
+
+    def _again(self, parts: int, every: int, nudge: Array | None, progress: Any) -> Run:
+        raise ValueError("an adaptive run has no steps of one size")
+
+    def _kept(self) -> dict[str, Any]:
+        own = {
+            "tol": self.tol, "rejected": self.rejected, "stiff_steps": self.stiff_steps,
+            "times": self.t, "h_most": self._h_most, "stiff": self._stiff, "begin": self._begin,
+            "t_end": self._t_end, "which": self._happened[0],
+            "event_rows": self._happened[1], "stopped": self.stopped, "limit": self.limit,
+            "period": self._period, "values": self._held,
+        }  # fmt: skip
+        return super()._kept() | own
+
+    @classmethod
+    def _of_kept(cls, model: Stepping, kept: Mapping[str, Any], **own: Any) -> Self:
+        held, values = kept.get("held"), kept.get("values")
+        made = cls(
+            model, kept["t0"], (kept["q"], kept["qd"]), kept["h"], kept["steps"], kept["status"],
+            kept["params"], 1, held if values is None or held is not None else LEFT_OUT,
+            kept["method"], kept["evaluations"],
+            tol=kept["tol"], rejected=kept["rejected"], stiff_steps=kept.get("stiff_steps", 0),
+            _times=kept["times"], _t_end=kept["t_end"],
+        )  # fmt: skip
+        made._h_most, made._stiff = kept["h_most"], bool(kept.get("stiff", False))
+        made._begin, made._happened = kept["begin"], (kept["which"], kept["event_rows"])
+        made.stopped, made.limit = kept["stopped"], kept["limit"]
+        made._period, made._held = kept.get("period", 0.0), values
+        made._told_inputs()
+        return made
+
+    def _state(self) -> dict[str, Any]:
+        found = super()._state() | {"_times": self._times}
+        found.pop("events", None)
+        return found
+
+    def _settings(self) -> tuple[Any, ...]:
+        return (*super()._settings(), self.tol, self._times.tolist())

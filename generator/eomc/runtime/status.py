@@ -1,0 +1,60 @@
+"""How runs and calls end: their statuses in words, and the errors that tell them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .arguments import Array
+from .package import reduced
+
+PART = 0.4  # of the machine's memory: where a run ends, what was kept is copied once
+FULL = "out of memory"  # the status of a run that ends since no more can be kept
+REMEDY = (
+    f"rows and events fill {100 * PART:.0f} % of this machine's memory: keep fewer rows with "
+    "times=, or, where events never cease, end sooner with duration="
+)
+STATUS = ("ok", "singular", "not finite", "no convergence", "accumulated", "locked")
+SAID = {
+    "singular": "D is not positive definite there, so no acceleration exists",
+    "not finite": "the state would no longer be finite: the step may be too long, "
+    "or the motion runs into a singularity",
+    "no convergence": "the iteration for the step does not converge: take a smaller h",
+    "locked": "no state near obeys the constraints: they contradict one another there, the "
+    "position is singular, as that of a stretched leg is (eomc dof tells; guess a bent one), or "
+    "the step is far too long",
+    "interrupted": "interrupted",
+    FULL: REMEDY,
+}
+
+
+class MotionError(ArithmeticError):
+    """There is no acceleration or step at a state; `status` says why, as that of a run."""
+
+    def __init__(self, message: str, status: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("status.MotionError", str(self), self.status)
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a simulation; `run` holds what was done until then."""
+
+    def __init__(self, run: Any) -> None:
+        super().__init__(run.message)
+        self.run = run
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("status.Interrupted", self.run)
+
+
+def state_text(q: Array, qd: Array) -> str:
+    """A state in a message."""
+
+    def text(x: Array) -> str:
+        return np.array2string(x + 0.0, precision=6, threshold=12)  # no -0
+
+    return f"q = {text(q)}, qd = {text(qd)}"

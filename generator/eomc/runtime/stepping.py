@@ -1,0 +1,81 @@
+"""Steps of a compiled scene: one by each method, and how many fixed ones a run has."""
+
+from __future__ import annotations
+
+from math import ceil
+from typing import Any
+
+from numpy import empty
+from numpy.typing import ArrayLike
+
+from .arguments import Array, Parameters, as_count, as_number, as_step_size
+from .compiled import Compiled
+from .happened import passed_over
+from .package import warn
+from .stability import beyond_end
+from .status import SAID, STATUS, MotionError, state_text
+
+_MOST = 2**60  # steps, so that C can return four times as many
+
+
+class Stepping(Compiled):
+    """A compiled scene that makes steps."""
+
+    def step(
+        self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
+        params: Parameters = None, method: str | None = None,
+        out: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """(q, qd) one step of size h later; u, (nu,) or a dict, is held over the step.
+
+        u None: the scene's signals, followed through the step. Raises MotionError where the step
+        can't be made; `out` is untouched then.
+        """
+        from_q, from_qd, at, moving = self._read(q, qd, many=False)
+        h = self.h if h is None else as_step_size(h, self.dtype)
+        inputs, p = self._given(u, params)
+        address, real, null = self._c
+        if out is None:
+            both = empty((2, self.nq), self.dtype)
+            ends, to_q, to_qd = (both[0], both[1]), address(real, both), null
+        else:
+            ends = self._pair(out, at.shape)
+            to_q, to_qd = address(real, ends[0]), address(real, ends[1])
+        step = self._loops[self._method(method)][0]
+        found = step(to_q, to_qd, from_q, from_qd, as_number(t, "t"), h, inputs, p)
+        if found:
+            said = STATUS[found]
+            raise MotionError(
+                f"no step from t = {t:.9g}, {state_text(at, moving)}: {SAID[said]}", said
+            )
+        return ends
+
+    def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
+        """So many fixed steps; warns, once, that they pass over events."""
+        steps = None if steps is None else as_count(steps, "steps", 0)
+        if self.events and steps != 0 and "events" not in self._warned:
+            self._warned.add("events")
+            warn(f"{self.name}: {passed_over(self)}")
+        if steps is not None:
+            if duration is not None:
+                raise ValueError("steps: give steps or duration, not both")
+            if steps > _MOST:
+                shown = f"{steps:.3g}" if steps < 10**300 else "so many"
+                raise ValueError(f"steps: {shown} are more than a run can count, {_MOST:.3g}")
+            return steps
+        time = self.duration if duration is None else as_number(duration, "duration")
+        if words := beyond_end(h, time):
+            warn(f"{self.name}: {words}")
+        if time < 0:
+            raise ValueError(f"duration: {duration} is not a time in s")
+        if time / h > _MOST:
+            raise ValueError(
+                f"duration: {time:g} s are more steps of h = {h:g} s than a run can count, "
+                f"{_MOST:.3g}: take a larger h, or a shorter duration"
+            )
+        # the first multiple of h that is not before the duration, rounding aside
+        return ceil(time / h * (1 - 1e-12))
+
+    def _trajectory(self, *_: Any) -> Any:
+        """A run by fixed steps from checked arguments, as `Model` makes it."""
+        raise NotImplementedError
