@@ -18,6 +18,7 @@ from eomc.model.system import Constraint, System, symbol, t
 from eomc.program import ranks
 from eomc.program.assembly import assembled
 from eomc.program.manifold import Manifold
+from eomc.program.walks import walk
 from eomc.scene.read import parse
 
 NAMES = list(constrained.cases())
@@ -401,7 +402,7 @@ def test_a_walk_stays_on_the_rows(name: str) -> None:
     manifold = Manifold(made)
     place = manifold.place(start_of(made)[0])
     assert place is not None
-    found = list(ranks.walk(manifold, place))
+    found = list(walk(manifold, place, ranks.POSITIONS))
     assert len(found) == (ranks.POSITIONS if made.closure and made.closure.freedoms else 0)
     for there in found:
         assert np.max(np.abs(there.phi)) < 1e-14 * (1 + np.max(np.abs(there.q)))

@@ -19,8 +19,8 @@ def command(scene: Path, as_json: bool) -> None:
     """Count a scene's freedoms, from its bodies and joints, and say which are redundant.
 
     Of a scene with constraints or loops also the rank of their rows and the freedoms that they
-    leave, which rows are redundant, how near the start is to a singular position, and where it is
-    assembled.
+    leave, which rows are redundant, how near the start is to a singular position, and with one
+    freedom its whole way, and where it is assembled.
 
     \b
     eomc dof scenes/arm.toml
@@ -37,6 +37,7 @@ def command(scene: Path, as_json: bool) -> None:
         counted, lines = found.as_dict(), [found.table()]
     if read.constrained:
         from eomc import pipeline
+        from eomc.program import singular
 
         system = pipeline.read(scene)
         assert system.closure is not None
@@ -46,6 +47,9 @@ def command(scene: Path, as_json: bool) -> None:
             "qd": {f"{c.name}_dot": c.rate for c in system.coordinates},
         }
         lines.append(system.closure.table())
+        if nearest := singular.nearest(system):
+            counted["constraints"]["nearest_singular"] = vars(nearest)
+            lines.append(str(nearest))
         start = (f"{c.name} = {c.start:.9g}" for c in system.coordinates)
         lines.append(f"  assembled start: {', '.join(start)}")
     say(json.dumps(counted, indent=1) if as_json else "\n".join(lines))

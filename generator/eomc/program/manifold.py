@@ -87,6 +87,11 @@ class Place:
         sizes = np.sqrt(np.sum(B**2, axis=0))
         return np.where(sizes > 0, sizes, 1.0)
 
+    @property
+    def slopes(self) -> Vector:
+        """(m,): sqrt(A D^-1 A^T) of each row."""
+        return np.where(np.any(self.A != 0, axis=1), self.sizes, 0.0)
+
     @cached_property
     def levels(self) -> Vector:
         """(m,): how much a row changes where all coordinates change by themselves."""

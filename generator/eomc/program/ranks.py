@@ -16,13 +16,11 @@ from typing import Any
 import numpy as np
 
 from eomc.program.interpret import context
-from eomc.program.manifold import RANK_TOLERANCE, Flags, Frame, Manifold, Place, Vector
+from eomc.program.manifold import RANK_TOLERANCE, Frame, Manifold, Place, Vector
+from eomc.program.walks import along, walk
 
 POSITIONS = 12  # beside the start
 MANY, FEWER = 24, 3  # rows of a large system; positions of one whose rank is full at the start
-STEPS = 6  # from one to the next
-FIRST, LONGEST = 0.1, 0.3  # of a step, in coordinates' own units
-BENT = 0.1  # of a step: the correction back onto the rows, at most
 SAME = 1e-20  # of a row: it is a sum of others in forty digits
 GOOD = 1e-2  # of the singular value of all rows: what that of the kept ones is at least
 BETTER = 1.02  # times another set's: a set is better
@@ -64,7 +62,7 @@ def ranks(manifold: Manifold, start: Place) -> Ranks:
     found, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)
     weights = tuple(start.weights.tolist()) if singular else ()
-    slopes = tuple(np.max([_slopes(place) ** 2 for place in places], axis=0).tolist())
+    slopes = tuple(np.max([place.slopes**2 for place in places], axis=0).tolist())
     latest = max(place.t for place in places)
     return replace(found, weights=weights, slopes=slopes, latest=latest)
 
@@ -114,7 +112,7 @@ def _sums(
     if manifold.timed or not set(shared) <= set(manifold.holonomic) or len(shared) > MIXED:
         return ()
     places = [start, *islice(along(manifold, start), ALONG)]
-    usual = np.max([_slopes(place) for place in places], axis=0)[shared]
+    usual = np.max([place.slopes for place in places], axis=0)[shared]
     free, spans = np.ones(len(start.q), dtype=bool), list[Vector]()
     for place in places:
         B = Frame(place, free, manifold.rows).B[shared] * (place.sizes[shared] / usual)[:, None]
@@ -176,82 +174,9 @@ def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
             reach = max(reach, KNOWN * float(np.max(np.abs(place.q))))
             q = [place.q + reach * random.normal(size=len(place.q)) for _ in range(BESIDE)]
             found = [p for p in (manifold.place(x, place.t) for x in q) if p is not None]
-            beside = np.max([_slopes(p) for p in found], axis=0, initial=0.0)
-            flat = [k for k in flat if _slopes(place)[k] < FLAT * beside[k]]
+            beside = np.max([p.slopes for p in found], axis=0, initial=0.0)
+            flat = [k for k in flat if place.slopes[k] < FLAT * beside[k]]
     return tuple(flat)
-
-
-def _slopes(place: Place) -> Vector:
-    """(m,): of each row, sqrt(A D^-1 A^T)."""
-    return np.where(np.any(place.A != 0, axis=1), place.sizes, 0.0)
-
-
-def walk(manifold: Manifold, start: Place, positions: int = POSITIONS) -> Iterator[Place]:
-    """Places that hold the rows, reached from the start by small steps in random directions."""
-    random = np.random.default_rng(17)
-    free = np.ones(len(start.q), dtype=bool)
-    span = manifold.system.run.duration if manifold.timed else 0.0
-    place, step = start, FIRST
-    for _ in range(positions):
-        heading = random.normal(size=len(start.q))
-        moved, steps = False, 0
-        for _ in range(8 * STEPS):
-            frame = Frame(place, free, manifold.holonomic)
-            unit = np.sqrt(np.diag(place.metric))
-            way = frame.along(heading / unit)
-            size = float(np.max(np.abs(way), initial=0))
-            drift = span / positions / STEPS * min(1.0, step / FIRST)
-            if size <= 1e-12 * float(np.max(1 / unit)) and not drift:
-                return  # no freedom
-            way = way * (step / size) if size > 0 else way
-            there = _moved(manifold, place, way, drift, free)
-            if there is None:
-                step /= 2
-                if step < 1e-9:
-                    break
-                continue
-            place, moved, steps, step = there, True, steps + 1, min(LONGEST, 1.5 * step)
-            if steps == STEPS:
-                break
-        if moved:
-            q, held = manifold.polished(place, free)
-            if held:
-                place = manifold.place(np.array([float(x) for x in q]), place.t) or place
-            yield place
-
-
-def along(manifold: Manifold, start: Place) -> Iterator[Place]:
-    """Places on one way along the rows, each a small step from the last: round a linkage."""
-    free, place, step = np.ones(len(start.q), dtype=bool), start, FIRST
-    way = np.random.default_rng(17).normal(size=len(start.q)) / np.sqrt(np.diag(start.metric))
-    while step > 1e-9:
-        way = Frame(place, free, manifold.holonomic).along(way)
-        size = float(np.max(np.abs(way), initial=0))
-        if size == 0:
-            return
-        there = _moved(manifold, place, way * (step / size), 0.0, free)
-        if there is None:
-            step /= 2
-            continue
-        place, step = there, min(LONGEST, 1.5 * step)
-        yield place
-
-
-def _moved(
-    manifold: Manifold, place: Place, way: Vector, drift: float, free: Flags
-) -> Place | None:
-    """The place a step on; None where it is too long to be sure of it."""
-    aimed = manifold.place(place.q + way, place.t + drift)
-    if aimed is None:
-        return None
-    frame = Frame(aimed, free, manifold.holonomic)
-    length = frame.length(way) + 1e-9 * frame.length(np.ones(len(way)))
-    if not drift and frame.length(frame.onto(aimed.phi)) > BENT * length:
-        return None
-    found, held = manifold.descend(aimed.q, free, aimed.t)
-    if not held or found is None:
-        return None
-    return found if drift or frame.length(found.q - aimed.q) <= 2 * BENT * length else None
 
 
 def _chosen(
