@@ -60,6 +60,16 @@ def test_the_pole_is_balanced_within_the_limits() -> None:
 
 @pytest.mark.slow
 @needs_scipy
+def test_the_quadrotor_comes_to_hover() -> None:
+    text = said("quadrotor.py")
+    assert text.startswith("12 states")
+    end = np.array(numbers(text.partition("[")[2].partition("]")[0], r"(\S+)"))
+    assert np.allclose(end, [0, 0, 1, 1, 0, 0, 0], atol=1e-3)
+    assert all(x < 1e-9 for x in numbers(text, r"within (\S+), the run is exact to (\S+)"))
+
+
+@pytest.mark.slow
+@needs_scipy
 def test_the_pole_is_swung_up() -> None:
     text = said("swing_up.py")
     assert numbers(text, r"upright from t = (\S+) s")[0] < 10

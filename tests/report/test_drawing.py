@@ -53,7 +53,7 @@ def test_drawings_are_as_they_were_read(name):
 
 
 @pytest.mark.parametrize("made", [chain, humanoid, *(lambda n=n: scene(n) for n in ("satellite",
-    "quadrotor", "crane", "suspension", "tumbling_box", "chain"))])  # fmt: skip
+    "slung_load", "crane", "suspension", "tumbling_box", "chain"))])  # fmt: skip
 def test_frames_are_where_the_other_kinematics_has_them(made):
     made = made()
     run = motion(made, rows=3)
@@ -115,11 +115,11 @@ def test_a_rail_is_as_long_as_the_travel():
 
 def test_a_scene_in_space_that_stays_in_a_plane_is_drawn_there():
     assert drawn(scene("crane")).axes == "xz"
-    assert drawn(scene("quadrotor")).axes == "xyz"
+    assert drawn(scene("slung_load")).axes == "xyz"
 
 
 def test_gravity_says_what_is_up():
-    text = (OWN / "quadrotor.toml").read_text()
+    text = (OWN / "slung_load.toml").read_text()
     assert drawn(parse(text)).up == 2
     assert drawn(parse(text.replace('[0, 0, "-9.81"]', '[0, "-9.81", 0]'))).up == 1
 
@@ -133,7 +133,7 @@ def test_a_free_body_is_the_box_of_its_inertia():
 
 def test_wheels_are_drawn_where_no_line_shows_how_they_turn():
     assert len(marks(drawn(scene("satellite")), "inertia")) == 3
-    assert len(marks(drawn(scene("quadrotor")), "inertia")) == 1  # not the load on its rope
+    assert len(marks(drawn(scene("slung_load")), "inertia")) == 1  # not the load on its rope
 
 
 TWINS = """
@@ -260,7 +260,7 @@ def test_what_has_no_value_is_left_out():
 
 
 def test_far_travel_is_told():
-    made = scene("quadrotor")
+    made = scene("slung_load")
     run = motion(made)
     assert not drawing(system(made), run.t, run.q).travels
     run.q[:, 0] += 100 * run.t

@@ -32,7 +32,7 @@ from eomc.verify import symbolic
 pytestmark = pytest.mark.slow
 KATEX = Path(__file__).parents[2] / "build" / "katex" / "node_modules"
 ALL = sorted(SCENES.glob("*.toml"))
-PICTURED = ("arm", "ball_beam", "crane", "quadrotor", "satellite")
+PICTURED = ("arm", "ball_beam", "crane", "slung_load", "satellite")
 # forces of every kind, a gear, a rotor, a slide on a slanted axis, a spring, a row: all at once
 LARGE = """
 eomc = 1

@@ -99,7 +99,7 @@ def test_a_spring_reaches_from_end_to_end():
 
 
 def test_a_mechanism_that_travels_is_shown_where_it_starts():
-    made = scene("quadrotor")
+    made = scene("slung_load")
     run = motion(made)
     run.q[:, 0] += 100 * run.t
     shown = picture.Mechanism(run.t, drawing(system(made), run.t, run.q))

@@ -14,8 +14,8 @@ pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
 
 GOLDEN = Path(__file__).parent / "images"
-NAMES = """acrobot anymal arm ball_beam bead_on_hoop cartpole chain crane
-furuta_pendulum heavy_top quadrotor satellite spring_pendulum suspension tumbling_box ur5""".split()
+NAMES = """acrobot anymal arm ball_beam bead_on_hoop cartpole chain crane furuta_pendulum
+heavy_top slung_load satellite spring_pendulum suspension tumbling_box ur5""".split()
 SIZE, BLOCK = 192, 8  # pixels
 TOLERANCE = 25  # of 255, of the mean of a block: versions of matplotlib smooth lines differently
 

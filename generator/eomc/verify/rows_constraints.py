@@ -46,6 +46,8 @@ def report(of: Comparison) -> None:
         of.row(name, LIMIT, UNITS, partial(of.value, name))
     if of.dtype == np.float64:  # single precision leaves differences too few digits
         of.row("A beside differences", SLOPE, "of A", rows.slopes)
+        if of.system.run.sloped and not of.system.modes:
+            of.row("tangent", SLOPE, "of the rows' slopes", rows.tangent)
     of.row("power of multipliers", LIMIT, UNITS, rows.power)
     if of.system.reactions:
         limit = max(WORK, ROUNDED * of.eps)
@@ -106,14 +108,40 @@ class Rows:
 
         return of.largest(error)
 
-    def _slope(self, s: State, field: str, i: int, step: float) -> Vector:
+    def tangent(self) -> float:
+        """What rows and their rates change by along changes that keep them, by differences: 0."""
+        moving = [i for i, q in enumerate(self.system.q) if q in self.system.rates]
+        steps = {"q": self.of.sampler.spread, "qd": self.of.sampler.speed}
+
+        def error(e: Expected) -> float:
+            s, n = e.state, len(self.system.q)
+            T = self.module.tangent(s.q, s.qd, t=s.t, params=s.params)
+
+            def off(width: float) -> float:
+                J = np.zeros((2, len(self.holonomic), 2 * n))
+                for half, (field, sizes) in enumerate(steps.items()):
+                    for i in moving:
+                        at = field, i, width * sizes[i]
+                        if field == "q":
+                            J[0, self.holonomic, i] = self._slope(s, *at)[self.holonomic]
+                        J[1, :, half * n + i] = self._slope(s, *at, name="constraint_rates")
+                size = np.abs(J) @ np.abs(T) + np.max(np.abs(J), axis=2, keepdims=True)
+                return float(np.max(np.abs(J @ T) / (size + 1e-300), initial=0))
+
+            return min(off(width) for width in (0.1, 0.03, 0.01, 0.003, 1e-3))
+
+        return self.of.largest(error, 2)
+
+    def _slope(
+        self, s: State, field: str, i: int, step: float, name: str = "constraints"
+    ) -> Vector:
         total = np.zeros(len(self.system.constraints))
         for n, weight in STENCIL:
             for k in (n, -n):
                 x = getattr(s, field).copy()
                 x[i] += k * step
                 at = replace(s, **{field: x})
-                total += (weight if k > 0 else -weight) * ask(self.module, "constraints", at) / step
+                total += (weight if k > 0 else -weight) * ask(self.module, name, at) / step
         return total
 
     def power(self) -> float | Finding:

@@ -40,7 +40,7 @@ def report(of: Comparison) -> None:
     limit = max(OF_MULTIPLIERS if formulas.multipliers else SLOPE_LIMIT, LIMIT * of.eps)
     for module, form in of.forms:
         of.row(f"{form}outputs", LIMIT, "units of rounding", partial(_values, of, module, formulas))
-        if of.system.run.linearize:
+        if of.system.run.sloped:
             unit, slopes = "of the largest derivative", partial(_slopes, of, module, formulas)
             of.row(f"{form}outputs: C, D", limit, unit, slopes)
 
