@@ -96,8 +96,9 @@ def unexplained(name: str, text: str, folder: Path) -> list[str]:
 def behind_steps(name: str, source: str) -> set[int]:
     """What refuses the end of a step under constraints, counts singular positions, judges these.
 
-    Where a step is lost, its stages nearly always are before; these linkages have no singular
-    positions on their way. Nor do they lie near zero, where positions are assembled to rounding.
+    Where a step is lost, or its derivatives, its stages nearly always are before; these linkages
+    have no singular positions on their way. Nor do they lie near zero, where positions are
+    assembled to rounding.
     tests/runtime/test_constrained_runs.py has others that do.
     """
     found: set[int] = set()
@@ -112,7 +113,15 @@ def behind_steps(name: str, source: str) -> set[int]:
         rounds = (rounds or "if (pass && 2*off > before)" in line) and line != " " * 8 + "}"
         if rounds:
             found.add(number)
-        within = (within or bool(re.match(rf".*\b{name}_projected\(.*[^;]$", line))) and line != "}"
+        within = (
+            within
+            or bool(
+                re.match(
+                    rf".*\b{name}_(projected|\w*derivative\w*|stage_slopes|projection_along)\(.*[^;]$",
+                    line,
+                )
+            )
+        ) and line != "}"
         refuses = within and re.search("return|break", line) and "OK" not in line
         if refuses or re.match(r"\s+x\.first = \(\w+\)\(first \+ n\)\*h;", line):
             found.add(number)

@@ -59,7 +59,9 @@ class Refusals:
     def report(self) -> None:
         """Add them."""
         row = self.check.row
-        if not self.check.system.constraints:  # which hold what has no inertia of its own
+        if self.check.system.constraints:
+            self.report_constrained()
+        else:
             self.report_singular()
         row("not finite", 0, "calls that do not refuse", self.odd)
         for method in self.check.methods:
@@ -76,7 +78,32 @@ class Refusals:
         row("singular D: refusals", 0, "calls that do not refuse", self.refuse)
         row("singular D in a run", 0, "runs that go on", self.run_into)
 
+    def report_constrained(self) -> None:
+        """Add those about D that is negative along changes that rows allow."""
+        row, unit = self.check.row, "calls that do not refuse"
+        row("negative D along the rows", 0, unit, self.held)
+        row("negative D along the rows: refusals", 0, unit, self.refuse)
+
     # where D is singular
+
+    def held(self) -> float:
+        """How often the module finds accelerations where D is negative along the rows.
+
+        Rows hold what has no inertia of its own, so that D alone says nothing.
+        """
+        wrong = 0
+        for s in self.suspects():
+            with np.errstate(all="ignore"):
+                D, A = (
+                    np.asarray(self.check.reference.evaluate(name, s.q, s.qd, 0.0, None, s.params))
+                    for name in ("D", "constraint_jacobian")
+                )
+            if _least_along(D, A) < -CLEAR:
+                if self.accelerate(s)[0] == SINGULAR:
+                    self.singular.append(s)
+                else:
+                    wrong += not self.lost(s, D)
+        return float(wrong)
 
     def definite(self) -> float:
         """How often the module finds D regular where it is not, or singular where it is regular."""
@@ -174,14 +201,15 @@ class Refusals:
 
     def refuse(self) -> float:
         """How many calls at singular states do not refuse, or write all the same."""
-        wrong = 0
+        wrong, run = 0, self.check.system.run
         for s in self.singular[:: max(1, len(self.singular) // 24)]:
             wrong += not self.accelerate(s)[1]
             wrong += not self.raises(partial(self.call, "acceleration", s), "singular")
             for method in self.check.methods:
                 wrong += not self.stays(method, s, "singular")
-            if self.model.has_slopes:
-                wrong += not self.raises(partial(self.call, "linearize", s), "singular")
+            sloped = {"linearize": self.model.has_slopes, "discretize": run.discretize}
+            for name in (name for name, there in sloped.items() if there):
+                wrong += not self.raises(partial(self.call, name, s), "singular")
         return float(wrong)
 
     def call(self, name: str, s: State) -> Any:
@@ -203,7 +231,10 @@ class Refusals:
         step = partial(self.module.step, s.q, s.qd, t=s.t, out=out, **way)
         if not self.raises(step, status) or not np.all(np.array(out) == MARK):
             return False
-        run = self.check.simulate(s, method=method, steps=5)
+        try:
+            run = self.check.simulate(s, method=method, steps=5)
+        except ArithmeticError:  # D puts a start onto the rows, too
+            return bool(self.check.system.constraints)
         kept = np.array_equal(run.q, np.asarray([s.q], run.q.dtype))
         return bool(kept and run.status == status and run.steps == 0 and "stopped" in run.message)
 
@@ -359,3 +390,20 @@ def _least(D: Vector) -> Vector:
     least[known] = np.linalg.eigvalsh(scaled[known])[:, 0]
     empty = np.any(diagonal == 0, axis=1) & np.all(np.isfinite(D), axis=(1, 2))
     return np.asarray(np.where(empty, 0.0, least))
+
+
+def _least_along(D: Vector, A: Vector) -> float:
+    """The least eigenvalue of D, (nq, nq), along what rows A, (m, nq), make zero, scaled as above.
+
+    nan: not to be judged, as where rows depend on one another.
+    """
+    size = np.sqrt(np.abs(np.diag(D)))
+    size = np.where(size > 0, size, 1.0)
+    rows = np.linalg.norm(A / size, axis=1)
+    if not (np.all(np.isfinite(D)) and np.all(np.isfinite(A)) and np.all(rows > 0)):
+        return math.nan
+    _, s, V = np.linalg.svd(A / size / rows[:, None])
+    if len(s) and s[-1] < CLEAR:
+        return math.nan
+    N = V[len(s) :].T
+    return float(np.linalg.eigvalsh(N.T @ (D / np.outer(size, size)) @ N)[0]) if N.size else 0.0

@@ -179,7 +179,9 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             changes=lane.linear("changes", "d", offset=False),
             sincos=lane.sincos,
             signal=signal,
-            signal_call=signal.function.call(u="now") if signal else "",
+            signal_call=""
+            if signal is None or made.given_signals
+            else signal.function.call(u="now"),
             rates=rates,
             rates_call=lane.velocity.function.call(k="&k", point="0")
             if parts

@@ -70,6 +70,13 @@ class Steppers:
         target = self.accelerations.target
         return "signal" in target.program and not target.signal_state
 
+    @property
+    def given_signals(self) -> bool:
+        """Whether all that asks for accelerations has the signals already."""
+        run = self.accelerations.target.system.run
+        alone = run.methods == ("rk4",) and run.tolerance is None
+        return self.shared_signals and alone and not self.predicted
+
     def accelerate(self, lane: Lane, **passed: str) -> str:
         """A call of the accelerations of a lane, with other expressions for some arguments."""
         if self.accelerations.angles:

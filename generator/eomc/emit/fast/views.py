@@ -68,7 +68,10 @@ class LibraryText(Prefixed, Laned):
 
 @dataclass(frozen=True)
 class LaneText(Laned):
-    """c/fast/lane.c.jinja. angles: their number, in C. rates: finished text."""
+    """c/fast/lane.c.jinja. angles: their number, in C. rates: finished text.
+
+    signal_call: where accelerations have to find the signals.
+    """
 
     TEMPLATE: ClassVar[str] = "c/fast/lane.c"
     prefix: str
