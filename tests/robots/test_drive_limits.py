@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -37,7 +38,7 @@ LIMITS = {
     "geared": [-1, 2],  # of the control, before the gear
     "gained": [-3, 2],  # the force -4 u within -8 and 12
     "weak": [-0.4, 0.3],  # the joint takes -3 to 4 N m of -10 u
-    "servo": [-7, 7],  # of the force, which is the input, before the gear
+    "servo": [-1, 1],  # of its set point; those of its force are in its law
     "first": [-1, 1],  # and second, idle and odd have none
 }
 
@@ -85,12 +86,24 @@ def test_limits_of_mjcf_are_those_of_the_input_before_the_gear(tmp_path: Path) -
     assert taken(scene) == LIMITS
     for words in (
         "limits of drives: 5 of 8 inputs have them, and act within; without are second, idle, odd",
-        "limits of force on joints that several inputs share: e",
-        "limits of controls whose law is left out, kept as notes: servo",
+        "limits of force on joints that several inputs, or tendons, drive: e",
         "ranges of actuators that exclude each other: odd",
     ):
         assert words in said, said
     assert "limits of actuators" not in said
+    law = "servo_kp*(servo - 2*d)"
+    assert scene["definitions"]["servo_force"] == f"min(max({law}, -7), 7)"
+    (tmp_path / "free").mkdir()
+    scene = imported(tmp_path / "free", mjcf(*"abcdefg"))[1]
+    assert scene["definitions"]["servo_force"] == law and not taken(scene)
+
+
+def test_what_a_joint_takes_is_a_limit_of_its_servo(tmp_path: Path) -> None:
+    text = mjcf("d").replace('name="d" ', 'name="d" actuatorfrcrange="-8 20"')
+    servo = re.search("<position.*", MOTORS)[0]
+    text = text.replace(MOTORS, servo)
+    _, scene = imported(tmp_path, text, "--limits")
+    assert scene["definitions"]["servo_force"] == "min(max(servo_kp*(servo - 2*d), -4), 7)"
 
 
 @pytest.mark.parametrize("words", [("--no-drives",), ("--lock", "slide=0", "--lock", "end=0")])
@@ -115,17 +128,17 @@ def test_they_act(tmp_path: Path, quickly_compiled: None) -> None:
 
 @pytest.mark.slow
 def test_the_forces_are_those_of_mujoco(tmp_path: Path, quickly_compiled: None) -> None:
-    """What drives each joint, of controls within and beyond all ranges; a servo's law is ours."""
+    """What drives each joint, of controls within and beyond all ranges."""
     mujoco = pytest.importorskip("mujoco", reason="pip install eomc[robots]")
-    text = mjcf(*"abc").split('<position name="servo"')[0] + "</actuator></mujoco>"
+    text = mjcf(*"abcd").split('<motor name="first"')[0] + "</actuator></mujoco>"
     imported(tmp_path, text, "--limits")
     m = eomc.load(tmp_path / "robot.toml", tmp_path)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     random = np.random.default_rng(0)
     for scale in (0.2, 1, 5, 20):
-        for u in random.normal(0, scale, (20, 3)):
-            data.ctrl[:] = u
+        for u, q in random.normal(0, scale, (20, 2, 4)):
+            data.ctrl[:], data.qpos[:] = u, q
             mujoco.mj_forward(model, data)
-            force = m.tau([0, 0, 0], [0, 0, 0], u=u)
+            force = m.tau(q, np.zeros(4), u=u)
             np.testing.assert_allclose(force, data.qfrc_actuator, rtol=1e-12)

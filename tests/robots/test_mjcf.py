@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mjcf_text import BALL, BODY, CLOSE, PI, model, reported
 
+from eomc.robots.robot import Law
 from eomc.robots.rotations import IDENTITY
 
 # ---- frames and joints
@@ -172,7 +173,7 @@ def test_motors_become_drives_with_their_gear(tmp_path: Path) -> None:
     actuators = """<actuator>
       <motor name="m" joint="j" gear="150" ctrlrange="-1 1" forcerange="-9 9"/> <motor joint="j"/>
       <general name="g" joint="j" gear="2" gainprm="3"/>
-      <position name="p" joint="j" kp="10" gear="4"/> <motor name="t" tendon="t"/>
+      <muscle name="p" joint="j" gear="4"/> <motor name="t" site="t"/>
     </actuator>"""
     robot = model(tmp_path, BODY, after=actuators)
     assert [(d.name, d.coordinate, d.gear) for d in robot.drives] == [
@@ -183,8 +184,8 @@ def test_motors_become_drives_with_their_gear(tmp_path: Path) -> None:
     ]
     assert robot.drives[0].note == "input from -1 to 1; force from -9 to 9"
     assert "limits of actuators, kept as notes: m" in robot.left_out
-    assert reported(robot, "laws of actuators", "p (position)")
-    assert reported(robot, "actuators on tendons", ": t")
+    assert reported(robot, "laws of actuators", "p (muscle)")
+    assert reported(robot, "actuators on sites", ": t")
 
 
 def test_armature_and_damping_of_actuators_count_by_the_gear_squared(tmp_path: Path) -> None:
@@ -199,8 +200,7 @@ def test_a_shortcut_does_not_inherit_the_law_of_another(tmp_path: Path) -> None:
     actuators = '<actuator><motor name="m" joint="j"/><general name="g" joint="j"/></actuator>'
     robot = model(tmp_path, BODY, defaults, actuators)
     assert [d.gear for d in robot.drives] == [5, 5]
-    assert reported(robot, "laws of actuators", "g (position)")
-    assert not reported(robot, "laws of actuators", "m (")
+    assert [d.law for d in robot.drives] == [None, Law((7, 0, 0), (0, -7, 0))]
 
 
 HOME = """<keyframe> <key name="other" qpos="1"/>
@@ -245,7 +245,6 @@ def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
         ("sites (2)", "s1, s2"),
         ("contacts of geoms", "floor"),
         ("shapes of geoms without contact", "ball"),
-        ("gravcomp", "a"),
         ("stiffness in the square", "j"),
         ("springdamper", "j"),
         ("limits of joints", "j"),

@@ -7,9 +7,7 @@ from dataclasses import replace
 
 from eomc.base import texts
 from eomc.base.errors import EomcError
-from eomc.robots.robot import UNLIMITED, Robot
-
-Range = tuple[float, float]  # the least and the largest
+from eomc.robots.robot import UNLIMITED, Range, Robot
 
 # what readers say of limits that act now, and of those of position and speed beside them
 _ACTING = re.compile(r"limits of (actuators|the actuators' force on joints), kept as notes")
@@ -34,27 +32,34 @@ def both(one: Range, other: Range) -> Range | None:
 def limited(robot: Robot) -> Robot:
     """The robot with limits of drives as those of their inputs; with those of its joint's force.
 
-    A joint that several drives share has the sum of their forces within its own limits, which no
-    limits of inputs can say: these are told and left out. Raises EomcError where none has limits.
+    Servos have limits of their forces besides. A joint that several drives share, or tendons pull,
+    has the sum of their forces within its own limits: these are told and left out. Raises
+    EomcError where none has limits.
     """
-    on = [d.coordinate for d in robot.drives]
+    on = [q for d in robot.drives for _, q in robot.along(d.coordinate)]
     driven = {m.name: m.driven for m in robot.motions if m.driven != UNLIMITED}
+    alone = {d.coordinate for d in robot.drives if on.count(d.coordinate) == 1}
     drives, apart = [], []
     for d in robot.drives:
-        found: Range | None = d.limits
-        if d.coordinate in driven and on.count(d.coordinate) == 1:
-            found = both(d.limits, through(driven[d.coordinate], d.gear))
+        found: Range | None = d.ends
+        if d.coordinate in driven and d.coordinate in alone:
+            found = both(d.ends, through(driven[d.coordinate], d.gear))
         if found is None:
             apart.append(d.name)
-        drives.append(replace(d, limits=found or d.limits))
-    free = [d.name for d in drives if d.limits == UNLIMITED]
+        elif d.law:
+            d = replace(d, law=replace(d.law, force=found))
+        else:
+            d = replace(d, limits=found)
+        drives.append(d)
+    free = [d.name for d in drives if d.limits == d.ends == UNLIMITED]
     if len(free) == len(drives):
         raise EomcError("--limits: no input of this robot has limits")
     many = len(drives) - len(free)
     told = [f"limits of drives: {many} of {len(drives)} inputs have them, and act within"]
     told[0] += f"; without are {texts.listed(free, 4)}" if free else ""
-    if shared := sorted({q for q in driven if on.count(q) > 1}):
-        told.append(f"limits of force on joints that several inputs share: {texts.listed(shared)}")
+    if shared := sorted(q for q in driven if q in on and q not in alone):
+        words = "limits of force on joints that several inputs, or tendons, drive"
+        told.append(f"{words}: {texts.listed(shared)}")
     if apart:
         told.append(f"limits of force that exclude those of the input: {texts.listed(apart)}")
     others = (

@@ -17,7 +17,8 @@ from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
 BARE = "no <inertial>"  # the note of a link that has none, and no shape
-UNLIMITED = (-math.inf, math.inf)
+Range = tuple[float, float]  # the least and the largest
+UNLIMITED: Range = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ class Motion:
     stiffness: float = 0.0
     rest: float = 0.0
     mimics: Mimic | None = None
-    limits: tuple[float, float] = UNLIMITED
-    driven: tuple[float, float] = UNLIMITED
+    limits: Range = UNLIMITED
+    driven: Range = UNLIMITED
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class RobotBody:
     its coordinates and its unit `axes` in the joint's frame. offset (m) and rotation: the joint's
     frame in the parent's, v_parent = offset + rotation v_joint. mass: kg. center: m, in the
     body's frame. inertia: kg m^2, of the centre of mass, along the body's axes. point: whether it
-    only marks a place on its parent.
+    only marks a place on its parent. lifted: the share of its weight that a force takes.
     """
 
     name: str
@@ -79,20 +80,90 @@ class RobotBody:
     inertia: Inertia = NO_INERTIA
     note: str = ""
     point: bool = False
+    lifted: float = 0.0
+
+
+@dataclass(frozen=True)
+class Law:
+    """A force that follows what it acts on: gain times an input, plus bias.
+
+    gain, bias: each of 1, of the length and of the velocity. force: within which it stays.
+    """
+
+    gain: Vector
+    bias: Vector
+    force: Range = UNLIMITED
+
+    @property
+    def kp(self) -> float:
+        """How stiff it is along the length."""
+        return -self.bias[1]
+
+    @property
+    def kv(self) -> float:
+        """How it damps the velocity."""
+        return -self.bias[2]
+
+    @property
+    def set_point(self) -> str:
+        """What pulls toward the input, "kp" or, where that is a velocity, "kv"; "" for none."""
+        gain, *more = self.gain
+        if not gain or any(more):
+            return ""
+        return "kp" if gain == self.kp else "kv" if gain == self.kv and not self.kp else ""
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is a number times the input."""
+        return not any((*self.gain[1:], *self.bias))
 
 
 @dataclass(frozen=True)
 class Drive:
-    """An input that acts along a coordinate with the force gear times its value.
+    """An input that acts along a coordinate, or a tendon, with the force gear times its value.
 
-    limits: of the input, in its own unit, before the gear.
+    law: of which that is the input; its length is gear times the coordinate, and gear times its
+    force acts. limits: of the input, in its own unit, before the gear. start: the input at first.
     """
 
     name: str
     coordinate: str
     gear: float = 1.0
     note: str = ""
-    limits: tuple[float, float] = UNLIMITED
+    limits: Range = UNLIMITED
+    law: Law | None = None
+    start: float = 0.0
+
+    @property
+    def ends(self) -> Range:
+        """Within which its force stays, before the gear."""
+        return self.law.force if self.law else self.limits
+
+    @property
+    def most(self) -> float:
+        """The largest force that acts, infinite where nobody says."""
+        return abs(self.gear) * max(map(abs, self.ends)) if self.gear else 0.0
+
+
+@dataclass(frozen=True)
+class Tendon:
+    """A sum of coordinates, each with its factor, that acts as its length does.
+
+    stiffness, damping, armature: along it. rest: the length, or the ends of those, where the
+    spring pulls nothing.
+    """
+
+    name: str
+    terms: tuple[tuple[float, str], ...]
+    stiffness: float = 0.0
+    damping: float = 0.0
+    armature: float = 0.0
+    rest: Range = (0.0, 0.0)
+
+    @property
+    def acts(self) -> bool:
+        """Whether it has an effect of its own, and not by a drive alone."""
+        return bool(self.stiffness or self.damping or self.armature)
 
 
 @dataclass(frozen=True)
@@ -137,6 +208,7 @@ class Robot:
     gravity: Vector
     bodies: tuple[RobotBody, ...]
     drives: tuple[Drive, ...] = ()
+    tendons: tuple[Tendon, ...] = ()
     loops: tuple[RobotLoop, ...] = ()
     couplings: tuple[Coupling, ...] = ()
     stopped: bool = False
@@ -147,6 +219,10 @@ class Robot:
     def motions(self) -> tuple[Motion, ...]:
         """The coordinates, in the order of the bodies."""
         return tuple(m for body in self.bodies for m in body.motions if not m.mimics)
+
+    def along(self, name: str) -> tuple[tuple[float, str], ...]:
+        """A coordinate or a tendon as a sum of coordinates."""
+        return {t.name: t.terms for t in self.tendons}.get(name, ((1.0, name),))
 
 
 def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
@@ -169,7 +245,7 @@ def fixed(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
 def settled(robot: Robot) -> Robot:
     """The robot with joints fixed at their start that mimic what does not move.
 
-    Drives of what is not there are left out, loops and couplings too, and these are told.
+    Drives of what is not there are left out, tendons, loops and couplings too, which is told.
     """
     there = {m.name for m in robot.motions}
     bodies = []
@@ -181,7 +257,9 @@ def settled(robot: Robot) -> Robot:
             body = fixed(body, *moved(body, (motion.start,)))
             body = replace(body, note=joined(body.note, note))
         bodies.append(body)
-    drives = tuple(d for d in robot.drives if d.coordinate in there)
+    tendons = tuple(t for t in robot.tendons if there.issuperset(q for _, q in t.terms))
+    acting = there | {t.name for t in tendons}
+    drives = tuple(d for d in robot.drives if d.coordinate in acting)
     known = {WORLD, *(body.name for body in bodies)}
     loops = tuple(loop for loop in robot.loops if known.issuperset(loop.bodies))
     couplings = tuple(
@@ -189,14 +267,18 @@ def settled(robot: Robot) -> Robot:
     )
     lost = {loop.name for loop in robot.loops} - {loop.name for loop in loops}
     lost |= {c.name for c in robot.couplings} - {c.name for c in couplings}
-    told = ("constraints of what is cut off or locked: " + ", ".join(sorted(lost)),) if lost else ()
+    told = [("constraints", lost), ("tendons", {t.name for t in robot.tendons} - acting)]
     return replace(
         robot,
         bodies=tuple(bodies),
         drives=drives,
+        tendons=tendons,
         loops=loops,
         couplings=couplings,
-        left_out=(*told, *robot.left_out),
+        left_out=(
+            *(f"{of} of what is cut off or locked: {', '.join(sorted(n))}" for of, n in told if n),
+            *robot.left_out,
+        ),
     )
 
 

@@ -10,13 +10,13 @@ from dataclasses import replace
 from eomc.base import names, texts
 from eomc.base.errors import EomcError
 from eomc.base.texts import line, toml
+from eomc.robots import acting
+from eomc.robots.formulas import angle, length, less, number, total, vector
 from eomc.robots.inertias import indefinite, unbalanced
 from eomc.robots.massless import light_root, without_inertia
 from eomc.robots.robot import (
     BARE,
-    UNLIMITED,
     Coupling,
-    Drive,
     Mimic,
     Motion,
     Robot,
@@ -25,7 +25,7 @@ from eomc.robots.robot import (
     joined,
     without_dust,
 )
-from eomc.robots.rotations import SNAP, Vector, turns_of
+from eomc.robots.rotations import SNAP, turns_of
 from eomc.robots.stops import DAMPING, DEPTHS, Stop, stops
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import CLOSINGS, JOINTS
@@ -113,8 +113,15 @@ def _named(robot: Robot) -> Robot:
             k += 1
 
     coordinates = {m.name: fit(m.name, "", "_dot") for m in robot.motions}
+    lengths = {t.name: fit(t.name, "") for t in robot.tendons}
+    tendons = tuple(
+        replace(t, name=lengths[t.name], terms=tuple((by, coordinates[q]) for by, q in t.terms))
+        for t in robot.tendons
+    )
+    along = coordinates | lengths
     drives = tuple(
-        replace(d, name=fit(d.name, ""), coordinate=coordinates[d.coordinate]) for d in robot.drives
+        replace(d, name=fit(d.name, "", *acting.law_names(d)), coordinate=along[d.coordinate])
+        for d in robot.drives
     )
     bodies = {WORLD: WORLD}
     out = []
@@ -150,8 +157,9 @@ def _named(robot: Robot) -> Robot:
     if names.module_fault(name):
         name += "_robot"
     return replace(
-        robot, name=name, bodies=tuple(out), drives=drives, loops=loops, couplings=couplings
-    )
+        robot, name=name, bodies=tuple(out), drives=drives, tendons=tendons, loops=loops,
+        couplings=couplings,
+    )  # fmt: skip
 
 
 def _of(motion: Motion, coordinates: Mapping[str, str]) -> Mimic | None:
@@ -180,69 +188,38 @@ def scene_text(robot: Robot) -> str:
         head += [each for words in robot.left_out for each in _bullet(words)]
     about = {"eomc": "1", "name": toml(robot.name), "title": toml(robot.title),
              "gravity": vector(robot.gravity)}  # fmt: skip
-    units = {m.name: m.unit for m in robot.motions}
     parts = [
         "\n".join(head),
         _table("", about),
         _table("[coordinates]", {m.name: _coordinate(m, robot) for m in robot.motions}),
     ]
-    if robot.drives:
-        inputs = {d.name: _input(d, units, robot.limited) for d in robot.drives}
-        parts.append(_table("[inputs]", inputs))
-    if found := stops(robot) if robot.stopped else []:
-        kinds = [unit for unit in DEPTHS if any(s.unit == unit for s in found)]
-        numbers = {}
-        for unit in kinds:
-            deep, soft = _stop_names(unit)
-            numbers[deep] = _depth(unit)
-            numbers[soft] = f'{{ value = {number(DAMPING[unit])}, unit = "s/{unit}" }}'
-        parts.append(_table("[parameters]", numbers))
-        parts.append(_table("[forces]", {s.coordinate: _stop(s) for s in found}))
+    found = stops(robot) if robot.stopped else []
+    numbers = acting.gains(robot)
+    for unit in (unit for unit in DEPTHS if any(s.unit == unit for s in found)):
+        deep, soft = _stop_names(unit)
+        numbers[deep] = _depth(unit)
+        numbers[soft] = f'{{ value = {number(DAMPING[unit])}, unit = "s/{unit}" }}'
+    tables = {
+        "[inputs]": acting.inputs(robot),
+        "[parameters]": numbers,
+        "[definitions]": acting.definitions(robot),
+        "[energy]": acting.energies(robot),
+        "[forces]": {s.coordinate: _stop(s) for s in found},
+    }
+    parts += [_table(head, entries) for head, entries in tables.items() if entries]
     bodies = sorted(robot.bodies, key=lambda body: body.point)
     parts += [_table(f"[[{'point' if b.point else 'body'}]]", _entry(b, robot)) for b in bodies]
     for motion in robot.motions:
         if motion.stiffness:
             spring = {"coordinate": toml(motion.name), "stiffness": number(motion.stiffness)}
             if motion.rest:
-                spring["length"] = _length(motion.rest, motion.unit)
+                spring["length"] = length(motion.rest, motion.unit)
             parts.append(_table("[[spring]]", spring))
     parts += [_table("[[loop]]", _loop(loop)) for loop in robot.loops]
     parts += [_table("[[loop]]", _gear(c)) for c in robot.couplings if _is_gear(c)]
     if rows := {c.name: _row(c) for c in robot.couplings if not _is_gear(c)}:
         parts.append(_table("[constraints]", rows))
     return "\n\n".join(parts) + "\n"
-
-
-def number(x: float) -> str:
-    """The shortest text that reads back as x."""
-    short = repr(float(x)).removesuffix(".0")
-    return "0" if short == "-0" else short
-
-
-def angle(x: float) -> str:
-    """An angle as a scene has it: 0.3, or "pi/2" in quotes within 1e-10 of multiples of pi/12."""
-    twelfths = round(x * 12 / math.pi)
-    if abs(x - twelfths * math.pi / 12) > SNAP or abs(twelfths) > 48:
-        return _shortest(x)
-    if not twelfths:
-        return "0"
-    common = math.gcd(twelfths, 12)
-    above, below = abs(twelfths) // common, 12 // common
-    words = ("-" if twelfths < 0 else "") + (f"{above}*pi" if above > 1 else "pi")
-    return f'"{words}/{below}"' if below > 1 else f'"{words}"'
-
-
-def _shortest(x: float) -> str:
-    """An angle of a rotation, computed to about 4e-16: no more digits than that means."""
-    for digits in range(1, 17):
-        short = f"{x:.{digits}g}"
-        if abs(float(short) - x) <= 4e-16:
-            return number(float(short))
-    return number(x)
-
-
-def _length(x: float, of: str) -> str:
-    return angle(x) if of == "rad" else number(x)
 
 
 def _stop_names(unit: str) -> tuple[str, str]:
@@ -259,7 +236,7 @@ def _depth(unit: str) -> str:
 def _stop(s: Stop) -> str:
     """The force of a stop, as `stops` has it."""
     deep, soft = _stop_names(s.unit)
-    q, (low, high) = s.coordinate, (_length(x, s.unit).strip('"') for x in s.limits)
+    q, (low, high) = s.coordinate, (length(x, s.unit).strip('"') for x in s.limits)
     before = f"max(0, {low} - {q})*max(0, 1 - {soft}*{q}_dot)"
     beyond = f"max(0, {q} - {high})*max(0, 1 + {soft}*{q}_dot)".replace("- -", "+ ")
     return toml(f"{number(s.effort)}/{deep}*({before} - {beyond})")
@@ -300,40 +277,21 @@ def _gear(c: Coupling) -> dict[str, str]:
 
 def _row(c: Coupling) -> str:
     """A coupling as a row of constraints."""
-    second = _less(_sum(c.second), c.at)
+    second = less(total(c.second), c.at)
     second = second if second.isidentifier() else f"({second})"
     powers = [f"{number(a)}*{second}**{k}" for k, a in enumerate(c.polynomial) if a and k]
     terms = [number(c.polynomial[0])] * bool(c.polynomial[0]) + powers
     right = " + ".join(terms).replace("**1", "").replace("+ -", "- ")
-    text = _less(_sum(c.first), c.zero) + (f" - ({right})" if right else "")
+    text = less(total(c.first), c.zero) + (f" - ({right})" if right else "")
     unit = f", unit = {toml(c.unit)}" if c.unit else ""
     return f"{{ formula = {toml(text)}{unit} }}"
 
 
-def _sum(terms: Sequence[tuple[float, str]]) -> str:
-    shown = [{1.0: q, -1.0: f"-{q}"}.get(by, f"{number(by)}*{q}") for by, q in terms]
-    return " + ".join(shown).replace("+ -", "- ") or "0"
-
-
-def _less(text: str, x: float) -> str:
-    return f"{text} - {number(x)}".replace("- -", "+ ") if x else text
-
-
 def _coordinate(m: Motion, robot: Robot) -> str:
-    start = f", start = {_length(m.start, m.unit)}" if m.start else ""
+    start = f", start = {length(m.start, m.unit)}" if m.start else ""
     note = f", note = {toml(m.note)}" if m.note else ""
     guess = ", guess = true" if robot.loops or robot.couplings else ""
     return f"{{ unit = {toml(m.unit)}{start}{guess}{note} }}"
-
-
-def _input(drive: Drive, units: Mapping[str, str], limited: bool) -> str:
-    force = "N m" if units[drive.coordinate] == "rad" else "N"
-    if drive.gear != 1:
-        force = ""  # a signal, which the gear makes a force
-    of = f"unit = {toml(force)}, " if force else ""
-    if limited and drive.limits != UNLIMITED:
-        of += f"limits = [{', '.join(map(number, drive.limits))}], "
-    return f"{{ {of}note = {toml(drive.note or 'along ' + drive.coordinate)} }}"
 
 
 def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
@@ -364,7 +322,7 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
         values = [number(getattr(m, key)) for m in body.motions]
         if any(value != "0" for value in values):
             entry[key] = values[0] if len(set(values)) == 1 else _each(values)
-    forces = [_force(m.name, robot.drives) for m in body.motions]
+    forces = [acting.force(m.name, robot) for m in body.motions]
     if any(force != "0" for force in forces):
         entry["actuator"] = _each([f if f == "0" else toml(f) for f in forces])
     if body.note:
@@ -381,22 +339,11 @@ def _moved_by(m: Motion) -> str:
     """The coordinate of a joint, or the formula of the one that it mimics."""
     if not m.mimics:
         return m.name
-    gear, shift = number(m.mimics.gear), _length(m.mimics.shift, m.unit).strip('"')
+    gear, shift = number(m.mimics.gear), length(m.mimics.shift, m.unit).strip('"')
     factor = {"1": "", "-1": "-"}.get(gear, f"{gear}*")
     return f"{factor}{m.mimics.coordinate}" + (f" + {shift}" if shift != "0" else "").replace(
         "+ -", "- "
     )
-
-
-def _force(coordinate: str, drives: Sequence[Drive]) -> str:
-    mine = [d for d in drives if d.coordinate == coordinate]
-    terms = [d.name if d.gear == 1 else f"{number(d.gear)}*{d.name}" for d in mine]
-    return " + ".join(terms).replace("+ -", "- ") or "0"
-
-
-def vector(v: Vector) -> str:
-    """A vector as TOML has it."""
-    return f"[{', '.join(map(number, v))}]"
 
 
 def _each(those: Sequence[str]) -> str:

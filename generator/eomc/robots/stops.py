@@ -42,8 +42,8 @@ def stops(robot: Robot) -> list[Stop]:
         carried[body.parent] = one[0] + other[0], one[1] + other[1]
     given: dict[str, float] = {}  # by a coordinate: what its drives give together
     for d in robot.drives:
-        most = abs(d.gear) * max(map(abs, d.limits)) if d.gear else 0.0
-        given[d.coordinate] = given.get(d.coordinate, 0.0) + most
+        for by, q in robot.along(d.coordinate):
+            given[q] = given.get(q, 0.0) + (abs(by) * d.most if by else 0.0)
 
     def effort(m: Motion) -> float:
         told = min(max(map(abs, m.driven)), given.get(m.name, math.inf))

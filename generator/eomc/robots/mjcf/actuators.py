@@ -5,77 +5,190 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple, TypeVar
 
 from eomc.robots.limits import both, through
 from eomc.robots.mjcf.file import ACTUATORS, Given, Report, missing
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
-from eomc.robots.robot import UNLIMITED, Drive, joined
-from eomc.robots.rotations import from_quaternion, yaw_pitch_roll
+from eomc.robots.mjcf.ratios import damping, has_ratio, masses_at_start
+from eomc.robots.mjcf.shortcuts import MEASURES
+from eomc.robots.mjcf.tendons import Tendons
+from eomc.robots.robot import UNLIMITED, Drive, Law, Motion, Range, RobotBody, Tendon, joined
+from eomc.robots.rotations import ORIGIN, from_quaternion, yaw_pitch_roll
 from eomc.robots.xml import Tag
+
+# how an activation, which is the input here, follows from the control
+DYNAMICS = {"none", "integrator", "filter", "filterexact"}
+ACTIVATIONS = "activations of actuators, which are their inputs here, not what they follow"
+BESIDES = "what the key frame home has besides positions and controls"
+LAWLESS = "laws of actuators, whose input here is their force"
+
+Loaded = TypeVar("Loaded", Motion, Tendon)
+
+
+class Actuator(NamedTuple):
+    """An actuator as it is read. drive: None where it is left out. dynamics: its dyntype.
+
+    lawful: whether its control, or activation, is the drive's input.
+    """
+
+    drive: Drive | None
+    dynamics: str
+    lawful: bool
 
 
 def actuated(
-    root: Tag, joints: Sequence[Found], reader: Reader
-) -> tuple[list[Found], tuple[Drive, ...]]:
-    """The joints with their actuators' armature and damping, and the drives of hinges and slides.
+    root: Tag, bodies: Sequence[RobotBody], joints: Sequence[Found], tendons: Tendons,
+    reader: Reader,
+) -> tuple[list[Found], list[Actuator]]:  # fmt: skip
+    """The joints with their actuators' armature and damping, and the actuators in their order.
 
-    Of an actuator whose force is gain times its control the input is the control; of any other
-    (servos, muscles, ...) it is the force, before the gear, which is reported.
+    Tendons get theirs in place. bodies: with all their masses, as the file places them.
     """
-    report = reader.report
     found = {joint.name: joint for joint in joints}
-    drives: list[Drive] = []
     tags = [tag for section in root.each("actuator") for tag in section.children]
     named = {tag.attributes["name"] for tag in tags if "name" in tag.attributes}
+    made: list[Actuator] = []
     for tag in tags:
         if tag.kind not in ACTUATORS:
-            report.leave("elements that MJCF does not have", f"{tag.kind} in actuator")
+            reader.report.leave("elements that MJCF does not have", f"{tag.kind} in actuator")
             continue
         a = reader.given(Placed(tag, "", STILL, ""), "actuator")
-        on = a.get("joint", a.get("jointinparent", ""))
+        on = a.get("joint", a.get("jointinparent", a.get("tendon")))
         name = a.get("name") or fresh(f"{on or 'no'}_{tag.kind}", named)
         named.add(name)
-        if not on:
-            report.leave("actuators on tendons, sites, bodies and slider-cranks", name)
-            continue
-        if on not in found:
-            a.fault(missing("joint", on, found))
-            continue
-        joint = found[on]
+        law, drive = _law(a), _drive(name, a, found, tendons, reader)
+        if drive:
+            ends = found[on].motions[0].limits if "tendon" not in a else UNLIMITED
+            drive = _lawful(drive, law, a, ends, reader)
+        made.append(Actuator(drive, a.get("dyntype", "none"), bool(drive and law)))
+    joints = list(found.values())
+    return joints, made if reader.report.faults else _damped(made, bodies, joints, tendons)
+
+
+def _drive(
+    name: str, a: Given, joints: dict[str, Found], tendons: Tendons, reader: Reader
+) -> Drive | None:
+    """The drive of an actuator; what it acts on gets its armature and damping."""
+    report = reader.report
+    damps, *more = a.numbers("damping", 3, 1) or (0.0,)
+    if any(more):
+        report.leave("damping in the square and cube of actuators", name)
+    gear = (a.numbers("gear", 6, 1) or (1.0,))[0]
+    load = gear**2 * a.number("armature"), gear**2 * damps
+    on = a.get("joint", a.get("jointinparent"))
+    if on:
+        if on not in joints:
+            a.fault(missing("joint", on, joints))
+            return None
+        joint = joints[on]
         if joint.type in {"free", "ball"}:
             report.leave("actuators on free and ball joints", name)
-            continue
-        gear = (a.numbers("gear", 6, 1) or (1.0,))[0]
-        damping = a.numbers("damping", 3, 1) or (0.0,)
-        if any(damping[1:]):
-            report.leave("damping in the square and cube of actuators", name)
+            return None
         (motion,) = joint.motions
-        motion = replace(
-            motion,
-            armature=motion.armature + gear**2 * a.number("armature"),
-            damping=motion.damping + gear**2 * damping[0],
-        )
-        found[on] = joint._replace(motions=(motion,))
-        law = a.get(" law", "general")
-        laws = [a.get(key, "none") for key in ("dyntype", "biastype")]
-        plain = law in {"motor", "general"}
-        plain = plain and {*laws, a.get("gaintype", "fixed")} == {"none", "fixed"}
-        gain = (a.numbers("gainprm", 100, 1) or (1.0,))[0] if plain else 1.0
-        if not plain:
-            report.leave("laws of actuators, whose input here is their force", f"{name} ({law})")
-        if a.number("delay"):
-            report.leave("delays of actuators", name)
-        control, force = (_range(a, key, reader) for key in ("ctrl", "force"))
-        limits = both(control if plain else UNLIMITED, through(force, gain))
-        if limits is None:
-            report.leave("ranges of actuators that exclude each other", name)
-        note = _noted(a, name, control, force, plain)
-        drives.append(Drive(name, on, gear * gain, note, limits or UNLIMITED))
-    return list(found.values()), tuple(drives)
+        joints[on] = joint._replace(motions=(_loaded(motion, *load),))
+    elif tendon := a.get("tendon"):
+        if not tendons.known(tendon, a):
+            return None
+        if tendon not in tendons.fixed:
+            report.leave("actuators on tendons through space", name)
+            return None
+        on = tendons.driven(tendon)
+        tendons.fixed[tendon] = _loaded(tendons.fixed[tendon], *load)
+    else:
+        report.leave("actuators on sites, bodies and slider-cranks", name)
+        return None
+    if a.number("delay"):
+        report.leave("delays of actuators", name)
+    return Drive(name, on, gear)
 
 
-def _range(a: Given, key: str, reader: Reader) -> tuple[float, float]:
+def _loaded(of: Loaded, armature: float, damping: float) -> Loaded:
+    return replace(of, armature=of.armature + armature, damping=of.damping + damping)
+
+
+def _lawful(drive: Drive, law: Law | None, a: Given, ends: Range, reader: Reader) -> Drive:
+    """The drive with the law of an actuator, its limits and its note.
+
+    Where its force is no affine law of its input the input is the force, before the gear. Of one
+    with an activation that is the input. ends: of what it acts on.
+    """
+    name, report = drive.name, reader.report
+    dynamics = a.get("dyntype", "none")
+    control, active, force = (_range(a, key, reader) for key in ("ctrl", "act", "force"))
+    inherits = a.number("inheritrange")
+    if law and law.set_point == "kp" and inherits > 0:
+        middle, half = sum(ends) / 2, (ends[1] - ends[0]) / 2
+        if math.isfinite(half):
+            mine = middle - inherits * half, middle + inherits * half
+            control, active = (control, mine) if dynamics == "integrator" else (mine, active)
+        else:
+            report.leave("ranges of actuators that inherit those of what has none here", name)
+    own, other = both(control, active) or control, UNLIMITED
+    if not law:
+        report.leave(LAWLESS, f"{name} ({a.get(' law', 'general')})")
+        own, other = UNLIMITED, control
+    elif dynamics == "integrator":
+        own, other = active, control
+    note = _noted(a.report, name, own, other, force)
+    if law and dynamics != "none":
+        report.leave(ACTIVATIONS, f"{name} ({dynamics})")
+        note = joined("its activation", note)
+    if law and not law.plain:
+        gain, follows = 1.0, replace(law, force=both(force, UNLIMITED) or UNLIMITED)
+        limits = both(own, UNLIMITED)
+    else:
+        gain, follows = law.gain[0] if law else 1.0, None
+        limits = both(own, through(force, gain))
+    if limits is None:
+        report.leave("ranges of actuators that exclude each other", name)
+    limits = limits or UNLIMITED
+    return replace(drive, gear=drive.gear * gain, law=follows, limits=limits, note=note)
+
+
+def _law(a: Given) -> Law | None:
+    """The force of an actuator by its input; None where that is not affine, and for a fault."""
+    gain_type, bias_type = a.get("gaintype", "fixed"), a.get("biastype", "none")
+    affine = gain_type in {"fixed", "affine"} and bias_type in {"none", "affine"}
+    if not affine or a.get("dyntype", "none") not in DYNAMICS:
+        return None
+    faults = len(a.report.faults)
+    for key in MEASURES if " law" in a else ():
+        a.number(key)
+    if len(a.report.faults) > faults:
+        return None
+    gain = (*(a.numbers("gainprm", 100, 1) or (1.0,)), 0.0, 0.0)
+    bias = (*(a.numbers("biasprm", 100, 0) or ()), 0.0, 0.0, 0.0)
+    return Law(
+        (gain[0], gain[1], gain[2]) if gain_type == "affine" else (gain[0], 0.0, 0.0),
+        (bias[0], bias[1], bias[2]) if bias_type == "affine" else ORIGIN,
+    )
+
+
+def _damped(
+    made: Sequence[Actuator], bodies: Sequence[RobotBody], joints: Sequence[Found],
+    tendons: Tendons,
+) -> list[Actuator]:  # fmt: skip
+    """The actuators, ratios of damping as damping."""
+    if not any(each.drive and has_ratio(each.drive.law) for each in made):
+        return list(made)
+    masses, rows = masses_at_start(bodies, joints, tendons.fixed.values())
+    terms = {t.name: t.terms for t in tendons.fixed.values()}
+    out = []
+    for each in made:
+        d = each.drive
+        if d and d.law and has_ratio(d.law):
+            along = [(d.gear * by, q) for by, q in terms.get(d.coordinate, ((1.0, d.coordinate),))]
+            kv = damping(d.law, along, masses, rows)
+            law = replace(d.law, bias=(*d.law.bias[:2], -kv))
+            note = joined(f"a damping ratio of {d.law.bias[2]:g}", d.note)
+            each = each._replace(drive=replace(d, law=law, note=note))
+        out.append(each)
+    return out
+
+
+def _range(a: Given, key: str, reader: Reader) -> Range:
     """A range of an actuator that holds, or an unlimited one."""
     values = a.numbers(f"{key}range", 2)
     if not values or not limited(a, f"{key}limited", reader.settings):
@@ -83,49 +196,32 @@ def _range(a: Given, key: str, reader: Reader) -> tuple[float, float]:
     return values[0], values[1]
 
 
-def _noted(
-    a: Given, name: str, control: tuple[float, float], force: tuple[float, float], plain: bool
-) -> str:
-    """Ranges of an actuator in words, for its note; reported as left out."""
+def _noted(report: Report, name: str, own: Range, control: Range, force: Range) -> str:
+    """Ranges of an actuator's input, control and force for its note; reported as left out."""
     words = []
-    for what, ends in (("input" if plain else "control", control), ("force", force)):
+    for what, ends in (("input", own), ("control", control), ("force", force)):
         if ends != UNLIMITED:
-            kind = "actuators" if what != "control" else "controls whose law is left out"
-            a.report.leave(f"limits of {kind}, kept as notes", name)
+            kind = "actuators" if what != "control" else "controls that are no inputs here"
+            report.leave(f"limits of {kind}, kept as notes", name)
             words.append(f"{what} from {ends[0]:.6g} to {ends[1]:.6g}")
     return joined(*words)
 
 
-def started(root: Tag, joints: Sequence[Found], report: Report) -> list[Found]:
-    """The joints with the start of the key frame "home"; singular starts are reported."""
-    sizes = {"hinge": 1, "slide": 1, "ball": 4, "free": 7}
-    size = sum(sizes[joint.type] for joint in joints)
-    out = list(joints)
+def started(
+    root: Tag, joints: Sequence[Found], actuators: Sequence[Actuator], report: Report
+) -> tuple[list[Found], tuple[Drive, ...]]:
+    """The joints and drives with the start of the key frame "home"; singular ones are reported."""
+    out, drives = list(joints), [each.drive for each in actuators]
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):
         a = Given(tag.attributes, tag, report)
-        if a.get("name") != "home" or "qpos" not in a:
+        if a.get("name") != "home" or not {"qpos", "ctrl", "act"} & a.attributes.keys():
             report.leave("key frames", a.get("name"))
             continue
-        others = ("qvel", "act", "ctrl", "mpos", "mquat")
-        for key in others:
+        for key in ("qvel", "mpos", "mquat"):
             if any(a.numbers(key, 1_000_000, 0) or ()):
-                report.leave("what the key frame home has besides positions", key)
-        values = a.numbers("qpos", 1_000_000, 0) or ()
-        if len(values) != size:
-            report.leave(f"the start of the key frame home: it has not the {size} numbers of qpos")
-            continue
-        out, at = [], 0
-        for joint in joints:
-            mine = values[at : at + sizes[joint.type]]
-            at += len(mine)
-            if joint.type in {"ball", "free"}:
-                if not any(mine[-4:]):
-                    a.fault(f"the quaternion of joint {joint.name} has the length zero")
-                    continue
-                w, x, y, z = mine[-4:]
-                mine = (*mine[:-4], *yaw_pitch_roll(from_quaternion(w, x, y, z)))
-            motions = (replace(m, start=v) for m, v in zip(joint.motions, mine, strict=True))
-            out.append(joint._replace(motions=tuple(motions)))
+                report.leave(BESIDES, key)
+        out = _posed(a, joints)
+        drives = _controlled(a, actuators)
     for joint in out:
         if joint.type in {"ball", "free"} and abs(math.cos(joint.motions[-2].start)) < 1e-6:
             report.leave(
@@ -133,4 +229,47 @@ def started(root: Tag, joints: Sequence[Found], report: Report) -> list[Found]:
                 "with a pitch of a quarter turn",
                 joint.name,
             )
+    return out, tuple(drive for drive in drives if drive)
+
+
+def _posed(a: Given, joints: Sequence[Found]) -> list[Found]:
+    """The joints with the positions of a key frame."""
+    sizes = {"hinge": 1, "slide": 1, "ball": 4, "free": 7}
+    size = sum(sizes[joint.type] for joint in joints)
+    values = a.numbers("qpos", 1_000_000, 0)
+    if values is None:
+        return list(joints)
+    if len(values) != size:
+        a.report.leave(f"the start of the key frame home: it has not the {size} numbers of qpos")
+        return list(joints)
+    out, at = [], 0
+    for joint in joints:
+        mine = values[at : at + sizes[joint.type]]
+        at += len(mine)
+        if joint.type in {"ball", "free"}:
+            if not any(mine[-4:]):
+                a.fault(f"the quaternion of joint {joint.name} has the length zero")
+                continue
+            w, x, y, z = mine[-4:]
+            mine = (*mine[:-4], *yaw_pitch_roll(from_quaternion(w, x, y, z)))
+        motions = (replace(m, start=v) for m, v in zip(joint.motions, mine, strict=True))
+        out.append(joint._replace(motions=tuple(motions)))
     return out
+
+
+def _controlled(a: Given, actuators: Sequence[Actuator]) -> list[Drive | None]:
+    """The drives with the controls of a key frame, or the activations that integrate these."""
+    found = [each.drive for each in actuators]
+    active = [k for k, each in enumerate(actuators) if each.dynamics != "none"]
+    for key, those in (("ctrl", range(len(found))), ("act", active)):
+        values = a.numbers(key, 1_000_000, 0) or ()
+        if len(values) != len(those) and any(values):
+            a.report.leave(f"the {key} of the key frame home: it has not {len(those)} numbers")
+            continue
+        for k, value in zip(those, values, strict=False):
+            each, drive = actuators[k], found[k]
+            if drive and each.lawful and (each.dynamics == "integrator") == (key == "act"):
+                found[k] = replace(drive, start=value)
+            elif value:
+                a.report.leave(BESIDES, key)
+    return found

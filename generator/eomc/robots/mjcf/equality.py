@@ -14,6 +14,7 @@ from eomc.robots import rotations
 from eomc.robots.mjcf.file import Given, missing
 from eomc.robots.mjcf.joints import Found, fresh
 from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader, pose_of, rounded
+from eomc.robots.mjcf.tendons import Tendons
 from eomc.robots.robot import Coupling, Motion, RobotBody, RobotLoop, moved
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times
 from eomc.robots.xml import Tag
@@ -58,6 +59,7 @@ def constrained(
     root: Tag,
     bodies: Sequence[RobotBody],
     joints: Sequence[Found],
+    tendons: Tendons,
     anchors: Mapping[str, Vector],
     reader: Reader,
 ) -> tuple[tuple[RobotLoop, ...], tuple[Coupling, ...]]:
@@ -66,7 +68,7 @@ def constrained(
     for body in bodies:
         offset, turn = moved(body, [m.start for m in body.motions])
         poses[body.name] = poses[body.parent].of(Pose(offset, turn))
-    made = _Reading(root, _Ends(poses, anchors), joints, reader)
+    made = _Reading(tendons, _Ends(poses, anchors), joints, reader)
     for section in root.each("equality"):
         for tag in section.children:
             made.read(tag)
@@ -76,13 +78,13 @@ def constrained(
 class _Reading:
     """The constraints read so far."""
 
-    def __init__(self, root: Tag, ends: _Ends, joints: Sequence[Found], reader: Reader) -> None:
+    def __init__(
+        self, tendons: Tendons, ends: _Ends, joints: Sequence[Found], reader: Reader
+    ) -> None:
         self.ends = ends
         self.reader = reader
         self.joints = {joint.name: joint for joint in joints}
-        self.tendons = {
-            tag.get("name"): tag for section in root.each("tendon") for tag in section.children
-        }
+        self.tendons = tendons
         self.taken: set[str] = set()
         self.loops: list[RobotLoop] = []
         self.couplings: list[Coupling] = []
@@ -198,18 +200,14 @@ class _Reading:
 
     def _tendon(self, tendon: str, name: str, a: Given) -> Sides | None:
         """A tendon's length in coordinates; None where it is not a sum of these."""
-        tag = self.tendons.get(tendon)
-        if tag is None:
-            a.fault(missing("tendon", tendon, self.tendons) if tendon else "it needs tendon1")
+        if not tendon:
+            a.fault("it needs tendon1")
             return None
-        if tag.kind != "fixed":
+        if not self.tendons.known(tendon, a):
+            return None
+        if tendon not in self.tendons.fixed:
             self.reader.report.leave("couplings of tendons through space", name)
             return None
-        total = []
-        for each in tag.each("joint"):
-            of = self.reader.own(each)
-            part = self._joint(of.get("joint"), name, of)
-            if part is None:
-                return None
-            total.append((of.number("coef", 1.0), part[0][1]))
-        return tuple(total)
+        self.tendons.reads(tendon)
+        motions = {m.name: m for joint in self.joints.values() for m in joint.motions}
+        return tuple((by, motions[q]) for by, q in self.tendons.fixed[tendon].terms)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from eomc.base.errors import Problem, SceneError
 from eomc.robots import xml
+from eomc.robots.mjcf.shortcuts import shortcut
 from eomc.robots.rotations import Vector
 from eomc.robots.xml import Tag
 from eomc.scene.formulas import suggest
@@ -50,7 +51,6 @@ ACTUATORS = set(
 )
 # arrays of which an element may give the first numbers and leave the rest to its class
 PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
-LAW = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}  # an actuator's force
 
 ONE_FILE = "let MuJoCo write the model as one file (MjSpec.to_xml)"  # a remedy
 
@@ -341,7 +341,7 @@ def merged(base: Attributes, tag: Tag) -> Attributes:
     """The attributes of a tag over those of its class.
 
     An orientation replaces an inherited one of whatever kind, and fromto a whole inherited pose.
-    A shortcut of <general> starts from its own law of force, kept under the key " law".
+    A shortcut of <general> is written as its law of force; its name stays under the key " law".
     """
     own = {k: v for k, v in tag.attributes.items() if k not in {"class", "childclass"}}
     over = dict(base)
@@ -350,8 +350,7 @@ def merged(base: Attributes, tag: Tag) -> Attributes:
     if "fromto" in own:
         over.pop("pos", None)
     if tag.kind in ACTUATORS and tag.kind != "general":
-        over = {k: v for k, v in over.items() if k not in LAW}
-        over[" law"] = tag.kind
+        over |= shortcut(tag.kind, over, own) | {" law": tag.kind}
     for key, value in own.items():
         words = value.split()
         if key in PARTIAL and key in over:

@@ -95,7 +95,7 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
         name,
         "rad" if turns else "m",
         start=ref,
-        rest=value("springref") if own["stiffness"] else 0.0,
+        rest=value("springref"),
         note=note,
         mimics=None,
         limits=ends,

@@ -22,6 +22,7 @@ from eomc.robots.mjcf.file import (
 )
 from eomc.robots.mjcf.joints import Found, fresh, joint_of, named
 from eomc.robots.mjcf.masses import STILL, Mass, Placed, Pose, Reader
+from eomc.robots.mjcf.tendons import Tendons
 from eomc.robots.robot import Robot, RobotBody, joined
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector
 from eomc.robots.xml import Tag
@@ -34,7 +35,6 @@ GENERATORS = {"replicate", "composite", "flexcomp", "attach", "plugin", "skin"}
 # sections of the file, with the word under which their entries are listed
 SECTIONS = {
     "asset": "assets",
-    "tendon": "tendons",
     "contact": "contact pairs and exclusions",
     "sensor": "sensors",
     "custom": "custom data",
@@ -47,7 +47,7 @@ KINDS = {
     "robot": "URDF",
     "mujocoinclude": "a part of a model: import the file that includes it, with --include",
 }
-READ = {"compiler", "option", "default", "worldbody", "equality", "actuator", "keyframe"}
+READ = set("compiler option default worldbody tendon equality actuator keyframe".split())
 
 
 def read(path: str | Path, include: bool = False) -> Robot:
@@ -73,11 +73,12 @@ def read(path: str | Path, include: bool = False) -> Robot:
     settings = settings_of(root, report)
     reader = Reader(settings, classes_of(root, report), report)
     bodies, joints, anchors = _bodies(root, reader)
-    loops, couplings = constrained(root, _moving(bodies, joints), joints, anchors, reader)
-    joints, drives = actuated(root, joints, reader)
-    joints = started(root, joints, report)
     if settings.totalmass > 0:
         bodies = masses.scaled_to(bodies, settings.totalmass)
+    tendons = Tendons(root, joints, reader)
+    loops, couplings = constrained(root, _moving(bodies, joints), joints, tendons, anchors, reader)
+    joints, actuators = actuated(root, bodies, joints, tendons, reader)
+    joints, drives = started(root, joints, actuators, report)
     _sections(root, report)
     if report.faults:
         raise SceneError(report.faults)
@@ -88,6 +89,7 @@ def read(path: str | Path, include: bool = False) -> Robot:
         gravity=settings.gravity,
         bodies=_moving(bodies, joints),
         drives=drives,
+        tendons=tendons.acting,
         loops=loops,
         couplings=couplings,
         left_out=report.lines(),
@@ -165,13 +167,13 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], di
                 a.fault("a body with a free joint has no other joints; leave one")
         if a.is_true("mocap"):
             report.leave("motions of mocap bodies, which stand still here", name)
-        if a.number("gravcomp"):
-            report.leave("compensation of gravity (gravcomp) of bodies", name)
         for p in inner:
             if p.tag.kind == "geom":
                 _geom_left_out(p, reader)
         mass = masses.body_mass(tag, inner, reader, still and not own)
         chain, own, anchor = _chain(name, parent, still, pose, own, mass, names["body"], report)
+        if own or not still:
+            chain[-1] = replace(chain[-1], lifted=a.number("gravcomp"))
         seen["body"].update(body.name for body in chain)
         bodies += chain
         anchors[name] = anchor

@@ -1,0 +1,92 @@
+"""The damping of MJCF's servos that is given as a ratio, of what they move in the file's pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+from eomc.base import spatial
+from eomc.base.spatial import apply, cross, plus, scaled
+from eomc.robots.mjcf.joints import Found
+from eomc.robots.mjcf.masses import STILL, Pose
+from eomc.robots.robot import Law, RobotBody, Tendon, moved
+from eomc.robots.rotations import ORIGIN, Vector
+from eomc.scene.assembly import WORLD
+from eomc.scene.joints import X, Y, Z
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+def has_ratio(law: Law | None) -> bool:
+    """Whether the damping is a ratio: a servo of positions whose velocity counts positive."""
+    return bool(law and law.bias[2] > 0 and law.set_point == "kp" and law.kp > 0)
+
+
+def damping(
+    law: Law, along: Iterable[tuple[float, str]], masses: NDArray[np.float64], rows: Sequence[str]
+) -> float:
+    """kv: ratio times 2 sqrt(kp m), as MuJoCo 4 has it, m = 1/(J M^-1 J^T).
+
+    along: J by coordinates, the gear in it. masses: M, its `rows`.
+    """
+    import numpy as np
+
+    J = np.zeros(len(rows))
+    for by, q in along:
+        J[rows.index(q)] += by
+    if not np.isfinite(masses).all():  # masses that overflow
+        return 0.0
+    mobility = float(J @ np.linalg.lstsq(masses, J, rcond=None)[0])
+    return 2 * law.bias[2] * math.sqrt(law.kp / mobility) if mobility > 0 else 0.0
+
+
+def masses_at_start(
+    bodies: Sequence[RobotBody], joints: Sequence[Found], tendons: Iterable[Tendon]
+) -> tuple[NDArray[np.float64], list[str]]:
+    """M in the pose of the file, and the coordinate of each row.
+
+    Whole turns have rows about x, y and z, called by angles that nothing else asks for.
+    """
+    import numpy as np
+
+    rows = [m.name for joint in joints for m in joint.motions]
+    M = np.diag([m.armature for joint in joints for m in joint.motions])
+    poses: dict[str, Pose] = {WORLD: STILL}
+    columns: dict[str, list[tuple[int, Vector, Vector]]] = {WORLD: []}
+    waiting, row = iter(joints), 0
+    for body in bodies:
+        around = poses[body.parent].of(Pose(body.offset, body.rotation))
+        stands = Pose(*moved(body, [m.start for m in body.motions]))
+        pose = poses[body.name] = poses[body.parent].of(stands)
+        mine = []  # turns: the rate and a point of the axis; slides: no rate, the velocity
+        if body.joint != "fixed":
+            joint = next(waiting)
+            kinds = {"prismatic": "t", "revolute": "r", "free": "tttrrr"}.get(body.joint, "rrr")
+            axes = body.axes or (X, Y, Z, X, Y, Z)[-len(kinds) :]
+            for kind, axis in zip(kinds, axes, strict=True):
+                axis = apply(around.turn, axis)
+                mine.append((row, axis, pose.place) if kind == "r" else (row, ORIGIN, axis))
+                M[row, row] += joint.armature if kind == "r" else 0.0
+                row += 1
+        columns[body.name] = [*columns[body.parent], *mine]
+        center = plus(pose.place, apply(pose.turn, body.center))
+        tensor = spatial.tensor(spatial.rotated_inertia(pose.turn, body.inertia))
+        at = [k for k, _, _ in columns[body.name]]
+        turns = np.array([w for _, w, _ in columns[body.name]]).reshape(-1, 3)
+        slides = np.array([_velocity(w, p, center) for _, w, p in columns[body.name]])
+        slides = slides.reshape(-1, 3)
+        M[np.ix_(at, at)] += body.mass * slides @ slides.T + turns @ np.array(tensor) @ turns.T
+    for t in tendons:
+        J = np.zeros(len(rows))
+        for by, q in t.terms:
+            J[rows.index(q)] += by
+        M += t.armature * np.outer(J, J)
+    return M, rows
+
+
+def _velocity(turn: Vector, of: Vector, at: Vector) -> Vector:
+    """Of the point `at`, by a turn about a line through `of`; by a slide, `of` itself."""
+    return cross(turn, plus(at, scaled(of, -1.0))) if any(turn) else of

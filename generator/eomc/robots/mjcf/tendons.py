@@ -1,0 +1,107 @@
+"""Fixed tendons of an MJCF file: sums of joints, with springs, dampers and actuators along them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from eomc.robots.mjcf.file import Given, missing
+from eomc.robots.mjcf.joints import Found, fresh, limited
+from eomc.robots.mjcf.masses import STILL, Placed, Reader
+from eomc.robots.robot import Range, Tendon
+from eomc.robots.xml import Tag
+
+LEFT = "tendons"  # the kind under which those are listed that do nothing here
+
+
+class Tendons:
+    """The tendons of a file by their names in it. fixed: those that are sums of joints."""
+
+    def __init__(self, root: Tag, joints: Sequence[Found], reader: Reader) -> None:
+        self.fixed: dict[str, Tendon] = {}
+        self._reader = reader
+        self._tags = [tag for section in root.each("tendon") for tag in section.children]
+        self._joints = {joint.name: joint for joint in joints}
+        self._driven: set[str] = set()
+        taken = {m.name for joint in joints for m in joint.motions}
+        for tag in self._tags:
+            name = tag.get("name")
+            reader.report.leave(LEFT, f"{tag.kind} {name}".rstrip())
+            terms = self._terms(tag) if tag.kind == "fixed" else None
+            if not terms:
+                continue
+            made = self._read(Tendon(fresh(name or "tendon", taken), terms), tag)
+            taken.add(made.name)
+            self.fixed[name or made.name] = made
+            if made.acts:
+                self.reads(name)
+
+    @property
+    def acting(self) -> tuple[Tendon, ...]:
+        """Those that have an effect."""
+        return tuple(t for name, t in self.fixed.items() if t.acts or name in self._driven)
+
+    def known(self, name: str, a: Given) -> bool:
+        """Whether there is such a tendon, a fault if there is none."""
+        names = {tag.get("name") for tag in self._tags}
+        if name not in names:
+            a.fault(missing("tendon", name, names))
+        return name in names
+
+    def reads(self, name: str) -> None:
+        """A fixed tendon that is not left out."""
+        self._reader.report.read(LEFT, f"fixed {name}".rstrip())
+
+    def driven(self, name: str) -> str:
+        """What the coordinate of a drive along a fixed tendon is called."""
+        self._driven.add(name)
+        self.reads(name)
+        return self.fixed[name].name
+
+    def _terms(self, tag: Tag) -> tuple[tuple[float, str], ...]:
+        """The joints of a fixed tendon, each with its factor; none where it is no sum of these."""
+        terms = []
+        for each in tag.each("joint"):
+            a = self._reader.own(each)
+            joint = a.get("joint")
+            if joint not in self._joints:
+                a.fault(missing("joint", joint, self._joints) if joint else "it needs a joint")
+                return ()
+            if self._joints[joint].type in {"free", "ball"}:
+                return ()
+            terms.append((a.number("coef", 1.0), self._joints[joint].motions[0].name))
+        return tuple(terms)
+
+    def _read(self, tendon: Tendon, tag: Tag) -> Tendon:
+        report, name = self._reader.report, tag.get("name")
+        a = self._reader.given(Placed(tag, "", STILL, ""), "tendon")
+        own = {}
+        for key in ("stiffness", "damping"):
+            own[key], *more = a.numbers(key, 3, 1) or (0.0,)
+            if any(more):
+                report.leave(f"{key} in the square and cube of tendons", name)
+        own["armature"] = a.number("armature")
+        for key, value in own.items():
+            if value < 0:
+                a.fault(f"{key} must not be negative")
+        for key, what in (("", "length"), ("actuatorfrc", "force")):
+            if a.numbers(f"{key}range", 2) and limited(a, f"{key}limited", self._reader.settings):
+                report.leave(f"limits of {what} of tendons", name)
+        if a.number("frictionloss"):
+            report.leave("friction of tendons", name)
+        return replace(
+            tendon,
+            stiffness=own["stiffness"],
+            damping=own["damping"],
+            armature=own["armature"],
+            rest=self._rest(tendon, a),
+        )
+
+    def _rest(self, tendon: Tendon, a: Given) -> Range:
+        """Where its spring is slack: as the file says, or as it is where those of joints are."""
+        given = a.numbers("springlength", 2, 1) or (-1.0,)
+        if {*given} != {-1.0}:
+            return given[0], given[-1]
+        rests = {joint.motions[0].name: joint.motions[0].rest for joint in self._joints.values()}
+        length = sum(by * rests[q] for by, q in tendon.terms)
+        return length, length
