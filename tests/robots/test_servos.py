@@ -55,7 +55,7 @@ def test_laws(default: str, tag: str, gain: tuple, bias: tuple, tmp_path: Path) 
 
 @pytest.mark.slow  # in the tier that installs MuJoCo
 def test_laws_are_those_of_mujoco(tmp_path: Path) -> None:
-    mujoco = pytest.importorskip("mujoco")
+    mujoco = pytest.importorskip("mujoco", minversion="4")
     for default, tag, gain, bias in SHORTCUTS:
         model(tmp_path, BODY, *written(tag, default))
         theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
@@ -136,6 +136,16 @@ def test_the_key_frame_home_has_controls_and_activations(tmp_path: Path) -> None
     short = model(tmp_path, ARM, BEFORE, AFTER.replace(" 7 0 9", " 7"))
     assert reported(short, "the ctrl of the key frame home", "9 numbers")
     assert [d.start for d in short.drives] == [0, 0, 0, 0, 0, 0, 0, 0.1, 0]
+
+
+def test_a_damping_ratio_is_that_of_what_moves(tmp_path: Path) -> None:
+    """A block on a sledge that slides freely: m = 1*3/(1 + 3), over the gear squared."""
+    inside = """<body name="sledge"><joint name="x" type="slide"/><geom size="0.1" mass="3"/>
+      <body><joint name="y" type="slide"/><geom size="0.1" mass="1"/></body></body>"""
+    servo = '<position joint="y" kp="12" gear="2" dampratio="0.5"/>'
+    (drive,) = model(tmp_path, inside, after=f"<actuator>{servo}</actuator>").drives
+    assert drive.law and drive.law.kv == pytest.approx(2 * 0.5 * (12 * 0.75 / 4) ** 0.5, rel=1e-14)
+    assert drive.note == "a damping ratio of 0.5"
 
 
 def test_what_is_not_a_law_of_the_input_is_told(tmp_path: Path) -> None:
@@ -221,7 +231,7 @@ def test_arms_move_as_mujoco_moves_them(
     words: tuple[str, ...], tmp_path: Path, quickly_compiled: None
 ) -> None:
     """Accelerations at random states, and a run from the key frame with its controls."""
-    mujoco = pytest.importorskip("mujoco")
+    mujoco = pytest.importorskip("mujoco", minversion="4")
     text = f"<mujoco>{BEFORE}<worldbody>{ARM}</worldbody>{AFTER}</mujoco>".replace(ROPE, "")
     mjcf_text.imported(tmp_path, text, *words)
     m = eomc.load(tmp_path / "robot.toml", tmp_path)
