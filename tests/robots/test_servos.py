@@ -14,6 +14,7 @@ import eomc
 from eomc.robots.edit import cut, lock
 from eomc.robots.robot import Law
 from eomc.robots.scene_text import finished, scene_text
+from eomc.robots.stops import stops
 
 GENERAL = '<general gainprm="3 1 2" biasprm="1 2 -5"/>'
 AFFINE = GENERAL.replace("/>", ' biastype="affine"/>')
@@ -202,6 +203,16 @@ def test_tendons_of_what_is_locked_or_cut_off_are_told(tmp_path: Path) -> None:
     assert "tendons of what is cut off or locked: a_2, pulled" in locked.left_out
     assert [d.name for d in locked.drives] == ["p", "q", "r", "g", "d", "i", "lag"]
     assert not cut(robot, "hand").tendons
+
+
+def test_stops_take_what_servos_and_tendons_give(tmp_path: Path) -> None:
+    inside = """<body><joint name="j" range="-1 1"/><geom size="0.1"/>
+      <body><joint name="k" range="-1 1"/><geom size="0.1" pos="1 0 0"/></body></body>"""
+    after = """<tendon><fixed name="t"><joint joint="j" coef="-0.5"/><joint joint="k" coef="3"/>
+      </fixed></tendon><actuator><position joint="j" gear="2" kp="9" forcerange="-7 5"/>
+      <motor tendon="t" gear="10" ctrlrange="-1 1"/></actuator>"""
+    found = stops(model(tmp_path, inside, after=after))
+    assert [stop.effort for stop in found] == [2 * 7 + 0.5 * 10, 3 * 10]
 
 
 def test_without_drives_no_tendon_stands_idle(tmp_path: Path) -> None:
