@@ -10,7 +10,7 @@ from eomc.robots.formulas import less, number, total
 from eomc.robots.robot import UNLIMITED, Drive, Law, Robot, Tendon, joined
 
 _FORCES = {"rad": "N m", "m": "N"}  # by a coordinate's unit
-_SUM = 50  # terms of a sum: formulas nest so deep at most, and each term counts
+_SUM = 50  # terms of a sum at most: each nests the formula deeper, which bears 150
 
 
 def law_names(drive: Drive) -> tuple[str, ...]:
@@ -53,16 +53,16 @@ def energies(robot: Robot) -> dict[str, str]:
     rates = [(t, f"dot({t.name})**2/2") for t in robot.tendons]
     borne = [b for b in robot.bodies if b.lifted and b.mass]
     weights = [
-        f"{number(g)}*{_sum([(b.lifted * b.mass, f'{b.name}_{axis}') for b in borne])}"
+        (g, _sum([(b.lifted * b.mass, f"{b.name}_{axis}") for b in borne]))
         for g, axis in zip(robot.gravity, "xyz", strict=True)
         if g and borne
     ]
     sums = {
-        "kinetic": [f"{number(t.armature)}*{rate}" for t, rate in rates if t.armature],
-        "potential": [*(_spring(t) for t in robot.tendons if t.stiffness), *weights],
-        "dissipation": [f"{number(t.damping)}*{rate}" for t, rate in rates if t.damping],
+        "kinetic": [(t.armature, rate) for t, rate in rates if t.armature],
+        "potential": [*((t.stiffness, _spring(t)) for t in robot.tendons if t.stiffness), *weights],
+        "dissipation": [(t.damping, rate) for t, rate in rates if t.damping],
     }
-    return {key: _long(" + ".join(terms)) for key, terms in sums.items() if terms}
+    return {key: _long(total(terms)) for key, terms in sums.items() if terms}
 
 
 def force(coordinate: str, robot: Robot) -> str:
@@ -124,12 +124,12 @@ def _law(d: Drive, law: Law, robot: Robot) -> str:
 
 
 def _spring(t: Tendon) -> str:
-    """The potential energy of a tendon, which has none between the ends of its rest."""
+    """The energy of a spring of stiffness 1, which has none between the ends of its rest."""
     low, high = t.rest
     if low == high:
-        return f"{number(t.stiffness)}*({less(t.name, low)})**2/2"
+        return f"({less(t.name, low)})**2/2"
     beyond = f"max(0, {less(t.name, high)})", f"max(0, {less(f'-{t.name}', -low)})"
-    return f"{number(t.stiffness)}*({beyond[0]}**2 + {beyond[1]}**2)/2"
+    return f"({beyond[0]}**2 + {beyond[1]}**2)/2"
 
 
 def _sum(terms: Sequence[tuple[float, str]]) -> str:
