@@ -9,7 +9,7 @@ from .constrained import Rows
 from .package import reduced, warn
 from .statics import Statics
 
-MANY = 1000  # steps from which a run is not taken in one call
+_MANY = 1000  # steps from which a run is not taken in one call
 CHUNK = 16_384  # steps times coordinates before the first look, some ms
 
 
@@ -62,7 +62,7 @@ class Compiled(Statics):
         work = self._ffi.typeof(f"{name}_work *")
         counted = getattr(self._lib, f"{name}_evaluations", None)
         short = (
-            -1 if counted or self._rows.names or self.events else min(MANY - 1, CHUNK // self.nq)
+            -1 if counted or self._rows.names or self.events else min(_MANY - 1, CHUNK // self.nq)
         )
         return step, run, short, stages, work, counted
 

@@ -1,4 +1,4 @@
-"""Runs, and how they end."""
+"""What users have of a run: its state at any time, its error, its balance, its pictures."""
 
 from __future__ import annotations
 
