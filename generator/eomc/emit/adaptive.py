@@ -251,9 +251,11 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
     takes_p = "p" in {a.name for a in made.rest} or bool(
         form.compute_constants or happen or form.project
     )
-
-    def projected(**state: str) -> str:
-        return functions.public.project.call(held="0", **state) if form.project else ""
+    projected = (
+        functions.public.project.call(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]", held="0")
+        if form.project
+        else ""
+    )
 
     return AdaptiveRun(
         **functions.names,
@@ -274,8 +276,7 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
         row=kept.call(q="x.q", qd="x.qd", **to),
         row_before=kept.call(q="q_at", qd="qd_at", **to),
         look=made.within.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
-        project_row=projected(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]"),
-        project_restart=projected(q="x.q", qd="x.qd", t="x.t"),
+        project_row=projected,
     )
 
 

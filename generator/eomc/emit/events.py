@@ -113,9 +113,12 @@ def _events(made: Stepping) -> Events:
     record = public.adaptive_events
     arguments = (made.state, *there, number("tol"), *rest, *record, made.held)
     happened = c.static(f"{method}_happened", "int", *arguments)
+    calls = [*(asked if jumps else ()), *([public.project] if made.form.project else ())]
+    takes = {a.name for f in calls for a in f.arguments}
     restart = c.static(
         f"{method}_restarted", functions.status, made.state, number("reached"), *there[1:],
-        *(own if jumps else ()), *([made.held] if jumps else []),
+        *(a for a in functions.usual("u", "p") if a.name in takes),
+        *([made.held] if jumps else []),
     )  # fmt: skip
     at = {"q": "q_at", "qd": "qd_at"}
     within = {"t": f"{c.member('x', 'from')} + z*{c.member('x', 'size')}", **at}
@@ -160,5 +163,8 @@ def _events(made: Stepping) -> Events:
         restart=restart,
         values_before=values.call(events="before", **reached),
         jump=asked[-1].call(**reached) if jumps else "",
+        project=public.project.call(held="0", **reached) if made.form.project else "",
+        modes=tuple((m.at, m.of) for m in system.modes),
+        own=len(system.events) - 2 * len(system.modes),
         values_after=values.call(events="value", **reached),
     )

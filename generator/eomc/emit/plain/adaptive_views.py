@@ -131,6 +131,9 @@ class Events(Named):
     restart: CFunction
     values_before: str
     jump: str
+    project: str
+    modes: tuple[tuple[int, int], ...]
+    own: int
     values_after: str
 
 
@@ -168,7 +171,6 @@ class AdaptiveRun(Named):
     row_before: str
     look: str
     project_row: str
-    project_restart: str
 
 
 @dataclass(frozen=True)
