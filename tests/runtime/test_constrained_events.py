@@ -21,8 +21,9 @@ name = "pulley"
 x = { rate = 2 }
 y = { friction = "rub" }
 [parameters]
-push = 0
-rub  = 0
+rub = 0
+[inputs]
+push = {}
 [energy]
 kinetic = "3*x_dot**2/2 + y_dot**2/2"
 [forces]
@@ -38,10 +39,46 @@ x_dot = "-x_dot"
 [[event]]
 name = "turn"
 when = "y_dot"
+[[event]]
+name = "behind"
+when = "x - push/4"
+direction = "falling"
 [run]
 friction = "stick"
 duration = 4
 """
+# a slide that a crank moves to and fro, and that has no force on the crank at its ends
+YOKE = """eomc = 1
+name = "yoke"
+[coordinates]
+s   = { friction = "rub" }
+phi = { start = "pi/2", rate = 3, friction = "bearing" }
+[parameters]
+r = 0.5
+bearing = 0
+rub = 1
+[inputs]
+torque = {}
+[energy]
+kinetic = "phi_dot**2/2 + 3*s_dot**2/2"
+[forces]
+phi = "torque"
+[constraints]
+pin = "s - r*cos(phi)"
+[[event]]
+name = "middle"
+when = "phi - 3*pi/2"
+action = "stop"
+[run]
+friction = "stick"
+tolerance = 1e-11
+duration = 4
+"""
+
+
+@pytest.fixture(scope="module")
+def yoke() -> ModuleType:
+    return eomc.load(from_scene(parse(YOKE, "yoke.toml")), BUILDS)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +88,7 @@ def pulley() -> ModuleType:
 
 def test_events_are_on_the_side_where_the_rows_leave_them(pulley: ModuleType) -> None:
     """y was thought to go on as before the jump, so where it turned was not seen."""
-    run = pulley.simulate(params={"push": 2.0})
+    run = pulley.simulate(u=2.0)
     speed = math.sqrt(5.0)
     hit = 2 * (speed - 2)
     assert run.events["wall"].t[0] == pytest.approx(hit, abs=1e-12)
@@ -67,3 +104,37 @@ def test_what_the_rows_turn_slides_the_other_way(pulley: ModuleType) -> None:
     assert run.events["y_stops"].t == pytest.approx([hit + speed], abs=1e-12)
     assert run["x"][-1] == pytest.approx(1 - speed**2 / 2, abs=1e-12)
     assert run["y_slides"][-1] == 0
+
+
+def test_inputs_that_grow_in_a_table_move_what_stuck(pulley: ModuleType) -> None:
+    """It stuck for ever: that a force had jumped over what friction holds was no crossing."""
+    how = {"params": {"rub": 1.0}, "control_period": 0.5, "duration": 1.5}
+    run = pulley.simulate([0, 0], [0, 0], u=[[0.0], [3.0], [3.0]], **how)
+    assert run.events["y_slips"].t.tolist() == [0.5]
+    assert run["x"][-1] == pytest.approx(0.25, abs=1e-12)
+
+
+def test_what_an_input_carries_over_zero_may_cross_it_later(pulley: ModuleType) -> None:
+    """The event was thought to be still on the side where it was by the input before."""
+    run = pulley.simulate([0, 0], [0, 0], u=[[4.0]] + 7 * [[-4.0]], control_period=0.5)
+    at = 1 + math.sqrt(0.25 + 2 * 1.125)
+    assert run.events["behind"].t == pytest.approx([at], abs=1e-12)
+
+
+def test_what_turns_at_a_dead_point_does_not_lock_the_rest(yoke: ModuleType) -> None:
+    """The row that held the slide came before the pin, which was left out in its place."""
+    run = yoke.simulate()
+    assert run.stopped == "middle" and len(run.events["s_stops"]) == 1
+    mass = 1 + 3 * 0.5**2
+    assert run["phi_dot"][-1] == pytest.approx(math.sqrt(9 - 2 * 0.5 * 2 / mass), rel=1e-11)
+
+
+@pytest.mark.parametrize("at", [0.3, 0.8, 1.2, 2.0, 2.9])
+def test_a_joint_that_another_holds_rests(yoke: ModuleType, at: float) -> None:
+    """By rounding it stopped and slipped for ever, until its jumps were said to accumulate."""
+    start = yoke.project([0, at, 0, 0], [0, 0, 0, 0], held=["phi"])
+    for bearing, rub, torque in ((0.1, 10.0, 1.0), (2.0, 1e-3, 1.0), (0.0, 9.0, -0.7)):
+        params = {"bearing": bearing, "rub": rub}
+        run = yoke.simulate(*start, params=params, u=torque, duration=50.0)
+        assert run.status == "ok" and run["phi"][-1] == pytest.approx(at, abs=1e-14)
+        assert len(run.events["phi_stops"]) <= 1 and len(run.events["s_stops"]) <= 1

@@ -83,11 +83,13 @@ def factors(
     faded: Sequence[Expr],
     short: Callable[[Expr], Expr] = lambda atom: atom,
     switched: Container[int] = (),
+    late: Container[int] = (),
 ) -> Factors:
     """The KKT matrix of D and A, factored.
 
     drop, faded: the part of itself, and of each row the number, below which a pivot is none.
-    switched: rows that modes switch, of which more is told.
+    switched: rows that modes switch, of which more is told. late: rows behind all others, which
+    are dropped where the others leave them nothing to hold.
     """
     n = len(D)
     M = {(i, j): D[i][j] for i in range(n) for j in range(n) if D[i][j] != 0}
@@ -95,7 +97,7 @@ def factors(
         for j, entry in enumerate(row):
             if entry != 0:
                 M[n + r, j] = M[j, n + r] = entry
-    order = _order(_pattern(M, n + len(A)), n, tape, M)
+    order = _order(_pattern(M, n + len(A)), n, tape, M, [n + r for r in range(len(A)) if r in late])
     parts: dict[tuple[int, int], list[Expr]] = {}  # of what is left: what is yet to be added
     alone: dict[int, list[Expr]] = {}  # of rows: what coordinates alone make of the pivot
     left, steps, pivots = set(order), [], []
@@ -149,7 +151,9 @@ def _pattern(M: Mapping[tuple[int, int], Expr], size: int) -> Pattern:
     return {i: {j for j in range(size) if j != i and (i, j) in M} for i in range(size)}
 
 
-def _order(pattern: Pattern, n: int, tape: Tape, M: Mapping[tuple[int, int], Expr]) -> list[int]:
+def _order(
+    pattern: Pattern, n: int, tape: Tape, M: Mapping[tuple[int, int], Expr], late: list[int]
+) -> list[int]:
     """The order with the fewest operations: rows as soon as they are ready, or at the end."""
     stage = [tape.stage_of(M[i, i]) if i < n and (i, i) in M else 0 for i in range(len(pattern))]
     found = []
@@ -159,7 +163,8 @@ def _order(pattern: Pattern, n: int, tape: Tape, M: Mapping[tuple[int, int], Exp
         while left:
             ready = [i for i in left if i < n]
             if early or not ready:
-                ready += [i for i in left if i >= n and not any(j in left for j in pattern[i])]
+                rows = [i for i in left if i >= n and i not in late] or late
+                ready += [i for i in rows if i in left and not any(j in left for j in pattern[i])]
             k = min(ready, key=lambda i: (len(left[i]), stage[i], i))
             row = left.pop(k)
             work += len(row) * (len(row) + 6) + 2
@@ -181,8 +186,8 @@ def accelerations(
     A = jacobian(tape, rows)
     c = [tape.scaled(S.NegativeOne, x) for x in chosen(tape, rows.rest, rows)]
     D, b = with_mass(tape, D, b, A, c, rows.weights)
-    switched = [r for r, row in enumerate(rows.solved) if row[0][0] in rows.switched]
-    made = factors(tape, D, A, rows.drop[0], rows.faded, short, switched)
+    switched = _switched(rows)
+    made = factors(tape, D, A, rows.drop[0], rows.faded, short, switched, switched)
     a, some, lacks = made.solve(b, c, short)
     parts: dict[int, list[Expr]] = {}
     for row, x in zip(rows.solved, some, strict=True):
@@ -196,6 +201,11 @@ def accelerations(
     told = zip(made.switched.items(), lacks, strict=True)
     lack_of = {rows.solved[r][0][0]: (lack, pivot) for (r, (pivot, _)), lack in told}
     return Solution(tape, a, order, made.pivots, "D", multipliers, lack_of)
+
+
+def _switched(rows: Constraints) -> list[int]:
+    """Those of the rows solved for that modes switch."""
+    return [r for r, row in enumerate(rows.solved) if row[0][0] in rows.switched]
 
 
 def with_mass(
@@ -231,7 +241,7 @@ def projection(
     """
     n, A = len(D), jacobian(tape, rows)
     D, _ = with_mass(tape, D, [S.Zero] * n, A, [S.Zero] * len(A), rows.weights)
-    made = factors(tape, D, A, rows.drop[1], rows.faded)
+    made = factors(tape, D, A, rows.drop[1], rows.faded, late=_switched(rows))
     places = [row[0][0] for row in rows.solved]  # sums are of positions
     lacks = [tape.scaled(S.NegativeOne, x) for x in chosen(tape, rows.values, rows)]
     positions = [S.Zero if k >= rows.holonomic else x for k, x in zip(places, lacks, strict=True)]

@@ -42,7 +42,7 @@ def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
     vectors, few = (8, 25) if steep(system) else (6, 21)
     stages = METHOD.stages * len(system.coordinates)
-    more = 2 * len(system.events) + 3 * bool(system.events) + bool(system.constraints)
+    more = 3 * len(system.events) + 3 * bool(system.events) + bool(system.constraints)
     return vectors * width + stages + few + more
 
 
@@ -241,8 +241,12 @@ def tightest(real: Real) -> float:
     return 1e-15 if real.epsilon < 1e-10 else 5e-7
 
 
-def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") -> AdaptiveRun:
-    """The loop. happen, restart, begun: the calls that find events, and go on behind them."""
+def run(
+    made: Stepping, happen: str = "", restart: str = "", begun: str = "", changed: str = "",
+    values: str = "",
+) -> AdaptiveRun:  # fmt: skip
+    """The loop. happen, restart, begun: the calls that find events, and go on behind them; changed,
+    values: that which tells whether inputs have changed them, and their values."""
     functions, form = made.functions, made.form
     target = functions.target
     row = {name: f"{name} + {functions.NQ}*rows" for name in ("q_rows", "qd_rows")}
@@ -251,11 +255,9 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
     takes_p = "p" in {a.name for a in made.rest} or bool(
         form.compute_constants or happen or form.project
     )
-    projected = (
-        functions.public.project.call(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]", held="0")
-        if form.project
-        else ""
-    )
+
+    def projected(**state: str) -> str:
+        return functions.public.project.call(held="0", **state) if form.project else ""
 
     return AdaptiveRun(
         **functions.names,
@@ -267,6 +269,8 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
         tightest=target.literal(tightest(target.real)),
         events=bool(happen),
         begun=begun,
+        changed=changed,
+        values=values,
         busy=busy(target.system),
         anew=ANEW,
         run=functions.public.adaptive(METHOD.name),
@@ -276,7 +280,8 @@ def run(made: Stepping, happen: str = "", restart: str = "", begun: str = "") ->
         row=kept.call(q="x.q", qd="x.qd", **to),
         row_before=kept.call(q="q_at", qd="qd_at", **to),
         look=made.within.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
-        project_row=projected,
+        project_row=projected(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]"),
+        project_restart=projected(q="x.q", qd="x.qd", t="x.t"),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from math import cos, pi, prod
+from typing import Any
 
 from eomc.emit import c_function as c
 from eomc.emit.adaptive import BUSY, METHOD, Form, Stepping, busy, run, steps
@@ -71,7 +72,12 @@ def views(functions: Functions, form: Form) -> Iterator[Adaptive | Events | Begu
     if begun:
         yield begun
     begins = begun.function.call(x="&x") if begun else ""
-    yield run(made, found.happened.call(**here), found.restart.call(**again), begins)
+    ended = {"events": "x.seen", "t": "x.t", "q": "x.q", "qd": "x.qd"}
+    values = functions.public.evaluation("events").call(**ended)
+    changed = found.changed.call(x="&x")
+    yield run(
+        made, found.happened.call(**here), found.restart.call(**again), begins, changed, values
+    )
 
 
 def _begun(made: Stepping, restart: CFunction) -> Begun:
@@ -106,40 +112,36 @@ def _events(made: Stepping) -> Events:
     looked = c.static(f"{method}_looked", "void", c.filled(real, "g"), read, number("z"), *own)
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
     bracketed = c.static(f"{method}_bracketed", real, read, k, *ends, *own)
+    above = tuple(int(e.above) for e in system.events if "begins" in target.program)
     crossing = c.static(
-        f"{method}_crossing", real, made.state, k, number("from"), c.given(real, "g"), *own
-    )
+        f"{method}_crossing", real, made.state, k, number("from"), c.given(real, "g"),
+        *([number("noise")] if above else []), *own,
+    )  # fmt: skip
     there = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
     record = public.adaptive_events
     arguments = (made.state, *there, number("tol"), *rest, *record, made.held)
     happened = c.static(f"{method}_happened", "int", *arguments)
-    calls = [*(asked if jumps else ()), *([public.project] if made.form.project else ())]
-    takes = {a.name for f in calls for a in f.arguments}
+    changed = c.static(f"{method}_changed", "int", made.state, *own)
+    calls = [*asked, *([public.project] if made.form.project else ())]
+    taken = {a.name for f in calls for a in f.arguments}
+    behind = [a for a in functions.usual("u", "p") if a.name in taken]
     restart = c.static(
         f"{method}_restarted", functions.status, made.state, number("reached"), *there[1:],
-        *(a for a in functions.usual("u", "p") if a.name in takes),
-        *([made.held] if jumps else []),
+        *(behind if jumps else ()), *([made.held] if jumps else []),
     )  # fmt: skip
     at = {"q": "q_at", "qd": "qd_at"}
     within = {"t": f"{c.member('x', 'from')} + z*{c.member('x', 'size')}", **at}
     reached = {"t": "reached", **at}
-    x, apart = nodes(), APART if target.real.epsilon < 1e-10 else 1e-3
+    now = {name: c.member("x", name) for name in ("t", "q", "qd")}
+    apart = APART if target.real.epsilon < 1e-10 else 1e-3
     return Events(
-        **functions.names,
         method=method,
         fabs=f"fabs{end}",
         sqrt=f"sqrt{end}",
-        eps=target.literal(target.real.epsilon),
-        tiny=target.literal(1e-30),
-        samples=SAMPLES,
-        nodes=numbers(x, target.real),
-        slopes=matrix(slopes(x), target.real),
-        stages=METHOD.stages,
-        once=c.in_braces(numbers(row, target.real) for row in integrals(x, METHOD.stages, 1)),
-        twice=c.in_braces(numbers(row, target.real) for row in integrals(x, METHOD.stages, 2)),
+        **_tables(functions),
         directions=tuple(DIRECTIONS[e.direction] for e in system.events),
         actions=tuple(ACTIONS.index(e.action) for e in system.events),
-        above=tuple(int(e.above) for e in system.events if "begins" in target.program),
+        above=above,
         jumps=jumps,
         busy=busy(system),
         together=BUSY + 4 * (busy(system) - BUSY),
@@ -155,11 +157,14 @@ def _events(made: Stepping) -> Events:
         bracket=bracketed.call(high="node[j]", at_high="g[j]"),
         bracket_dip=bracketed.call(high="z", at_high="value[k]"),
         happened=happened,
-        cross=crossing.call(**{"k": "i", "from": "from[i]", "g": "g[i]"}),
+        cross=crossing.call(**{"k": "i", "from": "from[i]", "g": "g[i]", "noise": "noise[i]"}),
         look_before=looked.call(g="value", z=f"z - {target.literal(apart / 2)}"),
         look_behind=looked.call(g="value", z=f"z + {target.literal(apart / 2)}"),
         inside=made.within.call(),
         values_there=values.call(events="value", **within),
+        values_end=values.call(events="value", **now),
+        changed=changed,
+        values_now=values.call(events="value", **now),
         restart=restart,
         values_before=values.call(events="before", **reached),
         jump=asked[-1].call(**reached) if jumps else "",
@@ -168,3 +173,20 @@ def _events(made: Stepping) -> Events:
         own=len(system.events) - 2 * len(system.modes),
         values_after=values.call(events="value", **reached),
     )
+
+
+def _tables(functions: Functions) -> dict[str, Any]:
+    """The numbers of the nodes at which events are looked at, by the names of their view."""
+    target = functions.target
+    x, real = nodes(), target.real
+    return {
+        **functions.names,
+        "eps": target.literal(real.epsilon),
+        "tiny": target.literal(1e-30),
+        "samples": SAMPLES,
+        "nodes": numbers(x, real),
+        "slopes": matrix(slopes(x), real),
+        "stages": METHOD.stages,
+        "once": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 1)),
+        "twice": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 2)),
+    }

@@ -128,6 +128,9 @@ class Events(Named):
     look_behind: str
     inside: str
     values_there: str
+    values_end: str
+    changed: CFunction
+    values_now: str
     restart: CFunction
     values_before: str
     jump: str
@@ -161,6 +164,8 @@ class AdaptiveRun(Named):
     tightest: str
     events: bool
     begun: str
+    changed: str
+    values: str
     busy: int
     anew: int
     run: CFunction
@@ -171,6 +176,7 @@ class AdaptiveRun(Named):
     row_before: str
     look: str
     project_row: str
+    project_restart: str
 
 
 @dataclass(frozen=True)
