@@ -73,6 +73,7 @@ action = "stop"
 friction = "stick"
 tolerance = 1e-11
 duration = 4
+batch = true
 """
 
 
@@ -138,3 +139,14 @@ def test_a_joint_that_another_holds_rests(yoke: ModuleType, at: float) -> None:
         run = yoke.simulate(*start, params=params, u=torque, duration=50.0)
         assert run.status == "ok" and run["phi"][-1] == pytest.approx(at, abs=1e-14)
         assert len(run.events["phi_stops"]) <= 1 and len(run.events["s_stops"]) <= 1
+
+
+def test_a_start_whose_rates_the_rows_give_slides(yoke: ModuleType) -> None:
+    """The slide was thought to stick, as no rate of it was given, and the start was refused."""
+    run = yoke.simulate(q0=[0, 1.0], qd0=[0, -2.0], duration=0.1)
+    assert run["s_dot"][0] == pytest.approx(math.sin(1.0), rel=1e-14)
+    assert run.q[0, 2:].tolist() == [1, -1] and run.status == "ok"
+    many = yoke.simulate_batch(q0=[[0, 1.0]], qd0=[[0, -2.0]], duration=0.1, tol=1e-11)
+    assert many.q[0, -1].tolist() == run.q[-1].tolist()
+    with pytest.raises(yoke.MotionError, match="with s, phi as given"):
+        yoke.project([1, 1, 1, 1], [0, 0, 0, 0], held=["s", "phi", "s_slides"])

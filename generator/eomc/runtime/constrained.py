@@ -189,6 +189,7 @@ class Constrained(Frames):
             k, said = found >> 3, STATUS[found & 7]
             where = state_text(at.reshape(-1, self.nq)[k], moving.reshape(-1, self.nq)[k])
             kept = [n for n, h in zip(self._states, held, strict=False) if h]
+            kept = [n for n in kept if n.removesuffix("_dot") not in self.still]
             what = SAID[said] if said != "locked" else (
                 "no state near that obeys the constraints"
                 + (f" with {', '.join(kept)} as given: leave one free" if kept else "")
@@ -210,16 +211,14 @@ class Constrained(Frames):
         """
         if not self._rows.names:
             return q, qd, None
-        held = self._rows.held
-        q, qd = self._in_modes(q, qd)
         if len(table) == 1:
             with suppress(MotionError):  # else each by itself
-                return *self._projected(q, qd, t0, table[0], held), None
+                return *self._begun(q, qd, t0, table[0]), None
         q, qd = np.array(q, self.dtype), np.array(qd, self.dtype)
         codes = np.zeros(len(q), "i")
         for k, p in enumerate(np.broadcast_to(table, (len(q), table.shape[1]))):
             try:
-                q[k], qd[k] = self._projected(q[k], qd[k], t0, p, held)
+                q[k], qd[k] = self._begun(q[k], qd[k], t0, p)
             except MotionError as fault:
                 codes[k] = STATUS.index(fault.status)
         return q, qd, codes if codes.any() else None
@@ -241,8 +240,18 @@ class Constrained(Frames):
         if not self._rows.names or (q0 is None and qd0 is None and params is None and t0 == 0):
             return q0, qd0
         q, qd = self._start
-        q, qd = self._in_modes(q if q0 is None else q0, qd if qd0 is None else qd0)
-        return self._projected(q, qd, t0, params, self._rows.held)
+        return self._begun(q if q0 is None else q0, qd if qd0 is None else qd0, t0, params)
+
+    def _begun(self, q: ArrayLike, qd: ArrayLike, t0: float, params: Any) -> tuple[Array, Array]:
+        """A start on the rows, and its modes as the velocities say that these leave."""
+        held = self._rows.held
+        if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
+            return self._projected(q, qd, t0, params, held)
+        q = np.array(q, self.dtype)
+        q[..., [at for at, _ in self._rows.modes]] = 1  # where all slides no row of a mode holds
+        return self._projected(
+            *self._in_modes(*self._projected(q, qd, t0, params, held)), t0, params, held
+        )
 
     @property
     def still(self) -> tuple[str, ...]:
@@ -257,12 +266,9 @@ class Constrained(Frames):
         shape = (*np.shape(x)[:-1], more)
         return np.concatenate([x, np.broadcast_to(self._start[half][-more:], shape)], axis=-1)
 
-    def _in_modes(self, q: Any, qd: Any) -> tuple[Any, Any]:
+    def _in_modes(self, q: Array, qd: Array) -> tuple[Array, Array]:
         """A start whose modes are what its velocities say; one that is rounding is 0."""
-        if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
-            return q, qd
         at, of = np.array(self._rows.modes).T
-        q, qd = np.array(q, self.dtype), np.array(qd, self.dtype)
         fastest = np.max(np.abs(qd), axis=-1, keepdims=True)
         qd[..., of] *= np.abs(qd[..., of]) > np.maximum(AT_REST * fastest, SLOWEST)
         q[..., at] = np.sign(qd[..., of])
