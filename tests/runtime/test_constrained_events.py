@@ -43,6 +43,11 @@ when = "y_dot"
 name = "behind"
 when = "x - push/4"
 direction = "falling"
+[[event]]
+name = "stroke"
+when = "t - 3.5"
+action = "jump"
+x_dot = "-4"
 [run]
 friction = "stick"
 duration = 4
@@ -98,7 +103,7 @@ def test_events_are_on_the_side_where_the_rows_leave_them(pulley: ModuleType) ->
 
 def test_what_the_rows_turn_slides_the_other_way(pulley: ModuleType) -> None:
     """Friction went on as before the jump, and drove what it should have braked."""
-    run = pulley.simulate(params={"rub": 4.0})
+    run = pulley.simulate(params={"rub": 4.0}, duration=3.0)
     hit = 2 - math.sqrt(2.0)
     assert run.events["wall"].t == pytest.approx([hit], abs=1e-12)
     speed = (2 - hit) / 2
@@ -139,6 +144,13 @@ def test_a_joint_that_another_holds_rests(yoke: ModuleType, at: float) -> None:
         run = yoke.simulate(*start, params=params, u=torque, duration=50.0)
         assert run.status == "ok" and run["phi"][-1] == pytest.approx(at, abs=1e-14)
         assert len(run.events["phi_stops"]) <= 1 and len(run.events["s_stops"]) <= 1
+
+
+def test_a_stroke_moves_what_sticks(pulley: ModuleType) -> None:
+    """What was held by 1 N took up all of it."""
+    run = pulley.simulate([0, 0], [0, 0], params={"rub": 1.0}, duration=4.0)
+    assert run.events["y_slips"].t.tolist() == [] and run["y_slides"][-1] == 1
+    assert run["x"][-1] == pytest.approx(-3 * 0.5 + 0.5 * 0.25 / 4, abs=1e-12)
 
 
 def test_a_start_whose_rates_the_rows_give_slides(yoke: ModuleType) -> None:

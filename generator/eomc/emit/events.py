@@ -169,7 +169,7 @@ def _events(made: Stepping) -> Events:
         values_before=values.call(events="before", **reached),
         jump=asked[-1].call(**reached) if jumps else "",
         project=public.project.call(held="0", **reached) if made.form.project else "",
-        modes=tuple((m.at, m.of) for m in system.modes),
+        modes=c.in_braces([str(m.at), str(m.of)] for m in system.modes),
         own=len(system.events) - 2 * len(system.modes),
         values_after=values.call(events="value", **reached),
     )

@@ -135,7 +135,7 @@ class Events(Named):
     values_before: str
     jump: str
     project: str
-    modes: tuple[tuple[int, int], ...]
+    modes: tuple[str, ...]
     own: int
     values_after: str
 
