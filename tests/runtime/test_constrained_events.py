@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from compilers import STRICT, compiled
 
 import eomc
 from eomc.model.from_scene import from_scene
@@ -162,3 +163,13 @@ def test_a_start_whose_rates_the_rows_give_slides(yoke: ModuleType) -> None:
     assert many.q[0, -1].tolist() == run.q[-1].tolist()
     with pytest.raises(yoke.MotionError, match="with s, phi as given"):
         yoke.project([1, 1, 1, 1], [0, 0, 0, 0], held=["s", "phi", "s_slides"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_c_of_joints_that_stick_gives_no_warning(tmp_path: Path, real: str) -> None:
+    text = YOKE.replace("tolerance = 1e-11", f'tolerance = 1e-5\nreal = "{real}"')
+    made = eomc.sources(from_scene(parse(text, "yoke.toml"))).files
+    for name in ("yoke.h", "yoke.c"):
+        (tmp_path / name).write_text(made[name], encoding="utf-8")
+    compiled("cc", *STRICT, "-c", "yoke.c", cwd=tmp_path)
