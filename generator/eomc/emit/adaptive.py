@@ -42,7 +42,7 @@ def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
     vectors, few = (8, 25) if steep(system) else (6, 21)
     stages = METHOD.stages * len(system.coordinates)
-    more = 3 * len(system.events) + 3 * bool(system.events) + bool(system.constraints)
+    more = 8 * len(system.events) + 6 * bool(system.events) + bool(system.constraints)
     return vectors * width + stages + few + more
 
 
@@ -271,6 +271,7 @@ def run(
         begun=begun,
         changed=changed,
         values=values,
+        huge=target.literal(1e30),
         busy=busy(target.system),
         anew=ANEW,
         run=functions.public.adaptive(METHOD.name),

@@ -166,6 +166,7 @@ class AdaptiveRun(Named):
     begun: str
     changed: str
     values: str
+    huge: str
     busy: int
     anew: int
     run: CFunction
