@@ -147,6 +147,14 @@ def test_a_joint_that_another_holds_rests(yoke: ModuleType, at: float) -> None:
         assert len(run.events["phi_stops"]) <= 1 and len(run.events["s_stops"]) <= 1
 
 
+def test_what_stopped_before_a_rest_may_stop_behind_it(yoke: ModuleType) -> None:
+    """As it had not moved in between, its stops were said to accumulate."""
+    for at, table in ((2.0, (0, 0, 3, 0, -3)), (1.0, (1, -1, 4, 0, 2))):
+        u = [[float(torque)] for torque in table]
+        how = {"params": {"bearing": 0.01, "rub": 3.0}, "control_period": 1.0, "duration": 5.0}
+        assert yoke.simulate([0, at], [0, 0.5], u=u, **how).status == "ok"
+
+
 def test_a_stroke_moves_what_sticks(pulley: ModuleType) -> None:
     """What was held by 1 N took up all of it."""
     run = pulley.simulate([0, 0], [0, 0], params={"rub": 1.0}, duration=4.0)
