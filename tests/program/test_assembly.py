@@ -236,6 +236,18 @@ def test_rates_that_a_singular_position_alone_forbids_are_told_so() -> None:
     assert "the start is a singular position. Start beside it, or correct a formula" in text
 
 
+@pytest.mark.parametrize("coupler", [0.6, 0.4])
+def test_a_linkage_that_starts_flat_keeps_its_rows(coupler: float) -> None:
+    """Of the headings that were tried one alone was of a length at which it could be a motion's."""
+    base = coupler + 0.2 - 0.2
+    x = f"0.2*cos(p) + {coupler}*cos(p + q) - {base} - 0.2*cos(r)"
+    y = f"0.2*sin(p) + {coupler}*sin(p + q) - 0.2*sin(r)"
+    made = scene("p = {}\nq = {}\nr = {}", f'x = "{x}"\ny = "{y}"')
+    found = assembled(made)
+    assert found.closure.rank == 2 and not any(row.redundant for row in found.constraints)
+    assert "singular position" in " ".join(map(str, found.warnings))
+
+
 def test_a_loop_that_can_not_close_is_refused() -> None:
     """Two rods of 1 m between points 3 m apart."""
     made = scene(

@@ -8,7 +8,7 @@ import numpy as np
 
 from eomc.program.manifold import Flags, Frame, Manifold, Place, Vector
 
-STEPS = 6  # from one position to the next
+STEPS, HEADINGS = 6, 4  # from one position to the next; that are tried for each
 FIRST, LONGEST = 0.1, 0.3  # of a step, in coordinates' own units
 BENT = 0.1  # of a step: the correction back onto the rows, at most
 
@@ -18,8 +18,8 @@ def walk(manifold: Manifold, start: Place, positions: int) -> Iterator[Place]:
     random = np.random.default_rng(17)
     free = np.ones(len(start.q), dtype=bool)
     span = manifold.system.run.duration if manifold.timed else 0.0
-    place, step = start, FIRST
-    for _ in range(positions):
+    place, step, found = start, FIRST, 0
+    for _ in range(HEADINGS * positions):
         heading = random.normal(size=len(start.q))
         gone, steps = False, 0
         for _ in range(8 * STEPS):
@@ -40,11 +40,16 @@ def walk(manifold: Manifold, start: Place, positions: int) -> Iterator[Place]:
             place, gone, steps, step = there, True, steps + 1, min(LONGEST, 1.5 * step)
             if steps == STEPS:
                 break
-        if gone:
-            q, held = manifold.polished(place, free)
-            if held:
-                place = manifold.place(np.array([float(x) for x in q]), place.t) or place
-            yield place
+        if not gone:  # at a singular position few headings are of a motion
+            step = FIRST
+            continue
+        q, held = manifold.polished(place, free)
+        if held:
+            place = manifold.place(np.array([float(x) for x in q]), place.t) or place
+        yield place
+        found += 1
+        if found == positions:
+            return
 
 
 def along(
