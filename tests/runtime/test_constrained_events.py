@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from compilers import STRICT, compiled
 
@@ -15,7 +16,7 @@ from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILDS = Path(__file__).parents[2] / "build" / "tests" / "constrained_events"
-# x hits a wall and would go back as fast; it drags y along, so it goes back half as fast
+# x hits a wall and goes back half as fast, and y with it
 PULLEY = """eomc = 1
 name = "pulley"
 [coordinates]
@@ -36,7 +37,7 @@ name = "wall"
 when = "x - 1"
 direction = "rising"
 action = "jump"
-x_dot = "-x_dot"
+x_dot = "-x_dot/2"
 [[event]]
 name = "turn"
 when = "y_dot"
@@ -48,7 +49,7 @@ direction = "falling"
 name = "stroke"
 when = "t - 3.5"
 action = "jump"
-x_dot = "-4"
+x_dot = "-3"
 [run]
 friction = "stick"
 duration = 4
@@ -81,6 +82,42 @@ tolerance = 1e-11
 duration = 4
 batch = true
 """
+# two bobs on rods in x and y; the lower one hits a wall, then both are stopped where they can't be
+BOBS = """eomc = 1
+name = "bobs"
+[coordinates]
+x1 = { start = 0.6, rate = 0.8 }
+y1 = { start = -0.8, rate = 0.6 }
+x2 = { start = 1.2, rate = 2.0 }
+y2 = { start = -1.6, rate = 1.5 }
+[parameters]
+m1 = 1.0
+m2 = 2.0
+e = 0.8
+[energy]
+kinetic = "m1*(x1_dot**2 + y1_dot**2)/2 + m2*(x2_dot**2 + y2_dot**2)/2"
+potential = "9.81*(m1*y1 + m2*y2)"
+[constraints]
+upper = "x1**2 + y1**2 - 1"
+lower = "(x2 - x1)**2 + (y2 - y1)**2 - 1"
+[[event]]
+name = "wall"
+when = "x2 - 1.3"
+direction = "rising"
+action = "jump"
+x2_dot = "-e*x2_dot"
+[[event]]
+name = "contradicts"
+when = "t - 0.5"
+action = "jump"
+x1_dot = 1
+y1_dot = 1
+x2_dot = 1
+y2_dot = -1
+[run]
+tolerance = 1e-11
+duration = 0.6
+"""
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +148,24 @@ def test_what_the_rows_turn_slides_the_other_way(pulley: ModuleType) -> None:
     assert run.events["y_stops"].t == pytest.approx([hit + speed], abs=1e-12)
     assert run["x"][-1] == pytest.approx(1 - speed**2 / 2, abs=1e-12)
     assert run["y_slides"][-1] == 0
+
+
+def test_what_a_jump_sets_stays_and_the_rest_follows_by_one_impulse() -> None:
+    """It was shared with the rest: x2 went back slower than the scene said."""
+    bobs = eomc.load(from_scene(parse(BOBS, "bobs.toml")), BUILDS)
+    run = bobs.simulate()
+    before, behind = np.flatnonzero(run.t == run.events["wall"].t[0])
+    q, one, other = run.q[before], run.qd[before], run.qd[behind]
+    assert other[2] == pytest.approx(-0.8 * one[2], rel=1e-14)
+    A = np.vstack([bobs.constraint_jacobian(q), [0, 0, 1, 0]])  # rods, and the wall
+    impulse = bobs.D(q) @ (other - one)
+    along = A.T @ np.linalg.lstsq(A.T, impulse, rcond=None)[0]
+    assert impulse == pytest.approx(along, abs=1e-12) and np.linalg.norm(impulse) > 1
+    before, behind = np.flatnonzero(run.t == 0.5)
+    D, A, asked = bobs.D(q := run.q[before]), bobs.constraint_jacobian(q), np.array([1, 1, 1, -1])
+    share = np.linalg.solve(A @ np.linalg.solve(D, A.T), A @ asked)
+    assert run.qd[behind] == pytest.approx(asked - np.linalg.solve(D, A.T @ share), abs=1e-12)
+    assert run.status == "ok" and max(abs(run.constraints["lower"])) < 1e-13
 
 
 def test_inputs_that_grow_in_a_table_move_what_stuck(pulley: ModuleType) -> None:

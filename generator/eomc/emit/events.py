@@ -14,6 +14,7 @@ from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
 from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Begun, Events
 from eomc.integrators.tableaux import Row
+from eomc.model.system import System
 from eomc.scene.schema import ACTIONS
 
 SAMPLES = 9  # values in a step
@@ -168,11 +169,21 @@ def _events(made: Stepping) -> Events:
         restart=restart,
         values_before=values.call(events="before", **reached),
         jump=asked[-1].call(**reached) if jumps else "",
-        project=public.project.call(held="0", **reached) if made.form.project else "",
+        project=public.project.call(held="set[k]", **reached) if made.form.project else "",
+        project_all=public.project.call(held="0", **reached) if made.form.project else "",
+        set=_set(system) if made.form.project and jumps else (),
         modes=c.in_braces([str(m.at), str(m.of)] for m in system.modes),
         own=len(system.events) - 2 * len(system.modes),
         values_after=values.call(events="value", **reached),
     )
+
+
+def _set(system: System) -> tuple[str, ...]:
+    """Of each event of the scene which of q and qd its jump sets."""
+    states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
+    own = system.events[: len(system.events) - 2 * len(system.modes)]
+    rows = ({name for name, _ in e.jump} for e in own)
+    return c.in_braces([str(int(name in names)) for name in states] for names in rows)
 
 
 def _tables(functions: Functions) -> dict[str, Any]:

@@ -135,6 +135,8 @@ class Events(Named):
     values_before: str
     jump: str
     project: str
+    project_all: str
+    set: tuple[str, ...]
     modes: tuple[str, ...]
     own: int
     values_after: str
