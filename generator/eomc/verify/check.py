@@ -20,6 +20,7 @@ from eomc.verify import (
     rows_constraints,
     rows_derivatives,
     rows_discretize,
+    rows_events,
     rows_frames,
     rows_limits,
     rows_newton,
@@ -70,6 +71,8 @@ def check(
             rows_frames.inverse_dynamics(made)
         if system.outputs and hasattr(module, "output"):
             rows_outputs.report(made)
+        if compiled and system.events:
+            rows_events.report(made)
         if hasattr(module, "applied"):
             rows_limits.report(made)
             rows_signals.report(made)

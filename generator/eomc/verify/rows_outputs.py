@@ -51,6 +51,14 @@ def _values(of: Comparison, module: Any, formulas: Formulas) -> float:
     def found(s: State) -> Vector:
         return np.asarray(module.output(s.q, s.qd, s.t, s.u, s.params), float)
 
+    return apart(of, module, formulas, found)
+
+
+def apart(
+    of: Comparison, module: Any, formulas: Formulas, found: Callable[[State], Vector]
+) -> float:
+    """What a function of the module's finds at some states beside formulas, in units."""
+
     def error(e: Expected) -> float:
         s = _held(of, module, e.state)
         value = found(s)

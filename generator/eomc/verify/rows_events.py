@@ -1,0 +1,51 @@
+"""Rows of `check` about events: what is zero where each happens, and the states behind jumps.
+
+Both beside the formulas as they stand, in many digits, at states anywhere. When and where events
+happen follows from these values alone; friction that sticks has its own events, which are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from eomc.model.symbols import Output
+from eomc.model.system import System
+from eomc.verify.comparison import Comparison
+from eomc.verify.oracle import Vector
+from eomc.verify.report import LIMIT
+from eomc.verify.rows_outputs import Formulas, apart
+from eomc.verify.sampling import State
+
+
+def report(of: Comparison) -> None:
+    """Add the rows of a scene that has events of its own."""
+    system = of.system
+    events = system.events[: len(system.events) - 2 * len(system.modes)]
+    asked = {"events": [Output(e.name, e.when) for e in events]}
+    names = [*(str(q) for q in system.q), *(str(qd) for qd in system.qd)]
+    states = dict(zip(names, (*system.q, *system.qd), strict=True))
+    if any(e.action == "jump" for e in events):
+        asked["jumps"] = [
+            Output(name, (states | dict(e.jump))[name]) for e in events for name in names
+        ]
+    for name, formulas in asked.items():
+        if formulas:
+            for module, form in of.forms:
+                find = partial(_values, of, module, name, replace(system, outputs=tuple(formulas)))
+                of.row(f"{form}{name}", LIMIT, "units of rounding", find)
+
+
+def _values(of: Comparison, module: Any, name: str, asked: System) -> float:
+    """A function of all events beside its formulas, as far as these are the scene's."""
+    model, count = module._model, len(of.system.events)
+
+    def found(s: State) -> Vector:
+        shape = (count, 2 * model.nq) if name == "jumps" else (count,)
+        args = (name, shape, s.q, s.qd, s.t, s.u, s.params, None)
+        return np.asarray(model._evaluate(*args), float).ravel()[: len(asked.outputs)]
+
+    return apart(of, module, Formulas(asked), found)

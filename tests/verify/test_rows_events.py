@@ -1,0 +1,70 @@
+"""The rows of `eomc check` about events notice a formula that is another one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import ModuleType
+
+import pytest
+from conftest import Modules
+
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System, symbol
+from eomc.scene.read import parse
+from eomc.verify.check import check
+
+BALL = from_scene(
+    parse("""eomc = 1
+name = "struck_ball"
+[coordinates]
+y = { start = 1 }
+z = { rate = 0.3 }
+[parameters]
+e = 0.7
+[inputs]
+push = {}
+[definitions]
+height = "y - push/9"
+[energy]
+kinetic = "(y_dot**2 + z_dot**2)/2"
+potential = "9.81*y"
+[[event]]
+name = "impact"
+when = "height"
+direction = "falling"
+action = "jump"
+y_dot = "-e*y_dot + dot(y**2)/8 - push"
+z = "z + cos(y)"
+[[event]]
+name = "top"
+when = "y_dot*exp(z) - t"
+[run]
+tolerance = 1e-9
+""")
+)
+
+
+@pytest.fixture(scope="module")
+def ball(modules: Modules) -> ModuleType:
+    return modules.unoptimised(BALL)
+
+
+def failed(system: System, ball: ModuleType) -> set[str]:
+    rows = check(system, ball, states=4).rows
+    assert {"events", "jumps"} <= {row.name for row in rows}
+    return {row.name for row in rows if not row.passed} & {"events", "jumps"}
+
+
+def test_what_is_right_passes(ball: ModuleType) -> None:
+    assert failed(BALL, ball) == set()
+
+
+def test_another_place_or_jump_fails(ball: ModuleType) -> None:
+    impact, top = BALL.events
+    later = replace(top, when=top.when + symbol("z") * 1e-9)
+    assert failed(replace(BALL, events=(impact, later)), ball) == {"events"}
+    (name, speed), place = impact.jump
+    harder = replace(impact, jump=((name, -speed), place))
+    assert failed(replace(BALL, events=(harder, top)), ball) == {"jumps"}
+    other = replace(impact, jump=(place,))  # the velocity goes on
+    assert failed(replace(BALL, events=(other, top)), ball) == {"jumps"}
