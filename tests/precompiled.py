@@ -63,6 +63,22 @@ static int array_argument(struct _cffi_ctypedescr *type, PyObject *given, char *
 DIRECT = re.compile(
     r"^static [^\n;]*?_cffi_d_(\w+)\([^\n]*\)\n\{\n  (?:return )?\1\([^\n]*\);\n\}\n", re.M
 )
+# a call from Python, which differs from those of functions of one type by the name alone
+WRAPPER = re.compile(
+    r"^static PyObject \*\n_cffi_f_(\w+)\(PyObject \*self, PyObject \*args\)\n\{\n(.*?)^\}\n",
+    re.M | re.S,
+)
+SHARED = """static PyObject *
+{shared}(PyObject *self, PyObject *args, const char *name, __typeof__({name}) *function)
+{{
+{body}}}
+"""
+SHORT = """static PyObject *
+_cffi_f_{name}(PyObject *self, PyObject *args)
+{{
+  return {shared}(self, args, "{name}", {name});
+}}
+"""
 FLAGS = ("-fPIC", "-fvisibility=hidden", compiler.STANDARD, "-DNDEBUG", "-O0")
 
 
@@ -76,7 +92,23 @@ def shortened(binding: str) -> str:
     functions = ARRAY.sub(CALL, DIRECT.sub("", functions))
     for name in direct:
         functions = functions.replace(f"(void *)_cffi_d_{name} ", f"(void *){name} ")
-    return head + FUNCTION + functions
+    return head + FUNCTION + _shared(functions)
+
+
+def _shared(functions: str) -> str:
+    """With one function for all wrappers that do the same by another name."""
+    made: dict[str, str] = {}
+
+    def short(found: re.Match[str]) -> str:
+        name, body = found.groups()
+        body = body.replace(f'args, "{name}", ', "args, name, ")
+        body = re.sub(rf"(\{{ (?:result = )?){name}\(", r"\1function(", body)
+        new = body not in made
+        shared = made.setdefault(body, f"wrapper_{len(made)}")
+        wrapper = SHORT.format(name=name, shared=shared)
+        return SHARED.format(name=name, shared=shared, body=body) + wrapper if new else wrapper
+
+    return WRAPPER.sub(short, functions)
 
 
 @cache
