@@ -11,6 +11,7 @@ from pathlib import Path
 
 from conftest import ROOT
 from packaging.requirements import Requirement
+from test_house import modules, tree
 
 PAGE = (ROOT / "docs" / "SECURITY.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| ([\w-]+) \| (>=[\d.]+) \| (MIT|BSD|PSF) \| (.+) \|$", PAGE, re.M)
@@ -68,8 +69,8 @@ def test_what_these_need_is_told() -> None:
 
 def test_nothing_else_is_imported() -> None:
     found = set()
-    for file in (ROOT / "generator" / "eomc").rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for name in modules():
+        for node in ast.walk(tree(name)):
             if isinstance(node, ast.Import):
                 found |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:

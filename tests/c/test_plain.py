@@ -199,7 +199,7 @@ def compared(name: str, fast: ModuleType, plain: ModuleType, states: int) -> lis
 
 
 @pytest.mark.parametrize(
-    "name", tiers([*NAMES, "steppers", "driven", "single", "everything"], "everything")
+    "name", tiers([*NAMES, "steppers", "driven", "single", "everything"], "driven")
 )
 def test_it_agrees_with_the_reference_and_the_fast_form(name: str) -> None:
     fast, plain = both(name)
@@ -271,7 +271,8 @@ def test_each_sweep_evaluates_all_stages(method: str, stages: int) -> None:
     assert rest == 0 and 2 * 20 <= sweeps <= 12 * 20
 
 
-@pytest.mark.parametrize("name", tiers(["many", "verlet"], "verlet"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["many", "verlet"])
 def test_a_batch_is_a_loop_over_instances(name: str) -> None:
     fast, plain = both(name)
     random = np.random.default_rng(5)

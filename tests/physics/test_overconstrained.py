@@ -128,6 +128,7 @@ def test_bennett_s_linkage_turns(bennett: ModuleType, how: dict[str, object]) ->
         assert np.abs(x).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_multipliers_are_of_the_rows_as_they_are_written(bennett: ModuleType) -> None:
     run = bennett.simulate(tol=1e-10, times=[0.0, 0.4, 1.1, 2.0])
     for q, qd in zip(run.q, run.qd, strict=True):

@@ -211,6 +211,7 @@ def test_an_unstable_equilibrium_is_called_chaotic_still(modules: Modules) -> No
         assert not run.estimate().resolved
 
 
+@pytest.mark.slow
 def test_a_motion_beyond_doubles_is_reported() -> None:
     """Errors grow by 1.7e11 in 15 s."""
     words = "^double_pendulum_chaotic: this motion is not resolved: the error of .* exceeds a tenth"

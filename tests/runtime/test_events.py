@@ -371,7 +371,8 @@ def test_single_precision_has_a_tolerance_that_it_can_keep() -> None:
         parse(text.replace("[run]", "[run]\ntolerance = 1e-9"), "float.toml")
 
 
-@pytest.mark.parametrize("real", tiers(["double", "float"], "double"))
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["double", "float"])
 def test_the_c_compiles_without_a_word_and_does_as_python(
     ball: ModuleType, real: str, tmp_path: Path
 ) -> None:
@@ -484,7 +485,9 @@ def test_events_and_tolerance_of_a_system_made_in_python() -> None:
 
 @pytest.mark.usefixtures("quickly_compiled")
 @pytest.mark.parametrize(
-    ("real", "w", "t0"), [("float", 1000.0, 300.0), ("double", 1e5, 1.7e9)], ids=["float", "double"]
+    ("real", "w", "t0"),
+    tiers([("float", 1000.0, 300.0), ("double", 1e5, 1.7e9)], "double"),
+    ids=["float", "double"],
 )
 def test_steps_of_few_roundings_of_the_time_keep_events_apart(
     real: str, w: float, t0: float

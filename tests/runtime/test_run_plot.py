@@ -280,6 +280,7 @@ def image(page: str) -> np.ndarray:
     return np.asarray(pyplot.imread(io.BytesIO(base64.b64decode(data)), format="png"))
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_the_mechanism_where_there_is_one(modules: Modules, monkeypatch) -> None:
     run = modules("cartpole").simulate(duration=0.5)
     page = run._repr_html_()

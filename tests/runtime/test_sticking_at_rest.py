@@ -13,6 +13,7 @@ from links import made_of
 
 import eomc
 
+BOTH = ", friction = 0.02"
 SLIPS = math.asin(0.4) / 3  # where 0.05 sin(3 t) exceeds 0.02
 
 JOINT = """eomc = 1
@@ -105,7 +106,7 @@ def test_where_it_starts_does_not_matter(joint: ModuleType) -> None:
         assert run.steps < 3 * duration
 
 
-@pytest.mark.parametrize("text", [BOUNDED, LIMITED], ids=["bounded", "limited"])
+@pytest.mark.parametrize("text", tiers([BOUNDED, LIMITED], BOUNDED), ids=["bounded", "limited"])
 def test_forces_with_corners_hold_it_too(modules: Modules, text: str) -> None:
     made = modules.unoptimised(text)
     bend = math.asin(0.8) / 3
@@ -124,7 +125,7 @@ def test_forces_with_corners_hold_it_too(modules: Modules, text: str) -> None:
             assert run.q[-1, 0] == pytest.approx(end, rel=max(10 * tol, 1e-12))
 
 
-@pytest.mark.parametrize("friction", ["", ", friction = 0.02"], ids=["one", "both"])
+@pytest.mark.parametrize("friction", tiers(["", BOTH], BOTH), ids=["one", "both"])
 @pytest.mark.parametrize("bounded", tiers([False, True], True), ids=["smooth", "bounded"])
 def test_what_hangs_on_it_rests_too(modules: Modules, friction: str, bounded: bool) -> None:
     """psi turns phi/0.3: J = 0.0007 + 0.003/0.09, and the friction of phi counts 1/0.3."""
@@ -155,7 +156,7 @@ def test_one_rests_while_another_moves(modules: Modules) -> None:
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-@pytest.mark.parametrize("text", [JOINT, BOUNDED], ids=["smooth", "bounded"])
+@pytest.mark.parametrize("text", tiers([JOINT, BOUNDED], BOUNDED), ids=["smooth", "bounded"])
 def test_the_plain_form_does_the_same(modules: Modules, text: str, tmp_path: Path) -> None:
     fast, plain = modules.unoptimised(text), eomc.load(made_of(text), tmp_path, form="plain")
     for tol in (1e-3, 1e-10):

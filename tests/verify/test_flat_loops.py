@@ -8,7 +8,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from conftest import Modules, tiers
+from conftest import Modules
 
 from eomc.model.from_scene import from_scene
 from eomc.model.system import System
@@ -96,7 +96,8 @@ def test_states_are_as_fast_as_the_motion(modules: Modules) -> None:
     assert comparison(modules, *TURNS).sampler.speed.max() < 12
 
 
-@pytest.mark.parametrize(("of", "seed"), tiers([(TURNS, 1), (RESTS, 0)], TURNS))
+@pytest.mark.slow
+@pytest.mark.parametrize(("of", "seed"), [(TURNS, 1), (RESTS, 0)])
 def test_roundings_that_grow_where_rows_fade_are_no_errors(
     of: tuple[object, ...], seed: int, modules: Modules
 ) -> None:

@@ -52,7 +52,7 @@ class Wrong:
 @pytest.fixture(scope="module")
 def comparison(modules: Modules) -> Comparison:
     made = from_scene(parse(SPACE, "test.toml"))
-    return Comparison(made, modules.of_text(SPACE), np.random.default_rng(0), 6)
+    return Comparison(made, modules.unoptimised(SPACE), np.random.default_rng(0), 6)
 
 
 @pytest.mark.parametrize("name", ["", *ROWS])

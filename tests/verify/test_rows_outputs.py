@@ -103,7 +103,7 @@ def test_wrong_ones_of_multipliers_fail(
         assembled(from_scene(parse(ON_A_ROD, "test.toml"))),
         modules.unoptimised(ON_A_ROD),
     )
-    comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
+    comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), 4)
     rows_outputs.report(comparison)
     assert [row.name for row in comparison.rows if not row.passed] == failed, comparison.rows
 
