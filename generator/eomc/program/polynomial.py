@@ -16,7 +16,8 @@ from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 from eomc.derive.atoms import split
 from eomc.derive.tape import Stage, Tape
 
-Monomial = tuple[tuple[str, Fraction], ...]  # ((name, exponent), ...), sorted by name
+Exponent = int | Fraction  # whole ones are ints, of which the hash is quick
+Monomial = tuple[tuple[str, Exponent], ...]  # sorted by name
 Polynomial = dict[Monomial, Expr]
 
 MOST_TERMS = 64  # of one polynomial
@@ -24,8 +25,6 @@ MOST_IN_ALL = 160  # of the outputs of one function
 MOST_EXPONENT = 2**20
 MOST_BITS = 900  # of a coefficient: a double holds it
 MOST_ON_THE_WAY = 8 * MOST_TERMS  # before terms have cancelled
-
-_ZERO, _ONE = Fraction(0), Fraction(1)
 
 
 class TooLargeError(Exception):
@@ -85,7 +84,7 @@ class Expander:
 
     def _whole(self, symbol: Symbol) -> Polynomial:
         self.symbols[symbol.name] = symbol
-        return {((symbol.name, _ONE),): S.One}
+        return {((symbol.name, 1),): S.One}
 
     def _of(self, name: Symbol) -> Polynomial:
         rhs = self.tape.rhs(name)
@@ -117,9 +116,10 @@ class Expander:
     def _power(self, base: Symbol, exponent: Expr) -> Polynomial:
         """A power that is not a whole positive one: spread over a product, kept on a sum."""
         inner = self.symbol(base)
-        power = Fraction(int(exponent.p), int(exponent.q)) if exponent.is_Rational else None
-        if power is None:
+        if not exponent.is_Rational:
             raise TooLargeError
+        p, q = int(exponent.p), int(exponent.q)
+        power: Exponent = p if q == 1 else Fraction(p, q)
         if len(inner) == 1 and power.denominator == 1:
             ((monomial, coefficient),) = inner.items()
             _short(coefficient, abs(power))
@@ -135,7 +135,7 @@ class Expander:
             for m2, c2 in other.items():
                 powers = dict(m1)
                 for n, e in m2:
-                    powers[n] = powers.get(n, _ZERO) + e
+                    powers[n] = powers.get(n, 0) + e
                 key = _monomial(powers)
                 out[key] = out.get(key, S.Zero) + c1 * c2
         return _bounded({m: c for m, c in out.items() if c != 0})
@@ -168,7 +168,7 @@ class Expander:
     def _stage(self, name: str) -> Stage:
         return self.tape.stage[self.symbols[name]]
 
-    def _expr(self, powers: Iterable[tuple[str, Fraction]]) -> Expr:
+    def _expr(self, powers: Iterable[tuple[str, Exponent]]) -> Expr:
         return Mul(*(Pow(self.symbols[n], Rational(e.numerator, e.denominator)) for n, e in powers))
 
     def _factored(self, terms: Mapping[Monomial, Expr]) -> Expr:
@@ -179,7 +179,7 @@ class Expander:
         inside: dict[Monomial, Expr] = {}
         outside: dict[Monomial, Expr] = {}
         for monomial, c in terms.items():
-            e = dict(monomial).get(best, _ZERO)
+            e = dict(monomial).get(best, 0)
             if e >= 1 and e.denominator == 1:
                 inside[_shifted(monomial, {best: -1})] = c
             else:
@@ -197,7 +197,7 @@ def _bounded(polynomial: Polynomial) -> Polynomial:
     return polynomial
 
 
-def _short(number: Expr, power: Fraction = _ONE) -> None:
+def _short(number: Expr, power: Exponent = 1) -> None:
     """Raises TooLargeError where a power of the number would be long."""
     if number.is_Rational and (number.p.bit_length() + number.q.bit_length()) * power > MOST_BITS:
         raise TooLargeError
@@ -207,11 +207,11 @@ def _shifted(monomial: Monomial, by: Mapping[str, int]) -> Monomial:
     """The monomial with other exponents."""
     powers = dict(monomial)
     for name, e in by.items():
-        powers[name] = powers.get(name, _ZERO) + e
+        powers[name] = powers.get(name, 0) + e
     return _monomial(powers)
 
 
-def _monomial(powers: Mapping[str, Fraction]) -> Monomial:
+def _monomial(powers: Mapping[str, Exponent]) -> Monomial:
     return tuple(sorted((n, e) for n, e in powers.items() if e))
 
 
@@ -221,7 +221,7 @@ def _without_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomia
         out: Polynomial = {}
         changed = False
         for monomial, c in polynomial.items():
-            e = dict(monomial).get(sine, _ZERO)
+            e = dict(monomial).get(sine, 0)
             if e >= 2 and e.denominator == 1:
                 changed = True
                 low = _shifted(monomial, {sine: -2})
@@ -240,7 +240,7 @@ def _without_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomia
 def _with_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomial:
     """a - a cos^2 -> a sin^2"""
     polynomial = dict(polynomial)
-    for monomial in sorted(m for m in polynomial if dict(m).get(cosine, _ZERO) >= 2):
+    for monomial in sorted(m for m in polynomial if dict(m).get(cosine, 0) >= 2):
         low = _shifted(monomial, {cosine: -2})
         if monomial in polynomial and polynomial.get(low) == -polynomial[monomial]:
             high = _shifted(monomial, {cosine: -2, sine: 2})
