@@ -170,7 +170,8 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Printed:
     return of
 
 
-@pytest.mark.parametrize("name", tiers(NAMES, "cartpole"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
 def test_the_example_prints_what_the_module_computes(
     name: str, printed: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -129,6 +129,7 @@ def test_a_build_has_the_same_files(tmp_path: Path, quickly_compiled: None) -> N
             assert (built / file.relative_to(folder)).read_bytes() == file.read_bytes()
 
 
+@pytest.mark.slow
 def test_two_versions_in_one_program(tmp_path: Path, printed: str) -> None:
     """The same scene twice, and the second with another gravity: by another prefix."""
     made(tmp_path / "a")

@@ -120,6 +120,7 @@ def test_dp8_reaches_what_doubles_allow(name: str, h: float) -> None:
     assert error["rk4"] > 100 * error["dp8"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quickly_compiled")
 def test_a_wrong_coefficient_is_found_by_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -122,7 +122,7 @@ class Expander:
         power: Exponent = p if q == 1 else Fraction(p, q)
         if len(inner) == 1 and power.denominator == 1:
             ((monomial, coefficient),) = inner.items()
-            _short(coefficient, abs(power))
+            _short(coefficient, max(power, -power))
             return _bounded({tuple((n, e * power) for n, e in monomial): coefficient**exponent})
         self.symbols[base.name] = base
         return {((base.name, power),): S.One}
