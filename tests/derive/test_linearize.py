@@ -93,7 +93,7 @@ def test_against_differences(scene: str) -> None:
 def test_linearize_is_the_slope_of_the_acceleration() -> None:
     module: Any = with_slopes("cartpole_driven")
     q, qd, u, d = np.array([0.3, 1.1]), np.array([-0.4, 0.7]), np.array([2.0]), 1e-6
-    A, B = module.linearize(q, qd, u)
+    A, B = module.linearize(q, qd, u=u)
     assert A.shape == (4, 4) and B.shape == (4, 1)
     x = np.concatenate([q, qd, u])
 
@@ -104,7 +104,10 @@ def test_linearize_is_the_slope_of_the_acceleration() -> None:
     # differences over 2e-6 of values below 100: off by d^2 and by rounding, 1e-16*100/1e-6
     np.testing.assert_allclose(np.hstack([A, B]), np.transpose(slopes), rtol=1e-7, atol=1e-7)
     with pytest.raises(ValueError, match="expected"):
-        module.linearize(q[None, None], qd[None, None], u)
+        module.linearize(q[None, None], qd[None, None], u=u)
+    for slopes in (module.linearize, module.sensitivity):
+        with pytest.raises(TypeError, match="positional"):  # time and inputs have their names
+            slopes(q, qd, u)
 
 
 @pytest.mark.slow
@@ -149,7 +152,7 @@ def test_derivatives_by_parameters(name: str, modules: Modules) -> None:
     random = np.random.default_rng(3)
     q, qd = random.uniform(0.3, 1.0, (2, len(m.coordinates)))
     u = random.standard_normal(len(m.inputs)) if m.inputs else None
-    E = m.sensitivity(q, qd, u)
+    E = m.sensitivity(q, qd, u=u)
     assert E.shape == (len(q), len(m.parameters))
     for k, (p, value) in enumerate(m.defaults.items()):
         by = 1e-5 * max(1.0, abs(value))
@@ -158,7 +161,7 @@ def test_derivatives_by_parameters(name: str, modules: Modules) -> None:
         np.testing.assert_allclose(E[:, k], (up - down) / (2 * by), rtol=1e-6, atol=1e-7 * size)
     assert np.abs(E).max() > 0
     with pytest.raises(ValueError, match='linearize = "parameters"'):
-        modules(name).sensitivity(q, qd, u)
+        modules(name).sensitivity(q, qd, u=u)
 
 
 LOOP = """eomc = 1
@@ -238,7 +241,7 @@ def test_a_loop_that_is_none_is_refused(modules: Modules, driven: ModuleType) ->
     assert "sign" in jumps
     for module, words in ((m, "give no u"), (modules.unoptimised(jumps), "has no loop to close")):
         with pytest.raises(ValueError, match=words):
-            module.linearize([0, 0], [0, 0], [1, 2] if module is m else None, closed=True)
+            module.linearize([0, 0], [0, 0], u=[1, 2] if module is m else None, closed=True)
     modules.unoptimised(jumps).linearize([0, 0], [0, 0])
 
 

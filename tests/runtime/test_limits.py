@@ -143,8 +143,8 @@ def test_runs_keep_what_was_asked_for(limited: ModuleType, tmp_path: Path) -> No
 
 def test_derivatives_are_zero_beyond(limited: ModuleType) -> None:
     q, qd = limited.start
-    within = limited.linearize(q, qd, [1, 1, 0])[1]
-    beyond = limited.linearize(q, qd, [4, -1, 0])[1]
+    within = limited.linearize(q, qd, u=[1, 1, 0])[1]
+    beyond = limited.linearize(q, qd, u=[4, -1, 0])[1]
     assert np.all(within[2:] != 0) and np.all(beyond[:, :2] == 0)
     assert np.array_equal(beyond[:, 2], within[:, 2])
 

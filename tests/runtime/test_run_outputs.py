@@ -148,7 +148,7 @@ def test_they_are_nan_where_there_is_no_acceleration(crane: ModuleType) -> None:
 
 def test_their_linearization_is_that_of_the_motion(crane: ModuleType) -> None:
     q, qd = (np.array(x) for x in crane.start)
-    A, B, C, D = crane.linearize(q, qd, [0.4], outputs=True)
+    A, B, C, D = crane.linearize(q, qd, u=[0.4], outputs=True)
     assert C.shape == (6, 4) and D.shape == (6, 1)
     x, e = np.hstack([q, qd]), 1e-6
 
@@ -160,7 +160,7 @@ def test_their_linearization_is_that_of_the_motion(crane: ModuleType) -> None:
         assert C[:, k] == pytest.approx(found, abs=1e-7)
     assert D[:, 0] == pytest.approx(slope(lambda d: crane.output(q, qd, u=[0.4 + d])), abs=1e-7)
     assert all(
-        np.array_equal(a, b) for a, b in zip((A, B), crane.linearize(q, qd, [0.4]), strict=True)
+        np.array_equal(a, b) for a, b in zip((A, B), crane.linearize(q, qd, u=[0.4]), strict=True)
     )
 
 

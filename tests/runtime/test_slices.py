@@ -185,7 +185,7 @@ def calls(f, g, G):
     for name in ("tau", "power", "acceleration"):
         yield getattr(m, name)(g, f(qd), u=f(u), params=f(p)), getattr(m, name)(G, f(QD), u=f(u))
     yield m.signal(g, f(qd)), m.rhs(0.0, f([*q, *qd]), f(u), f(p))
-    yield m.linearize(g, f(qd), f(u), params=f(p))
+    yield m.linearize(g, f(qd), u=f(u), params=f(p))
     yield m.step(g, f(qd), u=f(u), params=f(p))
     yield (m.advice(g, f(qd), 5.0, f(u), f(p)),)
     for t in (f(U), f(u)):

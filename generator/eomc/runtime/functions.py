@@ -304,7 +304,7 @@ class Functions(Arguments):
         return hasattr(self._lib, "linearization")
 
     def linearize(
-        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Any = None, *,
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, u: Any = None, params: Any = None,
         outputs: bool = False, closed: bool = False,
     ) -> tuple[Array, ...]:  # fmt: skip
         """d[q; qd]/dt = A dx + B du near a state, x = [q; qd]: A (2 nq, 2 nq), B (2 nq, nu).
@@ -334,9 +334,10 @@ class Functions(Arguments):
         at, moving = self._state(q, qd)
         each = for_each(self, len(at), u, params) if at.ndim == 2 else None
         if each:
-            times, how = row_times(t, at.shape[:1]), {"outputs": outputs, "closed": closed}
+            times = [t] * len(at) if (given := row_times(t, at.shape[:1])) is None else given
+            how = {"outputs": outputs, "closed": closed}
             found = [
-                self.linearize(at[k], moving[k], own, t if times is None else times[k], p, **how)
+                self.linearize(at[k], moving[k], t=times[k], u=own, params=p, **how)
                 for k, (own, p) in enumerate(each)
             ]
             return tuple(map(np.array, zip(*found, strict=True)))
@@ -392,8 +393,9 @@ class Functions(Arguments):
         return K
 
     def sensitivity(
-        self, q: ArrayLike, qd: ArrayLike, u: Any = None, t: float = 0.0, params: Parameters = None
-    ) -> Array:
+        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, u: Any = None,
+        params: Parameters = None,
+    ) -> Array:  # fmt: skip
         """dqdd/dp at a state, (nq, np), parameters in their order; exact derivatives, u held.
 
         Raises MotionError where a derivative is not finite, ValueError where the module lacks them.

@@ -70,7 +70,7 @@ def _modes(
     def spectrum(ways: Array) -> tuple[float, float]:
         moved = near[:, None] * ways
         if model.has_slopes and (u is not None or not model.nu):  # signals may depend on the state
-            rates = model.linearize(q, qd, u, t, params)[0].astype(float) @ moved
+            rates = model.linearize(q, qd, t=t, u=u, params=params)[0].astype(float) @ moved
         else:
             states = np.vstack([x, x + moved.T]).astype(model.dtype)
             a = model.acceleration(states[:, :n], states[:, n:], t, u, params).astype(float)
