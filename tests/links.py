@@ -28,7 +28,7 @@ def made_of(text: str) -> System:
 def by_multipliers(made: System) -> Function:
     """The acceleration by this route, whichever is the cheapest."""
     found = link_multipliers.solution(made)
-    return lower("acceleration", found.tape, found.acceleration, found.pivots, ())
+    return lower("acceleration", found.tape, found.acceleration, checks=found.pivots)
 
 
 def cheapest(made: System) -> tuple[Function, Mapping[str, str]]:

@@ -59,7 +59,7 @@ MANY = settings(FEW, max_examples=24)
 def by_lagrange(made: System) -> Function:
     _, found, _ = lagrange._by_lagrange(made)
     assert isinstance(found, Solution)
-    return lower("acceleration", found.tape, found.acceleration, found.pivots, ())
+    return lower("acceleration", found.tape, found.acceleration, checks=found.pivots)
 
 
 def assert_right(made: System) -> Function:

@@ -41,7 +41,7 @@ def test_each_is_good_for_something() -> None:
 def test_all_agree_in_forty_digits(scene: str) -> None:
     system = scene_system(scene)
     found = {
-        name: lower("acceleration", way.tape, way.acceleration, way.pivots, ())
+        name: lower("acceleration", way.tape, way.acceleration, checks=way.pivots)
         for name, way in solutions(scene).items()
     }
     assert len(found) > 1
@@ -59,7 +59,7 @@ def test_rotations_there_and_back_cancel_in_c() -> None:
     material = Material(derive(scene_system("tumbling_box")))
     plain, short = (ROUTES[name].functions(material) for name in ("newton-euler", "rotated"))
     assert plain is not None and short is not None
-    made = [lower("C", f.tape, f.outputs["C"], (), ()) for f in (plain, short)]
+    made = [lower("C", f.tape, f.outputs["C"]) for f in (plain, short)]
     assert made[0].cost.multiplications > 60 and made[1].cost.multiplications < 50
     for k in range(3):
         one, other = (evaluate(f, nearby(material.derived.system, k), exact=True)[0] for f in made)

@@ -55,7 +55,7 @@ class Ours:
 
     def values(self, tape: Tape, outputs: Sequence[object], *given: Array) -> Array:
         system: System = self.system
-        function = lower("values", tape, outputs, (), (), system.names)
+        function = lower("values", tape, outputs, system.names)
         leaves = [system.q, system.qd, system.qdd, wrenches(system)]
         state = {p.name: p.value for p in system.parameters} | {"t": 0.0}
         for symbols, numbers in zip(leaves, given, strict=False):

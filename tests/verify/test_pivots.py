@@ -98,7 +98,7 @@ def test_pivots_are_schur_complements_of_D(name: str) -> None:
     D = reference.evaluate("D", *place, 0.0, None, given)
     for route, way in solved.items():
         pairs = [x for pair in way.pivots for x in pair]
-        computed = evaluator(lower("pivots", way.tape, pairs, (), (), made.names))(values)[0]
+        computed = evaluator(lower("pivots", way.tape, pairs, made.names))(values)[0]
         assert len(way.order) == len(way.pivots) == len(D)
         for n, (k, pivot, size) in enumerate(
             zip(way.order, computed[::2], computed[1::2], strict=True)

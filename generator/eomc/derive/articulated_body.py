@@ -58,7 +58,7 @@ class _Articulated:
 
     def solve(self, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
         r, n = self.r, self.r.n
-        given = r.forces(r.rates(), [S.Zero] * n)
+        given = r.forces(r.speed, [S.Zero] * n)
         f, m = list(given.force), list(given.moment)
         bodies = [self._rigid(x) for x in r.inertia]
         size: list[Expr] = [S.Zero] * n

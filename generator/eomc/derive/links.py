@@ -100,10 +100,6 @@ class Links(Vectors):
         v[self.links[k].axis] = x
         return (v[0], v[1], v[2])
 
-    def rates(self) -> list[Expr]:
-        """The joints' rates, by link."""
-        return self.speed
-
     def angular_velocities(self, rates: Sequence[Expr]) -> list[Vector]:
         """omega of each link in its frame."""
         out: list[Vector] = []

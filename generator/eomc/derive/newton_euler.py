@@ -287,7 +287,7 @@ class Recursion(Links):
         return self._with_rotors(forces, direction)
 
     def _moving(self, faster: Sequence[Expr]) -> list[Expr]:
-        return self._with_rotors(self.forces(self.rates(), faster), faster)
+        return self._with_rotors(self.forces(self.speed, faster), faster)
 
     def _with_rotors(self, forces: _Forces, wishes: Sequence[Expr]) -> list[Expr]:
         """The forces along the joints, with those that armatures need."""
@@ -332,7 +332,7 @@ class Recursion(Links):
 
     def kinetic_energy(self) -> Expr:
         """K of the tree."""
-        rates = self.rates()
+        rates = self.speed
         spin = self.angular_velocities(rates)
         terms: list[Expr] = []
         for k, v in enumerate(self.velocities(rates, spin)):

@@ -39,7 +39,7 @@ class Candidate:
 def cheapest(name: str, system: System, routes: Mapping[str, Candidate]) -> Function:
     """By the route with the fewest operations among those that lose no digits against another."""
     made = {
-        way: lower(name, r.tape, r.outputs, r.checks, r.labels, system.names)
+        way: lower(name, r.tape, r.outputs, system.names, checks=r.checks, labels=r.labels)
         for way, r in routes.items()
     }
 

@@ -28,23 +28,23 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
         return
     yield from of_rows(derived)
     names = [f"lambda_{c.name}" for c in system.constraints]
-    yield lower("multipliers", taken.tape, taken.multipliers, (), names, system.names)
+    yield lower("multipliers", taken.tape, taken.multipliers, system.names, labels=names)
     e, values, pivots, correction = min(
         (_correction(system, e) for e in _both(derived)), key=lambda found: weight(found[-1].cost)
     )
     assert e.rows is not None
     yield correction
     if terms := rate_terms(e.tape, e.rows, system.qd):
-        yield lower("rate_terms", e.tape, terms, (), (), system.names)
+        yield lower("rate_terms", e.tape, terms, system.names)
     if system.run.discretize:
         moves = values[: 2 * len(system.q)]
         both = [*moves, *along(system, e.tape, moves)]
-        yield lower("projection_along", e.tape, both, pivots, (), system.names)
+        yield lower("projection_along", e.tape, both, system.names, checks=pivots)
     if system.reactions:
         yield _reactions(system)
     if system.run.sloped:
         slopes = [x for r in e.rows.rates for x in e.tape.gradient([(r, S.One)], system.q)]
-        yield lower("constraint_slopes", e.tape, slopes, (), (), system.names)
+        yield lower("constraint_slopes", e.tape, slopes, system.names)
 
 
 def of_rows(derived: Derivation) -> Iterator[Function]:
@@ -52,11 +52,11 @@ def of_rows(derived: Derivation) -> Iterator[Function]:
     system, e = derived.system, _equations(derived)
     assert e.rows is not None
     names = [c.name for c in system.constraints]
-    yield lower("constraints", e.tape, e.rows.values, (), names, system.names)
+    yield lower("constraints", e.tape, e.rows.values, system.names, labels=names)
     jacobian = [x for row in e.rows.jacobian for x in row]
-    yield lower("constraint_jacobian", e.tape, jacobian, (), (), system.names)
+    yield lower("constraint_jacobian", e.tape, jacobian, system.names)
     labels = [f"{name}_rate" for name in names]
-    yield lower("constraint_rates", e.tape, e.rows.rates, (), labels, system.names)
+    yield lower("constraint_rates", e.tape, e.rows.rates, system.names, labels=labels)
 
 
 def _equations(derived: Derivation) -> Equations:
@@ -72,7 +72,7 @@ def _correction(system: System, e: Equations) -> tuple[Equations, Vector, Pairs,
     """What steps lack for the rows to hold, by these equations; the pivots; the function of it."""
     assert e.rows is not None
     values, pivots = kkt.projection(e.tape, e.D, e.rows, system.q)
-    return e, values, pivots, lower("projection", e.tape, values, pivots, (), system.names)
+    return e, values, pivots, lower("projection", e.tape, values, system.names, checks=pivots)
 
 
 def _reactions(system: System) -> Function:
@@ -81,7 +81,7 @@ def _reactions(system: System) -> Function:
     named = tuple(Output(f"reaction_{k}", x) for k, x in enumerate(values))
     multipliers = [c.multiplier for c in system.constraints]
     made = outputs.outputs(replace(system, outputs=named), sloped=False, more=multipliers)
-    return lower("reactions", made.tape, made.values, (), (), system.names)
+    return lower("reactions", made.tape, made.values, system.names)
 
 
 def weighted(

@@ -19,15 +19,16 @@ def lower(
     name: str,
     tape: Tape,
     outputs: Sequence[Expr],
-    checks: Sequence[tuple[Expr, Expr]],
-    labels: Sequence[str],
     reserved: frozenset[str] = frozenset(),
+    *,
+    checks: Sequence[tuple[Expr, Expr]] = (),
+    labels: Sequence[str] = (),
 ) -> Function:
     """The function that computes `outputs`, and whose `checks` must be positive.
 
-    labels: names for outputs, then for pivots and diagonal entries, where they have none.
     reserved: names that no value gets, whether the function reads them or not: values of several
-    functions may lie in one struct with parameters.
+    functions may lie in one struct with parameters. labels: names for outputs, then for pivots and
+    diagonal entries, where they have none.
     """
     ends = [*outputs, *(atom for pair in checks for atom in pair)]
     work = _Reader(tape)

@@ -162,7 +162,7 @@ class Manifold:
         made = {f.name: f for f in constrained.of_rows(derived)}
         e = derived.lagrange or derived.newton_euler
         assert e is not None
-        D = lower("D", e.tape, [x for row in e.D for x in row], (), (), system.names)
+        D = lower("D", e.tape, [x for row in e.D for x in row], system.names)
         self.functions = {**made, "D": D}
         self.parameters = {p.name: p.value for p in system.parameters}
         self._names = [x.name for x in (*system.q, *system.qd)]

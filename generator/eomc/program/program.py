@@ -126,10 +126,10 @@ def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
         rows = linearization(system, taken.tape, taken.outputs)
         by_rows = len(rows) == len(system.q) and len(rows[0]) > len(rows)
         name = "linearization" if by_rows else "linearization_column"
-        yield lower(name, taken.tape, [x for row in rows for x in row], taken.checks, (), names)
+        yield lower(name, taken.tape, [x for row in rows for x in row], names, checks=taken.checks)
     if run.linearize == "parameters" and system.parameters:
         rows = sensitivity(system, taken.tape, taken.outputs)
-        yield lower("sensitivity", taken.tape, [x for row in rows for x in row], (), (), names)
+        yield lower("sensitivity", taken.tape, [x for row in rows for x in row], names)
 
 
 def _outputs(system: System, taken: Candidate) -> Iterator[Function]:
@@ -144,9 +144,9 @@ def _outputs(system: System, taken: Candidate) -> Iterator[Function]:
     known = (taken.tape, held) if read & held.keys() else None
     made = outputs.outputs(system, sloped=system.run.sloped, beside=known)
     labels = [o.name for o in system.outputs]
-    yield lower("outputs", made.tape, made.values, (), labels, system.names)
+    yield lower("outputs", made.tape, made.values, system.names, labels=labels)
     if rows := [x for row in made.slopes for x in row]:
-        yield lower("output_slopes", made.tape, rows, (), (), system.names)
+        yield lower("output_slopes", made.tape, rows, system.names)
 
 
 def _events(system: System, taken: Candidate) -> Iterator[Function]:
@@ -175,7 +175,7 @@ def _events(system: System, taken: Candidate) -> Iterator[Function]:
         read = {x for f in formulas for x in f.free_symbols}
         known = (taken.tape, held) if read & held.keys() else None
         found = outputs.outputs(replace(system, outputs=named), sloped=False, beside=known)
-        yield lower(name, found.tape, found.values, (), (), system.names)
+        yield lower(name, found.tape, found.values, system.names)
 
 
 def _asked(system: System) -> Iterator[Function]:
@@ -188,14 +188,14 @@ def _asked(system: System) -> Iterator[Function]:
         for name in ("poses", "velocities", "accelerations", "jacobians", "forces"):
             labels = where if name == "poses" and system.plane else ()
             values = getattr(found, name)
-            yield lower(f"frame_{name}", found.tape, values, (), labels, system.names)
+            yield lower(f"frame_{name}", found.tape, values, system.names, labels=labels)
     if system.run.inverse_dynamics:
         tape, forces = inverse_dynamics(system)
         labels = [f"tau_{c.name}" for c in system.coordinates]
-        yield lower("inverse_dynamics", tape, forces, (), labels, system.names)
+        yield lower("inverse_dynamics", tape, forces, system.names, labels=labels)
     if system.run.momentum:
         tape, values = momentum(system)
-        yield lower("momentum", tape, values, (), (), system.names)
+        yield lower("momentum", tape, values, system.names)
 
 
 def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterator[Function]:
@@ -214,7 +214,7 @@ def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterato
         )
         raise SceneError([system.problem("run.discretize", message)]) from None
     rows = [x for row in made.slopes for x in row[: len(state)]]
-    yield lower("signal_slopes", made.tape, rows, (), (), system.names)
+    yield lower("signal_slopes", made.tape, rows, system.names)
 
 
 def _applied(system: System) -> Iterator[Function]:
@@ -225,7 +225,7 @@ def _applied(system: System) -> Iterator[Function]:
     tape = Tape(leaves | dict.fromkeys(system.u, Stage.TIME))
     within = [tape.define(i.limited) for i in system.inputs]
     labels = [f"{i.name}_limited" for i in system.inputs]
-    yield lower("applied", tape, within, (), labels, system.names)
+    yield lower("applied", tape, within, system.names, labels=labels)
 
 
 def _unsuited(program: Program) -> list[Problem]:
