@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import os
 import shutil
 import stat
 import sys
 from collections.abc import Iterator
+from multiprocessing import get_context
+from multiprocessing.context import ForkProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
 
 KEPT = SCENES.parent / "build" / "tests" / "kept"  # builds to be copied, from run to run
 TEXT = (SCENES / "simple_pendulum.toml").read_text(encoding="utf-8")
+FRESH = 10  # what a process that builds returns, and one less where it was there already
 CHANGED = TEXT.replace('"m*g*y"', '"2*m*g*y"')
 
 
@@ -119,3 +123,24 @@ def leftovers(root: Path) -> list[str]:
     """Whatever stands beside the module and its lock."""
     expected = {"simple_pendulum", ".simple_pendulum.lock"}
     return sorted(f.name for f in root.iterdir() if f.name not in expected)
+
+
+def started(scene: Path, root: Path, **environment: str) -> ForkProcess:
+    """A process that builds, and has SymPy already."""
+
+    def build() -> None:
+        os.environ.update(environment)
+        sys.exit(FRESH - 1 + eomc.build(scene, root).fresh)
+
+    process = get_context("fork").Process(target=build)
+    process.start()
+    return process
+
+
+def marks(folder: Path) -> dict[str, tuple[int, int, int]]:
+    """What tells whether a file was touched, by name."""
+    return {
+        f.name: (f.stat().st_ino, f.stat().st_mtime_ns, f.stat().st_size)
+        for f in folder.iterdir()
+        if f.name != "__pycache__"
+    }

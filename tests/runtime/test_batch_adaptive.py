@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Modules, tiers
+from eventful import BALL, built
 from test_adaptive import KEPLER
-from test_events import BALL, built
 
 import eomc
 from eomc.model.from_scene import from_scene

@@ -10,9 +10,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 from conftest import Modules
+from eventful import BALL, G, built
 from test_adaptive_memory import ENDLESS
-from test_events import BALL, G, built
 
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
 FAR = np.array([1e9, 0.7, 1e9, 1e9])
 E = np.array([0.8, 0.8, 0.5, 0.9])
 HOW = {"params": {"far": FAR, "e": E}, "duration": 2.0}

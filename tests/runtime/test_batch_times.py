@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from conftest import Modules
-from test_events import BALL, built
+from eventful import BALL, built
 
 SPRINGS = """eomc = 1
 name = "many_springs"

@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 import pickle
 import subprocess
-import time
 from pathlib import Path
 from types import ModuleType
 
-import mpmath
 import numpy as np
 import pytest
 import sympy.physics.vector
 from compilers import STRICT, compiled
 from conftest import tiers
+from eventful import BALL, BUILDS, FREE, G, built, event
 
 import eomc
 from eomc.base.errors import SceneError
@@ -22,80 +21,12 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
-BUILDS = Path(__file__).parents[2] / "build" / "tests" / "events"
-G = 9.81
-BALL = """eomc = 1
-name = "bouncing"
-[coordinates]
-x = { unit = "m", rate = 1 }
-y = { unit = "m", start = 1 }
-[parameters]
-e = 0.8
-wall = 100
-far = 1e9
-[energy]
-kinetic = "(x_dot**2 + y_dot**2)/2"
-potential = "9.81*y"
-[[event]]
-name = "impact"
-when = "y"
-direction = "falling"
-action = "jump"
-y_dot = "-e*y_dot"
-[[event]]
-name = "top"
-when = "y_dot"
-direction = "falling"
-[[event]]
-name = "corner"
-when = "wall - x"
-action = "jump"
-x_dot = "-x_dot"
-[[event]]
-name = "away"
-when = "x - far"
-action = "stop"
-[run]
-duration = 3
-batch = true
-"""
-TWO = """eomc = 1
-name = "two_springs"
-[coordinates]
-x = { start = 1, rate = 0 }
-y = { start = 1, rate = 0 }
-[parameters]
-k = 2
-a = 1
-b = 1
-c = 0
-d = 0.1
-[energy]
-kinetic = "(x_dot**2 + y_dot**2)/2"
-potential = "(x**2 + k*y**2)/2"
-[[event]]
-name = "line"
-when = "a*x + b*y - c"
-[[event]]
-name = "curve"
-when = "x*y_dot - d"
-"""
-
-
-def built(text: str) -> ModuleType:
-    return eomc.load(from_scene(parse(text, "events.toml")), BUILDS)
 
 
 @pytest.fixture(scope="module")
 def ball() -> ModuleType:
     """A ball that falls from 1 m, moves along at 1 m/s, and bounces from floor and wall."""
     return built(BALL)
-
-
-@pytest.fixture(scope="module")
-def springs() -> ModuleType:
-    """Two oscillators of frequencies 1 and sqrt(k), with two events."""
-    return built(TWO)
 
 
 def impacts(e: float, count: int) -> np.ndarray:
@@ -193,66 +124,6 @@ def test_fixed_steps_say_that_they_pass_over_events(ball: ModuleType) -> None:
             run.events["impakt"]
 
 
-def test_crossings_close_together_in_one_long_step_are_seen(free: ModuleType) -> None:
-    for w in (0.3, 1e-2, 1e-4):
-        run = free.simulate(duration=4.0, params={"first": 1.0, "second": 1 + w})
-        assert run.events["pair"].t == pytest.approx([1, 1 + w], abs=1e-13)
-        assert run.events["three"].t == pytest.approx([2, 3], abs=1e-13)
-    assert run.steps < 20
-
-
-@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
-def test_a_dip_between_two_looks_is_seen(springs: ModuleType, tol: float) -> None:
-    """-sin(2 t)/2 + 1/2, less 1e-3; a cubic through two looks is no nearer than some percent."""
-    run = springs.simulate(tol=tol, duration=30.0, params={"k": 1.0, "d": 1e-3 - 0.5})
-    deep = math.asin(1 - 2e-3) / 2
-    exact = [t + math.pi * k for k in range(10) for t in (deep, math.pi / 2 - deep)]
-    assert run.events["curve"].t == pytest.approx(exact, abs=100 * tol)
-
-
-def roots(f, t_end: float) -> list[float]:
-    """All zeros in (0, t_end], by fine sampling and bisection in 30 digits."""
-    times = np.linspace(0, t_end, 4001).tolist()
-    values = [f(t, math) for t in times]
-    found = []
-    with mpmath.workdps(30):
-        for a, b, fa, fb in zip(times, times[1:], values, values[1:], strict=False):
-            if fa * fb < 0:
-                found.append(float(mpmath.findroot(f, (a, b), solver="anderson", tol=1e-40)))
-    return found
-
-
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 100))]
-)
-def test_random_events_are_those_of_the_exact_motion(springs: ModuleType, seed: int) -> None:
-    random = np.random.default_rng(seed)
-    k, a, b, c, d = random.uniform([0.5, -1, -1, -1, -1], [9, 1, 1, 1, 1])
-    q0, qd0 = random.normal(size=(2, 2))
-    run = springs.simulate(
-        q0, qd0, tol=1e-13, duration=12.0, params=dict(zip("kabcd", (k, a, b, c, d), strict=True))
-    )
-
-    def motion(t, by):
-        w = by.sqrt(k)
-        x = q0[0] * by.cos(t) + qd0[0] * by.sin(t)
-        y = q0[1] * by.cos(w * t) + qd0[1] / w * by.sin(w * t)
-        return x, y, -q0[1] * w * by.sin(w * t) + qd0[1] * by.cos(w * t)
-
-    def line(t, by=mpmath):
-        x, y, _ = motion(t, by)
-        return a * x + b * y - c
-
-    def curve(t, by=mpmath):
-        x, _, rate = motion(t, by)
-        return x * rate - d
-
-    for name, f in (("line", line), ("curve", curve)):
-        expected, found = roots(f, 12.0), run.events[name].t
-        assert len(found) == len(expected), name
-        assert found == pytest.approx(expected, abs=1e-11)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -272,77 +143,6 @@ def test_what_an_event_can_not_be_is_said(old: str, new: str, words: str) -> Non
     with pytest.raises(SceneError) as fault:
         parse(BALL.replace(old, new, 1), "events.toml")
     assert words in str(fault.value)
-
-
-FREE = """eomc = 1
-name = "{name}"
-[coordinates]
-x = {{ rate = 1 }}
-[parameters]
-a = 0
-first = 1e9
-second = 1e9
-wall = 1e9
-gap = 1e9
-[energy]
-kinetic = "x_dot**2/2"
-potential = "-a*x"
-{events}
-"""
-
-
-def event(name: str, when: str, *lines: str) -> str:
-    return "\n".join(["[[event]]", f'name = "{name}"', f'when = "{when}"', *lines])
-
-
-PAIR = "(x - first)*(x - second)"
-EVENTS = (
-    event("pair", PAIR),
-    event("up", PAIR, 'direction = "rising"'),
-    event("three", "(x - first - 1)*(x - second - 1)*(x - 3)", 'direction = "rising"'),
-    event("wall", "x - wall", 'action = "stop"'),
-    event("gap", "x - gap", 'action = "jump"', 'x_dot = "sqrt(x - 10)"'),
-)
-
-
-@pytest.fixture(scope="module")
-def free() -> ModuleType:
-    """A body under a constant force, with events where the parameters say."""
-    return built(FREE.format(name="free", events="\n".join(EVENTS)))
-
-
-def test_each_of_a_close_pair_has_its_own_time(free: ModuleType) -> None:
-    where = {"a": -1.0, "first": 0.3, "second": 0.3001}
-    run = free.simulate([1.0], [0.0], duration=2.0, params=where)
-    exact = [math.sqrt(2 * (1 - x)) for x in (0.3001, 0.3)]
-    assert run.events["pair"].t == pytest.approx(exact, abs=1e-12)
-
-
-def test_a_zero_that_is_touched_is_none_that_is_crossed(free: ModuleType) -> None:
-    where = {"a": 2.0, "wall": 0.0}
-    for tol in (1e-6, 1e-9, 1e-13):
-        run = free.simulate([1.0], [-2.0], duration=2.0, tol=tol, params=where)
-        assert run.t[-1] == 2.0 and len(run.events["wall"]) == 0
-    low = free.simulate([1 - 1e-6], [-2.0], duration=2.0, params=where)
-    assert low.stopped == "wall" and low.t[-1] == pytest.approx(1 - 1e-3, abs=1e-9)
-
-
-def test_events_of_one_formula_see_the_same_crossings(free: ModuleType) -> None:
-    run = free.simulate(duration=2.0, params={"first": 0.7, "second": 0.702})
-    assert run.events["pair"].t == pytest.approx([0.7, 0.702], abs=1e-13)
-    assert run.events["up"].t == pytest.approx([0.702], abs=1e-13)
-
-
-def test_at_rest_at_a_zero_it_first_has_to_leave(free: ModuleType) -> None:
-    run = free.simulate([1.0], [0.0], duration=1, params={"a": -1.0, "wall": 1.0})
-    assert run.t[-1] == 1.0 and run.stopped == ""
-
-
-def test_a_jump_to_no_state_ends_the_run_at_it_and_says_which(free: ModuleType) -> None:
-    with pytest.warns(RuntimeWarning, match="event 'gap' jumps to no finite state"):
-        run = free.simulate(duration=2.0, params={"gap": 0.5})
-    assert run.status == "not finite" and run.t[-1] == pytest.approx(0.5, abs=1e-13)
-    assert run.q[-1, 0] == pytest.approx(0.5) and len(run.events["gap"]) == 1
 
 
 def test_a_stopped_run_has_an_error_and_a_jumping_one_a_balance(ball: ModuleType) -> None:
@@ -433,31 +233,6 @@ def test_c_without_jumps_gives_no_warning(tmp_path: Path, action: str) -> None:
         compiled("cc", *flags, "-c", "no_jumps.c", cwd=at)
 
 
-def test_what_is_all_rounding_ends_soon() -> None:
-    events = event("noise", "sin(x)**2 + cos(x)**2 - 1", 'action = "stop"')
-    module = built(FREE.format(name="noisy", events=events))
-    begun = time.perf_counter()
-    assert module.simulate(duration=20.0, h_most=0.1).steps < 2000
-    assert time.perf_counter() - begun < 1.0
-
-
-def test_two_jumps_a_rounding_apart_do_not_accumulate(tmp_path: Path) -> None:
-    """A wall that is met when a clock strikes: both jump, one after the other."""
-    scene = tmp_path / "walls.toml"
-    scene.write_text(
-        'eomc = 1\nname = "struck"\n[coordinates]\n'
-        "x = { rate = 1.0 }\ny = { start = 0.25, rate = 1.0 }\n"
-        '[energy]\nkinetic = "(x_dot**2 + y_dot**2)/2"\n[run]\ntolerance = 1e-12\nduration = 3\n'
-        '[[event]]\nname = "wall"\nwhen = "1 - x**2"\naction = "jump"\nx_dot = "-0.5*x_dot"\n'
-        '[[event]]\nname = "clock"\nwhen = "t - 1"\naction = "jump"\ny_dot = "2*y_dot"\n',
-        encoding="utf-8",
-    )
-    run = eomc.load(scene, tmp_path).simulate()
-    assert run.status == "ok"
-    np.testing.assert_allclose(run.q[-1], [0.0, 5.25], atol=1e-12)
-    np.testing.assert_allclose(run.qd[-1], [-0.5, 2.0], atol=1e-12)
-
-
 @pytest.mark.usefixtures("quickly_compiled")
 def test_events_and_tolerance_of_a_system_made_in_python() -> None:
     """As in a scene; what a jump sets is named by symbols, dynamicsymbols or texts."""
@@ -481,32 +256,3 @@ def test_events_and_tolerance_of_a_system_made_in_python() -> None:
     np.testing.assert_allclose(run.events["top"].t[0], fall * 1.8, rtol=1e-12)
     np.testing.assert_allclose(run.events["middle"].t, [0.25], rtol=1e-13)
     assert run.q[-1, 0] == pytest.approx(1.5 + len(run.events["impact"]))
-
-
-@pytest.mark.usefixtures("quickly_compiled")
-@pytest.mark.parametrize(
-    ("real", "w", "t0"),
-    tiers([("float", 1000.0, 300.0), ("double", 1e5, 1.7e9)], "double"),
-    ids=["float", "double"],
-)
-def test_steps_of_few_roundings_of_the_time_keep_events_apart(
-    real: str, w: float, t0: float
-) -> None:
-    """One that never happens stands before the others."""
-    text = f"""
-    eomc = 1
-    name = "late_{real}"
-    [coordinates]
-    x = {{ start = 1.0, rate = 0.1 }}
-    [parameters]
-    w = {w}
-    [energy]
-    kinetic = "x_dot**2/2"
-    potential = "w**2*x**2/2"
-    [run]
-    real = "{real}"
-    tolerance = 1e-4
-    """
-    text += event("never", "x + 1000", 'direction = "rising"', "") + event("zero", "x")
-    run = built(text).simulate(t0=t0, duration=60 * math.pi / w)
-    assert {name: len(found.t) for name, found in run.events.items()} == {"never": 0, "zero": 60}

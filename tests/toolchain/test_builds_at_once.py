@@ -1,0 +1,82 @@
+"""Builds of one name side by side: each has its own module, or the last."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from builds import CHANGED, FRESH, TEXT, gravity, leftovers, started
+from instrument import in_a_fork
+
+import eomc
+from eomc.toolchain import cache
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+def test_a_module_that_another_build_replaces_is_not_taken_for_ones_own(
+    scene: Path, root: Path, found: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scene of the same name, built between this one's build and its loading: tried again."""
+    other, load, times = tmp_path / "other.toml", cache.load, 0
+    other.write_text(CHANGED, encoding="utf-8")
+
+    def late(built: cache.Built) -> ModuleType:
+        nonlocal times
+        times += 1
+        if times <= most:
+            eomc.build(other, root)
+        return load(built)
+
+    monkeypatch.setattr(cache, "load", late)
+    most = 2
+    assert eomc.load(scene, root).g([1.0])[0] == pytest.approx(8.2548, abs=1e-3)
+    assert times == 3
+    most, times = 100, 0
+    with pytest.raises(eomc.EomcError, match=r"other builds of a scene of this .*--build DIR"):
+        eomc.load(scene, root)
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+def test_a_face_that_another_build_replaces_meanwhile_is_not_loaded(
+    scene: Path, root: Path, found: None, tmp_path: Path
+) -> None:
+    """The manifest, which is moved last, is still the old one's."""
+    folder, other = root / "simple_pendulum", tmp_path / "other.toml"
+    scene.write_text(TEXT.replace('"m*g*y"', '"3*m*g*y"'), encoding="utf-8")  # loaded by no test
+    old = eomc.build(scene, root)
+    manifest = (folder / "build.json").read_bytes()
+    other.write_text(CHANGED, encoding="utf-8")
+    eomc.build(other, root)
+    (folder / "build.json").write_bytes(manifest)
+
+    def load() -> None:
+        cache.load(old)
+
+    how, words = in_a_fork(load, 20)
+    assert how == "raised" and str(words).startswith("ReplacedError: "), words
+
+
+def test_two_builds_at_once_both_end_well(scene: Path, root: Path) -> None:
+    """One of them builds, the other waits and finds."""
+    both = [started(scene, root) for _ in range(2)]
+    for process in both:
+        process.join(60)
+    assert sorted(str(process.exitcode) for process in both) == [str(FRESH), str(FRESH - 1)]
+    assert leftovers(root) == []
+    assert gravity(root) == pytest.approx(8.2548, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_two_scenes_of_one_name_built_at_once(scene: Path, root: Path, tmp_path: Path) -> None:
+    """The last one stays, and it is whole."""
+    other = tmp_path / "other.toml"
+    other.write_text(CHANGED, encoding="utf-8")
+    both = [started(file, root) for file in (scene, other)]
+    for process in both:
+        process.join(60)
+    assert [process.exitcode for process in both] == [FRESH, FRESH]
+    assert round(gravity(root)) in (8, 17)
+    assert leftovers(root) == []
