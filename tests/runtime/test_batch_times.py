@@ -117,6 +117,7 @@ def test_they_are_kept(springs: ModuleType, tmp_path: Path) -> None:
         assert np.array_equal(again(0.333), run(0.333))
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_a_batch_by_a_tolerance_has_them_too() -> None:
     balls = built(BALL)
     e = np.array([0.8, 0.5, 0.9])
