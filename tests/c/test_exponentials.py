@@ -23,7 +23,7 @@ from eomc.scene.read import parse
 pytestmark = pytest.mark.skipif(shutil.which(bench.compiler()) is None, reason="no C compiler")
 
 
-@pytest.fixture(scope="module", params=["double", "float"])
+@pytest.fixture(scope="module", params=tiers(["double", "float"], "double"))
 def of(request: pytest.FixtureRequest) -> Any:
     """The precision, as the benchmark describes it."""
     return {"double": bench.DOUBLE, "float": bench.SINGLE}[request.param]

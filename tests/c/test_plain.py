@@ -288,6 +288,7 @@ def test_a_batch_is_a_loop_over_instances(name: str) -> None:
         assert np.array_equal(single.q, other.q[0])
 
 
+@pytest.mark.slow
 def test_a_stiff_motion_in_long_steps() -> None:
     """A decay of 10,000 1/s in steps of 10 ms, and signals that answer the state as stiffly."""
     text = """

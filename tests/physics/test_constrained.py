@@ -24,10 +24,7 @@ pytestmark = pytest.mark.usefixtures("unoptimised_file")
 BUILT = ROOT / "build" / "tests" / "constrained"
 NAMES = list(constrained.cases())
 MEASURED = [name for name in NAMES if constrained.cases()[name]["rk4_measured"]]
-QUICK = (
-    "pendulum_over_the_top",
-    "four_bar_crank_rocker",
-)
+QUICK = ("pendulum_over_the_top",)
 FLAT = ("iftomm_A02_four_bar_N1", "iftomm_A02_four_bar_N2", "parallelogram_redundant_bar")
 ALIKE = 1.5  # times the error of the independent RK4
 

@@ -82,6 +82,7 @@ def test_the_check_compares_both_forms_and_slopes(real: str, tmp_path: Path) -> 
     assert all(row.passed for row in rows.values()), rows
 
 
+@pytest.mark.slow
 def test_reactions_in_the_plane(modules: Modules) -> None:
     outputs = 'h = "pin_force_x"\nv = "pin_force_y"\nturn = "pin_moment + q1"\none = "lambda_pin_y"'
     run = modules.unoptimised(with_outputs("four_bar", outputs)).simulate(steps=50)
