@@ -236,11 +236,7 @@ class Maker:
         moving = (s.name for c in made for s in (c.qd, c.qdd))
         taken = {*self.taken, *moving, "energy"}
         for one, formula in rows.items():
-            if not isinstance(one, (str, Symbol)):
-                raise given.fault("constraints", f"{one!r} is not a name")
-            name, role = str(one), f"constraint {one}"
-            if why := names.fault(name):
-                raise EomcError(f"System.make: constraints: {why}")
+            name, role = given.called(one, "constraints"), f"constraint {one}"
             if name in taken:
                 raise EomcError(f"System.make: {role}: the name '{name}' is taken already")
             expr = self._expression(formula, role)
@@ -313,11 +309,7 @@ class Maker:
             state |= {str(rate): f"{name}_dot", f"{given.name_of(one)}_dot": f"{name}_dot"}
         state |= {given.name_of(self.taken[p.name]): p.name for p in parameters}
         for name, entry in events.items():
-            role = f"event {name}"
-            if not isinstance(name, (str, Symbol)):
-                raise given.fault("events", f"{name!r} is not a name")
-            if why := names.fault(str(name)):
-                raise EomcError(f"System.make: events: {why}")
+            called, role = given.called(name, "events"), f"event {name}"
             table = {str(k): x for k, x in entry.items()} if isinstance(entry, Mapping) else {}
             when = self._expression(table.pop("when", None) if table else entry, role)
             if not when.free_symbols:
@@ -337,7 +329,7 @@ class Maker:
                 remedy = 'add "action": "jump" where something is set, and only there'
                 raise given.fault(role, remedy)
             jump = ((state[key], self._expression(x, f"{role}: {key}")) for key, x in table.items())
-            yield Event(str(name), when, direction, action, tuple(jump), note=note)
+            yield Event(called, when, direction, action, tuple(jump), note=note)
 
     def _frictions(
         self, friction: Any, starts: Iterable[Any], parameters: Iterable[Parameter]
@@ -375,14 +367,11 @@ class Maker:
         if not isinstance(outputs, Mapping):
             raise given.fault("outputs", f'give a dict, such as {{"tip": x + l}}, here {outputs!r}')
         for name, formula in outputs.items():
-            if not isinstance(name, (str, Symbol)):
-                raise given.fault("outputs", f"{name!r} is not a name")
-            if why := names.fault(str(name)):
-                raise EomcError(f"System.make: outputs: {why}")
+            called = given.called(name, "outputs")
             expr = self._expression(formula, f"output {name}")
-            if str(name) in rows:
+            if called in rows:
                 raise given.fault("outputs", f"'{name}' is a constraint already: rename one")
-            yield Output(str(name), expr, units.get(name, ""))
+            yield Output(called, expr, units.get(name, ""))
 
     def _declare(self, one: Any, role: str) -> str:
         used = self._name_of(one, role)

@@ -10,6 +10,7 @@ import sympy
 from sympy import Expr, Symbol
 from sympy.core.function import AppliedUndef
 
+from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.integrators.tableaux import METHODS
 from eomc.model import algebra, growth
@@ -38,6 +39,15 @@ _INSTEAD = {
 def fault(role: str, message: str) -> EomcError:
     """The error to raise."""
     return EomcError(f"System.make: {role}: {message}")
+
+
+def called(name: object, role: str) -> str:
+    """A name as text. Raises EomcError where it is none, or can be none in C and Python."""
+    if not isinstance(name, (str, Symbol)):
+        raise fault(role, f"{name!r} is not a name")
+    if why := names.fault(str(name)):
+        raise fault(role, why)
+    return str(name)
 
 
 # what scenes, runs and newcomers call the arguments of System.make

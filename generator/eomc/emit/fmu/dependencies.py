@@ -31,21 +31,17 @@ class Dependencies:
     @cached_property
     def accelerations(self) -> Sequence[Names]:
         """Of each acceleration."""
-        return [self._whole(x) for x in read(self.program["acceleration"])]
+        return self._of("acceleration")
 
     @cached_property
     def outputs(self) -> Sequence[Names]:
         """Of each output."""
-        if "outputs" not in self.program:
-            return []
-        return [self._whole(x) for x in read(self.program["outputs"])]
+        return self._of("outputs")
 
     @cached_property
     def events(self) -> Sequence[Names]:
         """Of each event."""
-        if "events" not in self.program:
-            return []
-        return [self._whole(x) for x in read(self.program["events"])]
+        return self._of("events")
 
     @cached_property
     def _signals(self) -> Mapping[str, Names]:
@@ -54,6 +50,10 @@ class Dependencies:
         if not self.signals or "signal" not in self.program:
             return {}
         return dict(zip(names, read(self.program["signal"]), strict=True))
+
+    def _of(self, name: str) -> Sequence[Names]:
+        """Of each result of a function, where there is that function."""
+        return [self._whole(x) for x in read(self.program[name])] if name in self.program else []
 
     def _whole(self, names: Names) -> Names:
         qdd = [x.name for x in self.program.system.qdd]
