@@ -28,7 +28,7 @@ CASES = ROOT / "build" / "tests" / "cases"
 # mass_spring has tests of its own
 SCENES = {scene: case for scene, case in ALIKE.items() if scene != "mass_spring"}
 # those that other tests of the quick tier have built
-QUICK = ("cartpole", "cartpole_driven", "kepler_orbit")
+QUICK = ("cartpole", "cartpole_driven", "kepler_orbit", "heavy_top")
 MOST_STEPS = 11_000_000  # about half a second
 
 # The quickest stepper and number of steps, of powers of two, that come down to the floor and stay

@@ -25,7 +25,7 @@ def bouncing(modules: Modules) -> ModuleType:
     return modules.unoptimised(BOUNCING)
 
 
-@pytest.mark.parametrize("name", tiers(CASES, "limits", "sign"))
+@pytest.mark.parametrize("name", tiers(CASES, "limits", "max", "sign"))
 def test_the_end_errs_by_about_the_tolerance(name: str, modules: Modules) -> None:
     case = CASES[name]
     module = modules.unoptimised(case.text)

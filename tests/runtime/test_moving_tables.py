@@ -73,7 +73,6 @@ def test_a_ball_does_not_fall_through_a_table_that_moves(tmp_path: Path, e: floa
     assert abs(there - A[90] * np.sin(30 * t[1])) < 1e-10
 
 
-@pytest.mark.slow
 def test_a_ball_stays_inside_of_walls_with_corners_in_their_formula(tmp_path: Path) -> None:
     """Where straight and round meet, a chord may be as short as rounding allows."""
     file = tmp_path / "stadium.toml"
