@@ -39,7 +39,7 @@ from eomc.scene.read import parse  # noqa: E402
 TARGETS = (1e-9, 1e-12)
 EACH, MEDIAN = 0.8, 0.4  # bars: our time over heyoka's
 METHODS = ("rk4", "dp8", "gauss8", "gauss16")
-LONG = 0.1  # s, of a run; the search takes dozens
+LONG = 0.15  # s, of a run; the search takes dozens
 WORTH = 1.0  # s: fixed steps that take longer are not looked for
 NONE = 1e-3  # who errs by more at every tolerance has no answer
 LOOSEST, TIGHTEST = 4, 30  # tolerances 10^(-k/2), all that eomc takes

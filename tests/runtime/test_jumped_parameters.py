@@ -368,3 +368,38 @@ def test_an_equilibrium_leaves_them_as_they_are(gripper: ModuleType) -> None:
     set_by_jumps = gripper.start[0][2:]
     assert q[:2] == pytest.approx([0.25, 0.0], abs=1e-12) and (q[2:] == set_by_jumps).all()
     assert u == [1.0]
+
+
+FAR = """eomc = 1
+name = "far_{}"
+[coordinates]
+x = {{ start = 1.0 }}
+y = {{ start = 0.5 }}
+[parameters]
+until = {}
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "x**2*y**2 + x**2 + 2*y**2"
+[[event]]
+name = "after"
+when = "t - until"
+action = "jump"
+until = "2*until"
+[run]
+tolerance = 1e-12
+duration = 20
+batch = true
+"""
+
+
+def test_how_large_they_are_is_nothing_to_steps_and_errors(modules: Modules) -> None:
+    """A time far away was the largest of all coordinates, and errors of others were beside it."""
+    near, far = (
+        modules.unoptimised(from_scene(parse(FAR.format(*x)))) for x in (("3", "1e3"), ("9", "1e9"))
+    )
+    one, other = near.simulate(), far.simulate()
+    assert np.array_equal(one.q[:, :2], other.q[:, :2])
+    a, b = (m.simulate_batch(np.tile([1.0, 0.5], (9, 1))).q[0, -1, :2] for m in (near, far))
+    assert np.array_equal(a, b)
+    found = [run.estimate() for run in (one, other)]
+    assert found[0].amplification == pytest.approx(found[1].amplification, rel=1e-6)

@@ -91,7 +91,7 @@ def test_a_joint_at_zero_rests_until_it_slips(joint: ModuleType, J: float, stiff
     for tol in (1e-3, 1e-6, 1e-9, 1e-10, 1e-12, 1e-15):
         run = joint.simulate(tol=tol, params={"J": J}, stiff=stiff)
         held(run)
-        assert run.status == "ok" and run.steps < 20
+        assert run.status == "ok" and run.steps < 30
         assert run.q[-1, 0] == pytest.approx(turned(1.0, J), rel=max(tol, 1e-14))
 
 
@@ -103,7 +103,7 @@ def test_where_it_starts_does_not_matter(joint: ModuleType) -> None:
     for duration in (10.0, 1000.0):
         run = joint.simulate(duration=duration)
         assert run.events["phi_slips"].t[0] == pytest.approx(SLIPS, abs=1e-14)
-        assert run.steps < 3 * duration
+        assert run.steps < 3 * duration + 10
 
 
 @pytest.mark.parametrize("text", tiers([BOUNDED, LIMITED], BOUNDED), ids=["bounded", "limited"])

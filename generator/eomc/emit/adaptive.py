@@ -172,6 +172,7 @@ def tableau(made: Stepping) -> dict[str, Any]:
         "c": numbers(m.c, real),
         "powers": matrix(list(zip(*m.powers, strict=True)), real),
         "anew": ANEW,
+        "still": len(target.system.modes) + len(target.system.discrete),
     }
 
 

@@ -39,7 +39,7 @@ def error_of(
     model, x = own._model, own.x.astype(float)
     u = Periods(own._u, own._period) if own._period else own._u
     eps, least = float(np.finfo(model.dtype).eps) / 2, LEAST[model.dtype.itemsize]
-    scale = scales(x, float(np.ptp(own.t)), eps)
+    scale = scales(x, float(np.ptp(own.t)), eps, len(model.still))
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
 
@@ -70,9 +70,9 @@ def error_of(
     if own.status == "ok" and not np.isfinite(finer).all():  # short ones near singular positions
         finer = again(tol, begin, own._h_most)
     modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), np.ones(x.shape[1])
-    for at, of in modes:  # which are not moved, nor what sticks, and have no error
-        moves[[at, model.nq + at]] = 0
-        moves[model.nq + of] = begin[at] != 0
+    still = np.arange(model.nq - len(model.still), model.nq)  # is not moved, nor what sticks
+    moves[[*still, *(model.nq + still)]] = 0
+    moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0
     x = x[beside]
 
     def grown(base: Array, size: float, tol: float) -> Array:
@@ -90,9 +90,9 @@ def error_of(
             near = grown(again(least, begin, own._h_most), _LITTLE * eps, least)
             rows = np.where(full[:, None], np.maximum(rows, near), rows)
         rounding = np.maximum(rounding, eps * rows)
-    still = [*modes[:, 0], *(model.nq + modes[:, 0])]
+    exact = [*modes[:, 0], *(model.nq + modes[:, 0])]
     for some in (left, rounding):
-        some[:, still] = some[own.t == own.t0] = 0.0
+        some[:, exact] = some[own.t == own.t0] = 0.0
     error = np.maximum(left, rounding)
     amplification = float(np.max(rows[-1] / scale))
     with np.errstate(divide="ignore"):

@@ -237,21 +237,25 @@ def _counts(run: Recorded, every: int, rows: int) -> Array:
     return np.minimum(np.arange(rows) * every, run.steps)
 
 
-def scales(x: Array, duration: float, eps: float) -> Array:
+def scales(x: Array, duration: float, eps: float, still: int = 0) -> Array:
     """The largest value of each column; those that only rounding moves count as a millionth of the
     largest position, or velocity, or of the state where all of these are 0.
 
     At rest, where velocities move no position beyond its rounding in that time, theirs is the one
-    that would move the largest by its own size.
+    that would move the largest by its own size. still: the number of last coordinates that jumps
+    alone change, which count by themselves.
     """
-    largest = np.max(np.abs(x), axis=0)
+    whole = np.max(np.abs(x), axis=0).reshape(2, -1)
+    moving = whole.shape[1] - still
+    largest = whole[:, :moving].ravel()
     most = np.max(largest.reshape(2, -1), axis=1)
     if 0 < most[1] * duration <= _REST * eps * most[0]:
         largest[len(largest) // 2 :] = most[1] = most[0] / duration
-    halves = np.repeat(most, len(largest) // 2)
-    whole = np.where(halves > 0, halves, np.max(largest))
-    scale: Array = np.maximum(largest, np.where(whole > 0, 1e-6 * whole, 1.0))
-    return scale
+    halves = np.repeat(most, moving)
+    rest = np.where(halves > 0, halves, np.max(largest))
+    scale = np.where(whole > 0, whole, 1.0)
+    scale[:, :moving] = np.maximum(largest, np.where(rest > 0, 1e-6 * rest, 1.0)).reshape(2, -1)
+    return scale.ravel()
 
 
 def _around(x: Array) -> Array:

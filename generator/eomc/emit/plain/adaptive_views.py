@@ -15,7 +15,7 @@ class AdaptiveTableau(Named):
 
     method: what C names begin with. powers: from accelerations at the stages, one a row, to their
     polynomial's powers. most: sweeps of a step; anew: steps by Newton's method, before sweeps alone
-    are tried again.
+    are tried again. still: how many of the last coordinates jumps alone change; they have no scale.
     """
 
     method: str
@@ -25,6 +25,7 @@ class AdaptiveTableau(Named):
     sqrt: str
     eps: str
     tiny: str
+    still: int
     most: int
     c: tuple[str, ...]
     powers: tuple[str, ...]
