@@ -79,3 +79,10 @@ def test_none_is_told_of_rows_in_time_or_of_rates(row: str) -> None:
 
 def test_none_is_told_of_several_freedoms() -> None:
     assert of("delta_robot") is None
+
+
+def test_a_row_without_a_slope_counts_as_it_is() -> None:
+    """A row that a parameter switches off had 0/0, and nothing was told but a traceback."""
+    text = PARALLELOGRAM.replace('y = "sin(A)', 'off = "k*(B - 0.1)"\ny = "sin(A)')
+    found = nearest(made(text.replace("[energy]", "[parameters]\nk = 0.0\n[energy]")))
+    assert found == nearest(made(PARALLELOGRAM))

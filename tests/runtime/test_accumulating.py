@@ -62,3 +62,12 @@ def test_a_ball_does_not_fall_through_its_floor(
     limit = math.sqrt(2 / 9.81) * (1 + e) / (1 - e)
     assert run.limit == pytest.approx(limit, rel=1e-8 if ground < 2 else 1e-6)
     assert (run["count"][-1] > 3) == (apart == 0)
+
+
+def test_a_jump_at_zero_time_ends(ball: ModuleType) -> None:
+    """Looks that are some roundings of the time apart were none apart there, for ever."""
+    for before in (1.0, 0.3, 1e-3):
+        start = 9.81 / 2 * before**2
+        run = ball.simulate([start], [0.0], t0=-before, duration=2 * before)
+        assert run.events["impact"].t[0] == pytest.approx(0, abs=1e-15)
+        assert run.status == "ok"

@@ -20,10 +20,16 @@ from click.testing import CliRunner
 from toolchain.test_installed import environment, fresh, pip
 
 from eomc import pipeline
+from eomc.base import resources
 from eomc.cli.main import main
 from eomc.toolchain import wheel
 
 NAME = "cartpole-0.1.0+sceneddc4d1636089-cp311-abi3-"
+
+
+def test_no_file_of_a_module_is_called_as_one_that_wheels_write() -> None:
+    """One of runtime/ was written over, and no wheel could be imported."""
+    assert f"{wheel.COMPILED}.py" not in resources.runtime(batch=True)
 
 
 def packed(folder: Path, text: str) -> Path:

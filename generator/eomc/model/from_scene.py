@@ -9,6 +9,7 @@ from sympy import Expr, Symbol
 
 from eomc.base.errors import Problem, SceneError
 from eomc.model import algebra, constraints, growth, limits
+from eomc.model.crossing import crossing
 from eomc.model.discrete import discrete
 from eomc.model.loops import Closed
 from eomc.model.multibody import Builder, Terms
@@ -245,7 +246,7 @@ def from_scene(scene: Scene) -> System:
     )
     if faults := made.problems or system.beyond_float():
         raise SceneError(faults)
-    return sticking(discrete(limits.within(system)), sticks)
+    return sticking(discrete(limits.within(crossing(system))), sticks)
 
 
 def _follows(scene: Scene, c: Written) -> Iterator[str]:

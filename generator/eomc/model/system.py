@@ -13,6 +13,7 @@ from typing import Any, Never
 
 from eomc.base.errors import SceneError
 from eomc.model import from_sympy, given
+from eomc.model.crossing import crossing
 from eomc.model.discrete import discrete
 from eomc.model.limits import within
 from eomc.model.mechanics import Mechanics
@@ -123,5 +124,5 @@ class System(Mechanics):
         )  # fmt: skip
         if faults := system.beyond_float():
             raise SceneError(faults)
-        system = sticking(discrete(within(system)), maker.frictions)
+        system = sticking(discrete(within(crossing(system))), maker.frictions)
         return replace(system, again=partial(cls.make, **asked))

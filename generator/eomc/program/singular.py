@@ -55,6 +55,7 @@ def nearest(system: System) -> Nearest | None:
         return None
     ways = [[start, *islice(along(manifold, start, STEP, to), PLACES)] for to in (1, -1)]
     usual = np.max([place.slopes for way in ways for place in way], axis=0)
+    usual = np.where(usual > 0, usual, 1.0)
     free = np.ones(len(start.q), dtype=bool)
 
     def sigma(place: Place | None) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arguments import Array, as_flag, as_number, as_step_size, unmasked
-from .compiled import Compiled
+from .facts import Facts
 
 LEAST = {8: 1e-15, 4: 5e-7}  # tolerances, by bytes of a number
 LOOSEST = 1e-2
@@ -19,9 +19,7 @@ FIXED = {  # what belongs to fixed steps, where nothing is said of it
 }  # fmt: skip
 
 
-def fits(
-    model: Compiled, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any
-) -> bool:
+def fits(model: Facts, h: Any, steps: Any, method: Any, tol: Any, h_most: Any, stiff: Any) -> bool:
     """Whether a run is by a tolerance: if asked, or where nothing is asked of fixed steps."""
     if tol is None and h_most is None and stiff is False and method != "auto":
         return bool(model.tolerance) and h is None and steps is None and method is None
@@ -29,7 +27,7 @@ def fits(
 
 
 def as_limits(
-    model: Compiled, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
+    model: Facts, tol: float | None, h_most: float | None, stiff: Any, fixed: tuple[Any, ...]
 ) -> tuple[float, float]:
     """(tolerance, longest step or 0); fixed: the values of FIXED, which belongs to fixed steps."""
     as_flag(stiff, "stiff")
@@ -47,7 +45,7 @@ def as_limits(
     return as_tolerance(model.tolerance if tol is None else tol, model.dtype), most
 
 
-def _why_not(model: Compiled, name: str, asked: bool) -> str:
+def _why_not(model: Facts, name: str, asked: bool) -> str:
     """Why a run by a tolerance takes no such argument; asked: whether the call asks for one."""
     if asked:
         return (
@@ -66,7 +64,7 @@ def as_progress(progress: Any) -> Any:
     return progress
 
 
-def as_end(model: Compiled, t0: float, duration: float | None) -> float:
+def as_end(model: Facts, t0: float, duration: float | None) -> float:
     """The time at which a run ends, as the module's numbers hold it."""
     span = model.duration if duration is None else as_number(duration, "duration")
     if span < 0:

@@ -10,7 +10,7 @@ import numpy as np
 
 from .arguments import Array
 from .by_name import ByName
-from .compiled import Compiled
+from .facts import Facts
 
 _Rows = tuple[slice, slice]  # of instances and of times
 
@@ -18,7 +18,7 @@ _Rows = tuple[slice, slice]  # of instances and of times
 class Values:
     """A part of `batch_run.BatchRun`: as in a single run, with the instances before all else."""
 
-    _model: Compiled
+    _model: Facts
     q: Array
     qd: Array
     _params: Array  # (batch or 1, np)

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from .arguments import Array, in_a_line, not_one_of
-from .compiled import Compiled
+from .facts import Facts
 
 INSTEAD = "give tol=, not h, steps or method"
 _EVENTS, _EVENTS_EACH = 1024, 64  # of one call, beside those of a step: of one, of each of many
@@ -77,7 +77,7 @@ class PassedOver(dict[str, Happened]):
         return dict, ()
 
 
-def passed_over(model: Compiled) -> str:
+def passed_over(model: Facts) -> str:
     """What to say of fixed steps of a scene with events."""
     sticks = "; friction that sticks is made of them" if model._rows.modes else ""
     law = "; a function as u then takes control_period=" if model.nu else ""
@@ -88,7 +88,7 @@ def passed_over(model: Compiled) -> str:
 class FoundInBatch:
     """All events of many instances, found in calls by any thread."""
 
-    def __init__(self, model: Compiled, most: float) -> None:
+    def __init__(self, model: Facts, most: float) -> None:
         self.model, self.most, self.count = model, most, 0
         self.pieces = list[tuple[Array, Array, Array]]()
 
@@ -120,7 +120,7 @@ class FoundInBatch:
 class GroupRoom:
     """Room for the events of a call of some instances."""
 
-    def __init__(self, model: Compiled, count: int) -> None:
+    def __init__(self, model: Facts, count: int) -> None:
         self.counts = np.zeros(count, "l")
         each = _EVENTS_EACH + len(model.events)
         self.which = np.empty((count, each), np.intc)
@@ -135,7 +135,7 @@ class GroupRoom:
 class Found:
     """Room for the events of a call, and all that were found."""
 
-    def __init__(self, model: Compiled) -> None:
+    def __init__(self, model: Facts) -> None:
         self.model, self.pieces = model, list[tuple[Array, Array]]()
         self.which = np.empty(_EVENTS + len(model.events), np.intc)
         self.rows = np.empty((len(self.which), 1 + 2 * model.nq), model.dtype)

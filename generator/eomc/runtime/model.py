@@ -27,8 +27,8 @@ from .arguments import (
     as_step_size,
     machine_memory,
 )
-from .compiled import CHUNK
 from .discretize import discretize
+from .facts import CHUNK
 from .laws import Law, Sampled
 from .package import warn
 from .shown import with_events

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array, as_step_size, machine_memory
-from .compiled import Compiled
+from .facts import Facts
 from .laws import Sampled, asked
 from .status import PART
 
@@ -37,7 +37,7 @@ def held_at(times: Array, t0: float, period: float, values: Array) -> Array:
 
 
 def as_acting(
-    model: Compiled, u: Any, control_period: float | None, span: float, params: Any
+    model: Facts, u: Any, control_period: float | None, span: float, params: Any
 ) -> Array | Periods | None:
     """The inputs of a run by a tolerance as `Acting` takes them, or a ValueError."""
     period = None
@@ -73,7 +73,7 @@ def as_acting(
     return _few(model, Periods(u, period), span)
 
 
-def _few(model: Compiled, made: Periods, span: float) -> Periods:
+def _few(model: Facts, made: Periods, span: float) -> Periods:
     """The same, or a MemoryError where a run can't keep its rows."""
     count = periods_in(span, made.period)
     if count * (model._bytes(1) + _VALUE) > PART * machine_memory():
@@ -99,7 +99,7 @@ class Acting:
 
     def __init__(
         self,
-        model: Compiled,
+        model: Facts,
         u: Array | Periods | None,
         t0: float,
         t_end: float,

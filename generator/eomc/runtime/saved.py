@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
-from .compiled import Compiled
+from .facts import Facts
 from .shown import eventful
 from .written import File, replacing
 
@@ -47,7 +47,7 @@ def _text(events: Any) -> str:
         return ""
 
 
-def read(model: Compiled, file: File) -> tuple[Any, str, dict[str, Any]]:
+def read(model: Facts, file: File) -> tuple[Any, str, dict[str, Any]]:
     """The model of a saved run, its kind, one of KINDS, and what it kept.
 
     The model is another than was given where a call had asked for events.
@@ -76,7 +76,7 @@ def read(model: Compiled, file: File) -> tuple[Any, str, dict[str, Any]]:
     return model, kind, {name: x.item() if x.ndim == 0 else x for name, x in found.items()}
 
 
-def _asked(model: Compiled, found: dict[str, Array], file: File) -> Any:
+def _asked(model: Facts, found: dict[str, Array], file: File) -> Any:
     """The model with the events that a saved run's call asked for."""
     known = vars(model).get("_eventful", {}).values()
     if same := [other for other in known if other.digest == found["digest"]]:

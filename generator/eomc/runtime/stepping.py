@@ -9,7 +9,7 @@ from numpy import empty
 from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, as_count, as_number, as_step_size
-from .compiled import Compiled
+from .facts import Facts
 from .happened import passed_over
 from .package import warn
 from .stability import beyond_end
@@ -18,7 +18,7 @@ from .status import SAID, STATUS, MotionError, state_text
 _MOST = 2**60  # steps, so that C can return four times as many
 
 
-class Stepping(Compiled):
+class Stepping(Facts):
     """A compiled scene that makes steps."""
 
     def step(

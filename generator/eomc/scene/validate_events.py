@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from eomc.base import names
@@ -10,6 +11,7 @@ from eomc.scene.scene import Event
 from eomc.scene.schema import Document, EventTable
 from eomc.scene.scope import Checker
 
+COMPARED = re.compile(r"\s*([^<>=!]+?)\s*(?:[<>]=?|==)\s*([^<>=!]+?)\s*")
 FACTOR = ": write '{name}*on' where it acts, with a parameter on = 1, and set that to 0"
 FIXED = ", and does not change in a run: make it a parameter"
 
@@ -26,6 +28,10 @@ def events(check: Checker, doc: Document) -> Iterator[Event]:
         seen.add(entry.name)
         path = ("event", k, "when")
         if path in check.mended:  # which is reported
+            continue
+        if isinstance(entry.when, str) and (found := COMPARED.fullmatch(entry.when)):
+            less = found[2] if re.fullmatch(r"[\w.]+", found[2]) else f"({found[2]})"
+            check.say(path, f'it happens where a formula crosses zero: write "{found[1]} - {less}"')
             continue
         when = check.formula(path, entry.when)
         jump = tuple(_jump(check, doc, k, entry))

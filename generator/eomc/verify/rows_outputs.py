@@ -63,8 +63,10 @@ def apart(
         s = _held(of, module, e.state)
         value = found(s)
         near = [found(x) for x in nudged(s, of.sampler.defaults)]
-        size = np.abs(value) + sum(np.abs(x - value) / NUDGE for x in near)
-        return of.units(value, formulas.at(s, *_solved(module, s)), size)
+        size = np.abs(value) + np.nansum([np.abs(x - value) / NUDGE for x in near], axis=0)
+        exact = formulas.at(s, *_solved(module, s))
+        real = np.isfinite(value) | np.isfinite(exact)  # sqrt(x) of x < 0 is neither
+        return of.units(value[real], exact[real], size[real]) if np.any(real) else 0.0
 
     return of.largest(error, STATES)
 
@@ -81,13 +83,15 @@ def _slopes(of: Comparison, module: Any, formulas: Formulas) -> float:
         slopes, m = formulas.slopes(s, *_solved(module, s)), len(s.u) if s.u is not None else 0
         own, by_qdd, by_force = np.split(slopes, [2 * n + m, 3 * n + m], axis=1)
         solved, found = np.hstack([A[n:], B[n:]]), np.hstack([C, D])
-        least = np.inf  # of all widths of differences: what is wrong is so at each
+        least: Vector = np.full(
+            (1, 1), np.inf
+        )  # of all widths of differences: what is wrong is so at each
         for forces in _of_multipliers(of, s) if formulas.multipliers else [by_force[:0]]:
             exact, sizes = own + by_qdd @ solved, abs(own) + abs(by_qdd) @ abs(solved)
             if formulas.multipliers:
                 exact, sizes = exact + by_force @ forces, sizes + abs(by_force) @ abs(forces)
             off = np.abs(found - exact) / (np.max(sizes, axis=1, keepdims=True) + 1e-300)
-            least = np.fmin(least, off)
+            least = np.fmin(least, np.where(np.isfinite(found) | np.isfinite(exact), off, 0.0))
         return float(np.max(least, initial=0))
 
     return of.largest(error, 2)
@@ -159,7 +163,7 @@ class Formulas:
 
     def _values(self, given: Mapping[Symbol, Any]) -> list[Any]:
         motion = _Motion(self, given)
-        return [motion.value(o.formula, mpmath.mpf(0)) for o in self.system.outputs]
+        return [_real(motion, o.formula) for o in self.system.outputs]
 
     def compiled(self, e: Expr) -> tuple[Callable[..., Any], Sequence[Symbol], Sequence[Expr]]:
         """A formula as a function of its symbols and of the rates in it."""
@@ -171,6 +175,15 @@ class Formulas:
             f = sympy.lambdify([*symbols, *stand_ins], bare, modules=[_NAMES, "mpmath"])
             self._compiled[e] = f, symbols, [d.args[0] for d in rates]
         return self._compiled[e]
+
+
+def _real(motion: _Motion, formula: Expr) -> Any:
+    """The value of a formula; nan where that is not real, or a pole."""
+    try:
+        value = mpmath.mpmathify(motion.value(formula, mpmath.mpf(0)))
+    except (ZeroDivisionError, ValueError):
+        return mpmath.mpf("nan")
+    return value.real if value.imag == 0 else mpmath.mpf("nan")
 
 
 class _Motion:

@@ -1,4 +1,4 @@
-"""A compiled scene with the facts of its methods, its tolerance and its events."""
+"""The facts of a compiled scene that runs need: its methods, its tolerance, its events."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _MANY = 1000  # steps from which a run is not taken in one call
 CHUNK = 16_384  # steps times coordinates before the first look, some ms
 
 
-class Compiled(Statics):
-    """What runs need to know of a scene."""
+class Facts(Statics):
+    """A compiled scene with the facts that runs need of it."""
 
     source: Any = None  # what eomc.load made it from, a path or a System; pictures need it
 
