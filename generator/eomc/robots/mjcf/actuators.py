@@ -8,7 +8,8 @@ from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 from eomc.robots.limits import both, through
-from eomc.robots.mjcf.file import ACTUATORS, Given, Report, missing
+from eomc.robots.mjcf.attributes import ACTUATORS
+from eomc.robots.mjcf.file import Given, Report, missing, unknown
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
 from eomc.robots.mjcf.ratios import damping, has_ratio, masses_at_start
@@ -54,6 +55,7 @@ def actuated(
         if tag.kind not in ACTUATORS:
             reader.report.leave("elements that MJCF does not have", f"{tag.kind} in actuator")
             continue
+        unknown(tag, reader.report)
         a = reader.given(Placed(tag, "", STILL, ""), "actuator")
         on = a.get("joint", a.get("jointinparent", a.get("tendon")))
         name = a.get("name") or fresh(f"{on or 'no'}_{tag.kind}", named)
@@ -213,6 +215,7 @@ def started(
     """The joints and drives with the start of the key frame "home"; singular ones are reported."""
     out, drives = list(joints), [each.drive for each in actuators]
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):
+        unknown(tag, report)
         a = Given(tag.attributes, tag, report)
         if a.get("name") != "home" or not {"qpos", "ctrl", "act"} & a.attributes.keys():
             report.leave("key frames", a.get("name"))

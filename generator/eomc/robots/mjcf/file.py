@@ -14,6 +14,7 @@ from pathlib import Path
 
 from eomc.base.errors import Problem, SceneError
 from eomc.robots import xml
+from eomc.robots.mjcf.attributes import ACTUATORS, ORIENTATION, attributes
 from eomc.robots.mjcf.shortcuts import shortcut
 from eomc.robots.rotations import Vector
 from eomc.robots.xml import Tag
@@ -21,34 +22,6 @@ from eomc.scene.formulas import suggest
 
 SHOWN = 12  # names in one line of what is left out
 
-ORIENTATION = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
-PLACE = {"name", "class", "pos", "user", "group", *ORIENTATION}
-CONTACT = set("solreflimit solimplimit solreffriction solimpfriction margin".split())
-
-# what a tag may have; an attribute not in here is reported
-KNOWN = {
-    "body": PLACE | {"childclass", "mocap", "gravcomp", "sleep", "simple", "fuse"},
-    "frame": PLACE | {"childclass"},
-    "inertial": PLACE | {"mass", "diaginertia", "fullinertia"},
-    "freejoint": {"name", "group", "align"},
-    "joint": CONTACT
-    | set(
-        """name class type group pos axis springdamper limited actuatorfrclimited stiffness range
-        actuatorfrcrange actuatorgravcomp ref springref springyield armature damping frictionloss
-        user""".split()
-    ),
-    "geom": PLACE
-    | set(
-        """type contype conaffinity condim priority size material friction mass density
-        shellinertia solmix solref solimp margin gap surfacevel adhesion fromto hfield mesh
-        fitscale rgba castshadow fluidshape fluidcoef""".split()
-    ),
-}
-
-ACTUATORS = set(
-    """general motor position velocity intvelocity orientation pid damper cylinder muscle adhesion
-    dcmotor plugin""".split()
-)
 # arrays of which an element may give the first numbers and leave the rest to its class
 PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
 
@@ -245,11 +218,16 @@ def missing(kind: str, name: str, known: Iterable[str]) -> str:
     return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
-def unknown(tag: Tag, report: Report) -> None:
-    """Report the attributes of a tag that MJCF doesn't have."""
+def unknown(tag: Tag, report: Report, around: Tag | None = None) -> None:
+    """Report the attributes of a tag that MJCF doesn't have. around: the tag that it stands in.
+
+    Without `around` what a tag has must not depend on where it stands.
+    """
+    known = attributes(tag.kind, around.kind if around else "")
+    place = f" in {called(around)}" if around else ""
     for key in tag.attributes:
-        if key not in KNOWN[tag.kind]:
-            report.leave("attributes that MJCF does not have", f"{key} of {called(tag)}")
+        if known and key not in known:
+            report.leave("attributes that MJCF does not have", f"{key} of {called(tag)}{place}")
 
 
 # ---- settings and defaults
@@ -259,21 +237,24 @@ def settings_of(root: Tag, report: Report) -> Settings:
     """<compiler> and <option>; of what is said twice, the last holds."""
     s = Settings()
     for tag in root.each("compiler"):
+        unknown(tag, report)
         s = _compiler(s, Given(tag.attributes, tag, report))
     for tag in root.each("option"):
+        unknown(tag, report)
         a = Given(tag.attributes, tag, report)
         s = replace(s, gravity=a.vector("gravity") or s.gravity)
         for key in a.attributes:
             if key in {"density", "viscosity", "wind"}:
                 if any(a.numbers(key, 3, 1) or ()):
                     report.leave("forces of the surrounding fluid", key)
-            elif key != "gravity":
+            elif key != "gravity" and key in attributes("option"):
                 report.leave("options of MuJoCo's simulation", key)
         for flag in tag.each("flag"):
+            unknown(flag, report)
             for key, value in flag.attributes.items():
                 if key == "gravity" and value == "disable":
                     s = replace(s, gravity=(0.0, 0.0, 0.0))
-                else:
+                elif key in attributes("flag"):
                     report.leave("flags of MuJoCo's simulation", f"{key}={value}")
     return s
 
@@ -320,7 +301,9 @@ def classes_of(root: Tag, report: Report) -> Classes:
         while waiting:
             tag, name = waiting.pop()
             own = classes[name]
+            unknown(tag, report)
             for child in tag.children:
+                unknown(child, report, tag)
                 kind = "actuator" if child.kind in ACTUATORS else child.kind
                 if kind != "default":
                     own[kind] = merged(own.get(kind, {}), child)

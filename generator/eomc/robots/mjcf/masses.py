@@ -17,8 +17,8 @@ from eomc.robots.inertias import (
     rotated_inertia,
     unbalanced,
 )
+from eomc.robots.mjcf.attributes import ORIENTATION
 from eomc.robots.mjcf.file import (
-    ORIENTATION,
     Classes,
     Given,
     Report,

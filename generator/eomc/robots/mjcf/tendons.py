@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from eomc.robots.mjcf.file import Given, missing
+from eomc.robots.mjcf.file import Given, missing, unknown
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
 from eomc.robots.robot import Range, Tendon
@@ -26,6 +26,7 @@ class Tendons:
         taken = {m.name for joint in joints for m in joint.motions}
         for tag in self._tags:
             name = tag.get("name")
+            unknown(tag, reader.report)
             reader.report.leave(LEFT, f"{tag.kind} {name}".rstrip())
             terms = self._terms(tag) if tag.kind == "fixed" else None
             if not terms:
@@ -62,6 +63,7 @@ class Tendons:
         """The joints of a fixed tendon, each with its factor; none where it is no sum of these."""
         terms = []
         for each in tag.each("joint"):
+            unknown(each, self._reader.report, tag)
             a = self._reader.own(each)
             joint = a.get("joint")
             if joint not in self._joints:
