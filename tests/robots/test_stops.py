@@ -58,7 +58,9 @@ def test_a_stop_gives_back_less_the_harder_it_is_hit(side: int, tmp_path: Path) 
 def test_without_an_effort_the_weight_stands_for_it(tmp_path: Path) -> None:
     """Of 3 kg at 10 m/s^2, stretched out by 1 m: a bob at v goes in by v sqrt(I/k)."""
     motor = '<actuator><motor joint="q" gear="50"/></actuator></mujoco>'  # without limits
-    _, scene = imported(tmp_path, MJCF.replace("</mujoco>", motor), "--stops")
+    said, scene = imported(tmp_path, MJCF.replace("</mujoco>", motor), "--stops")
+    assert "effort is not known" in said and "from weights: q (30 N m)" in said
+    assert "from weights: q (30 N m)" in scene.replace("\n#", "")
     assert 'q = "30/stop_depth_turn*(max(0, -0.5 - q)' in scene and "max(0, q - 0.7)" in scene
     m = eomc.load(eomc.read(tmp_path / "robot.toml"), tmp_path)
     run = m.simulate(q0=[0.6], qd0=[3.0], h=1e-4, duration=3.0, u=0.0)
@@ -85,8 +87,19 @@ def test_what_motors_give_is_the_effort(
 ) -> None:
     text = MJCF.replace("<joint ", f"<joint {of_joint} ")
     text = text.replace("</mujoco>", f"<actuator>{actuators}</actuator></mujoco>")
-    _, scene = imported(tmp_path, text, "--stops", *more)
+    said, scene = imported(tmp_path, text, "--stops", *more)
+    assert "effort is not known" not in said
     assert f"{effort}/stop_depth_turn*(max(0, -0.5 - q)" in scene
+
+
+def test_of_a_servo_the_range_of_its_force_is_the_effort(tmp_path: Path) -> None:
+    servo = '<position joint="q" kp="40" ctrlrange="-1 1" ctrllimited="true"/>'
+    text = MJCF.replace("</mujoco>", f"<actuator>{servo}</actuator></mujoco>")
+    for more, told in (("", True), (' forcerange="-7 7" forcelimited="true"', False)):
+        said, scene = imported(tmp_path, text.replace("/></act", f"{more}/></act"), "--stops")
+        assert ("from weights: q (30 N m)" in said) == told
+        assert f"{30 if told else 7}/stop_depth_turn*(max" in scene
+        (tmp_path / "robot.toml").unlink()
 
 
 def test_stops_need_limits(tmp_path: Path) -> None:

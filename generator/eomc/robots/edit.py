@@ -69,11 +69,19 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
 
 def stopped(robot: Robot) -> Robot:
     """The robot with stops where its joints have limits. Raises EomcError where none has."""
-    if not stops(robot):
+    found = stops(robot)
+    if not found:
         raise EomcError("--stops: no joint of this robot has limits")
-    told = "stops: at limits of positions [forces] pushes back; those of speed and effort are notes"
+    told = [
+        "stops: at limits of positions [forces] pushes back; those of speed and effort are notes"
+    ]
+    weighed = [s for s in found if not s.known]
+    if weighed:
+        newton = {"rad": "N m", "m": "N"}
+        those = texts.listed([f"{s.coordinate} ({s.effort:g} {newton[s.unit]})" for s in weighed])
+        told.append(f"stops whose effort is not known, and is taken from weights: {those}")
     others = (words for words in robot.left_out if not _LIMITS.match(words))
-    return replace(robot, stopped=True, left_out=(told, *others))
+    return replace(robot, stopped=True, left_out=(*told, *others))
 
 
 def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:

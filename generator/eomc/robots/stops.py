@@ -20,12 +20,16 @@ DAMPING = {"rad": 1.0, "m": 10.0}  # s/rad, s/m
 
 @dataclass(frozen=True)
 class Stop:
-    """The stop of a coordinate: its limits, and the force `effort` that pushes it in by depth."""
+    """The stop of a coordinate: its limits, and the force `effort` that pushes it in by depth.
+
+    known: whether the file tells that force.
+    """
 
     coordinate: str
     unit: str
     limits: tuple[float, float]
     effort: float
+    known: bool
 
 
 def stops(robot: Robot) -> list[Stop]:
@@ -45,12 +49,14 @@ def stops(robot: Robot) -> list[Stop]:
         for by, q in robot.along(d.coordinate):
             given[q] = given.get(q, 0.0) + (abs(by) * d.most if by else 0.0)
 
-    def effort(m: Motion) -> float:
-        told = min(max(map(abs, m.driven)), given.get(m.name, math.inf))
-        return told if 0 < told < math.inf else float(f"{held[m.name]:.3g}") or 1.0
+    def stop(m: Motion) -> Stop:
+        effort = min(max(map(abs, m.driven)), given.get(m.name, math.inf))
+        known = 0 < effort < math.inf
+        effort = effort if known else float(f"{held[m.name]:.3g}") or 1.0
+        return Stop(m.name, m.unit, m.limits, effort, known)
 
     return [
-        Stop(m.name, m.unit, m.limits, effort(m))
+        stop(m)
         for m in robot.motions
         if m.limits[0] < m.limits[1] and all(map(math.isfinite, m.limits))
     ]
