@@ -106,7 +106,8 @@ def command(
             stopped = True
     if out:
         _write(out, done)
-    balance = done.balance() if own.has_power and seconds < 2 else None
+    told = own.has_power or len(done.events) > 0  # forces, or jumps
+    balance = done.balance() if told and seconds < 2 else None
     if plot:
         from eomc.report import plot as plots
 
