@@ -93,8 +93,8 @@ def lowered(patch: pytest.MonkeyPatch) -> None:
     """On its way to assignments the last sum of the acceleration loses a sign."""
     right = admissible.lower
 
-    def wrong(name: str, *how: Any) -> Any:
-        made = right(name, *how)
+    def wrong(name: str, *how: Any, **more: Any) -> Any:
+        made = right(name, *how, **more)
         if name != "acceleration":
             return made
         body = list(made.body)

@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 import sympy
-from sympy import Heaviside, sign
+from sympy import Expr, Heaviside, Symbol, sign
 
 from eomc.base.errors import SceneError
 from eomc.model.mechanics import Made
-from eomc.model.symbols import resolved
 
 
 def crossing(system: Made) -> Made:
     """The system. Raises SceneError where sign and heaviside alone change what an event watches."""
-    known, fixed = resolved(system.definitions), {p.symbol for p in system.parameters}
-    problems = []
+    if not system.events:
+        return system
+    smooth: dict[Symbol, frozenset[Symbol]] = {}  # of definitions: what changes them between jumps
+    jumping: dict[Symbol, Expr] = {}  # and where they jump, if they do
+
+    def of(e: Expr) -> tuple[frozenset[Symbol], Expr | None]:
+        jumps = sorted(e.atoms(Heaviside, sign), key=str)
+        names = e.xreplace(dict.fromkeys(jumps, sympy.S.One)).free_symbols
+        inside = [j.args[0] for j in jumps] + [jumping[s] for s in names if s in jumping]
+        left = frozenset[Symbol]().union(*(smooth.get(s, {s}) for s in names))
+        return left, inside[0] if inside else None
+
+    for name, e in system.definitions:
+        smooth[name], where = of(e)
+        if where is not None:
+            jumping[name] = where
+    fixed, problems = {p.symbol for p in system.parameters}, []
     for k, event in enumerate(system.events, start=1):
-        when = event.when.xreplace(known)
-        jumps = sorted(when.atoms(Heaviside, sign), key=str)
-        outside = when.xreplace(dict.fromkeys(jumps, sympy.S.One)).free_symbols
-        if jumps and outside <= fixed:
-            why = f'jumps over zero, which is no crossing: write when = "{jumps[0].args[0]}"'
+        left, where = of(event.when)
+        if where is not None and left <= fixed:
+            why = f'jumps over zero, which is no crossing: write when = "{where}"'
             problems.append(system.problem(f"event.{k}.when", why))
     if problems:
         raise SceneError(problems)
