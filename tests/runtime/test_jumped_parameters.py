@@ -392,6 +392,7 @@ batch = true
 """
 
 
+@pytest.mark.filterwarnings("ignore:far_. fixed steps pass over events")
 def test_how_large_they_are_is_nothing_to_steps_and_errors(modules: Modules) -> None:
     """A time far away was the largest of all coordinates, and errors of others were beside it."""
     near, far = (
@@ -403,3 +404,5 @@ def test_how_large_they_are_is_nothing_to_steps_and_errors(modules: Modules) -> 
     assert np.array_equal(a, b)
     found = [run.estimate() for run in (one, other)]
     assert found[0].amplification == pytest.approx(found[1].amplification, rel=1e-6)
+    fixed = [m.simulate(h=0.01, steps=500).estimate() for m in (near, far)]
+    assert fixed[0].digits == pytest.approx(fixed[1].digits, rel=1e-6)

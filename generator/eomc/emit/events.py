@@ -173,7 +173,7 @@ def _events(made: Stepping) -> Events:
         project_all=public.project.call(held="0", **reached) if made.form.project else "",
         set=_set(system) if made.form.project and jumps else (),
         modes=c.in_braces([str(m.at), str(m.of)] for m in system.modes),
-        own=len(system.events) - 2 * len(system.modes),
+        own=len(system.own_events),
         values_after=values.call(events="value", **reached),
     )
 
@@ -181,8 +181,7 @@ def _events(made: Stepping) -> Events:
 def _set(system: System) -> tuple[str, ...]:
     """Of each event of the scene which of q and qd its jump sets."""
     states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
-    own = system.events[: len(system.events) - 2 * len(system.modes)]
-    rows = ({name for name, _ in e.jump} for e in own)
+    rows = ({name for name, _ in e.jump} for e in system.own_events)
     return c.in_braces([str(int(name in names)) for name in states] for names in rows)
 
 

@@ -138,6 +138,11 @@ class Mechanics:
         return self.frames if wanted is True else tuple(known[name] for name in wanted or ())
 
     @property
+    def own_events(self) -> tuple[Event, ...]:
+        """Those of the scene: friction that sticks has two more for each of its modes, behind."""
+        return self.events[: len(self.events) - 2 * len(self.modes)]
+
+    @property
     def reads_qdd(self) -> bool:
         """Whether functions may read accelerations."""
         return bool(self.outputs or self.events or self.asked or self.run.inverse_dynamics)

@@ -8,7 +8,7 @@ import numpy as np
 
 from .adaptive_arguments import LEAST
 from .arguments import Array
-from .estimate import Estimate, scales
+from .estimate import Estimate, moving, scales
 from .fitted import Fitted
 from .periods import Periods
 from .status import FULL, REMEDY
@@ -69,10 +69,8 @@ def error_of(
     finer = again(tol, begin, shorter)
     if own.status == "ok" and not np.isfinite(finer).all():  # short ones near singular positions
         finer = again(tol, begin, own._h_most)
-    modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), np.ones(x.shape[1])
-    still = np.arange(model.nq - len(model.still), model.nq)  # is not moved, nor what sticks
-    moves[[*still, *(model.nq + still)]] = 0
-    moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0
+    modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), moving(model)
+    moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0  # nor is what sticks moved
     x = x[beside]
 
     def grown(base: Array, size: float, tol: float) -> Array:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .package import reduced
 from .recorded import Recorded
+from .stepping import Stepping
 
 Array = NDArray[Any]
 
@@ -147,8 +148,9 @@ def _growth(run: Recorded, own: Array, eps: float, again: _Again) -> tuple[Array
     if len(run) < _ROWS:
         every = max(1, run.steps // _ROWS)
         base = again(1, every).x.astype(float)
-    scale = scales(base, float(np.ptp(run.t)), eps)
-    signs = np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
+    scale = scales(base, float(np.ptp(run.t)), eps, len(run._model.still))
+    moves = moving(run._model)
+    signs = moves * np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
 
     def moved(size: float) -> Array:
         x = again(1, every, size * scale * signs).x.astype(float)
@@ -165,7 +167,7 @@ def _growth(run: Recorded, own: Array, eps: float, again: _Again) -> tuple[Array
         finer = moved(max(2 * walked, 30 * eps))
         both = min(len(grown), len(finer))
         grown = np.where(full[:both, None], np.maximum(grown[:both], finer[:both]), grown[:both])
-    together = np.repeat([scale[:nq].max(), scale[nq:].max()], nq)
+    together = np.repeat(np.max((moves * scale).reshape(2, -1), axis=1), nq)
     amplification = float(np.max(grown[-1] / together))
     counts, times = _counts(run, run.every, len(run)), _counts(run, every, len(grown))
     rows = np.stack([np.interp(counts, times, column) for column in grown.T], axis=1)
@@ -181,7 +183,7 @@ def _leaps(run: Recorded, scale: Array, eps: float, again: _Again) -> bool:
     """
     every = run.every if len(run) >= _ROWS else max(1, run.steps // _ROWS)
     size = max(20 * eps * math.sqrt(run.steps), 1e4 * eps)
-    nudges = (part * size * scale for part in (0.0, 1.0, 0.01))
+    nudges = (part * size * scale * moving(run._model) for part in (0.0, 1.0, 0.01))
     base, *moved = (again(1, every, nudge).x.astype(float) for nudge in nudges)
     rows = min(len(base), *map(len, moved))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -237,6 +239,11 @@ def _counts(run: Recorded, every: int, rows: int) -> Array:
     return np.minimum(np.arange(rows) * every, run.steps)
 
 
+def moving(model: Stepping) -> Array:
+    """(2 nq,): 1 of what moves and is nudged, 0 of what jumps alone change."""
+    return np.tile(np.arange(model.nq) < model.nq - len(model.still), 2).astype(float)
+
+
 def scales(x: Array, duration: float, eps: float, still: int = 0) -> Array:
     """The largest value of each column; those that only rounding moves count as a millionth of the
     largest position, or velocity, or of the state where all of these are 0.
@@ -246,15 +253,15 @@ def scales(x: Array, duration: float, eps: float, still: int = 0) -> Array:
     alone change, which count by themselves.
     """
     whole = np.max(np.abs(x), axis=0).reshape(2, -1)
-    moving = whole.shape[1] - still
-    largest = whole[:, :moving].ravel()
+    n = whole.shape[1] - still
+    largest = whole[:, :n].ravel()
     most = np.max(largest.reshape(2, -1), axis=1)
     if 0 < most[1] * duration <= _REST * eps * most[0]:
         largest[len(largest) // 2 :] = most[1] = most[0] / duration
-    halves = np.repeat(most, moving)
+    halves = np.repeat(most, n)
     rest = np.where(halves > 0, halves, np.max(largest))
     scale = np.where(whole > 0, whole, 1.0)
-    scale[:, :moving] = np.maximum(largest, np.where(rest > 0, 1e-6 * rest, 1.0)).reshape(2, -1)
+    scale[:, :n] = np.maximum(largest, np.where(rest > 0, 1e-6 * rest, 1.0)).reshape(2, -1)
     return scale.ravel()
 
 

@@ -24,7 +24,7 @@ from eomc.verify.sampling import State
 def report(of: Comparison) -> None:
     """Add the rows of a scene that has events of its own."""
     system = of.system
-    events = system.events[: len(system.events) - 2 * len(system.modes)]
+    events = system.own_events
     asked = {"events": [Output(e.name, e.when) for e in events]}
     names = [*(str(q) for q in system.q), *(str(qd) for qd in system.qd)]
     states = dict(zip(names, (*system.q, *system.qd), strict=True))
