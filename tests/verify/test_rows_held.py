@@ -1,0 +1,76 @@
+"""Rows of `eomc check` about what constraints hold notice what is wrong."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import pytest
+from conftest import Modules
+
+from eomc.model.from_scene import from_scene
+from eomc.program.assembly import assembled
+from eomc.scene.read import parse
+from eomc.verify.check import check
+from eomc.verify.rows_refusals import OK, Refusals
+
+BOB = assembled(
+    from_scene(
+        parse("""eomc = 1
+name = "held_bob"
+[coordinates]
+x = { start = 0.6 }
+y = { start = -0.8 }
+[parameters]
+m = 1.2
+[energy]
+kinetic = "m*(x_dot**2 + y_dot**2)/2"
+potential = "m*9.81*y"
+[constraints]
+rod = "x**2 + y**2 - 1"
+[run]
+linearize = true
+""")
+    )
+)
+ROWS = {"tangent", "negative D along the rows"}
+
+
+@pytest.fixture(scope="module")
+def bob(modules: Modules) -> ModuleType:
+    return modules.unoptimised(BOB)
+
+
+def failed(module: Any) -> set[str]:
+    rows = check(BOB, module, states=4).rows
+    assert {row.name for row in rows} >= ROWS
+    return {row.name for row in rows if not row.passed} & ROWS
+
+
+class Bent:
+    """A module whose tangents lead a thousandth off the rows."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self.module = module
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.module, name)
+
+    def tangent(self, *state: Any, **how: Any) -> Any:
+        return self.module.tangent(*state, **how) + 1e-3
+
+
+@pytest.mark.slow
+def test_what_is_right_passes(bob: ModuleType) -> None:
+    assert failed(bob) == set()
+
+
+def test_a_tangent_that_leaves_the_rows_fails(bob: ModuleType) -> None:
+    assert failed(Bent(bob)) == {"tangent"}
+
+
+def test_accelerations_of_negative_masses_fail(
+    bob: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Refusals, "accelerate", lambda *_: (OK, True))
+    assert failed(bob) == {"negative D along the rows"}
