@@ -144,6 +144,12 @@ def source(target: Target, name: str) -> Function | None:
     return of.get(name) or of.get(f"{name}_column")
 
 
+def refuses(target: Target, name: str) -> bool:
+    """Whether a function returns a status: it finds multipliers, which not every state has."""
+    function = source(target, name)
+    return name == "multipliers" or bool(function and function.checks)
+
+
 def takes_qdd(target: Target, name: str) -> bool:
     """Whether a function reads accelerations."""
     function = source(target, name)

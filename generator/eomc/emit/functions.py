@@ -15,7 +15,7 @@ from eomc.emit import heading
 from eomc.emit.c_expression import REALS, Block, Body, Real, several
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target, sentence, unclashed
-from eomc.emit.evaluations import KINDS, doc, source
+from eomc.emit.evaluations import KINDS, doc, extent, refuses, source
 from eomc.emit.plain.parts import Computed
 from eomc.emit.plain.views import (
     Indexed,
@@ -257,6 +257,8 @@ class Functions:
         said = [doc(target, name)]
         if kind.takes_u and target.system.inputs:
             said.append("u: the inputs; NULL for the scene's signals.")
+        if refuses(target, name):
+            said.append(f"Where the status is not OK, {kind.out} is untouched.")
         if by_columns:
             told = f"By {len(target.names)} columns, each: {told[0].lower()}{told[1:]}"
         reads = self.read(function) | {kind.out}
@@ -267,14 +269,21 @@ class Functions:
             return summed
         if outline.is_large(function):
             out = kind.out or ("power" if name == "power" else "energy")
+            size, last = "1", Block("", (c.result(f"{out}[0]"),))
+            if refuses(target, name):  # and leaves its results untouched then
+                out, size = "a", extent(target, kind.shape)
+                last = Block("", (*c.copied(kind.out, "a", 0, size), c.result(self.ok)))
             values, parts, calls = self.cut(function, name, out, READ)
-            if not kind.out:
-                one = Block("", (c.local(self.real, f"{out}[1]"), *calls[0].lines))
-                calls = (one, calls[1], Block("", (c.result(f"{out}[0]"),)))
+            if out != kind.out:
+                one = Block("", (c.local(self.real, f"{out}[{size}]"), *calls[0].lines))
+                calls = (one, calls[1], last)
             body = (*self.signals(function), *calls)
             return Computed(replace(public, body=body), parts, values)
-        body = (*self.signals(function), *self.straight(function, kind.out)[0])
-        return Computed(replace(public, body=body))
+        (*blocks, last), found = self.straight(function, kind.out)
+        if refuses(target, name):
+            blocks.append(Block("", c.unless(found.failures, self.singular)))
+            last = Block("", (*last.lines, c.result(self.ok)))
+        return Computed(replace(public, body=(*self.signals(function), *blocks, last)))
 
     def _summed(self, energy: CFunction) -> Computed | None:
         """K + P by their own functions, whose arguments energy has."""

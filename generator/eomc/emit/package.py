@@ -10,7 +10,7 @@ from eomc.emit import adaptive
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import cast, member
 from eomc.emit.c_names import Target
-from eomc.emit.evaluations import KINDS, takes_qdd, takes_t
+from eomc.emit.evaluations import KINDS, refuses, takes_qdd, takes_t
 from eomc.emit.heading import stamp, words
 from eomc.emit.public import Public
 from eomc.emit.views import (
@@ -87,6 +87,7 @@ def main(target: Target) -> Main:
         energy=public.evaluation("energy").call(),
         outputs=outputs,
         accelerations=public.acceleration.call(u="NULL") if solved else "",
+        refuses=bool(asked and refuses(target, "outputs")),
     )  # fmt: skip
 
 
@@ -106,7 +107,8 @@ def _bound(target: Target) -> tuple[Bound, ...]:
         alone = not kind.out and target.real is DOUBLE and not {"t", "u", "qdd"} & set(extents)
         at_x = function.call(q="x", qd=f"x + {target.PREFIX}_NQ", p=_parameters(target))
         text = call if kind.out else f"out[k] = {call}"
-        found.append(Bound(name, text, solve, at_x if alone else ""))
+        size = extents[kind.out] if refuses(target, name) else ""
+        found.append(Bound(name, text, solve, at_x if alone else "", size))
     return tuple(found)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from eomc.emit.c_function import CArgument, CFunction, filled, given
 from eomc.emit.c_names import Target
-from eomc.emit.evaluations import KINDS, extent, source, takes_qdd, takes_t
+from eomc.emit.evaluations import KINDS, extent, refuses, source, takes_qdd, takes_t
 
 STATE = ("q", "qd")
 LIMITS = ("t_end", "tol", "h_most")  # of adaptive steps
@@ -44,9 +44,10 @@ class Public:
         signal = name == "signal"
         t = (CArgument(real, "t"),) if takes_t(target, name) else ()
         moving = STATE if "qd" in kind.takes.split() else STATE[:1]
+        returns = "void" if kind.out else real
         return CFunction(
             f"{target.prefix}_{name}",
-            "void" if kind.out else real,
+            f"{target.prefix}_status" if refuses(target, name) else returns,
             (
                 *([filled(real, kind.out, extent(target, kind.shape))] if kind.out else []),
                 *(t if signal else ()),

@@ -15,7 +15,7 @@ from eomc.program.ir import Cost
 class Main:
     """c/main.c.jinja: the scene's own run, adaptive where it has a tolerance.
 
-    run, energy, outputs: calls; accelerations: outputs'.
+    run, energy, outputs: calls; accelerations: outputs'; refuses: whether these have a status.
     """
 
     TEMPLATE: ClassVar[str] = "c/main.c"
@@ -39,6 +39,7 @@ class Main:
     energy: str
     outputs: str
     accelerations: str
+    refuses: bool
 
 
 @dataclass(frozen=True)
@@ -126,13 +127,15 @@ class Bound:
     """A function of the scene in the binding: its name, and its call for row k of many.
 
     solve: the call for the accelerations that it reads, if it does. at: of a number that depends on
-    the state alone, its call at x.
+    the state alone, its call at x. refuses: of one that returns a status, how many numbers a row
+    is.
     """
 
     name: str
     call: str
     solve: str
     at: str
+    refuses: str
 
 
 @dataclass(frozen=True)

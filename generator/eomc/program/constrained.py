@@ -28,7 +28,10 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
         return
     yield from of_rows(derived)
     names = [f"lambda_{c.name}" for c in system.constraints]
-    yield lower("multipliers", taken.tape, taken.multipliers, system.names, labels=names)
+    yield lower(
+        "multipliers", taken.tape, taken.multipliers, system.names, checks=taken.checks,
+        labels=names,
+    )  # fmt: skip
     e, values, pivots, correction = min(
         (_correction(system, e) for e in _both(derived)), key=lambda found: weight(found[-1].cost)
     )

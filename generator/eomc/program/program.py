@@ -142,11 +142,12 @@ def _outputs(system: System, taken: Candidate) -> Iterator[Function]:
     held = dict(zip((c.multiplier for c in system.constraints), taken.multipliers, strict=False))
     read = {x for o in system.outputs for x in o.formula.free_symbols}
     known = (taken.tape, held) if read & held.keys() else None
+    checks = taken.checks if known else ()
     made = outputs.outputs(system, sloped=system.run.sloped, beside=known)
     labels = [o.name for o in system.outputs]
-    yield lower("outputs", made.tape, made.values, system.names, labels=labels)
+    yield lower("outputs", made.tape, made.values, system.names, checks=checks, labels=labels)
     if rows := [x for row in made.slopes for x in row]:
-        yield lower("output_slopes", made.tape, rows, system.names)
+        yield lower("output_slopes", made.tape, rows, system.names, checks=checks)
 
 
 def _events(system: System, taken: Candidate) -> Iterator[Function]:

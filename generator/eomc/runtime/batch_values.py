@@ -63,7 +63,7 @@ class Values:
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "multipliers", names,
-            lambda: self._driven("multipliers", model.multipliers, (len(names),)),
+            lambda: self._driven("multipliers", model._multipliers, (len(names),)),
         )  # fmt: skip
 
     @property

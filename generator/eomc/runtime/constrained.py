@@ -126,8 +126,18 @@ class Constrained(Frames):
     ) -> Array:
         """lambda, (nc,), one a constraint as it is written. u None: the scene's signals.
 
-        A constraint that says what others say has 0. Not finite where D is singular.
+        A constraint that says what others say has 0. Raises MotionError as `acceleration` does.
         """
+        found = self._multipliers(q, qd, t, u, params)
+        if not np.isfinite(found).all():
+            self.acceleration(q, qd, t, u, params)  # which says where, and why
+            raise MotionError("multipliers: one is not finite there", "not finite")
+        return found
+
+    def _multipliers(
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
+    ) -> Array:
+        """The same, nan where there are none: of rows of runs."""
         shape = (len(self._rows.names),)
         found: Array = self._evaluate("multipliers", shape, q, qd, t, u, params, None)
         return found
@@ -138,21 +148,26 @@ class Constrained(Frames):
         """What each [[loop]] does to its second body, by name, along the world's axes.
 
         Force and moment about the joint's point: (6,), in the plane (3,), the force (2) and the
-        moment; N and N m. Raises ValueError where the scene has no loops.
+        moment; N and N m. Raises ValueError where the scene has no loops, MotionError as
+        `acceleration` does.
         """
         if not self._rows.loops:
             raise ValueError(f"reactions: {self.name} has no [[loop]]")
-        found = self._reactions(q, qd, t, u, params)
+        found = self._reactions_by(self.multipliers(q, qd, t, u, params), q, qd, t, params)
         return ByName("reactions", self._rows.loops, np.moveaxis(found, -2, 0))
 
     def _reactions(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
-        """Of all loops, (loops, 6), in the plane (loops, 3)."""
-        multipliers = np.ascontiguousarray(self.multipliers(q, qd, t, u, params))
+        """Of all loops, (loops, 6), in the plane (loops, 3); nan where there are none."""
+        return self._reactions_by(self._multipliers(q, qd, t, u, params), q, qd, t, params)
+
+    def _reactions_by(
+        self, multipliers: Array, q: ArrayLike, qd: ArrayLike, t: float, params: Any
+    ) -> Array:
         shape = (len(self._rows.loops), 3 if self._plane else 6)
-        args = ("reactions", shape, q, qd, t, None, params, None, multipliers)
-        found: Array = self._evaluate(*args)
+        each = np.ascontiguousarray(multipliers)
+        found: Array = self._evaluate("reactions", shape, q, qd, t, None, params, None, each)
         return found
 
     def project(

@@ -43,7 +43,7 @@ class ConstrainedRun:
     def multipliers(self) -> Mapping[str, Array]:
         """The multiplier of each constraint along the run, (n,), by name."""
         names = self._model.constraint_names
-        found = self._driven("multipliers", self._model.multipliers).T if names else ()
+        found = self._driven("multipliers", self._model._multipliers).T if names else ()
         return ByName("multipliers", names, np.ascontiguousarray(found))
 
     @property

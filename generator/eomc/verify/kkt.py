@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
+CLEAR = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
 RANK_TOLERANCE = 1e-9  # of the largest singular value: a row that is none here
 MOST = 60  # sweeps of Newton's method
 HELD = 1e-10  # of the terms of a row: what it may still be
@@ -112,6 +113,28 @@ def scales(D: Vector, A: Vector) -> Vector:
     coordinates = 1 / np.sqrt(inertia)
     rows = np.sqrt(np.sum((A * coordinates) ** 2, axis=1))
     return np.concatenate([coordinates, 1 / np.where(rows > 0, rows, 1)])
+
+
+def least_along(D: Vector, A: Vector) -> float:
+    """The least eigenvalue of D, (n, n), along what rows A, (m, n), make zero, scaled to 1.
+
+    nan: not to be judged, as where rows depend on one another.
+    """
+    size = np.sqrt(np.abs(np.diag(D)))
+    size = np.where(size > 0, size, 1.0)
+    rows = np.linalg.norm(A / size, axis=1)
+    if not (np.all(np.isfinite(D)) and np.all(np.isfinite(A)) and np.all(rows > 0)):
+        return np.nan
+    _, s, V = np.linalg.svd(A / size / rows[:, None])
+    if len(s) and s[-1] < CLEAR:
+        return np.nan
+    N = V[len(s) :].T
+    return float(np.linalg.eigvalsh(N.T @ (D / np.outer(size, size)) @ N)[0]) if N.size else 0.0
+
+
+def inert(D: Vector, A: Vector) -> bool:
+    """Whether D is negative along nothing that rows A leave; where these depend on others, too."""
+    return not least_along(D, A) < -CLEAR
 
 
 def onto(

@@ -15,14 +15,15 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.verify import kkt
 from eomc.verify.comparison import Comparison
+from eomc.verify.kkt import CLEAR
 from eomc.verify.oracle import Vector
 from eomc.verify.rows_runs import drive, parameters
 from eomc.verify.sampling import State
 
 OK, SINGULAR, NOT_FINITE, NO_CONVERGENCE, _, LOCKED = range(6)
 REFUSED = (SINGULAR, NOT_FINITE, NO_CONVERGENCE, LOCKED)
-CLEAR = 1e-6  # an eigenvalue of the scaled D is positive or negative beyond
 FACTORS = (0.0, -3.0, -1.0, -0.3, 2.0**-60, 2.0**60)  # of one parameter
 MIXED = 60  # changes of all parameters at random
 ALONE = 8  # changes of all at random, of which one alone is negative
@@ -98,7 +99,7 @@ class Refusals:
                     np.asarray(self.check.reference.evaluate(name, s.q, s.qd, 0.0, None, s.params))
                     for name in ("D", "constraint_jacobian")
                 )
-            if _least_along(D, A) < -CLEAR:
+            if kkt.least_along(D, A) < -CLEAR:
                 if self.accelerate(s)[0] == SINGULAR:
                     self.singular.append(s)
                 else:
@@ -390,20 +391,3 @@ def _least(D: Vector) -> Vector:
     least[known] = np.linalg.eigvalsh(scaled[known])[:, 0]
     empty = np.any(diagonal == 0, axis=1) & np.all(np.isfinite(D), axis=(1, 2))
     return np.asarray(np.where(empty, 0.0, least))
-
-
-def _least_along(D: Vector, A: Vector) -> float:
-    """The least eigenvalue of D, (nq, nq), along what rows A, (m, nq), make zero, scaled as above.
-
-    nan: not to be judged, as where rows depend on one another.
-    """
-    size = np.sqrt(np.abs(np.diag(D)))
-    size = np.where(size > 0, size, 1.0)
-    rows = np.linalg.norm(A / size, axis=1)
-    if not (np.all(np.isfinite(D)) and np.all(np.isfinite(A)) and np.all(rows > 0)):
-        return math.nan
-    _, s, V = np.linalg.svd(A / size / rows[:, None])
-    if len(s) and s[-1] < CLEAR:
-        return math.nan
-    N = V[len(s) :].T
-    return float(np.linalg.eigvalsh(N.T @ (D / np.outer(size, size)) @ N)[0]) if N.size else 0.0

@@ -175,8 +175,7 @@ class Sampler:
             (turns if link.turns else slides).update(link.q.free_symbols)
         slides -= turns
         self.angles = np.array([c.unit == "rad" and c.q not in slides for c in system.coordinates])
-        names = enumerate(c.name for c in system.coordinates)
-        self.discrete = [k for k, name in names if name in system.discrete]
+        self.discrete = [k for k, c in enumerate(system.coordinates) if c.name in system.discrete]
         far, fast = self._ahead(effort)
         self.spread = np.where(self.angles, np.pi, np.where(far > NOISE, far, 1.0))
         self.speed = np.maximum(fast, 10 * self.spread / system.run.duration)
@@ -317,13 +316,14 @@ class Sampler:
     def regular(self, s: State) -> bool:
         """D finite and far from singular, and positive definite where we chose the parameters.
 
-        Under constraints the KKT matrix is to be far from singular.
+        Under constraints the KKT matrix is to be far from singular, and D not negative.
         """
         D = self.reference.evaluate("D", s.q, s.qd, s.t, s.u, s.params)
         if self.system.constraints:
             A = self.rows("constraint_jacobian", s)
             off = self.reference.switched & ~np.any(A, axis=1)
-            return kkt.regular(D, A[~off], REGULAR)
+            weighted = bool(self.system.closure and self.system.closure.weights)
+            return kkt.regular(D, A[~off], REGULAR) and kkt.inert(D, A[~off] if weighted else A[:0])
         diagonal = np.abs(np.diag(D))
         if not (np.all(np.isfinite(D)) and np.all(diagonal > 0)):
             return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 from eomc.base.texts import FreeText
 from eomc.emit import adaptive, heading
 from eomc.emit.c_names import Target
-from eomc.emit.evaluations import source, takes_qdd
+from eomc.emit.evaluations import refuses, source, takes_qdd
 from eomc.emit.events import DIRECTIONS
 from eomc.emit.fmu.variables import input_starts
 from eomc.emit.fmu.views import SceneCalls, SceneEvent
@@ -60,6 +60,8 @@ def view(target: Target, token: str) -> SceneCalls:
         ) if by_tolerance else "",
         linearization=public.linearization.call() if s.run.sloped else "",
         output_slopes=_called(target, "output_slopes"),
+        refuses=refuses(target, "outputs"),
+        slopes_refuse=refuses(target, "output_slopes"),
         slopes_solved="output_slopes" in target.program and takes_qdd(target, "output_slopes"),
     )  # fmt: skip
 

@@ -59,6 +59,8 @@ class SceneCalls:
     linearization: str
     output_slopes: str
     slopes_solved: bool
+    refuses: bool
+    slopes_refuse: bool
 
 
 @dataclass(frozen=True)
