@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 from conftest import Modules
 
@@ -13,10 +15,10 @@ from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify.check import check
 from eomc.verify.rows_refusals import OK, Refusals
+from eomc.verify.sampling import SMALL, Sampler
+from eomc.verify.symbolic import of
 
-BOB = assembled(
-    from_scene(
-        parse("""eomc = 1
+SCENE = """eomc = 1
 name = "held_bob"
 [coordinates]
 x = { start = 0.6 }
@@ -30,9 +32,8 @@ potential = "m*9.81*y"
 rod = "x**2 + y**2 - 1"
 [run]
 linearize = true
-""")
-    )
-)
+"""
+BOB = assembled(from_scene(parse(SCENE)))
 ROWS = {"tangent", "negative D along the rows"}
 
 
@@ -74,3 +75,27 @@ def test_accelerations_of_negative_masses_fail(
 ) -> None:
     monkeypatch.setattr(Refusals, "accelerate", lambda *_: (OK, True))
     assert failed(bob) == {"negative D along the rows"}
+
+
+@pytest.mark.slow
+def test_multipliers_of_negative_masses_fail(
+    bob: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call = Refusals.call
+
+    def found(self: Refusals, name: str, s: Any) -> Any:
+        return None if name == "multipliers" else call(self, name, s)
+
+    monkeypatch.setattr(Refusals, "call", found)
+    rows = {row.name for row in check(BOB, bob, states=4).rows if not row.passed}
+    assert rows == {"negative D along the rows: refusals"}
+
+
+def test_states_with_a_negative_d_are_left_out() -> None:
+    """Of a scene with a mass that its coordinates may make negative, these say nothing."""
+    kinetic = "(m - 2*x)*(x_dot**2 + y_dot**2)/2"
+    text = SCENE.replace("m*(x_dot**2 + y_dot**2)/2", kinetic)
+    system = assembled(from_scene(parse(text)))
+    sampler = Sampler(of(system), np.random.default_rng(0), SMALL)
+    heavy, light = (replace(sampler.start, q=np.array(q)) for q in ((0.0, -1.0), (1.0, 0.0)))
+    assert sampler.regular(heavy) and not sampler.regular(light)

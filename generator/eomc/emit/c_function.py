@@ -170,7 +170,8 @@ def struct(type: str, real: str, members: Sequence[str]) -> str:
 
 def copied(to: str, array: str, first: int, count: str) -> tuple[str, ...]:
     """Numbers of an array from `first` on into another, in a loop."""
-    return (f"for (int k = 0; k < {count}; k++)", f"    {to}[k] = {array}[{first} + k];")
+    place = f"{first} + k" if first else "k"
+    return (f"for (int k = 0; k < {count}; k++)", f"    {to}[k] = {array}[{place}];")
 
 
 def in_braces(rows: Iterable[Sequence[str]]) -> tuple[str, ...]:

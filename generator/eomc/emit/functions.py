@@ -270,9 +270,8 @@ class Functions:
         if outline.is_large(function):
             out = kind.out or ("power" if name == "power" else "energy")
             size, last = "1", Block("", (c.result(f"{out}[0]"),))
-            if refuses(target, name):  # and leaves its results untouched then
-                out, size = "a", extent(target, kind.shape)
-                last = Block("", (*c.copied(kind.out, "a", 0, size), c.result(self.ok)))
+            if refuses(target, name):
+                out, size, last = "a", extent(target, kind.shape), self._told(name)
             values, parts, calls = self.cut(function, name, out, READ)
             if out != kind.out:
                 one = Block("", (c.local(self.real, f"{out}[{size}]"), *calls[0].lines))
@@ -281,9 +280,17 @@ class Functions:
             return Computed(replace(public, body=body), parts, values)
         (*blocks, last), found = self.straight(function, kind.out)
         if refuses(target, name):
-            blocks.append(Block("", c.unless(found.failures, self.singular)))
-            last = Block("", (*last.lines, c.result(self.ok)))
+            array = c.listed(self.real, "a", extent(target, kind.shape), found.results)
+            blocks.append(Block("", (array, *c.unless(found.failures, self.singular))))
+            last = self._told(name)
         return Computed(replace(public, body=(*self.signals(function), *blocks, last)))
+
+    def _told(self, name: str) -> Block:
+        """The end of a function that refuses: results `a` where they go, and the status."""
+        size = extent(self.target, KINDS[name].shape)
+        unfinite = [f"!{self.prefix}_finite(a, {size})"] if name == "multipliers" else []
+        told = c.unless(unfinite, f"{self.PREFIX}_NOT_FINITE")
+        return Block("", (*told, *c.copied(KINDS[name].out, "a", 0, size), c.result(self.ok)))
 
     def _summed(self, energy: CFunction) -> Computed | None:
         """K + P by their own functions, whose arguments energy has."""
