@@ -146,8 +146,12 @@ def test_starts_without_them_have_the_scenes(gripper: ModuleType) -> None:
     q0 = np.tile([0, 0.3], (3, 1))
     many = gripper.simulate_batch(q0, np.tile([1.0, 0], (3, 1)), tol=1e-12)
     assert np.array_equal(many.q[:, -1], np.tile(run.q[-1], (3, 1)))
-    with pytest.raises(ValueError, match="'m' is a coordinate: give it in q0"):
-        gripper.simulate(params={"m": 2.0})
+    told = r"a jump sets 'm', so it is a state .*: give it in q0, \[x, theta, m, l, k, on\], or"
+    for calls in (gripper.simulate, gripper.simulate_batch):
+        with pytest.raises(ValueError, match=f"params: {told}"):
+            calls(params={"m": 2.0})
+    with pytest.raises(TypeError, match=f"no argument 'm': {told}"):
+        gripper.simulate(m=2.0)
 
 
 def test_nothing_pulls_at_them(gripper: ModuleType) -> None:

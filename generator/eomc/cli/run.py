@@ -176,6 +176,7 @@ def _overrides(
                 remedy = f", but an input: --input {name}={value:g}"
             for kind, of in (("coordinate", name), ("velocity", name.removesuffix("_dot"))):
                 if of in module.coordinates:
+                    kind = "state that jumps set" if of in module._model.still else kind
                     remedy = f", but a {kind}: --start {name}={value:g}"
                     break
             raise EomcError(f"--set: '{name}' is not a parameter{remedy}")

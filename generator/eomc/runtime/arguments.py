@@ -16,7 +16,7 @@ import numpy as np
 from numpy import empty, ndarray
 from numpy.typing import ArrayLike, NDArray
 
-from .package import Defaults, meant, reduced
+from .package import Defaults, meant, of_a_start, reduced
 
 Array = NDArray[Any]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
@@ -244,7 +244,7 @@ class Arguments:
             given = self.Params()
             for name, value in named(params).items():
                 if name in self.coordinates:
-                    raise ValueError(f"params: '{name}' is a coordinate: give it in q0")
+                    raise ValueError(f"params: {of_a_start(self, name)}")
                 given._set(name, value)
             return np.asarray(given._array)
         unmasked(params, "params")

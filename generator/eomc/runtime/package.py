@@ -44,6 +44,16 @@ def meant(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{near[0]}'?" if near else ""
 
 
+def of_a_start(model: Any, name: str) -> str:
+    """That a name of `q` is no parameter, and where it is given."""
+    if name in model.still:
+        return (
+            f"a jump sets '{name}', so it is a state behind the coordinates, not a parameter: give "
+            f"it in q0, [{', '.join(model.coordinates)}], or eomc run --start {name}=..."
+        )
+    return f"'{name}' is a coordinate: give it in q0"
+
+
 # what newcomers call the arguments of a run
 _CALLED = {
     "dt": "h", "step": "h", "step_size": "h", "stepsize": "h", "timestep": "h", "rtol": "tol",
@@ -59,6 +69,8 @@ def no_argument(model: Any, call: Callable[..., Any], unknown: Mapping[str, Any]
     name, known = next(iter(unknown)), [*signature(call).parameters][:-1]  # all but **unknown
     table = "params" if name in model.parameters else "u" if name in model.inputs else ""
     near = f": write {table}={{'{name}': ...}}" if table else meant(_CALLED.get(name, name), known)
+    if name in model.coordinates:
+        near = f": {of_a_start(model, name)}"
     near = near or f": it has {', '.join(known)}"
     return TypeError(f"{call.__name__} has no argument '{name}'{near}")
 
