@@ -159,6 +159,26 @@ def test_what_is_no_parameter_is_told_where_it_belongs(
         run._overrides(Path("driven.toml"), driven, [given], [])
 
 
+INPUTS = """eomc = 1
+name = "inputs"
+[coordinates]
+x = {}
+[parameters]
+m = 2.0
+[inputs]
+f = { signal = "half" }
+free = {}
+w = { signal = "sin(t)" }
+[definitions]
+half = "m/2"
+[energy]
+kinetic = "m*x_dot**2/2"
+potential = "0"
+[forces]
+x = "f + free + w"
+"""
+
+
 def test_inputs_are_held_on_the_command_line(there: Path, driven: ModuleType) -> None:
     built(there, "cartpole_driven")
     shutil.copy(SCENES / "cartpole_driven.toml", there)
@@ -176,8 +196,27 @@ def test_inputs_are_held_on_the_command_line(there: Path, driven: ModuleType) ->
         "'x' is not an input: there are none"
         in eomc("run", "cartpole.toml", "--input", "x=1").output
     )
-    with pytest.raises(EomcError, match="no value for push: hold all inputs, or none"):
-        run._held(SimpleNamespace(inputs=("force", "push"), defaults={}), ["force=1"], {})
+
+
+def test_inputs_that_are_not_held_have_constant_signals(tmp_path: Path) -> None:
+    scene = tmp_path / "inputs.toml"
+    scene.write_text(INPUTS, encoding="utf-8")
+    module: Any = SimpleNamespace(inputs=("f", "free", "w"), defaults={"m": 2.0}, start=(0, 0))
+    module.signal = lambda q, qd, params: np.array([0.5 * params["m"], 0.0, 0.7])
+    assert run._held(scene, module, ["w=3"], {"m": 4.0}) == {"f": 2.0, "free": 0.0, "w": 3.0}
+    assert run._held(scene, module, [], {}) is None
+    with pytest.raises(EomcError, match=r"signal of w changes, .*: give w a value too"):
+        run._held(scene, module, ["f=1"], {})
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [("--rate", "--start NAME_dot=VALUE"), ("--params", "--set NAME=VALUE"), ("--dt", "is --h")],
+)
+def test_options_of_other_names_are_told_by_what_is_meant(option: str, said: str) -> None:
+    done = eomc("run", "cartpole.toml", option, "x=1")
+    assert done.exit_code == 2 and f"No such option '{option}': " in done.output
+    assert said in done.output
 
 
 @pytest.mark.parametrize(

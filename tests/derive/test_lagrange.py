@@ -338,6 +338,7 @@ def test_a_coordinate_without_inertia_is_refused(kinetic: sympy.Expr) -> None:
     with pytest.raises(EomcError, match="has no inertia") as fault:
         compiled(System.make("light", [x, y], kinetic, x**2 + y**2))
     assert "'y'" in str(fault.value) or kinetic == 0
+    assert ("write y_dot**2" in str(fault.value)) == kinetic.has(w)
 
 
 def test_a_derivative_of_a_jump_is_refused() -> None:

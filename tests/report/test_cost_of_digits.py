@@ -336,3 +336,15 @@ def test_a_stepper_that_a_scene_can_not_use_is_reported(
     assert module.methods == ("dp8",) and skipped == {"rk4": "rk4 is refused here"}
     with pytest.raises(EomcError, match="no stepper can be used: rk4 is refused here"):
         cost_of_digits.variant(oscillator(), ("rk4",), tmp_path)
+
+
+def test_progress_begins_before_the_reference_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[int, int]] = []
+
+    def of(*_: Any, **__: Any) -> Any:
+        assert told == [(0, len(METHODS) + 3)]
+        raise EomcError("seen")
+
+    monkeypatch.setattr(cost_of_digits.reference_solution, "of", of)
+    with pytest.raises(EomcError, match="seen"):
+        cost_of_digits.measure(SCENES / "cartpole.toml", progress=lambda *how: told.append(how))

@@ -145,6 +145,13 @@ def test_what_an_event_can_not_be_is_said(old: str, new: str, words: str) -> Non
     assert words in str(fault.value)
 
 
+def test_what_a_jump_may_set_is_told_as_part_of_many() -> None:
+    many = "".join(f"p{k} = 1.0\n" for k in range(9))
+    text = BALL.replace("[parameters]\n", f"[parameters]\n{many}", 1)
+    with pytest.raises(SceneError, match=r": a jump sets x, x_dot, .*, p\d and \d+ more"):
+        parse(text.replace('y_dot = "-e*y_dot"', 'zzz = "1"', 1), "events.toml")
+
+
 def test_a_stopped_run_has_an_error_and_a_jumping_one_a_balance(ball: ModuleType) -> None:
     run = ball.simulate(params={"far": 0.7}, duration=5.0, estimate=True)
     assert run.stopped == "away" and max(run.error.end.values()) < 1e-9 and run.error.resolved

@@ -17,8 +17,10 @@ from scipy.integrate import solve_ivp
 
 import eomc
 from eomc.base.errors import EomcError, SceneError
+from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.program.assembly import assembled
+from eomc.scene.read import parse
 from eomc.verify.check import check
 
 BLOCK = """eomc = 1
@@ -293,3 +295,10 @@ def test_check_passes(text: str, tmp_path: Path) -> None:
     system = eomc.read(tmp_path / "scene.toml")
     report = check(system, eomc.load(system, tmp_path / "build"))
     assert report.passed, str(report)
+
+
+@pytest.mark.parametrize("method", ["gauss8", "gauss16"])
+def test_implicit_steps_are_refused_by_the_key_that_is_meant(method: str) -> None:
+    text = BLOCK.replace("[run]\n", f'[run]\nmethod = "{method}"\n')
+    with pytest.raises(EomcError, match=r'friction = "stick".*: write friction = "smooth", or '):
+        eomc.sources(from_scene(parse(text, "test.toml")))

@@ -11,7 +11,7 @@ import click
 from eomc import pipeline
 from eomc.base.errors import SceneError
 from eomc.cli import files, options
-from eomc.cli.terminal import progress_bar, say, shown
+from eomc.cli.terminal import progress_bar, say, shown, status_line
 
 
 @click.command("report")
@@ -45,7 +45,7 @@ def command(
                 'these: report on friction = "smooth", or run it by several tolerances'
             )
             raise SceneError([system.problem("run.friction", why)])
-        with progress_bar(f"measuring {scene.stem}", quiet) as progress:
+        with progress_bar(f"measuring {scene.stem}", quiet, after=0.0) as progress:
             made = cost_of_digits.measure(system, root, progress=progress)
         measured.append(pages.as_dict(made))
         if digits is not None:
@@ -54,7 +54,9 @@ def command(
         if not quiet:
             say(pages.table(made))
         page = root / made.scene / "report.html"
-        files.write_text(page, pages.page(made, presented.of(system, made, root)))
+        with status_line(f"writing {shown(page)}", quiet):
+            text = pages.page(made, presented.of(system, made, root))
+        files.write_text(page, text)
         if not quiet:
             say(f"\nwrote {shown(page)}\n")
             if lacking := without_pictures():

@@ -7,7 +7,7 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
@@ -28,12 +28,39 @@ if TYPE_CHECKING:
     from eomc.runtime.trajectory import Run
 
 
-@click.command("run")
+# what newcomers write, and what they mean
+_MEANT = {
+    "--rate": "a velocity begins by --start NAME_dot=VALUE",
+    "--param": "a parameter is --set NAME=VALUE",
+    "--params": "a parameter is --set NAME=VALUE",
+    "--dt": "the step size is --h",
+}
+
+
+class _Run(click.Command):
+    """The command, with a hint at options of other names."""
+
+    def parse_args(self, context: click.Context, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(context, args)
+        except click.NoSuchOption as fault:
+            if not (meant := _MEANT.get(fault.option_name)):
+                raise
+            words = f"No such option '{fault.option_name}': {meant}"
+            raise click.UsageError(words, context) from None
+
+
+@click.command("run", cls=_Run)
 @options.SCENE
 @options.BUILD
 @click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE", help="A parameter.")
-@click.option("--start", multiple=True, metavar="NAME=VALUE", help="A coordinate, or its velocity.")
-@click.option("--input", "inputs", multiple=True, metavar="NAME=VALUE", help="An input, held.")
+@click.option(
+    "--start", multiple=True, metavar="NAME=VALUE", help="A coordinate, or its velocity NAME_dot."
+)
+@click.option(
+    "--input", "inputs", multiple=True, metavar="NAME=VALUE",
+    help="An input, held; the others have the scene's values.",
+)  # fmt: skip
 @click.option("--h", "h", type=float, help="Step size in s, instead of the scene's.")
 @click.option("--duration", type=float, help="In s, instead of the scene's.")
 @click.option("--method", help="A stepper that the scene asks for, its first by default, or auto.")
@@ -77,7 +104,7 @@ def command(
     with status_line(f"building {scene.stem}", quiet or as_json):
         module = _with_events(pipeline.load(scene, root, warn=warn), event)
     values, q0, qd0 = _overrides(scene, module, parameters, start)
-    u = _held(module, inputs, values)
+    u = _held(scene, module, inputs, values)
     options: dict[str, Any] = {
         "h": h, "duration": duration, "u": u, "params": values, "method": method, "tol": tol,
     }  # fmt: skip
@@ -199,9 +226,12 @@ def _overrides(
 
 
 def _held(
-    module: Any, given: Sequence[str], parameters: Mapping[str, float]
+    scene: Path, module: Any, given: Sequence[str], parameters: Mapping[str, float]
 ) -> dict[str, float] | None:
-    """The inputs that are held over the run, all of them; None where signals are followed."""
+    """The inputs that are held over the run, all of them; None where signals are followed.
+
+    Those that are not given are held at their signals, where these are constant.
+    """
     from eomc.scene.formulas import suggest
 
     values = dict(pairs(given, "--input", {**module.defaults, **parameters}))
@@ -210,12 +240,25 @@ def _held(
             remedy = suggest(name, module.inputs)
             remedy = remedy or (_there_are(module.inputs) if module.inputs else ": there are none")
             raise EomcError(f"--input: '{name}' is not an input{remedy}")
-    if values and (missing := [name for name in module.inputs if name not in values]):
+    if not values or not (missing := [name for name in module.inputs if name not in values]):
+        return values or None
+    if moving := [name for name in _moving(scene) if name in missing]:
+        names = texts.listed(moving)
         raise EomcError(
-            f"--input: no value for {', '.join(missing)}: hold all inputs, or none, for the "
-            "scene's signals"
+            f"--input: the scene's signal of {names} changes, and a run holds all inputs or none: "
+            f"give {names} a value too"
         )
-    return values or None
+    signals = module.signal(*module.start, params=parameters).tolist()
+    return {**dict(zip(module.inputs, signals, strict=True)), **values}
+
+
+def _moving(scene: Path) -> Iterator[str]:
+    """The inputs whose signals depend on more than parameters."""
+    from eomc.model.symbols import resolved
+
+    system = pipeline.read(scene)
+    known, fixed = resolved(system.definitions), {p.symbol for p in system.parameters}
+    return (i.name for i in system.inputs if i.signal.xreplace(known).free_symbols - fixed)
 
 
 def _there_are(known: Iterable[str]) -> str:

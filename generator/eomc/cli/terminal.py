@@ -74,8 +74,10 @@ def _watched(silent: bool) -> bool:
 
 
 @contextmanager
-def progress_bar(what: str, silent: bool) -> Iterator[Callable[[int, int], None]]:
-    """A bar for what takes longer than a second, where a person is watching."""
+def progress_bar(
+    what: str, silent: bool, after: float = 1.0
+) -> Iterator[Callable[[int, int], None]]:
+    """A bar for what takes longer than `after`, s, where a person is watching."""
     if not _watched(silent):
         yield lambda done, total: None
         return
@@ -83,7 +85,7 @@ def progress_bar(what: str, silent: bool) -> Iterator[Callable[[int, int], None]
     bar: list[Any] = []
 
     def update(done: int, total: int) -> None:
-        if not bar and time.monotonic() - begun > 1 and done < total:
+        if not bar and time.monotonic() - begun >= after and done < total:
             from rich.console import Console
             from rich.progress import Progress, TextColumn
 

@@ -130,4 +130,9 @@ def no_inertia(system: System, name: str) -> NoReturn:
             f"{name}_dot, so nothing can be solved for its acceleration; "
             "give it a mass, or make it an input"
         )
+        if symbol(f"{name}_dot") in system.kinetic.free_symbols:
+            message = (
+                f"coordinate '{name}' has no inertia: the kinetic energy has {name}_dot, but not "
+                f"its square, so nothing can be solved for its acceleration; write {name}_dot**2"
+            )
     raise SceneError([system.problem(key, message)])

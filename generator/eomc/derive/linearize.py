@@ -13,6 +13,16 @@ from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import RoughError, Tape
 from eomc.model.system import System
 
+# that accelerations jump, and what makes them smooth; by formulas, by friction that sticks
+JUMPS = (
+    "the accelerations jump (sign or heaviside of a coordinate or velocity)",
+    "make them smooth, say tanh(x/width)",
+)
+STICKS = (
+    'accelerations jump where friction = "stick" holds and lets go',
+    'write friction = "smooth"',
+)
+
 
 def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
     """[da/dq, da/dqd, da/du] at held inputs, (nq, 2 nq + nu), of accelerations a on the tape.
@@ -48,9 +58,9 @@ def _slopes(
     try:
         return [tuple(tape.forward(accelerations, entries)) for entries in along]
     except RoughError:
+        jump, smooth = STICKS if system.modes else JUMPS
         message = (
-            "the accelerations jump (sign or heaviside of a coordinate or velocity), so they have "
-            "no derivatives: make them smooth, say tanh(x/width), or do without linearize and the "
+            f"{jump}, so they have no derivatives: {smooth}, or do without linearize and the "
             "implicit methods"
         )
         raise SceneError([system.problem("run", message)]) from None

@@ -14,7 +14,7 @@ from eomc.derive.frames import motions
 from eomc.derive.inverse_dynamics import inverse_dynamics
 from eomc.derive.lagrange import Derivation
 from eomc.derive.ldl import Solution
-from eomc.derive.linearize import linearization, sensitivity
+from eomc.derive.linearize import STICKS, linearization, sensitivity
 from eomc.derive.momentum import momentum
 from eomc.derive.tape import Stage, Tape
 from eomc.integrators.tableaux import METHODS
@@ -250,6 +250,11 @@ def _unsuited(program: Program) -> list[Problem]:
             f"'{swept[0]}' needs smooth accelerations, and {jumps} of a coordinate or velocity "
             "jumps: make it smooth, say tanh(x/width), or take 'rk4' or 'dp8'"
         )
+        if s.modes:
+            message = (
+                f"'{swept[0]}' needs smooth accelerations, and {STICKS[0]}: {STICKS[1]}, or take "
+                "'rk4' or 'dp8'"
+            )
         out.append(s.problem("run.method", message))
     velocities = {x.name for x in s.qd}
     read = {

@@ -154,8 +154,11 @@ def measure(
     `reference_solution.of` does.
     """
     system = scene if isinstance(scene, System) else pipeline.read(scene)
-    reference = reference_solution.of(system, rows=ROWS, root=root)
     wanted = (*METHODS, ADAPTIVE) if methods is None else tuple(methods)
+    total = len(wanted) + 2  # the reference and the building besides, which take their time
+    progress(0, total)
+    reference = reference_solution.of(system, rows=ROWS, root=root)
+    progress(1, total)
     module, skipped = variant(system, wanted, Path(root) / system.name / "report")
     values, at, place = spectrum(module, reference)
     against = _Against(
@@ -163,11 +166,11 @@ def measure(
     )
     lines = []
     for k, name in enumerate(module.methods):
-        progress(k, len(module.methods))
+        progress(k + 2, total)
         lines.append(_line(module, against, name, values, system.run.duration, longest))
     if module._model.tolerance:
         lines.append(_adaptive(module, against, system.run.duration, longest))
-    progress(len(module.methods), len(module.methods))
+    progress(total, total)
     points = [p for line in lines for p in line.points]
     finest = min((p for p in points if not p.adaptive), key=lambda p: p.along)
     fastest = max(values, key=abs, default=0j)

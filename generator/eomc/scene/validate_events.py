@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from eomc.base import names
+from eomc.base import names, texts
 from eomc.scene.formulas import Formula, suggest
 from eomc.scene.scene import Event
 from eomc.scene.schema import Document, EventTable
@@ -56,7 +56,7 @@ def _jump(
                 remedy = FACTOR.format(name=name)
             elif name in doc.constants:
                 remedy = FIXED
-            remedy = remedy or f": a jump sets {', '.join(state[:9])}"
+            remedy = remedy or f": a jump sets {texts.listed(state, 9)}"
             check.say(path, f"'{name}' is no coordinate, velocity or parameter{remedy}")
         elif isinstance(value, bool) or not isinstance(value, (int, float, str)):
             check.say(path, "must be a number or a formula in quotes")
