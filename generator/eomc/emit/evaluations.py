@@ -15,7 +15,8 @@ class Kind:
     """What is known of a function before it is looked at: results, arguments, meaning.
 
     out: "" where it returns a number. shape: one that `extent` knows. takes: besides q and what it
-    reads of t: qd, u, qdd, wrenches, lambda; "qdd?" where it depends on the scene.
+    reads of t: qd, u, qdd, wrenches, lambda; "qdd?" where it depends on the scene. refuses: whether
+    it returns a status in every scene, also of what is not finite.
     """
 
     out: str
@@ -23,6 +24,7 @@ class Kind:
     takes: str
     doc: str
     symmetric: bool = False
+    refuses: bool = False
 
     @property
     def takes_u(self) -> bool:
@@ -80,7 +82,8 @@ KINDS: Mapping[str, Kind] = {
     "constraint_slopes": Kind("slopes", "c*n", "qd",
         "Of what constraint_rates gives, the derivatives along q, by rows; those along qd are A."),
     "multipliers": Kind("lambda", "c", "qd u",
-        "lambda in D qdd + C qd + g = tau + A^T lambda, one a constraint as it is written."),
+        "lambda in D qdd + C qd + g = tau + A^T lambda, one a constraint as it is written.",
+        refuses=True),
     "reactions": Kind("reactions", "l*6", "qd lambda",
         "Of each loop {reaction} on its second body, by the multipliers lambda."),
     "applied": Kind("applied", "m", "qd u",
@@ -147,7 +150,7 @@ def source(target: Target, name: str) -> Function | None:
 def refuses(target: Target, name: str) -> bool:
     """Whether a function returns a status: it finds multipliers, which not every state has."""
     function = source(target, name)
-    return name == "multipliers" or bool(function and function.checks)
+    return KINDS[name].refuses or bool(function and function.checks)
 
 
 def takes_qdd(target: Target, name: str) -> bool:

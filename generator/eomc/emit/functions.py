@@ -288,7 +288,7 @@ class Functions:
     def _told(self, name: str) -> Block:
         """The end of a function that refuses: results `a` where they go, and the status."""
         size = extent(self.target, KINDS[name].shape)
-        unfinite = [f"!{self.prefix}_finite(a, {size})"] if name == "multipliers" else []
+        unfinite = [f"!{self.prefix}_finite(a, {size})"] if KINDS[name].refuses else []
         told = c.unless(unfinite, f"{self.PREFIX}_NOT_FINITE")
         return Block("", (*told, *c.copied(KINDS[name].out, "a", 0, size), c.result(self.ok)))
 
