@@ -1,0 +1,101 @@
+"""Adaptive steps where one coordinate is far larger than others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+from eomc.verify.check import check
+
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
+BUILDS = Path(__file__).parents[2] / "build" / "tests" / "adaptive"
+END = 60.0
+# an orbit in m, and two arms on a spring each, pulled by the gradient of gravity
+SATELLITE = """eomc = 1
+name = "satellite"
+[coordinates]
+x = { unit = "m", start = 7e6 }
+y = { unit = "m", rate = 7500 }
+arm = { unit = "rad", start = 0.5, rate = 0.001 }
+tip = { unit = "rad", start = 0.1, rate = 0.3 }
+[parameters]
+mu = { value = 3.986e14, unit = "m**3/s**2" }
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2 + (arm_dot**2 + arm_dot*tip_dot*cos(arm - tip) + tip_dot**2)/2"
+potential = "-mu/r - mu/2*(x*cos(arm) + y*sin(arm))**2/r**5 - cos(arm) - cos(tip)"
+[definitions]
+r = "sqrt(x**2 + y**2)"
+[run]
+method = "dp8"
+tolerance = 1e-9
+duration = 60
+batch = true
+"""
+# a stiff and damped spring to a point FAR m away, whose force is taken from what is that large
+ANCHORED = """eomc = 1
+name = "anchored"
+[coordinates]
+base = { start = FAR }
+arm = { start = 0.1 }
+[energy]
+kinetic = "(1000*base_dot**2 + (base_dot + arm_dot)**2)/2"
+potential = "10000*(base + arm - FAR)**2/2 + 100*arm**4"
+[forces]
+arm = "-200*arm_dot"
+[run]
+tolerance = 1e-9
+duration = 5
+"""
+
+
+def built(text: str) -> ModuleType:
+    return eomc.load(from_scene(parse(text, "sizes.toml")), BUILDS)
+
+
+@pytest.fixture(scope="module")
+def satellite() -> ModuleType:
+    return built(SATELLITE)
+
+
+@pytest.fixture(scope="module")
+def right(satellite: ModuleType) -> np.ndarray:
+    """Its end, by fixed steps of two lengths."""
+    one, other = (
+        satellite.simulate(h=END / steps, steps=steps, every=steps).q[-1]
+        for steps in (16000, 24000)
+    )
+    assert np.max(np.abs(one - other) / [7e6, 7e6, 1, 1]) < 1e-13
+    return other
+
+
+@pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-12])
+def test_errors_of_angles_do_not_hide_behind_metres(
+    satellite: ModuleType, right: np.ndarray, tol: float
+) -> None:
+    run = satellite.simulate(tol=tol, duration=END)
+    many = satellite.simulate_batch(run.q[[0, 0]], run.qd[[0, 0]], tol=tol, duration=END)
+    for q in (run.q[-1], *many.q[:, -1]):
+        assert np.max(np.abs(q - right)[2:]) < 10 * tol
+        assert np.max(np.abs(q - right)[:2]) < 10 * tol * 7e6
+
+
+def test_a_module_with_metres_beside_angles_passes_its_check(satellite: ModuleType) -> None:
+    report = check(from_scene(parse(SATELLITE, "sizes.toml")), satellite, states=20)
+    assert report.passed, report.table()
+
+
+@pytest.mark.parametrize("far", ["1000", "1000000"])
+def test_rounding_of_what_is_large_takes_no_steps(far: str) -> None:
+    """What rests is 1e-13 m of 1000 m, and the stiff spring makes forces of that."""
+    near = built(ANCHORED.replace("FAR", "1").replace('"anchored"', '"anchored_1"'))
+    away = built(ANCHORED.replace("FAR", far).replace('"anchored"', f'"anchored_{far}"'))
+    for tol in (1e-6, 1e-12):
+        few, many = near.simulate(tol=tol), away.simulate(tol=tol)
+        assert many.status == "ok" and many.steps < 10 * few.steps
+        assert abs(many.q[-1, 1] - few.q[-1, 1]) < 10 * tol + 1e-14 * float(far)
