@@ -35,10 +35,11 @@ import work
 import eomc
 from eomc.derive import link_multipliers
 from eomc.emit import adaptive, c_expression
-from eomc.emit.fast import files
+from eomc.emit.fast import accelerations, files
 from eomc.emit.fast.accelerations import Accelerations
 from eomc.emit.fast.steppers import Steppers
 
+SCENES = Path(__file__).resolve().parent.parent / "scenes"
 SPAN = 5.0  # s, of the runs for an error
 METHODS = ("rk4", "dp8", "gauss4", "gauss6", "gauss8", "gauss16")
 SIDE_BY_SIDE = "adaptive steps of 4,096 side by side"
@@ -51,6 +52,10 @@ def without_prediction() -> Any:
 
 def without_two_points() -> Any:
     return patch.object(Accelerations, "parts", new_callable=PropertyMock, return_value=None)
+
+
+def without_registers() -> Any:
+    return patch.object(accelerations, "SEVERAL", 1000)
 
 
 def without_multipliers() -> Any:
@@ -103,12 +108,16 @@ CASES = work.CASES | {
         work.CASES["chain of 5"], [f"a{k}" for k in range(1, 6)]
     ),
 }
+LINKAGES = ("four_bar", "delta_robot", "andrews_squeezer")
+CASES |= {name: work.Case((SCENES / f"{name}.toml").read_text(encoding="utf-8"), physics.chain,
+                          np.array([]), 1e-4, 2000) for name in LINKAGES}  # fmt: skip
 EXPONENTIALS = ("Toda lattice", "cart-pole with friction", "chain of 5 with friction")
 
 # trick, what takes it away, the cases that it could change, what else is asked for under [run]
 TRICKS: tuple[tuple[str, Change, tuple[str, ...], str], ...] = (
     ("predicted angles", without_prediction, ("cart-pole", "double pendulum"), ""),
     ("two points", without_two_points, ("chain of 5", "chain of 10", "chain of 20"), ""),
+    ("angles in a register", without_registers, LINKAGES, ""),
     ("link multipliers", without_multipliers, ("chain of 5", "chain of 10", "chain of 20"), ""),
     ("link multipliers, 4,096 at once", without_multipliers, ("chain of 5", "chain of 10"),
      "batch = true\n"),
@@ -163,7 +172,8 @@ def run(module: ModuleType, case: work.Case, extra: str) -> Callable[[], Any]:
     if extra:
         return lambda: module.simulate_batch(q, qd, case.h, steps=20, every=20, threads=1)
     steps = min(case.steps, 4000)
-    return lambda: module.simulate(case.x0[:n], case.x0[n:], case.h, steps=steps, every=steps)
+    start = (case.x0[:n], case.x0[n:]) if n else module.start
+    return lambda: module.simulate(*start, case.h, steps=steps, every=steps)
 
 
 def tricks(rounds: int) -> Iterator[str]:

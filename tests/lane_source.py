@@ -199,7 +199,7 @@ def source(of: Any) -> str:
     several += "".join(EACH.replace("NAME", name) for name in EXPONENTIALS)
     texts += [over(of, several, name, width) for name, width in VECTORS.items()]
     texts += [over(of, file("vector"), f"_{n}", k * size) for n, k in (("two", 2), ("four", 4))]
-    return "\n".join([bench.HARNESS, *texts, over(of, file("four") + FOUR)])
+    return "\n".join([bench.HARNESS, *texts, over(of, file("four") + file("interleave") + FOUR)])
 
 
 @cache

@@ -1,5 +1,5 @@
 /*
- * Four numbers at a time between arrays: a vector load waits until numbers that were stored one by
+ * Four numbers at a time into an array: a vector load waits until numbers that were stored one by
  * one have reached the cache.
  */
 
@@ -9,15 +9,4 @@ EOMC_INLINE void eomc_put(EOMC_REAL *to, EOMC_REAL a, EOMC_REAL b, EOMC_REAL c, 
     const eomc_four all = { a, b, c, d };
 
     *(eomc_four_loose *)to = all;
-}
-
-/* to = x and y interleaved, four of each, in the order that takes one shuffle of either half:
- * x0 y0, x2 y2, x1 y1, x3 y3. */
-EOMC_INLINE void eomc_interleave(eomc_two *to, const EOMC_REAL *x, const EOMC_REAL *y)
-{
-    const eomc_four a = *(const eomc_four_loose *)x, b = *(const eomc_four_loose *)y;
-    const eomc_four even = { a[0], b[0], a[2], b[2] }, odd = { a[1], b[1], a[3], b[3] };
-
-    *(eomc_four_loose *)to = even;
-    *(eomc_four_loose *)(to + 2) = odd;
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import warnings
 from dataclasses import replace
 from itertools import permutations
@@ -11,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cases import fast_files
 from click.testing import CliRunner
 from conftest import Modules, tiers
 
@@ -145,6 +148,32 @@ def test_steps_behind_which_rows_depend_on_each_other_are_told(four_bar: ModuleT
     assert run.status == "ok" and run.singular_steps == 1 and run.first_singular == 3 / 64
     np.testing.assert_allclose(run.q[-1], [3 / 64, 3 / 64, 0.0], atol=1e-14)
     assert "a step ends where a constraint depends on others" in str(said[0].message)
+
+
+def test_steps_take_the_sines_of_three_angles_in_one_register(four_bar: ModuleType) -> None:
+    """At the middle, rotated from there, and where none are known."""
+    source = fast_files(four_bar)["four_bar.c"]
+    for name in ("rk4_begin", "rk4_rotate", "rk4_rotate_end", "sines_at"):
+        body = source.split(f" four_bar_{name}(")[1].split("\n}\n")[0]
+        taken = re.findall(r"four_bar_((?:sincos|rotate)\w*)\(", body)
+        assert taken and all(f.endswith("_four") for f in taken)
+
+
+@pytest.mark.parametrize("at", range(3))
+def test_an_angle_too_wide_for_the_register_leaves_the_others_alone(
+    at: int, four_bar: ModuleType
+) -> None:
+    """Beyond 2^20 by whole turns, where numbers are 2e-10 apart."""
+    wide = np.array([0.4, 0.9, -0.6])
+    wide[at] += 2**18 * math.tau
+    q = wide.copy()
+    q[at] = math.remainder(wide[at], math.tau)
+    a, b, c = q
+    bars = {"r": 1.0, "s": -1.5, "l": (1.5 * math.sin(b) - math.sin(a)) / math.sin(c)}
+    bars |= {"d": math.cos(a) - 1.5 * math.cos(b) + bars["l"] * math.cos(c), "g": 9.81}
+    known, run = (four_bar.simulate(start, np.zeros(3), params=bars) for start in (q, wide))
+    assert known.status == run.status == "ok" and np.abs(known.q[-1] - q).min() > 1e-3
+    np.testing.assert_allclose(run.q[-1] - wide, known.q[-1] - q, atol=1e-8)
 
 
 def test_the_linearization_along_the_constraints_is_that_of_minimal_coordinates(

@@ -7,7 +7,7 @@ from functools import cached_property
 
 from sympy import S
 
-from eomc.emit.c_expression import DOUBLE
+from eomc.emit.c_expression import DOUBLE, SEVERAL
 from eomc.emit.c_names import Target
 from eomc.program import outline, trig, two_point
 from eomc.program.ir import Function, Operand, rename
@@ -106,6 +106,12 @@ class Accelerations:
             return None
         early = {a.name for a in self.whole.early}
         return two_point.apart(self.rotated[1], self.angles, target.system, {*self.own, *early})
+
+    @property
+    def across(self) -> bool:
+        """Whether one trajectory takes the sines of four angles at a time."""
+        constrained = bool(self.target.system.constraints)
+        return self.parts is not None or (constrained and len(self.angles) >= SEVERAL)
 
     @property
     def long(self) -> bool:

@@ -84,8 +84,10 @@ def _csrc(made: Steppers) -> Iterator[str]:
     lanes = [("wide", f"{target.PREFIX}_WIDE_BYTES", True)] * _wide(made)
     if made.two_point:
         lanes += [("two", str(2 * size), False)]
-    if made.two_point or made.functions.several:
-        lanes += [("four", str(4 * size), made.two_point)]
+    across = made.accelerations.across
+    angles = made.functions.several or (across and made.one.alone)
+    if across or angles:
+        lanes += [("four", str(4 * size), across)]
     if RK4 in made.methods and made.predicted:
         bytes_ahead = size * ahead_count(len(made.accelerations.angles))
         lanes += [("ahead", str(bytes_ahead), False)]
@@ -102,8 +104,9 @@ def _csrc(made: Steppers) -> Iterator[str]:
         texts += [("lanes/select.h", name, width)] * selects
         texts += [(f"lanes/exp{end}.h", name, width)] * bool(ours)
         texts += [(f"lanes/tanh{end}.h", name, width)] * ("tanh" in ours)
-        texts += [("lanes/four.h", name, width)] * (name == "four" and made.two_point)
-        texts += [("lanes/angles.h", name, width)] * (name == "four" and made.functions.several)
+        texts += [("lanes/four.h", name, width)] * (name == "four" and across)
+        texts += [("lanes/interleave.h", name, width)] * (name == "four" and made.two_point)
+        texts += [("lanes/angles.h", name, width)] * (name == "four" and angles)
     for file, name, width in texts:
         text = resources.text("csrc", file).replace("#include <math.h>\n", "")
         integer, bits = ("long long", "0x7fffffffffffffff") if size == 8 else ("int", "0x7fffffff")
@@ -175,6 +178,7 @@ def _lane(made: Steppers, lane: Lane, show: Show) -> str:
             constants="\n\n".join(filter(None, (constants, computed))),
             angles=lane.angle_count if s.angles else "",
             count=len(s.angles),
+            across=lane.across,
             angles_at=lane.linear("angles_at", "q", offset=True),
             changes=lane.linear("changes", "d", offset=False),
             sincos=lane.sincos,

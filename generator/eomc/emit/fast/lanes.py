@@ -114,6 +114,11 @@ class Lane:
         """Whether vectors of coordinates are multiples of four numbers, with zeros behind."""
         return not self.name and self.accelerations.parts is not None
 
+    @property
+    def across(self) -> bool:
+        """Whether four angles go into a register."""
+        return not self.name and self.accelerations.across
+
     @cached_property
     def width(self) -> int:
         """Numbers in a vector of coordinates; angles that are coordinates are read there too."""
@@ -307,7 +312,7 @@ class Lane:
 
     def _stored(self, array: str, values: Sequence[str], width: int) -> tuple[str, ...]:
         """Numbers into an array of that width, zeros behind; four at a time if there are pads."""
-        if not self.padded:
+        if not self.padded and not (array == "x" and self.across):
             return tuple(c.assign(f"{array}[{k}]", x) for k, x in enumerate(values))
         whole = [*values, *[self.target.zero] * (width - len(values))]
         return tuple(
@@ -403,7 +408,7 @@ class Lane:
     def angle_count(self) -> str:
         """The number of angles, in C: to whole registers where those take them together."""
         n = len(self.accelerations.angles)
-        return str(four(n) if self.accelerations.parts and self.name != "wide" else n)
+        return str(four(n) if self.accelerations.across and self.name != "wide" else n)
 
     @cached_property
     def all_in_one(self) -> CFunction:

@@ -124,7 +124,6 @@ class Steppers:
         s = self.accelerations
         double, one = s.target.real is DOUBLE, not lane.name
         two_point = one and self.two_point
-        count = len(s.angles)
         signal = lane.signal.function if lane.signal else None
         known = c.member("w", "k")
         here = {"a": c.member("w", "a[k]"), "q": "at", "qd": "moving", "t": "t + node"}
@@ -138,9 +137,8 @@ class Steppers:
             title=RK4.title,
             source=RK4.source,
             stability=stability(RK4),
-            angles=lane.angle_count if count else "",
-            count=count,
-            across=two_point,
+            angles=lane.angle_count if s.angles else "",
+            across=lane.across,
             sincos=lane.sincos,
             largest=s.target.literal(0.125 if double else 0.25),
             small=s.target.literal(0.015625 if double else 0.0625),

@@ -70,6 +70,7 @@ class LibraryText(Prefixed, Laned):
 class LaneText(Laned):
     """c/fast/lane.c.jinja. angles: their number, in C. rates: finished text.
 
+    across: angles go into registers of four together.
     signal_call: where accelerations have to find the signals.
     """
 
@@ -81,6 +82,7 @@ class LaneText(Laned):
     constants: str
     angles: str
     count: int
+    across: bool
     angles_at: CFunction
     changes: CFunction
     sincos: str
@@ -124,7 +126,7 @@ class TwoPoints(Prefixed):
 
 @dataclass(frozen=True)
 class RungeKutta4(Named, Laned, Driven):
-    """c/fast/rk4.c.jinja. across: angles go into the registers of the wide lane together."""
+    """c/fast/rk4.c.jinja. across: angles go into registers of four together."""
 
     TEMPLATE: ClassVar[str] = "c/fast/rk4.c"
     unroll: str
@@ -135,7 +137,6 @@ class RungeKutta4(Named, Laned, Driven):
     source: str
     stability: str
     angles: str
-    count: int
     across: bool
     sincos: str
     largest: str
