@@ -84,6 +84,34 @@ K = "b_dot*c_dot*cos(b - c)/2 + c_dot*d_dot*cos(c - d)/2 + d_dot*e_dot*cos(d - e
 """
 
 
+# a rope of six bars between two hooks
+ROPE = """
+eomc = 1
+name = "rope"
+[coordinates]
+a = { start = 0.9, rate = 0.5 }
+b = { start = 0.6 }
+c = { start = 0.2 }
+d = { start = -0.3, rate = 1.0 }
+e = { start = -0.7, guess = true }
+f = { start = -0.9, guess = true }
+[definitions]
+x = "cos(a) + cos(b) + cos(c) + cos(d) + cos(e) + cos(f)"
+y = "sin(a) + sin(b) + sin(c) + sin(d) + sin(e) + sin(f)"
+K = "a_dot**2 + b_dot**2 + c_dot**2 + d_dot**2 + e_dot**2 + f_dot**2"
+[energy]
+kinetic = "K + a_dot*b_dot*cos(a - b)/2 + d_dot*e_dot*cos(d - e)/3"
+potential = "5*sin(a) + 4*sin(b) + 3*sin(c) + 2*sin(d) + sin(e)"
+[constraints]
+along = "x - 4.7"
+across = "y + 0.2"
+[run]
+h = 0.005
+duration = 1.0
+method = ["rk4", "gauss16"]
+"""
+
+
 @cache
 def odd() -> system.System:
     return system.from_scene(scene.parse(ODD, "odd.toml"))
@@ -311,6 +339,16 @@ def test_steps_take_it_and_predict_no_angles(modules: Modules) -> None:
 
 
 @pytest.mark.slow
+def test_steps_with_constraints_take_it_too(modules: Modules) -> None:
+    """The stages of gauss16 go by themselves."""
+    module = modules.unoptimised(ROPE)
+    assert "rope_both_configurations(&w->k, at, next" in written(module, "c")
+    run, other = (module.simulate(h=0.002, method=name) for name in ("rk4", "gauss16"))
+    assert run.status == "ok"
+    np.testing.assert_allclose(run.x[-1], other.x[-1], rtol=0, atol=1e-8)
+    assert np.abs(module.constraints(run.q[-1], run.qd[-1])).max() < 1e-14
+
+
 def test_sums_are_compensated_in_the_two_point_form(modules: Modules) -> None:
     """130,000 steps, so short that rounding is all of their error, beside 256 of order 8.
 

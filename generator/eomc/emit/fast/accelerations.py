@@ -101,8 +101,7 @@ class Accelerations:
     def parts(self) -> two_point.Parts | None:
         """Of the two-point form, which RK4 takes in double precision."""
         target = self.target
-        constrained = bool(target.system.constraints)
-        if target.real is not DOUBLE or constrained or "rk4" not in target.system.run.methods:
+        if target.real is not DOUBLE or "rk4" not in target.system.run.methods:
             return None
         early = {a.name for a in self.whole.early}
         return two_point.apart(self.rotated[1], self.angles, target.system, {*self.own, *early})
