@@ -311,8 +311,8 @@ class Lane:
         return (head, self._loads(function), *body.early, *body.blocks, end)
 
     def _stored(self, array: str, values: Sequence[str], width: int) -> tuple[str, ...]:
-        """Numbers into an array of that width, zeros behind; four at a time if there are pads."""
-        if not self.padded and not (array == "x" and self.across):
+        """Numbers into an array of that width, zeros behind, where angles go four at a time."""
+        if not self.across:
             return tuple(c.assign(f"{array}[{k}]", x) for k, x in enumerate(values))
         whole = [*values, *[self.target.zero] * (width - len(values))]
         return tuple(
