@@ -176,6 +176,31 @@ def test_where_jacobis_integral_is_conserved_its_balance_is_told(modules: Module
     assert balance.told and balance.left < 1e-7 and balance.lost == 0
 
 
+def test_a_potential_that_moves_with_time_puts_in_what_it_does(modules: Modules) -> None:
+    """x'' = -cos(t): Jacobi's integral is the energy, which depends on time all the same."""
+    scene = """
+eomc = 1
+name = "swayed"
+[coordinates]
+x = {}
+[energy]
+kinetic   = "x_dot**2/2"
+potential = "x*cos(t)"
+[run]
+h = 0.01
+duration = 2.0
+batch = true
+"""
+    swayed = modules.unoptimised(scene)
+    run = swayed.simulate()
+    assert np.array_equal(run.jacobi, run.energy) and abs(run.energy[-1]) > 0.1
+    runs = swayed.simulate_batch([[0.0], [0.5]])
+    assert np.array_equal(runs.jacobi, runs.energy)
+    balance = run.balance()
+    assert balance.told and balance.left < 1e-9
+    assert balance.forces == pytest.approx(run.energy[-1] - run.energy[0], abs=1e-9)
+
+
 def law(t: float, q: np.ndarray, qd: np.ndarray) -> list[float]:
     return [2.0 - q[0] - math.copysign(0.3, qd[0])]
 

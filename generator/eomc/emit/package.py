@@ -197,7 +197,11 @@ def declarations(bound: Binding) -> Declarations:
 
 
 def _timed(target: Target, name: str) -> bool:
-    return takes_t(target, name) or (target.driven and takes_qdd(target, name))
+    if name == "jacobi" not in target.program:
+        name = "energy"  # which it is there
+    return name in target.program and (
+        takes_t(target, name) or (target.driven and takes_qdd(target, name))
+    )
 
 
 def _functions(target: Target) -> tuple[str, ...]:
@@ -265,7 +269,7 @@ def face(target: Target, extension: str) -> Face:
         modes=tuple((m.at, m.of) for m in s.modes),
         discrete=len(s.discrete),
         reactions=tuple(r.name for r in s.reactions),
-        timed=tuple(n for n in TIMED if n in target.program and _timed(target, n)),
+        timed=tuple(n for n in TIMED if _timed(target, n)),
         batch=s.run.batch,
         methods=tuple(METHODS[name] for name in s.run.methods),
         functions=_functions(target),
