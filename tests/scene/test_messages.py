@@ -73,3 +73,14 @@ def test_a_file_may_be_so_long_and_no_longer(
         toml_text.tree_and_digest(file)
     with pytest.raises(EomcError, match="more than the 40 bytes"):
         parse(file.read_bytes(), "long.toml")
+
+
+def test_a_mark_of_byte_order_is_read_over(tmp_path: Path) -> None:
+    file = tmp_path / "marked.toml"
+    file.write_text("eomc = 1", encoding="utf-8-sig")
+    assert toml_text.tree_and_digest(file)[0] == {"eomc": 1}
+
+
+def test_a_robot_file_is_told_from_a_scene() -> None:
+    with pytest.raises(EomcError, match=r"'eomc import arm\.urdf' writes"):
+        parse(b'\n<robot name="arm"/>', "arm.urdf")

@@ -49,7 +49,7 @@ def tree_and_digest(path: Path) -> tuple[dict[str, Any], str]:
         data = stream.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
         raise ValueError("the file is too large for a scene")
-    return loads(data.decode()), hashlib.sha256(data).hexdigest()
+    return loads(data.decode("utf-8-sig")), hashlib.sha256(data).hexdigest()
 
 
 def events(given: Any, what: str) -> str:
@@ -83,6 +83,11 @@ def text_and_tree(data: bytes, file: str) -> tuple[str, dict[str, Any]]:
         raise SceneError(
             [Problem("the file is empty: 'eomc new NAME' writes a scene to start from", file=file)]
         )
+    if text.lstrip().startswith("<"):
+        message = (
+            f"this is XML and no scene: 'eomc import {texts.line(file)}' writes that of a robot"
+        )
+        raise SceneError([Problem(message, file=file)])
     if line := long_key(text):
         message = f"a key has more than {MOST_PARTS} parts: a scene's have three, a.b.c, at most"
         raise _in_line(message, text, line, file)
