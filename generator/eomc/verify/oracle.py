@@ -128,8 +128,8 @@ class Answer(ABC):
     def corrected(
         self, q: Vector, qd: Vector, t: ArrayLike, params: Params = None
     ) -> tuple[Vector, Vector]:
-        """q and qd behind a step, corrected as a step is."""
-        return self._each(self._corrected, q, qd, np.asarray(t, float), self._values(params))
+        """q and qd behind a step, corrected as a step is: of one state, or many at once."""
+        return self._corrected(q, qd, t, self._values(params))
 
     def step(
         self,
@@ -254,9 +254,12 @@ class Answer(ABC):
 
     def _row(self, name: str, q: Vector, qd: Vector, t: Any, values: Values) -> Vector:
         """D, or what is asked of the rows that are solved for."""
-        u = np.zeros(len(self.system.inputs))
+        u = np.zeros((*q.shape[:-1], len(self.system.inputs)))
         found = np.asarray(self._value(name, q, qd, t, u, values))
-        return found if name == "D" else np.asarray(self.solved @ found)
+        if name == "D":
+            return found
+        matrix = name == "constraint_jacobian"
+        return np.asarray(self.solved @ found if matrix else found @ self.solved.T)
 
     def _onto(
         self, q: Vector, qd: Vector, t: Any, values: Values, held: tuple[int, ...] = ()
@@ -280,26 +283,42 @@ class Answer(ABC):
         return q, qd
 
     def _corrected(self, q: Vector, qd: Vector, t: Any, values: Values) -> tuple[Vector, Vector]:
-        """One state behind a step: q and qd corrected together, until corrections of q are small.
+        """States behind a step: q and qd corrected together, until corrections of q are small.
 
         Both with the matrix before the correction, the rates where it leads to the first order.
         nan where that does not get there.
         """
-        rest = np.zeros(len(q))
+        if q.ndim == 1:
+            q, qd = self._corrected(q[None], qd[None], t, values)
+            return q[0], qd[0]
+        ends = np.full((2, *q.shape), np.nan)
+        left = np.arange(len(q))  # those that are not there yet
+        t, *each = (np.broadcast_to(x, len(q)) for x in (t, *values))
         for _ in range(CORRECTIONS):
-            D, A, off = (self._row(name, q, qd, t, values) for name in ROWS)
-            dq, _ = kkt.solve(D, A, rest, -self._holonomic * off)
-            part = min(1 / 16, LEAP / max(float(np.max(np.abs(dq))), LEAP))
-            slope = np.zeros_like(off)
-            for k, weight in STENCIL:
-                ends = [self._row(RATES, q + x * dq, qd, t, values) for x in (-k * part, k * part)]
-                slope += weight / part * (ends[1] - ends[0])
-            moved = self._row(RATES, q, qd, t, values) + slope
-            dqd, _ = kkt.solve(D, A, rest, -moved)
+            dq, dqd = self._correction(q, qd, t, tuple(each))
             q, qd = q + dq, qd + dqd
-            if np.all(np.abs(dq) <= CORRECTED * (np.abs(q) + 1e-3 * np.max(np.abs(q)))):
-                return q, qd
-        return np.full_like(q, np.nan), np.full_like(q, np.nan)
+            size = np.abs(q) + 1e-3 * np.max(np.abs(q), axis=-1, keepdims=True)
+            small = np.all(np.abs(dq) <= CORRECTED * size, axis=-1)
+            ends[:, left[small]] = q[small], qd[small]
+            if np.all(small):
+                break
+            left, q, qd, t, *each = (x[~small] for x in (left, q, qd, t, *each))
+        return ends[0], ends[1]
+
+    def _correction(self, q: Vector, qd: Vector, t: Vector, values: Values) -> Vector:
+        """One of Newton's method, of q and of qd, (2, b, nq)."""
+        rest = np.zeros_like(q)
+        D, A, off = (self._row(name, q, qd, t, values) for name in ROWS)
+        dq, _ = kkt.solve(D, A, rest, -self._holonomic * off)
+        far = np.max(np.abs(dq), axis=-1, keepdims=True)
+        part = np.minimum(1 / 16, LEAP / np.maximum(far, LEAP))
+        slope = np.zeros_like(off)
+        for k, weight in STENCIL:
+            ends = [self._row(RATES, q + x * dq, qd, t, values) for x in (-k * part, k * part)]
+            slope += weight / part * (ends[1] - ends[0])
+        moved = self._row(RATES, q, qd, t, values) + slope
+        dqd, _ = kkt.solve(D, A, rest, -moved)
+        return np.stack([dq, dqd])
 
     def _motion(
         self, q: Vector, qd: Vector, t: Any, u: ArrayLike | None, values: Values
@@ -320,11 +339,7 @@ class Answer(ABC):
         a4 = self._acceleration(q + h * v3, v4, t + h, u, values)
         q = q + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
         qd = qd + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-        return (
-            self._each(self._corrected, q, qd, t + h, values)
-            if self.system.constraints
-            else (q, qd)
-        )
+        return self._corrected(q, qd, np.add(t, h), values) if self.system.constraints else (q, qd)
 
 
 def by_rows(x: ArrayLike, rows: int) -> list[Any]:
