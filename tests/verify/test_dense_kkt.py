@@ -168,3 +168,19 @@ def test_a_row_of_rates_moves_no_position() -> None:
         q, qd = answer.project(np.array([1.0, 1.0, 5.0]), np.array([1.0, 1.0, 0.0]))
         np.testing.assert_allclose(q, [0.6, 1.2, 5.0], rtol=1e-15)
         np.testing.assert_allclose([qd[1] - 2 * qd[0], qd[2] - 1.2 * qd[0]], 0, atol=1e-15)
+
+
+def test_many_states_are_corrected_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each as it is alone, also where others take longer or never get there."""
+    answer = Jets(double_pendulum())
+    q = np.array([[1.001, 0.0], [0.7, -0.7], [np.nan, 0.0], [0.6, -0.8]])
+    qd = np.array([[0.1, 2.0], [1.0, 1.0], [0.0, 1.0], [0.8, 0.6]])
+    asked: list[object] = []
+    ask = answer._value
+    monkeypatch.setattr(answer, "_value", lambda *given: asked.append(given) or ask(*given))
+    alone = [answer.corrected(*state, 0.0) for state in zip(q, qd, strict=True)]
+    apart = len(asked)
+    found = answer.corrected(q, qd, np.zeros(4))
+    np.testing.assert_allclose(found, np.moveaxis(alone, 0, 1), rtol=1e-15, atol=1e-15)
+    assert np.isnan(found[0][2]).all() and np.isfinite(np.delete(found, 2, 1)).all()
+    assert len(asked) - apart < 0.8 * apart

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from cases import scene_system
 from conftest import Modules
 
 from eomc.model.from_scene import from_scene
@@ -78,3 +80,13 @@ def test_a_row_of_stiff_steps_takes_them(of: Comparison) -> None:
 
     rows_adaptive._error(of, Told(), 1e-6, True, of.expected[0].state)
     assert stiff.count(True) >= 3 and stiff.count(False) == 1
+
+
+def test_inputs_that_are_held_are_those_of_all_stages(modules: Modules) -> None:
+    """Where steps are too long for sweeps, stages are found by Newton's method, all at once."""
+    made = scene_system("cartpole_driven")
+    driven = Comparison(made, modules("cartpole_driven"), np.random.default_rng(1), 4)
+    s = replace(driven.expected[0].state, u=np.array([0.5]))
+    x, times = np.array([*s.q, *s.qd]), np.array([2.5])
+    rows, _ = rows_adaptive._reference(driven, s, x, times, times)
+    assert np.isfinite(rows).all()

@@ -91,3 +91,18 @@ def test_states_of_which_one_overflows_have_no_step() -> None:
     with np.errstate(all="ignore"):
         ends = one_step.step(METHODS["gauss4"], acceleration, 0 * qd, qd, 0.0, 1e-2)
     assert np.all(np.isnan(ends))
+
+
+def test_the_stages_of_one_state_are_asked_for_together() -> None:
+    calls = 0
+
+    def a(q: Any, qd: Any, t: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        return -np.sin(q) - qd**3 / 5 + np.cos(3 * np.asarray(t))[..., None]
+
+    q, qd, m = np.array([0.5, -0.3]), np.array([0.2, 0.7]), METHODS["gauss6"]
+    one = one_step.step(m, a, q, qd, 0.2, 0.3)
+    assert calls <= 1 + one_step.SWEEPS
+    of_many = one_step.step(m, a, q[None], qd[None], np.array([0.2]), 0.3)
+    assert np.allclose(one, of_many[:, 0], rtol=0, atol=1e-15)

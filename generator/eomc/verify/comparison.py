@@ -229,6 +229,15 @@ class Comparison:
         )
         return largest(errors, "no step from any state is finite")
 
+    def accelerations(self, s: State) -> one_step.Acceleration:
+        """The reference's, of one state or many, with the inputs and parameters of one."""
+
+        def found(q: Vector, qd: Vector, t: Vector) -> Vector:
+            held = None if s.u is None else np.broadcast_to(s.u, (*q.shape[:-1], len(s.u)))
+            return self.reference.acceleration(q, qd, t, held, s.params)
+
+        return found
+
     def one_step_of(self, method: str, e: Expected, longest: float) -> float | None:
         """None where the reference has no such step; inf where the module refuses what it has.
 

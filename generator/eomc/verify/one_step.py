@@ -25,8 +25,8 @@ Acceleration = Callable[[Vector, Vector, Any], Vector]
 def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h: float) -> Vector:
     """(2, ..., nq): q and qd at t + h; q, qd (..., nq), t a number or (...,).
 
-    acceleration: a(q, qd, t), of that shape. nan where the stages of an implicit method are not
-    found by plain sweeps: h is too long for them.
+    acceleration: a(q, qd, t), of that shape; of one state also (stages, nq), each with its t. nan
+    where the stages of an implicit method are not found by plain sweeps: h is too long for them.
     """
     q, qd = np.asarray(q, float), np.asarray(qd, float)
     A, AA = (_square(rows, m.stages) for rows in (m.a, m.a_squared))
@@ -36,6 +36,11 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
         place = q + c[i] * h * qd + h**2 * np.tensordot(AA[i], a, 1)
         return acceleration(place, qd + h * np.tensordot(A[i], a, 1), t + c[i] * h)
 
+    def at_stages(a: Vector) -> Vector:
+        if q.ndim > 1:
+            return np.array([at_stage(i, a) for i in range(m.stages)])
+        return acceleration(q + h * np.outer(c, qd) + h**2 * AA @ a, qd + h * A @ a, t + c * h)
+
     a = np.zeros((m.stages, *q.shape))
     if not m.implicit:
         for i in range(m.stages):
@@ -43,7 +48,7 @@ def step(m: Method, acceleration: Acceleration, q: Vector, qd: Vector, t: Any, h
     else:
         a[:] = acceleration(q, qd, t)
         for _ in range(SWEEPS):
-            new = np.array([at_stage(i, a) for i in range(m.stages)])
+            new = at_stages(a)
             change = float(np.max(np.abs(new - a)))
             size = np.abs(qd) / h + np.max(np.abs(new), axis=0)
             a = new

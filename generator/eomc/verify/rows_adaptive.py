@@ -112,23 +112,19 @@ def _reference(
 ) -> tuple[Vector, Vector]:
     """The states at some times, and their rates, (n, 2 nq); two fixed steps from each of a grid."""
     n, rows, rates = len(s.q), [], []
-    held = None if s.u is None else s.u[None]
-
-    def acceleration(q: Vector, qd: Vector, t: float) -> Vector:
-        return of.reference.acceleration(q, qd, np.full(len(q), t), held, s.params)
-
-    q, qd, t = x[None, :n], x[None, n:], s.t
+    acceleration = of.accelerations(s)
+    q, qd, t = x[:n], x[n:], s.t
     with np.errstate(all="ignore"):
         for end in np.union1d(grid[grid > s.t], times):
             h = (end - t) / 2
             for k in range(2):
-                made = one_step.step(GAUSS16, acceleration, q, qd, t + k * h, h)
+                state = q, qd, t + k * h, h
+                made = one_step.step(GAUSS16, acceleration, *state)
                 if not np.isfinite(made).all():  # too long for sweeps
-                    state = q[0], qd[0], t + k * h, h
-                    made = one_step.by_newton(GAUSS16, acceleration, *state)[0][:, None]
+                    made, _ = one_step.by_newton(GAUSS16, acceleration, *state)
                 q, qd = made
             t = float(end)
             if end in times:
-                rows.append(np.concatenate([q[0], qd[0]]))
-                rates.append(np.concatenate([qd[0], acceleration(q, qd, t)[0]]))
+                rows.append(np.concatenate([q, qd]))
+                rates.append(np.concatenate([qd, acceleration(q, qd, t)]))
     return np.array(rows), np.array(rates)

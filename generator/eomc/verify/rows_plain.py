@@ -153,12 +153,7 @@ def _run_off(of: Comparison, plain: Any, method: str, e: Expected, h: float) -> 
 
 def _can_go_on(of: Comparison, method: str, s: State, x: Vector, h: float, rows: int) -> bool:
     """Whether the next step is clear: of an implicit method, by plain sweeps or few of Newton's."""
-    m, t = METHODS[method], s.t + (rows - 1) * h
-
-    def acceleration(q: Vector, qd: Vector, t: Vector) -> Vector:
-        held = None if s.u is None else np.broadcast_to(s.u, (*q.shape[:-1], len(s.u)))
-        return of.reference.acceleration(q, qd, t, held, s.params)
-
+    m, t, acceleration = METHODS[method], s.t + (rows - 1) * h, of.accelerations(s)
     with np.errstate(all="ignore"):
         if np.all(np.isfinite(one_step.step(m, acceleration, x[0], x[1], t, h))):
             return True
