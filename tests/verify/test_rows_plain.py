@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -92,6 +93,7 @@ def test_steps_under_inputs_can_go_on_too() -> None:
 
     reference = SimpleNamespace(acceleration=acceleration)
     of: Any = SimpleNamespace(reference=reference)
+    of.accelerations = partial(Comparison.accelerations, of)
     x, s = np.array([[0.3, -0.2], [0.1, 0.4]]), State(*np.zeros((2, 2)), u=np.array([0.5]))
     for method in ("rk4", "gauss8", "gauss16"):
         assert rows_plain._can_go_on(of, method, s, x, 0.01, 3)

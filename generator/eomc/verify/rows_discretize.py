@@ -24,7 +24,6 @@ from eomc.verify.sampling import FARTHEST, State
 
 SLOPE_LIMIT = 1e-6  # of the largest derivative
 SMALL = 1e-4  # what inputs do to a coordinate in a step may be so little, and less is not seen
-WIDER = 10  # inputs act nearly in proportion, and the widest of WIDTHS is left out there
 SHORTER = (1.0, 0.1, 0.01)  # of the scene's h, until the stages of an implicit method are found
 
 Differences = Callable[[str, int, float], list[Vector]]  # of a method, state and step
@@ -36,15 +35,12 @@ def report(of: Comparison) -> None:
         return
     limit = max(SLOPE_LIMIT, LIMIT * of.eps)
     few = [e.state for e in of.few(4)]
-    widths = WIDTHS[1:-1] if of.system.constraints else WIDTHS  # each end takes a while to put back
 
     @cache
     def exact(method: str, k: int, h: float) -> list[Vector]:
         with np.errstate(all="ignore"):
             scales = _scales(of, few[k])
-            if of.system.constraints:
-                scales[2 * len(few[k].q) :] *= WIDER
-            return [_differences(of, method, few[k], h, width * scales) for width in widths]
+            return [_differences(of, method, few[k], h, width * scales) for width in WIDTHS]
 
     for module, form in of.forms:
         for method in of.methods:
