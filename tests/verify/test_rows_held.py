@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cases import SCENES
 from conftest import Modules
 
 from eomc.model.from_scene import from_scene
 from eomc.program.assembly import assembled
 from eomc.scene.read import parse
 from eomc.verify.check import check
+from eomc.verify.comparison import Comparison
+from eomc.verify.rows_constraints import HELD, Rows
 from eomc.verify.rows_refusals import OK, Refusals
 from eomc.verify.sampling import SMALL, Sampler
 from eomc.verify.symbolic import of
@@ -32,6 +35,12 @@ potential = "m*9.81*y"
 rod = "x**2 + y**2 - 1"
 [run]
 linearize = true
+"""
+STIFF = """
+[[spring]]
+coordinate = "q1"
+stiffness = 1e5
+length = 1.0
 """
 BOB = assembled(from_scene(parse(SCENE)))
 ROWS = {"tangent", "negative D along the rows"}
@@ -99,3 +108,13 @@ def test_states_with_a_negative_d_are_left_out() -> None:
     sampler = Sampler(of(system), np.random.default_rng(0), SMALL)
     heavy, light = (replace(sampler.start, q=np.array(q)) for q in ((0.0, -1.0), (1.0, 0.0)))
     assert sampler.regular(heavy) and not sampler.regular(light)
+
+
+@pytest.mark.slow
+def test_runs_whose_step_is_too_long_are_no_fault_of_the_rows(modules: Modules) -> None:
+    """Angles of 1e37, whose sines are anything, were taken for rows that are not held."""
+    system = assembled(from_scene(parse((SCENES / "four_bar.toml").read_text("utf-8") + STIFF)))
+    module, random = modules.unoptimised(system), np.random.default_rng(0)
+    made = Rows(Comparison(system, module, random, 4), module)
+    found = made.kept("rk4")
+    assert isinstance(found, float) and 0 < found < HELD

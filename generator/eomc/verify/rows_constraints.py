@@ -24,7 +24,7 @@ from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import STENCIL, Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.rows_bodies import Line
-from eomc.verify.sampling import EPS, Expected, State, along, ask, simulate
+from eomc.verify.sampling import EPS, FARTHEST, Expected, State, along, ask, simulate
 
 VALUES = ("constraints", "constraint_rates", "constraint_jacobian", "multipliers")
 WORK = 1e-9  # of what multipliers do: velocities of bodies are good to 1e-12
@@ -231,6 +231,9 @@ class Rows:
             how = {"h": min(of.system.run.h, longest), "steps": STEPS, "every": STEPS // 40}
             run = simulate(self.module, s, t0=s.t, method=method, **how)
             for at in along(run, s)[1:]:  # of a run that stops early the rows up to there
+                far = np.abs([at.q - s.q, at.qd - s.qd])
+                if not np.all(far < FARTHEST * of.sampler.scale):  # as h is too long
+                    break
                 errors += [self._off(at, "constraints"), self._off(at, "constraint_rates")]
         return largest(errors, "no step is taken")
 
