@@ -36,7 +36,7 @@ class AdaptiveTableau(Named):
 
 @dataclass(frozen=True)
 class Adaptive(AdaptiveTableau):
-    """c/adaptive.c.jinja, for both forms of C: a tableau, functions, calls.
+    """c/adaptive.c.jinja, which takes in four others, for both forms: tableau, functions, calls.
 
     total: the sum of half[0], ... over half of the stages. lanes: before loops over stages. top:
     from accelerations at the stages, one a row, to their polynomial's parts in the last four of
