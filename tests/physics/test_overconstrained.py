@@ -88,6 +88,22 @@ TURNTABLE = scene(
     PINNED,
 )
 STANDING = scene("standing", FOUR_BAR, four_bar(""), PINNED)
+DRIVEN = BENNETT.replace("[[loop]]", '[constraints]\ndrive = "q1 - 1 - t"\n[[loop]]')
+
+
+def tilted() -> str:
+    """A four-bar in a plane across an axis in doubles, along which all its points are."""
+    c, s = math.cos(0.7), math.sin(0.7)
+
+    def at(x: float) -> list[float]:
+        return [x * math.cos(0.4), x * math.sin(0.4) * c, x * math.sin(0.4) * s]
+
+    axis = f"0, {-s!r}, {c!r}"
+    crank = link("crank", "", "q1", axis, at(0.1), at(0.15))
+    coupler = link("coupler", "crank", "q2", axis, at(0.3), at(0.5))
+    rocker = link("rocker", "", "q3", axis, at(1.1), at(0.4))
+    pinned = f'bodies = ["coupler", "rocker"]\npoints = [{at(1)}, {at(0.8)}]\naxis = [{axis}]'
+    return scene("tilted", FOUR_BAR, crank + coupler + rocker, pinned)
 
 
 def read(text: str) -> System:
@@ -111,6 +127,31 @@ def test_sums_of_rows_stand_for_rows_that_depend_on_one_another() -> None:
     assert closure is not None and closure.rank == 2 and closure.freedoms == 1
     assert closure.redundant == () and len(closure.sums) == 2 and len(closure.shared) == 5
     assert "2 sums of them stand for these" in closure.ranks
+
+
+def test_a_plane_mechanism_closes_in_a_plane_across_an_axis_in_doubles() -> None:
+    """Rows across the plane are rounding, and left out; of the others one is redundant, nearly."""
+    flat, there = read(STANDING), read(tilted())
+    assert [c.name for c in there.constraints] == ["pin_x", "pin_y", "pin_z"]
+    for one, other in zip(flat.coordinates, there.coordinates, strict=True):
+        assert (other.start, other.rate) == pytest.approx((one.start, one.rate), abs=1e-14)
+
+
+@pytest.mark.parametrize("text", [DRIVEN, tilted().replace("[run]", '[constraints]\n'
+    'drive = "q1 - 1 - 2*t"\n[run]')])  # fmt: skip
+def test_rows_in_doubles_that_imply_others_stand_for_these_as_time_goes_on(text: str) -> None:
+    """Where they were all kept each step was said to be singular, and Bennett's linkage locked."""
+    closure = read(text).closure
+    assert closure is not None and closure.rank == 3 and not closure.freedoms
+    assert len(closure.redundant) == len(closure.rows) - 3
+    assert not any("far from singular" in remark for remark in closure.remarks)
+
+
+@pytest.mark.slow
+def test_bennett_s_linkage_is_driven_round(modules: Modules) -> None:
+    run = modules.unoptimised(DRIVEN).simulate(method="rk4")
+    assert run.status == "ok" and run.singular_steps == 0
+    assert run.q[-1, 0] == pytest.approx(4) and np.abs(run.q[:, 2] + run.q[:, 0]).max() < 1e-11
 
 
 @pytest.mark.parametrize("how", [{"tol": 1e-10}, {"method": "rk4"}, {"method": "gauss8"}])

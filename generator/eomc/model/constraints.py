@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import sympy
@@ -14,6 +16,8 @@ from eomc.model.loops import Closed
 from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
 
 NEAR = 1e-9  # m, or rad: a row that is off by less is zero
+ROUNDING = 1e-13  # of a loop's size, or of 1 where its row is of axes: it has not moved
+PLACES = 4  # at which rows of loops are compared
 LONGEST = 80  # characters of a position that a message writes out
 
 NOTHING_MOVES = (
@@ -129,7 +133,11 @@ class Rows:
 
     def settled(self, closed: Closed) -> Closed:
         """A loop without the rows that no coordinate changes; each is reported."""
-        kept, still = loops.settled(closed, self._fixed)
+        fixed = [self._fixed(row.formula) for row in closed.rows]
+        if closed.points and None in fixed:
+            hardly = self._hardly_moved(closed)
+            fixed = [b if a is None else a for a, b in zip(fixed, hardly, strict=True)]
+        kept, still = loops.settled(closed, fixed)
         far = [(row, value) for row, value in still if not abs(value) <= NEAR]
         for row, value in far:
             why = f"can't close: its row {row.name} is {value:.6g} wherever its bodies move"
@@ -152,6 +160,40 @@ class Rows:
             known[name] = formula.xreplace(known)
         value = e.xreplace(known).evalf()
         return float(value) if value.is_number else math.inf  # of t: no such loop stays closed
+
+    def _hardly_moved(self, closed: Closed) -> list[float | None]:
+        """The values of a loop's rows that change by rounding alone, None of others.
+
+        Where axes and points are given in doubles, those of a plane mechanism that is tilted in
+        space are parallel to sixteen digits, and rows across the plane change by what is left.
+        """
+        wanted = [*(x for point in closed.points for x in point), *(r.formula for r in closed.rows)]
+        known = needed(self.definitions, wanted)
+        names = [*self.values, t, *(c.q for c in self.coordinates)]
+        jumps = {"sign": _sign, "Heaviside": _step}
+        of = sympy.lambdify(names, wanted, [jumps, "math"], cse=lambda e: (known, e))
+        draw, found = random.Random(1), list[list[float]]()
+        for _ in range(PLACES):
+            q = [c.start + draw.uniform(-1, 1) for c in self.coordinates]
+            with suppress(ArithmeticError, ValueError, TypeError):  # no value, or none that is real
+                found.append([float(x) for x in of(*self.values.values(), draw.random(), *q)])
+        if len(found) < 2:
+            return [None] * len(closed.rows)
+        size = max(math.hypot(*place[k : k + 3]) for place in found for k in (0, 3))
+        sizes = {"m": size, "m^2": size**2}
+        columns = list(zip(*found, strict=True))[6:]
+        return [
+            column[0] if max(column) - min(column) <= ROUNDING * sizes.get(row.unit, 1) else None
+            for row, column in zip(closed.rows, columns, strict=True)
+        ]
+
+
+def _sign(x: float) -> float:
+    return float((x > 0) - (x < 0))
+
+
+def _step(x: float, at_zero: float = 0.5) -> float:
+    return (1 + _sign(x)) / 2 if x else at_zero
 
 
 def _instead(rate: Expr, coordinates: Iterable[Coordinate]) -> str:

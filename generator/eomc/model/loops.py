@@ -16,7 +16,7 @@ and one of them is 0 or -1 elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sympy import Expr, Float, S
@@ -48,10 +48,11 @@ class _Pull:
 
 @dataclass
 class Closed:
-    """A loop's rows and its reaction, which a gear has not."""
+    """A loop's rows and its reaction, which a gear has not; the points that it joins."""
 
     rows: list[Constraint]
     reactions: list[Reaction] = field(default_factory=list)
+    points: tuple[Vector, ...] = ()
 
 
 def close(
@@ -83,7 +84,8 @@ def close(
     if "ru" in kinds:
         a, b = (apply(end.R, _unit(axis)) for end, axis in zip(ends, loop.axes, strict=True))
         branches.append(dot(a, b))
-    return Closed(made, [Reaction(loop.name, values, loop.note, tuple(branches))])
+    reaction = Reaction(loop.name, values, loop.note, tuple(branches))
+    return Closed(made, [reaction], (first.point, second.point))
 
 
 def _of_points(p: Vector, length: Expr) -> dict[str, _Pull]:
@@ -164,15 +166,14 @@ def closed_otherwise(system: Mechanics) -> Iterator[str]:
 
 
 def settled(
-    made: Closed, value: Callable[[Expr], float | None]
+    made: Closed, values: Sequence[float | None]
 ) -> tuple[Closed, list[tuple[Constraint, float]]]:
     """Without the rows that no motion changes, whose multipliers are zero; and these.
 
-    value: of an expression without anything that moves, else None.
+    values: of each row, None of one that moves.
     """
     rows, still = [], []
-    for row in made.rows:
-        fixed = value(row.formula)
+    for row, fixed in zip(made.rows, values, strict=True):
         if fixed is None:
             rows.append(row)
         else:
@@ -181,4 +182,4 @@ def settled(
     reactions = [
         replace(r, values=tuple(S(e).xreplace(zero) for e in r.values)) for r in made.reactions
     ]
-    return Closed(rows, reactions), still
+    return replace(made, rows=rows, reactions=reactions), still

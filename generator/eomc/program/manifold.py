@@ -256,16 +256,16 @@ class Manifold:
             change = float(np.linalg.norm(place.A @ step / place.sizes))
             tiny = np.max(np.abs(step) / (np.abs(place.q) + 1e-3 + np.max(np.abs(place.q))))
             if change < 1e-4 * place.off:
-                return place, self._rounded(place)
+                return place, self.rounded(place)
             found = self._shortened(place, step, strict, LEAP * (1 + _most(q)))
             if found is None:
-                return place, self._rounded(place)
+                return place, self.rounded(place)
             if tiny < 1e-13 and found.off > place.off / 4:
                 return (found if found.off < place.off else place), True
             place = found
         return place, False
 
-    def _rounded(self, place: Place) -> bool:
+    def rounded(self, place: Place) -> bool:
         """Whether rows are as near to zero as doubles can tell."""
         off, limit = np.abs(place.phi), EPS * place.levels
         if not np.all(off <= ROUNDED * limit):

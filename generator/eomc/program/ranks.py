@@ -22,6 +22,7 @@ from eomc.program.walks import along, walk
 POSITIONS = 12  # beside the start
 MANY, FEWER = 24, 3  # rows of a large system; positions of one whose rank is full at the start
 SAME = 1e-20  # of a row: it is a sum of others in forty digits
+NEARLY = 1e-12  # the same of rows that hold in doubles alone
 GOOD = 1e-2  # of the singular value of all rows: what that of the kept ones is at least
 BETTER = 1.02  # times another set's: a set is better
 BESIDE, REACH = 3, 0.1  # places beside the start, and how far, of the coordinates' size
@@ -91,12 +92,19 @@ def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
     null = [np.linalg.svd(f.B)[0][:, rank:] for f in regular]
     shared = np.flatnonzero(np.max([np.linalg.norm(u, axis=1) for u in null], axis=0) > 1e-6)
     left_out, score = _chosen([f.B for f in regular], rank, shared.tolist())
-    good = score >= GOOD and all(_implied(manifold, f.place, left_out) for f in regular[:3])
-    found = Ranks(rank, (), tuple(shared.tolist()), good, sigma, len(places))
-    if good:
+    found = Ranks(rank, (), tuple(shared.tolist()), True, sigma, len(places))
+
+    def good(nearly: bool) -> bool:
+        some = [f.place for f in regular[:3]]
+        return score >= GOOD and all(_implied(manifold, x, left_out, nearly) for x in some)
+
+    if good(nearly=False):
         return replace(found, left_out=left_out), places
-    sums = _sums(manifold, start, rank, shared.tolist())
-    return replace(found, sums=sums, good=bool(sums)), places
+    if sums := _sums(manifold, start, rank, shared.tolist()):
+        return replace(found, sums=sums), places
+    if good(nearly=True):
+        return replace(found, left_out=left_out), places
+    return replace(found, good=False), places
 
 
 def _sums(
@@ -214,13 +222,17 @@ def _chosen(
     return tuple(sorted(chosen)), score(chosen, True)
 
 
-def _implied(manifold: Manifold, place: Place, out: Sequence[int]) -> bool:
-    """Whether the gradients of rows `out` are sums of the others', in forty digits."""
+def _implied(manifold: Manifold, place: Place, out: Sequence[int], nearly: bool) -> bool:
+    """Whether the gradients of rows `out` are sums of the others', in forty digits.
+
+    nearly: or as doubles tell, where rows of numbers that are given in doubles agree no better.
+    """
     mp, n = context(), len(place.q)
     free = np.ones(n, dtype=bool)
     q, held = manifold.polished(place, free)
-    if not held:
+    if not held and not (nearly and manifold.rounded(place)):
         return False
+    same = SAME if held else NEARLY
     flat = manifold.exactly("constraint_jacobian", q, [0] * n, place.t)
     rows = [flat[k * n : (k + 1) * n] for k in manifold.rows]
     kept = [k for k in manifold.rows if k not in out]
@@ -235,6 +247,6 @@ def _implied(manifold: Manifold, place: Place, out: Sequence[int]) -> bool:
                 if w:
                     left = [x - mp.mpf(w) * y for x, y in zip(left, row, strict=True)]
         whole = max(abs(x) for x in rows[k])
-        if max(abs(x) for x in left) > SAME * whole:
+        if max(abs(x) for x in left) > same * whole:
             return False
     return True
