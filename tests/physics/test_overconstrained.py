@@ -106,6 +106,19 @@ def tilted() -> str:
     return scene("tilted", FOUR_BAR, crank + coupler + rocker, pinned)
 
 
+def locked(angle: float) -> str:
+    """A joint about z that a hinge across it locks at an angle."""
+    c, s = math.cos(angle), math.sin(angle)
+    return scene(
+        "locked",
+        f"q1 = {{ start = 0.3, rate = 1.0 }}\nq2 = {{ start = {angle}, guess = true }}\n",
+        link("arm", "", "q1", "0, 0, 1", [0, 0, 0], [0.2, 0, 0])
+        + link("hand", "arm", "q2", "0, 0, 1", [0.5, 0, 0], [0.2, 0, 0]),
+        f'bodies = ["arm", "hand"]\npoints = [[0.5, 0.2, 0], [{0.2 * s}, {0.2 * c}, 0]]\n'
+        f"axis = [[0.6, 0.3, 0.8], [{0.6 * c + 0.3 * s}, {0.3 * c - 0.6 * s}, 0.8]]",
+    )
+
+
 def read(text: str) -> System:
     return assembled(from_scene(parse(text, "linkage.toml")))
 
@@ -137,14 +150,24 @@ def test_a_plane_mechanism_closes_in_a_plane_across_an_axis_in_doubles() -> None
         assert (other.start, other.rate) == pytest.approx((one.start, one.rate), abs=1e-14)
 
 
-@pytest.mark.parametrize("text", [DRIVEN, tilted().replace("[run]", '[constraints]\n'
-    'drive = "q1 - 1 - 2*t"\n[run]')])  # fmt: skip
-def test_rows_in_doubles_that_imply_others_stand_for_these_as_time_goes_on(text: str) -> None:
+@pytest.mark.parametrize("name", ["bennett", "tilted"])
+def test_rows_in_doubles_that_imply_others_stand_for_these_as_time_goes_on(name: str) -> None:
     """Where they were all kept each step was said to be singular, and Bennett's linkage locked."""
+    drive = '[constraints]\ndrive = "q1 - 1 - 2*t"\n[run]'
+    text = {"bennett": DRIVEN, "tilted": tilted().replace("[run]", drive)}[name]
     closure = read(text).closure
     assert closure is not None and closure.rank == 3 and not closure.freedoms
     assert len(closure.redundant) == len(closure.rows) - 3
     assert not any("far from singular" in remark for remark in closure.remarks)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4])  # at which numbers are exact, or doubles
+def test_a_row_without_slope_that_others_hold_is_left_out(angle: float) -> None:
+    """It was refused, or weighed by the inverse of its rounding in a sum."""
+    closure = read(locked(angle)).closure
+    assert closure is not None and closure.rank == 1 and closure.freedoms == 1
+    assert "pin_y" in closure.redundant
+    assert np.abs(closure.sums).max(initial=0) < 1e3
 
 
 @pytest.mark.slow

@@ -70,7 +70,9 @@ class Closure:
                 f"{'is' if len(self.redundant) == 1 else 'are'} redundant"
             )
         if self.sums:
-            text += f": {len(self.sums)} {plural('sum', len(self.sums))} of them stand for these"
+            of = "; {} of others" if self.redundant else ": {} of them"
+            text += of.format(f"{len(self.sums)} {plural('sum', len(self.sums))}")
+            text += " stand for these"
         if self.shared:
             start = "; the" if self.redundant or self.sums else ": the"
             text += f"{start} forces in {listed(self.shared)} are not unique"

@@ -30,6 +30,8 @@ LEAP = 0.5  # of a coordinate or rad: a step, at most
 SHORTEST = 2.0**-13  # part of a step
 ROUNDED = 64  # roundings: what a row of held values may be
 SWEEPS = 400  # of Newton's method, damped
+NO_SLOPE = 1e-13  # of a row's slope beside: it has none, but rounding
+BESIDE = 3  # places beside the start
 LEAST = 1e-14  # of the inverse inertia of a row: by so much it is always damped
 EPS = 2.0**-52
 EXACT = 12  # sweeps in forty digits; each gains ten or more
@@ -207,7 +209,21 @@ class Manifold:
         D = self.value("D", q, rest, time).reshape(n, n)
         if not all(np.all(np.isfinite(x)) for x in (phi, A, D)):
             return None
+        size = np.linalg.norm(A, axis=1)
+        A = np.where((size <= NO_SLOPE * self.usual)[:, None], 0.0, A)
         return Place(q, time, phi, A, D)
+
+    @cached_property
+    def usual(self) -> Vector:
+        """(m,): the length of each row's slope, over coordinates, beside the start."""
+        random, n = np.random.default_rng(3), len(self.system.q)
+        start = np.array([c.start for c in self.system.coordinates])
+        found = np.zeros((BESIDE, len(self.rows)))
+        for k in range(BESIDE):
+            q = start + random.uniform(-1, 1, n)
+            A = self.value("constraint_jacobian", q, np.zeros(n), 0.0).reshape(-1, n)
+            found[k] = np.linalg.norm(np.nan_to_num(A, posinf=0, neginf=0), axis=1)
+        return np.asarray(np.max(found, axis=0))
 
     def _off(self, q: Vector, time: float) -> Vector:
         """(m,): what the rows of positions are there, 0 for the others."""

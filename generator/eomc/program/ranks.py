@@ -63,9 +63,11 @@ def ranks(manifold: Manifold, start: Place) -> Ranks:
     found, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)
     weights = tuple(start.weights.tolist()) if singular else ()
-    slopes = tuple(np.max([place.slopes**2 for place in places], axis=0).tolist())
+    slopes = np.max([place.slopes**2 for place in places], axis=0)
+    scale = np.diag(start.metric) ** -0.5
+    slopes = np.where(slopes > 0, slopes, (manifold.usual * np.max(scale)) ** 2)
     latest = max(place.t for place in places)
-    return replace(found, weights=weights, slopes=slopes, latest=latest)
+    return replace(found, weights=weights, slopes=tuple(slopes.tolist()), latest=latest)
 
 
 def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
@@ -101,7 +103,8 @@ def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
     if good(nearly=False):
         return replace(found, left_out=left_out), places
     if sums := _sums(manifold, start, rank, shared.tolist()):
-        return replace(found, sums=sums), places
+        idle = tuple(k for k in shared.tolist() if not any(row[k] for row in sums))
+        return replace(found, left_out=idle, sums=sums), places
     if good(nearly=True):
         return replace(found, left_out=left_out), places
     return replace(found, good=False), places
@@ -121,6 +124,7 @@ def _sums(
         return ()
     places = [start, *islice(along(manifold, start), ALONG)]
     usual = np.max([place.slopes for place in places], axis=0)[shared]
+    usual = np.where(usual > 0, usual, np.inf)
     free, spans = np.ones(len(start.q), dtype=bool), list[Vector]()
     for place in places:
         B = Frame(place, free, manifold.rows).B[shared] * (place.sizes[shared] / usual)[:, None]
@@ -184,7 +188,24 @@ def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
             found = [p for p in (manifold.place(x, place.t) for x in q) if p is not None]
             beside = np.max([p.slopes for p in found], axis=0, initial=0.0)
             flat = [k for k in flat if place.slopes[k] < FLAT * beside[k]]
-    return tuple(flat)
+    return tuple(k for k in flat if not _held_by_others(manifold, start, k, flat))
+
+
+def _held_by_others(manifold: Manifold, start: Place, row: int, flat: Sequence[int]) -> bool:
+    """Whether a row of a loop is zero wherever the rows are that are not flat."""
+    system = manifold.system
+    if not system.constraints[row].loop:
+        return False
+    kept = tuple(c for k, c in enumerate(system.constraints) if k not in flat)
+    if not kept:
+        return False
+    alone = Manifold(replace(system, constraints=kept))
+    there = alone.place(start.q, start.t)
+    if there is None:
+        return False
+    found = [manifold.place(x.q, x.t) for x in walk(alone, there, FEWER)]
+    off = [abs(x.phi[row]) for x in found if x is not None]
+    return bool(off) and max(off) <= KNOWN * float(manifold.usual[row])
 
 
 def _chosen(
@@ -239,7 +260,7 @@ def _implied(manifold: Manifold, place: Place, out: Sequence[int], nearly: bool)
     A = np.array([[float(x) for x in rows[k]] for k in kept])
     size = np.linalg.norm(A, axis=1)
     into = np.linalg.pinv((A / size[:, None]).T) / size[:, None]
-    for k in out:
+    for k in (k for k in out if np.any(place.A[k])):
         left: list[Any] = [mp.mpf(x) for x in rows[k]]
         for _ in range(6):
             weights = (into @ np.array([float(x) for x in left])).tolist()
