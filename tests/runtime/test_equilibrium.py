@@ -221,3 +221,13 @@ def test_friction_that_sticks_holds_what_it_can(modules: Modules) -> None:
     with pytest.raises(block.MotionError, match=r"x slips, as 1\.5 is more than its friction hold"):
         block.equilibrium([0.15])
     assert block.equilibrium([0.15], params={"F": 2.0})[0].tolist() == [0.15, 0.0]
+
+
+def test_a_linkage_comes_to_hang_from_where_its_forces_are_least(modules: Modules) -> None:
+    """Newton's method ended halfway between the positions of rest, at a force of -1.31."""
+    four_bar = modules("four_bar")
+    q, _ = four_bar.equilibrium()
+    assert np.abs(four_bar.acceleration(q, [0, 0, 0])).max() < 1e-12
+    assert np.abs(four_bar.constraints(q, [0, 0, 0])).max() < 1e-14
+    beside = [four_bar.project(q + [d, 0, 0], [0, 0, 0], held=["q1"])[0] for d in (-0.01, 0.01)]
+    assert all(four_bar.potential_energy(x) > four_bar.potential_energy(q) for x in beside)

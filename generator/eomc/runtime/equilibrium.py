@@ -18,6 +18,9 @@ from .status import MotionError, state_text
 _MOST = 100  # steps of Newton's method
 _RANK_TOLERANCE = 1e-9  # of the largest singular value of A: a row that is none here
 _SHORTEST = 2.0**-20  # part of a step that is tried
+_TRIES, _STRIDE = 24, 0.2  # of Newton's method; rad, or of a coordinate: a step between them
+
+_Of = Callable[[Array], Array]
 
 
 def equilibrium(
@@ -56,10 +59,47 @@ def equilibrium(
 
     eps = float(np.finfo(model.dtype).eps)
     onto = rows.onto if rows else lambda z: z
-    z = onto(z)
-    now, sizes = rest(z), np.full(n, np.inf)
+
+    def D(z: Array) -> Array:
+        found: Array = model.D(z[:n], t=t, params=params)
+        return found.astype(float)
+
+    def ways(z: Array) -> Array:
+        return rows.along(z) if rows else np.eye(len(z))[moved]  # (k, len(z))
+
+    z, downhill = onto(z), None
+    ends = list[tuple[Array, Array]]()
+    for _ in range(_TRIES):
+        z, now, sizes = _newton(z, n, rest, onto, ways, eps)
+        sizes[:n] = np.max(sizes[:n], initial=0) + (np.max(np.abs(whole(z))) if rows else 0.0)
+        if rows:
+            sizes[n:] += rows.sizes(z)
+        ends.append((z, now * ~(np.abs(now) <= np.sqrt(eps) * sizes)))  # rounding leaves less
+        if not ends[-1][1].any():
+            break
+        downhill = _downhill(model, z if downhill is None else downhill, ways, whole, onto, D)
+        if downhill is None:
+            break
+        z = downhill
+    z, much = ends[-1] if not ends[-1][1].any() else ends[0]
+    _refuse(model, z, much, (q, qd), held(z), t, params)
+    at, moving = (x.astype(model.dtype) for x in (z[:n], z[n : 2 * n]))
+    if u is None:
+        return at, moving, np.asarray(model.signal(at, moving, t, params)) if model.nu else None
+    return at, moving, z[2 * n :].astype(model.dtype)
+
+
+def _newton(
+    z: Array, n: int, rest: _Of, onto: _Of, ways_of: _Of, eps: float
+) -> tuple[Array, Array, Array]:
+    """Where Newton's method on `rest` ends from z, what is left there, and the sizes of its terms.
+
+    ways_of: the directions, (k, len(z)), in which z may go; onto: back on rows from there.
+    """
+    now = rest(z)
+    sizes = np.full(len(now), np.inf)
     for _ in range(_MOST):
-        ways = rows.along(z) if rows else np.eye(len(z))[moved]  # (k, len(z))
+        ways = ways_of(z)
         reach = np.maximum(1.0, np.abs(ways) @ np.abs(z))
         near = np.cbrt(eps) * reach[:, None] * ways
         columns = [rest(onto(z + e)) - rest(onto(z - e)) for e in near]
@@ -82,15 +122,26 @@ def equilibrium(
             break
         assert there is not None and left is not None
         z, now = there, left
-    sizes[:n] = np.max(sizes[:n], initial=0) + (np.max(np.abs(whole(z))) if rows else 0.0)
-    if rows:
-        sizes[n:] += rows.sizes(z)
-    much = now * ~(np.abs(now) <= np.sqrt(eps) * sizes)  # rounding leaves less
-    _refuse(model, z, much, (q, qd), held(z), t, params)
-    at, moving = (x.astype(model.dtype) for x in (z[:n], z[n : 2 * n]))
-    if u is None:
-        return at, moving, np.asarray(model.signal(at, moving, t, params)) if model.nu else None
-    return at, moving, z[2 * n :].astype(model.dtype)
+    return z, now, sizes
+
+
+def _downhill(
+    model: Constrained, z: Array, ways_of: _Of, forces: _Of, onto: _Of, inertia: _Of
+) -> Array | None:
+    """A step from z as the forces push what is at rest; None where they push nothing.
+
+    Newton's method ends where forces are least, as halfway between two positions of rest.
+    """
+    n, ways = model.nq, ways_of(z)
+    ways = ways[:, :n][np.any(ways[:, :n], axis=1)]
+    if not len(ways):
+        return None
+    D = ways @ inertia(z) @ ways.T
+    step = np.linalg.lstsq(D, ways @ forces(z)[:n], rcond=1e-11)[0] @ ways
+    size = np.max(np.abs(step) / np.maximum(1.0, np.abs(z[:n])), initial=0.0)
+    if not 0 < size < np.inf:
+        return None
+    return _tried(onto, z + np.concatenate([_STRIDE / size * step, np.zeros(len(z) - n)]))
 
 
 def _refuse(
@@ -152,7 +203,7 @@ def _beyond(model: Constrained, q: Array, qd: Array, u: Array | None, t: float, 
     )
 
 
-def _tried(onto: Callable[[Array], Array], z: Array) -> Array | None:
+def _tried(onto: _Of, z: Array) -> Array | None:
     """`onto` of a state; None where the rows have none near."""
     try:
         return onto(z)
