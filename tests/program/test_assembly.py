@@ -17,7 +17,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import Constraint, System, symbol, t
 from eomc.program import ranks
 from eomc.program.assembly import assembled
-from eomc.program.manifold import Manifold
+from eomc.program.manifold import Manifold, Place
 from eomc.program.walks import walk
 from eomc.scene.read import parse
 
@@ -420,3 +420,15 @@ def test_a_walk_stays_on_the_rows(name: str) -> None:
         assert np.max(np.abs(there.phi)) < 1e-14 * (1 + np.max(np.abs(there.q)))
     far = np.ptp([p.q for p in found], axis=0)
     assert np.max(far) > 0.1
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_singular_mass_matrix_is_known_where_its_pivots_hide_it(seed: int) -> None:
+    """As at a gimbal lock that ranks are taken near: NumPy's error ended the build."""
+    random = np.random.default_rng(seed)
+    still = np.append(random.normal(size=5), 1e-3)  # what moves no mass, hardly the last one
+    across = np.eye(6) - np.outer(still, still) / (still @ still)
+    B = random.normal(size=(6, 6))
+    D = across @ (B @ B.T + np.eye(6)) @ across
+    place = Place(np.zeros(6), 0.0, np.zeros(1), np.ones((1, 6)), D)
+    assert place.singular and np.all(np.linalg.eigvalsh(place.metric) > 0)

@@ -59,8 +59,10 @@ class Place:
         if np.all(diagonal > 0):
             scale = 1 / np.sqrt(diagonal)
             with suppress(np.linalg.LinAlgError):
-                factor = np.linalg.cholesky(scale[:, None] * (self.D + self.D.T) / 2 * scale)
-                return not np.min(np.diag(factor)) > 1e-6
+                D = scale[:, None] * (self.D + self.D.T) / 2 * scale
+                pivots = np.diag(np.linalg.cholesky(D))
+                # of a singular one the least pivot may be far above the least eigenvalue
+                return not (np.min(pivots) > 1e-6 and np.linalg.eigvalsh(D)[0] > LEAST)
         return True
 
     @property
