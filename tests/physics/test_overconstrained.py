@@ -241,3 +241,14 @@ def test_rows_do_not_know_how_what_both_bodies_hang_from_moves(modules: Modules)
         c, s = math.cos(angle), math.sin(angle)
         turned = np.stack([c * force[:, 0], s * force[:, 0], force[:, 2]], axis=1)
         assert heavy.reactions["pin"][:, :3] == pytest.approx(turned, abs=1e-7)
+
+
+def test_rods_that_close_a_loop_may_have_no_mass(modules: Modules) -> None:
+    """The crank of a four-bar swings as if it were alone; bodies without mass were refused."""
+    crank, rods = STANDING.split('name = "coupler"')
+    rods = rods.replace("mass = 1\n", "mass = 0\n").replace("[0.01, 0.1, 0.1]", "[0, 0, 0]")
+    linkage = modules.unoptimised(crank + 'name = "coupler"' + rods.replace(', "gauss8"', ""))
+    q, qd = linkage.start
+    alone = -9.81 * 0.15 * np.cos(q[0]) / (0.1 + 0.15**2)
+    assert linkage.acceleration(q, qd)[0] == pytest.approx(alone, rel=1e-13)
+    assert linkage.reactions(q, qd)["pin"] == pytest.approx(0, abs=1e-13)

@@ -432,3 +432,11 @@ def test_a_singular_mass_matrix_is_known_where_its_pivots_hide_it(seed: int) -> 
     D = across @ (B @ B.T + np.eye(6)) @ across
     place = Place(np.zeros(6), 0.0, np.zeros(1), np.ones((1, 6)), D)
     assert place.singular and np.all(np.linalg.eigvalsh(place.metric) > 0)
+
+
+def test_what_moves_without_inertia_and_no_row_holds_is_named() -> None:
+    """It ended in SymPy's error, "Invalid NaN comparison"."""
+    made = scene("x = {}\nv = {}\nw = {}", 'r = "v - w"')
+    made = replace(made, kinetic=made.coordinates[0].qd ** 2 / 2)
+    assert "coordinates.v: v, w can move together without moving anything that has" in refusal(made)
+    assert assembled(replace(made, kinetic=sum(c.qd**2 for c in made.coordinates[:2]))).closure

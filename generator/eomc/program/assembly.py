@@ -63,6 +63,8 @@ def assembled(system: System) -> System:
     found = ranks(manifold, start.place)
     if found.rank == 0:
         raise SceneError(list(contradictions.of_slopes(system, found.flat)))
+    if found.loose:
+        raise SceneError([contradictions.of_inertia(system, found.loose)])
     constraints = tuple(
         replace(c, redundant=k in found.left_out) for k, c in enumerate(system.constraints)
     )

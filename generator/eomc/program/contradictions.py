@@ -218,6 +218,17 @@ def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
         yield system.problem("constraints", why)
 
 
+def of_inertia(system: System, loose: Sequence[int]) -> Problem:
+    """What moves without inertia, and without a row that holds it."""
+    names = [system.coordinates[k].name for k in loose]
+    why = (
+        f"{listed(names)} {'can move' if len(names) == 1 else 'can move together'} without moving "
+        "anything that has mass or inertia, and no row holds "
+        f"{'it' if len(names) == 1 else 'them'}: give what moves a mass, or add a row"
+    )
+    return system.problem(f"coordinates.{names[0]}", why)
+
+
 def of_values(manifold: Manifold, q: Vector) -> Iterator[Problem]:
     """What has no value, or no slope, at a start."""
     system, n = manifold.system, 0

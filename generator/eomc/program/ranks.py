@@ -22,6 +22,7 @@ from eomc.program.walks import along, walk
 POSITIONS = 12  # beside the start
 MANY, FEWER = 24, 3  # rows of a large system; positions of one whose rank is full at the start
 SAME = 1e-20  # of a row: it is a sum of others in forty digits
+NO_MASS = 1e-14  # of coordinates' own inertias
 NEARLY = 1e-12  # the same of rows that hold in doubles alone
 GOOD = 1e-2  # of the singular value of all rows: what that of the kept ones is at least
 BETTER = 1.02  # times another set's: a set is better
@@ -42,7 +43,8 @@ class Ranks:
     sigma: smallest over largest singular value that counts, at the start and at the worst place.
     weights: of the rows, that make D regular with them; none where it is so by itself. slopes: of
     each row the largest A D^-1 A^T. latest: the time of the last position, s.
-    flat: rows without a slope wherever they hold.
+    flat: rows without a slope wherever they hold. loose: coordinates that no inertia and no row
+    holds.
     """
 
     rank: int
@@ -55,6 +57,7 @@ class Ranks:
     slopes: tuple[float, ...] = ()
     latest: float = 0.0
     flat: tuple[int, ...] = ()
+    loose: tuple[int, ...] = ()
     sums: tuple[tuple[float, ...], ...] = ()
 
 
@@ -67,7 +70,29 @@ def ranks(manifold: Manifold, start: Place) -> Ranks:
     scale = np.diag(start.metric) ** -0.5
     slopes = np.where(slopes > 0, slopes, (manifold.usual * np.max(scale)) ** 2)
     latest = max(place.t for place in places)
-    return replace(found, weights=weights, slopes=tuple(slopes.tolist()), latest=latest)
+    return replace(
+        found, weights=weights, slopes=tuple(slopes.tolist()), latest=latest, loose=_loose(places)
+    )
+
+
+def _loose(places: Sequence[Place]) -> tuple[int, ...]:
+    """The coordinates along which, at every place, rows leave a way that moves no mass."""
+    found: tuple[int, ...] = ()
+    for place in places:
+        diagonal = np.diag(place.D)
+        scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        A = place.A / place.sizes[:, None] * scale
+        _, s, V = np.linalg.svd(A)
+        ways = V[int(np.sum(s > RANK_TOLERANCE * np.max(s, initial=0))) :]
+        if not len(ways):
+            return ()
+        values, vectors = np.linalg.eigh(ways @ (scale[:, None] * place.D * scale) @ ways.T)
+        least = int(np.argmin(np.abs(values)))
+        if abs(values[least]) > NO_MASS:
+            return ()
+        way = np.abs(vectors[:, least] @ ways)
+        found = tuple(np.flatnonzero(way > 1e-6 * np.max(way)).tolist())
+    return found
 
 
 def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:

@@ -268,10 +268,13 @@ class _Bodies(Joints):
         return out
 
     def _inertia_of_joints(self, ordered: Iterable[Body]) -> None:
-        """Every joint that moves needs something to move, unless energies are given besides."""
+        """Every joint that moves needs something to move, unless energies are given besides.
+
+        What rows hold may have no inertia, such as a massless rod that closes a loop.
+        """
         ordered = list(ordered)
-        kinetic = self.doc.energy.kinetic
-        if kinetic != 0.0 or any(body.position for body in ordered):
+        rows = self.doc.loop or self.doc.constraints
+        if self.doc.energy.kinetic != 0.0 or rows or any(body.position for body in ordered):
             return
         carries = dict(self.heavy)
         for body in reversed(ordered):
