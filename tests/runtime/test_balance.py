@@ -378,3 +378,30 @@ def test_of_many_jumps_it_is_told_without_many_rows(falling: ModuleType) -> None
     balance = run.balance()
     assert len(run.events["impact"]) > 2500 and balance.told
     assert abs(balance.jumps) < 1e-9 and balance.left < 1e-6
+
+
+STOP = """
+eomc = 1
+name = "meets_a_stop"
+[coordinates]
+x = { rate = 1.0 }
+[energy]
+kinetic = "x_dot**2/2"
+potential = "x**2/2"
+dissipation = "0.01*x_dot**2/2"
+[forces]
+x = "-1e7*max(0, x - 0.9)*max(0, 1 + x_dot)"
+[run]
+duration = 20.0
+tolerance = 1e-9
+"""
+
+
+@pytest.mark.parametrize("times", [None, np.linspace(0.0, 20.0, 41)])
+def test_short_contacts_are_seen(modules: Modules, times: np.ndarray | None) -> None:
+    """Rows equally far apart passed over them, and a right run had a numerical error of 8 %."""
+    run = modules.of_text(STOP).simulate(times=times)
+    found = run.balance()
+    assert found is not None and found.told
+    assert max(found.left, found.unsure) < 1e-8
+    assert found.lost == pytest.approx(run.energy[0] - run.energy[-1], abs=1e-8)

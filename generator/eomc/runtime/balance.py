@@ -137,8 +137,8 @@ def _rows(run: Recorded) -> _Rows | None:
     """Rows that tell a run's power, which is smooth between jumps of its state or its inputs."""
     model, u = run._model, run._u
     if u is None or np.ndim(u) == 1:
-        run = _between_jumps(run)  # all its rows: few may look smooth and not be
-        return _Rows(model, run._params, run.t, run.q, run.qd, [(slice(None), u)])
+        made = _in_steps(run) or _between_jumps(run)  # all its rows: few may look smooth and not be
+        return _Rows(model, run._params, *made, [(slice(None), u)])
     run = _with_jumps(run)
     ends, values = _held(run)
     if not len(values):
@@ -185,15 +185,33 @@ def _held(run: Any) -> tuple[Array, Array]:
     return np.append(starts[begun], last), values[begun]
 
 
-def _between_jumps(run: Recorded) -> Recorded:
-    """With rows equally far apart, in each piece between jumps, which stand on two rows each."""
+def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
+    """t, q and qd, equally far apart in each step that fits a tolerance; its ends on two rows.
+
+    Such steps are short where power is not smooth, as in a stop. None: fixed steps, or too many.
+    """
+    if not hasattr(run, "tol") or run.steps * _FEWEST > _MOST or not run._model.has_power:
+        return None
+    run = _with_jumps(run)
+    if len(run) - 1 - np.sum(np.diff(run.t) == 0) != run.steps:  # its rows were asked for
+        run = run._made(None, float(run.t[-1]))
+    begun = np.flatnonzero(np.diff(run.t) > 0)
+    at = np.linspace(run.t[begun], run.t[begun + 1], _FEWEST, axis=1)
+    inner = np.array(run(at[:, 1:-1]))
+    ends = np.array([run.q, run.qd])
+    made = np.concatenate([ends[:, begun, None], inner, ends[:, begun + 1, None]], axis=2)
+    q, qd = made.reshape(2, -1, run._model.nq)
+    return at.ravel(), q, qd
+
+
+def _between_jumps(run: Recorded) -> tuple[Array, Array, Array]:
+    """t, q, qd equally far apart, in each piece between jumps, which stand on two rows each."""
     run = _with_jumps(run)
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
-    if not len(jumps):
-        return run._even()
+    if not len(jumps) or not run._model.has_power:
+        even = run if len(jumps) else run._even()
+        return even.t, even.q, even.qd
     firsts, lasts = np.array([0, *jumps]), np.array([*(jumps - 1), n - 1])
-    if not run._model.has_power:
-        return run
     times, grain = [], 16 * np.finfo(run._model.dtype).eps
     for a, b in zip(firsts.tolist(), lasts.tolist(), strict=True):
         rows = min(max(_EVEN * (b - a + 1), _PIECE), max(_MOST // len(firsts), 2))
@@ -204,7 +222,7 @@ def _between_jumps(run: Recorded) -> Recorded:
     adaptive: Any = run
     bare = adaptive._at(run.t[ends], np.array([run.q[ends], run.qd[ends]]))
     made: Recorded = bare._with(np.concatenate(times)) if times else bare
-    return made
+    return made.t, made.q, made.qd
 
 
 def _with_jumps(run: Any) -> Any:
