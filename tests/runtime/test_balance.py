@@ -405,3 +405,18 @@ def test_short_contacts_are_seen(modules: Modules, times: np.ndarray | None) -> 
     assert found is not None and found.told
     assert max(found.left, found.unsure) < 1e-8
     assert found.lost == pytest.approx(run.energy[0] - run.energy[-1], abs=1e-8)
+
+
+@pytest.mark.parametrize("roundings", [-2, 0, 1, 5])
+def test_jumps_within_roundings_of_an_end_count(falling: ModuleType, roundings: int) -> None:
+    """Steps of some roundings had rows between their ends that fell on the time of the jump."""
+    impact = float(falling.simulate(duration=1.0).events["impact"].t[0])
+    sheds = 0.3 - roundings * np.spacing(0.3)
+    for run in (
+        falling.simulate(duration=impact + roundings * np.spacing(impact)),
+        falling.simulate(duration=0.3, params={"at": sheds}),
+        falling.simulate(duration=0.3, params={"at": max(0.0, -roundings)}),
+    ):
+        found = run.balance()
+        assert found is not None and found.told and found.left < 1e-13
+        assert found.jumps == pytest.approx(run.energy[-1] - run.energy[0], abs=1e-12)

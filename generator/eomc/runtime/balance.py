@@ -188,20 +188,24 @@ def _held(run: Any) -> tuple[Array, Array]:
 def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     """t, q and qd, equally far apart in each step that fits a tolerance; its ends on two rows.
 
-    Such steps are short where power is not smooth, as in a stop. None: fixed steps, or too many.
+    Such steps are short where power is not smooth, as in a stop. Those of some roundings of the
+    time have their ends alone. None: fixed steps, or too many.
     """
     if not hasattr(run, "tol") or run.steps * _FEWEST > _MOST or not run._model.has_power:
         return None
     run = _with_jumps(run)
-    if len(run) - 1 - np.sum(np.diff(run.t) == 0) != run.steps:  # its rows were asked for
-        run = run._made(None, float(run.t[-1]))
-    begun = np.flatnonzero(np.diff(run.t) > 0)
-    at = np.linspace(run.t[begun], run.t[begun + 1], _FEWEST, axis=1)
-    inner = np.array(run(at[:, 1:-1]))
-    ends = np.array([run.q, run.qd])
-    made = np.concatenate([ends[:, begun, None], inner, ends[:, begun + 1, None]], axis=2)
-    q, qd = made.reshape(2, -1, run._model.nq)
-    return at.ravel(), q, qd
+    if np.sum(np.diff(run.t) > 0) != run.steps:  # its rows were asked for
+        run = _after_steps(run)
+    t, both, grain = run.t, np.array([run.q, run.qd]), 16 * np.finfo(run._model.dtype).eps
+    apart = np.diff(t)
+    long = np.flatnonzero(apart > _FEWEST * grain * np.maximum(np.abs(t[:-1]), np.abs(t[1:])))
+    inner = np.arange(1, _FEWEST - 1) / (_FEWEST - 1)
+    at = (t[long, None] + apart[long, None] * inner).ravel()
+    between = 1 + np.flatnonzero(apart[:-1] * apart[1:])  # they end a step, and begin one
+    rows = np.sort([*range(len(t)), *between])
+    places = np.repeat(np.searchsorted(rows, long, side="right"), len(inner))
+    q, qd = np.insert(both[:, rows], places, np.array(run(at)), axis=1)
+    return np.insert(t[rows], places, at), q, qd
 
 
 def _between_jumps(run: Recorded) -> tuple[Array, Array, Array]:
@@ -230,6 +234,11 @@ def _with_jumps(run: Any) -> Any:
     happened = getattr(run, "_happened", ((),))[0]
     if not len(happened) or (np.diff(run.t) == 0).any():
         return run
+    return _after_steps(run)
+
+
+def _after_steps(run: Any) -> Any:
+    """The same run with a row after each step, and both of each jump."""
     return run._made(None, float(run.t[-1]) if run.status == "interrupted" else run._t_end)
 
 
