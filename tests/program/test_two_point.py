@@ -349,6 +349,7 @@ def test_steps_with_constraints_take_it_too(modules: Modules) -> None:
     assert np.abs(module.constraints(run.q[-1], run.qd[-1])).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_sums_are_compensated_in_the_two_point_form(modules: Modules) -> None:
     """130,000 steps, so short that rounding is all of their error, beside 256 of order 8.
 

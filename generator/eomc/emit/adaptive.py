@@ -28,7 +28,7 @@ MOST = 14  # sweeps of a step
 ROUGHEST = 2 * 0.8**-8  # of the root of tol/2: a step that is refused after two sweeps
 LONGEST = 1e4  # times of the motion at the start: by no longer a time the least step is measured
 OF_MOST = 1e-4  # of the largest coordinate and velocity, in the measures of all
-OF_MOST_SINGLE = 0.01  # in single precision, whose rounding is larger
+OF_MOST_COARSE = 0.01  # where rounding counts, and in single precision, whose rounding is larger
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
 SMALL = 300  # operations of accelerations, up to which many instances go side by side
@@ -170,7 +170,8 @@ def tableau(made: Stepping) -> dict[str, Any]:
         "sqrt": f"sqrt{real.function_suffix}",
         "eps": target.literal(real.epsilon),
         "tiny": target.literal(1e-30),
-        "of_most": target.literal(OF_MOST if real.epsilon < 1e-10 else OF_MOST_SINGLE),
+        "of_most": target.literal(OF_MOST if real.epsilon < 1e-10 else OF_MOST_COARSE),
+        "of_most_coarse": target.literal(OF_MOST_COARSE),
         "most": MOST,
         "c": numbers(m.c, real),
         "powers": matrix(list(zip(*m.powers, strict=True)), real),

@@ -197,7 +197,7 @@ def declarations(bound: Binding) -> Declarations:
 
 
 def _timed(target: Target, name: str) -> bool:
-    if name == "jacobi" not in target.program:
+    if name == "jacobi" and name not in target.program:
         name = "energy"  # which it is there
     return name in target.program and (
         takes_t(target, name) or (target.driven and takes_qdd(target, name))

@@ -17,6 +17,7 @@ from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
 
 NEAR = 1e-9  # m, or rad: a row that is off by less is zero
 ROUNDING = 1e-13  # of a loop's size, or of 1 where its row is of axes: it has not moved
+BENDING = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside)
 PLACES = 4  # at which rows of loops are compared
 LONGEST = 80  # characters of a position that a message writes out
 
@@ -165,18 +166,21 @@ class Rows:
         """The values of a loop's rows that change by rounding alone, None of others.
 
         Where axes and points are given in doubles, those of a plane mechanism that is tilted in
-        space are parallel to sixteen digits, and rows across the plane change by what is left.
+        space are parallel to sixteen digits, and rows across the plane change by what is left, at
+        other parameters too.
         """
         wanted = [*(x for point in closed.points for x in point), *(r.formula for r in closed.rows)]
         known = needed(self.definitions, wanted)
+        if any(e.has(*BENDING) for e in (*wanted, *(formula for _, formula in known))):
+            return [None] * len(closed.rows)  # such a row may be level for a while
         names = [*self.values, t, *(c.q for c in self.coordinates)]
-        jumps = {"sign": _sign, "Heaviside": _step}
-        of = sympy.lambdify(names, wanted, [jumps, "math"], cse=lambda e: (known, e))
+        of = sympy.lambdify(names, wanted, "math", cse=lambda e: (known, e))
         draw, found = random.Random(1), list[list[float]]()
         for _ in range(PLACES):
+            p = [x + 0.1 * draw.uniform(-1, 1) * (abs(x) or 1.0) for x in self.values.values()]
             q = [c.start + draw.uniform(-1, 1) for c in self.coordinates]
             with suppress(ArithmeticError, ValueError, TypeError):  # no value, or none that is real
-                found.append([float(x) for x in of(*self.values.values(), draw.random(), *q)])
+                found.append([float(x) for x in of(*p, draw.random(), *q)])
         if len(found) < 2:
             return [None] * len(closed.rows)
         size = max(math.hypot(*place[k : k + 3]) for place in found for k in (0, 3))
@@ -186,14 +190,6 @@ class Rows:
             column[0] if max(column) - min(column) <= ROUNDING * sizes.get(row.unit, 1) else None
             for row, column in zip(closed.rows, columns, strict=True)
         ]
-
-
-def _sign(x: float) -> float:
-    return float((x > 0) - (x < 0))
-
-
-def _step(x: float, at_zero: float = 0.5) -> float:
-    return (1 + _sign(x)) / 2 if x else at_zero
 
 
 def _instead(rate: Expr, coordinates: Iterable[Coordinate]) -> str:

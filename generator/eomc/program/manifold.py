@@ -30,7 +30,8 @@ LEAP = 0.5  # of a coordinate or rad: a step, at most
 SHORTEST = 2.0**-13  # part of a step
 ROUNDED = 64  # roundings: what a row of held values may be
 SWEEPS = 400  # of Newton's method, damped
-NO_SLOPE = 1e-13  # of a row's slope beside: it has none, but rounding
+NO_SLOPE = 1e-13  # of a loop's row, of its slope beside: it has none, but rounding
+NO_MASS = 1e-14  # the least eigenvalue of a D that is scaled to 1: it is singular
 BESIDE = 3  # places beside the start
 LEAST = 1e-14  # of the inverse inertia of a row: by so much it is always damped
 EPS = 2.0**-52
@@ -62,7 +63,7 @@ class Place:
                 D = scale[:, None] * (self.D + self.D.T) / 2 * scale
                 pivots = np.diag(np.linalg.cholesky(D))
                 # of a singular one the least pivot may be far above the least eigenvalue
-                return not (np.min(pivots) > 1e-6 and np.linalg.eigvalsh(D)[0] > LEAST)
+                return not (np.min(pivots) > 1e-6 and np.linalg.eigvalsh(D)[0] > NO_MASS)
         return True
 
     @property
@@ -211,9 +212,14 @@ class Manifold:
         D = self.value("D", q, rest, time).reshape(n, n)
         if not all(np.all(np.isfinite(x)) for x in (phi, A, D)):
             return None
-        size = np.linalg.norm(A, axis=1)
-        A = np.where((size <= NO_SLOPE * self.usual)[:, None], 0.0, A)
+        level = self._of_loops & (np.linalg.norm(A, axis=1) <= NO_SLOPE * self.usual)
+        A[level] = 0.0
         return Place(q, time, phi, A, D)
+
+    @cached_property
+    def _of_loops(self) -> Flags:
+        """(m,): the rows of lengths and axes, which have slopes of one size."""
+        return np.array([bool(c.loop) for c in self.system.constraints])
 
     @cached_property
     def usual(self) -> Vector:

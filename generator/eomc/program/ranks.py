@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 
 from eomc.program.interpret import context
-from eomc.program.manifold import RANK_TOLERANCE, Frame, Manifold, Place, Vector
+from eomc.program.manifold import NO_MASS, RANK_TOLERANCE, Frame, Manifold, Place, Vector
 from eomc.program.walks import along, walk
 
 POSITIONS = 12  # beside the start
 MANY, FEWER = 24, 3  # rows of a large system; positions of one whose rank is full at the start
 SAME = 1e-20  # of a row: it is a sum of others in forty digits
-NO_MASS = 1e-14  # of coordinates' own inertias
 NEARLY = 1e-12  # the same of rows that hold in doubles alone
 GOOD = 1e-2  # of the singular value of all rows: what that of the kept ones is at least
 BETTER = 1.02  # times another set's: a set is better
@@ -217,7 +216,10 @@ def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
 
 
 def _held_by_others(manifold: Manifold, start: Place, row: int, flat: Sequence[int]) -> bool:
-    """Whether a row of a loop is zero wherever the rows are that are not flat."""
+    """Whether a row of a loop is zero wherever the rows are that are not flat.
+
+    A row that a person wrote is reported all the same: it may be meant otherwise.
+    """
     system = manifold.system
     if not system.constraints[row].loop:
         return False

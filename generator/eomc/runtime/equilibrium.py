@@ -27,7 +27,7 @@ def equilibrium(
     model: Constrained, q: Array, qd: Array, u: Array | None, free: Collection[str], t: float,
     params: Any,
 ) -> tuple[Array, Array, Array | None]:  # fmt: skip
-    """(q, qd, u) near a guess where tau + A^T lambda = C qd + g, what is not `free` as it was.
+    """(q, qd, u) where tau + A^T lambda = C qd + g, from a guess, what is not `free` as it was.
 
     Forces, not accelerations: D couples these, and may be singular. Their slopes are differences,
     which cost a step some digits and the result none. Where more is free than they determine, each
@@ -67,21 +67,22 @@ def equilibrium(
     def ways(z: Array) -> Array:
         return rows.along(z) if rows else np.eye(len(z))[moved]  # (k, len(z))
 
-    z, downhill = onto(z), None
-    ends = list[tuple[Array, Array]]()
+    z, downhill, tried = onto(z), None, list[tuple[Array, Array]]()
     for _ in range(_TRIES):
         z, now, sizes = _newton(z, n, rest, onto, ways, eps)
         sizes[:n] = np.max(sizes[:n], initial=0) + (np.max(np.abs(whole(z))) if rows else 0.0)
         if rows:
             sizes[n:] += rows.sizes(z)
-        ends.append((z, now * ~(np.abs(now) <= np.sqrt(eps) * sizes)))  # rounding leaves less
-        if not ends[-1][1].any():
+        much = now * ~(np.abs(now) <= np.sqrt(eps) * sizes)  # rounding leaves less
+        tried.append((z, much))
+        if not much.any():
             break
         downhill = _downhill(model, z if downhill is None else downhill, ways, whole, onto, D)
         if downhill is None:
             break
         z = downhill
-    z, much = ends[-1] if not ends[-1][1].any() else ends[0]
+    if much.any():
+        z, much = tried[0]
     _refuse(model, z, much, (q, qd), held(z), t, params)
     at, moving = (x.astype(model.dtype) for x in (z[:n], z[n : 2 * n]))
     if u is None:
@@ -136,8 +137,10 @@ def _downhill(
     ways = ways[:, :n][np.any(ways[:, :n], axis=1)]
     if not len(ways):
         return None
-    D = ways @ inertia(z) @ ways.T
-    step = np.linalg.lstsq(D, ways @ forces(z)[:n], rcond=1e-11)[0] @ ways
+    D, pushes = ways @ inertia(z) @ ways.T, ways @ forces(z)[:n]
+    if not (np.isfinite(D).all() and np.isfinite(pushes).all()):
+        return None
+    step = np.linalg.lstsq(D, pushes, rcond=1e-11)[0] @ ways
     size = np.max(np.abs(step) / np.maximum(1.0, np.abs(z[:n])), initial=0.0)
     if not 0 < size < np.inf:
         return None

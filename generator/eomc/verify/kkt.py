@@ -133,7 +133,7 @@ def least_along(D: Vector, A: Vector) -> float:
 
 
 def inert(D: Vector, A: Vector) -> bool:
-    """Whether D is negative along nothing that rows A leave; where these depend on others, too."""
+    """Whether D is negative along nothing that rows A leave; True where that can't be judged."""
     return not least_along(D, A) < -CLEAR
 
 

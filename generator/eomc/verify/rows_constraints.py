@@ -232,10 +232,10 @@ class Rows:
             run = simulate(self.module, s, t0=s.t, method=method, **how)
             for at in along(run, s)[1:]:  # of a run that stops early the rows up to there
                 far = np.abs([at.q - s.q, at.qd - s.qd])
-                if not np.all(far < FARTHEST * of.sampler.scale):  # as h is too long
+                if np.any(far >= FARTHEST * of.sampler.scale):  # as h is too long
                     break
                 errors += [self._off(at, "constraints"), self._off(at, "constraint_rates")]
-        return largest(errors, "no step is taken")
+        return largest(errors, "no step is taken, or all lead too far")
 
     def _off(self, s: State, name: str) -> float | None:
         A = np.abs(ask(self.module, "constraint_jacobian", s))

@@ -85,8 +85,8 @@ def _csrc(made: Steppers) -> Iterator[str]:
     if made.two_point:
         lanes += [("two", str(2 * size), False)]
     across = made.accelerations.across
-    angles = made.functions.several or (across and made.one.alone)
-    if across or angles:
+    angles = made.functions.several or across
+    if angles:
         lanes += [("four", str(4 * size), across)]
     if RK4 in made.methods and made.predicted:
         bytes_ahead = size * ahead_count(len(made.accelerations.angles))

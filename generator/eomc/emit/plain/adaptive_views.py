@@ -15,8 +15,9 @@ class AdaptiveTableau(Named):
 
     method: what C names begin with. powers: from accelerations at the stages, one a row, to their
     polynomial's powers. most: sweeps of a step; anew: steps by Newton's method, before sweeps alone
-    are tried again. of_most: of the largest coordinate and velocity, in the measures of all. still:
-    how many of the last coordinates jumps alone change; they have no scale.
+    are tried again. of_most, of_most_coarse: of the largest coordinate and velocity, in the
+    measures of all, and where rounding counts. still: how many of the last coordinates jumps alone
+    change; they have no scale.
     """
 
     method: str
@@ -27,6 +28,7 @@ class AdaptiveTableau(Named):
     eps: str
     tiny: str
     of_most: str
+    of_most_coarse: str
     still: int
     most: int
     c: tuple[str, ...]
