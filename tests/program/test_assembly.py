@@ -440,3 +440,51 @@ def test_what_moves_without_inertia_and_no_row_holds_is_named() -> None:
     made = replace(made, kinetic=made.coordinates[0].qd ** 2 / 2)
     assert "coordinates.v: v, w can move together without moving anything that has" in refusal(made)
     assert assembled(replace(made, kinetic=sum(c.qd**2 for c in made.coordinates[:2]))).closure
+
+
+STEEP = """eomc = 1
+name = "steep"
+[coordinates]
+x = {}
+y = { guess = true }
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+[constraints]
+diode = "exp(x/0.01) - exp(2*y/0.01)"
+"""
+SLOPING = """eomc = 1
+name = "sloping"
+gravity = [0, -9.81]
+[coordinates]
+x = { rate = 1.0 }
+s = { guess = true }
+[parameters]
+w = 0.0
+[[body]]
+name = "cart"
+mass = 1
+inertia = 1
+position = ["x", "w*x"]
+[[body]]
+name = "rod"
+mass = 1
+inertia = 1
+position = ["s", "0"]
+[[loop]]
+name = "pin"
+joint = "revolute"
+bodies = ["cart", "rod"]
+points = [[0, 0], [0, 0]]
+"""
+
+
+def test_a_row_that_is_far_steeper_elsewhere_has_a_slope() -> None:
+    """Beside a slope of e^100 its own was taken for rounding, and the scene was refused."""
+    closure = assembled(from_scene(parse(STEEP))).closure
+    assert closure is not None and closure.rank == 1 and not closure.redundant
+
+
+def test_a_row_that_is_level_at_these_parameters_alone_stays() -> None:
+    """It was left out for good, and nothing held it at others."""
+    rows = assembled(from_scene(parse(SLOPING))).constraints
+    assert [row.name for row in rows] == ["pin_x", "pin_y"]
