@@ -243,6 +243,7 @@ def test_rows_do_not_know_how_what_both_bodies_hang_from_moves(modules: Modules)
         assert heavy.reactions["pin"][:, :3] == pytest.approx(turned, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_rods_that_close_a_loop_may_have_no_mass(modules: Modules) -> None:
     """The crank of a four-bar swings as if it were alone; bodies without mass were refused."""
     crank, rods = STANDING.split('name = "coupler"')

@@ -85,6 +85,7 @@ def test_errors_of_angles_do_not_hide_behind_metres(
         assert np.max(np.abs(q - right)[:2]) < 10 * tol * 7e6
 
 
+@pytest.mark.slow
 def test_a_module_with_metres_beside_angles_passes_its_check(satellite: ModuleType) -> None:
     report = check(from_scene(parse(SATELLITE, "sizes.toml")), satellite, states=20)
     assert report.passed, report.table()
