@@ -319,11 +319,26 @@ class Refusals:
             # tanh and exp(-x) are finite at infinity, and what they multiply may vanish
             silent = math.isnan(what) and not found and self.matters(s, field, i)
             wrong += silent and not self.bounded(at)
+            if self.check.system.constraints:
+                wrong += not self.multiplied(at)
             for method in self.check.methods:
                 run = drive(self.model, method, at, self.check.system.run.h, 3)
                 wrong += run.done != 0 or run.status not in REFUSED
             wrong += self.model.has_slopes and not self.linearized(at)
         return float(wrong)
+
+    def multiplied(self, s: State) -> bool:
+        """Whether multipliers are finite, or were not written: nan in the place of each."""
+        model = self.model
+        found = np.zeros(len(model.constraint_names), model.dtype)
+        q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
+        u = None if s.u is None else np.array(s.u, model.dtype)
+        p = parameters(model, s)
+        model._lib.multipliers(
+            1, model._pointer(found), model._pointer(q), model._pointer(qd), s.t,
+            model._pointer(u), model._pointer(p),
+        )  # fmt: skip
+        return bool(np.all(np.isfinite(found)) or np.all(np.isnan(found)))
 
     def matters(self, s: State, field: str, i: int) -> bool:
         """Whether accelerations depend on a coordinate or velocity."""
