@@ -233,3 +233,17 @@ def test_a_linkage_comes_to_hang_from_where_its_forces_are_least(modules: Module
         four_bar.project(q + np.array([d, 0, 0]), [0, 0, 0], held=["q1"])[0] for d in (-0.01, 0.01)
     ]
     assert all(four_bar.potential_energy(x) > four_bar.potential_energy(q) for x in beside)
+
+
+def test_where_the_mass_has_no_value_there_is_none(modules: Modules) -> None:
+    """NumPy's error came out of the way downhill."""
+    text = """eomc = 1
+name = "no_mass_here"
+[coordinates]
+x = { start = 1 }
+[energy]
+kinetic = "log(x)*x_dot**2/2"
+potential = "x"
+"""
+    with pytest.raises(ArithmeticError, match=r"no equilibrium found from q = \[0\.\]"):
+        modules.of_text(text).equilibrium([0.0])

@@ -328,17 +328,17 @@ class Refusals:
         return float(wrong)
 
     def multiplied(self, s: State) -> bool:
-        """Whether multipliers are finite, or were not written: nan in the place of each."""
+        """Whether multipliers are finite, or refused by the C function: nan for each then."""
         model = self.model
         found = np.zeros(len(model.constraint_names), model.dtype)
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
         u = None if s.u is None else np.array(s.u, model.dtype)
         p = parameters(model, s)
-        model._lib.multipliers(
+        refused = model._lib.multipliers(
             1, model._pointer(found), model._pointer(q), model._pointer(qd), s.t,
             model._pointer(u), model._pointer(p),
         )  # fmt: skip
-        return bool(np.all(np.isfinite(found)) or np.all(np.isnan(found)))
+        return bool(np.all(np.isnan(found) if refused else np.isfinite(found)))
 
     def matters(self, s: State, field: str, i: int) -> bool:
         """Whether accelerations depend on a coordinate or velocity."""
