@@ -308,7 +308,7 @@ def _summary(
         "message": done.message,
         "method": done.method,
         "h": done.h,
-        "tolerance": getattr(done, "tol", None),
+        "tolerance": getattr(done, "tol", None) or None,  # 0: of fixed steps
         "steps": done.steps,
         "t": float(done.t[-1]),
         "q": dict(zip(module.coordinates, map(float, q), strict=True)),
@@ -360,13 +360,11 @@ def _print_summary(
         say(f"  event {name}: {len(times)} {'time' if len(times) == 1 else 'times'}{last}{over}")
     for name, part in summary["saturated"].items():
         say(f"  {name} beyond its limits, and so at them, in {max(part, 0.001):.1%} of the rows")
-    if module._model.events and summary["tolerance"] is None:
-        say("  fixed steps pass over the scene's events: leave out --h and --method")
     for words in (summary["beyond_stability"], summary["beyond_duration"], summary["remark"]):
         if words:
             say(f"  {words}")
     if done.error is not None:
-        _print_error(module, done.error, summary["tolerance"] is not None)
+        _print_error(module, done.error, done)
     speed = summary["steps_per_second"] or 0.0
     say(f"  {summary['seconds'] * 1e3:.3g} ms, {speed:.3g} steps a second")
     for file in summary["files"]:
@@ -388,14 +386,14 @@ def _print_energy(done: Run, balance: Balance | None, summary: Mapping[str, Any]
     say(f"  {name} {end:.9g} J{how}")
 
 
-def _print_error(module: Any, error: Estimate, adaptive: bool) -> None:
+def _print_error(module: Any, error: Estimate, done: Run) -> None:
     import math
 
     q, qd = float(error.q[-1].max()), float(error.qd[-1].max())
     seen = "only rounding seen" if math.isnan(error.observed) else f"seen: {error.observed:.1f}"
     how = f"in shorter steps; order {error.order}, {seen}"
-    if adaptive:
-        how = "with a hundredth of the tolerance"
+    if hasattr(done, "tol"):
+        how = "with a hundredth of the tolerance" if done.tol else "in steps a quarter as long"
     say(f"  error at the end about {q:.1g} in q, {qd:.1g} in qd (from the same run {how})")
     digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
     grown = f"; a difference at the start has become {error.amplification:.2g} times as large"

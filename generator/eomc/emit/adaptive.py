@@ -15,7 +15,7 @@ from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.c_names import Target
 from eomc.emit.coefficients import matrix, numbers, rounded
 from eomc.emit.functions import Functions
-from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun
+from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, FixedSteps
 from eomc.integrators.tableaux import GAUSS16, Row
 from eomc.model.corners import steep
 from eomc.model.system import System
@@ -44,7 +44,7 @@ def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
     vectors, few = (8, 25) if steep(system) else (6, 21)
     stages = METHOD.stages * len(system.coordinates)
-    more = 8 * len(system.events) + 6 * bool(system.events) + bool(system.constraints)
+    more = 8 * len(system.events) + 12 * bool(system.events) + bool(system.constraints)
     return vectors * width + stages + few + more
 
 
@@ -156,6 +156,27 @@ class Stepping:
         given = (state, self.number("z"), self.number("tol"), *self.rest)
         return c.static(f"{self.method}_inside", "void", *out, *given, self.held)
 
+    @property
+    def taken(self) -> Sequence[CArgument]:
+        """The rest, and what the public functions of steps take."""
+        rest = self.rest
+        there = {a.name for a in rest}
+        return [*rest, *(a for a in self.functions.usual("u", "p") if a.name not in there)]
+
+    @cached_property
+    def fixed(self) -> CFunction:
+        """The next step of fixed size."""
+        limits, status = map(self.number, ("t_end", "h_most")), self.functions.status
+        return c.static(f"{self.method}_fixed", status, self.state, *limits, *self.taken, self.held)
+
+    @cached_property
+    def at(self) -> CFunction:
+        """The state within the last step, where that may be of fixed size."""
+        if not self.functions.target.system.events:
+            return self.within
+        own = self.within.arguments[: -len(self.rest) - 1]
+        return c.static(f"{self.method}_at", "void", *own, *self.taken, self.held)
+
 
 def tableau(made: Stepping) -> dict[str, Any]:
     """The numbers that both texts of adaptive steps have, by the names of their views."""
@@ -230,6 +251,31 @@ def steps(made: Stepping) -> Adaptive:
     )
 
 
+def fixed(made: Stepping) -> FixedSteps:
+    """Steps of fixed size in which events are seen."""
+    functions = made.functions
+    target, real = functions.target, functions.target.real
+    at = {"q": "q_at", "qd": "qd_at"}
+    state = {name: c.member(made.state.name, name) for name in ("q", "qd")}
+    return FixedSteps(
+        **functions.names,
+        method=made.method,
+        extent=made.form.extent,
+        stages=METHOD.stages,
+        f=real.suffix,
+        eps=target.literal(real.epsilon),
+        fabs=f"fabs{real.function_suffix}",
+        timed=target.driven,
+        jumps="jumps" in target.program,
+        fixed=made.fixed,
+        at=made.at,
+        inside=made.within.call(),
+        step=functions.public.fixed_step.call(**at),
+        forces_before=made.forces.call(f="before", **state),
+        forces_behind=made.forces.call(f="behind", t="t + h", **at),
+    )
+
+
 def busy(system: System) -> int:
     """Events in one step, from which on it ends there."""
     return BUSY + sum(e.begins is not None for e in system.events)
@@ -281,11 +327,12 @@ def run(
         anew=ANEW,
         run=functions.public.adaptive(METHOD.name),
         advance=made.step.call(x="&x"),
+        fixed=made.fixed.call(x="&x") if happen else "",
         happen=happen,
         restart=restart,
         row=kept.call(q="x.q", qd="x.qd", **to),
         row_before=kept.call(q="q_at", qd="qd_at", **to),
-        look=made.within.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
+        look=made.at.call(q_at=row["q_rows"], qd_at=row["qd_rows"], x="&x"),
         project_row=projected(q=row["q_rows"], qd=row["qd_rows"], t="times[rows]"),
         project_restart=projected(q="x.q", qd="x.qd", t="x.t"),
     )

@@ -8,11 +8,11 @@ from math import cos, pi, prod
 from typing import Any
 
 from eomc.emit import c_function as c
-from eomc.emit.adaptive import BUSY, METHOD, Form, Stepping, busy, run, steps
+from eomc.emit.adaptive import BUSY, METHOD, Form, Stepping, busy, fixed, run, steps
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
-from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Begun, Events
+from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveRun, Begun, Events, FixedSteps
 from eomc.integrators.tableaux import Row
 from eomc.model.system import System
 from eomc.scene.schema import ACTIONS
@@ -58,13 +58,16 @@ def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
     return [tuple(integral(n, at) for n in range(count)) for at in x]
 
 
-def views(functions: Functions, form: Form) -> Iterator[Adaptive | Events | Begun | AdaptiveRun]:
-    """Adaptive steps, the events in them, and the loop over both."""
+def views(
+    functions: Functions, form: Form
+) -> Iterator[Adaptive | FixedSteps | Events | Begun | AdaptiveRun]:
+    """Adaptive steps, fixed ones and the events in them, and the loop over all."""
     made = Stepping(functions, form)
     yield steps(made)
     if not functions.target.system.events:
         yield run(made)
         return
+    yield fixed(made)
     found = _events(made)
     yield found
     here = {"x": "&x", "reached": "&reached", "q_at": "q_at", "qd_at": "qd_at"}
@@ -106,9 +109,8 @@ def _events(made: Stepping) -> Events:
     needed = {a.name for f in asked for a in f.arguments}
     values, number, k = asked[0], made.number, CArgument("int", "k")
     read = c.given(f"{method}_adaptive_state", "x")
-    # what the formulas take besides the state, and what steps do
+    # what the formulas take besides the state
     own = [a for a in functions.usual("u", "p") if a.name in needed]
-    rest = [*made.rest, *(a for a in own if a.name not in {b.name for b in made.rest})]
 
     looked = c.static(f"{method}_looked", "void", c.filled(real, "g"), read, number("z"), *own)
     ends = [number(name) for name in ("low", "high", "at_low", "at_high")]
@@ -120,7 +122,7 @@ def _events(made: Stepping) -> Events:
     )  # fmt: skip
     there = [c.filled(real, name) for name in ("reached", "q_at", "qd_at")]
     record = public.adaptive_events
-    arguments = (made.state, *there, number("tol"), *rest, *record, made.held)
+    arguments = (made.state, *there, number("tol"), *made.taken, *record, made.held)
     happened = c.static(f"{method}_happened", "int", *arguments)
     changed = c.static(f"{method}_changed", "int", made.state, *own)
     calls = [*asked, *([public.project] if made.form.project else ())]
@@ -161,7 +163,7 @@ def _events(made: Stepping) -> Events:
         cross=crossing.call(**{"k": "i", "from": "from[i]", "g": "g[i]", "noise": "noise[i]"}),
         look_before=looked.call(g="value", z=f"z - {target.literal(apart / 2)}"),
         look_behind=looked.call(g="value", z=f"z + {target.literal(apart / 2)}"),
-        inside=made.within.call(),
+        inside=made.at.call(),
         values_there=values.call(events="value", **within),
         values_end=values.call(events="value", **now),
         changed=changed,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from eomc.emit.c_function import CArgument, CFunction, filled, given
+from eomc.emit.c_function import CArgument, CFunction, filled, given, member
 from eomc.emit.c_names import Target
 from eomc.emit.evaluations import KINDS, extent, refuses, source, takes_qdd, takes_t
 
@@ -91,6 +91,16 @@ class Public:
     def step(self, method: str) -> CFunction:
         """One step in place."""
         return self._status(f"{method}_step", *self._moved, *self.usual("t", "h", "u", "p"))
+
+    @property
+    def fixed_step(self) -> CFunction:
+        """The same of any method, as what keeps an adaptive run has it."""
+        return replace(self.step("fixed"), name=member("memory", "step"))
+
+    @property
+    def fixed_type(self) -> CFunction:
+        """Its type."""
+        return self.step("fixed")
 
     def derivative(self, method: str) -> CFunction:
         """Phi and Gamma of one step, with a status."""

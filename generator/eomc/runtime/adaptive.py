@@ -68,7 +68,7 @@ class AdaptiveRun(Fitted):
         return run(
             self._model, q, qd, self.t0, end, self.tol, times,
             self._u if self._held is None else Periods(self._held, self._period),
-            self._params, self._h_most, None, self._stiff,
+            self._params, self._h_most, None, self._stiff, method=self._by,
         )  # fmt: skip
 
     @property
@@ -116,6 +116,24 @@ class AdaptiveRun(Fitted):
 
     def _estimated(self, progress: Callable[[int, int], None] | None) -> Estimate:
         return error_of(self, run, progress)
+
+
+class SteppedRun(AdaptiveRun):
+    """A run by fixed steps of a scene with events: a row after each step, two where it jumps.
+
+    A step ends where the state jumps, and a shorter one goes to the next multiple of h. events,
+    stopped, limit: as of an AdaptiveRun. evaluations: each call of an implicit method counts as one
+    of each stage.
+    """
+
+    @property
+    def told(self) -> str:
+        """What steps they were, in words."""
+        return f"h = {self.h:g} s"
+
+    def __repr__(self) -> str:
+        how = "" if self.status == "ok" else f"{self.status} after "
+        return f"<Run of {self._model.name}: {how}{self.steps} steps of {self.h:g} s>"
 
 
 def simulate(
@@ -194,13 +212,16 @@ def run(
     model: Stepping, q: Array, qd: Array, t0: float, t_end: float, tol: float, times: Array | None,
     u: Array | Periods | None, p: Array, h_most: float,
     progress: Callable[[int, int], None] | None, stiff: bool = False, enough: float = inf,
+    method: str = "",
 ) -> AdaptiveRun:  # fmt: skip
     """A run from checked arguments, whatever its status, not far beyond `enough` steps; times (n,)
-    later than t0."""
+    later than t0. method: of fixed steps of the size h_most."""
     (address, real, _), nq = model._c, model.nq
     work = model._ffi.new("adaptive_work *")
     if stiff:
         work.stiff = 1
+    if method:
+        work.fixed = 1 + model.methods.index(method)
     acting = Acting(model, u, t0, t_end, q, qd)
     at_p = model._at[2] if p is model._p0 else address(real, p)
     events = Found(model) if model.events else None
@@ -241,12 +262,16 @@ def run(
     steps = work.steps
     odd = events or model.constraint_names or nq * steps > _AT_ONCE
     model._room = 0 if odd else steps + _ROOM
-    made = AdaptiveRun(
-        model, t0, both, (work.t - t0) / steps if steps else t_end - t0, steps, said, p, 1,
-        acting.u, "gauss16", work.evaluations, tol=tol,
+    h = h_most if method else (work.t - t0) / steps if steps else t_end - t0
+    called = work.evaluations
+    if method:
+        called = 2 * steps + model._facts[method][1] * called
+    made = (SteppedRun if method else AdaptiveRun)(
+        model, t0, both, h, steps, said, p, 1, acting.u, method or "gauss16",
+        called, tol=tol,
         rejected=work.rejected, stiff_steps=work.stiff_steps, _times=stamps, _t_end=t_end,
     )  # fmt: skip
-    made._h_most, made._stiff = h_most, bool(stiff)
+    made._h_most, made._stiff, made._by = h_most, bool(stiff), method
     if times is not None:
         made._begin = np.array([q, qd])
     if acting.periods:

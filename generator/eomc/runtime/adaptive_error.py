@@ -54,7 +54,7 @@ def error_of(
         if len(kept):
             made = run(
                 model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], u,
-                own._params, h_most, progress, own._stiff, steps,
+                own._params, h_most, progress, own._stiff, steps, own._by,
             )  # fmt: skip
             if made.status == "interrupted":
                 raise KeyboardInterrupt
@@ -98,14 +98,18 @@ def error_of(
     names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
     end, right = (dict(zip(names, map(float, x), strict=True)) for x in (error[-1], digits))
     return Estimate(
-        error[:, : model.nq], error[:, model.nq :], end, right, ORDER, float("nan"),
+        error[:, : model.nq], error[:, model.nq :], end, right,
+        model.orders[own._by] if own._by else ORDER, float("nan"),
         amplification, _verdict(own, left / scale, rounding / scale, amplification),
     )  # fmt: skip
 
 
 def _finer(own: Fitted, least: float) -> tuple[float, float]:
     """Tolerance and longest step of a run to compare with: in other steps where there is no smaller
-    tolerance too, as rounding differs, and what comes and goes between two nodes shows."""
+    tolerance too, as rounding differs, and what comes and goes between two nodes shows. Of fixed
+    steps a quarter of their size."""
+    if own._by:
+        return own.tol, own.h / 4
     tol = max(own.tol / _FINER, least) if own.tol >= 2 * least else 4 * least
     longest = (own.h / 2, float(np.ptp(own.t)) / _LEAST, own._h_most)
     return tol, min((h for h in longest if h > 0), default=0.0)

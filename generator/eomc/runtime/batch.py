@@ -26,7 +26,8 @@ from .arguments import (
 from .batch_instances import Instances
 from .batch_run import BatchRun
 from .batch_work import WORTH, Work
-from .model import RARELY, SOME
+from .facts import SOME
+from .model import RARELY
 from .shown import with_events
 from .status import Interrupted
 from .timed import as_asked

@@ -14,9 +14,9 @@ from .arguments import Array
 from .batch_plot import Fans, alone
 from .batch_values import Values
 from .batch_work import Way
+from .by_name import ByName
 from .columns import Columns
 from .dense import parts, within
-from .happened import PassedOver
 from .model import Model
 from .package import reduced
 from .status import STATUS
@@ -136,8 +136,8 @@ class BatchRun(Values, Fans, Columns):
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """What adaptive steps find by the scene's events; fixed steps pass over them: empty."""
-        return PassedOver(self._model.events)
+        """Where and when each event happened, by its name; of scenes without events none."""
+        return ByName("events", (), ())
 
     def _kept(self) -> dict[str, Any]:
         """What a saved run keeps of it besides its columns; None: nothing."""

@@ -11,6 +11,7 @@ from .statics import Statics
 
 _MANY = 1000  # steps from which a run is not taken in one call
 CHUNK = 16_384  # steps times coordinates before the first look, some ms
+SOME = 20  # steps from which a look at the stability limit is worth its time, once a method and h
 
 
 class Facts(Statics):
@@ -33,6 +34,7 @@ class Facts(Statics):
         self._loops = {name: self._loop(name, stages) for name, (_, stages, *_) in methods.items()}
         self._warned: set[Any] = set()  # methods with a step size, and u
         self._room = 0  # for the steps of an adaptive run
+        self._passes_over = False  # whether fixed steps see no events, as `check` needs them
 
     @property
     def orders(self) -> dict[str, int]:

@@ -43,6 +43,7 @@ class Fitted(Run):
     _t_end: float = field(kw_only=True)
     # what few runs have is set behind: a run of few steps takes no longer than its making
     _h_most: float = field(default=0.0, init=False)
+    _by: str = field(default="", init=False)  # the method of fixed steps
     _stiff: bool = field(default=False, init=False)
     _happened: tuple[Array, Array] = field(default=_NONE, init=False)  # which, rows of t, q, qd
     stopped: str = field(default="", init=False)
@@ -74,7 +75,8 @@ class Fitted(Run):
                 f"run ends, after {done}"
             )
         remedy = REMEDIES[bool(self._model._rows.modes)]
-        said = STOPPED.format(remedy) if self.status == "no convergence" else SAID[self.status]
+        short = self.status == "no convergence" and not self._by
+        said = STOPPED.format(remedy) if short else SAID[self.status]
         said = infinite_at_start(self) or said
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
@@ -123,7 +125,7 @@ class Fitted(Run):
             "times": self.t, "h_most": self._h_most, "stiff": self._stiff, "begin": self._begin,
             "t_end": self._t_end, "which": self._happened[0],
             "event_rows": self._happened[1], "stopped": self.stopped, "limit": self.limit,
-            "period": self._period, "values": self._held,
+            "period": self._period, "values": self._held, "by": self._by,
         }  # fmt: skip
         return super()._kept() | own
 
@@ -138,6 +140,7 @@ class Fitted(Run):
             _times=kept["times"], _t_end=kept["t_end"],
         )  # fmt: skip
         made._h_most, made._stiff = kept["h_most"], bool(kept.get("stiff", False))
+        made._by = kept.get("by", "")
         made._begin, made._happened = kept["begin"], (kept["which"], kept["event_rows"])
         made.stopped, made.limit = kept["stopped"], kept["limit"]
         made._period, made._held = kept.get("period", 0.0), values

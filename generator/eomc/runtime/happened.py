@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import index
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
-from .arguments import Array, in_a_line, not_one_of
+from .arguments import Array
 from .facts import Facts
 
-INSTEAD = "give tol=, not h, steps or method"
 _EVENTS, _EVENTS_EACH = 1024, 64  # of one call, beside those of a step: of one, of each of many
 
 
@@ -59,30 +57,6 @@ class HappenedInBatch(Happened):
     def __repr__(self) -> str:
         many = f", in {len(np.unique(self.instance))} of {self._batch} instances"
         return f"<{self._times}{many if len(self) else ''}>"
-
-
-class PassedOver(dict[str, Happened]):
-    """What fixed steps have of events: none."""
-
-    def __init__(self, names: Sequence[str]) -> None:
-        super().__init__()
-        self.names = names
-
-    def __missing__(self, name: object) -> NoReturn:
-        if name in self.names:
-            raise KeyError(f"events: fixed steps pass over '{name}': {INSTEAD}")
-        raise KeyError(not_one_of("events", str(name), self.names))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return dict, ()
-
-
-def passed_over(model: Facts) -> str:
-    """What to say of fixed steps of a scene with events."""
-    sticks = "; friction that sticks is made of them" if model._rows.modes else ""
-    law = "; a function as u then takes control_period=" if model.nu else ""
-    start = "fixed steps pass over events, "
-    return f"{in_a_line(start, model.events, '')}{sticks}: {INSTEAD}{law}"
 
 
 class FoundInBatch:

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from .arguments import Array
+from .facts import Facts
 from .functions import Functions
+from .package import warn
 
 
 def asked(
@@ -28,6 +30,16 @@ def asked(
     if found is None:
         raise ValueError("u: the function returned None, not the inputs")
     return np.array(found)
+
+
+def called_each_step(model: Facts) -> None:
+    """Warn, once, that a function as u is slow."""
+    if "u" not in model._warned:
+        model._warned.add("u")
+        warn(
+            f"{model.name}: u is a Python function, called before each step: some hundred times "
+            "slower than a table (steps, nu) or the scene's own signal"
+        )
 
 
 class Law:

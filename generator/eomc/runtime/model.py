@@ -15,7 +15,7 @@ import numpy as np
 from numpy import empty
 from numpy.typing import ArrayLike
 
-from . import adaptive, saved, timed
+from . import adaptive, saved, stepped, timed
 from .adaptive_arguments import as_progress, fits
 from .arguments import (
     Array,
@@ -28,8 +28,8 @@ from .arguments import (
     machine_memory,
 )
 from .discretize import discretize
-from .facts import CHUNK
-from .laws import Law, Sampled
+from .facts import CHUNK, SOME
+from .laws import Law, Sampled, called_each_step
 from .package import warn
 from .shown import with_events
 from .slices import longer
@@ -42,7 +42,6 @@ from .written import File
 
 Inputs = ArrayLike | Mapping[str, ArrayLike] | Callable[[float, Array, Array], ArrayLike] | None
 
-SOME = 20  # steps from which a look at the stability limit is worth its time, once a method and h
 LARGE = 2**24  # positions from which a look at the memory is worth its time
 RARELY = 2**48  # steps from row to row, more than any run makes
 
@@ -67,7 +66,8 @@ class Model(Stepping):
     @property
     def _kinds(self) -> dict[str, Any]:
         """The classes of its runs by their names."""
-        return {x.__name__: x for x in (Run, timed.TimedRun, adaptive.AdaptiveRun)}
+        kinds = (Run, timed.TimedRun, adaptive.AdaptiveRun, adaptive.SteppedRun)
+        return {x.__name__: x for x in kinds}
 
     def discretize(
         self, q: ArrayLike, qd: ArrayLike, h: float | None = None, t: float = 0.0, u: Any = None,
@@ -132,6 +132,12 @@ class Model(Stepping):
                 control_period, (h, steps, method, every, out),
             )  # fmt: skip
             return self._finished(fitted, estimate)
+        if self.events and not self._passes_over:
+            seen = stepped.simulate(
+                self, q0, qd0, h, duration, steps, every, u, params, method, t0, progress, times,
+                control_period, out, self._look,
+            )  # fmt: skip
+            return self._finished(seen, estimate)
         method = self.methods[0] if method is None else self._method(method)
         (q, qd), (from_q, from_qd, at_p), p = self._start, self._at, self._p0
         if q0 is not None:
@@ -289,12 +295,8 @@ class Model(Stepping):
         if not self.nu:
             raise ValueError("u: this scene has no inputs")
         if callable(u):
-            if "u" not in self._warned and hold == 1:
-                self._warned.add("u")
-                warn(
-                    f"{self.name}: u is a Python function, called before each step: some hundred "
-                    "times slower than a table (steps, nu) or the scene's own signal"
-                )
+            if hold == 1:
+                called_each_step(self)
             return Law(u, self._inputs, every, hold), None, 0
         if isinstance(u, Mapping):
             u = self._by_name(u)

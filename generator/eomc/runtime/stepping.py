@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, as_count, as_number, as_step_size
 from .facts import Facts
-from .happened import passed_over
 from .package import warn
 from .stability import beyond_end
 from .status import SAID, STATUS, MotionError, state_text
@@ -28,8 +27,8 @@ class Stepping(Facts):
     ) -> tuple[Array, Array]:  # fmt: skip
         """(q, qd) one step of size h later; u, (nu,) or a dict, is held over the step.
 
-        u None: the scene's signals, followed through the step. Raises MotionError where the step
-        can't be made; `out` is untouched then.
+        u None: the scene's signals, followed through the step. Events are not seen. Raises
+        MotionError where the step can't be made; `out` is untouched then.
         """
         from_q, from_qd, at, moving = self._read(q, qd, many=False)
         h = self.h if h is None else as_step_size(h, self.dtype)
@@ -51,11 +50,8 @@ class Stepping(Facts):
         return ends
 
     def _steps(self, h: float, duration: float | None, steps: int | None) -> int:
-        """So many fixed steps; warns, once, that they pass over events."""
+        """So many fixed steps."""
         steps = None if steps is None else as_count(steps, "steps", 0)
-        if self.events and steps != 0 and "events" not in self._warned:
-            self._warned.add("events")
-            warn(f"{self.name}: {passed_over(self)}")
         if steps is not None:
             if duration is not None:
                 raise ValueError("steps: give steps or duration, not both")

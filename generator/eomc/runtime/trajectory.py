@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from .arguments import Array
 from .balance import Balance, balance
 from .begun import infinite_at_start
+from .by_name import ByName
 from .dense import states
 from .estimate import Estimate, estimate
-from .happened import PassedOver
 from .laws import asked
 from .notebook import html
 from .package import warn
@@ -56,12 +56,12 @@ class Run(Recorded):
         """
         return states(self, t)
 
-    stopped = ""  # by which event; fixed steps pass over them
+    stopped = ""  # by which event
 
     @property
     def events(self) -> Mapping[str, Any]:
-        """What adaptive steps find by the scene's events; fixed steps pass over them: empty."""
-        return PassedOver(self._model.events)
+        """Where and when each event happened, by its name; of scenes without events none."""
+        return ByName("events", (), ())
 
     def balance(self) -> Balance | None:
         """What inputs and forces put in and what was lost, J, and the error that this leaves.

@@ -60,7 +60,7 @@ def check(
             rows_constraints.report(made)
         compiled = hasattr(module, "_model")
         if compiled:  # what is compiled has several ways to one answer
-            module._model._warned.add("events")  # which fixed steps are to pass over here
+            module._model._passes_over = True
             compiled_rows(made)
         scene = system.scene
         if scene is not None and scene.assembly is not None:

@@ -90,6 +90,32 @@ class Adaptive(AdaptiveTableau):
 
 
 @dataclass(frozen=True)
+class FixedSteps(Named):
+    """c/fixed_steps.c.jinja: steps of fixed size of a scene with events, and calls in them.
+
+    fixed, at: the next step, and the state within the last one; step: the call of the method's own,
+    through a pointer; inside: that of the state within an adaptive step; forces_before,
+    forces_behind: of the accelerations at both ends.
+    """
+
+    TEMPLATE: ClassVar[str] = "c/fixed_steps.c"
+    method: str
+    extent: str
+    stages: int
+    f: str
+    eps: str
+    fabs: str
+    timed: bool
+    jumps: bool
+    fixed: CFunction
+    at: CFunction
+    inside: str
+    step: str
+    forces_before: str
+    forces_behind: str
+
+
+@dataclass(frozen=True)
 class Events(Named):
     """c/events.c.jinja: functions that find events in an adaptive step, and calls in them.
 
@@ -178,6 +204,7 @@ class AdaptiveRun(Named):
     anew: int
     run: CFunction
     advance: str
+    fixed: str
     happen: str
     restart: str
     row: str

@@ -122,6 +122,7 @@ def header(
             plain.public.adaptive(adaptive.METHOD.name),
             plain.public.adaptive_batch(adaptive.METHOD.name) if s.run.batch else None,
             adaptive.together(target),
+            plain.public.fixed_type if s.events else None,
         ) if s.run.tolerance else None,
         busy=adaptive.busy(s),
     )  # fmt: skip

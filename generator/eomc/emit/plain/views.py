@@ -7,7 +7,14 @@ from typing import ClassVar
 
 from eomc.base.texts import FreeText
 from eomc.emit.c_function import CFunction
-from eomc.emit.plain.adaptive_views import Adaptive, AdaptiveBatch, AdaptiveRun, Begun, Events
+from eomc.emit.plain.adaptive_views import (
+    Adaptive,
+    AdaptiveBatch,
+    AdaptiveRun,
+    Begun,
+    Events,
+    FixedSteps,
+)
 from eomc.emit.plain.constraint_views import Project, Projection
 from eomc.emit.plain.parts import Computed, Named, Tableau
 
@@ -50,7 +57,8 @@ class Declared:
 class AdaptiveDeclared:
     """Adaptive steps in the header. memory: the type of what they keep, kept numbers of it.
 
-    together: whether the fast form has many side by side.
+    together: whether the fast form has many side by side. fixed: the type of fixed steps in which
+    events are seen, where there are events.
     """
 
     title: str
@@ -59,6 +67,7 @@ class AdaptiveDeclared:
     run: CFunction
     batch: CFunction | None
     together: bool
+    fixed: CFunction | None
 
 
 @dataclass(frozen=True)
@@ -292,5 +301,5 @@ class Loop(Named):
 
 View = (
     Header | Source | Slopes | Projection | Project | Derivative | RungeKutta4 | Explicit | Implicit
-    | Gauss | Nodes | Adaptive | Events | Begun | AdaptiveRun | AdaptiveBatch | Loop
+    | Gauss | Nodes | Adaptive | FixedSteps | Events | Begun | AdaptiveRun | AdaptiveBatch | Loop
 )  # fmt: skip

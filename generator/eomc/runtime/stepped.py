@@ -1,0 +1,78 @@
+"""Runs by fixed steps of a scene with events, which are seen in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from . import adaptive
+from .adaptive import SteppedRun
+from .adaptive_arguments import as_times
+from .arguments import Array, as_count, as_number, as_period, as_step_size
+from .facts import SOME
+from .laws import called_each_step
+from .periods import as_acting
+from .stepping import Stepping
+
+
+def simulate(
+    model: Stepping, q0: ArrayLike | None, qd0: ArrayLike | None, h: float | None,
+    duration: float | None, steps: int | None, every: int, u: Any, params: Any,
+    method: str | None, t0: float, progress: Callable[[int, int], None] | None,
+    times: ArrayLike | None, control_period: float | None, out: Any,
+    look: Callable[..., None],
+) -> SteppedRun:  # fmt: skip
+    """`Model.simulate` by fixed steps where there are events; look: warns of an h too large."""
+    if out is not None:
+        raise ValueError("out: events add rows, and no one knows how many: leave it out")
+    q, qd = model._start
+    if q0 is not None or qd0 is not None:
+        q, qd = model._one(q if q0 is None else q0, qd if qd0 is None else qd0)
+    method, t0 = model._method(method), as_number(t0, "t0")
+    h = model.h if h is None else as_step_size(h, model.dtype)
+    p = model._p0 if params is None else model._parameters(params).copy()
+    rows, end = as_rows(model, times, t0, h, duration, steps, every)
+    hold = as_hold(u, control_period, h)
+    if callable(u) and hold == h:
+        called_each_step(model)
+    held = as_acting(model, u, hold, end - t0, params)
+    if end - t0 >= SOME * h and (method, h) not in model._warned:
+        look(q, qd, h, t0, held if isinstance(held, np.ndarray) else None, p, method)
+    first = 0 if rows is None else int(rows[0] == t0)
+    asked = None if rows is None else rows[first:]
+    found = adaptive.run(model, q, qd, t0, end, 0.0, asked, held, p, h, progress, method=method)
+    assert isinstance(found, SteppedRun)
+    if rows is not None and first:
+        both = np.concatenate([np.array([[q], [qd]]), found._rows], axis=1)
+        return found._at(rows[: both.shape[1]], both)
+    return found
+
+
+def as_rows(
+    model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
+    steps: int | None, every: int,
+) -> tuple[Array | None, float]:  # fmt: skip
+    """The times of the rows, of all steps where None, and the end of the run."""
+    every = as_count(every, "every", 1)
+    if times is not None:
+        if steps is not None or every != 1:
+            name = "every" if steps is None else "steps"
+            raise ValueError(f"{name}: times say where rows are; give one or the other")
+        found = as_times(times, t0, model.dtype, duration)
+        return found, float(found[-1])
+    count = model._steps(h, duration, steps)
+    end = float(model.dtype.type(t0 + count * h))
+    if every == 1:
+        return None, end
+    kept = (t0 + h * np.arange(0, count, every)).astype(model.dtype)
+    return np.append(kept, model.dtype.type(end)), end
+
+
+def as_hold(u: Any, control_period: float | None, h: float) -> float | None:
+    """Over what time inputs are held, whole steps; None where they follow signals."""
+    if u is None and control_period is None:
+        return None
+    return as_period(control_period, h) * h
