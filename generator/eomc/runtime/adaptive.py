@@ -138,8 +138,8 @@ class SteppedRun(AdaptiveRun):
 
 def simulate(
     model: Stepping, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
-    params: Any, t0: float, progress: Callable[[int, int], None] | None, tol: float | None,
-    times: ArrayLike | None, h_most: float | None, stiff: bool, control_period: float | None,
+    params: Any, t0: float, progress: Callable[[int, int], None] | None, times: ArrayLike | None,
+    control_period: float | None, tol: float | None, h_most: float | None, stiff: bool,
     fixed: tuple[Any, ...],
 ) -> AdaptiveRun:  # fmt: skip
     """`Model.simulate` with a tolerance; fixed: the values of FIXED."""

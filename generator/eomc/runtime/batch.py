@@ -75,6 +75,14 @@ class BatchModel(Instances):
             if not whole:
                 raise Interrupted(fitted)
             return fitted
+        if self.events and not self._passes_over:
+            seen, whole = batch_adaptive.stepped(
+                self, q0, qd0, h, duration, steps, every, params, u, threads, method, t0, progress,
+                times, control_period,
+            )  # fmt: skip
+            if not whole:
+                raise Interrupted(seen)
+            return seen
         step = self._stepper(method, "batch")
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         at = None

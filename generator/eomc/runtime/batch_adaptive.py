@@ -18,18 +18,20 @@ from .batch_instances import Instances
 from .batch_run import BatchRun, stuck
 from .batch_work import all_of, as_threads
 from .by_name import ByName
+from .facts import SOME
 from .happened import FoundInBatch, HappenedInBatch
 from .package import reduced
 from .periods import end_of, held_at, periods_in
 from .slices import longer
 from .status import FULL, STATUS
+from .stepped import as_hold, as_rows
 
 _GROUP, _FEWEST = 128, 16  # instances that a thread takes at once, of many and of few
 _COUNTED = ("steps", "evaluations", "rejected", "stiff_steps")
 _FEW = 64  # steps of an instance before the first look at Ctrl-C
 _NAMES = (
     "tol", "evaluations", "rejected", "stiff_steps", "reached", "_times", "_begin", "_h_most",
-    "_stiff", "_period",
+    "_stiff", "_period", "_by",
 )  # fmt: skip
 _HAPPENED = ("event_instances", "which", "event_rows")  # in what is kept of a run
 _ENDS = np.array([*STATUS, "interrupted", FULL])
@@ -37,9 +39,10 @@ _ENDS = np.array([*STATUS, "interrupted", FULL])
 
 @dataclass(eq=False, repr=False)
 class AdaptiveBatchRun(BatchRun):
-    """Trajectories by steps that fit `tol`, rows at the same times for all.
+    """Trajectories by steps that fit `tol`, or fixed ones in which events are seen.
 
-    evaluations, rejected, stiff_steps: of each instance, (batch,). reached: the time to which each
+    Rows are at the same times for all. evaluations, rejected, stiff_steps: of each instance,
+    (batch,). reached: the time to which each
     has come, (batch,), s; rows behind it are nan, as where an event stops an instance. events: by
     name where and when each happened, t, q, qd, instance, of all instances one after the other.
     Everything else as in a BatchRun.
@@ -55,6 +58,7 @@ class AdaptiveBatchRun(BatchRun):
     _h_most: float = field(kw_only=True)
     _stiff: bool = field(kw_only=True)
     _period: float = field(default=0.0, kw_only=True)  # over which a row of _u is held, if any is
+    _by: str = field(default="", kw_only=True)  # the method of fixed steps
     _happened: tuple[Array, Array, Array] | None = field(default=None, kw_only=True)
     _stopped: Array | None = field(default=None, kw_only=True)  # 1 + which event, or 0
     _limit: Array | None = field(default=None, kw_only=True)
@@ -88,7 +92,7 @@ class AdaptiveBatchRun(BatchRun):
         held = self._held if self._u is None else self._u
         work = _Work(
             model, self._begin.copy(), self.t0, times.astype(model.dtype), limits,
-            (held, self._period), p, self._stiff,
+            (held, self._period), p, self._stiff, self._by,
         )  # fmt: skip
         work.leave(stuck(self))
         if len(times) and not work.run(None, None):
@@ -115,7 +119,8 @@ class AdaptiveBatchRun(BatchRun):
         names, counts = np.unique(self.stopped, return_counts=True)
         ends = zip(counts, names, strict=True)
         stops = "".join(f", {c} stopped by '{n}'" for c, n in ends if n)
-        return f"{len(self)} instances, {done} steps, tolerance {self.tol:g}: {found}{stops}"
+        how = f" of {self.h:g} s" if self._by else f", tolerance {self.tol:g}"
+        return f"{len(self)} instances, {done} steps{how}: {found}{stops}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("batch_adaptive.AdaptiveBatchRun._of_kept", self._model, self._kept())
@@ -156,30 +161,66 @@ def simulate(
         end = as_end(model, t0, duration)
         times, duration = [t0, end] if end > t0 else [t0], None
     rows = as_times(times, t0, model.dtype, duration)
-    no_signals(model, u, control_period)
-    span, period, count = float(rows[-1]) - t0, 0.0, None
+    period = 0.0
     if control_period is not None:
         period = as_step_size(control_period, model.dtype, "control_period")
-        count = periods_in(span, period)
+    return _run(model, q0, qd0, params, u, threads, t0, progress, tol, rows, most, stiff, period)
+
+
+def stepped(
+    model: Instances, q0: ArrayLike | None, qd0: ArrayLike | None, h: float | None,
+    duration: float | None, steps: int | None, every: int, params: Any, u: ArrayLike | None,
+    threads: int | None, method: str | None, t0: float,
+    progress: Callable[[int, int], None] | None, times: ArrayLike | None,
+    control_period: float | None,
+) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
+    """The same by fixed steps where there are events, which are seen in them."""
+    h = model.h if h is None else as_step_size(h, model.dtype)
+    method, t0 = model._method(method), as_number(t0, "t0")
+    rows, _ = as_rows(model, times, t0, h, duration, steps, every, listed=True)
+    period = as_hold(u, control_period, h) or 0.0
+    return _run(
+        model, q0, qd0, params, u, threads, t0, progress, 0.0, rows, h, False, period, method
+    )
+
+
+def _run(
+    model: Instances, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any,
+    u: ArrayLike | None, threads: int | None, t0: float,
+    progress: Callable[[int, int], None] | None, tol: float, rows: Any, most: float,
+    stiff: bool, period: float, method: str = "",
+) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
+    """From checked arguments. period: over which rows of u are held; 0: none is given.
+
+    method: of fixed steps of the size `most`.
+    """
+    no_signals(model, u, period or None)
+    span = float(rows[-1]) - t0
+    count = periods_in(span, period) if period else None
     starts, table, held, codes = model._instances(q0, qd0, params, u, count, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))
     begin = np.array([q, qd])
     limits, over = (float(rows[-1]), tol, most), held is not None and held.shape[1] > 1
-    work = _Work(model, begin.copy(), t0, rows, limits, (held, period), table, stiff)
+    if method and span >= SOME * most and (method, most) not in model._warned:
+        first = None if held is None else held[0, 0]
+        model._look(q[0], qd[0], most, t0, first, table[0], method, "the first instance: ")
+    work = _Work(model, begin.copy(), t0, rows, limits, (held, period), table, stiff, method)
     work.leave(codes)
     whole = work.run(threads, progress)
     counts = work.counts
     cut = len(STATUS) + int(work.full)
     codes = np.where((work.status == 0) & work.open, cut, work.status).astype("i")
     given = None if held is None else held_at(rows, t0, period, held) if over else held.copy()
+    h, called = span / max(1.0, float(counts["steps"].mean())), counts["evaluations"]
+    if method:
+        h, called = most, 2 * counts["steps"] + model._facts[method][1] * called
     made = AdaptiveBatchRun(
-        model, t0, work.rows[0], work.rows[1], span / max(1.0, float(counts["steps"].mean())),
-        counts["steps"], codes, 1, 0, table.copy(), given, "gauss16",
-        held.copy() if held is not None and over else None, tol=tol,
-        evaluations=counts["evaluations"], rejected=counts["rejected"],
+        model, t0, work.rows[0], work.rows[1], h, counts["steps"], codes, 1, 0, table.copy(), given,
+        method or "gauss16", held.copy() if held is not None and over else None, tol=tol,
+        evaluations=called, rejected=counts["rejected"],
         stiff_steps=counts["stiff_steps"],
         reached=work.t, _times=rows, _begin=begin, _h_most=most, _stiff=bool(stiff),
-        _period=period,
+        _period=period, _by=method,
     )  # fmt: skip
     if work.events:
         made._happened = work.events.all()
@@ -201,9 +242,12 @@ class _Work:
     def __init__(
         self, model: Instances, begin: Array, t0: float, times: Array,
         limits: tuple[float, float, float], inputs: tuple[Array | None, float], table: Array,
-        stiff: bool,
+        stiff: bool, method: str,
     ) -> None:  # fmt: skip
-        """limits: the end, tolerance, h_most; inputs: (batch or 1, periods or 1, nu), a period."""
+        """limits: the end, tolerance, h_most; inputs: (batch or 1, periods or 1, nu), a period.
+
+        method: of fixed steps.
+        """
         self.model, (self.q, self.qd), self.times = model, begin, times
         (self.held, self.period), self.table, self.limits = inputs, table, limits
         (count, _), n = self.q.shape, len(times)
@@ -213,6 +257,8 @@ class _Work:
         self.memory = model._ffi.new("adaptive_memory[]", count)
         for memory in self.memory if stiff else ():
             memory.stiff = 1
+        if method:
+            model._lib.adaptive_fixed(count, self.memory, 1 + model.methods.index(method))
         self.open, self.stop, self.ended = np.ones(count, bool), False, 0
         self.events = FoundInBatch(model, room_for(model) - count * n) if model.events else None
         if times[0] == t0:

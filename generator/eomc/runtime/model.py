@@ -114,10 +114,8 @@ class Model(Stepping):
             return cast(Run, other.simulate(**given))
         if params is not None and self._follows:
             q0, qd0 = started(self, q0, qd0, self._parameters(params))
-        usual = (
-            out is None and progress is None and control_period is None and not estimate
-            and times is None and type(t0) is float and isfinite(t0)
-        )  # fmt: skip
+        usual = (out is None and progress is None and control_period is None and not estimate
+                 and times is None and type(t0) is float and isfinite(t0))  # fmt: skip
         if (
             usual and (room := self._room) and h is None and steps is None and method is None
             and h_most is None and every == 1 and stiff is False
@@ -126,18 +124,14 @@ class Model(Stepping):
             return r
         estimate, progress = as_flag(estimate, "estimate"), as_progress(progress)
         q0, qd0 = self._assembled(q0, qd0, t0, params)
-        if fits(self, h, steps, method, tol, h_most, stiff):
-            fitted = adaptive.simulate(
-                self, q0, qd0, duration, u, params, t0, progress, tol, times, h_most, stiff,
-                control_period, (h, steps, method, every, out),
-            )  # fmt: skip
-            return self._finished(fitted, estimate)
-        if self.events and not self._passes_over:
-            seen = stepped.simulate(
-                self, q0, qd0, h, duration, steps, every, u, params, method, t0, progress, times,
-                control_period, out, self._look,
-            )  # fmt: skip
-            return self._finished(seen, estimate)
+        by_tol = fits(self, h, steps, method, tol, h_most, stiff)
+        if by_tol or (self.events and not self._passes_over):
+            given = q0, qd0, duration, u, params, t0, progress, times, control_period
+            fixed = h, steps, method, every, out
+            if not by_tol:
+                return self._finished(stepped.simulate(self, *given, fixed, self._look), estimate)
+            made = adaptive.simulate(self, *given, tol, h_most, stiff, fixed)
+            return self._finished(made, estimate)
         method = self.methods[0] if method is None else self._method(method)
         (q, qd), (from_q, from_qd, at_p), p = self._start, self._at, self._p0
         if q0 is not None:

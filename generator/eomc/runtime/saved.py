@@ -16,7 +16,15 @@ from .facts import Facts
 from .shown import eventful
 from .written import File, replacing
 
-KINDS = ("Run", "AdaptiveRun", "TimedRun", "BatchRun", "TimedBatchRun", "AdaptiveBatchRun")
+KINDS = (
+    "Run",
+    "AdaptiveRun",
+    "SteppedRun",
+    "TimedRun",
+    "BatchRun",
+    "TimedBatchRun",
+    "AdaptiveBatchRun",
+)
 _WRITTEN = 'load_run reads what run.save("NAME.npz") wrote'
 _KIND = "eomc {} 1"  # and the version of what such a file holds
 

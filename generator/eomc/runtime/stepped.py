@@ -19,13 +19,15 @@ from .stepping import Stepping
 
 
 def simulate(
-    model: Stepping, q0: ArrayLike | None, qd0: ArrayLike | None, h: float | None,
-    duration: float | None, steps: int | None, every: int, u: Any, params: Any,
-    method: str | None, t0: float, progress: Callable[[int, int], None] | None,
-    times: ArrayLike | None, control_period: float | None, out: Any,
-    look: Callable[..., None],
+    model: Stepping, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
+    params: Any, t0: float, progress: Callable[[int, int], None] | None, times: ArrayLike | None,
+    control_period: float | None, fixed: tuple[Any, ...], look: Callable[..., None],
 ) -> SteppedRun:  # fmt: skip
-    """`Model.simulate` by fixed steps where there are events; look: warns of an h too large."""
+    """`Model.simulate` by fixed steps where there are events; fixed: the values of FIXED.
+
+    look: warns of an h too large.
+    """
+    h, steps, method, every, out = fixed
     if out is not None:
         raise ValueError("out: events add rows, and no one knows how many: leave it out")
     q, qd = model._start
@@ -53,9 +55,9 @@ def simulate(
 
 def as_rows(
     model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
-    steps: int | None, every: int,
+    steps: int | None, every: int, *, listed: bool = False,
 ) -> tuple[Array | None, float]:  # fmt: skip
-    """The times of the rows, of all steps where None, and the end of the run."""
+    """The times of the rows, None after each step where they need not be listed, and the end."""
     every = as_count(every, "every", 1)
     if times is not None:
         if steps is not None or every != 1:
@@ -65,7 +67,7 @@ def as_rows(
         return found, float(found[-1])
     count = model._steps(h, duration, steps)
     end = float(model.dtype.type(t0 + count * h))
-    if every == 1:
+    if every == 1 and not listed:
         return None, end
     kept = (t0 + h * np.arange(0, count, every)).astype(model.dtype)
     return np.append(kept, model.dtype.type(end)), end
