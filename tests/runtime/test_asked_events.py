@@ -73,10 +73,10 @@ def test_they_stand_beside_the_scene_s(oscillator: ModuleType) -> None:
 def test_a_warning_points_to_the_caller_s_line(oscillator: ModuleType) -> None:
     """Of a run and of a batch, which another module makes; its own estimate's too."""
     never = {"never": "x - 5"}
-    stiff = {"params": {"k": 1e6}, "h": 0.0028, "events": never}
+    stiff = {"params": {"k": 1e6}, "h": 0.0029, "events": never}
     ways = (
         lambda: oscillator.simulate(steps=50, **stiff),
-        lambda: oscillator.simulate_batch(steps=50, **stiff | {"h": 0.0029}),
+        lambda: oscillator.simulate_batch(steps=50, **stiff | {"h": 0.003}),
         lambda: oscillator.simulate(h=0.5, duration=0.2, events=never),
         lambda: oscillator.simulate(h=0.4, duration=30, estimate=True, events=never),
     )

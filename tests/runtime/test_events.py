@@ -109,21 +109,6 @@ def test_what_is_at_zero_at_the_start_has_not_happened(ball: ModuleType) -> None
     assert len(down.events["impact"]) == 0 and down.q[-1, 1] < 0
 
 
-def test_fixed_steps_say_that_they_pass_over_events(ball: ModuleType) -> None:
-    words = "bouncing: fixed steps pass over events, impact, top, corner, away: give tol=, not h, "
-    for simulate in (ball.simulate, ball.simulate_batch):
-        for steps in (100, 2):  # however few they are
-            ball._model._warned.clear()
-            with pytest.warns(RuntimeWarning) as said:
-                run = simulate(h=0.01, steps=steps)
-            assert [str(one.message) for one in said] == [f"{words}steps or method"]
-        assert run.events == {} and np.all(simulate(h=0.01, duration=1.0).q[..., -1, 1] < 0)
-        with pytest.raises(KeyError, match="fixed steps pass over 'top': give tol=, not h"):
-            run.events["top"]
-        with pytest.raises(KeyError, match="did you mean 'impact'"):
-            run.events["impakt"]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -162,8 +147,7 @@ def test_a_stopped_run_has_an_error_and_a_jumping_one_a_balance(ball: ModuleType
     assert resting.estimate().resolved
 
 
-def test_fixed_steps_have_no_events(ball: ModuleType) -> None:
-    assert ball.simulate(h=0.01, steps=3).events == {}
+def test_no_argument_belongs_to_fixed_and_to_adaptive_steps(ball: ModuleType) -> None:
     with pytest.raises(ValueError, match="h: belongs to fixed steps"):
         ball.simulate(h=0.01, h_most=0.1)
 

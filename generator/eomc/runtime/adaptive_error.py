@@ -1,4 +1,4 @@
-"""The error of adaptive steps: the same run with a tighter tolerance, and from a moved start."""
+"""The error of a run by a tolerance or among events: beside a finer one, and a moved start."""
 
 from __future__ import annotations
 
@@ -141,6 +141,6 @@ def _verdict(own: Fitted, left: Array, rounding: Array, amplification: float) ->
         row = int(np.argmax(wrong))
         words.append(
             f"the error exceeds a tenth of the motion from t = {own.t[row]:.4g} s on: take a "
-            "tighter tolerance, or a shorter duration"
+            f"{'smaller h' if own._by else 'tighter tolerance'}, or a shorter duration"
         )
     return "; ".join(words)

@@ -1,0 +1,97 @@
+"""Rows of `check` about events in fixed steps: each row is one step of the method from that before.
+
+So is the state at each event; and where what an event watches changes its sign, there it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from eomc.verify.comparison import Comparison
+from eomc.verify.finding import Finding, largest
+from eomc.verify.oracle import Vector
+from eomc.verify.report import LIMIT
+from eomc.verify.sampling import State, simulate
+
+STEPS = 25  # of a run
+CLEAR = 1e-6  # of what an event watches: more is on one side of zero
+SIDES = {"falling": (-1,), "rising": (1,), "both": (-1, 1)}
+
+
+def report(of: Comparison) -> None:
+    """Add the row of a scene with events."""
+    for module, form in of.forms:
+        for method in of.methods:
+            of.row(
+                f"{form}events in steps of {method}", LIMIT, "units of rounding",
+                partial(_worst, of, module, method),
+            )  # fmt: skip
+
+
+def _worst(of: Comparison, module: Any, method: str) -> float | Finding:
+    model, passed = module._model, module._model._passes_over
+    model._passes_over = False
+    try:
+        errors = [_error(of, module, method, e.state) for e in of.few(4)]
+    finally:
+        model._passes_over = passed
+    return largest(errors, "no step can be made")
+
+
+def _error(of: Comparison, module: Any, method: str, s: State) -> float | None:
+    """Of a run from one state; inf where an event is missing."""
+    run = simulate(module, s, t0=s.t, h=of.system.run.h, steps=STEPS, method=method)
+    if len(run) < 2:
+        return None
+    if _missing(of, module, run, s):
+        return math.inf
+    size = np.abs(run.x).max(axis=0) + of.sampler.scale.ravel()
+    worst = 0.0
+    for k, t, end in _steps(run):
+        h = t - run.t[k]
+        try:
+            made = module.step(run.q[k], run.qd[k], h, run.t[k], s.u, s.params, method)
+        except module.MotionError:
+            return math.inf
+        moved = np.abs(np.concatenate(made) - run.x[k]) * (abs(t) + abs(h)) / h  # by rounding of t
+        off = np.abs(np.concatenate(made) - end) / (of.eps * (size + moved))
+        worst = max(worst, float(np.nan_to_num(off.max(), nan=math.inf)))
+    return worst
+
+
+def _steps(run: Any) -> Iterator[tuple[int, float, Vector]]:
+    """Of each row and each event the row before it, its time and state.
+
+    The state behind a jump at the start is in no row, nor that between jumps at one time.
+    """
+    _, told = run._happened
+    first = int(len(told) > 0 and told[0, 0] <= run.t[0])
+    for k in range(first, len(run) - 1):
+        if run.t[k + 1] > run.t[k]:
+            yield k, float(run.t[k + 1]), run.x[k + 1]
+    for t, *x in told[np.diff(told[:, 0], prepend=-np.inf) > 0]:
+        if (k := int(np.searchsorted(run.t, t)) - 1) >= first:
+            yield k, float(t), np.array(x)
+
+
+def _missing(of: Comparison, module: Any, run: Any, s: State) -> bool:
+    """Whether what an event watches comes from clearly one side to the other, which is not told."""
+    events = of.system.events
+    rows = zip(run.t, run.q, run.qd, strict=True)
+    values = np.array([
+        module._model._evaluate("events", (len(events),), q, qd, float(t), s.u, s.params, None)
+        for t, q, qd in rows
+    ])  # fmt: skip
+    for event, g in zip(events, values.T, strict=True):
+        sides = np.where(np.abs(g) > CLEAR * np.abs(g).max(), np.sign(g), 0)
+        told = run.events[event.name].t
+        for k in np.flatnonzero((sides[1:] * sides[:-1] < 0) & (np.diff(run.t) > 0)):
+            here = (told > run.t[k]) & (told <= run.t[k + 1])
+            if sides[k + 1] in SIDES[event.direction] and not here.any():
+                return True
+    return False

@@ -1,0 +1,348 @@
+"""Events in fixed steps: found by shorter steps of the same method, and what is kept of them."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import subprocess
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from compilers import STRICT, compiled
+from conftest import Modules
+from eventful import BALL, FREE, G
+
+import eomc
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+
+pytestmark = pytest.mark.usefixtures("unoptimised_file")
+METHODS = '["rk4", "dp8"]'
+
+
+@pytest.fixture(scope="module")
+def ball(modules: Modules) -> ModuleType:
+    """A ball that falls from 1 m, moves along at 1 m/s, and bounces from floor and wall."""
+    text = BALL.replace("bouncing", "stepped_ball")
+    return modules.unoptimised(text.replace("[run]", f"[run]\nmethod = {METHODS}\nh = 0.01"))
+
+
+SWING = f"""eomc = 1
+name = "stepped_swing"
+[coordinates]
+theta = {{ unit = "rad", start = 1.0 }}
+[inputs]
+torque = {{ signal = "0.3*sin(t)" }}
+[energy]
+kinetic = "theta_dot**2/2"
+potential = "-9.81*cos(theta)"
+[forces]
+theta = "torque"
+[[event]]
+name = "below"
+when = "theta"
+[[event]]
+name = "wall"
+when = "theta + 0.8"
+direction = "falling"
+action = "jump"
+theta_dot = "-0.9*theta_dot"
+[run]
+h = 0.01
+method = {METHODS}
+batch = true
+duration = 4.0
+"""
+
+
+@pytest.fixture(scope="module")
+def swing(modules: Modules) -> ModuleType:
+    """A driven pendulum beside a wall."""
+    return modules.unoptimised(SWING)
+
+
+def impacts(e: float, count: int) -> np.ndarray:
+    times = [math.sqrt(2 / G)]
+    for k in range(1, count):
+        times.append(times[-1] + 2 * math.sqrt(2 * G) * e**k / G)
+    return np.array(times)
+
+
+@pytest.mark.parametrize("h", [0.01, 0.25, 2.0])
+@pytest.mark.parametrize("method", ["rk4", "dp8"])
+def test_a_ball_bounces_at_the_right_times(ball: ModuleType, h: float, method: str) -> None:
+    """Both are exact for parabolas, however long a step is."""
+    run = ball.simulate(h=h, method=method, duration=2.0)
+    assert run.events["impact"].t == pytest.approx(impacts(0.8, 3), rel=1e-13)
+    tops = run.events["top"]
+    times = impacts(0.8, 4)
+    assert tops.t == pytest.approx((times[1:] + times[:-1]) / 2, rel=1e-12)
+    assert tops.q[:, 1] == pytest.approx([0.8**2, 0.8**4, 0.8**6], rel=1e-12)
+    assert run.method == method and run.h == h and run.status == "ok" and run.t[-1] == 2.0
+
+
+@pytest.mark.parametrize("h", [0.001, 0.5])
+def test_it_comes_to_rest(ball: ModuleType, h: float) -> None:
+    """Its last flights are a millionth of a step."""
+    with pytest.warns(RuntimeWarning, match="jumps follow one another ever sooner"):
+        run = ball.simulate(h=h, duration=20.0)
+    times = impacts(0.8, len(run.events["impact"]))
+    assert len(times) >= 50 and np.max(np.abs(run.events["impact"].t - times) / times) < 1e-12
+    assert run.status == "accumulated"
+    assert run.limit == pytest.approx(9 * math.sqrt(2 / G), rel=1e-10)
+
+
+def test_rows_are_multiples_of_h_and_both_sides_of_each_jump(ball: ModuleType) -> None:
+    run = ball.simulate(h=0.1, duration=1.0, t0=0.7)
+    (jump,) = run.events["impact"].t
+    grid = 0.7 + 0.1 * np.arange(11)
+    assert run.t.tolist() == np.sort([*grid, jump, jump]).tolist()
+    at = run.t.tolist().index(jump)
+    assert run.qd[at, 1] < 0 < run.qd[at + 1, 1] == pytest.approx(-0.8 * run.qd[at, 1])
+    assert run.steps == 11 and run.q[at].tolist() == run.events["impact"].q[0].tolist()
+
+
+def test_what_ends_a_run_ends_it(ball: ModuleType) -> None:
+    run = ball.simulate(h=0.1, params={"far": 0.44}, duration=5.0)
+    assert run.status == "ok" and run.stopped == "away"
+    assert run.t[-1] == pytest.approx(0.44, abs=1e-15) == run.events["away"].t[0]
+    at_multiple = ball.simulate(h=0.1, params={"far": 0.4}, duration=5.0)
+    assert at_multiple.t[-1] == pytest.approx(0.4, abs=1e-15) and len(at_multiple) in (5, 6)
+
+
+def test_between_events_they_are_the_steps_of_the_method(swing: ModuleType) -> None:
+    for method in swing.methods:
+        run = swing.simulate(method=method)
+        for k in range(len(run) - 1):
+            if h := run.t[k + 1] - run.t[k]:
+                q, qd = swing.step(run.q[k], run.qd[k], h, run.t[k], method=method)
+                np.testing.assert_allclose(run.x[k + 1], [*q, *qd], rtol=1e-13, atol=1e-14)
+    assert len(run.events["wall"]) == 2 and len(run.events["below"]) == 4
+
+
+@pytest.mark.parametrize(("method", "order", "h"), [("rk4", 4, 0.05), ("dp8", 8, 0.2)])
+def test_times_err_as_the_method_does(swing: ModuleType, method: str, order: int, h: float) -> None:
+    exact = swing.simulate(tol=1e-14, duration=4.0).events["wall"]
+    errors = []
+    for parts in (1, 2):
+        found = swing.simulate(h=h / parts, method=method, duration=4.0).events["wall"]
+        assert len(found) == len(exact) > 1
+        errors.append(np.max(np.abs(found.t - exact.t)))
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.9)
+    assert errors[1] < 1e-6
+
+
+def test_events_that_never_happen_change_nothing(
+    swing: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = swing.simulate(q0=[0.5], h=0.01, duration=0.3)
+    assert not any(map(len, run.events.values()))
+    monkeypatch.setattr(swing._model, "_passes_over", True)
+    plain = swing.simulate(q0=[0.5], h=0.01, duration=0.3)
+    np.testing.assert_allclose(run.x, plain.x, rtol=1e-14, atol=1e-15)
+    assert run.t.tolist() == plain.t.tolist()
+
+
+def law(t: float, q: Any, qd: Any) -> list[float]:
+    return [-2 * q[0] - math.sin(3 * t) * (qd[0] > 0)]
+
+
+def test_laws_are_asked_at_each_step_or_period(swing: ModuleType) -> None:
+    """Not behind a jump: inputs are held to the next multiple of h."""
+    asked: list[float] = []
+
+    def kept(t: float, q: Any, qd: Any) -> list[float]:
+        asked.append(t)
+        return law(t, q, qd)
+
+    with pytest.warns(RuntimeWarning, match="called before each step"):
+        run = swing.simulate(h=0.01, u=kept, duration=2.0)
+    assert len(run.events["wall"]) == 1
+    assert asked == pytest.approx(0.01 * np.arange(200), abs=1e-12)
+    for period in (0.01, 0.05):
+        run = swing.simulate(u=law, method="dp8", control_period=period, duration=2.0)
+        same = swing.simulate(u=law, tol=1e-12, control_period=period, duration=2.0)
+        np.testing.assert_allclose(run.x[-1], same.x[-1], atol=1e-10)
+        table = run.u[np.searchsorted(run.t, period * np.arange(round(2 / period)) - 1e-9)]
+        rows = swing.simulate(u=table, method="dp8", control_period=period, duration=2.0)
+        assert np.array_equal(rows.x, run.x) and np.array_equal(rows.u, run.u)
+    with pytest.raises(ValueError, match="3 rows for 200 control periods"):
+        swing.simulate(h=0.01, u=np.zeros((3, 1)), duration=2.0)
+
+
+def test_rows_where_they_are_asked_for(swing: ModuleType) -> None:
+    run = swing.simulate(h=0.01, duration=2.0)
+    times = np.array([0.0, 0.015, 0.83, 1.9999])
+    rows = swing.simulate(h=0.01, times=times)
+    assert rows.t.tolist() == times.tolist()
+    q, qd = run(times)
+    np.testing.assert_allclose(rows.q, q, atol=1e-15)
+    np.testing.assert_allclose(rows.qd, qd, atol=1e-15)
+    some = swing.simulate(h=0.01, duration=2.0, every=30)
+    assert some.t == pytest.approx([*0.3 * np.arange(7), 2.0])
+    np.testing.assert_allclose(some.q, run(some.t)[0], atol=1e-15)
+    for wrong in ({"every": 2}, {"steps": 3}):
+        with pytest.raises(ValueError, match="times say where rows are"):
+            swing.simulate(times=times, h=0.01, **wrong)
+    with pytest.raises(ValueError, match="out: events add rows"):
+        swing.simulate(h=0.01, steps=3, out=(np.empty((4, 1)), np.empty((4, 1))))
+
+
+def test_each_of_a_batch_is_its_run_alone(swing: ModuleType) -> None:
+    starts = np.linspace(0.2, 1.4, 7)[:, None]
+    runs = swing.simulate_batch(starts, duration=2.0, method="dp8")
+    again = swing.simulate_batch(starts, duration=2.0, method="dp8", threads=1)
+    assert runs == again and runs.q.shape == (7, 201, 1) and runs.method == "dp8"
+    assert "of 0.01 s" in runs.message
+    for k, start in enumerate(starts):
+        alone = swing.simulate(start, duration=2.0, method="dp8")
+        for name in ("below", "wall"):
+            one, own = alone.events[name], runs.events[name].of(k)
+            assert own.t.tolist() == one.t.tolist() and own.q.tolist() == one.q.tolist()
+        assert runs.q[k, -1].tolist() == alone.q[-1].tolist()
+        assert runs.evaluations[k] >= alone.evaluations > 14 * alone.steps
+    q, _ = runs([0.305])
+    assert q[3, 0] == pytest.approx(swing.simulate(starts[3], method="dp8")(0.305)[0], abs=1e-15)
+    table = np.full((1, 200, 1), 0.2)
+    tabled = swing.simulate_batch(starts, h=0.01, duration=2.0, u=table)
+    held = swing.simulate_batch(starts, h=0.01, duration=2.0, u=[0.2])
+    np.testing.assert_allclose(tabled.q, held.q, atol=1e-14)
+
+
+def test_its_error_is_estimated(swing: ModuleType) -> None:
+    exact = swing.simulate(tol=1e-14)
+    for h in (0.01, 0.02):
+        run = swing.simulate(h=h)
+        found = run.estimate()
+        error = abs(run.q[-1, 0] - exact.q[-1, 0])
+        assert found.order == 4 and found.end["theta"] == pytest.approx(error, rel=0.2)
+        assert found.resolved
+
+
+def test_what_is_kept_is_the_run(swing: ModuleType, tmp_path: Path) -> None:
+    run = swing.simulate(h=0.01, duration=1.0)
+    run.save(tmp_path / "one.npz")
+    for same in (swing.load_run(tmp_path / "one.npz"), pickle.loads(pickle.dumps(run))):
+        assert same == run and same.events["wall"].t.tolist() == run.events["wall"].t.tolist()
+        assert same(0.777)[0] == run(0.777)[0] and "steps of 0.01 s" in repr(same)
+        assert same.estimate().end == run.estimate().end
+    runs = swing.simulate_batch([[0.5], [1.2]], h=0.01, duration=1.0)
+    runs.save(tmp_path / "many.npz")
+    same = swing.load_run(tmp_path / "many.npz")
+    assert same == runs and np.array_equal(same([0.31])[0], runs([0.31])[0])
+
+
+def test_an_h_that_time_does_not_resolve_is_refused(swing: ModuleType) -> None:
+    with pytest.warns(RuntimeWarning):
+        run = swing.simulate(t0=1e6, h=1e-9, steps=1000)
+    assert run.status == "no convergence" and len(run) == 1
+
+
+def test_events_that_a_call_asks_for(tmp_path: Path) -> None:
+    scene = tmp_path / "asked_stepped.toml"
+    scene.write_text(FREE.format(name="asked_stepped", events="[run]\nduration = 1"))
+    module = eomc.load(scene, tmp_path / "build")
+    run = module.simulate(events={"third": "x - 1/3"}, h=0.1)
+    assert run.events["third"].t == pytest.approx([1 / 3], rel=1e-14)
+
+
+STUCK = """eomc = 1
+name = "stepped_stick"
+[coordinates]
+x = { unit = "m", start = 1.0, friction = 1.7 }
+[energy]
+kinetic = "x_dot**2/2"
+potential = "5*x**2"
+[run]
+h = 0.02
+duration = 5.0
+friction = "stick"
+"""
+
+
+def test_friction_sticks(modules: Modules) -> None:
+    """Each half period is one around +-0.17: it stops at -0.66, 0.32 and 0.02, there for good."""
+    run = modules.unoptimised(STUCK).simulate(h=0.02)
+    half = math.pi / math.sqrt(10)
+    assert run.events["x_stops"].t == pytest.approx(half * np.arange(1, 4), rel=1e-6)
+    assert run.events["x_slips"].t == pytest.approx(half * np.arange(3), abs=1e-6)
+    assert run.q[-1] == pytest.approx([0.34 - 0.32, 0], abs=1e-6) and run.qd[-1, 0] == 0
+
+
+RAIL = """eomc = 1
+name = "stepped_rod"
+[coordinates]
+x = { start = 0.6, unit = "m" }
+y = { start = -0.8, unit = "m" }
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "9.81*y"
+[constraints]
+rod = "x**2 + y**2 - 1"
+[[event]]
+name = "wall"
+when = "x + 0.3"
+direction = "falling"
+action = "jump"
+x_dot = "-0.5*x_dot"
+[run]
+h = 0.01
+duration = 4.0
+"""
+
+
+def test_jumps_stay_on_constraints(modules: Modules) -> None:
+    module = modules.unoptimised(RAIL)
+    run, fine = module.simulate(h=0.01), module.simulate(tol=1e-12)
+    assert len(run.events["wall"]) == len(fine.events["wall"]) == 3
+    np.testing.assert_allclose(run.events["wall"].t, fine.events["wall"].t, atol=1e-7)
+    assert np.max(np.abs(np.sum(run.q**2, axis=1) - 1)) < 1e-14
+    assert np.max(np.abs(np.sum(run.q * run.qd, axis=1))) < 1e-13
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("folder", ["", "fast"])
+def test_a_program_in_c_takes_any_step(folder: str, real: str, tmp_path: Path) -> None:
+    run = f'[run]\nmethod = {METHODS}\nreal = "{real}"'
+    text = BALL.replace("bouncing", "embedded").replace("[run]", run)
+    made = eomc.sources(from_scene(parse(text, "c.toml"))).files
+    for end in "hc":
+        file = tmp_path / f"embedded.{end}"
+        file.write_text(made[f"{folder}/embedded.{end}".lstrip("/")], encoding="utf-8")
+    (tmp_path / "main.c").write_text(
+        f"""#include "embedded.h"
+#include <stdio.h>
+int main(void)
+{{
+    {real} q[EMBEDDED_NQ] = {{ 0, 1 }}, qd[EMBEDDED_NQ] = {{ 1, 0 }}, t = 0;
+    {real} h = ({real})0.01, rows[EMBEDDED_NE_ROOM*(1 + 2*EMBEDDED_NQ)];
+    embedded_gauss16_adaptive_memory memory = {{ 0 }};
+    embedded_status status = EMBEDDED_OK;
+    int which[EMBEDDED_NE_ROOM];
+    long found;
+
+    memory.step = embedded_rk4_step;
+    for (int k = 1; k <= 200 && !status; k++) {{
+        embedded_gauss16_adaptive(q, qd, &t, k*h, 0, h, 10, NULL, 0, NULL, NULL, NULL,
+                                  EMBEDDED_NE_ROOM, &found, which, rows,
+                                  &embedded_defaults, &memory, &status);
+        for (long i = 0; i < found; i++)
+            if (which[i] == EMBEDDED_EVENT_IMPACT)
+                printf("%.17g\\n", (double)rows[(1 + 2*EMBEDDED_NQ)*i]);
+    }}
+    return (int)status + (memory.steps > 204);
+}}
+""",
+        encoding="utf-8",
+    )
+    flags = ["-Wall", "-Wextra", "-Werror"] if folder else STRICT
+    compiled("cc", *flags, "-O1", "-c", "embedded.c", "-o", "scene.o", cwd=tmp_path)
+    compiled("cc", "main.c", "scene.o", "-O1", "-o", "a", "-lm", cwd=tmp_path)
+    said = subprocess.run([str(tmp_path / "a")], capture_output=True, text=True)
+    times = [float(line) for line in said.stdout.split()]
+    assert said.returncode == 0
+    assert times == pytest.approx(impacts(0.8, 3), rel=1e-13 if real == "double" else 3e-6)
