@@ -150,6 +150,7 @@ class _Check(Checker):
             picture=picture,
             places=self.places,
             warnings=tuple(self.problems),
+            used=dict(self.used),
         )
 
     def _run(self) -> Run:

@@ -284,7 +284,7 @@ class _Expansion:
         if term in index:
             return index[term]
         if term in self.constants:
-            self.check.used.add(term)
+            self.check.used[term].append(("constants", term))
             value = self.constants[term]
             if not value.is_integer() or abs(value) > 1e9:
                 raise FormulaError(f"'{term}' is {value:g}, and an index is a whole number")

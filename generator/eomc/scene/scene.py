@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from eomc.base.errors import EomcError, Problem
 from eomc.scene.assembly import Assembly
 from eomc.scene.formulas import Formula
 from eomc.scene.picture import Picture
-from eomc.scene.scope import value_of
+from eomc.scene.scope import Path, value_of
 from eomc.scene.source_map import SourceMap
 
 
@@ -126,7 +126,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Scene:
-    """A checked scene: nothing in it is undeclared, circular, misspelt or of the wrong kind."""
+    """A checked scene: nothing in it is undeclared, circular, misspelt or of the wrong kind.
+
+    used: where each name stands.
+    """
 
     name: str
     title: str
@@ -150,6 +153,7 @@ class Scene:
     picture: Picture | None
     places: SourceMap = field(repr=False, compare=False)
     warnings: tuple[Problem, ...] = ()
+    used: Mapping[str, Sequence[Path]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def constrained(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 
@@ -69,8 +70,8 @@ class Checker:
     """The names of a scene, as they become known, and the faults found so far.
 
     tables: every declared name and its table. kinds: what each name that may be used so far
-    depends on. centers: the names made by bodies, link_x. mended: places that hold something
-    harmless instead of what is written.
+    depends on. used: where each name stands. centers: the names made by bodies, link_x. mended:
+    places that hold something harmless instead of what is written.
     """
 
     def __init__(self, places: SourceMap) -> None:
@@ -78,7 +79,7 @@ class Checker:
         self.problems: list[Problem] = []
         self.faults = 0  # reported, each repetition of one counted
         self.reported: set[tuple[Path, str]] = set()
-        self.used: set[str] = set()
+        self.used: dict[str, list[Path]] = defaultdict(list)
         self.mended: set[Path] = set()
         self.tables: dict[str, str] = {}
         self.kinds: dict[str, frozenset[str]] = {}
@@ -157,7 +158,7 @@ class Checker:
         """Whether the formula uses only names that it may; what it may not is reported."""
         before = self.faults
         for node in formula.names():
-            self.used.add(node.id)
+            self.used[node.id].append(path)
             if node.id not in (self.kinds if allowed is None else allowed):
                 self.say(path, self._refused(node.id, rule), node, formula.text)
         if self.faults == before:

@@ -156,6 +156,7 @@ class Loops(Springs):
                 remedy = remedy or f": known are {', '.join([*self.doc.coordinates][:9])}"
                 why = f"'{name}' is not a coordinate{remedy}"
                 check.say((*path, "coordinates"), why, text=name)
+            check.used[name].append((*path, "coordinates"))
         if coordinates and coordinates[0] == coordinates[1]:
             why = f"a gear couples two coordinates, here both are '{coordinates[0]}'"
             check.say((*path, "coordinates"), why)
@@ -169,7 +170,6 @@ class Loops(Springs):
             why = 'missing: add ratio = "n", of the second coordinate over the first'
             check.say((*path, "ratio"), why)
         offset = self._formula((*path, "offset"), entry.offset) if entry.offset else ZERO
-        check.used.update(coordinates)
         return {"coordinates": coordinates, "ratio": ratio, "offset": offset}
 
     def _foreign(self, path: Path, kind: str, entry: LoopTable) -> None:

@@ -1,0 +1,91 @@
+"""Parameters that energies and forces have and no equation of motion: a warning names each."""
+
+from __future__ import annotations
+
+import re
+
+import sympy
+
+from eomc import pipeline
+from eomc.base.errors import Problem
+from eomc.model.from_scene import from_scene
+from eomc.model.system import System
+from eomc.scene import read
+
+SCENE = """eomc = 1
+name = "m"
+parameters = { M = 1, m = 1, I = 1, a = 1, shift = 1, none = 1, seen = 1, asked = 1, begun = 1 }
+[coordinates]
+x = { start = "begun" }
+theta = {}
+[definitions]
+J = "2*I"
+y = "x + asked"
+z = "x + seen"
+of_both = "asked*shift"
+[energy]
+kinetic = "M*x_dot/2 + m*theta_dot**2/2 + x_dot**2/2 + J*theta_dot + a*dot(z) + asked*x_dot"
+potential = "cos(theta) + of_both + begun"
+[forces]
+x = "none - 2*none + none"
+[outputs]
+y = { formula = "y + energy" }
+[picture]
+dots = [["z", 0]]
+"""
+
+
+def warned(system: System) -> list[Problem]:
+    """What a build warns of."""
+    found: list[Problem] = []
+    pipeline._program(system, found.append)
+    return found
+
+
+def test_what_reaches_no_equation_is_told_by_the_place_where_it_stands() -> None:
+    """What an output, a picture or a start has as well is of use; energies of outputs are none."""
+    told = warned(from_scene(read.parse(SCENE)))
+    keys = {str(re.findall(r"'(\w+)'", p.message)[0]): p.key for p in told}
+    assert keys == {
+        "M": "energy.kinetic", "I": "definitions.J", "a": "energy.kinetic",
+        "shift": "definitions.of_both", "none": "forces.x",
+    }  # fmt: skip
+    assert all(p.severity == "warning" and p.line for p in told)
+    why = {p.key: p.message for p in told if p.message[1] in "MI"}
+    assert "has it with x_dot, but not its square; write x_dot**2" in why["energy.kinetic"]
+    assert "has it with theta_dot, but not its square" in why["definitions.J"]
+
+
+def test_of_bodies_nothing_is_told() -> None:
+    """The mass of a body that does not move is no slip."""
+    text = """eomc = 1
+name = "b"
+gravity = [0, -9.81]
+parameters = { m = 1, I = 1 }
+coordinates.x = {}
+[[body]]
+name = "base"
+joint = "fixed"
+mass = "m"
+inertia = "I"
+[[body]]
+name = "cart"
+parent = "base"
+joint = "prismatic"
+axis = [1, 0]
+coordinates = "x"
+mass = 1
+inertia = "I"
+"""
+    assert warned(from_scene(read.parse(text))) == []
+
+
+def test_systems_made_in_python_tell_it_too() -> None:
+    x, v, m, shift, seen = sympy.symbols("x x_dot m shift seen")
+    system = System.make(
+        "made", [x], m * v + v**2, shift + seen + x**2, parameters={m: 1, shift: 2, seen: 3},
+        picture={"points": {"tip": [x + seen, 0]}, "dots": ["tip"]},
+    )  # fmt: skip
+    told = warned(system)
+    assert [p.key for p in told] == ["energy.kinetic", "energy.potential"]
+    assert "'m' reaches no" in str(told[0]) and "'shift' reaches no" in str(told[1])
