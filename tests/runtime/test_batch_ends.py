@@ -79,7 +79,12 @@ def test_an_instance_that_fails_on_the_way_keeps_its_last_state() -> None:
     k[4] *= 1e6  # far beyond the stability limit: it grows until it overflows
     with pytest.warns(RuntimeWarning, match="not finite|no longer be finite"):
         alone = m.simulate(steps=400, every=5, params={"k": k[4]})
-    runs = m.simulate_batch(steps=400, every=5, params={"k": k})
+    words = r"9 instances, \d+ of 3600 steps of [\d.]+ s: 1 not finite, 8 ok; .* go on, instance 4,"
+    with pytest.warns(RuntimeWarning, match=words) as said:
+        runs = m.simulate_batch(steps=400, every=5, params={"k": k})
+    (told,) = said
+    at = f"at t = {runs.h * runs.steps[4]:.9g}: the state would no longer be finite: the step"
+    assert told.filename == __file__ and at in str(told.message)
     assert 5 < alone.steps < 400 and runs.status[4] == alone.status == "not finite"
     assert runs.steps[4] == alone.steps
     rows = len(alone.t)

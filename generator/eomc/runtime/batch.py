@@ -28,6 +28,7 @@ from .batch_run import BatchRun
 from .batch_work import WORTH, Work
 from .facts import SOME
 from .model import RARELY
+from .package import warn
 from .shown import with_events
 from .status import Interrupted
 from .timed import as_asked
@@ -72,17 +73,13 @@ class BatchModel(Instances):
                 self, q0, qd0, duration, params, u, threads, t0, progress, tol, times, h_most,
                 stiff, control_period, (h, steps, method, every, None),
             )  # fmt: skip
-            if not whole:
-                raise Interrupted(fitted)
-            return fitted
+            return self._told(fitted, whole)
         if self.events and not self._passes_over:
             seen, whole = batch_adaptive.stepped(
                 self, q0, qd0, h, duration, steps, every, params, u, threads, method, t0, progress,
                 times, control_period,
             )  # fmt: skip
-            if not whole:
-                raise Interrupted(seen)
-            return seen
+            return self._told(seen, whole)
         step = self._stepper(method, "batch")
         h, t0 = self.h if h is None else as_step_size(h, self.dtype), as_number(t0, "t0")
         at = None
@@ -101,8 +98,14 @@ class BatchModel(Instances):
             self._look(*first, h, t0, u0, table[0], method, "the first instance: ")
         asked = batch_fixed.Asked(step, h, t0, steps, every, at, method, threads, progress, codes)
         run, whole = batch_fixed.simulate(self, starts, held, table, asked)
+        return self._told(run, whole)
+
+    def _told(self, run: BatchRun, whole: bool) -> BatchRun:
+        """A batch as `simulate_batch` returns it, with a warning of those that could not go on."""
         if not whole:
             raise Interrupted(run)
+        if words := run._lost:
+            warn(f"{self.name}: {words}")
         return run
 
     def step_batch(

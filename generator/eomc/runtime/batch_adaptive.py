@@ -19,6 +19,7 @@ from .batch_run import BatchRun, stuck
 from .batch_work import all_of, as_threads
 from .by_name import ByName
 from .facts import SOME
+from .fitted import said
 from .happened import FoundInBatch, HappenedInBatch
 from .package import reduced
 from .periods import end_of, held_at, periods_in
@@ -121,6 +122,17 @@ class AdaptiveBatchRun(BatchRun):
         stops = "".join(f", {c} stopped by '{n}'" for c, n in ends if n)
         how = f" of {self.h:g} s" if self._by else f", tolerance {self.tol:g}"
         return f"{len(self)} instances, {done} steps{how}: {found}{stops}"
+
+    def _end(self, k: int) -> float:
+        return float(self.reached[k])
+
+    def _why(self, k: int) -> str:
+        status, event = str(_ENDS[self._codes[k]]), self.stopped[k]
+        if status == "not finite" and event:
+            return f"event '{event}' jumps to no finite state"
+        if status == "accumulated":
+            return f"jumps follow one another ever sooner, up to t = {self.limit[k]:.15g} s"
+        return said(self._model, status, self._by)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("batch_adaptive.AdaptiveBatchRun._of_kept", self._model, self._kept())

@@ -19,7 +19,7 @@ from .columns import Columns
 from .dense import parts, within
 from .model import Model
 from .package import reduced
-from .status import STATUS
+from .status import SAID, STATUS
 
 _ENDS = np.array([*STATUS, "interrupted"])
 _KEPT = "t0 q qd h steps codes every wanted params held method _u".split()  # as the fields go
@@ -156,6 +156,23 @@ class BatchRun(Values, Fans, Columns):
         done = int(self.steps.sum())
         wanted = len(self) * self._wanted
         return f"{len(self)} instances, {done} of {wanted} steps of {self.h:g} s: {found}"
+
+    @property
+    def _lost(self) -> str:
+        """How many could not go on, and why the first of them could not; "" where all did."""
+        if not self._codes.any():
+            return ""
+        k = int(self._codes.nonzero()[0][0])
+        first = f"the first that could not go on, instance {k}, stopped at t = {self._end(k):.9g}"
+        return f"{self.message}; {first}: {self._why(k)}"
+
+    def _end(self, k: int) -> float:
+        """The time that instance k has come to, s."""
+        return float(self.t0 + self.h * self.steps[k])
+
+    def _why(self, k: int) -> str:
+        """Why instance k could not go on."""
+        return SAID[str(_ENDS[self._codes[k]])]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("batch_run.BatchRun", *self._all())

@@ -32,6 +32,13 @@ REMEDIES = (
 )
 
 
+def said(model: Stepping, status: str, fixed: str) -> str:
+    """Why steps by a tolerance, or fixed ones of a method, could not go on."""
+    if status == "no convergence" and not fixed:
+        return STOPPED.format(REMEDIES[bool(model._rows.modes)])
+    return SAID[status]
+
+
 @dataclass(eq=False, repr=False)
 class Fitted(Run):
     """What `adaptive.AdaptiveRun` keeps, and what follows from that alone."""
@@ -74,13 +81,10 @@ class Fitted(Run):
                 f"jumps follow one another ever sooner, up to t = {self.limit:.15g} s: there the "
                 f"run ends, after {done}"
             )
-        remedy = REMEDIES[bool(self._model._rows.modes)]
-        short = self.status == "no convergence" and not self._by
-        said = STOPPED.format(remedy) if short else SAID[self.status]
-        said = infinite_at_start(self) or said
+        why = infinite_at_start(self) or said(self._model, self.status, self._by)
         where = state_text(self.q[-1], self.qd[-1]) if len(self) else ""
         end = self.t[-1] if len(self) else self.t0
-        return f"stopped at t = {end:.9g} after {done}, {where}: {said}"
+        return f"stopped at t = {end:.9g} after {done}, {where}: {why}"
 
     @cached_property
     def events(self) -> dict[str, Happened]:
