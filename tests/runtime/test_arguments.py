@@ -95,6 +95,29 @@ def identify(value: Any) -> str | None:
     return value if isinstance(value, str) and value.isidentifier() else None
 
 
+@pytest.mark.filterwarnings("ignore:.*Python function")
+def test_a_control_law_of_other_arguments_is_told_what_it_is_called_with(
+    driven: ModuleType,
+) -> None:
+    """What goes wrong within the law stays as it is."""
+    for law, why in (
+        (lambda t, q: [0.0], "takes 2 positional arguments but 3 were given"),
+        (lambda t, q, qd, gain: [0.0], "missing 1 required positional argument: 'gain'"),
+    ):
+        with pytest.raises(TypeError, match=rf"^u: is called as u\(t, q, qd\), and .* {why}"):
+            driven.simulate(steps=2, u=law)
+    with pytest.raises(TypeError, match=r"^unsupported operand"):
+        driven.simulate(steps=2, u=lambda t, q, qd: [t + "x"])
+
+
+@pytest.mark.parametrize("t", ["a", "0.001", [0.0, "a"], 1j, {}, [[0.0], [0.0, 0.0]]])
+def test_times_of_a_run_that_are_none_are_told(driven: ModuleType, t: Any) -> None:
+    run = driven.simulate(steps=2)
+    with pytest.raises(ValueError, match=f"^t: {re.escape(repr(t))} is not an array of numbers"):
+        run(t)
+    assert run(0.001)[0].shape == (2,) and run([0, 0.001])[0].shape == (2, 2)
+
+
 @pytest.mark.parametrize(("name", "place", "how", "words"), BAD_VALUES, ids=identify)
 def test_a_wrong_argument_is_named(
     driven: ModuleType, name: str, place: Any, how: Any, words: str

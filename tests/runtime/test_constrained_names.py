@@ -61,6 +61,20 @@ def test_the_tangent_of_many_states_has_a_leading_n(module: ModuleType) -> None:
         module.tangent([[0.6, -0.8], [0.0, 0.0]], np.zeros((2, 2)))
 
 
+def test_where_something_is_not_finite_is_told(
+    module: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    q, qd = np.array([[0.6, -0.8], [1.7e308, 0.0]]), np.zeros((2, 2))
+    for at in (q[1], qd[1]), (q, qd):
+        with pytest.raises(module.MotionError, match=r"at q = \[1\.7e\+308 .* slope is not finite"):
+            module.tangent(*at)
+    q[1] = 0.8, 0.6
+    monkeypatch.setattr(module._model, "_multipliers", lambda *_: np.array([[1.0], [np.inf]]))
+    words = r"at q = \[0\.8 0\.6\], qd = \[0\. 0\.\]: the multiplier of rod is not finite there"
+    with pytest.raises(module.MotionError, match=words):
+        module.multipliers(q, qd)
+
+
 def test_what_is_held_is_a_list_of_names(module: ModuleType) -> None:
     for held in (3, 2.5, True):
         with pytest.raises(ValueError, match="no list of names: x, y, x_dot, y_dot"):

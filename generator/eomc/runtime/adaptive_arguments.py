@@ -82,18 +82,23 @@ def as_tolerance(tol: Any, dtype: np.dtype[Any]) -> float:
     return number
 
 
+def as_numbers(value: ArrayLike, name: str, dtype: np.dtype[Any]) -> Array:
+    """A C-contiguous array, of any shape, or a ValueError."""
+    unmasked(value, name)
+    try:
+        given = np.asarray(value)
+        if given.dtype.kind in "cUSmM":  # text that looks like a number is none
+            raise TypeError
+        return np.asarray(given, dtype, order="C")
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: {value!r} is not an array of numbers") from None
+
+
 def as_times(
     times: ArrayLike, t0: float, dtype: np.dtype[Any], duration: float | None = None
 ) -> Array:
     """Times in ascending order from t0 on, within the duration if there is one, or a ValueError."""
-    unmasked(times, "times")
-    try:
-        given = np.asarray(times)
-        if given.dtype.kind in "cUSmM":  # text that looks like a number is none
-            raise TypeError
-        found = np.ascontiguousarray(given, dtype)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"times: {times!r} is not an array of numbers") from None
+    found = np.atleast_1d(as_numbers(times, "times", dtype))
     if found.ndim != 1 or not len(found) or not (isfinite(found[0]) and isfinite(found[-1])):
         raise ValueError("times: expected a row of finite numbers, in s")
     if found[0] < t0 or not (found[1:] > found[:-1]).all():

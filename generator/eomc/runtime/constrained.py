@@ -98,8 +98,9 @@ class Constrained(Frames):
         A = self.constraint_jacobian(q, t=t, params=params)
         slopes = self._evaluate("constraint_slopes", shape, q, qd, t, None, params, None)
         if A.ndim == 2:
-            return self._kernel(A, slopes)
-        found = [self._kernel(*pair) for pair in zip(A, slopes, strict=True)]
+            return self._kernel(A, slopes, q, qd)
+        each = zip(A, slopes, np.asarray(q), np.asarray(qd), strict=True)
+        found = [self._kernel(*one) for one in each]
         if len({x.shape for x in found}) > 1:
             few, many = (
                 pick(range(len(found)), key=lambda k: found[k].size) for pick in (min, max)
@@ -110,12 +111,13 @@ class Constrained(Frames):
             )
         return np.array(found) if found else np.empty((0, 2 * self.nq, 0))
 
-    def _kernel(self, A: Array, slopes: Array) -> Array:
+    def _kernel(self, A: Array, slopes: Array, q: ArrayLike, qd: ArrayLike) -> Array:
         """The tangent of one state."""
         of_q = A[: self._rows.holonomic]
         whole = np.block([[of_q, np.zeros_like(of_q)], [slopes, A]])
         if not np.isfinite(whole).all():
-            raise MotionError("tangent: a constraint's slope is not finite there", "not finite")
+            where = state_text(np.asarray(q), np.asarray(qd))
+            raise MotionError(f"at {where}: a constraint's slope is not finite there", "not finite")
         whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-300)
         _, sizes, rows = np.linalg.svd(whole)
         rank = int((sizes > 1e-9 * sizes[0]).sum()) if sizes.size else 0
@@ -131,7 +133,10 @@ class Constrained(Frames):
         found = self._multipliers(q, qd, t, u, params)
         if not np.isfinite(found).all():
             self.acceleration(q, qd, t, u, params)  # which says where, and why
-            raise MotionError("multipliers: one is not finite there", "not finite")
+            at, k = np.argwhere(~np.isfinite(np.atleast_2d(found)))[0]
+            where = state_text(*(np.atleast_2d(x)[at] for x in (q, qd)))
+            words = f"the multiplier of {self._rows.names[k]} is not finite there"
+            raise MotionError(f"at {where}: {words}", "not finite")
         return found
 
     def _multipliers(

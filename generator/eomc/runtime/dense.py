@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .adaptive_arguments import as_numbers
 from .arguments import Array
 from .recorded import Recorded
 
@@ -15,7 +16,7 @@ _AT = 1e-12  # of a step: so near a time is that of the step itself
 
 def within(run: Any, t: ArrayLike) -> Array:
     """Times as an array, or a ValueError where one is outside of the run."""
-    times = np.asarray(t, float)
+    times = as_numbers(t, "t", np.dtype(float))
     begin, end = run.t0, float(run.t[-1])
     slack = 1e-12 * max(abs(begin), abs(end), end - begin)
     if times.size and not (times.min() >= begin - slack and times.max() <= end + slack):

@@ -18,7 +18,12 @@ def asked(
 ) -> Array:
     """What a function gives at a state, as the inputs are; what it raises says when."""
     try:
-        given = law(t, q.copy(), qd.copy())
+        try:
+            given = law(t, q.copy(), qd.copy())
+        except TypeError as fault:
+            if fault.__traceback__ and fault.__traceback__.tb_next:  # of what the function does
+                raise
+            raise TypeError(f"u: is called as u(t, q, qd), and {fault}") from None
         try:
             found = inputs(given)
         except ValueError as fault:
