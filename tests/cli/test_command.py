@@ -374,6 +374,27 @@ def test_a_name_without_its_file_suggests_the_file(here: Path) -> None:
     assert "cartpole: there is no such file; did you mean 'cartpole.toml'?" in done.output
 
 
+def test_a_scene_that_comes_with_eomc_is_told_how_to_have(here: Path) -> None:
+    """One of that name that lies here comes first."""
+    for name in ("bricard", "bricard.toml"):
+        done = eomc("run", name)
+        assert done.exit_code == 2
+        told = f"{name}: there is no such file; eomc new --from bricard writes the one that comes"
+        assert told in done.output
+    eomc("new", "--from", "bricard")
+    assert "did you mean 'bricard.toml'?" in eomc("check", "bricard").output
+
+
+def test_of_a_command_that_there_is_not_the_nearest_is_told(here: Path) -> None:
+    for name, told in (
+        ("runn", "'runn'; did you mean 'run'?"),
+        ("simulate", "'simulate': they are build, check,"),
+        ("cartpole.toml", "'cartpole.toml': they are build, check,"),
+    ):
+        done = eomc(name, "cartpole.toml")
+        assert done.exit_code == 2 and f"No such command {told}" in done.output
+
+
 def test_a_folder_that_is_none_suggests_the_option(here: Path) -> None:
     (here / "file").write_text("", encoding="utf-8")
     done = eomc("build", "cartpole.toml", "--build", "file")

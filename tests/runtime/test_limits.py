@@ -62,6 +62,8 @@ def limited(modules: Modules) -> ModuleType:
 def test_they_are_told_by_name(limited: ModuleType, cartpole: ModuleType) -> None:
     ends = {"force": (-2.0, 3.0), "push": (0.0, np.inf), "free": (-np.inf, np.inf)}
     assert limited.limits() == ends and cartpole.limits() == {}
+    with pytest.raises(ValueError, match="params: 'mass' is not one of m_c, m_p"):
+        cartpole.limits(params={"mass": 1.0})
     assert limited.limits({"most": 4.0}) == ends | {"force": (-4.0, 6.0)}
     assert all(type(x) is float for pair in limited.limits().values() for x in pair)
     with pytest.raises(ValueError, match="params: 'least' is not one of most"):

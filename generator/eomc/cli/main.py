@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+from eomc.base import texts
 from eomc.base.errors import EomcError, FolderError, SceneError
 from eomc.base.version import __version__
 from eomc.cli import terminal
@@ -35,6 +36,15 @@ class _Group(terminal.Group):
         module = "import_robot" if name == "import" else name  # which Python can't import
         command: click.Command = import_module(f"eomc.cli.{module}").command
         return command
+
+    def resolve_command(self, context: click.Context, args: list[str]) -> Any:
+        """As click has it; of a command that there is not, what may be meant."""
+        if args[0] not in COMMANDS:
+            from eomc.scene.formulas import suggest
+
+            near = suggest(args[0], COMMANDS) or f": they are {', '.join(COMMANDS)}"
+            context.fail(f"No such command '{texts.line(args[0])}'{near}")
+        return super().resolve_command(context, args)
 
     def invoke(self, context: click.Context) -> Any:
         try:

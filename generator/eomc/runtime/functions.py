@@ -217,7 +217,7 @@ class Functions(Arguments):
 
     def limits(self, params: Parameters = None) -> dict[str, tuple[float, float]]:
         """The limits of each input, (least, largest), by name; -inf and inf where it has none."""
-        far = float(np.finfo(self.dtype).max)
+        far, params = float(np.finfo(self.dtype).max), self._parameters(params)
         both = [self._within(np.full(self.nu, x, self.dtype), params).tolist() for x in (-far, far)]
         ends = [[x if abs(x) < far else copysign(inf, x) for x in some] for some in both]
         return dict(zip(self.inputs, zip(*ends, strict=True), strict=True))

@@ -7,6 +7,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+from eomc.base import resources
+
 LONGEST = 60  # characters of a text that may be a number with its unit
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -167,3 +169,10 @@ def file(path: Path) -> str:
         if path.name and (folder / name).is_file():
             return str(folder / name)
     return ""
+
+
+def shipped(path: Path) -> str:
+    """Where the scene of that name comes with eomc: how to have it, else the empty string."""
+    name = path.name.removesuffix(".toml")
+    remedy = f"; eomc new --from {name} writes the one that comes with eomc"
+    return remedy if name in resources.scenes() else ""

@@ -57,7 +57,8 @@ def read(file: str | os.PathLike[str], parameters: Mapping[str, float] | None = 
     except FileNotFoundError:
         others = (p.name for p in path.parent.glob("*.toml") if p.name != "pyproject.toml")
         meant = messages.file(path)
-        near = f"; did you mean '{texts.line(meant)}'?" if meant else suggest(path.name, others)
+        near = f"; did you mean '{texts.line(meant)}'?" if meant else messages.shipped(path)
+        near = near or suggest(path.name, others)
         raise EomcError(f"{shown}: there is no such file{near}") from None
     except IsADirectoryError:
         raise EomcError(f"{shown}: is a folder: name a scene, such as scenes/NAME.toml") from None
