@@ -41,7 +41,7 @@ def command(
         system = pipeline.read(scene)
         if system.modes:
             why = (
-                'a report compares steps that pass over events, and friction = "stick" is made of '
+                'a report compares motions without events, and friction = "stick" is made of '
                 'these: report on friction = "smooth", or run it by several tolerances'
             )
             raise SceneError([system.problem("run.friction", why)])

@@ -112,8 +112,8 @@ def remarks(report: Report) -> list[str]:
         )
     if report.events:
         said.append(
-            f"The scene has events ({report.events}); all figures here are of runs that "
-            "pass over them."
+            f"The scene has events ({report.events}); all figures here are of its motion without "
+            "them."
         )
     if report.corners:
         said.append(
