@@ -1,0 +1,91 @@
+"""The rows of `eomc check` about events in fixed steps notice what is wrong."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Modules
+
+from eomc.model.from_scene import from_scene
+from eomc.scene.read import parse
+from eomc.verify import rows_stepped
+from eomc.verify.comparison import Comparison
+
+SCENE = """eomc = 1
+name = "told_swing"
+[coordinates]
+theta = { unit = "rad", start = 1.0 }
+[energy]
+kinetic = "theta_dot**2/2"
+potential = "-9.81*cos(theta)"
+[[event]]
+name = "below"
+when = "theta"
+[[event]]
+name = "wall"
+when = "theta + 0.8"
+direction = "falling"
+action = "jump"
+theta_dot = "-0.9*theta_dot"
+[run]
+h = 0.05
+"""
+SWING = from_scene(parse(SCENE))
+
+
+@pytest.fixture(scope="module")
+def swing(modules: Modules) -> ModuleType:
+    return modules.unoptimised(SWING)
+
+
+class Bent:
+    """A module whose runs are changed on their way out."""
+
+    def __init__(self, module: Any, change: Any) -> None:
+        self.module, self.change = module, change
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.module, name)
+
+    def simulate(self, *args: Any, **how: Any) -> Any:
+        run = self.module.simulate(*args, **how)
+        self.change(run)
+        return run
+
+
+def lost(run: Any) -> None:
+    """One event is not told."""
+    which, rows = run._happened
+    run._happened = which[which != 0], rows[which != 0]
+
+
+def late(run: Any) -> None:
+    """The state at each event is that of a moment later."""
+    which, rows = run._happened
+    run._happened = which, rows + np.array([0, 1e-9, 0])
+
+
+def aside(run: Any) -> None:
+    """A row is beside the motion."""
+    run._rows[1][len(run) // 2] += 1e-9
+
+
+def row(module: Any) -> Any:
+    made = Comparison(SWING, module, np.random.default_rng(0), 4, None)
+    rows_stepped.report(made)
+    (found,) = made.rows
+    assert found.name == "events in steps of rk4" and not module._model._passes_over
+    return found
+
+
+def test_a_right_module_passes(swing: ModuleType) -> None:
+    found = row(swing)
+    assert found.passed and found.judged and found.error < 10
+
+
+@pytest.mark.parametrize("change", [lost, late, aside])
+def test_a_wrong_one_fails(swing: ModuleType, change: Any) -> None:
+    assert not row(Bent(swing, change)).passed
