@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from compilers import STRICT, compiled
 from conftest import Modules
-from eventful import BALL, FREE, G
+from eventful import BALL, FREE, G, event
 
 import eomc
 from eomc.model.from_scene import from_scene
@@ -346,3 +346,22 @@ int main(void)
     times = [float(line) for line in said.stdout.split()]
     assert said.returncode == 0
     assert times == pytest.approx(impacts(0.8, 3), rel=1e-13 if real == "double" else 3e-6)
+
+
+@pytest.mark.parametrize("how", [{}, {"h": 0.1}])
+def test_a_recorder_counts_a_zero_once_from_which_another_jumps_back(
+    recorded: ModuleType, how: dict[str, float]
+) -> None:
+    run = recorded.simulate(**how)
+    assert run.events["low"].t.tolist() == run.events["impact"].t.tolist()
+    assert len(run.events["impact"]) == 3
+
+
+@pytest.fixture(scope="module")
+def recorded(modules: Modules) -> ModuleType:
+    """A ball whose impacts another event takes note of, in both directions."""
+    text = BALL.replace("bouncing", "recorded_ball").replace("duration = 3", "duration = 2")
+    low = event("low", "y")
+    return modules.unoptimised(
+        text.replace('[[event]]\nname = "impact"', f'{low}\n[[event]]\nname = "impact"')
+    )

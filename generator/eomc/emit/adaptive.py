@@ -44,7 +44,7 @@ def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
     vectors, few = (8, 25) if steep(system) else (6, 21)
     stages = METHOD.stages * len(system.coordinates)
-    more = 8 * len(system.events) + 12 * bool(system.events) + bool(system.constraints)
+    more = 9 * len(system.events) + 12 * bool(system.events) + bool(system.constraints)
     return vectors * width + stages + few + more
 
 
