@@ -3,6 +3,7 @@
 import base64
 import itertools
 import json
+import os
 import re
 from types import SimpleNamespace
 
@@ -267,7 +268,9 @@ def test_a_batch_as_a_film(batch, tmp_path):
     short.q, short.qd = short.q[:, :11], short.qd[:, :11]
     short.animate(tmp_path / "b.gif")
     with image.open(tmp_path / "b.gif") as made:
-        colours = {c for _, c in made.convert("RGB").getcolors(1 << 20)}
+        counted = made.convert("RGB").getcolors(1 << 20)
+    assert max(counted)[1] == (255, 255, 255)
+    colours = {c for _, c in counted}
     assert any(r < 40 and b > 150 for r, _, b in colours)  # the first in blue
     assert any(r > 180 and b < 60 for r, _, b in colours)  # the second in orange
 
@@ -294,6 +297,38 @@ def test_a_gif_has_a_picture_for_each_instant(tmp_path):
             pictures.append(np.asarray(made.convert("L"), int)[60:])  # below the title
     changes = [np.abs(a - b).sum() for a, b in itertools.pairwise(pictures)]
     assert min(changes) > max(changes) / 3  # it moves from each to the next
+
+
+def test_of_a_film_what_stands_is_drawn_once_and_all_is_in_view(monkeypatch):
+    matplotlib = pytest.importorskip("matplotlib")
+    from eomc.report.film import Pictures
+
+    drawn, draw = [], matplotlib.axis.Axis.draw
+    monkeypatch.setattr(
+        matplotlib.axis.Axis, "draw", lambda self, r: drawn.append(self) or draw(self, r)
+    )
+    reel = Reel(system(scene("suspension")), motion(scene("suspension"), seconds=0.5))
+    rows = np.arange(0, len(reel.t), len(reel.t) // 8)
+    pictures = Pictures([reel], [reel.drawing(rows)], reel.t[rows], None)
+    shown = [pictures.at(k) for k in (*range(len(rows)), 0)]
+    assert len(drawn) == 2  # an axis to the right, one upwards
+    assert (shown[0] == shown[-1]).all() and (shown[0] != shown[1]).any()
+    (axes,), (moving,) = pictures.figure.axes, pictures.moving
+    low, high = axes.viewLim.get_points()
+    lines = np.concatenate([line for each in moving.shapes for line in each])
+    assert (low < lines).all() and (lines < high).all()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a script of sh stands for ffmpeg")
+def test_an_mp4_is_given_a_picture_for_each_instant(tmp_path, monkeypatch):
+    matplotlib = pytest.importorskip("matplotlib")
+    program = tmp_path / "ffmpeg"
+    program.write_text('#!/bin/sh\nfor last; do :; done\ncat > "$last"\n')
+    program.chmod(0o755)
+    monkeypatch.setitem(matplotlib.rcParams, "animation.ffmpeg_path", str(program))
+    film(scene("simple_pendulum"), tmp_path / "a.mp4", seconds=0.04)
+    pictures = np.fromfile(tmp_path / "a.mp4", np.uint8).reshape(3, 480, 480, 4)
+    assert (pictures[:, 0, 0] == 255).all() and (pictures[1] != pictures[2]).any()
 
 
 def test_films_that_can_not_be_made_say_why(tmp_path, monkeypatch):

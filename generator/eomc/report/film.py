@@ -5,19 +5,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from subprocess import CalledProcessError
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eomc.base import texts
 from eomc.base.errors import EomcError
-from eomc.report.picture import frame, seen, still
+from eomc.report.marks import Drawing
+from eomc.report.picture import frame, seen, shapes, still
 from eomc.report.reel import Reel
 from eomc.report.style import COLOURS, INK, colours
 from eomc.runtime.written import replacing
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+Pixels = NDArray[np.uint8]
+
 RATES = {".gif": 25, ".mp4": 50}  # pictures a second; a GIF counts in hundredths of a second
 MOST = 1500  # pictures
 SIZE, DPI = 4.8, 100  # inches of a run, dots an inch
+WHITE = 248  # from which on it is white: Pillow finds the nearest colour to four values or so
 
 
 def write(reels: Sequence[Reel], file: Path, title: str | None) -> None:
@@ -25,8 +35,7 @@ def write(reels: Sequence[Reel], file: Path, title: str | None) -> None:
     suffix, shown = file.suffix.lower(), texts.line(str(file))
     try:
         import matplotlib
-        from matplotlib.animation import FFMpegWriter, PillowWriter
-        from matplotlib.figure import Figure
+        from matplotlib.animation import FFMpegWriter
     except ImportError:
         raise EomcError(f"{shown}: films need matplotlib: pip install matplotlib") from None
     if suffix == ".mp4" and not FFMpegWriter.isAvailable():
@@ -49,27 +58,115 @@ def write(reels: Sequence[Reel], file: Path, title: str | None) -> None:
                 f"{shown}: {reel.system.name} says nothing about its shape: add [picture] to the "
                 "scene, or write .html, which has the curves"
             )
-        made.append((drawn, seen(drawn)))
-    maker = PillowWriter if suffix == ".gif" else FFMpegWriter
-    writer = maker(fps=rate, metadata={"title": texts.line(title or reels[0].title)})
+        made.append(drawn)
     with matplotlib.rc_context({"text.usetex": False}):
-        figure = Figure(figsize=(SIZE * len(reels), SIZE), dpi=DPI, layout="constrained")
-        panels = figure.subplots(1, len(reels), squeeze=False)[0]
+        pictures = Pictures(reels, made, times, title)
         try:
-            with replacing(file) as new, writer.saving(figure, str(new), DPI):
-                for k, t in enumerate(times):
-                    for axes, reel, (drawn, flat) in zip(panels, reels, made, strict=True):
-                        axes.clear()
-                        words = texts.figure(title or reel.title)
-                        axes.set_title(f"{words}, t = {t:.2f} s", fontsize=10, color=INK)
-                        hues = colours(len(reel.key) or len(COLOURS))
-                        for path, own in zip(drawn.paths, hues, strict=False):
-                            colour = own if path.whose is None else hues[path.whose]
-                            axes.plot(*flat[: k + 1, path.point].T, color=colour, linewidth=1.0)
-                        still(axes, drawn, flat[k], hues=hues)
-                        frame(axes, drawn, flat)
-                    writer.grab_frame()
-                    figure.set_layout_engine("none")  # as in the first: nothing jumps
+            with replacing(file) as new:
+                if suffix == ".gif":
+                    _gif(pictures, new)
+                else:
+                    _mp4(pictures, new, texts.line(title or reels[0].title))
         except (OSError, CalledProcessError) as fault:
             words = getattr(fault, "strerror", None) or str(fault)
             raise EomcError(f"{shown}: can't be written ({words})") from None
+
+
+def _gif(pictures: Pictures, file: Path) -> None:
+    """In the colours of three of its pictures, as it takes longer to find those of each."""
+    from PIL import Image
+
+    def image(picture: Pixels) -> Image.Image:
+        return Image.fromarray(picture).convert("RGB")
+
+    count = len(pictures.times)
+    some = np.concatenate([pictures.at(k) for k in (0, count // 2, count - 1)])
+    few = image(some).quantize(method=Image.Quantize.MAXCOVERAGE)
+    known = np.reshape(few.getpalette() or [], (-1, 3)).astype(np.uint8)
+    known[known.min(axis=1) >= WHITE] = 255
+    few.putpalette(known.tobytes())
+    first, *others = (
+        image(pictures.at(k)).quantize(palette=few, dither=Image.Dither.NONE) for k in range(count)
+    )
+    delay = 1000 // RATES[".gif"]
+    first.save(file, save_all=True, append_images=others, duration=delay, loop=0)
+
+
+def _mp4(pictures: Pictures, file: Path, title: str) -> None:
+    from matplotlib.animation import FFMpegWriter
+    from matplotlib.figure import Figure
+
+    writer = FFMpegWriter(fps=RATES[".mp4"], metadata={"title": title})
+    width, height = pictures.figure.get_size_inches()
+    sheet = Figure(figsize=(width, height), dpi=DPI)
+    image = sheet.figimage(pictures.at(0))
+    with writer.saving(sheet, str(file), DPI):
+        for k in range(len(pictures.times)):
+            image.set_data(pictures.at(k))
+            writer.grab_frame()
+
+
+class Pictures:
+    """The pictures of a film, side by side what is drawn of each run, at some times.
+
+    What stands is drawn once, and what moves over it.
+    """
+
+    def __init__(
+        self, reels: Sequence[Reel], made: Sequence[Drawing], times: Array, title: str | None
+    ) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        self.times = times
+        self.figure = Figure(figsize=(SIZE * len(reels), SIZE), dpi=DPI, layout="constrained")
+        self.canvas = cast(Any, FigureCanvasAgg(self.figure))
+        panels = self.figure.subplots(1, len(reels), squeeze=False)[0]
+        self.moving = [
+            _Moving(axes, drawn, times, len(reel.key), texts.figure(title or reel.title))
+            for axes, reel, drawn in zip(panels, reels, made, strict=True)
+        ]
+        self.canvas.draw()
+        self.standing = self.canvas.copy_from_bbox(self.figure.bbox)
+
+    def at(self, k: int) -> Pixels:
+        """The picture at an instant, (height, width, 4)."""
+        self.canvas.restore_region(self.standing)
+        for moving in self.moving:
+            moving.draw(k)
+        return np.array(self.canvas.buffer_rgba())
+
+
+class _Moving:
+    """What moves of one run: the marks, the paths so far and the time in the title."""
+
+    def __init__(self, axes: Axes, made: Drawing, times: Array, instances: int, words: str) -> None:
+        self.axes, self.times, self.words, self.flat = axes, times, words, seen(made)
+        hues = colours(instances or len(COLOURS))
+        self.title = axes.set_title(self._title(0), fontsize=10, color=INK)
+        pairs = [*zip(made.paths, hues, strict=False)]
+        self.points = [path.point for path, _ in pairs]
+        self.paths = [
+            axes.plot([], [], color=own if path.whose is None else hues[path.whose], linewidth=1.0)
+            for path, own in pairs
+        ]
+        self.marks = still(axes, made, self.flat[0], hues=hues)
+        self.shapes = [[line for line, _ in shapes(made, at, hues=hues)] for at in self.flat]
+        for each in self.shapes:
+            axes.update_datalim(np.concatenate(each))  # the view has room for all
+        frame(axes, made, self.flat)
+        for artist in (self.title, *axes.lines):
+            artist.set_animated(True)  # not drawn with what stands
+
+    def _title(self, k: int) -> str:
+        return f"{self.words}, t = {self.times[k]:.2f} s"
+
+    def draw(self, k: int) -> None:
+        """Over what stands."""
+        self.title.set_text(self._title(k))
+        for (line,), point in zip(self.paths, self.points, strict=True):
+            line.set_data(*self.flat[: k + 1, point].T)
+        for line, points in zip(self.marks, self.shapes[k], strict=True):
+            line.set_data(*points.T)
+        for artist in (self.title, *sorted(self.axes.lines, key=lambda line: line.zorder)):
+            self.axes.draw_artist(artist)

@@ -20,6 +20,7 @@ from eomc.report.style import COLOURS, INK, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
 Array = NDArray[np.float64]
 
@@ -213,10 +214,24 @@ SKIPPED = frozenset(("rail", "arm", "inertia"))  # at earlier instants
 
 def still(
     axes: Axes, made: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
-) -> None:
+) -> list[Line2D]:
     """The marks at one instant; in a shade of grey, without symbols, where it is an earlier one.
 
     hues: of instances, where several are drawn over each other.
+    """
+    return [
+        line
+        for points, look in shapes(made, flat, shade, hues)
+        for line in axes.plot(*points.T, **look)
+    ]
+
+
+def shapes(
+    made: Drawing, flat: Array, shade: str = "", hues: Sequence[str] = ()
+) -> Iterator[tuple[Array, dict[str, Any]]]:
+    """The lines and symbols of the marks, (k, 2) each, and how they look: the same at any instant.
+
+    Not finite where a point of the mark is not.
     """
     widest = np.linalg.norm(np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0))
     width = 0.02 * float(widest)
@@ -224,28 +239,32 @@ def still(
     for mark in made.marks:
         points = flat[list(mark.points)]
         if not np.isfinite(points).all():
-            continue
+            points = np.full_like(points, np.nan)
         ink, rod = (INK, BODY) if mark.whose is None else (hues[mark.whose],) * 2
         if mark.kind in LINES:
             if shade and (mark.kind in SKIPPED and len(made.marks) > 3):
                 continue
             aside = width * 1.4 if pairs.count(frozenset(mark.points)) > 1 else 0.0
+            look = {
+                "color": shade or (rod if mark.kind != "line" else ink),
+                "linewidth": LINES[mark.kind] * (0.7 if shade else 1.0),
+                "zorder": 1 if shade else 3,
+                "linestyle": (0, (4, 3)) if mark.kind == "rail" else "-",
+                "solid_capstyle": "round",
+                "solid_joinstyle": "round",
+            }
             for line in outline(mark, points, width, aside):
-                axes.plot(
-                    *line.T, color=shade or (rod if mark.kind != "line" else ink),
-                    linewidth=LINES[mark.kind] * (0.7 if shade else 1.0), zorder=1 if shade else 3,
-                    solid_capstyle="round", linestyle=(0, (4, 3)) if mark.kind == "rail" else "-",
-                    solid_joinstyle="round",
-                )  # fmt: skip
+                yield line, look
         elif not shade:
             symbol, size, face = SYMBOLS[mark.kind]
             face = ink if face == INK else face
-            axes.plot(*points[0], symbol, color=ink, markersize=size, markerfacecolor=face,
-                      markeredgewidth=0.9, zorder=4)  # fmt: skip
+            yield points[:1], {"marker": symbol, "linestyle": "none", "color": ink, "zorder": 4,
+                               "markersize": size, "markerfacecolor": face,
+                               "markeredgewidth": 0.9}  # fmt: skip
             if mark.kind == "mass" and len(points) == 2:  # how it is turned
                 way = points[1] - points[0]
                 tick = points[0] + way / np.linalg.norm(way) * 2 * width
-                axes.plot(*np.array([points[0], tick]).T, color=ink, linewidth=1.2, zorder=4)
+                yield np.array([points[0], tick]), {"color": ink, "linewidth": 1.2, "zorder": 4}
 
 
 def outline(mark: Mark, points: Array, width: float, aside: float) -> Iterator[Array]:
