@@ -15,7 +15,9 @@ from eomc.cli.main import main
 from eomc.model import kinematics, mobility
 from eomc.model.from_scene import from_scene
 from eomc.model.mobility import Mobility
+from eomc.program import singular
 from eomc.program.assembly import assembled
+from eomc.program.singular import Nearest
 from eomc.scene.read import parse
 
 
@@ -394,7 +396,9 @@ def test_loops_and_rows_count():
     assert "M = d(N - 1 - j) + sum f - constraints = 3(4 - 1 - 4) + 4 - 1 = 0" in driven.table()
 
 
-def test_dof_tells_rank_and_the_assembled_start(tmp_path: Path) -> None:
+def test_dof_tells_rank_and_the_assembled_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "four_bar.toml"
     file.write_text(FOUR_BAR.replace("1.4 }", "1.4, guess = true }") + "\n".join(BARS))
     done = CliRunner().invoke(main, ["dof", str(file), "--json"])
@@ -410,7 +414,10 @@ def test_dof_tells_rank_and_the_assembled_start(tmp_path: Path) -> None:
         3.5 + 2.5 * np.exp(1j * q["q3"]),
     ]
     assert abs(ends[0] - ends[1]) < 1e-14
+    near = Nearest(**found["constraints"]["nearest_singular"])
+    monkeypatch.setattr(singular, "nearest", lambda _: near)  # not sought again
     shown = CliRunner().invoke(main, ["dof", str(file)]).output
+    assert str(near) in shown
     assert "2 rows of constraints on 3 coordinates, rank 2 of 2" in shown
     assert "assembled start: q1 = 1.04719755, q2 = " in shown
 
