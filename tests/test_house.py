@@ -37,8 +37,9 @@ def modules() -> dict[str, Path]:
 
 
 @cache
-def tree(name: str) -> ast.Module:
-    return ast.parse(modules()[name].read_text(encoding="utf-8"))
+def nodes(name: str) -> list[ast.AST]:
+    """All of a module's syntax, at any depth."""
+    return [*ast.walk(ast.parse(modules()[name].read_text(encoding="utf-8")))]
 
 
 @cache
@@ -49,7 +50,7 @@ def imports(name: str) -> frozenset[str]:
 
 def _imports(name: str) -> Iterator[str]:
     known, runtime = modules(), name.startswith("runtime.")
-    for node in ast.walk(tree(name)):
+    for node in nodes(name):
         if isinstance(node, ast.Import):
             wanted = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -115,7 +116,7 @@ def test_pictures_and_events_alone_are_asked_of_eomc_beside_a_built_module() -> 
         name
         for name in modules()
         if room(name) == "runtime"
-        for node in ast.walk(tree(name))
+        for node in nodes(name)
         if isinstance(node, ast.Constant)
         and isinstance(node.value, str)
         and node.value.startswith("eomc.")
@@ -130,6 +131,6 @@ MODULE, FUNCTION = 450, 80  # lines
 def test_rooms_are_small() -> None:
     for name, path in modules().items():
         assert path.read_text(encoding="utf-8").count("\n") <= MODULE, name
-        for node in ast.walk(tree(name)):
+        for node in nodes(name):
             if isinstance(node, ast.FunctionDef) and node.end_lineno is not None:
                 assert node.end_lineno - node.lineno < FUNCTION, f"{name}: {node.name}"
