@@ -45,6 +45,7 @@ def kept(system: System, width: int) -> int:
     vectors, few = (8, 25) if steep(system) else (6, 21)
     stages = METHOD.stages * len(system.coordinates)
     more = 9 * len(system.events) + 12 * bool(system.events) + bool(system.constraints)
+    vectors += 2 * any(e.begins is not None for e in system.events)
     return vectors * width + stages + few + more
 
 
@@ -222,6 +223,7 @@ def steps(made: Stepping) -> Adaptive:
         capped=made.capped,
         capped_now=made.capped.call(a="&a"),
         events=bool(target.system.events),
+        begins="begins" in target.program,
         project=form.project,
         whole=form.whole,
         settle=made.settle,
@@ -267,11 +269,13 @@ def fixed(made: Stepping) -> FixedSteps:
         fabs=f"fabs{real.function_suffix}",
         timed=target.driven,
         jumps="jumps" in target.program,
+        above="begins" in target.program,
         fixed=made.fixed,
         at=made.at,
         inside=made.within.call(),
         step=functions.public.fixed_step.call(**at),
         forces_before=made.forces.call(f="before", **state),
+        forces_halfway=made.forces.call(f="halfway", t="t + h/2", **at),
         forces_behind=made.forces.call(f="behind", t="t + h", **at),
     )
 

@@ -165,7 +165,7 @@ def _events(made: Stepping) -> Events:
         look_behind=looked.call(g="value", z=f"z + {target.literal(apart / 2)}"),
         inside=made.at.call(),
         values_there=values.call(events="value", **within),
-        values_end=values.call(events="value", **now),
+        values_end=values.call(events="value", t=now["t"]),
         changed=changed,
         values_now=values.call(events="value", **now),
         restart=restart,

@@ -62,6 +62,7 @@ class Adaptive(AdaptiveTableau):
     capped: CFunction
     capped_now: str
     events: bool
+    begins: bool
     project: str
     whole: bool
     settle: CFunction
@@ -95,7 +96,8 @@ class FixedSteps(Named):
 
     fixed, at: the next step, and the state within the last one; step: the call of the method's own,
     through a pointer; inside: that of the state within an adaptive step; forces_before,
-    forces_behind: of the accelerations at both ends.
+    forces_halfway, forces_behind: of the accelerations there. above: whether events are made of
+    friction that sticks.
     """
 
     TEMPLATE: ClassVar[str] = "c/fixed_steps.c"
@@ -107,11 +109,13 @@ class FixedSteps(Named):
     fabs: str
     timed: bool
     jumps: bool
+    above: bool
     fixed: CFunction
     at: CFunction
     inside: str
     step: str
     forces_before: str
+    forces_halfway: str
     forces_behind: str
 
 
