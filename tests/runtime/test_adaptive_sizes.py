@@ -100,3 +100,27 @@ def test_rounding_of_what_is_large_takes_no_steps(far: str) -> None:
         few, many = near.simulate(tol=tol), away.simulate(tol=tol)
         assert many.status == "ok" and many.steps < 10 * few.steps
         assert abs(many.q[-1, 1] - few.q[-1, 1]) < 10 * tol + 1e-14 * float(far)
+
+
+OSCILLATOR = """eomc = 1
+name = "late"
+[coordinates]
+x = { start = 1 }
+[energy]
+kinetic = "x_dot**2/2"
+potential = "x**2/2"
+[run]
+tolerance = 1e-13
+batch = true
+"""
+
+
+def test_a_large_time_costs_no_digits() -> None:
+    """What rounding of times leaves is kept: 2.4e-7 s at 1.7e9 s made 5e-8 of the state."""
+    late, t0 = built(OSCILLATOR), 1.7e9
+    since = np.array([0.0, 1, 5, 10.5, 20])
+    for run in (late.simulate(times=t0 + since, t0=t0), late.simulate(duration=20, t0=t0)):
+        np.testing.assert_allclose(run.q[:, 0][run.t == t0 + 20], np.cos(20), atol=1e-13)
+    runs = late.simulate_batch(times=t0 + since, t0=t0)
+    for q in (runs.q[0], late.simulate(times=t0 + since, t0=t0).q):
+        np.testing.assert_allclose(q[:, 0], np.cos(since), atol=1e-13)

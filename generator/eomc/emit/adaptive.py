@@ -42,7 +42,7 @@ def memory(functions: Functions) -> str:
 
 def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
-    vectors, few = (8, 25) if steep(system) else (6, 21)
+    vectors, few = (8, 26) if steep(system) else (6, 22)
     stages = METHOD.stages * len(system.coordinates)
     more = 9 * len(system.events) + 12 * bool(system.events) + bool(system.constraints)
     vectors += 2 * any(e.begins is not None for e in system.events)

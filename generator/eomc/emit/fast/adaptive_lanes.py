@@ -35,7 +35,7 @@ def view(made: Steppers, form: Form) -> views.AdaptiveLanes:
         alone=adaptive.alone(made.functions),
         kept=adaptive.keep(stepping).call(q="s.q", qd="s.qd"),
         look=stepping.within.call(
-            q_at="q_row", qd_at="qd_row", x="&s", z="(times[kept[k]] - s.from)/s.size", u="given",
-            memory="memory + k",
+            q_at="q_row", qd_at="qd_row", x="&s", u="given", memory="memory + k",
+            z="(times[kept[k]] - s.from - s.from_rest)/s.size",
         ),
     )  # fmt: skip
