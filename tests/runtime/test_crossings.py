@@ -62,6 +62,29 @@ def test_a_dip_between_two_looks_is_seen(springs: ModuleType, tol: float) -> Non
     assert run.events["curve"].t == pytest.approx(exact, abs=100 * tol)
 
 
+FAST = (
+    TWO.replace("two_springs", "fast_events")
+    .replace('"x*y_dot - d"', '"cos(w*x - d)"')
+    .replace('"a*x + b*y - c"', '"sin(w*t)"')
+    .replace("k = 2", "w = 50\nk = 2")
+)
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-12])
+def test_events_that_change_faster_than_the_motion_are_seen(tol: float) -> None:
+    """A stroboscope lost two thirds of its flashes, in steps of a second."""
+    fast = built(FAST)
+    for w in (50.0, 7.0, 301.0):
+        run = fast.simulate(tol=tol, duration=10.0, params={"w": w})
+        exact = math.pi / w * np.arange(1, int(10 * w / math.pi) + 1)
+        assert run.events["line"].t == pytest.approx(exact, abs=1e-11)
+        folds = w * np.cos(np.linspace(0, 10, 1_000_001)) - 0.1  # x = cos t, over half turns
+        crossings = np.abs(np.diff(np.floor(folds / math.pi + 0.5))).sum()
+        assert len(run.events["curve"]) == crossings
+    slow = fast.simulate(tol=tol, duration=10.0, params={"w": 0.1})
+    assert slow.steps < 20 and slow.rejected < 5
+
+
 def roots(f, t_end: float) -> list[float]:
     """All zeros in (0, t_end], by fine sampling and bisection in 30 digits."""
     times = np.linspace(0, t_end, 4001).tolist()

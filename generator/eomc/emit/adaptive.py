@@ -44,7 +44,7 @@ def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
     vectors, few = (8, 26) if steep(system) else (6, 22)
     stages = METHOD.stages * len(system.coordinates)
-    more = 9 * len(system.events) + 12 * bool(system.events) + bool(system.constraints)
+    more = 9 * len(system.events) + 14 * bool(system.events) + bool(system.constraints)
     vectors += 2 * any(e.begins is not None for e in system.events)
     return vectors * width + stages + few + more
 
@@ -323,6 +323,7 @@ def run(
         loosest=target.literal(LOOSEST),
         tightest=target.literal(tightest(target.real)),
         events=bool(happen),
+        f=target.real.suffix,
         begun=begun,
         changed=changed,
         values=values,
@@ -330,7 +331,7 @@ def run(
         busy=busy(target.system),
         anew=ANEW,
         run=functions.public.adaptive(METHOD.name),
-        advance=made.step.call(x="&x"),
+        advance=made.step.call(x="&x", **({"h_most": "longest"} if happen else {})),
         fixed=made.fixed.call(x="&x") if happen else "",
         happen=happen,
         restart=restart,

@@ -18,6 +18,8 @@ from eomc.model.system import System
 from eomc.scene.schema import ACTIONS
 
 SAMPLES = 9  # values in a step
+TOLD = 0.02  # of the largest value: what the last coefficients of an event in a step may be
+HALVINGS = 6  # of a step in which they are more
 APART = 1e-6  # parts of a step between values that make a slope
 DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
 
@@ -39,6 +41,20 @@ def slopes(x: Row) -> Sequence[Row]:
     for i, row in enumerate(rows):
         row[i] = -sum(row, Fraction(0))
     return tuple(map(tuple, rows))
+
+
+def last(count: int) -> Sequence[Row]:
+    """From values at the nodes to the last two coefficients by Chebyshev's polynomials."""
+    top = count - 1
+    ends = [Fraction(1, 2) if j in (0, top) else Fraction(1) for j in range(count)]
+    return tuple(
+        tuple(
+            Fraction((-1) ** n * cos(pi * n * j / top)).limit_denominator(10**12)
+            * end * Fraction(1 if n == top else 2, top)
+            for j, end in enumerate(ends)
+        )
+        for n in (top - 1, top)
+    )  # fmt: skip
 
 
 def integrals(x: Row, count: int, times: int) -> Sequence[Row]:
@@ -152,6 +168,9 @@ def _events(made: Stepping) -> Events:
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
         chance=target.literal(1e-6),
+        huge=target.literal(1e30),
+        halvings=HALVINGS,
+        told=target.literal(TOLD),
         looked=looked,
         values=values.call(events="g", **within),
         bracketed=bracketed,
@@ -198,6 +217,7 @@ def _tables(functions: Functions) -> dict[str, Any]:
         "samples": SAMPLES,
         "nodes": numbers(x, real),
         "slopes": matrix(slopes(x), real),
+        "last": c.in_braces(numbers(row, real) for row in last(SAMPLES)),
         "stages": METHOD.stages,
         "once": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 1)),
         "twice": c.in_braces(numbers(row, real) for row in integrals(x, METHOD.stages, 2)),

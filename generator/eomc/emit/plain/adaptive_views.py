@@ -125,7 +125,9 @@ class Events(Named):
 
     samples: the parts of a step at which events are looked at, nodes; slopes: of the polynomial
     through values there. busy: the most events in one step; apart, near, close: parts of a step;
-    chance: of the time between jumps, below which the next one has come by chance.
+    chance: of the time between jumps, below which the next one has come by chance. last: to the
+    last coefficients of the polynomial through values; told: what these may be of the largest
+    value, beyond which a step is halved, `halvings` times at most.
     """
 
     TEMPLATE: ClassVar[str] = "c/events.c"
@@ -150,6 +152,10 @@ class Events(Named):
     near: str
     close: str
     chance: str
+    huge: str
+    halvings: int
+    told: str
+    last: tuple[str, ...]
     looked: CFunction
     values: str
     bracketed: CFunction
@@ -200,6 +206,7 @@ class AdaptiveRun(Named):
     loosest: str
     tightest: str
     events: bool
+    f: str
     begun: str
     changed: str
     values: str
