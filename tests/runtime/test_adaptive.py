@@ -241,6 +241,7 @@ def test_a_section_is_as_exact_as_the_steps(kepler: ModuleType) -> None:
     assert found["t"] == pytest.approx(PERIOD * np.array([0.5, 1.5, 2.5]), abs=1e-9)
     assert found["x"] == pytest.approx([-1.9] * 3, abs=1e-9)
     assert np.abs(found["y"]).max() < 1e-12
+    assert [len(x) for x in run.section("x", 9.0).values()] == [0] * len(found)
 
 
 @pytest.mark.parametrize("every", [1, 7])

@@ -126,7 +126,7 @@ class Functions(Arguments):
         self, name: str, t: Array, q: Array, qd: Array
     ) -> Iterator[tuple[int, Array, Array]]:
         """Rows that can be evaluated in one call: all of them, unless time matters."""
-        if name not in self._timed:
+        if name not in self._timed or not len(t):
             yield 0, q, qd
         else:
             for k in range(len(t)):

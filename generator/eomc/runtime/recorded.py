@@ -133,8 +133,9 @@ class Recorded(ConstrainedRun, Columns):
 
     def _values(self, name: str, function: Callable[..., Any] | None = None, **held: Any) -> Array:
         function = function or getattr(self._model, name)
+        times = self.t if len(self) else [self.t0]
         values = [
-            np.atleast_1d(function(q, qd, t=float(self.t[k]), params=self._params, **held))
+            np.atleast_1d(function(q, qd, t=float(times[k]), params=self._params, **held))
             for k, q, qd in self._model._by_time(name, self.t, self.q, self.qd)
         ]
         return np.concatenate(values)
