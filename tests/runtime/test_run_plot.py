@@ -151,6 +151,17 @@ def test_wrapped_angles_have_breaks_and_no_jumps(modules: Modules) -> None:
         run.plot("theta", wrap=["thetta"])
 
 
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"period": 0}, "period: 0 is not a period: give a number greater than 0"),
+    ({"period": -1.0}, "period: -1 is not a period"),
+    ({"period": np.nan}, "period: nan is not a finite number"),
+    ({"value": np.inf}, "value: inf is not a finite number"),
+    ({"value": "x"}, "value: 'x' is not a number"),
+    ({"rising": "yes"}, "rising: 'yes' is not True or False"),
+    ({"rising": 1}, "rising: 1 is not True or False"),
+]
+
+
 def test_sections_are_exact_to_the_fourth_power_of_the_rows(modules: Modules) -> None:
     """x = cos(t/2) falls through 1/2 at 2 pi/3, and 4 pi later."""
     spring = modules("mass_spring")
@@ -170,6 +181,9 @@ def test_sections_are_exact_to_the_fourth_power_of_the_rows(modules: Modules) ->
     assert np.allclose(run.section("x", 0.5)["x"], 0.5) and not len(run.section("x", 2.0)["t"])
     with pytest.raises(ValueError, match="3 rows, where a cubic needs 4"):
         spring.simulate(steps=2).section("x")
+    for given, words in WRONG:
+        with pytest.raises(ValueError, match=words):
+            run.section("x", **given)
     points = run.plot(phase="x", section=run.section("t", period=4.0)).get_lines()[0]
     assert points.get_linestyle() == "None" and len(points.get_xdata()) == 5
 

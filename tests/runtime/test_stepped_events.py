@@ -365,3 +365,44 @@ def recorded(modules: Modules) -> ModuleType:
     return modules.unoptimised(
         text.replace('[[event]]\nname = "impact"', f'{low}\n[[event]]\nname = "impact"')
     )
+
+
+@pytest.mark.parametrize("steps", [{"h": 0.01}, {"tol": 1e-9}, {"times": [0.0, 3.0]}])
+def test_a_section_crosses_between_jumps(ball: ModuleType, steps: dict[str, Any]) -> None:
+    """The floor is touched and not crossed, and an impact carries the velocity over zero."""
+    run = ball.simulate(**steps)
+    hits, e = impacts(0.8, 6), 0.8 ** np.arange(1, 7)
+    tops = run.section("y_dot")
+    assert tops["t"] == pytest.approx(hits + math.sqrt(2 / G) * e, rel=1e-12)
+    assert tops["y"] == pytest.approx(e**2, rel=1e-12)
+    assert not len(run.section("y")["t"]) and not len(run.section("y_dot", rising=True)["t"])
+    up = run.section("y", 0.25, rising=True)
+    speed = np.sqrt(2 * G * (e[:3] ** 2 - 0.25))
+    assert up["y_dot"] == pytest.approx(speed, rel=1e-12)
+    assert run.section("t", 0.1, period=0.5)["t"] == pytest.approx(0.1 + 0.5 * np.arange(6))
+    with pytest.raises(KeyError, match="did you mean 'y_dot'"):
+        run.section("y_dott")
+
+
+def test_a_section_where_a_jump_changes_what_acts(modules: Modules) -> None:
+    """x passes 0 there; s falls back from 1 to 0, from which it begins."""
+    events = (
+        event("turn", "x", 'action = "jump"', 'a = "-a"'),
+        event("back", "s - 1", 'action = "jump"', "s = 0"),
+    )
+    text = FREE.format(name="section_switch", events="\n".join(events))
+    text = text.replace("x = { rate = 1 }", "x = { rate = 1 }\ns = { rate = 1 }")
+    text = text.replace("[energy]", '[outputs]\nlate = "a*t"\n[energy]')
+    text = text.replace("a = 0", "a = -1").replace('"x_dot**2/2"', '"(x_dot**2 + s_dot**2)/2"')
+    run = modules.unoptimised(text).simulate(duration=9.5, h=0.1)
+    assert run.events["turn"].t == pytest.approx([2, 4, 6, 8])
+    assert run.section("x")["t"] == pytest.approx([0, 2, 4, 6, 8], abs=1e-12)
+    assert run.section("x", rising=True)["t"] == pytest.approx([0, 4, 8], abs=1e-12)
+    assert run.section("s", 0.25)["t"] == pytest.approx(0.25 + np.arange(10))
+    assert run.section("s", 0)["t"].tolist() == [0]
+    assert not len(run.section("s", 1.0)["t"]) and not len(run.section("s", 5.0)["late"])
+
+
+def test_a_run_that_ends_before_its_first_row_has_no_values(ball: ModuleType) -> None:
+    run = ball.simulate(times=[3.0], params={"far": 0.5})
+    assert run.stopped == "away" and {len(x) for x in run.to_dict().values()} == {0}

@@ -17,6 +17,7 @@ from .adaptive_arguments import as_end, as_limits, as_times, as_tolerance
 from .adaptive_error import error_of
 from .adaptive_memory import Kept, Rows
 from .arguments import Array, as_number
+from .balance import with_jumps
 from .dense import within
 from .estimate import Estimate
 from .fitted import Fitted
@@ -85,21 +86,23 @@ class AdaptiveRun(Fitted):
         both = zip((self.q, self.qd), self(times), strict=True)
         return self._at(whole[order], np.array([np.concatenate(x)[order] for x in both]))
 
-    def section(
-        self, name: str, value: float = 0.0, *, rising: bool | None = None,
-        period: float | None = None,
-    ) -> dict[str, Array]:  # fmt: skip
-        """As of any run, with crossings placed by states within the steps: as exact as these.
-
-        Raises ValueError where the state jumps: events find crossings there.
-        """
-        if (np.diff(self.t) == 0).any():
-            raise ValueError("section: the state jumps; make an [[event]] of it, which is exact")
-        parts, ends = np.arange(1, _EVEN) / _EVEN, self.t[[0, -1]]
-        between = (self.t[:-1, None] + np.diff(self.t)[:, None] * parts).ravel()
-        found = crossings(self._with(between).to_dict(), name, value, rising, period)
-        times, by = found["t"], 1e-6 * float(np.max(np.diff(self.t), initial=0.0))
-        turns = 0.0 if period is None else period * np.round((found[name] - value) / period)
+    def _crossings(
+        self, name: str, value: float, rising: bool | None, period: float | None
+    ) -> dict[str, Array]:
+        made: AdaptiveRun = with_jumps(self)
+        t, parts = made.t[:, None], np.arange(1, _EVEN) / _EVEN
+        between = (t[:-1] + np.diff(t, axis=0) * parts).astype(t.dtype)
+        apart = (t[:-1] < between) & (between < t[1:])
+        found = crossings(made._with(between[apart]).to_dict(), name, value, rising, period)
+        asked = found["t"] >= self.t[0]
+        times, by = found["t"][asked], 1e-6 * float(np.max(np.diff(made.t)))
+        turns = 0.0 if period is None else period * np.round((found[name][asked] - value) / period)
+        jumps = np.unique(made.t[1:][np.diff(made.t) == 0])
+        piece = np.searchsorted(jumps, times)  # a state at a jump is that before it
+        ends = (
+            np.array([made.t[0], *np.nextafter(jumps, np.inf)])[piece],
+            np.array([*jumps, made.t[-1]])[piece],
+        )
         for _ in range(2):  # Newton's method
             places = times, np.clip(times - by, *ends), np.clip(times + by, *ends)
             here, one, other = (self._at(x, np.array(self(x)))[name] for x in places)

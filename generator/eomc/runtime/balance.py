@@ -139,7 +139,7 @@ def _rows(run: Recorded) -> _Rows | None:
     if u is None or np.ndim(u) == 1:
         made = _in_steps(run) or _between_jumps(run)  # all its rows: few may look smooth and not be
         return _Rows(model, run._params, *made, [(slice(None), u)])
-    run = _with_jumps(run)
+    run = with_jumps(run)
     ends, values = _held(run)
     if not len(values):
         return None
@@ -193,7 +193,7 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
     """
     if not hasattr(run, "tol") or run.steps * _FEWEST > _MOST or not run._model.has_power:
         return None
-    run = _with_jumps(run)
+    run = with_jumps(run)
     if np.sum(np.diff(run.t) > 0) != run.steps:  # its rows were asked for
         run = _after_steps(run)
     t, both, grain = run.t, np.array([run.q, run.qd]), 16 * np.finfo(run._model.dtype).eps
@@ -210,7 +210,7 @@ def _in_steps(run: Any) -> tuple[Array, Array, Array] | None:
 
 def _between_jumps(run: Recorded) -> tuple[Array, Array, Array]:
     """t, q, qd equally far apart, in each piece between jumps, which stand on two rows each."""
-    run = _with_jumps(run)
+    run = with_jumps(run)
     n, jumps = len(run.t), 1 + np.flatnonzero(np.diff(run.t) == 0)
     if not len(jumps) or not run._model.has_power:
         even = run if len(jumps) else run._even()
@@ -229,7 +229,7 @@ def _between_jumps(run: Recorded) -> tuple[Array, Array, Array]:
     return made.t, made.q, made.qd
 
 
-def _with_jumps(run: Any) -> Any:
+def with_jumps(run: Any) -> Any:
     """The same run with both rows of each jump, also where others were asked for."""
     happened = getattr(run, "_happened", ((),))[0]
     if not len(happened) or (np.diff(run.t) == 0).any():

@@ -20,7 +20,7 @@ from .notebook import html
 from .package import warn
 from .plot import plot
 from .recorded import Recorded
-from .section import crossings
+from .section import as_section, crossings
 from .shown import by_eomc
 from .status import SAID, Interrupted, state_text
 from .written import File
@@ -98,9 +98,16 @@ class Run(Recorded):
         rising: only where it grows, or only where it falls. period: whole periods above and below
         the value count too, as 2 pi of an angle, or of t that of a drive. Each column is a cubic
         through four rows: errors go as the fourth power of the time between rows, and crossings
-        closer than rows are missed, so keep every=1. Raises ValueError below four rows.
+        closer than rows are missed, so keep every=1. By a tolerance, and of scenes with events,
+        states within the steps place crossings: as exact as these; a jump crosses nothing. Raises
+        ValueError below four rows.
         """
-        return crossings(self._drawn.to_dict(), name, value, rising, period)
+        return self._crossings(name, *as_section(self._columns(), name, value, rising, period))
+
+    def _crossings(
+        self, name: str, value: float, rising: bool | None, period: float | None
+    ) -> dict[str, Array]:
+        return crossings(self.to_dict(), name, value, rising, period)
 
     @property
     def _drawn(self) -> Run:
