@@ -227,6 +227,16 @@ def test_a_wrong_weight_is_found_by_check(tmp_path: Path) -> None:
     assert failed == {"plain C: one step", "plain C: run", "plain C beside fast: rk4"}
 
 
+def test_the_commands_of_the_page_compile_the_self_test(tmp_path: Path) -> None:
+    title, page = kit("cartpole", tmp_path), (ROOT / "docs" / "c.md").read_text(encoding="utf-8")
+    commands = re.findall(r"^cc .*selftest.*?(?= *#)", page, re.M)
+    assert len(commands) == 2
+    for command in commands:
+        _, *arguments = command.replace("NAME", title).split()
+        run(needs("cc"), *arguments, cwd=tmp_path)
+        assert run("./a.out", cwd=tmp_path).startswith(f"{title}: right in ")
+
+
 @pytest.mark.parametrize("name", tiers(["cartpole", "everything"], "cartpole"))
 @pytest.mark.parametrize("form", tiers(["plain", "fast", "mixed"], "plain", "mixed"))
 def test_example_and_self_test_serve_both_forms(name: str, form: str, tmp_path: Path) -> None:
