@@ -190,7 +190,7 @@ def test_systems_made_in_python() -> None:
         ({"H": (0, 1)}, "limits of H: inputs are F, G"),
         ({"F": 1}, "give the least and the largest value, here 1"),
         ({"F": (2, "m")}, "2, the least value, is not below m"),
-        ({"F": ("x", 1)}, "x not declared"),
+        ({"F": ("x", 1)}, "x can't be used here: limits are made of numbers and parameters"),
     ):
         with pytest.raises(EomcError, match=words):
             system(limits)

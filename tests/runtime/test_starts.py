@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+import sympy
 from conftest import Modules
 
+import eomc
 from eomc.base.errors import EomcError
 from eomc.runtime import starts
 from eomc.scene import formulas
@@ -98,6 +101,25 @@ def test_one_under_constraints_is_assembled(modules: Modules) -> None:
     bob = modules("pendulum_xy")
     run = bob.simulate(params={"l": 1.5}, steps=2)
     assert run["y"][0] == -1.5 and bob.simulate(steps=2)["y"][0] == -0.8
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+def test_those_of_a_system_made_in_python(tmp_path: Path) -> None:
+    r, lam, k = sympy.Symbol("r"), sympy.Symbol("lambda"), sympy.Symbol("k")
+    system = eomc.System.make(
+        "made_hangs",
+        {"x": ("1 - k/lambda_1", "-k"), r: sympy.Max(lam, k) / sympy.sec(k) + sympy.E, "y": "pi/2"},
+        "(x_dot**2 + r_dot**2 + y_dot**2)/2",
+        k * r**2 + sympy.Symbol("load"),
+        parameters={lam: 4, k: 2, "load": 3},
+        events={"drops": {"when": "y - 9", "action": "jump", "load": 1}},
+    )
+    module = eomc.load(system, tmp_path)
+    e, half = np.e, np.pi / 2
+    assert module.start[0] == pytest.approx([0.5, 4 * np.cos(2) + e, half, 3], rel=1e-15)
+    run = module.simulate(steps=1, params={"k": 8.0})
+    assert run.q[0] == pytest.approx([-1, 8 * np.cos(8) + e, half, 3], rel=1e-15)
+    assert run.qd[0].tolist() == [-8, 0, 0, 0]
 
 
 def test_starts_know_every_function_of_formulas() -> None:

@@ -17,6 +17,7 @@ from eomc.model import constraints, given
 from eomc.model.algebra import UNDEFINED
 from eomc.model.mechanics import Made
 from eomc.model.pictured import pictured
+from eomc.model.pictured import text as formula_text
 from eomc.model.rewrite import JumpError, rewritten
 from eomc.model.sticking import Friction
 from eomc.model.symbols import (
@@ -35,6 +36,9 @@ from eomc.model.symbols import (
 from eomc.scene.scene import Run
 from eomc.scene.schema import ACTIONS, DIRECTIONS
 
+_OF_NUMBERS = (
+    "a parameter's value is made of numbers; what depends on other parameters is a definition"
+)
 Ends = tuple[Expr | None, ...]  # the least and the largest value of an input
 
 
@@ -65,10 +69,10 @@ class Maker:
         self.taken[used] = one
         return used
 
-    def _expression(self, value: Any, role: str) -> Expr:
+    def _expression(self, value: Any, role: str, rule: str = "") -> Expr:
         if isinstance(value, str):
             known = {s.name: s for s in self.known}
-            value = given.from_text(value, role, known)
+            value = given.from_text(value, role, known, rule)
         expr = given.expression(value, role)
         expr = expr.replace(
             lambda e: isinstance(e, sympy.Derivative),
@@ -82,14 +86,14 @@ class Maker:
         strange += sorted(s.name for s in expr.free_symbols if s not in self.known)
         if any(d.derivative_count > 1 for d in expr.atoms(sympy.Derivative)):
             raise given.fault(role, "accelerations are what is solved for, none can be used")
-        if strange == ["t"]:
+        if strange == ["t"] and not rule:
             raise given.fault(
                 role,
                 "this t is not the time: write eomc.model.system.t, or "
                 "dynamicsymbols._t where coordinates are dynamicsymbols",
             )
         if strange:
-            raise given.undeclared(role, strange, (s.name for s in self.known))
+            raise given.undeclared(role, strange, (s.name for s in self.known), rule)
         try:
             expr = rewritten(expr, self.fixed)
         except JumpError as jump:
@@ -100,7 +104,7 @@ class Maker:
         return expr
 
     def _parameter(self, one: Any, given_value: Any, units: Mapping[str, str]) -> Parameter:
-        value = given.number(given_value, f"parameter {one}")
+        value = given.number(given_value, f"parameter {one}", _OF_NUMBERS)
         never_negative = getattr(one, "is_nonnegative", None) is True
         if never_negative and value < 0:
             raise given.fault(f"parameter {one}", f"its symbol can't be negative, here {value:g}")
@@ -128,9 +132,10 @@ class Maker:
                 raise EomcError(f"System.make: a title or unit is a text, not {text!r}")
         if not starts:
             raise EomcError("System.make: give at least one coordinate")
-        made = [self._coordinate(one, units, start) for one, start in starts.items()]
-        made = self._held(made, [*starts], guess, bool(rows))
+        made = [self._coordinate(one, units) for one in starts]
         declared = [self._parameter(p, v, units) for p, v in parameters.items()]
+        made = [*self._started(made, starts.values(), declared)]
+        made = self._held(made, [*starts], guess, bool(rows))
         pending = given.symbols(inputs, "inputs", 0)
         named = map(given.name_of, (*starts, *parameters, *pending, *definitions))
         given.check_units(units, (*named, *map(str, (*rows, *outputs))))
@@ -180,18 +185,10 @@ class Maker:
         digest = hashlib.sha256(whole.encode()).hexdigest()
         return of(**made_of, digest=digest, renamed=tuple(self.renamed), pictured=drawn)
 
-    def _coordinate(self, one: Any, units: Mapping[Any, str], start: Any) -> Coordinate:
-        """A coordinate, whose symbols are known from here on; what is given of it is held."""
+    def _coordinate(self, one: Any, units: Mapping[Any, str]) -> Coordinate:
+        """A coordinate, whose symbols are known from here on."""
         name = self._name_of(one, "coordinate")
-        start, rate = given.start(start, f"start of {name}")
-        c = Coordinate(
-            name,
-            units.get(given.name_of(one), ""),
-            start or 0.0,
-            rate or 0.0,
-            held=start is not None,
-            held_rate=rate is not None,
-        )
+        c = Coordinate(name, units.get(given.name_of(one), ""))
         self.map[one] = c.q
         if isinstance(one, AppliedUndef):
             time = one.args[0]
@@ -202,6 +199,32 @@ class Maker:
             if one == symbol(one.name):
                 self.map[Symbol(one.name)], self.map[Symbol(f"{one}_dot")] = c.q, c.qd
         return c
+
+    def _started(
+        self, made: Iterable[Coordinate], starts: Iterable[Any], parameters: Iterable[Parameter]
+    ) -> Iterator[Coordinate]:
+        """The coordinates with their starts, over parameters; what is given of one is held."""
+        values = {p.symbol: p.value for p in parameters}
+        self.known = {*values}
+        rule = "a start is made of numbers and parameters"
+        for c, whole in zip(made, starts, strict=True):
+            role, ends = f"start of {c.name}", []
+            for x in given.start(whole, role):
+                follows = ""
+                if isinstance(x, (str, Expr)):
+                    x = self._expression(x, role, rule)
+                    if x.has(dot):
+                        raise given.undeclared(role, ["dot(...)"], (), rule)
+                    if x.free_symbols:
+                        follows = formula_text(x)
+                        given.from_text(follows, role, {s.name: s for s in values}, rule)
+                    x = x.xreplace(values)
+                ends.append((None if x is None else given.number(x, role), follows))
+            (start, follows), (rate, rate_follows) = ends
+            yield replace(
+                c, start=start or 0.0, rate=rate or 0.0, held=start is not None,
+                held_rate=rate is not None, follows=follows, rate_follows=rate_follows,
+            )  # fmt: skip
 
     def _held(
         self, made: Sequence[Coordinate], given_as: Sequence[Any], guess: Any, rows: bool
@@ -280,6 +303,7 @@ class Maker:
         values = {p.symbol: p.value for p in parameters}
         self.known = {*values}
         known, found = {given.name_of(i) for i in inputs}, dict[str, Ends]()
+        rule = "limits are made of numbers and parameters"
         for name, pair in given.by_name(limits, "limits", "{F: (-1, 1)}").items():
             role = f"limits of {name}"
             if name not in known:
@@ -288,7 +312,8 @@ class Maker:
                 raise given.fault(role, f"give the least and the largest value, here {pair!r}")
             ends = zip(pair, (-sympy.oo, sympy.oo), strict=True)
             least, most = (
-                None if x is None or x == end else self._expression(x, role) for x, end in ends
+                None if x is None or x == end else self._expression(x, role, rule)
+                for x, end in ends
             )
             if least is not None and most is not None and (most - least).xreplace(values) <= 0:
                 raise given.fault(role, f"{least}, the least value, is not below {most}")

@@ -80,29 +80,30 @@ def check_units(units: Iterable[str], known: Iterable[str]) -> None:
             )
 
 
-def from_text(text: str, role: str, known: Mapping[str, Symbol]) -> Expr:
-    """A formula as scenes have it. Raises EomcError."""
+def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "") -> Expr:
+    """A formula as scenes have it; rule: what it is made of, in words. Raises EomcError."""
     try:
         formula = formulas.parse(text)
         if strange := [n.id for n in formula.names() if n.id not in known]:
-            raise undeclared(role, strange, known)
+            raise undeclared(role, strange, known, rule)
         growth.size(formula, {})
         return algebra.expression(formula, known)
     except FormulaError as wrong:
         raise fault(role, f"'{text if len(text) <= 80 else text[:79] + '…'}' {wrong}") from None
 
 
-def undeclared(role: str, strange: Sequence[str], known: Iterable[str]) -> EomcError:
-    """The error where an expression has names that nobody declared."""
+def undeclared(
+    role: str, strange: Sequence[str], known: Iterable[str], rule: str = ""
+) -> EomcError:
+    """The error where an expression has names that nobody declared, or that a rule forbids."""
     known = [*known]
     meant = formulas.suggest(strange[0], known)
     if strange[0] in known:
         meant = f"; the '{strange[0]}' declared there is another symbol: take the same one"
-    return fault(
-        role,
-        f"{', '.join(strange)} not declared: name it among coordinates, parameters, inputs or "
-        f"definitions{meant}",
-    )
+    why = "not declared: name it among coordinates, parameters, inputs or definitions"
+    if rule:
+        why = f"can't be used here: {rule}"
+    return fault(role, f"{', '.join(strange)} {why}{meant}")
 
 
 def expression(given: Any, role: str) -> Expr:
@@ -160,10 +161,12 @@ def check_smooth(
         seen.update(more)
 
 
-def number(given: Any, role: str) -> float:
+def number(given: Any, role: str, rule: str = "it is made of numbers") -> float:
     """A finite number, or a formula of numbers. Raises EomcError."""
     if isinstance(given, str):
-        given = from_text(given, role, {})
+        given = from_text(given, role, {}, rule)
+    if isinstance(given, Expr) and given.free_symbols:
+        raise undeclared(role, sorted(map(str, given.free_symbols)), (), rule)
     try:
         value = float(given)
     except (TypeError, ValueError, OverflowError, IndexError):  # as SymPy has it
@@ -173,13 +176,12 @@ def number(given: Any, role: str) -> float:
     return value
 
 
-def start(given: Any, role: str) -> tuple[float | None, float | None]:
-    """A start, or a (start, rate) pair; None where there is none."""
+def start(given: Any, role: str) -> tuple[Any, Any]:
+    """A start and a rate, as they were given; None where there is none."""
     pair = given if isinstance(given, (tuple, list)) else (given, None)
     if len(pair) != 2:
         raise fault(role, f"give a start, or a pair (start, rate), here {given!r}")
-    one, other = (None if x is None else number(x, role) for x in pair)
-    return one, other
+    return pair[0], pair[1]
 
 
 def mapping(given: Any, role: str, example: str) -> Mapping[Any, Any]:

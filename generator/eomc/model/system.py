@@ -56,7 +56,7 @@ class System(Mechanics):
     def make(
         cls,
         name: str,
-        coordinates: Sequence[Any] | Mapping[Any, float | tuple[float, float]],
+        coordinates: Sequence[Any] | Mapping[Any, Any],
         kinetic: Any,
         potential: Any = 0,
         *,
@@ -87,21 +87,21 @@ class System(Mechanics):
         r"""A system from SymPy expressions.
 
         coordinates: symbols, names or dynamicsymbols, or a mapping to their start (or (start,
-        rate)). Names stand for symbols, and formulas as scenes have them for expressions. With
-        plain symbols the velocity of `theta` is the symbol `theta_dot`; with dynamicsymbols
-        it is `theta.diff()`. parameters, inputs (to their default signal) and definitions are
-        mappings from symbols, outputs from names; `theta_ddot`, or the second derivative of a
-        dynamicsymbol, is an acceleration there. constraints: mapping from names to what is zero,
-        over coordinates and t, or linear in the velocities; assembling the start moves coordinates
-        without a start (None, or a list of coordinates alone) and those in `guess`. limits: mapping
-        from inputs to pairs, the least and largest value that acts, None for no such. events:
-        mapping from names to what crosses zero, or to a dict as [[event]] has it, {"when": y,
-        "direction": "falling", "action": "jump", y_dot: -e*y_dot}. tolerance: of adaptive steps;
-        events have 1e-9 where none is given. picture: what it looks like, a dict as [picture] of a
-        scene has it, with expressions or formulas: {"lines": [[[0, 0], [x, -l]]]}. Names that C
-        can't bear (`\theta`, `lambda`) are replaced, and `renamed` says how. friction: mapping from
-        coordinates to Coulomb's, N or N m, which sticks and slides exactly, as [run] friction =
-        "stick". Raises EomcError where something is undeclared.
+        rate)), numbers or formulas of parameters. Names stand for symbols, and formulas as scenes
+        have them for expressions. With plain symbols the velocity of `theta` is the symbol
+        `theta_dot`; with dynamicsymbols it is `theta.diff()`. parameters, inputs (to their default
+        signal) and definitions are mappings from symbols, outputs from names; `theta_ddot`, or the
+        second derivative of a dynamicsymbol, is an acceleration there. constraints: mapping from
+        names to what is zero, over coordinates and t, or linear in the velocities; assembling the
+        start moves coordinates without a start (None, or a list of coordinates alone) and those in
+        `guess`. limits: mapping from inputs to pairs, the least and largest value that acts, None
+        for no such. events: mapping from names to what crosses zero, or to a dict as [[event]] has
+        it, {"when": y, "direction": "falling", "action": "jump", y_dot: -e*y_dot}. tolerance: of
+        adaptive steps; events have 1e-9 where none is given. picture: what it looks like, a dict as
+        [picture] of a scene has it, with expressions or formulas: {"lines": [[[0, 0], [x, -l]]]}.
+        Names that C can't bear (`\theta`, `lambda`) are replaced, and `renamed` says how. friction:
+        mapping from coordinates to Coulomb's, N or N m, which sticks and slides exactly, as [run]
+        friction = "stick". Raises EomcError where something is undeclared.
 
         >>> from sympy.physics.mechanics import dynamicsymbols
         >>> theta, (m, l, g) = dynamicsymbols("theta"), sympy.symbols("m l g")
