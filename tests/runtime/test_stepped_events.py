@@ -17,6 +17,7 @@ from eventful import BALL, FREE, G, event
 
 import eomc
 from eomc.model.from_scene import from_scene
+from eomc.runtime import section
 from eomc.scene.read import parse
 
 pytestmark = pytest.mark.usefixtures("unoptimised_file")
@@ -401,6 +402,25 @@ def test_a_section_where_a_jump_changes_what_acts(modules: Modules) -> None:
     assert run.section("s", 0.25)["t"] == pytest.approx(0.25 + np.arange(10))
     assert run.section("s", 0)["t"].tolist() == [0]
     assert not len(run.section("s", 1.0)["t"]) and not len(run.section("s", 5.0)["late"])
+
+
+@pytest.mark.parametrize("behind", [1.0, -1.0])
+@pytest.mark.parametrize("noise", [0.0, 1e-17, -1e-17])
+def test_what_rests_crosses_once_where_it_leaves_to_the_other_side(
+    behind: float, noise: float
+) -> None:
+    """It comes down to 0, stays there up to t = 2, and goes on."""
+    piece = np.linspace(0.0, 1.0, 9)
+    rest = noise * (-1.0) ** np.arange(9)
+    columns = {
+        "t": np.concatenate([piece, 1 + piece, 2 + piece]),
+        "v": np.concatenate([1 - piece + rest, rest, behind * piece]),
+    }
+    for level, period in ((0.0, None), (0.0, 10.0), (-10.0, 10.0)):
+        found = section.crossings(columns, "v", level, None, period)
+        assert found["t"] == pytest.approx([2.0] if behind < 0 else [])
+    with_nan = columns | {"v": np.where(columns["t"] < 0.5, np.nan, columns["v"] - 0.3)}
+    assert len(section.crossings(with_nan, "v", 0.0, False, None)["t"]) == 1
 
 
 def test_a_run_that_ends_before_its_first_row_has_no_values(ball: ModuleType) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from .arguments import Array, as_flag, as_number, not_one_of
 
-_AT = 1e-9  # of what is between two rows: so near a jump is at it
+_ROUNDING = 16  # of the largest number, where it jumps: from a value, or at rest on it
 
 
 def as_section(
@@ -33,43 +33,45 @@ def crossings(
 
     Two rows of the same time are those of a jump: cubics end there, and the jump crosses nothing.
     """
-    t, f = columns["t"], np.asarray(columns[name], float) - value
-    n = len(t)
+    t, column = columns["t"], columns[name]
+    f, n = np.asarray(column, float) - value, len(t)
     if n < 4:
         raise ValueError(f"section: {n} rows, where a cubic needs 4")
     moving = np.diff(t) > 0
-    edges = np.diff(moving.astype(int), prepend=0, append=0)
-    firsts, lasts = (np.flatnonzero(edges == side) for side in (1, -1))  # of pieces between jumps
-    end, begin = lasts[:-1], firsts[1:]
-    change = abs(f[end] - f[end - 1]) + abs(f[begin + 1] - f[begin])
-    on = abs(f[begin] - f[end]) <= _AT * change
-    f[begin[on]] = f[end[on]]  # where it goes on, it is crossed once, whatever rounding says
-    low, high = np.minimum(f[:-1], f[1:]), np.maximum(f[:-1], f[1:])
-    levels = np.zeros(n - 1) if period is None else np.ceil(low / period) * period
-    inside = (low <= levels) & (levels < high) & moving
-    up = f[1:] > f[:-1]
+    near = 0.0 if moving.all() else _ROUNDING * np.finfo(column.dtype).eps * np.max(abs(column))
+    sides = _sides(f, near, period)
+    up = sides[1:] > sides[:-1]
+    inside = (sides[1:] != sides[:-1]) & moving & np.isfinite(np.diff(f))
     if rising is not None:
         inside &= up == rising
+    edges = np.diff(moving.astype(int), prepend=0, append=0)
+    firsts, lasts = (np.flatnonzero(edges == side) for side in (1, -1))  # of pieces between jumps
     rows = np.flatnonzero(inside)
     piece = np.searchsorted(firsts, rows, "right") - 1
     long = (lasts - firsts)[piece] >= 3
     rows, piece = rows[long], piece[long]
     first = np.clip(rows - 1, firsts[piece], lasts[piece] - 3)[:, None] + np.arange(4)  # about each
     s = (t[first] - t[rows][:, None]) / (t[rows + 1] - t[rows])[:, None]
-    target = levels[rows]
+    target = np.minimum(sides[rows], sides[rows + 1]) * (period or 0.0)
     a, b = np.zeros(len(rows)), np.ones(len(rows))
     for _ in range(60):  # bisection of the cubic, whose ends are the two rows
         middle = (a + b) / 2
         beyond = ((_weights(s, middle) * f[first]).sum(axis=1) > target) == up[rows]
         a, b = np.where(beyond, a, middle), np.where(beyond, middle, b)
-    weights, kept = _weights(s, (a + b) / 2), np.full(len(rows), True)
-    ending = (a > 1 - _AT) & (rows + 1 == lasts[piece]) & (piece < len(firsts) - 1)
-    beginning = (b < _AT) & (rows == firsts[piece]) & (piece > 0)
-    for at, last in (ending, piece[ending]), (beginning, piece[beginning] - 1):  # of two pieces
-        before, behind = (f[row] < target[at] for row in (lasts[last] - 1, firsts[last + 1] + 1))
-        kept[at] = before != behind  # what is touched at a jump is not crossed
-    found = {key: (weights * np.asarray(x, float)[first]).sum(axis=1) for key, x in columns.items()}
-    return {key: x[kept] for key, x in found.items()}
+    weights = _weights(s, (a + b) / 2)
+    return {key: (weights * np.asarray(x, float)[first]).sum(axis=1) for key, x in columns.items()}
+
+
+def _sides(f: Array, near: float, period: float | None) -> Array:
+    """How many values are below each of f (n,), of 0 or of whole periods from there on.
+
+    What is as near as this to a value stays on the side from which it came.
+    """
+    turns = np.zeros(len(f)) if period is None else np.round(f / period)
+    found = (f > 0).astype(float) if period is None else np.ceil(f / period)
+    for k in np.flatnonzero(abs(f - turns * (period or 0.0)) <= near):
+        found[k] = turns[k] + bool(k and found[k - 1] > turns[k])
+    return found
 
 
 def _weights(nodes: Array, at: Array) -> Array:
