@@ -55,22 +55,42 @@ def comparison(modules: Modules) -> Comparison:
     return Comparison(made, modules.unoptimised(SPACE), np.random.default_rng(0), 6)
 
 
+def failed(of: Comparison, module: Any) -> set[str]:
+    """The rows that do not pass of a module in the comparison's place."""
+    right, of.rows, of.module = of.module, [], module
+    try:
+        rows_frames.report(of, of.system.scene)
+        rows_frames.inverse_dynamics(of)
+    finally:
+        of.module = right
+    return {row.name for row in of.rows if not row.passed}
+
+
 @pytest.mark.parametrize("name", ["", *ROWS])
 def test_wrong_ones_fail(comparison: Comparison, name: str) -> None:
-    system, module = comparison.system, comparison.module
-    comparison.rows = []
-    made = Wrong(module, name)
-    comparison.module = made
-    try:
-        rows_frames.report(comparison, system.scene)
-        rows_frames.inverse_dynamics(comparison)
-    finally:
-        comparison.module = module
+    found = failed(comparison, Wrong(comparison.module, name))
     assert sorted(row.name for row in comparison.rows) == sorted(ROWS.values())
-    failed = {row.name for row in comparison.rows if not row.passed}
     # forces are held against the Jacobians
     also = {"forces at frames"} if name == "jacobian" else set()
-    assert failed == ({ROWS[name], *also} if name else set()), comparison.rows
+    assert found == ({ROWS[name], *also} if name else set()), comparison.rows
+
+
+@pytest.fixture(scope="module")
+def stiff(comparison: Comparison) -> Comparison:
+    """Two of the coordinates move as on stiff springs."""
+    of = Comparison(comparison.system, comparison.module, np.random.default_rng(0), 4)
+    for sizes, hardly in ((of.sampler.spread, 1e-7), (of.sampler.speed, 1e-4)):
+        sizes[[0, -1]] = hardly
+    of.expected = of.sampler.states(4)
+    return of
+
+
+@pytest.mark.parametrize("name", ["", "frame_acceleration", "jacobian"])
+def test_of_what_hardly_moves_differences_are_no_rounding(stiff: Comparison, name: str) -> None:
+    """They were, along lines no longer than such a coordinate's way."""
+    also = {"forces at frames"} if name == "jacobian" else set()
+    found = failed(stiff, Wrong(stiff.module, name))
+    assert found == ({ROWS[name], *also} if name else set()), stiff.rows
 
 
 @pytest.mark.slow

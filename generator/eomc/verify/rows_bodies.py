@@ -31,6 +31,7 @@ UNITS = 1e3  # of rounding, which are more in single precision
 STATES = 8  # at most
 NODES = 16  # of the interpolating polynomials
 WIDTHS = (0.1, 0.01, 1e-3)  # of the line, in parts of the time in which things go far
+WIDER = 3.0  # times as wide, where things hardly move
 
 _X, _Y, _Z = np.eye(3)
 
@@ -45,6 +46,24 @@ _MOTIONS: Mapping[str, Sequence[tuple[str, Vector | None]]] = {
     "spherical": (("r", _Z), ("r", _Y), ("r", _X)),
     "free": (("t", _X), ("t", _Y), ("t", _Z), ("r", _Z), ("r", _Y), ("r", _X)),
 }
+
+
+def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[float]:
+    """Of lines at such rates, s: the best of them counts, as no width makes what is wrong right.
+
+    First parts of the time in which a coordinate goes as far as in a motion. Where that is little,
+    as of a stiff spring, differences are rounding: so wider ones too, until one goes a unit.
+    """
+
+    def rate(far: Vector) -> float:
+        return float(np.max([np.abs(qd) / far, np.sqrt(np.abs(qdd) / far)])) or 1.0
+
+    usual, least = rate(spread), rate(np.maximum(spread, 1))
+    yield from (width / usual for width in WIDTHS)
+    width = WIDTHS[0] / usual
+    while WIDER * width < 1 / least:
+        width *= WIDER
+        yield width
 
 
 class Bodies:
@@ -70,17 +89,16 @@ class Bodies:
         """The difference at one state, in parts of its size; nan where nothing can be compared."""
         s, found, system = e.state, [], self.check.system
         slides = {system.coordinates[m.of].name: float(s.q[m.at]) for m in system.modes}
-        rate = float(np.max(np.abs(s.qd) / self.check.sampler.spread)) or 1.0
         if name == "power":  # that of forces alone
             value = float(self.check.ask("tau", s) @ s.qd)
             size = float(e.size["tau"] @ np.abs(s.qd))
         else:
             value, size = float(self.check.ask(name, s)), float(e.size[name])
-        for width in WIDTHS:
+        for width in widths(self.check.sampler.spread, s.qd):
             with np.errstate(all="ignore"):
                 key = id(e), width
                 told = self.check.sampler.told(s)
-                line = self.lines.get(key) or Line(self.scene, told, width / rate, slides=slides)
+                line = self.lines.get(key) or Line(self.scene, told, width, slides=slides)
                 ours = self.lines.setdefault(key, line).value(name)
             if not math.isnan(ours):
                 found.append(abs(value - ours) / (size or 1.0))

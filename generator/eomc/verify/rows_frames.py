@@ -17,7 +17,7 @@ from eomc.scene.scene import Scene
 from eomc.verify.comparison import Comparison
 from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT as ROUNDINGS
-from eomc.verify.rows_bodies import LIMIT, UNITS, WIDTHS, Line, rotated
+from eomc.verify.rows_bodies import LIMIT, UNITS, Line, rotated, widths
 from eomc.verify.sampling import Expected, State
 
 STATES = 4
@@ -71,10 +71,9 @@ class _Frames:
 
     def lines(self, s: State, bend: Vector | float = 0.0) -> Iterator[Line]:
         """Of several widths: the best counts."""
-        rate = float(np.max(np.abs(s.qd) / self.of.sampler.spread)) or 1.0
-        for width in WIDTHS:
+        for width in widths(self.of.sampler.spread, s.qd, bend):
             with np.errstate(all="ignore"):
-                yield Line(self.scene, self.of.sampler.told(s), width / rate, 1.0, bend)
+                yield Line(self.scene, self.of.sampler.told(s), width, 1.0, bend)
 
     def off(
         self, found: Vector, exact: Callable[[Line], Vector], *state: Any, least: float = 0.0
@@ -158,7 +157,7 @@ class _Frames:
         s = e.state
         found = np.asarray(self.module.jacobian(s.q, **self.held(s)), float)
         still = self.of.sampler.told(replace(s, qd=0 * s.qd))
-        worst = 0.0
+        rates, worst = np.maximum(self.of.sampler.spread, 1), 0.0
         for k, direction in enumerate(np.eye(len(s.q))):
 
             def exact(line: Line) -> Vector:
@@ -166,9 +165,8 @@ class _Frames:
                 both = [self.of_twists(self.twists(x)[..., x.middle]) for x in (line, rest)]
                 return both[0] - both[1]
 
-            moving = replace(s, qd=direction * self.of.sampler.spread)
-            column = found[..., k] * self.of.sampler.spread[k]
-            worst = max(worst, self.off(column, exact, moving))
+            moving = replace(s, qd=direction * rates)
+            worst = max(worst, self.off(found[..., k] * rates[k], exact, moving))
         return worst
 
     def forces(self, e: Expected) -> float:
