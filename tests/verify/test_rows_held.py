@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import SCENES
+from cases import SCENES, scene_system
 from conftest import Modules
 
 from eomc.model.from_scene import from_scene
@@ -18,7 +18,8 @@ from eomc.scene.read import parse
 from eomc.verify import rows_constraints
 from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
-from eomc.verify.rows_constraints import HELD, Rows
+from eomc.verify.report import LIMIT
+from eomc.verify.rows_constraints import HELD, WORK, Rows
 from eomc.verify.rows_refusals import OK, Refusals
 from eomc.verify.sampling import SMALL, Sampler
 from eomc.verify.symbolic import of
@@ -81,6 +82,69 @@ def test_what_is_right_passes(bob: ModuleType) -> None:
 
 def test_a_tangent_that_leaves_the_rows_fails(bob: ModuleType) -> None:
     assert failed(Bent(bob), rows_constraints.report) == {"tangent"}
+
+
+class Answering:
+    """A module made of the reference alone, with what one of its values goes through."""
+
+    def __init__(self, of: Comparison, **bent: Callable[[Any], Any]) -> None:
+        self.reference, self.bent = of.reference, bent
+
+    def __getattr__(self, name: str) -> Any:
+        bend = self.bent.get(name, lambda found: found)
+
+        def found(q: Any, qd: Any = None, t: float = 0.0, u: Any = None, params: Any = None) -> Any:
+            if name in ("multipliers", "reactions"):
+                return bend(self.reference.multipliers(q, qd, t, u, params))
+            return bend(self.reference.evaluate(name, q, qd, t, u, params))
+
+        return found
+
+
+@pytest.fixture(scope="module")
+def hinged() -> Comparison:
+    """A four-bar with a crank that hardly moves."""
+    of = Comparison(assembled(scene_system("four_bar")), None, np.random.default_rng(0), 2)
+    of.sampler.spread[0] = 1e-7
+    return of
+
+
+@pytest.mark.parametrize(
+    ("sign", "least", "most"), [(1, 0, WORK), (-1, 0.1, 2), (np.nan, 1, np.inf)]
+)
+def test_reactions_are_compared_where_a_coordinate_hardly_moves(
+    hinged: Comparison, sign: float, least: float, most: float
+) -> None:
+    """What is no number passed."""
+    made = Rows(hinged, Answering(hinged, reactions=lambda f: {"pin": [sign * f[0], f[1], 0]}))
+    assert least <= made.reactions() <= most
+
+
+BELT = """eomc = 1
+name = "belt"
+[coordinates]
+x = {}
+y = { start = 1.0 }
+z = {}
+[energy]
+kinetic = "x_dot**2/2 + y_dot**2/2 + z_dot**2/2"
+potential = "y**2/2 + z**2"
+[constraints]
+belt = "x_dot - y"
+wheel = "z_dot - x*y_dot"
+motor = "y + z - sin(t) - 1"
+"""
+
+
+@pytest.mark.parametrize(
+    "bent", [{}, {"constraint_rates": np.zeros_like}, {"constraint_jacobian": np.abs}]
+)
+def test_rows_do_the_work_of_their_parts_without_rates(bent: dict[str, Any]) -> None:
+    """A belt's with no t in it, of which it was expected that it does none."""
+    system = assembled(from_scene(parse(BELT)))
+    of = Comparison(system, None, np.random.default_rng(0), 4)
+    power = Rows(of, Answering(of, **bent)).power()
+    assert (power > LIMIT) == bool(bent)
 
 
 def test_accelerations_of_negative_masses_fail(

@@ -3,7 +3,7 @@
 At states that the reference has put onto the rows, along a run, and of both forms of C. Multipliers
 and accelerations are compared with those of a dense KKT matrix in NumPy (`kkt`), a corrected step
 in `comparison` with a step that is put back by Newton's method. The module alone is asked whether
-multipliers work where no row moves by itself, whether A is the slope of the rows, and whether
+multipliers work only where rows move by themselves, whether A is the slope of the rows, and whether
 reactions do what multipliers do.
 """
 
@@ -16,21 +16,19 @@ from typing import Any
 
 import numpy as np
 
-from eomc.model.symbols import t as time
 from eomc.scene.assembly import Loop
 from eomc.verify import rows_projection
 from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import STENCIL, Vector
 from eomc.verify.report import LIMIT
-from eomc.verify.rows_bodies import Line
+from eomc.verify.rows_bodies import Line, widths
 from eomc.verify.sampling import EPS, FARTHEST, Expected, State, along, ask, simulate
 
 VALUES = ("constraints", "constraint_rates", "constraint_jacobian", "multipliers")
 WORK = 1e-9  # of what multipliers do: velocities of bodies are good to 1e-12
 ROUNDED = 30  # roundings of multipliers and forces, where those are more: in single precision
 STATES = 4
-WIDTHS = (0.1, 0.01, 1e-3)  # of the lines along which bodies move, s at one `spread` a second
 STEPS = 200  # of a run that is to stay on the rows
 SHARE = 0.02  # of how far things go, in a step of it
 HELD = 450.0  # units: what rows may be along it, 1e-13 of their terms
@@ -144,32 +142,20 @@ class Rows:
                 total += (weight if k > 0 else -weight) * ask(self.module, name, at) / step
         return total
 
-    def power(self) -> float | Finding:
-        """lambda . A qd of the rows in which t does not stand: they do no work."""
-        timeless = np.array([not self._timed(k) for k in range(len(self.system.constraints))])
-        if not np.any(timeless):
-            return Finding(math.inf, "every row moves by itself in time")
+    def power(self) -> float:
+        """lambda . A qd beside -lambda . b, of rows A qd + b: 0 where none moves by itself."""
 
         def error(e: Expected) -> float:
-            multipliers, A = (
-                ask(self.module, n, e.state) for n in ("multipliers", "constraint_jacobian")
-            )
-            work = (multipliers * (A @ e.state.qd))[timeless]
+            s = e.state
+            names = ("multipliers", "constraint_jacobian")
+            multipliers, A = (ask(self.module, n, s) for n in names)
+            b = ask(self.module, "constraint_rates", replace(s, qd=0 * s.qd))
+            work, done = multipliers * (A @ s.qd), -multipliers * b
             size = np.abs(multipliers) * e.size["constraint_rates"]
-            size = size + e.size["multipliers"] * (np.abs(A) @ np.abs(e.state.qd))
-            return self.of.units(work, np.zeros_like(work), size[timeless])
+            size = size + e.size["multipliers"] * (np.abs(A) @ np.abs(s.qd))
+            return self.of.units(work, done, size)
 
         return self.of.largest(error)
-
-    def _timed(self, k: int) -> bool:
-        """Whether t stands in a row, or in what it is made of."""
-        known, found = dict(self.system.definitions), [self.system.constraints[k].formula]
-        while found:
-            symbols = found.pop().free_symbols
-            if time in symbols:
-                return True
-            found += [known[x] for x in symbols if x in known]
-        return False
 
     def reactions(self) -> float:
         """Virtual work: what reactions do as one coordinate moves, beside lambda . A of the loop.
@@ -185,28 +171,26 @@ class Rows:
         found = self.module.reactions(s.q, s.qd, t=s.t, u=s.u, params=s.params)
         multipliers, A = (ask(self.module, n, s) for n in ("multipliers", "constraint_jacobian"))
         loops = {loop.name: loop for loop in scene.assembly.loops}
-        worst = 0.0
+        spread, worst = self.of.sampler.spread, 0.0
         for name in (r.name for r in self.system.reactions):
             rows = [k for k, c in enumerate(self.system.constraints) if c.loop == name]
             force = np.asarray(found[name], float)
             expected = multipliers[rows] @ A[rows]
             size = np.abs(multipliers[rows]) @ np.abs(A[rows])
             least = float(np.max(size, initial=0)) or 1.0
-            for j in range(len(s.q)):
-                off = min(
-                    abs(self._along(loops[name], s, j, width, force) - expected[j])
-                    for width in WIDTHS
+            for j, moving in enumerate(np.diag(np.maximum(spread, 1))):
+                powers = (
+                    self._along(loops[name], s, moving, x, force) for x in widths(spread, moving)
                 )
-                worst = max(worst, off / least)
+                off = (abs(power - expected[j]) for power in powers if not math.isnan(power))
+                worst = max(worst, min(off, default=math.inf) / least)
         return worst
 
-    def _along(self, loop: Loop, s: State, j: int, width: float, force: Vector) -> float:
-        """The power of a reaction at a velocity 1 of coordinate j, less that at rest."""
-        total, spread, scene = 0.0, self.of.sampler.spread[j], self.system.scene
+    def _along(self, loop: Loop, s: State, moving: Vector, width: float, force: Vector) -> float:
+        """The power of a reaction at velocities `moving`, less that at rest, per their sum."""
+        total, scene = 0.0, self.system.scene
         assert scene is not None
-        for sign, rate in ((1, spread), (-1, 0.0)):
-            qd = np.zeros(len(s.q))
-            qd[j] = rate
+        for sign, qd in ((1, moving), (-1, 0 * moving)):
             with np.errstate(all="ignore"):
                 line = Line(scene, self.of.sampler.told(replace(s, qd=qd)), width)
                 m, second = line.middle, line.frames[loop.bodies[1]]
@@ -218,7 +202,7 @@ class Rows:
             v, w = v - (v0 + np.cross(w0, at - first.at[m])), w - w0
             twist = [*v[:2], w[2]] if self.system.plane else [*v, *w]
             total += sign * float(force @ np.array(twist))
-        return float(total / spread)
+        return float(total / np.sum(moving))
 
     def kept(self, method: str) -> float | Finding:
         """What rows and their rates are along a run, in units of their terms there."""
