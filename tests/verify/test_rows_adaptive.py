@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,10 @@ from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify import rows_adaptive
 from eomc.verify.comparison import Comparison
+from eomc.verify.finding import Finding
+from eomc.verify.rows_adaptive_batch import LIMIT, Many
+from eomc.verify.rows_adaptive_refusals import _Adaptive
+from eomc.verify.rows_refusals import Refusals
 
 # the more it has jumped the sooner it jumps again: without end before 0.17 s
 ENDLESS = """eomc = 1
@@ -38,6 +43,24 @@ y_dot = "y_dot + 1"
 h = 0.01
 duration = 5.0
 tolerance = 1e-6
+"""
+
+
+# steps of 1e-5 s, which a time of 15 s has no digits for in single precision
+STIFF = """eomc = 1
+name = "stiff_single"
+[coordinates]
+x = { start = 1.0 }
+y = {}
+[energy]
+kinetic = "x_dot**2/2 + 0.01*y_dot**2/2"
+potential = "2*x**2 + 1e4*(y - x**2)**2/2"
+dissipation = "50*y_dot**2 + 0.05*x_dot**2"
+[run]
+tolerance = 1e-4
+real = "float"
+duration = 20
+batch = true
 """
 
 
@@ -90,3 +113,47 @@ def test_inputs_that_are_held_are_those_of_all_stages(modules: Modules) -> None:
     x, times = np.array([*s.q, *s.qd]), np.array([2.5])
     rows, _ = rows_adaptive._reference(driven, s, x, times, times)
     assert np.isfinite(rows).all()
+
+
+@pytest.fixture(scope="module")
+def stiff(modules: Modules) -> Comparison:
+    made = from_scene(parse(STIFF, "test.toml"))
+    of = Comparison(made, modules.unoptimised(STIFF), np.random.default_rng(0), 2)
+    late = replace(of.expected[-1].state, t=14.64)
+    of.expected[-1] = replace(of.expected[-1], state=late)
+    return of
+
+
+def test_steps_are_judged_where_time_tells_them(
+    stiff: Comparison, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, drive = _Adaptive(stiff, Refusals(stiff)), _Adaptive.drive
+    assert made.longest() == 0
+    start, late = (e.state for e in stiff.expected)
+    assert made.parted(start) == 0 and made.parted(late) is None
+
+    def unheard(self: _Adaptive, *of: Any, h_most: float = 0.0, **how: Any) -> Any:
+        return drive(self, *of, **how)
+
+    monkeypatch.setattr(_Adaptive, "drive", unheard)
+    assert made.longest() == 1
+    monkeypatch.setattr(stiff, "expected", stiff.expected[1:])
+    assert isinstance(made.longest(), Finding)  # nothing is judged, and it says so
+
+
+def test_steps_of_many_are_judged_where_time_tells_them(stiff: Comparison) -> None:
+    many = Many(stiff, [])
+    assert many.state is stiff.expected[0].state
+    right = many.beside()
+    assert isinstance(right, float) and right < LIMIT
+
+    class Off:
+        simulate = staticmethod(stiff.module.simulate)
+
+        def simulate_batch(self, *args: Any, **how: Any) -> Any:
+            run = stiff.module.simulate_batch(*args, **how)
+            return SimpleNamespace(q=run.q * 1.01, qd=run.qd)
+
+    many.module = Off()
+    wrong = many.beside()
+    assert isinstance(wrong, float) and wrong > LIMIT

@@ -25,6 +25,7 @@ LIMIT, UNIT = 0.1, "tolerances a step, times growth"
 STEPS = (12, 6, 3)  # of a run that is compared, the first in which a difference grows little
 LEAST = {"float64": 1e-15, "float32": 5e-7}  # tolerance
 TICKS = 4  # roundings of a time
+FINEST = 16 * TICKS  # in a step: C refuses those of TICKS, and begins with parts of what it takes
 ROUNDING = 1e3  # in a tolerance's place, where that is smaller
 
 
@@ -38,6 +39,11 @@ def report(of: Comparison) -> None:
             measure = partial(_worst, of, module, tol, stiff)
             how = "stiff" if stiff else f"{tol:g}"
             of.row(f"{form}adaptive steps, {how}", LIMIT, UNIT, measure)
+
+
+def resolved(of: Comparison, s: State, h: float) -> bool:
+    """Whether times from a state on tell steps so long: in single precision they have 7 digits."""
+    return h > FINEST * of.eps * (abs(s.t) + h)
 
 
 def _worst(of: Comparison, module: Any, tol: float, stiff: bool) -> float | Finding:

@@ -17,6 +17,7 @@ import numpy as np
 from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
+from eomc.verify.rows_adaptive import resolved
 from eomc.verify.rows_refusals import NOT_FINITE, SINGULAR
 from eomc.verify.rows_runs import parameters
 from eomc.verify.sampling import State, simulate
@@ -81,12 +82,14 @@ class Found:
 
 
 class Many:
-    """Instances beside the first sampled state, under its inputs, at its time."""
+    """Instances beside a sampled state whose time tells steps, under its inputs, at its time."""
 
     def __init__(self, of: Comparison, singular: list[State], module: Any = None) -> None:
         self.of, self.module, self.singular = of, module or of.module, singular
         self.model = self.module._model
-        self.state = s = of.few(2)[-1].state
+        self.tol = TOLERANCE[self.model.dtype.itemsize]
+        states = [e.state for e in reversed(of.few(2))]
+        self.state = s = next(filter(self.told, states), states[0])
         random, sampler = np.random.default_rng(3), of.sampler
         self.starts = [
             sampler.onto(replace(s, q=s.q + dq, qd=s.qd + dv))
@@ -95,20 +98,25 @@ class Many:
                 1e-2 * sampler.speed * random.standard_normal((COUNT, len(s.q))), strict=True,
             )
         ]  # fmt: skip
-        self.tol = TOLERANCE[self.model.dtype.itemsize]
 
     def alone(self, s: State, **span: Any) -> Any:
         """A run of one from there."""
         return simulate(self.module, s, tol=self.tol, t0=s.t, **span)
 
-    def span(self) -> float:
+    def span(self, s: State) -> float:
         """How long some steps take; 0 where there is none."""
-        run = self.alone(self.state, duration=self.of.system.run.duration)
-        return float(run.t[min(STEPS, len(run) - 1)]) - self.state.t if len(run) else 0.0
+        run = self.alone(s, duration=self.of.system.run.duration)
+        return float(run.t[min(STEPS, len(run) - 1)]) - s.t if len(run) else 0.0
+
+    def told(self, s: State) -> bool:
+        """Whether times there tell steps."""
+        return resolved(self.of, s, self.span(s) / STEPS)
 
     def beside(self) -> float | Finding:
         """The ends and rows of some steps of each, beside those of its run alone."""
-        s, T = self.state, self.span()
+        s, T = self.state, self.span(self.state)
+        if not self.told(s):
+            return Finding(math.nan, "times tell no steps")
         times = s.t + T * np.array([0.4, 1.0])
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
             q, qd = (np.array([getattr(x, name) for x in self.starts]) for name in ("q", "qd"))
@@ -165,7 +173,7 @@ class Many:
 
     def alike(self) -> float:
         """How many differ in other places, in calls of one step each, or where some begin stiff."""
-        wrong, T = 0, self.span()
+        wrong, T = 0, self.span(self.state)
         for stiff, longest in ((False, LONGEST * T), (False, 0.0), (True, 0.0)):
             how: Any = {"stiff": stiff, "longest": longest}
             whole, few = (self.drive(self.starts, T, n, **how) for n in (1000, 1))
@@ -178,7 +186,7 @@ class Many:
 
     def refused(self) -> float:
         """How many do not say that they can't begin, or disturb those who can."""
-        T, rest = self.span(), self.starts[3:]
+        T, rest = self.span(self.state), self.starts[3:]
         odd = [replace(self.state, t=math.nan), replace(self.state, q=self.state.q * math.nan)]
         known = self.singular[:: max(1, len(self.singular) // FEW)]
         odd += [replace(x, t=self.state.t, u=self.state.u) for x in known]

@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eomc.verify.comparison import Comparison
+from eomc.verify.finding import Finding, largest
 from eomc.verify.oracle import Vector
+from eomc.verify.rows_adaptive import TICKS, resolved
 from eomc.verify.rows_refusals import OK, REFUSED, SINGULAR, Refusals, unfinite
 from eomc.verify.rows_runs import parameters
 from eomc.verify.sampling import State
@@ -99,19 +101,22 @@ class _Adaptive:
                     wrong += not (np.all(np.isfinite(run.rows)) and np.all(np.isfinite(run.x)))
         return wrong
 
-    def longest(self) -> float:
+    def longest(self) -> float | Finding:
         """No step is longer than asked for, the last ends at the end, and calls leave no trace."""
-        first = self.drive(self.state, self.check.system.run.duration, LOOSE)
-        later = first.times[first.times > self.state.t]  # the state may jump at once
-        if not len(later):
-            return 0.0
-        span = float(later[0]) - self.state.t
-        run, cut = (
-            self.drive(self.state, span, LOOSE, h_most=span / PARTS, each=n) for n in (ROOM, 1)
-        )
-        sizes = np.diff(np.concatenate([[self.state.t], run.times]))
-        rounding = 4 * self.check.eps * (abs(self.state.t) + span)
+        errors = (self.parted(e.state) for e in self.check.few(2))
+        return largest(errors, "time tells no parts of a first step")
+
+    def parted(self, s: State) -> float | None:
+        """What is wrong with the first step in PARTS; None where there are none."""
+        first = self.drive(s, self.check.system.run.duration, LOOSE)
+        later = first.times[first.times > s.t]  # the state may jump at once
+        span = float(later[0]) - s.t if len(later) else 0.0
+        if not resolved(self.check, s, span / PARTS):
+            return None
+        run, cut = (self.drive(s, span, LOOSE, h_most=span / PARTS, each=n) for n in (ROOM, 1))
+        sizes = np.diff(np.concatenate([[s.t], run.times]))
+        rounding = TICKS * self.check.eps * (abs(s.t) + span)
         late = bool(np.any(sizes > span / PARTS + rounding)) or len(run.times) < PARTS
-        end = np.asarray(self.state.t + span, run.times.dtype)
+        end = np.asarray(s.t + span, run.times.dtype)
         there = run.status == OK and run.times[-1] == end
         return float(late) + float(not there) + float(not np.array_equal(run.rows, cut.rows))
