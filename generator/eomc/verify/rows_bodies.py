@@ -61,7 +61,7 @@ def widths(spread: Vector, qd: Vector, qdd: Vector | float = 0.0) -> Iterator[fl
     usual, least = rate(spread), rate(np.maximum(spread, 1))
     yield from (width / usual for width in WIDTHS)
     width = WIDTHS[0] / usual
-    while WIDER * width < 1 / least:
+    while 0 < WIDER * width < 1 / least:
         width *= WIDER
         yield width
 
