@@ -53,7 +53,7 @@ action = "jump"
 theta_dot = "-0.9*theta_dot"
 [run]
 h = 0.01
-method = {METHODS}
+method = ["rk4", "dp8", "euler"]
 batch = true
 duration = 4.0
 """
@@ -116,7 +116,7 @@ def test_what_ends_a_run_ends_it(ball: ModuleType) -> None:
 
 def test_between_events_they_are_the_steps_of_the_method(swing: ModuleType) -> None:
     for method in swing.methods:
-        run = swing.simulate(method=method)
+        run = swing.simulate(method=method, duration=3.9)
         for k in range(len(run) - 1):
             if h := run.t[k + 1] - run.t[k]:
                 q, qd = swing.step(run.q[k], run.qd[k], h, run.t[k], method=method)
@@ -124,7 +124,9 @@ def test_between_events_they_are_the_steps_of_the_method(swing: ModuleType) -> N
     assert len(run.events["wall"]) == 2 and len(run.events["below"]) == 4
 
 
-@pytest.mark.parametrize(("method", "order", "h"), [("rk4", 4, 0.05), ("dp8", 8, 0.2)])
+@pytest.mark.parametrize(
+    ("method", "order", "h"), [("rk4", 4, 0.05), ("dp8", 8, 0.2), ("euler", 1, 0.01)]
+)
 def test_times_err_as_the_method_does(swing: ModuleType, method: str, order: int, h: float) -> None:
     exact = swing.simulate(tol=1e-14, duration=4.0).events["wall"]
     errors = []
@@ -133,7 +135,7 @@ def test_times_err_as_the_method_does(swing: ModuleType, method: str, order: int
         assert len(found) == len(exact) > 1
         errors.append(np.max(np.abs(found.t - exact.t)))
     assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.9)
-    assert errors[1] < 1e-6
+    assert errors[1] < (0.1 if order == 1 else 1e-6)
 
 
 def test_events_that_never_happen_change_nothing(
