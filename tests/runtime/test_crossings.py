@@ -85,6 +85,24 @@ def test_events_that_change_faster_than_the_motion_are_seen(tol: float) -> None:
     assert slow.steps < 20 and slow.rejected < 5
 
 
+ROUNDED = (
+    TWO.replace("two_springs", "rounded_events")
+    .replace('"a*x + b*y - c"', '"x**2 + x_dot**2 - 1"')
+    .replace('"x*y_dot - d"', '"min(x, 0.5 - x)"')
+)
+
+
+def test_steps_are_not_halved_for_rounding_and_corners() -> None:
+    """What is conserved is rounding alone, in steps of any size: they were halved for ever."""
+    module = built(ROUNDED)
+    for duration in (1e-6, 1e-3, 20.0):
+        run = module.simulate(tol=1e-9, duration=duration)
+        assert run.status == "ok" and run.steps + run.rejected < 150
+    third, turn = math.pi / 3, 2 * math.pi
+    exact = [a + turn * k for k in range(4) for a in (third, 1.5 * third, 4.5 * third, 5 * third)]
+    assert run.events["curve"].t == pytest.approx([t for t in exact if t < 20], abs=1e-8)
+
+
 def roots(f, t_end: float) -> list[float]:
     """All zeros in (0, t_end], by fine sampling and bisection in 30 digits."""
     times = np.linspace(0, t_end, 4001).tolist()

@@ -31,12 +31,12 @@ def ball(modules: Modules) -> ModuleType:
     return modules.unoptimised(text.replace("[run]", f"[run]\nmethod = {METHODS}\nh = 0.01"))
 
 
-SWING = f"""eomc = 1
+SWING = """eomc = 1
 name = "stepped_swing"
 [coordinates]
-theta = {{ unit = "rad", start = 1.0 }}
+theta = { unit = "rad", start = 1.0 }
 [inputs]
-torque = {{ signal = "0.3*sin(t)" }}
+torque = { signal = "0.3*sin(t)" }
 [energy]
 kinetic = "theta_dot**2/2"
 potential = "-9.81*cos(theta)"
@@ -194,6 +194,15 @@ def test_rows_where_they_are_asked_for(swing: ModuleType) -> None:
         swing.simulate(h=0.01, steps=3, out=(np.empty((4, 1)), np.empty((4, 1))))
 
 
+def test_where_it_stops_there_is_a_row(ball: ModuleType) -> None:
+    run = ball.simulate(h=0.1, every=100, params={"far": 0.317}, duration=20.0)
+    assert run.stopped == "away" and run.t == pytest.approx([0, 0.317])
+    assert run.q[-1] == pytest.approx([0.317, 1 - G / 2 * 0.317**2])
+    with pytest.warns(RuntimeWarning, match="ever sooner"):
+        run = ball.simulate(h=0.1, every=10, duration=20.0)
+    assert run.t[-1] == pytest.approx(9 * math.sqrt(2 / G)) and run.q[-1, 1] == pytest.approx(0)
+
+
 def test_each_of_a_batch_is_its_run_alone(swing: ModuleType) -> None:
     starts = np.linspace(0.2, 1.4, 7)[:, None]
     runs = swing.simulate_batch(starts, duration=2.0, method="dp8")
@@ -238,10 +247,73 @@ def test_what_is_kept_is_the_run(swing: ModuleType, tmp_path: Path) -> None:
     assert same == runs and np.array_equal(same([0.31])[0], runs([0.31])[0])
 
 
-def test_an_h_that_time_does_not_resolve_is_refused(swing: ModuleType) -> None:
-    with pytest.warns(RuntimeWarning):
-        run = swing.simulate(t0=1e6, h=1e-9, steps=1000)
-    assert run.status == "no convergence" and len(run) == 1
+@pytest.mark.parametrize(("t0", "h"), [(1e6, 1e-9), (1.7e9, 2e-5), (1e3, 1e-4)])
+def test_steps_that_time_hardly_resolves_are_made_all_the_same(
+    ball: ModuleType, t0: float, h: float
+) -> None:
+    """They went by h, and time by 2h."""
+    run = ball.simulate(t0=t0, h=h, steps=500)
+    np.testing.assert_allclose(run.q[-1], [500 * h, 1 - G / 2 * (500 * h) ** 2], rtol=1e-12)
+    assert run.steps == 500 and run.status == "ok" and run.t[-1] == t0 + 500 * h
+
+
+def test_an_h_below_what_time_resolves_is_refused(ball: ModuleType) -> None:
+    for simulate in (ball.simulate, ball.simulate_batch):
+        with pytest.raises(ValueError, match=r"h: 1e-09 s .* at 1.7e\+09 s, .* smaller t0"):
+            simulate(t0=1.7e9, h=1e-9, steps=1000)
+
+
+@pytest.mark.parametrize("h", [0.1, 0.05, 0.01])
+@pytest.mark.parametrize("how", [{}, {"u": "table"}, {"tol": 1e-9, "control_period": 0.1}])
+def test_jumps_at_multiples_of_h_happen_once(
+    clock: ModuleType, h: float, how: dict[str, Any]
+) -> None:
+    """One rounding before the end of a step they happened twice, and were said to accumulate."""
+    for at in (0.3, 0.5, 0.7, 0.9, round(7 * h, 6), 9 * h):
+        given = dict(how)
+        if given.get("u"):
+            given["u"] = np.zeros((round(1 / h), 1))
+        elif not given:
+            given["control_period"] = h
+        if "tol" not in given:
+            given["h"] = h
+        run = clock.simulate(params={"at": at}, duration=1.0, **given)
+        assert run.status == "ok" and run.events["strike"].t == pytest.approx([at], abs=1e-15)
+        assert run.q[-1, 0] == pytest.approx(2 - at, abs=1e-12)
+        ticks = clock.simulate(h=h, duration=1.0).events["tick"].t  # the last at its end, or not
+        assert ticks == pytest.approx(0.1 * np.arange(1, len(ticks) + 1), abs=1e-14)
+        assert len(ticks) in (9, 10)
+
+
+@pytest.fixture(scope="module")
+def clock(modules: Modules) -> ModuleType:
+    """A body that is struck at a time."""
+    return modules.unoptimised(CLOCK)
+
+
+CLOCK = """eomc = 1
+name = "struck"
+[coordinates]
+x = { rate = 1 }
+[parameters]
+at = 9.0
+[inputs]
+push = {}
+[energy]
+kinetic = "x_dot**2/2"
+[forces]
+x = "push"
+[[event]]
+name = "strike"
+when = "t - at"
+action = "jump"
+x_dot = "x_dot + 1"
+[[event]]
+name = "tick"
+when = "sin(10*pi*t)"
+[run]
+h = 0.01
+"""
 
 
 def test_events_that_a_call_asks_for(tmp_path: Path) -> None:
@@ -428,3 +500,14 @@ def test_what_rests_crosses_once_where_it_leaves_to_the_other_side(
 def test_a_run_that_ends_before_its_first_row_has_no_values(ball: ModuleType) -> None:
     run = ball.simulate(times=[3.0], params={"far": 0.5})
     assert run.stopped == "away" and {len(x) for x in run.to_dict().values()} == {0}
+
+
+def test_single_precision_takes_a_row_a_step(modules: Modules) -> None:
+    """Its time resolves h so badly that a row seemed to lack, and time ran ahead of the state."""
+    module = modules.unoptimised(CLOCK.replace("struck", "struck_float") + 'real = "float"\n')
+    for t0, h, steps in ((0.0, 0.003, 777), (0.1, 0.01, 2000), (123.4, 0.0007, 999)):
+        run = module.simulate(
+            t0=t0, h=h, steps=steps, u=np.full((steps, 1), 1.0), params={"at": 1e4}
+        )
+        T = steps * h
+        assert run.steps == steps and run.q[-1, 0] == pytest.approx(T + T**2 / 2, rel=1e-4)

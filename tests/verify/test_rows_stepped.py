@@ -12,6 +12,7 @@ from conftest import Modules
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
 from eomc.verify import rows_stepped
+from eomc.verify.check import check
 from eomc.verify.comparison import Comparison
 
 SCENE = """eomc = 1
@@ -82,6 +83,8 @@ def row(module: Any) -> Any:
 
 
 def test_a_right_module_passes(swing: ModuleType) -> None:
+    check(SWING, swing, states=4)
+    assert swing.simulate(h=0.05, duration=2.0).events["wall"]  # as before
     found = row(swing)
     assert found.passed and found.judged and found.error < 10
 

@@ -32,6 +32,7 @@ OF_MOST_COARSE = 0.01  # where rounding counts, and in single precision, whose r
 SHARE = 0.1  # of the tolerance, for what a step with a corner errs by
 ANEW = 32  # steps by Newton's method, before sweeps alone are tried again
 SMALL = 300  # operations of accelerations, up to which many instances go side by side
+LATELY = 4  # steps, in which one may be halved for its events without being counted
 BUSY = 32  # events in one step, without those that happen at once
 
 
@@ -44,7 +45,7 @@ def kept(system: System, width: int) -> int:
     """Numbers that it has room for; width: of a vector of coordinates."""
     vectors, few = (8, 26) if steep(system) else (6, 22)
     stages = METHOD.stages * len(system.coordinates)
-    more = 9 * len(system.events) + 14 * bool(system.events) + bool(system.constraints)
+    more = 11 * len(system.events) + 14 * bool(system.events) + bool(system.constraints)
     vectors += 2 * any(e.begins is not None for e in system.events)
     return vectors * width + stages + few + more
 
@@ -324,6 +325,9 @@ def run(
         tightest=target.literal(tightest(target.real)),
         events=bool(happen),
         f=target.real.suffix,
+        eps=target.literal(target.real.epsilon),
+        fabs=f"fabs{target.real.function_suffix}",
+        lately=LATELY,
         begun=begun,
         changed=changed,
         values=values,

@@ -8,7 +8,7 @@ from math import cos, pi, prod
 from typing import Any
 
 from eomc.emit import c_function as c
-from eomc.emit.adaptive import BUSY, METHOD, Form, Stepping, busy, fixed, run, steps
+from eomc.emit.adaptive import BUSY, LATELY, METHOD, Form, Stepping, busy, fixed, run, steps
 from eomc.emit.c_function import CArgument, CFunction
 from eomc.emit.coefficients import matrix, numbers
 from eomc.emit.functions import Functions
@@ -19,7 +19,7 @@ from eomc.scene.schema import ACTIONS
 
 SAMPLES = 9  # values in a step
 TOLD = 0.02  # of the largest value: what the last coefficients of an event in a step may be
-HALVINGS = 6  # of a step in which they are more
+HALVINGS = 10  # of steps in which they are more, beside one in LATELY
 APART = 1e-6  # parts of a step between values that make a slope
 DIRECTIONS = {"falling": -1, "both": 0, "rising": 1}
 
@@ -168,6 +168,7 @@ def _events(made: Stepping) -> Events:
         near=target.literal(0.01),
         close=target.literal(1e-10 if target.real.epsilon < 1e-10 else 1e-5),
         chance=target.literal(1e-6),
+        **_rounding(made, own),
         looked=looked,
         values=values.call(events="g", **within),
         bracketed=bracketed,
@@ -196,6 +197,15 @@ def _events(made: Stepping) -> Events:
     )
 
 
+def _rounding(made: Stepping, own: Sequence[CArgument]) -> dict[str, Any]:
+    """What rounding makes of an event: its function, its call and the call in it."""
+    read, k = c.given(f"{made.method}_adaptive_state", "x"), CArgument("int", "k")
+    function = c.static(f"{made.method}_rounding", made.functions.real, read, k, *own)
+    state = {"t": c.member("x", "t"), "q": "q_at", "qd": "qd_at"}
+    values = made.functions.public.evaluation("events").call(events="value", **state)
+    return {"rounding": function, "rounded": function.call(), "values_near": values}
+
+
 def _set(system: System) -> tuple[str, ...]:
     """Of each event of the scene which of q and qd its jump sets."""
     states = [name for end in ("", "_dot") for name in (c.name + end for c in system.coordinates)]
@@ -216,6 +226,7 @@ def _tables(functions: Functions) -> dict[str, Any]:
         "slopes": matrix(slopes(x), real),
         "huge": target.literal(1e30),
         "halvings": HALVINGS,
+        "lately": LATELY,
         "told": target.literal(TOLD),
         "last": c.in_braces(numbers(row, real) for row in last(SAMPLES)),
         "stages": METHOD.stages,

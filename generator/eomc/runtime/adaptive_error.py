@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,9 @@ def error_of(
     if own.status == FULL:
         raise MemoryError(f"estimate: {REMEDY}")
     model, x = own._model, own.x.astype(float)
-    u = Periods(own._u, own._period) if own._period else own._u
+    u: Any = own._u
+    if own._period:
+        u = Periods(u, own._period, len(own._held))  # type: ignore[arg-type]
     eps, least = float(np.finfo(model.dtype).eps) / 2, LEAST[model.dtype.itemsize]
     scale = scales(x, float(np.ptp(own.t)), eps, len(model.still))
     size = max(1e4 * eps, 100 * own.tol)

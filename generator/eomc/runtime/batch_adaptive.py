@@ -176,7 +176,10 @@ def simulate(
     period = 0.0
     if control_period is not None:
         period = as_step_size(control_period, model.dtype, "control_period")
-    return _run(model, q0, qd0, params, u, threads, t0, progress, tol, rows, most, stiff, period)
+    span = float(rows[-1]) - t0
+    return _run(
+        model, q0, qd0, params, u, threads, t0, progress, tol, rows, most, stiff, period, span
+    )
 
 
 def stepped(
@@ -189,10 +192,10 @@ def stepped(
     """The same by fixed steps where there are events, which are seen in them."""
     h = model.h if h is None else as_step_size(h, model.dtype)
     method, t0 = model._method(method), as_number(t0, "t0")
-    rows, _ = as_rows(model, times, t0, h, duration, steps, every, listed=True)
+    rows, span = as_rows(model, times, t0, h, duration, steps, every, listed=True)
     period = as_hold(u, control_period, h) or 0.0
     return _run(
-        model, q0, qd0, params, u, threads, t0, progress, 0.0, rows, h, False, period, method
+        model, q0, qd0, params, u, threads, t0, progress, 0.0, rows, h, False, period, span, method
     )
 
 
@@ -200,14 +203,13 @@ def _run(
     model: Instances, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any,
     u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float, rows: Any, most: float,
-    stiff: bool, period: float, method: str = "",
+    stiff: bool, period: float, span: float, method: str = "",
 ) -> tuple[AdaptiveBatchRun, bool]:  # fmt: skip
-    """From checked arguments. period: over which rows of u are held; 0: none is given.
+    """From checked arguments. period: over which rows of u are held; 0: none is given. span: s.
 
     method: of fixed steps of the size `most`.
     """
     no_signals(model, u, period or None)
-    span = float(rows[-1]) - t0
     count = periods_in(span, period) if period else None
     starts, table, held, codes = model._instances(q0, qd0, params, u, count, t0)
     q, qd = (model._array(x, name, model.nq) for x, name in zip(starts, ("q0", "qd0"), strict=True))

@@ -51,6 +51,7 @@ class Fitted(Run):
     # what few runs have is set behind: a run of few steps takes no longer than its making
     _h_most: float = field(default=0.0, init=False)
     _by: str = field(default="", init=False)  # the method of fixed steps
+    _last: tuple[float, Array] = field(default=(0.0, _NONE[1]), init=False)  # t, [q; qd] reached
     _stiff: bool = field(default=False, init=False)
     _happened: tuple[Array, Array] = field(default=_NONE, init=False)  # which, rows of t, q, qd
     stopped: str = field(default="", init=False)

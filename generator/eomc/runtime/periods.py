@@ -27,6 +27,7 @@ class Periods:
 
     of: Callable[..., Any] | Array
     period: float  # s
+    count: int  # of the run, the last of which may be shorter
 
 
 def held_at(times: Array, t0: float, period: float, values: Array) -> Array:
@@ -46,7 +47,7 @@ def as_acting(
     if u is None:
         if period is None or not model.nu:
             return None
-        return _few(model, Periods(Sampled(model, params), period), span)
+        return _few(model, Periods(Sampled(model, params), period, periods_in(span, period)))
     if not model.nu:
         raise ValueError("u: this scene has no inputs")
     if not callable(u):
@@ -70,12 +71,12 @@ def as_acting(
         u = rows.copy()
     if period is None:
         raise ValueError(NO_PERIOD)
-    return _few(model, Periods(u, period), span)
+    return _few(model, Periods(u, period, periods_in(span, period)))
 
 
-def _few(model: Facts, made: Periods, span: float) -> Periods:
+def _few(model: Facts, made: Periods) -> Periods:
     """The same, or a MemoryError where a run can't keep its rows."""
-    count = periods_in(span, made.period)
+    count = made.count
     if count * (model._bytes(1) + _VALUE) > PART * machine_memory():
         raise MemoryError(
             f"control_period: the rows of {count:.3g} periods of {made.period:g} s don't fit in "
@@ -111,7 +112,6 @@ class Acting:
         self.held: Any = None if self.periods else u
         self.values: list[Array] = []  # of each period
         if self.periods:
-            self.count = periods_in(t_end - t0, self.periods.period)
             self._next(t0, q, qd)
 
     @property
@@ -139,7 +139,7 @@ class Acting:
             self.held = of[min(done, len(of) - 1)]  # of a run that was interrupted
         self.values.append(self.held)
         self.stop = self.t_end
-        if done + 1 < self.count:
+        if done + 1 < self.periods.count:
             self.stop = end_of(done, self.t0, self.periods.period, model.dtype)
 
     @property

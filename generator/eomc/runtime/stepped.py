@@ -36,41 +36,49 @@ def simulate(
     method, t0 = model._method(method), as_number(t0, "t0")
     h = model.h if h is None else as_step_size(h, model.dtype)
     p = model._p0 if params is None else model._parameters(params).copy()
-    rows, end = as_rows(model, times, t0, h, duration, steps, every)
+    rows, span = as_rows(model, times, t0, h, duration, steps, every)
+    end = float(model.dtype.type(t0 + span))
     hold = as_hold(u, control_period, h)
     if callable(u) and hold == h:
         called_each_step(model)
-    held = as_acting(model, u, hold, end - t0, params)
-    if end - t0 >= SOME * h and (method, h) not in model._warned:
+    held = as_acting(model, u, hold, span, params)
+    if span >= SOME * h and (method, h) not in model._warned:
         look(q, qd, h, t0, held if isinstance(held, np.ndarray) else None, p, method)
     first = 0 if rows is None else int(rows[0] == t0)
     asked = None if rows is None else rows[first:]
     found = adaptive.run(model, q, qd, t0, end, 0.0, asked, held, p, h, progress, method=method)
     assert isinstance(found, SteppedRun)
-    if rows is not None and first:
-        both = np.concatenate([np.array([[q], [qd]]), found._rows], axis=1)
-        return found._at(rows[: both.shape[1]], both)
-    return found
+    if rows is None:
+        return found
+    both = np.concatenate([np.array([[q], [qd]])[:, :first], found._rows], axis=1)
+    stamps, (t, x) = rows[: both.shape[1]], found._last
+    if times is None and t > stamps[-1]:  # where it stopped on the way
+        both, stamps = np.append(both, x.reshape(2, 1, -1), axis=1), np.append(stamps, t)
+    return found._at(stamps, both)
 
 
 def as_rows(
     model: Stepping, times: ArrayLike | None, t0: float, h: float, duration: float | None,
     steps: int | None, every: int, *, listed: bool = False,
 ) -> tuple[Array | None, float]:  # fmt: skip
-    """The times of the rows, None after each step where they need not be listed, and the end."""
+    """The times of the rows, None for all where they need not be listed; the span, s."""
     every = as_count(every, "every", 1)
     if times is not None:
         if steps is not None or every != 1:
             name = "every" if steps is None else "steps"
             raise ValueError(f"{name}: times say where rows are; give one or the other")
         found = as_times(times, t0, model.dtype, duration)
-        return found, float(found[-1])
+        return found, float(found[-1]) - t0
     count = model._steps(h, duration, steps)
-    end = float(model.dtype.type(t0 + count * h))
+    span = count * h
+    if count and h < (least := float(np.spacing(model.dtype.type(abs(t0) + span)))):
+        raise ValueError(
+            f"h: {h:g} s is less than what time resolves at {t0 + span:g} s, {least:.2g} s, and "
+            "events are told by it: take a smaller t0, or a larger h"
+        )
     if every == 1 and not listed:
-        return None, end
-    kept = (t0 + h * np.arange(0, count, every)).astype(model.dtype)
-    return np.append(kept, model.dtype.type(end)), end
+        return None, span
+    return (t0 + h * np.append(np.arange(0, count, every), count)).astype(model.dtype), span
 
 
 def as_hold(u: Any, control_period: float | None, h: float) -> float | None:

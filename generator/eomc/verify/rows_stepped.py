@@ -18,7 +18,7 @@ from eomc.verify.oracle import Vector
 from eomc.verify.report import LIMIT
 from eomc.verify.sampling import State, simulate
 
-STEPS = 25  # of a run
+STEPS = 250  # of a run
 CLEAR = 1e-6  # of what an event watches: more is on one side of zero
 SIDES = {"falling": (-1,), "rising": (1,), "both": (-1, 1)}
 

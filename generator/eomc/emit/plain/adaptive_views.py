@@ -127,7 +127,7 @@ class Events(Named):
     through values there. busy: the most events in one step; apart, near, close: parts of a step;
     chance: of the time between jumps, below which the next one has come by chance. last: to the
     last coefficients of the polynomial through values; told: what these may be of the largest
-    value, beyond which a step is halved, `halvings` times at most.
+    value, beyond which a step is halved, `halvings` times more than a step in `lately` at most.
     """
 
     TEMPLATE: ClassVar[str] = "c/events.c"
@@ -154,6 +154,10 @@ class Events(Named):
     chance: str
     huge: str
     halvings: int
+    lately: int
+    rounding: CFunction
+    rounded: str
+    values_near: str
     told: str
     last: tuple[str, ...]
     looked: CFunction
@@ -207,6 +211,9 @@ class AdaptiveRun(Named):
     tightest: str
     events: bool
     f: str
+    eps: str
+    fabs: str
+    lately: int
     begun: str
     changed: str
     values: str
