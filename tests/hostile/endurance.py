@@ -21,7 +21,6 @@ import statistics
 import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -133,7 +132,6 @@ class Loop:
         self.made = {name: eomc.read(self.scene(name, 0)) for name in BUILT}
         self.loaded = {name: eomc.load(made, folder / "own") for name, made in self.made.items()}
         self.samples: list[Sample] = []
-        warnings.filterwarnings("ignore", message=".* pass over events")
 
     def scene(self, name: str, number: int) -> Path:
         """The file of a scene, another one for each number."""

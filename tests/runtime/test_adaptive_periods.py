@@ -52,7 +52,6 @@ def law(t: float, q: Any, qd: Any) -> list[float]:
     return [60 * q[1] + 12 * qd[1] + q[0] + math.sin(3 * t)]
 
 
-@pytest.mark.filterwarnings("ignore:.*pass over")
 @pytest.mark.parametrize("u", [law, None])
 def test_it_ends_where_short_fixed_steps_do(sampled: ModuleType, u: Any) -> None:
     run = sampled.simulate(u=u, control_period=0.05, tol=1e-11)

@@ -396,7 +396,6 @@ batch = true
 """
 
 
-@pytest.mark.filterwarnings("ignore:far_. fixed steps pass over events")
 def test_how_large_they_are_is_nothing_to_steps_and_errors(modules: Modules) -> None:
     """A time far away was the largest of all coordinates, and errors of others were beside it."""
     near, far = (

@@ -60,7 +60,6 @@ def scene() -> Scene:
     return parse(TEXT, "hangs.toml")
 
 
-@pytest.mark.filterwarnings("ignore:.*pass over")
 @pytest.mark.parametrize("how", [{}, {"h": 0.01}])
 def test_a_run_starts_where_its_parameters_say(hangs: ModuleType, scene: Scene, how: dict) -> None:
     for params in ({"k": 60.0}, {"v": -3.0, "l0": 2.0}, {"m": 2.0, "load": 3.0}, {}):
@@ -75,7 +74,6 @@ def test_a_run_starts_where_its_parameters_say(hangs: ModuleType, scene: Scene, 
     assert run.q[0].tolist() == start and run.qd[0, 0] == scene.start({"v": 1.0})[1][0]
 
 
-@pytest.mark.filterwarnings("ignore:.*pass over")
 @pytest.mark.parametrize("how", [{}, {"h": 0.01}])
 def test_each_of_a_batch_starts_where_its_own_say(
     hangs: ModuleType, scene: Scene, how: dict

@@ -415,7 +415,7 @@ int main(void)
         encoding="utf-8",
     )
     flags = ["-Wall", "-Wextra", "-Werror"] if folder else STRICT
-    compiled("cc", *flags, "-O1", "-c", "embedded.c", "-o", "scene.o", cwd=tmp_path)
+    compiled("cc", *flags, "-O2", "-c", "embedded.c", "-o", "scene.o", cwd=tmp_path)
     compiled("cc", "main.c", "scene.o", "-O1", "-o", "a", "-lm", cwd=tmp_path)
     said = subprocess.run([str(tmp_path / "a")], capture_output=True, text=True)
     times = [float(line) for line in said.stdout.split()]
