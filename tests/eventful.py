@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from types import ModuleType
 
+import numpy as np
 from cases import SCENES
 
 import eomc
@@ -72,3 +74,11 @@ potential = "-a*x"
 
 def event(name: str, when: str, *lines: str) -> str:
     return "\n".join(["[[event]]", f'name = "{name}"', f'when = "{when}"', *lines])
+
+
+def impacts(e: float, count: int) -> np.ndarray:
+    """The times of the first impacts, by the formula."""
+    times = [math.sqrt(2 / G)]
+    for k in range(1, count):
+        times.append(times[-1] + 2 * math.sqrt(2 * G) * e**k / G)
+    return np.array(times)

@@ -13,7 +13,7 @@ import pytest
 import sympy.physics.vector
 from compilers import STRICT, compiled
 from conftest import tiers
-from eventful import BALL, BUILDS, FREE, G, built, event
+from eventful import BALL, BUILDS, FREE, G, built, event, impacts
 
 import eomc
 from eomc.base.errors import SceneError
@@ -27,14 +27,6 @@ pytestmark = pytest.mark.usefixtures("unoptimised_file")
 def ball() -> ModuleType:
     """A ball that falls from 1 m, moves along at 1 m/s, and bounces from floor and wall."""
     return built(BALL)
-
-
-def impacts(e: float, count: int) -> np.ndarray:
-    """The times of the first impacts, by the formula."""
-    times = [math.sqrt(2 / G)]
-    for k in range(1, count):
-        times.append(times[-1] + 2 * math.sqrt(2 * G) * e**k / G)
-    return np.array(times)
 
 
 @pytest.mark.parametrize("e", [0.55, 0.8, 0.95])

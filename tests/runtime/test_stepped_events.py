@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from compilers import STRICT, compiled
 from conftest import Modules
-from eventful import BALL, FREE, G, event
+from eventful import BALL, FREE, G, event, impacts
 
 import eomc
 from eomc.model.from_scene import from_scene
@@ -63,13 +63,6 @@ duration = 4.0
 def swing(modules: Modules) -> ModuleType:
     """A driven pendulum beside a wall."""
     return modules.unoptimised(SWING)
-
-
-def impacts(e: float, count: int) -> np.ndarray:
-    times = [math.sqrt(2 / G)]
-    for k in range(1, count):
-        times.append(times[-1] + 2 * math.sqrt(2 * G) * e**k / G)
-    return np.array(times)
 
 
 @pytest.mark.parametrize("h", [0.01, 0.25, 2.0])
