@@ -278,6 +278,33 @@ def test_jumps_at_multiples_of_h_happen_once(
         assert len(ticks) in (9, 10)
 
 
+@pytest.mark.parametrize("how", ["fixed", "tol", "period"])
+def test_jumps_some_roundings_before_an_end_happen_once(clock: ModuleType, how: str) -> None:
+    """In what was left of the step, or of the run, they happened again."""
+    ways = {
+        "fixed": {"h": 0.1, "duration": 1.0},
+        "tol": {"tol": 1e-9},
+        "period": {
+            "tol": 1e-9,
+            "control_period": 0.1,
+            "u": lambda t, q, qd: [0.0],
+            "duration": 1.0,
+        },
+    }
+    for k in (3, 7, 9):
+        for by in (-40, -17, -5, -1, 0, 2, 30):
+            at = 0.1 * k * (1 + by * 2.0**-53)
+            end = {"duration": 0.1 * k} if how == "tol" else {}
+            run = clock.simulate(params={"at": at}, **ways[how], **end)
+            assert run.status == "ok" and len(run.events["strike"]) <= 1
+            if how != "tol":
+                assert run.q[-1, 0] == pytest.approx(2 - at, abs=1e-12)
+            q, _ = run([0.05, run.t[-1]])
+            assert q[0] == pytest.approx([0.05]) and q[1] == pytest.approx(run.q[-1], abs=1e-14)
+            rows = clock.simulate(params={"at": at}, times=[0, 0.15, 0.1 * k], tol=1e-9)
+            assert len(rows) == 3
+
+
 @pytest.fixture(scope="module")
 def clock(modules: Modules) -> ModuleType:
     """A body that is struck at a time."""
