@@ -68,7 +68,7 @@ class AdaptiveRun(Fitted):
         q, qd = self._begin
         return run(
             self._model, q, qd, self.t0, end, self.tol, times,
-            self._u if self._held is None else Periods(self._held, self._period, len(self._held)),
+            self._u if self._held is None else Periods(self._held, self._period, self._periods),
             self._params, self._h_most, None, self._stiff, method=self._by,
         )  # fmt: skip
 
@@ -281,6 +281,7 @@ def run(
         made._last = work.t, np.frombuffer(model._ffi.buffer(work.x), model.dtype).copy()
     if acting.periods:
         made._period, made._held = acting.periods.period, np.array(acting.values)
+        made._periods = acting.periods.count
         made._told_inputs()
     if events:
         made._happened = events.all()

@@ -38,9 +38,7 @@ def error_of(
     if own.status == FULL:
         raise MemoryError(f"estimate: {REMEDY}")
     model, x = own._model, own.x.astype(float)
-    u: Any = own._u
-    if own._period:
-        u = Periods(u, own._period, len(own._held))  # type: ignore[arg-type]
+    u: Any = Periods(own._u, own._period, own._periods) if own._period else own._u
     eps, least = float(np.finfo(model.dtype).eps) / 2, LEAST[model.dtype.itemsize]
     scale = scales(x, float(np.ptp(own.t)), eps, len(model.still))
     size = max(1e4 * eps, 100 * own.tol)

@@ -58,6 +58,7 @@ class Fitted(Run):
     limit: float = field(default=float("nan"), init=False)
     _period: float = field(default=0.0, init=False)  # over which inputs are held, if any are,
     _held: Array | None = field(default=None, init=False)  # and these, (n, nu)
+    _periods: int = field(default=0, init=False)  # of the whole run
 
     @property
     def t(self) -> Array:
@@ -131,6 +132,7 @@ class Fitted(Run):
             "t_end": self._t_end, "which": self._happened[0],
             "event_rows": self._happened[1], "stopped": self.stopped, "limit": self.limit,
             "period": self._period, "values": self._held, "by": self._by,
+            "periods": self._periods,
         }  # fmt: skip
         return super()._kept() | own
 
@@ -149,6 +151,7 @@ class Fitted(Run):
         made._begin, made._happened = kept["begin"], (kept["which"], kept["event_rows"])
         made.stopped, made.limit = kept["stopped"], kept["limit"]
         made._period, made._held = kept.get("period", 0.0), values
+        made._periods = kept.get("periods", 0 if values is None else len(values))
         made._told_inputs()
         return made
 

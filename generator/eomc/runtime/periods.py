@@ -140,7 +140,7 @@ class Acting:
         self.values.append(self.held)
         self.stop = self.t_end
         if done + 1 < self.periods.count:
-            self.stop = end_of(done, self.t0, self.periods.period, model.dtype)
+            self.stop = min(end_of(done, self.t0, self.periods.period, model.dtype), self.t_end)
 
     @property
     def u(self) -> Any:
