@@ -53,6 +53,6 @@ def test_every_function_of_a_header_is_called(tmp_path: Path) -> None:
     entry_points.built("bouncer", "plain", tmp_path)
     header = (tmp_path / "bouncer.h").read_text(encoding="utf-8")
     driver = Driver("bouncer", header)
-    bare = re.sub(r"/\*.*?\*/", "", header, flags=re.S)
+    bare = re.sub(r"/\*.*?\*/|typedef [^{};]*;", "", header, flags=re.S)
     assert len(driver.functions) == bare.count(");") >= 30
     assert all(f"{f.name}(a_" in driver.text() for f in driver.functions)
