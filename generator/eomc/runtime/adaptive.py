@@ -266,9 +266,7 @@ def run(
     odd = events or model.constraint_names or nq * steps > _AT_ONCE
     model._room = 0 if odd else steps + _ROOM
     h = h_most if method else (work.t - t0) / steps if steps else t_end - t0
-    called = work.evaluations
-    if method:
-        called = 2 * steps + model._facts[method][1] * called
+    called = model._called(method, steps, work.evaluations) if method else work.evaluations
     made = (SteppedRun if method else AdaptiveRun)(
         model, t0, both, h, steps, said, p, 1, acting.u, method or "gauss16",
         called, tol=tol,

@@ -227,7 +227,7 @@ def _run(
     given = None if held is None else held_at(rows, t0, period, held) if over else held.copy()
     h, called = span / max(1.0, float(counts["steps"].mean())), counts["evaluations"]
     if method:
-        h, called = most, 2 * counts["steps"] + model._facts[method][1] * called
+        h, called = most, model._called(method, counts["steps"], called)
     made = AdaptiveBatchRun(
         model, t0, work.rows[0], work.rows[1], h, counts["steps"], codes, 1, 0, table.copy(), given,
         method or "gauss16", held.copy() if held is not None and over else None, tol=tol,
