@@ -104,6 +104,7 @@ class Driver:
     def __init__(self, scene: str, header: str) -> None:
         self.n, self.N = scene, scene.upper()
         self.functions = list(functions(header, scene))
+        self.fixed = "_fixed_step *step;" in header
         self.real = "float" if re.search(r"\bfloat q\[", header) else "double"
         self.nu = f"{self.N}_NU" if f"{self.N}_NU" in header else "0"
 
@@ -182,7 +183,12 @@ class Driver:
             # by a memory, and perhaps cut in two
             again = f"if (byte() % 2 && *a_status == {self.N}_OK) (void){call};"
             fresh = "if (byte() % 3 == 0) a_memory = space(sizeof *a_memory);"
-            lines = [fresh, f"(void){call};", f"if (a_memory != NULL) {{ {again} }}"]
+            lines = [
+                fresh,
+                *self._stepped(f),
+                f"(void){call};",
+                f"if (a_memory != NULL) {{ {again} }}",
+            ]
             fine = " && ".join(f"finite_all(was_{n}, {s})" for n, s in before)
             if any(a.name == "t" and a.kind == f"{self.real} *" for a in f.arguments):
                 fine += " && isfinite(before_t)"
@@ -190,6 +196,13 @@ class Driver:
             return lines
         again = [f"if (byte() % 2) (void){call};"] if f.name.endswith("_adaptive_batch") else []
         return [f"(void){call};", *again]
+
+    def _stepped(self, f: Function) -> list[str]:
+        """Steps of fixed size, in which events are seen, in place of adaptive ones."""
+        steps = [x.name for x in self.functions if x.name.endswith("_step")]
+        if not (f.name.endswith("_adaptive") and self.fixed):
+            return []
+        return [f"if (a_memory && byte() % 2) a_memory->step = {one};" for one in steps]
 
     def _kept(self, f: Function, name: str, size: str) -> str:
         what = f'"{f.name}", "a run left what is not finite"'
