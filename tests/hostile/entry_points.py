@@ -104,7 +104,7 @@ class Driver:
     def __init__(self, scene: str, header: str) -> None:
         self.n, self.N = scene, scene.upper()
         self.functions = list(functions(header, scene))
-        self.fixed = "_fixed_step *step;" in header
+        self.fixed = bool(re.search(r"_fixed_step\s*\*step;", header))
         self.real = "float" if re.search(r"\bfloat q\[", header) else "double"
         self.nu = f"{self.N}_NU" if f"{self.N}_NU" in header else "0"
 

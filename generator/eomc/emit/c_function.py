@@ -228,5 +228,5 @@ def laid_out(text: str) -> str:
             parts = [" " * 4 + part.lstrip() for part in broken(rest, WIDTH - width - 4)]
         else:
             parts = list(broken(inside, WIDTH - width))
-        out += [" " * width + part for part in parts]
+        out += [" " * width + part.rstrip() for part in parts]
     return "\n".join(out)
