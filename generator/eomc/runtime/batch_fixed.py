@@ -105,11 +105,9 @@ def _by_steps(
         q_rows[:, -1], qd_rows[:, -1] = q, qd
     if not whole or work.failed:
         short = work.done < steps
-        for k in short.nonzero()[0]:
-            # the last good state stands where the next row would have
-            last = -(-work.done[k] // every)
-            q_rows[k, last], qd_rows[k, last] = q[k], qd[k]
-            q_rows[k, last + 1 :] = qd_rows[k, last + 1 :] = np.nan
+        for k in short.nonzero()[0]:  # a row exists where its own step was completed
+            completed = 1 + work.done[k] // every
+            q_rows[k, completed:] = qd_rows[k, completed:] = np.nan
         if not whole:
             work.status[(work.status == 0) & short] = _CUT
     given = None if held is None else _at_rows(held, np.arange(rows) * every, steps)

@@ -34,8 +34,9 @@ class BatchRun(Values, Fans, Columns):
     """Trajectories: t (n,), q and qd (batch, n, nq), u (batch, n, nu), status and steps (batch,).
 
     status: "ok", "singular", "not finite", "no convergence", "locked" or "interrupted", one an
-    instance; the rows behind the last good one of an instance that could not go on are nan. Where
-    a start can't be assembled, "locked", it is the last good one. steps: how many each has made.
+    instance. The rows of an instance after its failure are nan: a row is stored where the instance
+    completed the steps to its time. Where a start can't be assembled, "locked", the first row is
+    the start as it was given. steps: how many each has made.
     By name, run["theta_dot"], (batch, n). Equal where scene, settings and rows are, bit
     by bit; a pickled one keeps all of them.
     """
