@@ -54,6 +54,11 @@ HARD = [
     '<joint joint1="g" polycoef="0.2"/>',
     '<tendon tendon1="belt"/>',
     '<tendon name="both" tendon1="belt" tendon2="chain" polycoef="0 1.5 0.5"/>',
+    '<weld name="seam" body1="rocker" body2="wheel" anchor="0.2 -0.1 0.3" '
+    'relpose="0.1 0.2 0.3 0.9 0.1 -0.2 0.4"/>',
+    '<weld name="seam" body1="wheel" anchor="0.2 -0.1 0.3" relpose="0.1 0.2 0.3 1 0 0 0"/>',
+    '<weld name="seam" body1="world" body2="wheel" anchor="0.2 0.1 0" relpose="1 2 3 0 0 1 1"/>',
+    '<weld name="seam" body1="crank" body2="wheel" anchor="0.2 0.1 0" relpose="1 2 3 0 0 0 0"/>',
 ]
 
 
@@ -80,8 +85,11 @@ def equality(*entries):
 
 @pytest.mark.slow  # in the tier that installs MuJoCo
 @pytest.mark.parametrize("entry", HARD)
-def test_rows_are_those_of_mujoco(entry: str, tmp_path: Path) -> None:
+def test_rows_are_those_of_mujoco(
+    entry: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     mujoco = pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings into the working folder
     system = scene_of(model(tmp_path, INSIDE, after=equality(entry)))
     theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     data = mujoco.MjData(theirs)
@@ -125,6 +133,29 @@ def test_rows_hold_in_the_pose_of_the_file(tmp_path: Path) -> None:
     system = scene_of(model(tmp_path, INSIDE, after=equality(*hard)))
     assert np.abs(rows(system)([c.start for c in system.coordinates])).max() < 1e-14
     assert not any(c.held for c in system.coordinates)
+
+
+@pytest.mark.parametrize(
+    ("ends", "points"),
+    [
+        ('body1="world" body2="a"', ((1, 2, 3), (0.1, 0.2, 0.3))),
+        ('body1="a"', ((1, 2, 3), (0.1, 0.2, 0.3))),
+        ('body1="hinged" body2="a"', ((0.5, 2, 3), (0.1, 0.2, 0.3))),
+        ('body1="a" body2="hinged"', ((1, 2, 3), (-0.4, 0.2, 0.3))),
+    ],
+)
+def test_relpose_is_met_by_the_anchor_of_the_second_body(
+    ends: str, points: object, tmp_path: Path
+) -> None:
+    """MuJoCo: x1 + R1 relpos = x2 + R2 anchor, and R2 = R1 R(relquat)."""
+    bodies = (
+        '<body name="a" pos="4 5 6" euler="10 20 30"><freejoint/><geom size="0.1"/></body>'
+        '<body name="hinged"><joint pos="0.5 0 0"/><geom size="0.1"/></body>'
+    )
+    entry = f'<weld {ends} anchor="0.1 0.2 0.3" relpose="1 2 3 0 1 0 0"/>'
+    (loop,) = model(tmp_path, bodies, after=equality(entry).replace(TENDONS, "")).loops
+    assert loop.points == points
+    np.testing.assert_allclose(loop.rotation, np.diag([1, -1, -1]), atol=1e-15)
 
 
 def test_a_linear_coupling_of_two_joints_is_a_gear(tmp_path: Path) -> None:

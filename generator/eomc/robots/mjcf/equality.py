@@ -49,6 +49,10 @@ class _Ends:
         x, y, z = apply(transposed(turn), plus(place, scaled(at, -1.0)))
         return _plain(x), _plain(y), _plain(z)
 
+    def shifted(self, body: str, point: Vector) -> Vector:
+        """Return a point of the file's frame of a body in our frame of that body."""
+        return plus(point, scaled(self.anchors.get(body, ORIGIN), -1.0))
+
 
 def _plain(x: float) -> float:
     """A length that was computed, in m: without what rounding left in its last digit."""
@@ -156,16 +160,18 @@ class _Reading:
                 return [None, None]
             place = first.of(Pose(anchor, IDENTITY)).place
             return [(name, self.ends.point(name, place), IDENTITY) for name in names]
+        point = anchor or ORIGIN  # in the frame of the second body
+        place, turn = (
+            second.of(Pose(point, IDENTITY)).place,
+            times(transposed(first.turn), second.turn),
+        )
+        on_first = self.ends.point(one, place)
         relative = a.numbers("relpose", 7)
-        if relative and any(relative[3:]):
+        if relative and any(relative[3:]):  # a zero quaternion means the pose of the file
             x, y, z, *quaternion = relative
-            second = first.of(Pose((x, y, z), rotations.from_quaternion(*quaternion)))
-        at = plus(anchor or ORIGIN, scaled(self.ends.anchors.get(other, ORIGIN), -1.0))
-        place = second.of(Pose(anchor or ORIGIN, IDENTITY)).place
-        return [
-            (one, self.ends.point(one, place), IDENTITY),
-            (other, at, times(transposed(first.turn), second.turn)),
-        ]
+            on_first = self.ends.shifted(one, (x, y, z))
+            turn = rotations.from_quaternion(*quaternion)
+        return [(one, on_first, IDENTITY), (other, self.ends.shifted(other, point), turn)]
 
     # --- joints
 
