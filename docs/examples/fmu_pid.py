@@ -41,7 +41,7 @@ class Unit:
 
 with tempfile.TemporaryDirectory() as folder:
     at = Path(folder)
-    arm_file = eomc.export_fmu(HERE / "servo.toml", at / "servo.fmu", 3).file
+    arm_file = eomc.export_fmu(HERE / "servo.toml", at / "servo.fmu", fmi=3).file
     pid_file = FmuBuilder.build_FMU(HERE / "pid_unit.py", dest=at)
     arm, pid = Unit(arm_file, at / "arm"), Unit(at / pid_file, at / "pid")
     pid["target"] = 1.2

@@ -14,8 +14,8 @@ PERIOD = 0.02  # s, four steps
 cartpole = eomc.load(Path(__file__).with_name("balance.toml"))
 
 # x' = Phi x + Gamma u over one period, exact, where the pole stands
-q, u = cartpole.equilibrium([0.0, 0.0], u=[0.0])
-Phi, Gamma = cartpole.discretize(q, [0.0, 0.0], u=u, control_period=PERIOD)
+q, qd, u = cartpole.equilibrium([0.0, 0.0], u=[0.0])
+Phi, Gamma = cartpole.discretize(q, qd, u=u, control_period=PERIOD)
 
 Q, R = np.diag([10.0, 10.0, 1.0, 1.0]), np.array([[0.1]])
 P = solve_discrete_are(Phi, Gamma, Q, R)

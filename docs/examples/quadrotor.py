@@ -14,8 +14,7 @@ PERIOD = 0.02  # s, four steps
 quadrotor = eomc.load(Path(__file__).parents[2] / "scenes" / "quadrotor.toml")
 
 # z' = Phi z + Gamma u of the changes z = T^T (x - x0) that keep the quaternion's length
-q0, u0 = quadrotor.equilibrium()
-qd0 = np.zeros(7)
+q0, qd0, u0 = quadrotor.equilibrium()
 T = quadrotor.tangent(q0, qd0)
 Phi, Gamma = quadrotor.discretize(q0, qd0, u=u0, control_period=PERIOD)
 Phi, Gamma = T.T @ Phi @ T, T.T @ Gamma

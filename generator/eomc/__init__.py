@@ -5,8 +5,6 @@
 `load` goes the whole way, `sources` stops at the text; pipeline.py shows each step.
 """
 
-from typing import Any
-
 from eomc.base.errors import EomcError, SceneError
 from eomc.base.version import __version__
 from eomc.pipeline import build, export_fmu, load, read, sources
@@ -17,7 +15,12 @@ __all__ = [
 ]  # fmt: skip
 
 
-def __getattr__(name: str) -> Any:
+def __dir__() -> list[str]:
+    """The names that the package offers, those that are imported on first use included."""
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
+
+
+def __getattr__(name: str) -> object:
     """What needs SymPy, imported when it is asked for: that takes half a second."""
     if name in ("System", "dot"):
         from eomc.model import system

@@ -100,21 +100,19 @@ def _program(system: System, warn: Callable[[Problem], None] | None) -> Program:
 
 
 @_garbage_kept()
-def unit(
-    system: System, version: int = 2, *, warn: Callable[[Problem], None] | None = None
-) -> Unit:
+def unit(system: System, fmi: int = 2, *, warn: Callable[[Problem], None] | None = None) -> Unit:
     """The files of a unit of FMI 2 or 3, as text. warn is called with each warning."""
     from eomc.emit import render
 
-    if version not in (2, 3):
-        raise EomcError(f"version: FMI 2 or 3, here {version!r}")
-    return render.unit(_program(system, warn), version)
+    if fmi not in (2, 3):
+        raise EomcError(f"fmi: give the version of FMI, 2 or 3, here {fmi!r}")
+    return render.unit(_program(system, warn), fmi)
 
 
 def export_fmu(
     scene: ScenePath | System,
     out: ScenePath | None = None,
-    version: int = 2,
+    fmi: int = 2,
     *,
     binary: bool = True,
     warn: Callable[[Problem], None] | None = None,
@@ -128,7 +126,7 @@ def export_fmu(
     from eomc.toolchain import fmu
 
     _refuse_other(scene, "" if out is None else out)
-    made = unit(read(scene) if isinstance(scene, (str, os.PathLike)) else scene, version, warn=warn)
+    made = unit(read(scene) if isinstance(scene, (str, os.PathLike)) else scene, fmi, warn=warn)
     return fmu.export(made, Path(f"{made.name}.fmu" if out is None else out), binary)
 
 
@@ -150,9 +148,11 @@ def build(
 
     _refuse_other(scene, root)
     if not isinstance(scene, (str, os.PathLike)):
-        # what was replaced in a System has left its digest as it was
+        from eomc.model.mechanics import Mechanics
+
+        # dataclasses.replace does not change the digest of a System, so all fields are digested
         made, name = scene, scene.name
-        digest = hashlib.sha256(f"{scene.digest} {scene!r}".encode()).hexdigest()
+        digest = hashlib.sha256(f"{scene.digest} {Mechanics.__repr__(scene)}".encode()).hexdigest()
     else:
         made = None
         name, digest = name_and_digest(Path(scene))

@@ -242,6 +242,15 @@ def show(*words: str) -> str:
     return done.output
 
 
+def test_the_repr_of_equations_and_systems_is_a_line() -> None:
+    system = eomc.read(SCENES / "cartpole_driven.toml")
+    said = "2 coordinates, 1 input, 4 parameters"
+    assert repr(system) == f"<System cartpole_driven: {said}>"
+    assert repr(eomc.equations(system)) == (
+        f"<Equations of cartpole_driven: {said}; print() shows them>"
+    )
+
+
 def test_what_was_shown_is_kept_until_the_scene_changes(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -164,7 +164,7 @@ def hanging(modules: Modules, form: str) -> ModuleType:
 def test_a_regulator_of_it_is_that_of_minimal_coordinates(modules: Modules) -> None:
     """About the equilibrium T^T Phi T is the step of the angle, in steps and control periods."""
     xy, angle = (hanging(modules, form) for form in ("xy", "angle"))
-    q, u = xy.equilibrium(u=[0.0])
+    q, _, u = xy.equilibrium(u=[0.0])
     T = xy.tangent(q, 0 * q)
     for period in (None, 0.05):
         Phi, Gamma = xy.discretize(q, 0 * q, u=u, control_period=period)

@@ -18,15 +18,22 @@ def test_a_pole_upright_or_hanging(
     cartpole: ModuleType, driven: ModuleType, guess: float, found: float
 ) -> None:
     """The cart, which no force holds, stays where it was; so does a force that is no unknown."""
-    q, u = cartpole.equilibrium([0.3, guess])
+    q, _, u = cartpole.equilibrium([0.3, guess])
     assert q == pytest.approx([0.3, found], abs=1e-14) and u is None
-    q, u = driven.equilibrium([0.3, guess], u={"force": 0.0})
+    q, _, u = driven.equilibrium([0.3, guess], u={"force": 0.0})
     assert q == pytest.approx([0.3, found], abs=1e-14) and u.tolist() == [0.0]
     assert np.abs(driven.acceleration(q, [0, 0], u=u)).max() < 1e-13
 
 
+def test_the_result_is_named_and_unpacks_as_a_state_and_inputs(driven: ModuleType) -> None:
+    found = driven.equilibrium([0.3, 0.4], 0.0, 0.0, [3.0], free=["theta", "force"])
+    q, qd, u = found
+    assert found.q is q and found.qd is qd and found.u is u
+    assert qd.tolist() == [0.0, 0.0] and repr(found).startswith("Equilibrium(q=array(")
+
+
 def test_an_input_is_found(driven: ModuleType) -> None:
-    q, u = driven.equilibrium([0.3, 0.4], u=[3.0], free=["theta", "force"])
+    q, _, u = driven.equilibrium([0.3, 0.4], u=[3.0], free=["theta", "force"])
     assert u == pytest.approx([0.0], abs=1e-14) and q == pytest.approx([0.3, 0.0], abs=1e-14)
 
 
@@ -41,7 +48,7 @@ def test_what_is_not_free_stays(
     everything: ModuleType, free: set[str], kept: dict[str, float]
 ) -> None:
     params = {"gamma": 0.0, "N": 0.1}
-    q, u = everything.equilibrium(
+    q, _, u = everything.equilibrium(
         [0.3, 1.0, 0.1], u={"u": 1.0, "push": 0.5}, free=free, params=params
     )
     found = dict(zip((*everything.coordinates, *everything.inputs), [*q, *u], strict=True))
@@ -53,11 +60,11 @@ def test_what_is_not_free_stays(
 
 def test_signals_are_followed_where_no_input_is_free(driven: ModuleType) -> None:
     """At t = 1 the signal pushes, and nothing holds the cart against it."""
-    _, u = driven.equilibrium([0.0, 0.1])
+    u = driven.equilibrium([0.0, 0.1]).u
     assert u.tolist() == [0.0]
     with pytest.raises(driven.MotionError, match=r"where a force of 0\.00841 is left on x"):
         driven.equilibrium([0.0, 0.1], t=1.0)
-    _, u = driven.equilibrium([0.0, 0.1], t=1.0, free=("theta", "force"))
+    u = driven.equilibrium([0.0, 0.1], t=1.0, free=("theta", "force")).u
     assert u == pytest.approx([0.0], abs=1e-14)
 
 
@@ -70,17 +77,17 @@ def test_a_steady_precession(modules: Modules) -> None:
     c = (p["I3"] * psi_dot * phi_dot - p["m"] * p["g"] * p["l"]) / (
         (p["I1"] - p["I3"]) * phi_dot**2
     )
-    q, _ = top.equilibrium(top.start[0], qd, free="theta")
+    q = top.equilibrium(top.start[0], qd, free="theta").q
     assert math.cos(q[top.coordinates.index("theta")]) == pytest.approx(c, rel=1e-13)
     assert np.abs(top.acceleration(q, qd)).max() < 1e-12
-    upright, _ = top.equilibrium()  # where D is singular, and forces are not
+    upright = top.equilibrium().q  # where D is singular, and forces are not
     assert np.sin(upright[top.coordinates.index("theta")]) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.slow
 def test_a_chain_comes_to_rest_from_afar(modules: Modules) -> None:
     chain = modules("chain")
-    q, _ = chain.equilibrium()
+    q = chain.equilibrium().q
     assert np.abs(chain.acceleration(q, 0 * q)).max() < 1e-12
 
 
@@ -143,9 +150,9 @@ integral = "z_dot - (r - x)"
 def test_rows_of_rates_hold_there_too(modules: Modules) -> None:
     """A controller's integral rests where its error is zero, and ramps where that is asked for."""
     loop = modules.unoptimised(INTEGRAL)
-    q, u = loop.equilibrium()
+    q, _, u = loop.equilibrium()
     assert q == pytest.approx([1.0, 0.5], abs=1e-14) and u == pytest.approx([1.0], abs=1e-14)
-    q, u = loop.equilibrium(qd=[0.0, 0.25], u=[0.0], free=["x", "force"])
+    q, _, u = loop.equilibrium(qd=[0.0, 0.25], u=[0.0], free=["x", "force"])
     assert q == pytest.approx([0.75, 0.0], abs=1e-14) and u == pytest.approx([1.0], abs=1e-14)
     with pytest.raises(loop.MotionError, match=r"where the rates break integral by -0\.5; start"):
         loop.equilibrium([0.5, 0.0], free="z")
@@ -184,7 +191,7 @@ error = "sum_dot - (1 - phi)"
 
 def test_rates_that_rows_of_positions_do_not_allow_are_told(modules: Modules) -> None:
     bob = modules("pendulum_xy")
-    q, _ = bob.equilibrium()
+    q = bob.equilibrium().q
     with pytest.raises(bob.MotionError, match=r"the rates break \w+ by .*rate \(free="):
         bob.equilibrium(qd=[1.0, -2.0])
     assert q[1] < 0
@@ -227,7 +234,7 @@ def test_friction_that_sticks_holds_what_it_can(modules: Modules) -> None:
 def test_a_linkage_comes_to_hang_from_where_its_forces_are_least(modules: Modules) -> None:
     """Newton's method ended halfway between the positions of rest, at a force of -1.31."""
     four_bar = modules.unoptimised(scene_system("four_bar"))
-    q, _ = four_bar.equilibrium()
+    q = four_bar.equilibrium().q
     assert np.abs(four_bar.acceleration(q, [0, 0, 0])).max() < 1e-12
     assert np.abs(four_bar.constraints(q, [0, 0, 0])).max() < 1e-14
     beside = [

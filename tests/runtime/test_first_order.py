@@ -39,7 +39,7 @@ def test_they_move_as_their_equations_do(positioned: ModuleType) -> None:
 def test_a_steady_current_holds_the_load(positioned: ModuleType) -> None:
     """0.6 A against 0.3 N m, by 1.2 V, which the integral alone gives."""
     current = [0.0, 0.6, 0.0]
-    q, u = positioned.equilibrium([1.0, 0.0, 0.0], current)
+    q, _, u = positioned.equilibrium([1.0, 0.0, 0.0], current)
     assert q == pytest.approx([1.0, 0.0, 0.3], abs=1e-12) and u == pytest.approx([1.2], abs=1e-12)
     A, _ = positioned.linearize(q, current, closed=True)
     T = positioned.tangent(q, current)

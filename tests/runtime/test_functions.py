@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from inspect import signature
 from types import ModuleType
 from typing import Any
 
@@ -11,7 +12,10 @@ import pytest
 from conftest import EVERYTHING
 from states import QD, Q, same
 
+from eomc.emit.package import ASKED, FUNCTIONS
 from eomc.model.system import System
+from eomc.runtime.batch import BatchModel
+from eomc.runtime.package import CONSTRAINED
 from eomc.verify.taylor import Jets
 
 
@@ -33,6 +37,27 @@ def test_values_are_those_of_the_textbook(cartpole: ModuleType) -> None:
     assert cartpole.energy(Q, QD) == pytest.approx(K + P, rel=1e-14)
     assert cartpole.jacobi(Q, QD) == cartpole.energy(Q, QD)
     assert cartpole.power(Q, QD) == 0
+
+
+def test_time_inputs_and_parameters_are_positional_in_this_order() -> None:
+    """After the state and whatever else the function is of, in all functions of a state."""
+    told = []
+    for name in [*FUNCTIONS, *CONSTRAINED, "reactions", *(n for x in ASKED.values() for n in x)]:
+        found = list(signature(getattr(BatchModel, name)).parameters.values())
+        names = [p.name for p in found if p.kind is p.POSITIONAL_OR_KEYWORD]
+        if "t" in [p.name for p in found] and name not in ("rhs", "step_batch"):
+            told.append(name)
+            order = [n for n in names if n in ("q", "qd", "qdd", "t", "u", "params", "method")]
+            assert order == sorted(order, key="q qd qdd t u params method".split().index), name
+            assert {"q", "t", "params"} <= {*order}, name
+    assert len(told) > 25
+
+
+def test_positional_arguments_are_those_by_name(everything: ModuleType) -> None:
+    q, qd, at, p = [0.2, -0.5, 0.4], [0.3, 0.6, -0.2], 1.7, {"m": 2.5}
+    assert np.array_equal(everything.D(q, at, p), everything.D(q, t=at, params=p))
+    assert np.array_equal(everything.bias(q, qd, at, p), everything.bias(q, qd, t=at, params=p))
+    assert everything.energy(q, qd, at, p) == everything.energy(q, qd, t=at, params=p)
 
 
 def test_every_value_agrees_with_the_reference(everything: ModuleType) -> None:

@@ -368,7 +368,7 @@ def test_a_mass_that_is_no_number_may_lock_the_rows(tmp_path: Path) -> None:
 
 def test_an_equilibrium_leaves_them_as_they_are(gripper: ModuleType) -> None:
     """Where a force is missing no stiffness is invented; what is left out is the scene's."""
-    q, u = gripper.equilibrium([0.1, 0.2], [0.0, 0.0], u=1.0)
+    q, _, u = gripper.equilibrium([0.1, 0.2], [0.0, 0.0], u=1.0)
     set_by_jumps = gripper.start[0][2:]
     assert q[:2] == pytest.approx([0.25, 0.0], abs=1e-12) and (q[2:] == set_by_jumps).all()
     assert u == [1.0]

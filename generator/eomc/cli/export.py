@@ -23,13 +23,13 @@ def command() -> None:
 @command.command("fmu")
 @options.SCENE
 @click.option(
-    "--fmi", "version", type=click.Choice(["2", "3"]), default="2", show_default=True,
+    "--fmi", type=click.Choice(["2", "3"]), default="2", show_default=True,
     help="Version 2.0, which most tools read, or 3.0.",
 )  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), help="The file, by default NAME.fmu.")
 @click.option("--sources", is_flag=True, help="Sources only, no binary.")
 @options.QUIET
-def fmu(scene: Path, version: str, out: Path | None, sources: bool, quiet: bool) -> None:
+def fmu(scene: Path, fmi: str, out: Path | None, sources: bool, quiet: bool) -> None:
     """Write a unit of FMI: co-simulation and model exchange, binary and source.
 
     \b
@@ -37,9 +37,9 @@ def fmu(scene: Path, version: str, out: Path | None, sources: bool, quiet: bool)
     eomc export fmu scenes/cartpole.toml --fmi 3 --out cartpole3.fmu
     """
     with status_line("exporting", quiet):
-        made = pipeline.export_fmu(scene, out, int(version), binary=not sources, warn=warn)
+        made = pipeline.export_fmu(scene, out, int(fmi), binary=not sources, warn=warn)
     if made.why:
         say(f"sources only: {made.why}", err=True)
     if not quiet:
         inside = f"sources and a binary for {made.binary}" if made.binary else "sources"
-        say(f"{shown(made.file)}: FMI {version}.0, {inside}")
+        say(f"{shown(made.file)}: FMI {fmi}.0, {inside}")

@@ -52,6 +52,17 @@ class System(Mechanics):
     Its fields are those of `Mechanics`.
     """
 
+    def __repr__(self) -> str:
+        return f"<System {self.name}: {self.size}>"
+
+    @property
+    def size(self) -> str:
+        """The numbers of coordinates, inputs and parameters, in words."""
+        counts = {
+            "coordinate": self.coordinates, "input": self.inputs, "parameter": self.parameters,
+        }  # fmt: skip
+        return ", ".join(f"{len(x)} {what}{'s' * (len(x) != 1)}" for what, x in counts.items())
+
     @classmethod
     def make(
         cls,

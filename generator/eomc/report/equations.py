@@ -43,6 +43,10 @@ class Equations(Derived):
         long = not self.named and _operations(self) > WRITTEN_OUT
         return abbreviations.of(self) if long else self
 
+    def __repr__(self) -> str:
+        s = self.system
+        return f"<Equations of {s.name}: {s.size}; print() shows them>"
+
     def __str__(self) -> str:
         return equations_text.text(self.set_out)
 

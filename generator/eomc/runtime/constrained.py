@@ -70,9 +70,7 @@ class Constrained(Frames):
         found: Array = self._evaluate(name, (len(self._rows.names),), q, qd, t, None, params, None)
         return found
 
-    def constraint_jacobian(
-        self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None
-    ) -> Array:
+    def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, params: Parameters = None) -> Array:
         """A, (nc, nq): dphi/dq of holonomic constraints, dpsi/dqd of others."""
         shape = (len(self._rows.names), self.nq)
         found: Array = self._evaluate("constraint_jacobian", shape, q, None, t, None, params, None)

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .arguments import Array, not_one_of
 from .constrained import Constrained
+from .package import reduced
 from .status import MotionError, state_text
 
 _MOST = 100  # steps of Newton's method
@@ -23,10 +24,29 @@ _TRIES, _STRIDE = 24, 0.2  # of Newton's method; rad, or of a coordinate: a step
 _Of = Callable[[Array], Array]
 
 
+class Equilibrium(NamedTuple):
+    """A state and inputs at which the accelerations are zero.
+
+    Attributes
+    ----------
+    q, qd : (nq,) arrays
+        Positions and velocities.
+    u : (nu,) array, or None
+        Inputs; None where the scene has none.
+    """
+
+    q: Array
+    qd: Array
+    u: Array | None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("equilibrium.Equilibrium", *self)
+
+
 def equilibrium(
     model: Constrained, q: Array, qd: Array, u: Array | None, free: Collection[str], t: float,
     params: Any,
-) -> tuple[Array, Array, Array | None]:  # fmt: skip
+) -> Equilibrium:  # fmt: skip
     """(q, qd, u) where tau + A^T lambda = C qd + g, from a guess, what is not `free` as it was.
 
     Forces, not accelerations: D couples these, and may be singular. Their slopes are differences,
@@ -85,9 +105,10 @@ def equilibrium(
         z, much = tried[0]
     _refuse(model, z, much, (q, qd), held(z), t, params)
     at, moving = (x.astype(model.dtype) for x in (z[:n], z[n : 2 * n]))
-    if u is None:
-        return at, moving, np.asarray(model.signal(at, moving, t, params)) if model.nu else None
-    return at, moving, z[2 * n :].astype(model.dtype)
+    if u is not None:
+        return Equilibrium(at, moving, z[2 * n :].astype(model.dtype))
+    signals = np.asarray(model.signal(at, moving, t, params)) if model.nu else None
+    return Equilibrium(at, moving, signals)
 
 
 def _newton(

@@ -47,7 +47,7 @@ class Frames(Functions):
         return self._frames[0]
 
     def pose(
-        self, q: ArrayLike, frame: str | None = None, *, t: float = 0.0, params: Parameters = None
+        self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
     ) -> Pose:
         """Where a body or point is and how it is turned; without `frame` all of them.
 
@@ -59,7 +59,7 @@ class Frames(Functions):
         return Pose(found[..., :3], found[..., 3:].reshape(*found.shape[:-1], 3, 3))
 
     def frame_velocity(
-        self, q: ArrayLike, qd: ArrayLike, frame: str | None = None, *, t: float = 0.0,
+        self, q: ArrayLike, qd: ArrayLike, frame: str | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
         """The twist of a frame, (6,), in the plane (3,): m/s, rad/s."""
@@ -67,7 +67,7 @@ class Frames(Functions):
 
     def frame_acceleration(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike | None = None, frame: str | None = None,
-        *, t: float = 0.0, params: Parameters = None,
+        t: float = 0.0, params: Parameters = None,
     ) -> Array:  # fmt: skip
         """The rate of `frame_velocity` at accelerations qdd: m/s2, rad/s2.
 
@@ -78,14 +78,14 @@ class Frames(Functions):
         return self._of("frame_accelerations", (self._width,), frame, q, qd, t, params, given)
 
     def jacobian(
-        self, q: ArrayLike, frame: str | None = None, *, t: float = 0.0, params: Parameters = None
+        self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
     ) -> Array:
         """J of a frame, (6, nq), in the plane (3, nq): J qd is its twist."""
         shape = (self._width, self.nq)
         return self._of("frame_jacobians", shape, frame, q, None, t, params)
 
     def frame_forces(
-        self, q: ArrayLike, wrenches: Mapping[str, ArrayLike] | ArrayLike, *, t: float = 0.0,
+        self, q: ArrayLike, wrenches: Mapping[str, ArrayLike] | ArrayLike, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
         """The generalized forces of wrenches, (nq,): the sum of J^T w.
@@ -97,7 +97,7 @@ class Frames(Functions):
 
     def inverse_dynamics(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike,
-        f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, *, t: float = 0.0,
+        f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
         """tau = D qdd + C qd + g, (nq,), less what f_ext does: recursively, without D.
@@ -113,7 +113,7 @@ class Frames(Functions):
         return found if f_ext is None else found - self.frame_forces(q, f_ext, t=t, params=params)
 
     def momentum(
-        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Momentum:
         """Mass, centre of mass and momenta of all bodies that move, rotors of drives aside."""
         d, turns = (2, 1) if self._plane else (3, 3)

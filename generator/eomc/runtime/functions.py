@@ -132,23 +132,23 @@ class Functions(Arguments):
             for k in range(len(t)):
                 yield k, q[k : k + 1], qd[k : k + 1]
 
-    def D(self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
+    def D(self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
         """D(q): mass matrix, (nq, nq), symmetric positive definite. Others call it M."""
         return self._evaluate("D", (self.nq, self.nq), q, None, t, None, params, out)
 
     def C(
-        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
         """C(q, qd): Coriolis matrix, (nq, nq), Christoffel form: Ddot - 2 C is skew-symmetric."""
         return self._evaluate("C", (self.nq, self.nq), q, qd, t, None, params, out)
 
-    def g(self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
+    def g(self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None) -> Any:
         """g(q) = dP/dq, (nq,): generalized forces of the potential energy."""
         return self._evaluate("g", (self.nq,), q, None, t, None, params, out)
 
     def bias(
-        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
         """C(q, qd) qd + g(q), (nq,), without forming C."""
@@ -162,27 +162,27 @@ class Functions(Arguments):
         return self._evaluate("tau", (self.nq,), q, qd, t, u, params, out)
 
     def kinetic_energy(
-        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
         """K(q, qd), J."""
         return self._evaluate("kinetic_energy", (), q, qd, t, None, params, out)
 
     def potential_energy(
-        self, q: ArrayLike, *, t: float = 0.0, params: Parameters = None, out: Any = None
+        self, q: ArrayLike, t: float = 0.0, params: Parameters = None, out: Any = None
     ) -> Any:
         """P(q), J."""
         return self._evaluate("potential_energy", (), q, None, t, None, params, out)
 
     def energy(
-        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
         """K + P, J."""
         return self._evaluate("energy", (), q, qd, t, None, params, out)
 
     def jacobi(
-        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, params: Parameters = None,
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None,
         out: Any = None,
     ) -> Any:  # fmt: skip
         """qd.dK/dqd - K + P, J: K + P where K is quadratic in qd, else what takes its place."""
@@ -304,7 +304,7 @@ class Functions(Arguments):
         return hasattr(self._lib, "linearization")
 
     def linearize(
-        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, u: Any = None, params: Any = None,
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Any = None, *,
         outputs: bool = False, closed: bool = False,
     ) -> tuple[Array, ...]:  # fmt: skip
         """d[q; qd]/dt = A dx + B du near a state, x = [q; qd]: A (2 nq, 2 nq), B (2 nq, nu).
@@ -393,7 +393,7 @@ class Functions(Arguments):
         return K
 
     def sensitivity(
-        self, q: ArrayLike, qd: ArrayLike, *, t: float = 0.0, u: Any = None,
+        self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
         params: Parameters = None,
     ) -> Array:  # fmt: skip
         """dqdd/dp at a state, (nq, np), parameters in their order; exact derivatives, u held.

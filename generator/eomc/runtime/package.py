@@ -138,6 +138,11 @@ class Package(ModuleType):
             return ""
         return f"is no name of the scene{near}; values are given to a call: {call}(params={{...}})"
 
+    def __dir__(self) -> list[str]:
+        """The names that the module offers, without those of its files."""
+        names = vars(self)
+        return sorted({*names.get("__all__", names), *(n for n in names if n.startswith("__"))})
+
     def __repr__(self) -> str:
         model = self.__dict__.get("_model")
         if model is None:  # not imported yet

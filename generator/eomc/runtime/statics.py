@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from .arguments import Array, Parameters, as_number
 from .constrained import Constrained
 from .drives import drive_forces, driven
-from .equilibrium import equilibrium
+from .equilibrium import Equilibrium, equilibrium
 from .functions import row_times
 from .starts import started
 
@@ -21,7 +21,7 @@ class Statics(Constrained):
 
     def drive_forces(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, drives: Sequence[str] | None = None,
-        f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, *, t: float = 0.0,
+        f_ext: Mapping[str, ArrayLike] | ArrayLike | None = None, t: float = 0.0,
         params: Parameters = None,
     ) -> tuple[Array, Array]:  # fmt: skip
         """(tau, lambda): what drives give in a motion, (nq,), and the multipliers, (nc,).
@@ -46,17 +46,37 @@ class Statics(Constrained):
         return tau, found
 
     def equilibrium(
-        self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, u: Any = None,
-        free: Collection[str] | None = None, *, t: float = 0.0, params: Parameters = None,
-    ) -> tuple[Any, ...]:  # fmt: skip
-        """(q, u) where no force is left, so that q̈ = 0: by Newton's method from the guess q, u.
+        self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, t: float = 0.0, u: Any = None,
+        params: Parameters = None, *, free: Collection[str] | None = None,
+    ) -> Equilibrium:  # fmt: skip
+        """Find a state and inputs at which q̈ = 0, by Newton's method from a guess.
 
-        q None: the scene's start. qd: held as it is, 0 or (nq,). free: names of the coordinates,
-        rates and inputs that are found, all coordinates that move where None; the others stay, as
-        what jumps set does. Where a rate,
-        "charge_dot", is among them, (q, qd, u) comes back: a steady motion, if no force changes
-        along it. u None: the scene's signals. u comes back as (nu,), None where the scene has no
-        inputs. Raises MotionError, status "no convergence", where none is found.
+        Parameters
+        ----------
+        q : (nq,) array, optional
+            The guess of the positions; by default the start of the scene.
+        qd : float or (nq,) array
+            The velocities, 0 by default.
+        t : float
+            The time, s.
+        u : (nu,) array or dict, optional
+            The inputs, or their guess; by default the scene's signals.
+        params : optional
+            Parameters that differ from those of the scene.
+        free : names of coordinates, rates and inputs, optional
+            What is solved for; by default all coordinates that have velocities. All other values
+            stay as they are given. With rates among them, such as "charge_dot", the result is a
+            steady motion if no force changes along it.
+
+        Returns
+        -------
+        Equilibrium
+            The named tuple (q, qd, u).
+
+        Raises
+        ------
+        MotionError
+            No equilibrium was found; its status is "no convergence".
         """
         if isinstance(free, str):
             free = (free,)
@@ -71,5 +91,4 @@ class Statics(Constrained):
         moves = [name for name in self.coordinates if name not in self.still]
         names = moves if free is None else tuple(free)
         held = self._inputs(u)
-        found = equilibrium(self, at, moving, held, names, as_number(t, "t"), params)
-        return found if set(names) & set(self._states[self.nq :]) else found[::2]
+        return equilibrium(self, at, moving, held, names, as_number(t, "t"), params)

@@ -1,0 +1,27 @@
+"""The names that `import eomc` and a built module offer, as tab completion lists them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from types import ModuleType
+
+import eomc
+
+PUBLIC = {"System", "build", "dot", "equations", "export_fmu", "load", "read", "sources"}
+
+
+def test_dir_lists_what_the_package_offers_and_no_more() -> None:
+    names = {name for name in dir(eomc) if not name.startswith("__")}
+    assert names == PUBLIC | {"EomcError", "SceneError"}
+    assert all(hasattr(eomc, name) for name in names)
+
+
+def test_neither_import_nor_dir_imports_sympy() -> None:
+    code = "import eomc, sys; dir(eomc); sys.exit('sympy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_dir_of_a_module_lists_its_functions_and_no_files(driven: ModuleType) -> None:
+    names = {name for name in dir(driven) if not name.startswith("__")}
+    assert names == set(driven.__all__) and {"simulate", "start", "defaults"} <= names
