@@ -113,6 +113,8 @@ def test_a_lock_freezes_what_mimics_too(tmp_path: Path) -> None:
     assert "joint thumb stands at -0.6 rad" in locked.bodies[4].note
     with pytest.raises(EomcError, match="--lock far: it moves as 'near' does: lock that"):
         edit.lock(robot, {"far": 0.1})
+    with pytest.raises(EomcError, match=r"--lock far: .* which puts it at 0.3 rad"):
+        edit.lock(robot, {"near": 0.4, "far": 0.1})
 
 
 def test_without_the_joint_it_mimics_a_joint_stands_where_it_starts(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Equality constraints of MJCF: rows of the scene, beside MuJoCo's own at random positions."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,11 @@ import pytest
 import sympy
 from mjcf_text import model, refused, reported
 
+from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
 from eomc.model.symbols import needed
 from eomc.robots.edit import cut, lock
+from eomc.robots.robot import moved
 from eomc.robots.scene_text import scene_text
 from eomc.scene.read import parse
 
@@ -185,11 +188,70 @@ def test_sites_that_are_used_are_not_left_out(tmp_path: Path) -> None:
     assert [line for line in robot.left_out if line.startswith("site")] == ["sites: hub"]
 
 
-def test_constraints_of_what_is_cut_off_or_locked_are_told(tmp_path: Path) -> None:
+def test_a_coupling_to_a_locked_joint_fixes_the_other(tmp_path: Path) -> None:
+    robot = model(tmp_path, INSIDE, after=equality(HARD[7], HARD[8]))
+    q1 = 0.1
+    g = math.radians(15) + 0.1 + 2 * q1
+    for values in ({"q1": q1}, {"g": g}, {"g": g, "q1": q1}):
+        locked = lock(robot, values)
+        assert [m.name for m in locked.motions] == ["q2", "q3", "slip", "h", "k"]
+        assert [c.name for c in locked.couplings] == ["cubic"]
+        assert not [words for words in locked.left_out if words.startswith("constraints")]
+        turned, whole = (moved_as(r, {"q1": q1, "g": g}) for r in (locked, robot))
+        for name, pose in whole.items():
+            np.testing.assert_allclose(turned[name][1], pose[1], atol=1e-15)
+    assert (
+        lock(robot, {"q1": q1}).left_out[0]
+        == f"fixed by couplings to what is locked: g at {g:g} rad"
+    )
+    with pytest.raises(EomcError, match="break the coupling joint_g_q1 by"):
+        lock(robot, {"g": g - 0.2, "q1": q1})
+
+
+def moved_as(robot, values):
+    """The pose of each body in its parent."""
+    return {b.name: moved(b, [values.get(m.name, 0.0) for m in b.motions]) for b in robot.bodies}
+
+
+def test_a_locked_joint_is_the_root_of_a_polynomial_next_to_the_start(tmp_path: Path) -> None:
+    robot = model(tmp_path, INSIDE, after=equality(HARD[8]))  # slip is a polynomial of q3
+    value = 0.3 + np.polynomial.Polynomial([0.01, 0.1, 0.5, -2, 0.7])(0.2)
+    (found,) = [b for b in lock(robot, {"slip": value}).bodies if "q3" in b.note]
+    assert "joint q3 stands at 0.2 rad" in found.note
+    with pytest.raises(EomcError, match="coupling cubic: no value of 'q3' fulfils it while slip"):
+        lock(robot, {"slip": -9.0})
+
+
+def test_couplings_in_a_chain_fix_one_another(tmp_path: Path) -> None:
+    chain = equality(HARD[7], '<joint joint1="h" joint2="g"/>', '<joint joint1="k" joint2="g"/>')
+    assert [m.name for m in lock(model(tmp_path, INSIDE, after=chain), {"k": 0.1}).motions] == [
+        "q2", "q3", "slip",
+    ]  # fmt: skip
+
+
+def test_a_sum_of_several_joints_keeps_the_locked_one_as_a_constant(tmp_path: Path) -> None:
+    robot = model(tmp_path, INSIDE, after=equality(HARD[12]))
+    (row,) = lock(robot, {"g": 0.5}).couplings
+    (whole,) = robot.couplings
+    assert row.first == ((2.0, "q1"),)
+    rest = {"q1": 0.3, "slip": 0.4}
+    assert row.excess(rest) == pytest.approx(whole.excess({**rest, "g": 0.5}))
+    (row,) = lock(robot, {"slip": 0.5}).couplings
+    assert row.excess({**rest, "g": 1}) == pytest.approx(
+        whole.excess({"q1": 0.3, "slip": 0.5, "g": 1})
+    )
+    scene_of(lock(robot, {"slip": 0.5}))
+
+
+def test_a_coupling_to_what_carries_the_new_root_fixes_the_other(tmp_path: Path) -> None:
+    entry = '<joint joint1="k" joint2="g" polycoef="0.1 2"/>'
+    robot = cut(model(tmp_path, INSIDE, after=equality(entry)), "wheel_h")
+    assert not robot.motions
+    assert robot.left_out[0] == "fixed by couplings to what is locked: k at 0.1 rad"
+
+
+def test_constraints_of_what_is_cut_off_are_told(tmp_path: Path) -> None:
     robot = model(tmp_path, INSIDE, after=equality(HARD[0], HARD[7], HARD[8]))
-    without = lock(robot, {"q1": 0.1})
-    assert [c.name for c in without.couplings] == ["cubic"]
-    assert without.left_out[0] == "constraints of what is cut off or locked: joint_g_q1"
     without = cut(robot, root="crank")
     assert not without.loops
     assert "cubic, joint_g_q1, pin" in without.left_out[0]

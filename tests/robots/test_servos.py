@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 import mjcf_text
@@ -11,10 +12,15 @@ import pytest
 from mjcf_text import BODY, model, refused, reported
 
 import eomc
+from eomc.derive.lagrange import derive
+from eomc.model.from_scene import from_scene
+from eomc.program import program
+from eomc.program.interpret import evaluate
 from eomc.robots.edit import cut, lock
-from eomc.robots.robot import Law
+from eomc.robots.robot import Law, Robot
 from eomc.robots.scene_text import finished, scene_text
 from eomc.robots.stops import stops
+from eomc.scene.read import parse
 
 GENERAL = '<general gainprm="3 1 2" biasprm="1 2 -5"/>'
 AFFINE = GENERAL.replace("/>", ' biastype="affine"/>')
@@ -197,12 +203,46 @@ def test_names_are_kept_when_finished_again(tmp_path: Path) -> None:
     assert finished(robot) == robot
 
 
-def test_tendons_of_what_is_locked_or_cut_off_are_told(tmp_path: Path) -> None:
+def equations(robot: Robot, state: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """D, bias and tau of a robot, from the program that becomes C."""
+    made = from_scene(parse(scene_text(robot), "robot.toml"))
+    known = {**dict.fromkeys((x.name for x in made.u), 0.0), **state, "t": 0.0}
+    known |= {p.name: p.value for p in made.parameters}
+    functions = program.build(derive(made)).functions
+    out = {name: np.array(evaluate(functions[name], known)[0]) for name in ("D", "bias", "tau")}
+    return {**out, "D": out["D"].reshape(len(out["bias"]), -1)}
+
+
+@pytest.mark.parametrize(("joint", "row"), [("s", 2), ("a", 0)])
+def test_a_locked_joint_is_a_constant_in_tendons(joint: str, row: int, tmp_path: Path) -> None:
+    """The equations of the other coordinates are those of the whole robot at its value, at rest."""
     robot = model(tmp_path, ARM, BEFORE, AFTER)
-    locked = lock(robot, {"s": 0.1})
-    assert "tendons of what is cut off or locked: a_2, pulled" in locked.left_out
-    assert [d.name for d in locked.drives] == ["p", "q", "r", "g", "d", "i", "lag"]
-    assert not cut(robot, "hand").tendons
+    locked = lock(robot, {joint: 0.15})
+    assert [t.name for t in locked.tendons] == [t.name for t in robot.tendons]
+    state = {"a": 0.3, "b": -0.7, "s": 0.4, "c": 0.5, joint: 0.15}
+    state |= {f"{q}_dot": v for q, v in zip("absc", (0.8, 1.2, 0.6, -0.9), strict=True)}
+    state |= {f"{joint}_dot": 0.0, "p": 0.5, "q": 1.0, "g": 0.3, "m": 2.0}
+    whole, found = equations(robot, state), equations(locked, state)
+    whole["D"] = np.delete(whole["D"], row, axis=1)
+    for name, value in whole.items():
+        np.testing.assert_allclose(found[name], np.delete(value, row, axis=0), rtol=1e-12)
+
+
+def test_a_tendon_of_locked_joints_only_is_left_out(tmp_path: Path) -> None:
+    locked = lock(model(tmp_path, ARM, BEFORE, AFTER), {"s": 0.1, "b": 0.2})
+    assert "tendons of what is cut off or locked: a_2" in locked.left_out
+    assert [(t.name, t.terms, t.offset) for t in locked.tendons] == [
+        ("sum", ((2.0, "a"),), -0.2),
+        ("pulled", ((1.0, "a"),), pytest.approx(0.3)),
+    ]
+    assert [d.name for d in locked.drives] == ["p", "q", "r", "d", "m", "i"]
+
+
+def test_joints_that_carry_the_new_root_stay_constants_in_tendons(tmp_path: Path) -> None:
+    after = AFTER.replace('joint="s" coef="3"', 'joint="c" coef="3"')
+    robot = cut(model(tmp_path, ARM, BEFORE, after), "fore")
+    ((name, terms, offset),) = [(t.name, t.terms, t.offset) for t in robot.tendons]
+    assert (name, terms, offset) == ("pulled", ((3.0, "c"),), 0.1)  # a starts at 0.1
 
 
 def test_stops_take_what_servos_and_tendons_give(tmp_path: Path) -> None:

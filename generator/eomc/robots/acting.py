@@ -41,7 +41,7 @@ def definitions(robot: Robot) -> dict[str, str]:
     """The lengths of tendons and the forces of servos, entries of [definitions]."""
     driven = {d.coordinate for d in robot.drives}
     acting = [t for t in robot.tendons if t.acts or t.name in driven]
-    entries = {t.name: toml(total(t.terms)) for t in acting}
+    entries = {t.name: toml(less(total(t.terms), -t.offset)) for t in acting}
     for d in robot.drives:
         if d.law:
             entries[f"{d.name}_force"] = toml(_law(d, d.law, robot))

@@ -11,6 +11,7 @@ from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus
 from eomc.robots.inertias import indefinite, nearest, principal, shown, unbalanced
 from eomc.robots.robot import (
+    LACK,
     Robot,
     RobotBody,
     fixed,
@@ -53,6 +54,11 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
                 f"--lock {name}: it moves as '{mimics.coordinate}' does: lock that, and both are "
                 "frozen"
             )
+        if mimics and abs(mimics.at(values[mimics.coordinate]) - values[name]) > LACK:
+            raise EomcError(
+                f"--lock {name}: it moves as '{mimics.coordinate}' does, which puts it at "
+                f"{mimics.at(values[mimics.coordinate]):g} {body.motions[0].unit}: lock it there"
+            )
     bodies = []
     for body in robot.bodies:
         motion = body.motions[0] if body.motions else None
@@ -60,11 +66,15 @@ def lock(robot: Robot, values: Mapping[str, float]) -> Robot:
             value = values[motion.name]
             note = joined(body.note, f"joint {motion.name} locked at {value!r} {motion.unit}")
             body = replace(fixed(body, *moved(body, (value,))), note=note)
-        elif motion and motion.mimics and motion.mimics.coordinate in values:
-            start = motion.mimics.at(values[motion.mimics.coordinate])
-            body = replace(body, motions=(replace(motion, start=start),))
         bodies.append(body)
-    return settled(replace(robot, bodies=tuple(bodies)))
+    for c in robot.couplings:
+        if c.coordinates <= values.keys() and abs(lack := c.excess(values)) > LACK:
+            those = " ".join(f"--lock {q}={values[q]:g}" for q in sorted(c.coordinates))
+            raise EomcError(
+                f"{those}: these values break the coupling {c.name} by {lack:g}: lock one of the "
+                "joints only, and the coupling fixes the other, or give values that agree"
+            )
+    return settled(replace(robot, bodies=tuple(bodies)), values)
 
 
 def stopped(robot: Robot) -> Robot:
@@ -121,7 +131,12 @@ def cut(robot: Robot, root: str = "", tip: str = "") -> Robot:
             bodies[k] = replace(fixed(body, *_stands(by_name, body)), parent=WORLD)
     gone = tuple(name for name in by_name if name not in kept)
     left_out = ((f"cut off: {texts.listed(gone)}",) if gone else ()) + robot.left_out
-    return settled(replace(robot, bodies=tuple(bodies), left_out=left_out))
+    frozen: dict[str, float] = {}  # the joints that hold the root, at their start
+    above = by_name[root] if root and by_name[root].parent != WORLD else None
+    while above:
+        frozen |= {m.name: m.start for m in above.motions if not m.mimics}
+        above = by_name.get(above.parent)
+    return settled(replace(robot, bodies=tuple(bodies), left_out=left_out), frozen)
 
 
 def mended(robot: Robot) -> Robot:
@@ -167,7 +182,8 @@ def based(robot: Robot, free: bool) -> Robot:
             "which the file gives it: --base free is for a root without one"
         )
     bodies = tuple(new if body is root else body for body in robot.bodies)
-    return settled(replace(robot, bodies=bodies))
+    frozen = {} if free else {m.name: m.start for m in root.motions}
+    return settled(replace(robot, bodies=bodies), frozen)
 
 
 def _at_start(body: RobotBody) -> tuple[Vector, Matrix]:

@@ -7,9 +7,10 @@ asks, scene_text.py makes it fit for a scene and writes that.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
+from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus, scaled
 from eomc.robots.inertias import NO_INERTIA, Inertia
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_axis_angle, times
@@ -18,6 +19,8 @@ from eomc.scene.joints import JOINTS
 
 BARE = "no <inertial>"  # the note of a link that has none, and no shape
 Range = tuple[float, float]  # the least and the largest
+Terms = tuple[tuple[float, str], ...]  # a sum of coordinates, each with its factor
+LACK = 1e-4  # rad or m: what locked values may break a coupling by, as typed decimals do
 UNLIMITED: Range = (-math.inf, math.inf)
 
 
@@ -150,11 +153,12 @@ class Tendon:
     """A sum of coordinates, each with its factor, that acts as its length does.
 
     stiffness, damping, armature: along it. rest: the length, or the ends of those, where the
-    spring pulls nothing.
+    spring pulls nothing. offset: what locked joints add to the length.
     """
 
     name: str
-    terms: tuple[tuple[float, str], ...]
+    terms: Terms
+    offset: float = 0.0
     stiffness: float = 0.0
     damping: float = 0.0
     armature: float = 0.0
@@ -188,12 +192,33 @@ class Coupling:
     """
 
     name: str
-    first: tuple[tuple[float, str], ...]
-    second: tuple[tuple[float, str], ...]
+    first: Terms
+    second: Terms
     zero: float
     at: float
     polynomial: tuple[float, ...]
     unit: str = ""
+
+    @property
+    def coordinates(self) -> set[str]:
+        """The coordinates in it."""
+        return {q for _, q in (*self.first, *self.second)}
+
+    def excess(self, values: Mapping[str, float]) -> float:
+        """Return the left side less the right side."""
+        first, second = (sum(by * values[q] for by, q in s) for s in (self.first, self.second))
+        right = sum(a * (second - self.at) ** k for k, a in enumerate(self.polynomial))
+        return first - self.zero - right
+
+    def root(self, near: float) -> float | None:
+        """Return the value of its only coordinate that is closest to `near`; None for none."""
+        from numpy.polynomial import Polynomial
+
+        one, other = (sum(by for by, _ in side) for side in (self.first, self.second))
+        right = Polynomial(self.polynomial)(Polynomial([-self.at, other]))
+        lack = (Polynomial([-self.zero, one]) - right).trim()
+        real = [x.real for x in lack.roots() if abs(x.imag) <= 1e-6 * max(1.0, abs(x.real))]
+        return min(map(float, real), key=lambda x: abs(x - near), default=None)
 
 
 @dataclass(frozen=True)
@@ -220,7 +245,7 @@ class Robot:
         """The coordinates, in the order of the bodies."""
         return tuple(m for body in self.bodies for m in body.motions if not m.mimics)
 
-    def along(self, name: str) -> tuple[tuple[float, str], ...]:
+    def along(self, name: str) -> Terms:
         """A coordinate or a tendon as a sum of coordinates."""
         return {t.name: t.terms for t in self.tendons}.get(name, ((1.0, name),))
 
@@ -242,44 +267,101 @@ def fixed(body: RobotBody, offset: Vector, rotation: Matrix) -> RobotBody:
     return replace(body, joint="fixed", motions=(), axes=(), offset=offset, rotation=rotation)
 
 
-def settled(robot: Robot) -> Robot:
-    """The robot with joints fixed at their start that mimic what does not move.
+def settled(robot: Robot, frozen: Mapping[str, float] | None = None) -> Robot:
+    """Return the robot with its joints fixed at coordinates that are frozen (rad or m).
 
-    Drives of what is not there are left out, tendons, loops and couplings too, which is told.
+    A joint that mimics a coordinate without motion is fixed too, and so is one whose coordinate is
+    the only one that a coupling still has. In tendons and couplings frozen coordinates are
+    constants. What needs a coordinate or a body that is neither there nor frozen is left out, and
+    reported.
     """
-    there = {m.name for m in robot.motions}
+    values, held = _held(robot, frozen or {})
+    there = {m.name for m in robot.motions} - values.keys()
     bodies = []
     for body in robot.bodies:
         motion = body.motions[0] if body.motions else None
-        mimics = motion.mimics if motion else None
-        if motion and mimics and (not mimics.gear or mimics.coordinate not in there):
-            note = f"joint {motion.name} stands at {motion.start:g} {motion.unit}"
-            body = fixed(body, *moved(body, (motion.start,)))
-            body = replace(body, note=joined(body.note, note))
+        stands = _standing(motion, values, there) if motion else None
+        if motion and stands is not None:
+            note = f"joint {motion.name} stands at {stands:g} {motion.unit}"
+            body = replace(fixed(body, *moved(body, (stands,))), note=joined(body.note, note))
         bodies.append(body)
-    tendons = tuple(t for t in robot.tendons if there.issuperset(q for _, q in t.terms))
+    tendons = tuple(t for each in robot.tendons if (t := _shortened(each, values)).terms)
+    tendons = tuple(t for t in tendons if there.issuperset(q for _, q in t.terms))
     acting = there | {t.name for t in tendons}
     drives = tuple(d for d in robot.drives if d.coordinate in acting)
     known = {WORLD, *(body.name for body in bodies)}
     loops = tuple(loop for loop in robot.loops if known.issuperset(loop.bodies))
-    couplings = tuple(
-        c for c in robot.couplings if there.issuperset(q for _, q in (*c.first, *c.second))
-    )
+    couplings = tuple(_reduced(c, values) for c in robot.couplings)
     lost = {loop.name for loop in robot.loops} - {loop.name for loop in loops}
-    lost |= {c.name for c in robot.couplings} - {c.name for c in couplings}
-    told = [("constraints", lost), ("tendons", {t.name for t in robot.tendons} - acting)]
+    lost |= {c.name for c in couplings if not there.issuperset(c.coordinates)}
+    whole = [c for c in robot.couplings if c.coordinates <= values.keys()]
+    broken = [c.name for c in whole if abs(c.excess(values)) > LACK]
+    told = [
+        ("constraints that the values of locked joints break", broken),
+        ("constraints of what is cut off or locked", sorted(lost)),
+        ("tendons of what is cut off or locked", sorted({t.name for t in robot.tendons} - acting)),
+        ("fixed by couplings to what is locked", held),
+    ]
     return replace(
         robot,
         bodies=tuple(bodies),
         drives=drives,
         tendons=tendons,
         loops=loops,
-        couplings=couplings,
-        left_out=(
-            *(f"{of} of what is cut off or locked: {', '.join(sorted(n))}" for of, n in told if n),
-            *robot.left_out,
-        ),
+        couplings=tuple(c for c in couplings if c.coordinates and c.name not in lost),
+        left_out=(*(f"{what}: {', '.join(n)}" for what, n in told if n), *robot.left_out),
     )
+
+
+def _standing(motion: Motion, values: Mapping[str, float], there: Set[str]) -> float | None:
+    """Return where a joint without motion stands; None for one that moves."""
+    mimics = motion.mimics
+    if not mimics:
+        return values.get(motion.name)
+    if mimics.coordinate in values:
+        return mimics.at(values[mimics.coordinate])
+    return None if mimics.gear and mimics.coordinate in there else motion.start
+
+
+def _held(robot: Robot, frozen: Mapping[str, float]) -> tuple[dict[str, float], list[str]]:
+    """Return the frozen coordinates, with those that couplings to them fix, and these in words."""
+    values, words = dict(frozen), []
+    motions = {m.name: m for m in robot.motions}
+    waiting = [c for c in robot.couplings if c.coordinates & values.keys()]
+    while waiting:
+        c = waiting.pop()
+        free = c.coordinates - values.keys()
+        if len(free) != 1 or not free <= motions.keys():
+            continue
+        (name,) = free
+        value = _reduced(c, values).root(motions[name].start)
+        if value is None:
+            raise EomcError(
+                f"coupling {c.name}: no value of '{name}' fulfils it while "
+                + ", ".join(f"{q} = {values[q]:g}" for q in sorted(c.coordinates - free))
+            )
+        values[name] = value
+        words.append(f"{name} at {value:g} {motions[name].unit}")
+        waiting += [other for other in robot.couplings if name in other.coordinates]
+    return values, words
+
+
+def _split(terms: Terms, values: Mapping[str, float]) -> tuple[Terms, float]:
+    """Return the terms of coordinates without a value, and the sum of the others."""
+    kept = tuple((by, q) for by, q in terms if q not in values)
+    return kept, sum((by * values[q] for by, q in terms if q in values), 0.0)
+
+
+def _shortened(tendon: Tendon, values: Mapping[str, float]) -> Tendon:
+    """Return the tendon with its locked coordinates as constants."""
+    terms, constant = _split(tendon.terms, values)
+    return replace(tendon, terms=terms, offset=tendon.offset + constant)
+
+
+def _reduced(c: Coupling, values: Mapping[str, float]) -> Coupling:
+    """Return the coupling with its locked coordinates as constants."""
+    (first, one), (second, other) = _split(c.first, values), _split(c.second, values)
+    return replace(c, first=first, zero=c.zero - one, second=second, at=c.at - other)
 
 
 def free_motions(of: str = "") -> tuple[Motion, ...]:

@@ -187,9 +187,11 @@ class _Reading:
             polynomial = (given[0], 1.0, 0.0, 0.0, 0.0)
         if not second:
             polynomial = (polynomial[0], 0.0, 0.0, 0.0, 0.0)
+        elif not any(polynomial[1:]):
+            second = ()
         unit = {m.unit for _, m in first}.pop() if first else ""
         zeros = [sum((by * m.start for by, m in side), 0.0) for side in (first, second)]
-        sides = [tuple((by, m.name) for by, m in side) for side in (first, second)]
+        sides = [tuple((by, m.name) for by, m in side if by) for side in (first, second)]
         self.couplings.append(
             Coupling(name, sides[0], sides[1], zeros[0], zeros[1], polynomial, unit)
         )
