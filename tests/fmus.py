@@ -70,6 +70,36 @@ duration = 3
 linearize = true
 """
 
+# limits, starts that are formulas of parameters, derivatives with respect to parameters
+RIG = """
+eomc = 1
+name = "rig"
+[coordinates]
+x = { unit = "m", start = "2*x0 + w", rate = "w" }
+y = { unit = "m", start = 0.3 }
+[parameters]
+k = 4.0
+most = 3.0
+x0 = 0.1
+w = 0.05
+[inputs]
+force = { unit = "N", limits = [-1, 1.5], signal = "2*k*cos(t)" }
+pull = { unit = "N", limits = ["-most", "most"] }
+push = { limits = [0, inf] }
+[energy]
+kinetic = "x_dot**2/2 + k*y_dot**2/2"
+potential = "k*x**2/2 + w*y**4"
+[forces]
+x = "force + pull"
+y = "w*push"
+[outputs]
+load = "k*(x + y) + x_ddot*w"
+where = "x"
+[run]
+h = 0.01
+linearize = "parameters"
+"""
+
 # in single precision, with the method that is implicit, and an input that answers the state
 FLOAT = """
 eomc = 1
@@ -158,6 +188,7 @@ class Host:
         )
         self.of = {v.name: v.valueReference for v in described.modelVariables}
         self.t = 0.0
+        self.returned_early = False  # what FMI 3.0 says of the last step
 
     def _logged2(self, _: Any, name: bytes, status: int, category: bytes, message: bytes) -> None:
         self.said.append((category.decode(), message.decode()))
@@ -206,6 +237,7 @@ class Host:
                     raise
                 self.t = self.unit.getRealStatus(2)  # fmi2LastSuccessfulTime
                 return True
+        self.returned_early = bool(told and told[2])
         self.t = told[3] if told else self.t + size
         return bool(told and told[1])
 

@@ -69,8 +69,12 @@ FMI(Status) FMI(ExitInitializationMode)(FMI_INSTANCE instance)
 
     if (status == FMI(OK)) {
         Unit *const x = &a->unit.x;
-        const int found = unitAssemble(x->q, x->qd, (unitReal)x->t, &x->p);
+        int found = 0;
 
+        for (int i = 0; i < unitNQ && !found; i++)
+            found = x->q[i] - x->q[i] == 0 && x->qd[i] - x->qd[i] == 0 ? 0 : 2;
+        if (!found)
+            found = unitAssemble(x->q, x->qd, (unitReal)x->t, &x->p);
         if (found)
             return outcome(a, unitFailed(&a->unit, found));
         (void)unitCrossed(x);

@@ -394,8 +394,11 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
         unitCommunicate(&a->unit, currentCommunicationPoint, communicationStepSize, happened, a);
 
     (void)noSetFMUStatePriorToCurrentPoint;
-    *eventHandlingNeeded = *earlyReturn = false;
+    *eventHandlingNeeded = false;
     *terminateSimulation = a->unit.x.stopped != 0;
+    /* an event has stopped the motion inside the step; at its very end the step is complete */
+    *earlyReturn = a->unit.x.stopped &&
+        a->unit.x.t < currentCommunicationPoint + communicationStepSize;
     *lastSuccessfulTime = a->unit.x.t;
     return outcome(a, result);
 }

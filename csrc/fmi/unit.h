@@ -51,6 +51,7 @@ typedef struct {
     long steps;
     unitReal q[unitNQ], qd[unitNQ], u[unitNU + 1];
     unitParameters p;
+    char own[2*unitNQ]; /* of q, then of qd: whether the importer has set the start */
     int signals; /* whether the scene's signals act */
     double tolerance;
     int stopped; /* 1 + the event that has ended the motion */
@@ -206,11 +207,14 @@ static UnitResult unitSet(UnitInstance *a, unsigned reference, double value)
         x->u[r - unitU] = number;
     } else if (r >= unitP && r < unitE) {
         *unitParameter(&x->p, (int)(r - unitP)) = number;
+        if (x->mode == unitNew || x->mode == unitStarting)
+            unitStarts(x->q, x->qd, x->own, &x->p);
     } else if (r >= unitQ && r < unitDerQ) {
         if (!free)
             return unitSay(a, unitRefused,
                 "in co-simulation coordinates and velocities can be set until its start only");
         *(r < unitQd ? &x->q[r - unitQ] : &x->qd[r - unitQd]) = number;
+        x->own[r - unitQ] = 1;
     } else {
         snprintf(a->said, sizeof a->said,
             "the variable of the value reference %u is calculated and can't be set", reference);
@@ -441,18 +445,19 @@ static UnitResult unitCommunicate(UnitInstance *a, double t, double size, UnitTo
 /* --- derivatives -------------------------------------------------------------------------------- */
 
 /*
- * sensitivities = d(unknowns)/d(knowns) seeds, at what else there is held. Known can be coordinates,
- * velocities and inputs; unknown these, their derivatives and outputs.
+ * sensitivities = d(unknowns)/d(knowns) seeds, where everything else is held constant. Knowns are
+ * coordinates, velocities, inputs and, where the scene has such derivatives, parameters; unknowns are
+ * coordinates, velocities, their derivatives and outputs.
  */
 static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t unknownCount,
     const unsigned *knowns, size_t knownCount, const double *seeds, double *sensitivities)
 {
     const Unit *const x = &a->x;
     const unitReal t = (unitReal)x->t, *const u = unitInputs(x);
-    double along[unitNX + unitNU + 1] = { 0 }, rates[unitNQ];
-    unitReal Aq[unitNQ*unitNQ], Aqd[unitNQ*unitNQ], B[unitNQ*unitNU + 1],
-        slopes[unitNY*(3*unitNQ + unitNU) + 1];
-    int status;
+    double along[unitNX + unitNU + 1] = { 0 }, change[unitNP + 1] = { 0 }, rates[unitNQ];
+    unitReal Aq[unitNQ*unitNQ], Aqd[unitNQ*unitNQ], B[unitNQ*unitNU + 1], E[unitNQ*unitNP + 1] = { 0 },
+        slopes[unitNY*(3*unitNQ + unitNU) + 1], parametric[unitNY*unitNP + 1] = { 0 };
+    int status, parameters = 0;
 
     if (!unitLinearized)
         return unitSay(a, unitRefused,
@@ -467,13 +472,29 @@ static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t un
             along[r - unitQ] += seeds[k];
         else if (r >= unitU && r < unitY)
             along[unitNX + r - unitU] += x->signals ? 0 : seeds[k];
-        else
-            return unitSay(
-                a, unitRefused, "derivatives are along coordinates, velocities and inputs only");
+        else if (r >= unitP && r < unitE) {
+            change[r - unitP] += seeds[k];
+            parameters = 1;
+        } else
+            return unitSay(a, unitRefused,
+                "there are derivatives with respect to coordinates, velocities, inputs and parameters "
+                "only");
     }
+    if (parameters && !unitSensitive)
+        return unitSay(a, unitRefused,
+            "there are no derivatives with respect to parameters: [run] linearize = \"parameters\" of "
+            "the scene adds them");
+    if (parameters && x->signals && unitSignalParameters)
+        return unitSay(a, unitRefused,
+            "there are no derivatives with respect to parameters while signals depend on parameters: "
+            "inputs are held constant in them");
     status = unitLinearize(Aq, Aqd, B, x->q, x->qd, t, u, &x->p);
     if (!status)
         status = unitOutputSlopes(slopes, x->q, x->qd, t, u, &x->p);
+    if (!status && parameters) {
+        unitSensitivity(E, x->q, x->qd, t, u, &x->p);
+        status = unitOutputSensitivity(parametric, x->q, x->qd, t, u, &x->p);
+    }
     if (status)
         return unitFailed(a, status);
     for (int i = 0; i < unitNQ; i++) {
@@ -484,6 +505,8 @@ static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t un
                 (double)Aqd[unitNQ*i + j]*along[unitNQ + j];
         for (int j = 0; j < unitNU; j++)
             sum += (double)B[unitNU*i + j]*along[unitNX + j];
+        for (int j = 0; parameters && j < unitNP; j++)
+            sum += (double)E[unitNP*i + j]*change[j];
         rates[i] = sum;
     }
     for (size_t k = 0; k < unknownCount; k++) {
@@ -503,10 +526,14 @@ static UnitResult unitSlope(UnitInstance *a, const unsigned *unknowns, size_t un
                 sum += (double)row[j]*along[j];
             for (int j = 0; j < unitNQ; j++)
                 sum += (double)row[unitNX + unitNU + j]*rates[j];
+            for (int j = 0; parameters && j < unitNP; j++)
+                sum += (double)parametric[unitNP*(r - unitY) + j]*change[j];
         } else {
             return unitSay(a, unitRefused,
                 "there are derivatives of coordinates, velocities, accelerations and outputs only");
         }
+        if (!(sum - sum == 0))
+            return unitSay(a, unitImpossible, "a derivative is not finite there");
         sensitivities[k] = sum;
     }
     return unitOk;

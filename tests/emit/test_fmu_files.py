@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from compilers import compiled, run
 from conftest import EVERYTHING, needs, tiers
-from fmus import BALL, FLOAT, derived_of
+from fmus import BALL, FLOAT, RIG, derived_of
 from payloads import FEW, PAYLOADS, RAW, derived, tokens, with_texts
 
 from eomc import pipeline
@@ -174,6 +174,33 @@ def test_the_standard_brings_its_licence() -> None:
     assert "2-Clause BSD" in text and "Modelica Association" in text
     for version in (2, 3):
         assert made(FLOAT, version).files["documentation/licenses/fmi-headers.txt"] == text
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_numeric_limits_are_min_and_max_and_starts_of_parameters_depend_on_them(
+    version: int,
+) -> None:
+    root = described(made(RIG, version))
+    variables = {v.get("name"): v for v in root.find("ModelVariables") or ()}
+
+    def attributes(name: str) -> dict[str, str]:
+        v = variables[name]
+        return {**v.attrib, **{k: x for inner in v for k, x in inner.attrib.items()}}
+
+    force, pull, push = (attributes(name) for name in ("force", "pull", "push"))
+    # the signal starts at 8 N; what acts is the limit
+    assert [float(force[key]) for key in ("min", "max", "start")] == [-1.0, 1.5, 1.5]
+    assert not {"min", "max"} & {*pull} and "max" not in push and float(push["min"]) == 0
+    assert attributes("x")["initial"] == attributes("x_dot")["initial"] == "approx"
+    assert attributes("y")["initial"] == "exact"
+    by_number = {attributes(name)["valueReference"]: name for name in variables}
+    key = "index" if version == 2 else "valueReference"
+    initial = {
+        by_number[str(e.get(key))]: {by_number[r] for r in str(e.get("dependencies")).split()}
+        for e in root.iter()
+        if (e.tag == "InitialUnknown" or version == 2) and e.get("dependencies") is not None
+    }
+    assert initial["x"] == {"x0", "w"} and initial["x_dot"] == {"w"}
 
 
 def test_constraints_are_for_co_simulation_alone() -> None:

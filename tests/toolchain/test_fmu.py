@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from cases import SCENES
 from conftest import tiers
-from fmus import BALL, FLOAT, VERSIONS, Host, exported, needs_fmpy, plain, rows
+from fmus import BALL, FLOAT, RIG, VERSIONS, Host, exported, needs_fmpy, plain, rows
 
 from eomc.model.from_scene import from_scene
 from eomc.scene.read import parse
@@ -332,6 +332,22 @@ def test_an_event_stops_the_unit(version: int, hosts: list[Host]) -> None:
     assert host.step(0.25) and host.get("x") == pytest.approx([0.9], abs=1e-9)
 
 
+def test_a_stop_inside_a_step_returns_early_and_a_complete_step_does_not(
+    hosts: list[Host],
+) -> None:
+    end = plain(BALL).simulate(tol=1e-9, duration=3.0, u=[0.0]).t[-1]
+    host = Host(exported(BALL, 3))
+    hosts.append(host)
+    host.start()
+    while not host.step(0.25):
+        assert not host.returned_early
+    assert host.returned_early and host.t == pytest.approx(end, abs=1e-9)
+    # a step that ends exactly where the motion has stopped is complete
+    host.unit.reset()
+    host.start()
+    assert host.step(end) is host.returned_early
+
+
 @pytest.mark.parametrize("scene", ["cartpole", "cartpole_driven", "kapitza_pendulum", FALLS])
 def test_model_exchange_by_cvode(scene: str, version: int) -> None:
     from fmpy import simulate_fmu
@@ -450,13 +466,70 @@ def test_slopes_of_outputs_may_read_accelerations(version: int, hosts: list[Host
     assert found == pytest.approx([*C[0], *D[0]], rel=1e-14)
 
 
+@both
+def test_derivatives_with_respect_to_parameters_are_the_modules(
+    version: int, hosts: list[Host]
+) -> None:
+    module, host = plain(RIG), Host(exported(RIG, version))
+    hosts.append(host)
+    host.set(x=0.7, y=-0.4, x_dot=0.2, y_dot=0.1, force=0.5, pull=5.0, push=0.3)
+    host.start()
+    q, qd, u = np.array([0.7, -0.4]), np.array([0.2, 0.1]), np.array([0.5, 5.0, 0.3])
+    E = module.sensitivity(q, qd, u=u)
+    rates, outputs = ["der(x_dot)", "der(y_dot)"], ["load", "where"]
+    for k, name in enumerate(module.parameters):
+        h = 1e-6
+        above, below = (
+            module.output(q, qd, u=u, params={name: module.defaults[name] + d}) for d in (h, -h)
+        )
+        by_differences = (above - below) / (2 * h)
+        found = host.slope([*rates, *outputs, "x", "der(x)"], [name], [2.0])
+        assert found[:2] == pytest.approx(2 * E[:, k], rel=1e-14)
+        assert found[2:4] == pytest.approx(2 * by_differences, rel=1e-8, abs=1e-8)
+        assert found[4:] == [0, 0]
+    # the least upper limit of the pull acts, so that the acceleration of x follows it
+    assert host.slope(["der(x_dot)"], ["most"], [1.0]) == [1.0]
+    both_at_once = host.slope(rates, ["k", "y"], [0.5, 3.0])
+    alone = np.array([host.slope(rates, [name], [1.0]) for name in ("k", "y")])
+    assert both_at_once == pytest.approx(alone.T @ [0.5, 3.0], rel=1e-14)
+    host.follow_signals()
+    with pytest.raises(Exception, match="status 3"):
+        host.slope(rates, ["k"], [1.0])
+    assert "while signals depend on parameters" in host.said.pop()[1]
+
+
+@both
+@pytest.mark.parametrize("kind", KINDS)
+def test_starts_that_are_formulas_follow_parameters(
+    kind: str, version: int, hosts: list[Host]
+) -> None:
+    host = Host(exported(RIG, version), kind)
+    hosts.append(host)
+    assert host.get("x", "x_dot") == [0.25, 0.05]
+    host.set(x0=0.5, w=0.2)
+    assert host.get("x", "x_dot", "y") == [1.2, 0.2, 0.3]
+    host.set(x=3.0)  # the importer's own start stays
+    host.set(x0=0.7)
+    host.start()
+    assert host.get("x", "x_dot") == [3.0, 0.2]
+    host.set(w=0.9)  # after the start a parameter moves no state
+    assert host.get("x", "x_dot") == [3.0, 0.2]
+    host.unit.reset()
+    host.set(w=0.1)
+    host.start()
+    assert host.get("x", "x_dot") == pytest.approx([0.3, 0.1], rel=1e-15)
+    host.unit.reset()
+    assert host.get("x", "x_dot") == [0.25, 0.05]
+
+
 def test_derivatives_that_there_are_not_are_refused_in_words(
     version: int, hosts: list[Host]
 ) -> None:
     for scene, unknown, known, words in (
         ("cartpole", "der(x_dot)", "x", "[run] linearize = true"),
         (BALL, "energy.total", "x", "of coordinates, velocities, accelerations and outputs only"),
-        (BALL, "ax", "m", "along coordinates, velocities and inputs only"),
+        (BALL, "ax", "m", '[run] linearize = "parameters"'),
+        (BALL, "ax", "energy.total", "coordinates, velocities, inputs and parameters only"),
         (FEEDBACK, "der(phi_dot)", "phi", "while signals answer the state"),
     ):
         host = Host(exported(scene, version))

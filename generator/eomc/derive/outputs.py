@@ -17,11 +17,16 @@ from eomc.model.system import System, t
 
 @dataclass(frozen=True)
 class Outputs:
-    """values: (ny,), atoms of a tape. slopes: along q, qd, u and qdd, (ny, 3 nq + nu), by rows."""
+    """Outputs and their derivatives as atoms of a tape.
+
+    values: (ny,). slopes: with respect to q, qd, u and qdd, (ny, 3 nq + nu). sensitivity: with
+    respect to the parameters, the others held, (ny, np).
+    """
 
     tape: Tape
     values: Vector
     slopes: Rows
+    sensitivity: Rows = ()
 
 
 def outputs(
@@ -84,8 +89,11 @@ def _outputs(system: System, sloped: bool, tape: Tape, known: dict[Symbol, Expr]
     values = tuple(tape.named(value(o.formula), o.name) for o in system.outputs)
     if not sloped:
         return Outputs(tape, values, ((),) * len(values))
-    along = (*state, *system.u, *system.qdd)
+    parameters = system.parameters if system.run.linearize == "parameters" else ()
+    along = (*state, *system.u, *system.qdd, *(p.symbol for p in parameters))
     kept, tape.still = tape.still, frozenset()  # outputs have slopes along discrete variables
-    slopes = tuple(tuple(tape.gradient([(y, S.One)], along)) for y in values)
+    rows = [tuple(tape.gradient([(y, S.One)], along)) for y in values]
     tape.still = kept
-    return Outputs(tape, values, slopes)
+    first = len(along) - len(parameters)
+    slopes, sensitivity = (tuple(row[:first] for row in rows), tuple(row[first:] for row in rows))
+    return Outputs(tape, values, slopes, sensitivity)

@@ -219,8 +219,11 @@ def stub(target: Target) -> Stub:
     return Stub(tuple(stamp(target)), target.system.run.batch, _functions(target))
 
 
-def _follows(target: Target) -> dict[str, str]:
-    """Formulas of starts and rates over parameters, of those that have some."""
+def start_formulas(target: Target) -> dict[str, str]:
+    """Return the starts and rates that are formulas of parameters, by the name of their state.
+
+    Parameters that jumps set are replaced by their values in the scene.
+    """
     s, written = target.system, target.as_written
     set_by_jumps = {written(c.name): c.start for c in s.coordinates if c.name in s.discrete}
     return {
@@ -257,7 +260,7 @@ def face(target: Target, extension: str) -> Face:
         plane=bool(s.plane and (s.asked or s.run.momentum or s.reactions)),
         units=FreeText({written(name): unit for name, unit in units.items() if unit}),
         start=([c.start for c in s.coordinates], [c.rate for c in s.coordinates]),
-        follows=FreeText(_follows(target)),
+        follows=FreeText(start_formulas(target)),
         h=s.run.h,
         duration=s.run.duration,
         tolerance=s.run.tolerance,

@@ -148,6 +148,8 @@ def _outputs(system: System, taken: Candidate) -> Iterator[Function]:
     yield lower("outputs", made.tape, made.values, system.names, checks=checks, labels=labels)
     if rows := [x for row in made.slopes for x in row]:
         yield lower("output_slopes", made.tape, rows, system.names, checks=checks)
+    if rows := [x for row in made.sensitivity for x in row]:
+        yield lower("output_sensitivity", made.tape, rows, system.names, checks=checks)
 
 
 def _events(system: System, taken: Candidate) -> Iterator[Function]:

@@ -11,7 +11,7 @@ from eomc.program.program import Program
 from eomc.scene.scene import Scene
 
 ENERGIES = frozenset({"kinetic_energy", "potential_energy", "energy", "jacobi", "power"})
-OUTPUTS = frozenset({"outputs", "output_slopes"})
+OUTPUTS = frozenset({"outputs", "output_slopes", "output_sensitivity"})
 OF_MOTION = ("kinetic", "potential", "dissipation")
 
 

@@ -12,7 +12,9 @@ from eomc.emit.fmu import units
 from eomc.emit.fmu.dependencies import Dependencies, Names
 from eomc.emit.fmu.variables import Variable, Variables, has_signals, variables
 from eomc.emit.fmu.views import Attributes, Described, Description2, Description3, Unknown
+from eomc.emit.package import start_formulas
 from eomc.program.program import TIME
+from eomc.scene.formulas import parse
 
 
 def view(
@@ -28,6 +30,13 @@ def view(
         (v, frozenset({x.name})) for v, x in zip((*known.q, *known.qd), (*s.q, *s.qd), strict=True)
     ]
     computed = [*zip(known.outputs, behind.outputs, strict=True)]
+    names = {target.as_written(p.name): p.name for p in s.parameters}
+    formulas = start_formulas(target)
+    starts = [
+        (v, frozenset(names[n.id] for n in parse(formulas[v.name]).names()))
+        for v in (*known.q, *known.qd)
+        if v.name in formulas
+    ]
     about = [("description", s.title), ("version", s.digest[:16])]
     experiment = [("startTime", "0"), ("stopTime", repr(s.run.duration))]
     tolerance, h = s.run.tolerance, repr(s.run.h)
@@ -45,7 +54,7 @@ def view(
         "variables": tuple(_described(v, version) for v in known if v.reference or version == 3),
         "outputs": structure.unknowns([*outputs, *computed]),
         "rates": structure.unknowns(rates),
-        "initial": structure.unknowns([*rates, *computed], initial=True),
+        "initial": structure.unknowns([*starts, *rates, *computed], initial=True),
     }
     if version == 2:
         return Description2(**common, indicators=len(known.indicators), sources=tuple(sources))
@@ -107,7 +116,8 @@ def _described(v: Variable, version: int) -> Described:
         ]
     )
     derivative = "" if v.derivative is None else str(v.derivative)
-    inner = _free([("unit", unit), ("start", v.start), ("derivative", derivative)])
+    limits = [("min", v.minimum), ("max", v.maximum)]
+    inner = _free([("unit", unit), *limits, ("start", v.start), ("derivative", derivative)])
     if version == 2:
         return Described("Boolean" if v.boolean else "Real", outer, inner)
     return Described("Boolean" if v.boolean else "Float64", outer, inner)

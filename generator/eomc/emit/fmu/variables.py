@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count
+from math import inf
 
 from eomc.emit.c_names import Target
 from eomc.emit.fmu.units import rate
+from eomc.emit.package import start_formulas
+from eomc.model.symbols import Input
 from eomc.program.interpret import evaluate, nearby
 
 TIME_NAME = "t"  # which no scene can give to anything else
@@ -15,7 +18,11 @@ TIME_NAME = "t"  # which no scene can give to anything else
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable; start: a number as text, or none. derivative: the reference of its state."""
+    """A variable of modelDescription.xml.
+
+    start, minimum, maximum: numbers as text, "" for none. derivative: the value reference of the
+    state of which it is the derivative.
+    """
 
     name: str
     reference: int
@@ -25,6 +32,8 @@ class Variable:
     unit: str = ""
     start: str = ""
     words: str = ""
+    minimum: str = ""
+    maximum: str = ""
     derivative: int | None = None
     boolean: bool = False
 
@@ -59,26 +68,40 @@ def has_signals(target: Target) -> bool:
 
 
 def input_starts(target: Target) -> list[float]:
-    """What inputs are until they are set: their signals at the start, 0 where these have none."""
-    if not target.system.inputs:
+    """Return the initial value of each input: its signal at the start, 0 if that has no value.
+
+    A value outside of numeric limits is replaced by the limit, which is what acts in its place.
+    """
+    inputs = target.system.inputs
+    if not inputs:
         return []
     try:
-        return evaluate(target.program["signal"], nearby(target.system, 0))[0]
+        starts = evaluate(target.program["signal"], nearby(target.system, 0))[0]
     except (ArithmeticError, ValueError):
-        return [0.0] * len(target.system.inputs)
+        starts = [0.0] * len(inputs)
+    return [
+        min(max(start, -inf if low is None else low), inf if high is None else high)
+        for start, (low, high) in zip(starts, map(numeric_limits, inputs), strict=True)
+    ]
+
+
+def numeric_limits(one: Input) -> tuple[float | None, float | None]:
+    """Return the limits of an input that are numbers; None for formulas of parameters."""
+    low, high = (float(x) if x is not None and x.is_number else None for x in one.limits)
+    return low, high
 
 
 def variables(target: Target) -> Variables:
     """Those of a scene."""
     s, written, next_reference = target.system, target.as_written, count().__next__
+    of_parameters = start_formulas(target)
 
     def made(name: str, causality: str, **more: str | int | bool) -> Variable:
         return Variable(name, next_reference(), causality, **more)  # type: ignore[arg-type]
 
     def state(name: str, start: float, unit: str, words: str) -> Variable:
-        return made(
-            name, "output", initial="exact", start=repr(start), unit=unit, words=words
-        )  # fmt: skip
+        initial = "approx" if name in of_parameters else "exact"
+        return made(name, "output", initial=initial, start=repr(start), unit=unit, words=words)
 
     time = made(TIME_NAME, "independent", unit="s", words="time")
     named = [(written(c.name), c) for c in s.coordinates]
@@ -99,7 +122,8 @@ def variables(target: Target) -> Variables:
     return Variables(
         time, q, qd, der_q, der_qd,
         inputs=tuple(
-            made(written(i.name), "input", start=repr(value), unit=i.unit, words=i.note)
+            made(written(i.name), "input", start=repr(value), unit=i.unit, words=i.note,
+                 **_range_of(i))
             for i, value in zip(s.inputs, input_starts(target), strict=True)
         ),
         outputs=tuple(
@@ -126,6 +150,12 @@ def variables(target: Target) -> Variables:
             for name in ["inputs.follow_signals"] * has_signals(target)
         ),
     )  # fmt: skip
+
+
+def _range_of(one: Input) -> dict[str, str]:
+    """Return `minimum` and `maximum` of an input as text, where its limits are numbers."""
+    limits = zip(("minimum", "maximum"), numeric_limits(one), strict=True)
+    return {key: repr(limit) for key, limit in limits if limit is not None}
 
 
 _ENERGIES: Mapping[str, str] = {

@@ -20,13 +20,26 @@ class SceneEvent:
 
 
 @dataclass(frozen=True)
+class Start:
+    """A state that starts at a formula of parameters.
+
+    state: its index in [q; qd]. element, value: the array element and the value, in C.
+    """
+
+    state: int
+    element: str
+    value: str
+
+
+@dataclass(frozen=True)
 class SceneCalls:
     """fmu/scene.h.jinja. inputs: their starts; from acceleration on calls, "" for none.
 
     project: onto constraints; held: whether each of q and qd stays there as it is. run, step: of
     steps of fixed size; adaptive: of those that fit a tolerance, one or the other. solved,
-    slopes_solved: whether outputs, and their slopes, read accelerations. feedback: whether signals
-    answer the state.
+    slopes_solved: whether outputs, and their derivatives, read accelerations. feedback,
+    signals_of_parameters: whether signals depend on the state, on parameters. starts: of states
+    whose start is a formula of parameters, after the statements start_lines.
     """
 
     TEMPLATE: ClassVar[str] = "fmu/scene.h"
@@ -56,6 +69,11 @@ class SceneCalls:
     run: str
     step: str
     adaptive: str
+    start_lines: tuple[str, ...]
+    starts: tuple[Start, ...]
+    sensitivity: str
+    output_sensitivity: str
+    signals_of_parameters: bool
     linearization: str
     output_slopes: str
     slopes_solved: bool
