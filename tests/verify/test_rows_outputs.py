@@ -120,3 +120,28 @@ def test_slopes_along_what_jumps_set_are_right(modules: Modules) -> None:
     comparison = Comparison(made, module, np.random.default_rng(0), None)
     rows_outputs.report(comparison)
     assert [row.passed for row in comparison.rows] == [True, True], comparison.rows
+
+
+CANCELLING = """eomc = 1
+name = "cancelling"
+[coordinates]
+x = { start = 0.2 }
+[parameters]
+k = 4.0
+[inputs]
+force = {}
+[energy]
+kinetic = "x_dot**2/2"
+potential = "k*x**2/2"
+[forces]
+x = "force"
+[outputs]
+load = "k*x + x_ddot"
+"""
+
+
+def test_an_output_that_cancels_against_an_acceleration_passes(modules: Modules) -> None:
+    made, module = from_scene(parse(CANCELLING, "test.toml")), modules.unoptimised(CANCELLING)
+    comparison = Comparison(made, module, np.random.default_rng(0), None)
+    rows_outputs.report(comparison)
+    assert {row.name: row.passed for row in comparison.rows} == {"outputs": True}

@@ -64,7 +64,12 @@ def apart(
         value = found(s)
         near = [found(x) for x in nudged(s, of.sampler.defaults)]
         size = np.abs(value) + np.nansum([np.abs(x - value) / NUDGE for x in near], axis=0)
-        exact = formulas.at(s, *_solved(module, s))
+        qdd, forces = _solved(module, s)
+        exact = formulas.at(s, qdd, forces)
+        # terms that cancel against an acceleration leave its rounding error
+        for k in range(len(qdd)):
+            moved = np.where(np.arange(len(qdd)) == k, 1 + NUDGE, 1.0) * qdd
+            size += np.nan_to_num(np.abs(formulas.at(s, moved, forces) - exact) / NUDGE)
         real = np.isfinite(value) | np.isfinite(exact)  # sqrt(x) of x < 0 is neither
         return of.units(value[real], exact[real], size[real]) if np.any(real) else 0.0
 
