@@ -488,3 +488,15 @@ def test_a_row_that_is_level_at_these_parameters_alone_stays() -> None:
     """It was left out for good, and nothing held it at others."""
     rows = assembled(from_scene(parse(SLOPING))).constraints
     assert [row.name for row in rows] == ["pin_x", "pin_y"]
+
+
+def test_rounding_is_that_of_the_terms_and_the_intermediate_values() -> None:
+    made = Manifold(scene("x = {}\ny = {}", 'r = "3*x + 1e6*sin(y) - 1e6*y + 2e3*cos(x) - 2e3"'))
+    at = np.array([0.0, 1.0])
+    found = made.rounding(at, 0 * at, 0.0)[0] / 2.0**-52
+    # the terms, and what one rounding of y and of sin(y) does
+    terms = 1e6 * np.sin(1) + 1e6 + 4e3
+    expected = terms + 1e6 * np.sin(1) + 1e6 * abs(np.cos(1) - 1) + 2e3
+    assert found == pytest.approx(expected, rel=0.01)
+    nowhere = Manifold(scene("x = {}", 'r = "log(x)"'))
+    assert nowhere.rounding(np.zeros(1), np.zeros(1), 0.0) == [0.0]

@@ -11,6 +11,7 @@ from mjcf_text import model, refused, reported
 from eomc.base.errors import EomcError
 from eomc.model.from_scene import from_scene
 from eomc.model.symbols import needed
+from eomc.program.assembly import assembled
 from eomc.robots.edit import cut, lock
 from eomc.robots.robot import moved
 from eomc.robots.scene_text import scene_text
@@ -279,3 +280,22 @@ def test_constraints_of_what_is_cut_off_are_told(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_faults(entry: str, said: str, tmp_path: Path) -> None:
     assert said in refused(tmp_path, INSIDE, after=equality(entry))
+
+
+FOUR_BAR = """<body name="base" pos="0 0 0.9116" quat="1 0 0 -1">
+<body name="crank" pos="0 {} {}"><joint name="q1" axis="1 0 0"/><geom size="0.01"/>
+<body name="coupler" pos="0 {} {}"><joint name="q2" axis="1 0 0"/><geom size="0.01"/></body></body>
+<body name="rocker" pos="0 {} {}"><joint name="q3" axis="1 0 0"/><geom size="0.01"/>
+<body name="follower" pos="0 {} {}"><joint name="q4" axis="1 0 0" pos="0 {} {}"/>
+<geom size="0.01"/></body></body></body>"""
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0])
+def test_a_linkage_that_the_file_closes_to_rounding_is_closed(size: float, tmp_path: Path) -> None:
+    """The second point of `connect` follows from the pose of the file, in doubles."""
+    connect = '<connect name="pin" body1="coupler" body2="follower" anchor="0 0 0"/>'
+    for seed in (0, 5, 7):
+        lengths = size * (np.random.default_rng(seed).normal(size=10) / 2).round(3)
+        robot = model(tmp_path, FOUR_BAR.format(*lengths), after=equality(connect)[len(TENDONS) :])
+        made = assembled(scene_of(robot))
+        assert max(abs(c.start) for c in made.coordinates) < 1e-12

@@ -118,5 +118,6 @@ def project(functions: Functions) -> Project:
         redundant=tuple(
             k for k, row in enumerate(rows) if row.redundant or k in mixed[len(sums) :]
         ),
+        pinned=bool(weights) and not all(row.holonomic for row in rows),
         tiny=target.literal(1e-30),
     )

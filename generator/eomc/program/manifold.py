@@ -12,13 +12,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from eomc.derive import lagrange
 from eomc.model.system import System, t
 from eomc.program import constrained
-from eomc.program.interpret import context, evaluator, exact_evaluator
+from eomc.program.interpret import context, evaluator, exact_evaluator, rounding_evaluator
 from eomc.program.lower import lower
 
 Vector = NDArray[np.float64]
@@ -77,10 +76,18 @@ class Place:
     @cached_property
     def metric(self) -> Vector:
         """D, with the rows' own weight where some coordinate has no inertia."""
-        D, A = (self.D + self.D.T) / 2, self.A
+        return self.metric_of(range(len(self.A)))
+
+    def metric_of(self, rows: Sequence[int]) -> Vector:
+        """The same with the weight of some rows.
+
+        A least change with A d given for these rows is the same with and without their weight;
+        other rows would change it.
+        """
+        D, A = (self.D + self.D.T) / 2, self.A[rows]
         if not self.singular:
             return D
-        D = D + (A.T * self.weights) @ A
+        D = D + (A.T * self.weights[rows]) @ A
         values, vectors = np.linalg.eigh(D)
         least = 1e-12 * max(float(values[-1]), 1e-300)
         return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
@@ -114,7 +121,8 @@ class Frame:
 
     def __init__(self, place: Place, free: Flags, rows: Sequence[int]) -> None:
         self.place, self.free, self.rows = place, np.flatnonzero(free), list(rows)
-        self.L = np.linalg.cholesky(place.metric[self.free][:, self.free])
+        metric = place.metric_of(self.rows)
+        self.L = np.linalg.cholesky(metric[self.free][:, self.free])
         A = place.A[self.rows][:, self.free] / place.sizes[self.rows, None]
         self.B = np.linalg.solve(self.L, A.T).T
 
@@ -177,6 +185,7 @@ class Manifold:
         self.timed = any(t.name in made[name].uses for name in ("constraints", "constraint_rates"))
         self._plain: dict[str, Callable[..., Any]] = {}
         self._exact: dict[str, Callable[..., Any]] = {}
+        self._rounding: dict[str, Callable[..., list[float]]] = {}
 
     @cached_property
     def reads(self) -> Flags:
@@ -188,13 +197,12 @@ class Manifold:
         moving = dict(zip(self._names, (*q, *qd), strict=True))
         return {**self._fixed, t.name: time, **moving}
 
-    def value(self, name: str, q: Vector, qd: Vector, time: float, /, **changed: float) -> Vector:
+    def value(self, name: str, q: Vector, qd: Vector, time: float) -> Vector:
         """What a function gives, in doubles; nan where it has no value."""
         if name not in self._plain:
             self._plain[name] = evaluator(self.functions[name])
-        values = self._values(q.tolist(), qd.tolist(), time) | changed
         try:
-            return np.array(self._plain[name](values)[0])
+            return np.array(self._plain[name](self._values(q.tolist(), qd.tolist(), time))[0])
         except (ArithmeticError, ValueError):
             return np.full(len(self.functions[name].outputs), np.nan)
 
@@ -239,26 +247,15 @@ class Manifold:
         phi[len(self.holonomic) :] = 0
         return phi
 
-    @cached_property
-    def constants(self) -> Vector:
-        """(m,): how large the numbers are that a row adds."""
-        rows = (sympy.Add.make_args(c.formula) for c in self.system.constraints)
-        return np.array([sum(abs(float(x)) for x in row if not x.free_symbols) for row in rows])
-
     def rounding(self, q: Vector, qd: Vector, time: float, name: str = "constraints") -> Vector:
-        """(m,): what one rounding of each coordinate, rate, parameter and number does to a row."""
-        total = self.constants if name == "constraints" else np.zeros(len(self.rows))
-        value, step = self.value(name, q, qd, time), 2.0**-20
-        for k in range(len(q)):
-            for x in (q, qd) if name != "constraints" else (q,):
-                nudged = x.copy()
-                nudged[k] *= 1 + step
-                moved = self.value(name, *((nudged, qd) if x is q else (q, nudged)), time)
-                total = total + np.nan_to_num(np.abs(moved - value)) / step
-        for name_of, p in self.parameters.items():
-            moved = self.value(name, q, qd, time, **{name_of: p * (1 + step)})
-            total = total + np.nan_to_num(np.abs(moved - value)) / step
-        return EPS * (total + np.abs(value))
+        """(m,): the rounding error of each row, to first order; 0 where a row has no value."""
+        if name not in self._rounding:
+            self._rounding[name] = rounding_evaluator(self.functions[name])
+        try:
+            bounds = self._rounding[name](self._values(q.tolist(), qd.tolist(), time))
+        except (ArithmeticError, ValueError):
+            return np.zeros(len(self.rows))
+        return EPS * np.array(bounds)
 
     def descend(
         self, q: Vector, free: Flags, time: float = 0.0, strict: bool = True

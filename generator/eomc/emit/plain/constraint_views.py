@@ -60,7 +60,8 @@ class Project(Named):
     q, where a change is rounding; enough: where what rows lack is; loose: of the terms of a rate;
     rounded: the same of rows and rates, where a state is left as it is; redundant: rows that the
     others imply; weights: of rows, an initializer, where D alone is singular; sums: initializers of
-    sums of rows, which stand in the places of the rows `sum_places`.
+    sums of rows, which stand in the places of the rows `sum_places`. pinned: whether coordinates
+    may have neither inertia nor a row of positions.
     """
 
     TEMPLATE: ClassVar[str] = "c/project.c"
@@ -82,4 +83,5 @@ class Project(Named):
     weights: str
     sums: tuple[str, ...]
     sum_places: tuple[int, ...]
+    pinned: bool
     tiny: str
