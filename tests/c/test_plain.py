@@ -188,6 +188,24 @@ def test_header_and_source_of_the_two_forms_do_not_go_together(tmp_path: Path) -
     assert done.returncode != 0 and "with -ffast-math" in done.stderr
 
 
+@pytest.mark.parametrize("form", ["plain", "fast"])
+@pytest.mark.parametrize("name", tiers(["gcc", "clang"], "gcc"))
+def test_flags_that_ignore_nan_are_refused(name: str, form: str, tmp_path: Path) -> None:
+    """-ffinite-math-only alone is the part of -ffast-math that removes the checks."""
+    title, level = kit("cartpole", tmp_path), ["-std=gnu99", "-fsyntax-only"]
+    source = f"{title}.c" if form == "plain" else f"fast/{title}.c"
+    for flags, refused in (
+        (["-ffast-math"], True), (["-Ofast"], True), (["-ffinite-math-only"], True),
+        (["-O3", "-funroll-loops"], False), (["-fno-finite-math-only"], False),
+        (["-fno-math-errno", "-fno-trapping-math"], False),
+    ):  # fmt: skip
+        done = subprocess.run(
+            [needs(name), *level, *flags, source], cwd=tmp_path, capture_output=True, text=True
+        )
+        assert (done.returncode != 0) == refused, (flags, done.stderr)
+        assert ("no NaN would be noticed" in done.stderr) == refused
+
+
 # --- what it computes -----------------------------------------------------------------------------
 
 
