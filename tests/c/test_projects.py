@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -182,6 +183,29 @@ def test_a_cpp_project_adds_the_fast_form(tmp_path: Path, printed: str) -> None:
     made(tmp_path / "cartpole")
     fast = built(tmp_path, SUBDIRECTORY, "-DCARTPOLE_FAST=ON")
     assert float(fast.split()[1]) == pytest.approx(float(printed.split()[1]), rel=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["OFF", "ON"])
+def test_a_shared_library_is_built_and_installed(form: str, tmp_path: Path) -> None:
+    """CMake's own switch; functions of the library are found by ctypes."""
+    made(tmp_path / "cartpole")
+    words = ["BUILD_SHARED_LIBS=ON", f"CARTPOLE_FAST={form}", "CMAKE_C_VISIBILITY_PRESET=hidden"]
+    cmake("-S", "cartpole", "-B", "library", *(f"-D{w}" for w in words), at=tmp_path)
+    cmake("--build", "library", at=tmp_path)
+    cmake("-E", "chdir", "library", "ctest", "--output-on-failure", at=tmp_path)
+    cmake("--install", "library", "--prefix", str(tmp_path / "there"), at=tmp_path)
+    (library,) = (tmp_path / "there").rglob("libeomc_cartpole.*")
+    assert library.suffix == ".so"
+    code = f"import ctypes; print(ctypes.CDLL({str(library)!r}).cartpole_rk4_step is not None)"
+    assert run(sys.executable, "-c", code, cwd=tmp_path).stdout == "True\n"
+
+
+def test_a_library_is_shared_where_cmake_is_told_so(tmp_path: Path) -> None:
+    text = (made(tmp_path) / "CMakeLists.txt").read_text(encoding="utf-8")
+    assert re.search(r"^add_library\(eomc_cartpole \$\{sources\}/cartpole.c\)$", text, re.M)
+    for kind in ("ARCHIVE", "LIBRARY", "RUNTIME"):
+        assert f"{kind} DESTINATION" in text
 
 
 @pytest.fixture
