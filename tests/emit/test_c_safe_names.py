@@ -31,6 +31,10 @@ from eomc.toolchain.running import lay_out
 MODES = ["-xc -std=gnu99", "-xc -std=c99", "-xc -std=gnu17", "-xc++ -std=c++17"]
 INCLUDE = f"-I{sysconfig.get_path('include')}"
 OUTSIDE = "#include <math.h>\n#include <stdio.h>\n#include <stddef.h>\n"
+# what a program may include before the header of a model: C's own headers, and serial ports
+HEADERS = """assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal
+stdalign stdarg stdatomic stdbool stddef stdint stdio stdlib stdnoreturn string tgmath time uchar
+wchar wctype termios""".split()
 
 
 def dumped(mode: str, text: str) -> set[str]:
@@ -51,12 +55,13 @@ def macros() -> frozenset[str]:
     ffi.emit_c_code(str(target))
     binding = target.read_text(encoding="utf-8")
     found = {m for mode in MODES for m in dumped(mode, OUTSIDE)}
+    found |= dumped("-xc -std=c99", "".join(f"#include <{h}.h>\n" for h in HEADERS))
     return frozenset(found | {m for mode in MODES[:1] for m in dumped(mode, binding)})
 
 
 def test_the_compiler_has_told_its_macros() -> None:
     assert len(macros()) > 1000
-    assert {"NAN", "EOF", "errno", "M_PI", "CHAR_BIT", "Py_None", "stdout"} <= macros()
+    assert {"NAN", "EOF", "errno", "M_PI", "CHAR_BIT", "Py_None", "stdout", "I", "B0"} <= macros()
 
 
 def test_no_name_of_a_scene_is_a_macro_in_c() -> None:
@@ -224,6 +229,27 @@ def test_macros_as_names_compile(role: str, tmp_path: Path) -> None:
         compiled(tmp_path, "scene")
     if role != "definitions":
         assert f"{given[4]} is {given[4]}_" in files["fast/scene.h"]
+
+
+def test_a_moment_of_inertia_stands_beside_complex_numbers(tmp_path: Path) -> None:
+    """`I` is the imaginary unit of <complex.h>, which <tgmath.h> includes."""
+    text = """eomc = 1
+name = "scene"
+[coordinates]
+theta = {}
+[parameters]
+I = 2.0
+[energy]
+kinetic = "I*theta_dot**2/2"
+"""
+    write(tmp_path, made(text))
+    program = (
+        "#include <tgmath.h>\n#include <scene.h>\nint main(void) { return scene_defaults.I_ != 2; }"
+    )
+    (tmp_path / "program.c").write_text(program, encoding="utf-8")
+    command = [needs("cc"), "-std=c99", "-I.", "program.c", "scene.c", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    assert subprocess.run(["./a.out"], cwd=tmp_path).returncode == 0
 
 
 def test_accelerations_are_renamed_with_their_coordinates() -> None:

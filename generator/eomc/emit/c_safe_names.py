@@ -21,15 +21,16 @@ _SHOUTED = re.compile(r"[^a-z]*[A-Z][^a-z]*[A-Z][^a-z]*[A-Z][^a-z]*")
 _OTHERS = re.compile(
     r"M_(\d_)?(E|PI|SQRT|LN|LOG)\w*|Py\w*|(PRI|SCN)[bdioux]\w*|L_(ctermid|cuserid|tmpnam)|P_tmpdir|"
     r"errno|math_errhandling|std(in|out|err)|st_[acm]time|sched_priority|static_assert|complex|"
-    r"imaginary|noreturn|true|false|s[ai]_\w+|linux|unix|near|far|small|interface"
+    r"imaginary|I|noreturn|true|false|s[ai]_\w+|linux|unix|near|far|small|interface|"
+    r"B(0|[1-9]\d{1,6})|(BS|FF|NL|VT)[01]|CR[0-3]|CS[5-8]"  # <termios.h>
 )
 
 # words that macros begin with; an enumerator of a scene that is called so could be one of them
 _FAMILY = re.compile(
-    "(?:ADJ|AIO|ALIGNOF|BC|CHAR|CHARCLASS|CLOCKS?|CLONE|CLOSE|COLL|CPU|DELAYTIMER|ENABLE|EXIT|EXPR|"
-    r"FD|FILENAME|FOPEN|FP|FV[CS]|HAVE|HUGE|IOV|ITIMER|LC|MATH|MAX|MB|METH|MOD|MQ|NGROUPS|NL|PIPE|"
-    r"PTHREAD|PY\w*|RAND|RE|RENAME|RTSIG|SCHED|SEEK|SEM|SIG|SIZEOF|STA|STATX|STD(?:C|ERR|IN|OUT)|SYS|"
-    r"TIMER?|TMP|TTY|UTIME|WCHAR|WINT|WITH|XATTR|S?SIZE|SCHAR|SHRT|LL?ONG|INT\d*|INTMAX|INTPTR|"
+    "(?:ADJ|AIO|ALIGNOF|ATOMIC|BC|CHAR|CHARCLASS|CLOCKS?|CLONE|CLOSE|COLL|CPU|DBL|DELAYTIMER|ENABLE|"
+    "EXIT|EXPR|FD|FE|FILENAME|FLT|FOPEN|FP|FV[CS]|HAVE|HUGE|IOV|ITIMER|LC|LDBL|MATH|MAX|MB|METH|MOD|"
+    r"MQ|NGROUPS|NL|PIPE|PTHREAD|PY\w*|RAND|RE|RENAME|RTSIG|SCHED|SEEK|SEM|SIG|SIZEOF|STA|STATX|"
+    r"STD(?:C|ERR|IN|OUT)|SYS|TIMER?|TMP|TTY|UTIME|WCHAR|WINT|WITH|XATTR|S?SIZE|SCHAR|SHRT|LL?ONG|INT\d*|INTMAX|INTPTR|"
     r"PTRDIFF|UCHAR|USHRT|UL?LONG|UINT\d*|UINTMAX|UINTPTR)_\w+|"
     r"(?:BIG|LITTLE|PDP)_ENDIAN|BYTE_ORDER|BOOL_(?:MAX|WIDTH)|(?:HOST_|LOGIN_)?NAME_MAX|LINE_MAX|"
     r"PATH_MAX|(?:NO)?WAIT_LOCK|WORD_BIT|WINDOW_HAS_FLAGS|MAJOR_IN_\w+|MVWDELCH_\w+|DOUBLE_IS_\w+|"
