@@ -11,7 +11,7 @@
   everything else included.
 
 Times are medians of three, each in a fresh process and from an empty folder. Behind each figure
-stands its bar, where it has one. Robots come from example-robot-data (pip install 'eomc[robots]').
+stands its bar, where it has one. Robots come from example-robot-data (pip install '.[robots]').
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent.parent
-EXTRA = "pip install 'eomc[robots]'"
+EXTRA = "pip install '.[robots]'"
 
 ARM = """
 eomc = 1

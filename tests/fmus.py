@@ -263,7 +263,7 @@ class Host:
 
 def needs_fmpy() -> None:
     """Skip where FMPy is not installed, by name."""
-    pytest.importorskip("fmpy", reason="FMPy is not installed: pip install 'eomc[fmu]'")
+    pytest.importorskip("fmpy", reason="FMPy is not installed: pip install '.[fmu]'")
 
 
 def rows(host: Host, names: Sequence[str], size: float, count: int) -> np.ndarray:

@@ -137,7 +137,7 @@ def test_the_path_of_the_tip_is_in_the_file() -> None:
 
 @pytest.mark.skipif(
     not all(map(importlib.util.find_spec, ("fmpy", "pythonfmu3"))),
-    reason="FMPy and PythonFMU3 are not installed: pip install 'eomc[fmu]'",
+    reason="FMPy and PythonFMU3 are not installed: pip install '.[fmu]'",
 )
 @pytest.mark.slow
 def test_a_controller_that_is_another_unit_holds_the_arm() -> None:
@@ -152,7 +152,7 @@ def test_a_controller_that_is_another_unit_holds_the_arm() -> None:
 
 @pytest.mark.slow
 def test_an_arm_is_held_and_pushed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mujoco", reason="robot files come with pip install 'eomc[robots]'")
+    pytest.importorskip("mujoco", reason="robot files come with pip install '.[robots]'")
     from robots.test_robots_mujoco import robot_data
 
     file = robot_data("/ur5_robot.urdf")

@@ -85,7 +85,7 @@ def test_julia(page: Path) -> None:
 
 @pytest.mark.slow
 def test_casadi(page: Path) -> None:
-    pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'eomc[fmu]'")
+    pytest.importorskip("casadi", reason="CasADi is not installed: pip install '.[fmu]'")
     (program,) = blocks("python")
     said = ran(sys.executable, "-c", program, at=page)
     numbers = [float(x) for x in re.findall(r"[-\d.]+(?:e[-+]\d+)?", said)]

@@ -52,6 +52,19 @@ def test_python_answers_as_shown() -> None:
     assert doctest.DocTestRunner().run(test).failed == 0
 
 
+def test_nothing_tells_to_install_eomc_from_a_package_index() -> None:
+    """No index has a package of that name: clones and wheels are installed by path."""
+    by_name = re.compile(r"""pip3? install (?:-\S+ )*\\?["']?eomc(?![\w./*-])""")
+    assert by_name.search("pip install " + '"eomc[plot]"')
+    assert not by_name.search("pip install dist/eomc-*.whl")
+    root = Path(__file__).parents[1]
+    places = [root / "README.md", root / "CONTRIBUTING.md"]
+    for folder in ("docs", "generator", "templates", "tests", "benchmarks"):
+        places += (root / folder).rglob("*")
+    texts = (f for f in places if f.suffix in (".md", ".py", ".jinja", ".ipynb") and f.is_file())
+    assert [f.name for f in texts if by_name.search(f.read_text(encoding="utf-8"))] == []
+
+
 def headings(page: Path) -> set[str]:
     """The anchors of a page's headings, outside its blocks of code."""
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)

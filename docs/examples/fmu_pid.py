@@ -1,6 +1,6 @@
 """Two units of FMI that drive each other: an arm by eomc, a PID controller by PythonFMU3.
 
-python docs/examples/fmu_pid.py        (pip install 'eomc[fmu]' brings FMPy and PythonFMU3)
+python docs/examples/fmu_pid.py        (pip install ".[fmu]" installs FMPy and PythonFMU3)
 """
 
 import sys

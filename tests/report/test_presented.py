@@ -92,7 +92,7 @@ def test_without_latex2mathml_equations_say_what_to_install(
     for name in [name for name in sys.modules if name.startswith("latex2mathml")]:
         monkeypatch.setitem(sys.modules, name, None)
     mathml._made.cache_clear()
-    with pytest.raises(EomcError, match=r'need latex2mathml: pip install "eomc\[plot\]"'):
+    with pytest.raises(EomcError, match="need latex2mathml: pip install latex2mathml"):
         mathml.lines(equations.of(system()))
 
 

@@ -129,7 +129,7 @@ def test_they_act(tmp_path: Path, quickly_compiled: None) -> None:
 @pytest.mark.slow
 def test_the_forces_are_those_of_mujoco(tmp_path: Path, quickly_compiled: None) -> None:
     """What drives each joint, of controls within and beyond all ranges."""
-    mujoco = pytest.importorskip("mujoco", reason="pip install eomc[robots]")
+    mujoco = pytest.importorskip("mujoco", reason="pip install '.[robots]'")
     text = mjcf(*"abcd").split('<motor name="first"')[0] + "</actuator></mujoco>"
     imported(tmp_path, text, "--limits")
     m = eomc.load(tmp_path / "robot.toml", tmp_path)

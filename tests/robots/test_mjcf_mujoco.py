@@ -15,7 +15,7 @@ from eomc.robots.robot import Robot, RobotBody
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import JOINTS
 
-WANTED = "MuJoCo is what these tests compare with: pip install eomc[robots]"
+WANTED = "MuJoCo is what these tests compare with: pip install '.[robots]'"
 mujoco = pytest.importorskip("mujoco", reason=WANTED)
 pytestmark = pytest.mark.slow  # in the tier that installs what they compare with
 

@@ -35,7 +35,7 @@ from eomc.robots.mjcf import read
 from eomc.robots.robot import Robot
 from eomc.scene.read import parse
 
-WANTED = "robots are compared with MuJoCo where it is there: pip install 'eomc[robots]'"
+WANTED = "robots are compared with MuJoCo where it is there: pip install '.[robots]'"
 mujoco = pytest.importorskip("mujoco", reason=WANTED)
 pytestmark = pytest.mark.slow  # in the tier that installs what they compare with
 

@@ -663,7 +663,7 @@ def test_it_is_compiled_from_its_sources(scene: str, version: int, tmp_path: Pat
 @pytest.mark.parametrize("target", ["x86_64-windows-gnu", "aarch64-macos", "aarch64-linux-gnu"])
 def test_it_compiles_for_other_machines(target: str, version: int, tmp_path: Path) -> None:
     """By ziglang, without a warning; nothing here can run it."""
-    pytest.importorskip("ziglang", reason="ziglang is not installed: pip install 'eomc[cc]'")
+    pytest.importorskip("ziglang", reason="ziglang is not installed: pip install '.[cc]'")
     import sys
 
     from compilers import compiled

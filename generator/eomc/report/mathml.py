@@ -37,6 +37,6 @@ def _made(latex: str) -> Markup:
     try:
         from latex2mathml.converter import convert
     except ImportError:
-        raise EomcError('equations in a page need latex2mathml: pip install "eomc[plot]"') from None
+        raise EomcError("equations in a page need latex2mathml: pip install latex2mathml") from None
     made = convert(latex).replace('display="inline"', 'displaystyle="true"')
     return Markup(_FUNCTION.sub(_SPACED, made))

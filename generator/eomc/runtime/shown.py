@@ -20,7 +20,10 @@ def by_eomc(room: str, what: str = "runs are drawn") -> Any:
     except ModuleNotFoundError as fault:
         if not str(fault.name).startswith("eomc"):
             raise
-        raise ImportError(f"{what} by eomc, which is not here: pip install eomc") from None
+        raise ImportError(
+            f"{what} by eomc, which is not here: in its clone 'pip install .' "
+            "installs it, elsewhere 'pip install' with the file of its wheel"
+        ) from None
 
 
 def with_events(call: Callable[..., Any], given: dict[str, Any]) -> Any:
