@@ -11,8 +11,13 @@ from pathlib import Path
 
 import pytest
 from cases import SCENES
+from click.testing import CliRunner
 from conftest import ROOT
 from fmus import needs_fmpy
+
+import eomc
+from eomc.base.errors import EomcError
+from eomc.cli.main import main
 
 BUILT = ROOT / "build" / "tests" / "fmu"
 DOCUMENT = (ROOT / "docs" / "fmu.md").read_text(encoding="utf-8")
@@ -56,6 +61,38 @@ def test_it_holds_a_binary_and_sources(version: str, binary: str, here: Path) ->
     export(here, "simple_pendulum.toml", "--fmi", version, "-q", EOMC_CFLAGS="-O0")
     assert (here / "simple_pendulum.fmu").read_bytes() == first
     assert [p.name for p in here.iterdir() if p.name.startswith(".")] == []
+
+
+def test_a_scene_or_a_file_that_is_no_unit_stays(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(here)
+    scene = Path("simple_pendulum.toml")
+    before = scene.read_bytes()
+    Path("copied.fmu").write_bytes(before)
+    Path("notes.fmu").write_text("notes", encoding="utf-8")
+    for name, said in (
+        ("simple_pendulum.toml", "give a name that ends in .fmu"),
+        ("unit.zip", "give a name that ends in .fmu"),
+        ("copied.fmu", "is a scene, and stays"),
+        ("notes.fmu", "is no .fmu file, and stays"),
+    ):
+        words = ["export", "fmu", str(scene), "--sources", "--out", name]
+        done = CliRunner().invoke(main, words)
+        assert done.exit_code == 2 and said in done.output, done.output
+    assert scene.read_bytes() == before == Path("copied.fmu").read_bytes()
+    assert Path("notes.fmu").read_text(encoding="utf-8") == "notes"
+    with pytest.raises(EomcError, match=r"written as \.fmu"):
+        eomc.export_fmu(scene, scene, binary=False)
+    for _ in range(2):  # a unit that is there is written anew
+        eomc.export_fmu(scene, "unit.fmu", binary=False)
+    assert Path("unit.fmu").read_bytes()[:2] == b"PK"
+    done = CliRunner().invoke(main, ["report", str(scene), "--json", str(scene)])
+    assert done.exit_code == 2 and "give a name that ends in .json" in done.output
+    Path("run.csv").write_bytes(before)
+    done = CliRunner().invoke(main, ["run", str(scene), "--out", "run.csv"])
+    assert done.exit_code == 2 and "is a scene, and stays" in done.output
+    assert scene.read_bytes() == before == Path("run.csv").read_bytes()
 
 
 @pytest.mark.slow

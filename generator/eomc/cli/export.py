@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from eomc import pipeline
-from eomc.cli import options
+from eomc.cli import files, options
 from eomc.cli.terminal import say, shown, status_line, warn
 
 
@@ -36,6 +36,7 @@ def fmu(scene: Path, fmi: str, out: Path | None, sources: bool, quiet: bool) -> 
     eomc export fmu scenes/cartpole.toml
     eomc export fmu scenes/cartpole.toml --fmi 3 --out cartpole3.fmu
     """
+    files.check_target(out, (".fmu",), "--out")
     with status_line("exporting", quiet):
         made = pipeline.export_fmu(scene, out, int(fmi), binary=not sources, warn=warn)
     if made.why:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from eomc.base.errors import EomcError, writing
 from eomc.cli.terminal import shown
-from eomc.runtime.written import replacing
+from eomc.runtime.written import check_replaceable, replacing
 
 
 def scene_path(name: str) -> Path:
@@ -29,6 +30,16 @@ def write_new(path: Path, text: str) -> None:
     finally:
         if made:  # and not whole
             path.unlink(missing_ok=True)
+
+
+def check_target(path: Path | None, endings: Sequence[str], option: str) -> None:
+    """Raise EomcError where an option names a file of another kind than the command writes."""
+    if path is None:
+        return
+    if path.suffix not in endings:
+        raise EomcError(f"{option} {shown(path)}: give a name that ends in {' or '.join(endings)}")
+    with writing(f"{option} {shown(path)}"):
+        check_replaceable(path)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -36,6 +36,7 @@ def command(
     from eomc.report import page as pages
     from eomc.report.plot import without_pictures
 
+    files.check_target(file, (".json",), "--json")
     measured = []
     for scene in scenes:
         system = pipeline.read(scene)

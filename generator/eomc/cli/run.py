@@ -18,7 +18,7 @@ import click
 from eomc import pipeline
 from eomc.base import texts
 from eomc.base.errors import EomcError, writing
-from eomc.cli import options
+from eomc.cli import files, options
 from eomc.cli.pairs import pairs
 from eomc.cli.terminal import progress_bar, say, shown, status_line, warn
 
@@ -96,9 +96,9 @@ def command(
     """
     from eomc.runtime.stability import beyond_end
 
-    _known_suffix(out, (".csv", ".npz"), "--out")
-    _known_suffix(plot, (".png", ".svg", ".pdf"), "--plot")
-    _known_suffix(animate, (".html", ".gif", ".mp4"), "--animate")
+    files.check_target(out, (".csv", ".npz"), "--out")
+    files.check_target(plot, (".png", ".svg", ".pdf"), "--plot")
+    files.check_target(animate, (".html", ".gif", ".mp4"), "--animate")
     if wrap and not plot:
         raise EomcError("--wrap: says how --plot draws angles: give --plot FILE.png too")
     with status_line(f"building {scene.stem}", quiet or as_json):
@@ -150,8 +150,8 @@ def command(
     if animate:
         with status_line(f"drawing {animate.name}", quiet or as_json):
             done.animate(animate)
-    files = {"plot": plot, "animate": animate, "out": out}
-    summary = _summary(module, done, balance, seconds, unstable, ends, **files)
+    written = {"plot": plot, "animate": animate, "out": out}
+    summary = _summary(module, done, balance, seconds, unstable, ends, **written)
     if as_json:
         say(json.dumps(summary, indent=1))
     elif not quiet:
@@ -182,11 +182,6 @@ def _with_events(module: ModuleType, given: Sequence[str]) -> ModuleType:
 def _reported_below() -> AbstractContextManager[Any]:
     """No warnings: what they say is part of the summary."""
     return warnings.catch_warnings(action="ignore", category=RuntimeWarning)
-
-
-def _known_suffix(path: Path | None, known: Sequence[str], option: str) -> None:
-    if path is not None and path.suffix not in known:
-        raise EomcError(f"{option} {shown(path)}: give a name that ends in {' or '.join(known)}")
 
 
 def _overrides(

@@ -128,7 +128,7 @@ def of(
     kept["key"] = wanted
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as new:
+        with replacing(file, cached=True) as new:
             new.write_text(json.dumps(kept) + "\n", encoding="utf-8")
     except OSError as fault:
         raise FolderError(f"{file}: can't be written ({fault.strerror})") from None

@@ -31,13 +31,15 @@ class Exported:
 
 
 def export(made: Unit, file: Path, binary: bool = True) -> Exported:
-    """Write a unit to `file`, over what is there, with a binary for this machine where wanted.
+    """Write a unit to `file`, over a unit that is there, with a binary for this machine if wanted.
 
     Without a compiler the unit has its sources alone. Raises EomcError where the compiler fails,
     with its own words, or the file can't be written.
     """
     if file.is_dir():
         raise EomcError(f"{file}: is a folder: name a file, --out {made.name}.fmu")
+    if file.suffix != ".fmu":
+        raise EomcError(f"{file}: a unit of FMI is written as .fmu: end its name so")
     held: dict[str, bytes] = {}
     folder = why = ""
     if binary:

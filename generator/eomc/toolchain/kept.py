@@ -33,6 +33,6 @@ def texts(
     if name:
         with contextlib.suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(file) as new:
+            with replacing(file, cached=True) as new:
                 new.write_text(json.dumps({"key": key, "texts": made}), encoding="utf-8")
     return made
