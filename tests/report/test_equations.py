@@ -46,8 +46,8 @@ def same(found: Eq, left: sympy.Expr, right: sympy.Expr = sympy.S.Zero) -> bool:
 
 def test_the_tutorials_cart_pole() -> None:
     found = eomc.equations(SCENES / "cartpole_tutorial.toml")
-    q2, v2, a1, a2 = symbols("q2 q2_dot q1_ddot q2_ddot", real=True)
-    mc, mp, r, g = symbols("mc mp l g", real=True)
+    q2, v2, a1, a2 = symbols("q2 q2_dot q1_ddot q2_ddot")
+    mc, mp, r, g = symbols("mc mp l g")
     first, second = found.scalar
     assert same(first, (mc + mp) * a1 - mp * r * cos(q2) * a2 / 2 + mp * r * sin(q2) * v2**2 / 2)
     assert same(second, -mp * r * cos(q2) * a1 / 2 + mp * r**2 * a2 / 3 - mp * g * r * sin(q2))
@@ -301,3 +301,78 @@ def test_four_coordinates_take_less_than_three_seconds_and_a_third_of_one_again(
 def test_nothing_is_kept_where_nothing_can_be_written(here: Path) -> None:
     (here / "build").write_text("in the way")
     assert "mass matrix" in show("cartpole.toml")
+
+
+PENDULUM = """eomc = 1
+name = "pendulum"
+[coordinates]
+theta = { unit = "rad", start = 0.5 }
+[parameters]
+m = 1.0
+l = 0.5
+[energy]
+kinetic = "m*l**2*theta_dot**2/2"
+potential = "-m*9.81*l*cos(theta)"
+"""
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path) -> Path:
+    (tmp_path / "pendulum.toml").write_text(PENDULUM, encoding="utf-8")
+    return tmp_path / "pendulum.toml"
+
+
+def test_the_symbols_of_a_scenes_equations_are_plain_ones(pendulum: Path) -> None:
+    found = eomc.equations(pendulum)
+    m, r, theta, acceleration = symbols("m l theta theta_ddot")
+    assert found.D.subs({"m": 2, "l": 3})[0, 0] == found.D.subs({m: 2, r: 3})[0, 0] == 18
+    assert sympy.lambdify((m, r), found.D)(2, 3) == 18
+    g = sympy.Rational(981, 100)
+    assert sympy.solve(found.scalar[0], acceleration) == [-g * sin(theta) / r]
+    assert found.symbols["theta_ddot"] == acceleration and found.symbols["m"] == m
+    assert found.set_out.D == found.D and "θ̈" in str(found)
+
+
+@pytest.mark.parametrize("assumptions", [{}, {"real": True}, {"positive": True}])
+def test_the_symbols_of_a_systems_equations_are_the_users(assumptions: dict[str, bool]) -> None:
+    from sympy.physics.mechanics import dynamicsymbols
+
+    m, r = symbols("m l", **assumptions)
+    theta = dynamicsymbols("theta")
+    made = eomc.System.make(
+        "pendulum", [theta], m * r**2 * theta.diff() ** 2 / 2, -m * r * cos(theta),
+        parameters={m: 1, r: 1},
+    )  # fmt: skip
+    found = eomc.equations(made)
+    assert found.D.subs({m: 2, r: 3})[0, 0] == 18
+    assert found.scalar[0].lhs.has(theta.diff(dynamicsymbols._t, 2))
+    assert found.symbols["theta"] == theta and found.symbols["theta_dot"] == theta.diff()
+    x, v = symbols("x x_dot", **assumptions)
+    plain = eomc.System.make("mass", [x], m * v**2 / 2, m * x**2, parameters={m: 1})
+    assert eomc.equations(plain).g[0] == 2 * m * x
+    assert m * v**2 / 2 - m * x**2 == eomc.equations(plain).L
+
+
+def test_names_given_as_text_are_plain_symbols() -> None:
+    made = eomc.System.make("mass", ["x"], "m*x_dot**2/2", "k*x**2/2", parameters={"m": 1, "k": 1})
+    assert eomc.equations(made).g.subs({"k": 2, "x": 3})[0] == 6
+
+
+def test_equations_take_numbers_for_parameters(pendulum: Path) -> None:
+    found = eomc.equations(pendulum)
+    changed = found.with_values({"m": 2}, l=0.1)
+    assert changed.D[0, 0] == sympy.Rational(1, 50)
+    assert "0.02⋅θ̈" in unicodedata.normalize("NFC", str(changed))
+    assert found.with_values({found.symbols["m"]: 3}).D.free_symbols == {sympy.Symbol("l")}
+    with pytest.raises(eomc.EomcError, match="ll is not a parameter; did you mean 'l'"):
+        found.with_values(ll=1)
+    for wrong in (float("nan"), "x", sympy.Symbol("y"), 1j):
+        with pytest.raises(eomc.EomcError, match="m must be a finite real number"):
+            found.with_values(m=wrong)
+
+
+def test_a_fraction_that_a_double_does_not_tell_from_the_number_is_shown() -> None:
+    made = eomc.System.make("a", ["x"], f"{8 / 3!r}*x_dot**2/2", "0.3333333333333*x")
+    text = str(of(made))
+    assert "2.6666" not in text and "[8/3]" in text
+    assert "0.3333333333333" in text  # which is not a third

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -122,6 +122,7 @@ class Maker:
         picture: Any, friction: Any,
     ) -> Made:  # fmt: skip
         """The system, of the class `of`."""
+        as_given = (coordinates, parameters, inputs, definitions)
         starts = given.symbols(coordinates, "coordinates", None)
         parameters = given.mapping(parameters, "parameters", "{m: 2.0}")
         forces = given.by_name(forces, "forces", "{x: F}")
@@ -181,9 +182,13 @@ class Maker:
             "title": title or self.name.replace("_", " ").capitalize(),
         }
         self.frictions = list(self._frictions(friction, starts, declared))
+        as_text = {one for group in as_given for one in group if isinstance(one, str)}
+        own = _own_symbols(self.taken, starts, as_text)
         whole = sympy.srepr(sorted(made_of.items())) + drawn_text + str(self.frictions or "")
         digest = hashlib.sha256(whole.encode()).hexdigest()
-        return of(**made_of, digest=digest, renamed=tuple(self.renamed), pictured=drawn)
+        return of(
+            **made_of, digest=digest, renamed=tuple(self.renamed), pictured=drawn, own_symbols=own
+        )
 
     def _coordinate(self, one: Any, units: Mapping[Any, str]) -> Coordinate:
         """A coordinate, whose symbols are known from here on."""
@@ -404,3 +409,26 @@ class Maker:
         if one == symbol(given.name_of(one)):  # as a name gives it: whatever the assumptions
             self.map[Symbol(one.name)] = symbol(used)
         return used
+
+
+def _own_symbols(
+    used: Mapping[str, Any], coordinates: Iterable[Any], as_text: Collection[str]
+) -> dict[str, Expr]:
+    """Return the user's symbols of coordinates, their derivatives, and all other quantities.
+
+    used: what was declared, by the name that it has in the system. Names that were given as text
+    (`as_text`) have no symbol of the user.
+    """
+    moving, found = {*coordinates}, dict[str, Expr]()
+    for name, one in used.items():
+        if given.name_of(one) in as_text:
+            continue
+        found[name] = one
+        if one in moving and isinstance(one, AppliedUndef):
+            (time,) = one.args
+            found["t"] = time
+            found[f"{name}_dot"], found[f"{name}_ddot"] = one.diff(time), one.diff(time, 2)
+        elif one in moving:
+            for order in ("_dot", "_ddot"):
+                found[name + order] = Symbol(f"{one}{order}", **one.assumptions0)
+    return found

@@ -47,7 +47,8 @@ class Mechanics:
     its names and that alone. `closure`: what its constraints leave, once its start is assembled.
     `modes`: of friction that sticks, the last coordinates. `discrete`: coordinates before them that
     jumps alone change, which no derivative is taken along. `again`: `make` with what made it; other
-    arguments take the place of those.
+    arguments take the place of those. `own_symbols`: the symbols, functions of time and their
+    derivatives that the user gave to `make`, by the names that they have here.
     """
 
     name: str
@@ -81,10 +82,11 @@ class Mechanics:
     modes: tuple[Mode, ...] = ()
     discrete: tuple[str, ...] = ()
     again: partial[Any] | None = field(default=None, compare=False, repr=False)
+    own_symbols: Mapping[str, Expr] = field(default_factory=dict, compare=False, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without `again`, whose symbols may not bear to be pickled."""
-        return {**self.__dict__, "again": None}
+        """Leave out `again` and `own_symbols`, whose symbols may not support pickling."""
+        return {**self.__dict__, "again": None, "own_symbols": {}}
 
     @property
     def q(self) -> tuple[Symbol, ...]:

@@ -1,9 +1,11 @@
-"""What is derived of a system, as SymPy expressions: K, P, scalar equations, D, C, g and tau."""
+"""The equations of a system as SymPy expressions: K, P, scalar equations, D, C, g and tau."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, Self
 
 import sympy
 from sympy import Expr, ImmutableMatrix
@@ -15,7 +17,10 @@ Terms = list[tuple[Expr, Expr]]  # a product of accelerations or rates, and its 
 
 @dataclass(frozen=True)
 class Derived:
-    """The expressions of `equations.Equations`, which says what each is."""
+    """The expressions of `equations.Equations`, which says what each is.
+
+    symbols: by name the symbols that the expressions have in place of the system's own.
+    """
 
     system: System
     D: ImmutableMatrix
@@ -31,11 +36,30 @@ class Derived:
     power: Expr | None
     left: tuple[Terms, ...]  # of each scalar equation
     named: tuple[tuple[sympy.Symbol, Expr], ...] = ()  # abbreviations, in their order
+    symbols: Mapping[str, Expr] = field(default_factory=dict)
 
     @property
-    def multipliers(self) -> tuple[sympy.Symbol, ...]:
-        """Of the constraints."""
-        return tuple(symbol(f"lambda_{c.name}") for c in self.system.constraints)
+    def multipliers(self) -> tuple[Expr, ...]:
+        """The Lagrange multipliers, one a constraint."""
+        names = (f"lambda_{c.name}" for c in self.system.constraints)
+        return tuple(self.symbols.get(name, symbol(name)) for name in names)
+
+    def replaced(self, values: Mapping[Expr, Expr], form: Callable[[Expr], Expr]) -> Self:
+        """Return the equations with `values` in place of symbols, each result in a `form`."""
+
+        def new(e: Expr) -> Expr:
+            return form(e.xreplace(values))
+
+        matrices = ("D", "C", "g", "tau", "forces", "zero", "A")
+        scalars = ("kinetic", "potential", "jacobi", "power")
+        changed: dict[str, Any] = {name: getattr(self, name).applyfunc(new) for name in matrices}
+        changed |= {name: new(e) for name in scalars if (e := getattr(self, name)) is not None}
+        return replace(
+            self,
+            **changed,
+            left=tuple([(e.xreplace(values), new(c)) for e, c in terms] for terms in self.left),
+            named=tuple((s.xreplace(values), new(e)) for s, e in self.named),
+        )
 
     @property
     def right(self) -> ImmutableMatrix:

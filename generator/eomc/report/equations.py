@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import sympy
 from sympy import Expr, ImmutableMatrix
@@ -10,11 +13,13 @@ from sympy import Expr, ImmutableMatrix
 from eomc import pipeline
 from eomc.base.errors import EomcError
 from eomc.model.discrete import constant
+from eomc.model.symbols import symbol
 from eomc.model.system import System
 from eomc.pipeline import ScenePath
 from eomc.report import abbreviations, equations_text, large_system
 from eomc.report.derived import Derived, Terms
 from eomc.report.typeset import readable
+from eomc.scene.formulas import suggest
 from eomc.verify import symbolic
 from eomc.verify.shorter import coefficients, shorter
 
@@ -23,6 +28,7 @@ DERIVED = 8_000  # operations of D, C and bias as they are derived, up to which 
 WRITTEN_OUT = 1_000  # operations of what is set out, which then fills a page or two
 
 
+@dataclass(frozen=True, repr=False)
 class Equations(Derived):
     """D q̈ + C q̇ + g = tau and what it comes from, as SymPy expressions over the scene's names.
 
@@ -32,34 +38,106 @@ class Equations(Derived):
     them, at most 100 columns wide; a notebook shows them typeset; long ones with names for what
     they share, `named` in those that are `set_out`.
 
+    The symbols of a scene's equations are plain ones, `sympy.Symbol("m_c")`; those of a System are
+    the symbols and functions of time that `System.make` was given. `symbols` has them by name.
+
     >>> import eomc
-    >>> eomc.equations("scenes/simple_pendulum.toml").scalar    # doctest: +SKIP
+    >>> found = eomc.equations("scenes/simple_pendulum.toml")   # doctest: +SKIP
+    >>> found.scalar                                            # doctest: +SKIP
     (Eq(g*l*m*sin(theta) + l**2*m*theta_ddot, 0),)
+    >>> found.D.subs({"m": 2, "l": 0.5})                        # doctest: +SKIP
+    Matrix([[0.5]])
     """
+
+    _internal: Equations | None = None  # the same over the system's own symbols, which are printed
 
     @cached_property
     def set_out(self) -> Equations:
         """The same as they are printed: long ones by abbreviations."""
+        if self._internal is not None:
+            return self._internal.set_out.in_symbols_of_the_user()
         long = not self.named and _operations(self) > WRITTEN_OUT
         return abbreviations.of(self) if long else self
+
+    def in_symbols_of_the_user(self) -> Equations:
+        """Return the equations over the symbols that the user has or can make by name."""
+        s = self.system
+        names = [x.name for x in (*s.q, *s.qd, *s.qdd, *s.u, *(p.symbol for p in s.parameters))]
+        names += [*(x.name for x in self.multipliers), *(x.name for x, _ in self.named), "t"]
+        plain = {name: sympy.Symbol(name) for name in names}
+        symbols = {name: s.own_symbols.get(name, plain[name]) for name in names}
+        changed = self.replaced({symbol(n): new for n, new in symbols.items()}, lambda e: e)
+        return replace(changed, symbols=symbols, _internal=self)
+
+    def with_values(self, values: Mapping[Any, Any] | None = None, /, **by_name: Any) -> Equations:
+        """Return the equations with numbers in place of parameters.
+
+        Parameters
+        ----------
+        values : mapping, optional
+            From parameters, as names or as the symbols of `symbols`, to numbers.
+        **by_name
+            The same by keyword, ``with_values(m=2)``.
+
+        Returns
+        -------
+        Equations
+            Decimal numbers are taken as exact fractions, as in a scene.
+
+        Raises
+        ------
+        EomcError
+            If a name is not one of a parameter, or a value not a finite real number.
+        """
+        if self._internal is None:
+            return self.in_symbols_of_the_user().with_values(values, **by_name)
+        parameters = {p.name: p.symbol for p in self.system.parameters}
+        names = {self.symbols[name]: name for name in parameters}
+        new = dict[Expr, Expr]()
+        for key, value in {**(values or {}), **by_name}.items():
+            name = names.get(key, key)
+            if name not in parameters:
+                known = [*parameters]
+                raise EomcError(
+                    f"with_values: {name!s} is not a parameter{suggest(str(name), known)}: "
+                    + (f"there are {', '.join(known)}" if known else "there are none")
+                )
+            new[parameters[name]] = _exact(value, f"with_values: {name}")
+        return self._internal.replaced(new, readable).in_symbols_of_the_user()
 
     def __repr__(self) -> str:
         s = self.system
         return f"<Equations of {s.name}: {s.size}; print() shows them>"
 
     def __str__(self) -> str:
-        return equations_text.text(self.set_out)
+        return equations_text.text((self._internal or self).set_out)
 
     def _repr_latex_(self) -> str:
-        return equations_text.latex(self.set_out)
+        return equations_text.latex((self._internal or self).set_out)
 
 
 def equations(scene: System | ScenePath) -> Equations:
-    """The equations of motion of a scene file or a System, simplified, as SymPy expressions.
+    """Derive the equations of motion of a scene file or a System, simplified.
 
-    Raises SceneError for a faulty scene, EomcError where they would fill many pages.
+    Parameters
+    ----------
+    scene : str, path or System
+
+    Returns
+    -------
+    Equations
+        SymPy expressions over plain symbols of the scene's names, or over the symbols that
+        `System.make` was given.
+
+    Raises
+    ------
+    SceneError
+        If the scene is faulty.
+    EomcError
+        If the equations would fill many pages.
     """
-    return of(scene if isinstance(scene, System) else pipeline.read(scene))
+    system = scene if isinstance(scene, System) else pipeline.read(scene)
+    return of(system).in_symbols_of_the_user()
 
 
 def of(system: System) -> Equations:
@@ -90,6 +168,18 @@ def of(system: System) -> Equations:
     if _operations(made.set_out) > WRITTEN_OUT:
         raise too_long(system)
     return made
+
+
+def _exact(value: Any, what: str) -> Expr:
+    """Return a number as SymPy has it, a decimal one as a fraction. Raises EomcError."""
+    try:
+        number = sympy.Rational(repr(float(value))) if not isinstance(value, Expr) else value
+        number = sympy.nsimplify(number, rational=True) if number.has(sympy.Float) else number
+    except (TypeError, ValueError, OverflowError):
+        number = None
+    if number is None or not (number.is_number and number.is_real and number.is_finite):
+        raise EomcError(f"{what} must be a finite real number, here {value!r}")
+    return number
 
 
 def _operations(found: Equations) -> int:

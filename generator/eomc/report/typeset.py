@@ -10,6 +10,7 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from typing import Any
 
 import sympy
@@ -247,7 +248,13 @@ def readable(value: Expr) -> Expr:
         return value
     short = _rounded(sympy.expand(value))
     plain = _rounded(sympy.expand(short))  # each factor whole again
-    return plain.xreplace({x: sympy.Float(x, 15) for x in _long(plain)})
+    return plain.xreplace({x: _simple_fraction(x) or sympy.Float(x, 15) for x in _long(plain)})
+
+
+def _simple_fraction(x: sympy.Rational) -> sympy.Rational | None:
+    """Return the fraction of at most three digits that float64 does not tell from x, if any."""
+    simple = Fraction(int(x.p), int(x.q)).limit_denominator(999)
+    return sympy.Rational(simple) if float(simple) == float(x) else None
 
 
 def _rounded(e: Expr) -> Expr:

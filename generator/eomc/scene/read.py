@@ -239,10 +239,14 @@ class _Check(Checker):
                     f"'{velocity}' is the velocity of coordinate '{name}': choose another name",
                 )
         self._output_names(seen)
-        units = ("coordinates", "parameters", "constants", "inputs", "outputs", "constraints")
-        for table in units:
+        for table in ("coordinates", "parameters", "constants", "inputs", "constraints"):
             for name, entry in getattr(doc, table).items():
                 self._unit((table, name), entry.unit, getattr(entry, "start", 0))
+        # the formula of an output may convert to any unit; a coordinate by itself does not
+        states = {*doc.coordinates, *(f"{name}_dot" for name in doc.coordinates)}
+        for name, output in doc.outputs.items():
+            if (formula := str(output.formula).strip()) in states:
+                self._unit(("outputs", name), output.unit, formula=formula)
         return seen
 
     def _output_names(self, seen: Mapping[str, str]) -> None:
@@ -258,12 +262,18 @@ class _Check(Checker):
             elif why := names.fault(name):
                 self.say(("outputs", name), why)
 
-    def _unit(self, path: tuple[str, ...], unit: str, start: float | str = 0) -> None:
-        """Units are texts; those that were meant to be converted are reported."""
+    def _unit(
+        self, path: tuple[str, ...], unit: str, start: float | str = 0, formula: str = ""
+    ) -> None:
+        """Report a unit that suggests a conversion: units are texts, nothing is converted.
+
+        formula: of an output, the coordinate or velocity that it consists of.
+        """
         plain = unit.strip().lower()
         if plain in ("deg", "degree", "degrees", "°", "deg/s", "°/s"):
             number = f"{start:g}" if isinstance(start, float) and start else "30"
             remedy = f'write {number} degrees as {messages.radians(number)}, with unit = "rad"'
+            remedy = f'write formula = "{formula}*180/pi"' if formula else remedy
             self.say((*path, "unit"), f"angles are in radians, nothing is converted: {remedy}")
         elif plain in _NOT_SI:
             message = (
