@@ -173,7 +173,7 @@ def build(
         _tell_preparing(warn)
         return sources(made, extension, warn=warn)
 
-    return cache.build(made.name, wanted, texts, Path(root), form)
+    return cache.build(made.name, wanted, texts, Path(root), form, digest)
 
 
 def write_c(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import sys
 from types import ModuleType
 
 import numpy as np
@@ -163,6 +165,17 @@ def test_momenta_as_on_paper(plane: ModuleType) -> None:
     spin = 1.2 * 0.7**2 / 12 * (2 * QD[0] + QD[1])
     about = sum(1.2 * (r[0] * v[1] - r[1] * v[0]) for r, v in ((one - two, v1), (two - one, v2)))
     assert found.angular == pytest.approx(spin + about / 2, rel=1e-13)
+
+
+def test_poses_and_momenta_are_read_where_the_module_was_not_loaded(
+    plane: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = plane.pose([0.3, 0.2]), plane.momentum([0.3, 0.2], [0.1, 0.4])
+    pickled = pickle.dumps(values)
+    for name in [m for m in sys.modules if m.startswith("_eomc_")]:
+        monkeypatch.delitem(sys.modules, name)
+    for read, value in zip(pickle.loads(pickled), values, strict=True):
+        assert repr(read) == repr(value)
 
 
 def test_many_states_are_rows(space: ModuleType) -> None:

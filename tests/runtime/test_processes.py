@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 from cases import SCENES
 from conftest import MODULES, Modules
-from instrument import in_a_fork
 
 import eomc
 from eomc.base.errors import Problem
@@ -254,41 +253,6 @@ def test_a_module_imported_by_its_own_name_needs_no_eomc(cartpole: ModuleType) -
     assert done.returncode == 0, done.stderr.decode()
     assert done.stdout.decode().split(">")[0] == "<Run of cartpole: 5 steps of 0.005 s"
     assert "cartpole.status 4.0 (6,)" in done.stdout.decode()
-
-
-@pytest.mark.usefixtures("quickly_compiled")
-def test_a_run_of_another_version_of_the_scene_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "cartpole.toml"
-    text = (SCENES / "cartpole.toml").read_text(encoding="utf-8")
-    file.write_text(text, encoding="utf-8")
-
-    for name in [name for name in sys.modules if name.startswith("_eomc_cartpole_")]:
-        monkeypatch.delitem(sys.modules, name)  # another test's, from a folder that is gone
-
-    def pickled() -> list[str]:
-        m = eomc.load(file, tmp_path / "build")
-        with pytest.raises(m.MotionError) as fault:
-            m.step([0, 0.4], [0, 1e200], h=1.0)
-        return [pickle.dumps(x).hex() for x in (m.simulate(steps=5), fault.value)]
-
-    how, told = in_a_fork(pickled, 30)
-    assert how == "done" and isinstance(told, list), told
-    run, fault = map(bytes.fromhex, told)
-    file.write_text(text + "# a comment\n", encoding="utf-8")
-    eomc.build(file, tmp_path / "build")
-    for name in [name for name in sys.modules if name.startswith("_eomc_cartpole_")]:
-        monkeypatch.delitem(sys.modules, name)  # another test's may be of that version
-    with pytest.warns(RuntimeWarning, match="pickled from another version of the scene"):
-        assert len(pickle.loads(run)) == 6
-    for name in [name for name in sys.modules if name.startswith("_eomc_cartpole_")]:
-        if str(tmp_path) in str(sys.modules[name].__file__):
-            del sys.modules[name]
-    (tmp_path / "build" / "cartpole" / "build.json").unlink()
-    with pytest.raises(eomc.EomcError, match="not there: build the scene again"):
-        pickle.loads(run)
-    assert pickle.loads(fault).status == "not finite"  # a pool would wait for ever
 
 
 @pytest.mark.slow

@@ -155,6 +155,44 @@ def test_bytecode_of_the_build_before_is_not_taken(scene: Path, root: Path, foun
     assert all(int(file.stat().st_mtime) > int(ahead) for file in files)
 
 
+def test_builds_of_other_versions_are_kept_some_of_them(
+    scene: Path, root: Path, found: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For what they have pickled; not of the same scene with other flags."""
+    monkeypatch.setattr(cache, "KEPT_BUILDS", 1)
+    folder = root / "simple_pendulum"
+    kept, keys = folder / ".builds", [json.loads((folder / cache.MANIFEST).read_text())["key"]]
+    monkeypatch.setenv("EOMC_CFLAGS", "-O0 -DOTHER")
+    eomc.build(scene, root)
+    assert not kept.exists()
+    for text in (CHANGED, CHANGED + "# a comment\n"):
+        keys.append(json.loads((folder / cache.MANIFEST).read_text())["key"])
+        scene.write_text(text, encoding="utf-8")
+        eomc.build(scene, root)
+        assert [place.name for place in kept.iterdir()] == [keys[-1][:12]]
+        assert cache.found(kept / keys[-1][:12], keys[-1])
+
+
+def test_a_list_of_files_that_lacks_one_is_no_build(root: Path, found: None) -> None:
+    """Whatever lies there would be run."""
+    folder = root / "simple_pendulum"
+    manifest = json.loads((folder / cache.MANIFEST).read_text(encoding="utf-8"))
+    key, files = manifest["key"], manifest["files"]
+    assert cache.found(folder, key)
+
+    def altered(**change: object) -> bool:
+        text = json.dumps({k: x for k, x in (manifest | change).items() if x is not None})
+        (folder / cache.MANIFEST).write_text(text, encoding="utf-8")
+        return cache.found(folder, key)
+
+    assert altered()
+    for name in files:
+        assert not altered(files={n: x for n, x in files.items() if n != name}), name
+    for change in ({"files": {}}, {"files": {}, "files_digest": None}, {"files_digest": None}):
+        assert not altered(**change)
+    assert not altered(files=[]) and not altered(files=None)
+
+
 @pytest.fixture
 def no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")

@@ -21,7 +21,6 @@ from .by_name import ByName
 from .facts import SOME
 from .fitted import said
 from .happened import FoundInBatch, HappenedInBatch
-from .package import reduced
 from .periods import end_of, held_at, periods_in
 from .slices import longer
 from .status import FULL, STATUS
@@ -133,9 +132,6 @@ class AdaptiveBatchRun(BatchRun):
         if status == "accumulated":
             return f"jumps follow one another ever sooner, up to t = {self.limit[k]:.15g} s"
         return said(self._model, status, self._by)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return reduced("batch_adaptive.AdaptiveBatchRun._of_kept", self._model, self._kept())
 
     def _all(self) -> tuple[Any, ...]:
         return tuple(getattr(self, each.name) for each in fields(BatchRun))

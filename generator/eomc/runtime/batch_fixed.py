@@ -17,7 +17,6 @@ from .batch_run import BatchRun, way_of
 from .batch_work import Way, Work
 from .dense import parts
 from .model import LARGE
-from .package import reduced
 from .status import STATUS
 
 _NAMES = ("_times", "_begin")
@@ -45,9 +44,6 @@ class TimedBatchRun(BatchRun):
         way = way_of(self, self._begin.copy(), self._u)
         way.rows(parts(times, self.t0, self.h), found)
         return found
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return reduced("batch_fixed.TimedBatchRun._of_kept", self._model, self._kept())
 
     def _all(self) -> tuple[Any, ...]:
         return tuple(getattr(self, each.name) for each in fields(BatchRun))

@@ -18,7 +18,7 @@ from .by_name import ByName
 from .columns import Columns
 from .dense import parts, within
 from .model import Model
-from .package import reduced
+from .package import own_model, reduced
 from .status import SAID, STATUS
 
 _ENDS = np.array([*STATUS, "interrupted"])
@@ -149,6 +149,10 @@ class BatchRun(Values, Fans, Columns):
         values: Any = map(kept.get, _KEPT)
         return cls(model, *values)
 
+    @classmethod
+    def _of_pickled(cls, kept: Mapping[str, Any]) -> BatchRun:
+        return cls._of_kept(own_model(), kept)
+
     @property
     def message(self) -> str:
         """What happened, in a sentence."""
@@ -176,7 +180,9 @@ class BatchRun(Values, Fans, Columns):
         return SAID[str(_ENDS[self._codes[k]])]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return reduced("batch_run.BatchRun", *self._all())
+        kind = type(self)
+        path = f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}._of_pickled"
+        return reduced(path, self._kept())
 
     def _all(self) -> tuple[Any, ...]:
         return tuple(getattr(self, each.name) for each in fields(self))

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 from .constrained import Rows
-from .package import reduced, warn
+from .package import MODEL, reduced
 from .statics import Statics
 
 _MANY = 1000  # steps from which a run is not taken in one call
@@ -47,15 +47,9 @@ class Facts(Statics):
         return {name: (turn, decay) for name, (_, _, turn, decay) in self._facts.items()}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return reduced("_model._again", self.digest)
+        return reduced(MODEL)
 
-    def _again(self, digest: str, what: str = "this was pickled") -> Self:
-        """Itself, found by a value that was kept; a warning where the scene was another then."""
-        if digest != self.digest:
-            warn(
-                f"{self.name}: {what} from another version of the scene; what is "
-                "computed from it now is of the present version"
-            )
+    def _itself(self) -> Self:
         return self
 
     def _loop(self, name: str, stages: int) -> tuple[Any, Any, int, int, Any, Any]:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, not_one_of
 from .functions import Functions
+from .package import reduced
 
 
 class Pose(NamedTuple):
@@ -24,6 +25,9 @@ class Pose(NamedTuple):
 
     position: Array
     rotation: Array
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("frames.Pose", *self)
 
 
 class Momentum(NamedTuple):
@@ -36,6 +40,9 @@ class Momentum(NamedTuple):
     center: Array
     linear: Array
     angular: Array
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced("frames.Momentum", *self)
 
 
 class Frames(Functions):

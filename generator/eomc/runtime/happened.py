@@ -10,6 +10,7 @@ import numpy as np
 
 from .arguments import Array
 from .facts import Facts
+from .package import reduced
 
 _EVENTS, _EVENTS_EACH = 1024, 64  # of one call, beside those of a step: of one, of each of many
 
@@ -21,6 +22,9 @@ class Happened:
     t: Array
     q: Array
     qd: Array
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced(f"happened.{type(self).__name__}", *self.__dict__.values())
 
     def __len__(self) -> int:
         return len(self.t)

@@ -13,25 +13,142 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from types import ModuleType
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
-# How another process finds this package where its name can't be imported, (function, arguments),
-# set by whoever loaded it under that name.
-found_by: tuple[Callable[..., Any], tuple[Any, ...]] | None = None
+# How another process finds this package where its name can't be imported, (function, place), set by
+# whoever loaded it under that name.
+found_by: tuple[Callable[..., Any], tuple[str, ...]] | None = None
+
+MODULE, MODEL = "_self", "_model._itself"  # paths of the code of a build; all others are of data
+
+
+class Identity(NamedTuple):
+    """What every pickled value carries of the build that pickled it.
+
+    extension: its name ends with the digest of the build. digest: of the scene. The names are in
+    the order of the columns and indices of stored values.
+    """
+
+    extension: str
+    digest: str
+    dtype: str
+    coordinates: tuple[str, ...]
+    parameters: tuple[str, ...]
+    inputs: tuple[str, ...]
+    events: tuple[str, ...]
+
+
+@functools.cache
+def identity() -> tuple[Any, ...]:
+    """The `Identity` of this build, as a plain tuple, which any other build can read.
+
+    () within eomc itself, which is no build.
+    """
+    package: Any = import_module(str(__package__))
+    if (model := getattr(package, "_model", None)) is None:
+        return ()
+    return (
+        package._extension.__name__.rpartition(".")[2], model.digest, model.dtype.name,
+        model.coordinates, model.parameters, model.inputs, model.events,
+    )  # fmt: skip
+
+
+def own_model() -> Any:
+    """The model of this package."""
+    return import_module(str(__package__))._model
 
 
 def reduced(path: str, *arguments: Any) -> tuple[Any, ...]:
     """What __reduce__ returns of a value that `made` makes again from a path and arguments."""
     if found_by is None:
-        return made, (path, arguments)
-    function, where = found_by
-    return function, (*where, path, arguments)
+        return unpickled, (identity(), path, arguments)
+    function, place = found_by
+    return function, (place, identity(), path, arguments)
 
 
 def made(path: str, arguments: tuple[Any, ...]) -> Any:
     """What lies at a path in this package, such as "status.MotionError", called."""
-    package: Any = import_module(str(__package__))
-    return functools.reduce(getattr, path.split("."), package)(*arguments)
+    first, *rest = path.split(".")
+    # a function of the package may have the name of a file, which begins without an underscore
+    inside = () if first.startswith("_") else (first,)
+    start: Any = import_module(".".join((str(__package__), *inside)))
+    return functools.reduce(getattr, rest if inside else (first, *rest), start)(*arguments)
+
+
+def unpickled(pickled: tuple[Any, ...], path: str, arguments: tuple[Any, ...]) -> Any:
+    """A value pickled by a package of this name, imported by its own name; pickle calls this."""
+    if why := refusal(pickled, path):
+        return Unreadable(why, RuntimeError, (unpickled, (pickled, path, arguments)))
+    return made(path, arguments)
+
+
+def refusal(pickled: tuple[Any, ...], path: str) -> str:
+    """Why this build can't stand in for the one that pickled a value; "" where it can.
+
+    The code of another build is refused. Data of another build are read, with a warning, where
+    their columns have the same names in the same order.
+    """
+    if path.startswith("status."):  # errors have a text alone
+        return ""
+    own, other = Identity(*identity()), Identity(*pickled)
+    if own[:2] == other[:2]:
+        return ""
+    name = own_model().name
+    if path in (MODULE, MODEL):
+        return (
+            f"{name}: this was pickled by the build {other.extension}, which is gone; the build "
+            f"here is {own.extension}: load the scene again and pickle its module"
+        )
+    for what in ("coordinates", "parameters", "inputs", "events"):
+        if getattr(own, what) != getattr(other, what):
+            return (
+                f"{name}: this was pickled by another version of the scene, whose {what} were "
+                f"{', '.join(getattr(other, what)) or 'none'}; here they are "
+                f"{', '.join(getattr(own, what)) or 'none'}"
+            )
+    if own.dtype != other.dtype:
+        return f"{name}: this was pickled in {other.dtype}; the build here has {own.dtype}"
+    warn(
+        f"{name}: this was pickled by another build of the scene, which is gone; what is computed "
+        "from it now is of the present version"
+    )
+    return ""
+
+
+class Unreadable:
+    """The place of a pickled value whose build is not there: any use of it raises an error.
+
+    Pools of processes wait for ever where reading a task raises, so the error comes with its use.
+    A function or a member that was pickled by its name is read, and is as unreadable.
+    """
+
+    _why: str
+    _error: type[Exception]
+    _again: tuple[Any, ...]
+
+    def __init__(self, why: str, error: type[Exception], again: tuple[Any, ...]) -> None:
+        self.__dict__.update(_why=why, _error=error, _again=again)
+
+    def __getattr__(self, name: str) -> Unreadable:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return Unreadable(self._why, self._error, (getattr, (self, name)))
+
+    def __repr__(self) -> str:
+        return f"<unreadable: {self._why}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self._again
+
+    def _refused(self, *_: Any, **__: Any) -> NoReturn:
+        raise self._error(self._why)
+
+    __call__ = __getitem__ = __setitem__ = __iter__ = __len__ = __contains__ = _refused
+    __bool__ = __int__ = __float__ = __index__ = __complex__ = __array__ = __setattr__ = _refused
+    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _refused
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __matmul__ = _refused
+    __truediv__ = __rtruediv__ = __neg__ = __pow__ = __enter__ = __exit__ = _refused
+    __hash__ = object.__hash__
 
 
 def meant(name: str, known: Iterable[str]) -> str:
@@ -152,7 +269,7 @@ class Package(ModuleType):
         return f"<compiled scene {model.name}: {said}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return reduced("_self")
+        return reduced(MODULE)
 
     def _self(self) -> Package:
         return self

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from .arguments import Array
 from .columns import Columns
 from .constrained_run import ConstrainedRun
-from .package import reduced
+from .package import own_model, reduced
 from .stepping import Stepping
 
 LEFT_OUT = "u was a function, which a pickled or saved run doesn't keep: simulate again"
@@ -193,7 +193,7 @@ class Recorded(ConstrainedRun, Columns):
     @classmethod
     def _of_state(cls, state: dict[str, Any]) -> Self:
         run = cls.__new__(cls)
-        run.__dict__.update(state)
+        run.__dict__.update({"_model": own_model()} | state)
         return run
 
     def __copy__(self) -> Self:
@@ -204,6 +204,7 @@ class Recorded(ConstrainedRun, Columns):
 
     def __reduce__(self) -> tuple[Any, ...]:
         state = self._state()
+        del state["_model"]  # the build that reads it has its own
         if callable(self._u):
             state["_u"] = LEFT_OUT
         kind = type(self)

@@ -13,6 +13,7 @@ import numpy as np
 
 from .arguments import Array
 from .facts import Facts
+from .package import warn
 from .shown import eventful
 from .written import File, replacing
 
@@ -35,6 +36,7 @@ def write(run: Any, path: Path) -> None:
     arrays: dict[str, Any] = {
         "kind": _KIND.format(type(run).__name__), "scene": model.name, "digest": model.digest,
         "coordinates": model.coordinates, "parameters": model.parameters, "inputs": model.inputs,
+        "events": model.events,
         "t": run["t"], "energy": run.energy, "u": run.u,
     }  # fmt: skip
     if asked := vars(model).get("_asked"):
@@ -69,11 +71,16 @@ def read(model: Facts, file: File) -> tuple[Any, str, dict[str, Any]]:
         raise ValueError(f"{file}: was not written by run.save in this version of eomc")
     if found["scene"] != model.name:
         raise ValueError(f"{file}: is a run of {found['scene']}, not of {model.name}")
-    model._again(str(found.get("own", found["digest"])), f"{file}: was saved")
+    if str(found.get("own", found["digest"])) != model.digest:
+        warn(
+            f"{model.name}: {file}: was saved from another version of the scene; what is computed "
+            "from it now is of the present version"
+        )
     if "asked" in found:
         model = _asked(model, found, file)
-    for what in ("coordinates", "parameters", "inputs"):
-        saved, own = tuple(found[what].tolist()), getattr(model, what)
+    for what in ("coordinates", "parameters", "inputs", "events"):
+        own = getattr(model, what)
+        saved = tuple(found.get(what, np.array(own)).tolist())  # old files have no events
         if saved != own:
             raise ValueError(
                 f"{file}: is a run of another version of {model.name}, whose {what} were "

@@ -43,7 +43,8 @@ class Run(Recorded):
 
     Runs are equal where their scene, settings and rows are, bit by bit. A pickled run keeps all of
     that, its parameters and its inputs, but not a u that is a function: estimate() is refused then.
-    Where it is read again, it finds the built module as it was found here.
+    Where it is read again, it belongs to the build that pickled it; where that is gone, to the
+    present one, with a warning, if the names of its columns are the same there.
     """
 
     error: Estimate | None = field(default=None, init=False)

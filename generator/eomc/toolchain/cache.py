@@ -1,9 +1,10 @@
-"""Built modules: found by a key, built under a lock, loaded.
+"""Built modules: found by a key, built under a lock, loaded, unpickled.
 
 A module lies in `build/<name>/`. Its extension carries a digest in its name, and `__init__.py`,
 which says which extension is its own, is moved into place last: whatever interrupts a build, the
 module that was there stays whole, and what fails is taken back. A file lock keeps builds of one
-scene apart.
+scene apart. The build of another version of the scene that it replaces is kept in
+`build/<name>/.builds/`, where values that it has pickled find it.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 MANIFEST = "build.json"
 HALF = 32  # letters of a key
+KEPT_BUILDS = 32  # of other versions of a scene, some 0.5 MB each: designs compared in one pool
 
 
 @dataclass(frozen=True)
@@ -98,17 +100,31 @@ def _total(*parts: str) -> str:
 
 
 def found(folder: Path, wanted: str) -> bool:
-    """Whether `folder` holds a whole build of this key, each file with its digest.
+    """Whether `folder` holds a whole build of this key: all of its files, each with its digest.
 
     A single bit that has changed in an extension may end the process that loads it.
     """
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        return manifest["key"] == wanted and all(
-            _digest(folder / name) == digest for name, digest in manifest["files"].items()
+        manifest = _manifest(folder)
+        files = manifest["files"]
+        return (
+            manifest["key"] == wanted
+            and manifest["files_digest"] == _digest_of_files(files)
+            and all(_digest(folder / name) == digest for name, digest in files.items())
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return False
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    """What the build in `folder` says of itself."""
+    manifest: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    return manifest
+
+
+def _digest_of_files(files: dict[str, str]) -> str:
+    """SHA-256 of a list of files and their digests: a list that lacks one is no build."""
+    return hashlib.sha256(json.dumps(sorted(files.items())).encode()).hexdigest()
 
 
 def _digest(file: Path) -> str:
@@ -122,11 +138,13 @@ def build(
     sources: Callable[[str], Sources],
     root: Path,
     form: str = "fast",
+    scene_digest: str = "",
 ) -> Built:
     """The module of one scene under `root`, built where it isn't there yet.
 
     wanted: the key. sources: makes the files, given the name of the extension; called only where
-    something is to be built. form: of the C that it is compiled from.
+    something is to be built. form: of the C that it is compiled from. scene_digest: of the scene;
+    a build of another one is kept, for what it has pickled.
     Raises EomcError where the compiler fails, with its own words, or the folder can't be written.
     """
     folder = place(name, root, form)
@@ -142,7 +160,7 @@ def build(
             for left in root.glob(f".{folder.name}.build-*"):  # by a build that was killed
                 shutil.rmtree(left, ignore_errors=True)
             with tempfile.TemporaryDirectory(dir=root, prefix=f".{folder.name}.build-") as new:
-                _build(name, wanted, sources, folder, Path(new), form)
+                _build(name, wanted, sources, folder, Path(new), form, scene_digest)
     except OSError as fault:
         raise FolderError(
             f"{fault.filename or folder}: can't be written ({fault.strerror})"
@@ -174,6 +192,7 @@ def _build(
     folder: Path,
     new: Path,
     form: str,
+    scene_digest: str,
 ) -> None:
     from eomc.toolchain import extension
     from eomc.toolchain.running import lay_out
@@ -185,22 +204,53 @@ def _build(
     compiler = compiler_for(made.operations)
     extension.build(made, called, new, library, compiler, form)
     kept = [library, *(f for f in made.files if form == "fast" or f.endswith(".py"))]
+    files = {file: _digest(new / file) for file in kept}
     manifest = {
         "key": wanted,
         "name": name,
+        "scene": scene_digest,
         "eomc": __version__,
         "compiler": " ".join(compiler.command),
         "flags": " ".join((standard(form), *flags(form))),
-        "files": {file: _digest(new / file) for file in kept},
+        "files": files,
+        "files_digest": _digest_of_files(files),
     }
     (new / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     for file in kept:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    _keep(folder, scene_digest, new / ".kept")
     stale = [p for p in folder.glob(f"_{name}_*") if p.name != library]
     # the face last: until it is there, the old one is whole; the manifest after it
     _move(new, folder, [*(f for f in kept if f != "__init__.py"), "__init__.py", MANIFEST])
     for path in stale:
         path.unlink(missing_ok=True)
+
+
+def _keep(folder: Path, scene_digest: str, links: Path) -> None:
+    """Keep the build in `folder`, if it is of another version of the scene, in its `.builds`.
+
+    links: where its files are put together. The oldest of more than KEPT_BUILDS are removed. A
+    build that can't be kept is left out: values that it has pickled are refused then.
+    """
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        manifest = _manifest(folder)
+        key = str(manifest["key"])
+        place = _place_of_kept(folder, key)
+        if manifest["scene"] == scene_digest or found(place, key) or not found(folder, key):
+            return
+        for file in (*manifest["files"], MANIFEST):
+            _also_at(folder / file, links / file)
+        shutil.rmtree(place, ignore_errors=True)
+        place.parent.mkdir(exist_ok=True)
+        os.replace(links, place)
+        dated = sorted((p.stat().st_mtime, p) for p in place.parent.iterdir())
+        for _, old in dated[:-KEPT_BUILDS]:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _place_of_kept(folder: Path, key: str) -> Path:
+    """Where the build of this key lies, once another has replaced it in `folder`."""
+    return folder / ".builds" / key[:12]
 
 
 def _move(new: Path, folder: Path, files: list[str]) -> None:
@@ -247,10 +297,11 @@ def _date_later(new: Path, old: Path) -> None:
         os.utime(new, (before + 1, before + 1))
 
 
-def load(built: Built) -> ModuleType:
+def load(built: Built, home: str = "") -> ModuleType:
     """Import a built module, whatever else bears its name; the same build gives the same module.
 
-    Raises ReplacedError where another build has replaced it.
+    home: the folder of builds of this scene, where that is another. Raises ReplacedError where
+    another build has replaced it.
     """
     folder = built.folder.resolve()  # Python caches finders by path, whatever the current folder
     key = _key(folder)
@@ -260,7 +311,7 @@ def load(built: Built) -> ModuleType:
     )
     if built.key not in ("", key):
         raise replaced
-    alias = f"_eomc_{built.name}_{key[:12]}"
+    alias = _alias(built.name, key)
     if alias in sys.modules:
         return sys.modules[alias]
     spec = importlib.util.spec_from_file_location(
@@ -279,31 +330,60 @@ def load(built: Built) -> ModuleType:
             raise replaced from None
         raise
     # another process can't import the alias; what is pickled here is found by its place there
-    place = (built.name, str(built.folder.resolve()), alias)
+    place = (built.name, home or str(folder), key)
     sys.modules[f"{alias}.package"].found_by = (unpickled, place)  # type: ignore[attr-defined]
     return module
 
 
+def _alias(name: str, key: str) -> str:
+    """What the module of a build is called in `sys.modules`."""
+    return f"_eomc_{name}_{key[:12]}"
+
+
 def _key(folder: Path) -> str:
     """Of the build that lies there now."""
-    return str(json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["key"])
+    return str(_manifest(folder)["key"])
 
 
-def unpickled(name: str, folder: str, alias: str, path: str, arguments: tuple[Any, ...]) -> Any:
-    """A value pickled by a module that `load` had loaded; pickle calls this.
+def unpickled(
+    place: tuple[str, str, str], identity: tuple[Any, ...], path: str, arguments: tuple[Any, ...]
+) -> Any:
+    """A value that was pickled by a module that `load` had imported; pickle calls this.
 
-    Raises EomcError where the module is no longer there; a MotionError is made all the same, since
-    pools of processes wait for ever for what can't be read.
+    place: the name of the scene, the folder of its builds, and the key of the one that pickled.
+    A pool of processes waits for ever where a task can't be read, so nothing is raised here: what
+    can't be read is an `Unreadable`, which raises EomcError when it is used.
     """
-    try:
-        if alias not in sys.modules:
-            alias = load(Built(name, Path(folder), False)).__name__
-    except (OSError, ValueError, KeyError, ImportError):
-        if path == "status.MotionError":
-            from eomc.runtime.status import MotionError
+    from eomc.runtime import status
+    from eomc.runtime.package import Unreadable
 
-            return MotionError(*arguments)
-        raise EomcError(
-            f"{folder}: the module that pickled this is not there: build the scene again"
-        ) from None
-    return importlib.import_module(f"{alias}.package").made(path, arguments)
+    name, folder, _ = place
+    try:
+        package = importlib.import_module(f"{_build_of(place).__name__}.package")
+        why = package.refusal(identity, path)
+        if not why:
+            return package.made(path, arguments)
+        why = f"{folder}: {why}"
+    except Exception as fault:  # whatever it is, a pool would wait
+        if path.startswith("status."):
+            return getattr(status, path.removeprefix("status."))(*arguments)
+        lacking = isinstance(fault, (OSError, KeyError))
+        cause = "" if lacking else f" ({type(fault).__name__}: {fault})"
+        why = (
+            f"{folder}: the build of {name} that pickled this is gone{cause}: build the scene "
+            "again, and pickle anew"
+        )
+    return Unreadable(why, EomcError, (unpickled, (place, identity, path, arguments)))
+
+
+def _build_of(place: tuple[str, str, str]) -> ModuleType:
+    """The module of the build at a place, also where another has replaced it; else that other."""
+    name, folder, key = place
+    if (loaded := sys.modules.get(_alias(name, key))) is not None:
+        return loaded
+    for there in (Path(folder), _place_of_kept(Path(folder), key), Path(folder)):
+        # another process may replace it just now: then it is kept, or the other is looked at
+        if found(there, key):
+            with suppress(ReplacedError, OSError):
+                return load(Built(name, there, False, key), folder)
+    return load(Built(name, Path(folder), False))
