@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mjcf_text import BALL, BODY, CLOSE, PI, model, reported
+from mjcf_text import BALL, BODY, CLOSE, PI, model, refused, reported
 
-from eomc.robots.robot import Law
+from eomc.robots.robot import Law, Motion
 from eomc.robots.rotations import IDENTITY
 
 # ---- frames and joints
@@ -229,7 +229,7 @@ def test_the_key_frame_home_is_the_start(tmp_path: Path) -> None:
 def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
     inside = """<light/><camera name="cam"/><site name="s1"/><site name="s2"/>
       <geom name="floor" type="plane" size="1 1 1"/>
-      <body name="a" gravcomp="1"><joint name="j" stiffness="1 2" springdamper="1 1" range="0 9"/>
+      <body name="a" gravcomp="1"><joint name="j" stiffness="1 2" range="0 9"/>
         <geom name="ball" size="0.1" contype="0" conaffinity="0" colour="red"/>
         <composite type="cable"/><replicate count="2"><geom size="1"/></replicate><wheel/></body>
       <body name="m" mocap="true"><geom size="0.1"/></body>"""
@@ -246,12 +246,11 @@ def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
         ("contacts of geoms", "floor"),
         ("shapes of geoms without contact", "ball"),
         ("stiffness in the square", "j"),
-        ("springdamper", "j"),
         ("limits of joints", "j"),
         ("attributes that MJCF does not have", 'colour of geom "ball"'),
         ("<composite>",),
         ("<replicate>",),
-        ("elements that MJCF does not have (2)", "wheel in a", "nonsense"),
+        ("elements that MJCF does not have", 'wheel in body "a"', "nonsense in mujoco"),
         ("mocap", "m"),
         ("fluid", "viscosity"),
         ("options", "timestep"),
@@ -264,6 +263,36 @@ def test_everything_that_is_not_read_is_reported(tmp_path: Path) -> None:
         ("settings", "size"),
     ):
         assert reported(robot, *words), words
+
+
+def test_springdamper_is_a_stiffness_and_a_damping_for_what_the_joint_moves(tmp_path: Path) -> None:
+    """A ball of 2 kg about its centre has 0.008 kg m^2: k = m/(t r)^2, d = 2 m/t."""
+    ball = '<geom size="0.1" mass="2"/>'
+    own = 'springdamper="0.2 1.5" stiffness="7" damping="7" armature="0.5"'
+
+    def motions(joint: str, before: str = "", after: str = "") -> tuple[Motion, ...]:
+        return model(tmp_path, f"<body>{joint}{ball}</body>", before, after).motions
+
+    for joint, m in (
+        ('<joint springdamper="0.2 1.5"/>', 0.008),
+        ('<joint type="slide" springdamper="0.2 1.5"/>', 2.0),
+        ('<joint type="ball" springdamper="0.2 1.5"/>', 0.008),
+        ('<joint type="free" springdamper="0.2 1.5"/>', 2 / (1 / 0.008 + 1 / 2)),  # a mean
+        (f"<joint {own}/>", 0.508),
+    ):
+        for motion in motions(joint):
+            assert motion.stiffness == pytest.approx(m / 0.3**2, rel=1e-12)
+            assert motion.damping == pytest.approx(2 * m / 0.2, rel=1e-12)
+    driven = '<actuator><motor joint="j" armature="0.25" gear="2" damping="0.5"/></actuator>'
+    (motion,) = motions('<joint name="j" springdamper="1 1"/>', after=driven)
+    assert motion.stiffness == pytest.approx(1.008) and motion.damping == pytest.approx(4.016)
+    default = '<default><joint springdamper="0.2 1.5"/></default>'
+    assert motions("<joint/>", default)[0].stiffness == pytest.approx(0.008 / 0.09)
+    whole = model(tmp_path, f'<body><joint type="ball" springdamper="1 1"/>{ball}</body>')
+    assert reported(whole, "damping and stiffness of whole turns")
+    for wrong in ("0.2 0", "-1 1"):
+        words = refused(tmp_path, f'<body><joint springdamper="{wrong}"/>{ball}</body>')
+        assert "a time constant and a damping ratio, both positive" in words
 
 
 def test_what_joints_actuators_and_couplings_have_besides_is_reported(tmp_path: Path) -> None:

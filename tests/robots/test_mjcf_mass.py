@@ -124,6 +124,19 @@ def test_inertia_from_geoms_or_from_inertial(tmp_path: Path) -> None:
     assert [mass("auto"), mass("true"), mass("false")] == [7, 2, 7]
 
 
+@pytest.mark.parametrize(
+    "geoms", ['mass="0"', 'density="0"', 'mass="1e-16"', 'group="4"', 'mass="0" mesh="m"']
+)
+def test_inertial_holds_where_no_geom_has_mass(tmp_path: Path, geoms: str) -> None:
+    inertial = '<inertial pos="0 0 .2" mass="7" diaginertia="1 1 1"/>'
+    inside = f'<body><joint/>{inertial}<geom size="1" pos=".3 0 0" {geoms}/></body>'
+    before = '<compiler inertiafromgeom="true" inertiagrouprange="0 3"/>'
+    body = model(tmp_path, inside, before).bodies[0]
+    assert (body.mass, body.center, body.inertia) == (7, (0, 0, 0.2), (1, 1, 1, 0, 0, 0))
+    alone = f'<body name="b"><joint/><geom size="1" {geoms}/></body>'
+    assert model(tmp_path, alone, before).bodies[0].mass < 1e-15
+
+
 def test_geoms_of_groups_out_of_range_and_without_mass_do_not_count(tmp_path: Path) -> None:
     geoms = (
         '<geom size="1" mass="2" group="1"/><geom type="mesh" mesh="m" group="0"/>'

@@ -130,6 +130,26 @@ def test_the_nearest_tensor_is_a_bodys_and_none_is_nearer(inertia: Inertia) -> N
     assert inertias.nearest(good) == pytest.approx(good, rel=1e-14)  # eigenvalues and back
 
 
+@pytest.mark.parametrize(
+    "tensor",
+    [
+        (-1.2, -1.1, 0.3, 0, 0, 0),
+        (-1.2, -1.1, -0.3, 0, 0, 0),
+        (-1, 0, 0, 0, 0, 0),
+        (0, 0, 0, 1, 1, 1),
+    ],
+)
+def test_a_tensor_whose_signs_were_lost_gets_no_tensor_as_a_remedy(tensor: Inertia) -> None:
+    """The nearest tensor of a body is zero there, or unlike it."""
+    base, body, *rest = arm().bodies
+    robot = replace(arm(), bodies=(base, replace(body, inertia=tensor), *rest))
+    assert edit.mended(robot) == robot
+    with pytest.raises(EomcError) as fault:
+        scene_text.finished(robot)
+    assert "check the signs of the tensor" in str(fault.value)
+    assert "would do" not in str(fault.value) and "--mend-inertias" not in str(fault.value)
+
+
 def test_tensors_that_no_body_has_are_mended_where_it_is_asked_for() -> None:
     bad = replace(arm().bodies[2], inertia=(0.1, 0.1, 0.3, 0.0, 0.0, 0.0))
     worse = replace(arm().bodies[1], inertia=(0.1, -0.1, 0.3, 0.0, 0.0, 0.0))

@@ -86,7 +86,11 @@ def test_an_arm_is_read(read: Reader) -> None:
     assert np.allclose(arm.inertia, (0.2, 0.1, 0.25, -0.01, -0.03, 0.02), rtol=0, atol=1e-16)
     (shoulder,) = arm.motions
     assert (shoulder.name, shoulder.unit, shoulder.start) == ("shoulder", "rad", 0.2)
-    assert (shoulder.damping, shoulder.friction, shoulder.note) == (0.4, 0.3, "0.2 to 1.5")
+    assert (shoulder.damping, shoulder.friction, shoulder.note) == (
+        0.4,
+        0.3,
+        "0.2 to 1.5; at most 2 rad/s",
+    )
     assert slide.joint == "prismatic" and slide.axes == ((1, 0, 0),)  # URDF's default
     assert [(d.name, d.coordinate) for d in robot.drives] == [
         ("shoulder_torque", "shoulder"),
@@ -117,8 +121,8 @@ def test_attributes_that_are_not_read_are_reported(read: Reader) -> None:
     """A stiffness in <dynamics>, a misspelt axis: without them it is another robot."""
     text = ARM.replace('damping="0.4"', 'damping="0.4" K="30"').replace("<axis xyz", "<axis xzy")
     reported = read(text).left_out
-    assert "attributes that URDF does not give <dynamics>: K (joint shoulder)" in reported
-    assert any("<axis>: xzy (joint shoulder" in words for words in reported)
+    assert any('K of dynamics in joint "shoulder"' in words for words in reported)
+    assert any('xzy of axis in joint "shoulder"' in words for words in reported)
     assert not any("attributes" in words for words in read(ARM).left_out)
     floats = ARM.replace('type="revolute"', 'type="floating"')
     assert "<dynamics> of floating joints: shoulder" in read(floats).left_out

@@ -52,6 +52,7 @@ def command(
     from eomc.robots import edit, scene_text, urdf, xml
     from eomc.robots.limits import limited
     from eomc.robots.mjcf import read
+    from eomc.robots.robot import refused
     from eomc.scene.toml_text import MAX_BYTES
 
     element = xml.root(file).kind
@@ -61,23 +62,27 @@ def command(
         raise EomcError(f"--include is for MJCF files, and {shown(file)} is none")
     else:
         robot = urdf.read(file)
-    robot = edit.lock(robot, dict(pairs(locks, "--lock", {})))
-    robot = edit.cut(robot, root, tip)
-    if base:
-        robot = edit.based(robot, free=base == "free")
-    if no_drives:
-        robot = replace(robot, drives=())
-    if mend_inertias:
-        robot = edit.mended(robot)
-    if stops:
-        robot = edit.stopped(robot)
-    if limits:
-        robot = limited(robot)
     if name is not None:
         if why := names.module_fault(name):
             raise EomcError(f"--name: {why}")
         robot = replace(robot, name=name)
-    robot = scene_text.finished(robot)
+    values = dict(pairs(locks, "--lock", {}))
+    try:
+        robot = edit.lock(robot, values)
+        robot = edit.cut(robot, root, tip)
+        if base:
+            robot = edit.based(robot, free=base == "free")
+        if no_drives:
+            robot = replace(robot, drives=())
+        if mend_inertias:
+            robot = edit.mended(robot)
+        if stops:
+            robot = edit.stopped(robot)
+        if limits:
+            robot = limited(robot)
+        robot = scene_text.finished(robot)
+    except EomcError as fault:
+        raise refused(fault, robot.left_out) from None
     path = out or files.scene_path(robot.name)
     text = scene_text.scene_text(robot)
     if len(text.encode()) > MAX_BYTES:

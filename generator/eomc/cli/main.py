@@ -51,17 +51,22 @@ class _Group(terminal.Group):
             return super().invoke(context)
         except SceneError as fault:
             count = sum(p.severity == "error" for p in fault.problems)
-            say(str(fault), err=True)
+            say(noted(fault), err=True)
             fail(f"eomc: {count} error{'s' if count != 1 else ''}, nothing was built or changed")
         except FolderError as fault:
             fail(f"eomc: {fault.what}: choose another place with --build DIR")
         except EomcError as fault:
-            fail(f"eomc: {fault}")
+            fail(f"eomc: {noted(fault)}")
         except MemoryError as fault:
             fail(f"eomc: {fault}" if str(fault) else "eomc: not enough memory")
         except KeyboardInterrupt:
             say("eomc: interrupted", err=True)
             sys.exit(130)
+
+
+def noted(fault: EomcError) -> str:
+    """Return the text of an error with the notes that were added to it."""
+    return "\n".join([str(fault), *getattr(fault, "__notes__", ())])
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})

@@ -9,7 +9,7 @@ from dataclasses import replace
 from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus
-from eomc.robots.inertias import indefinite, nearest, principal, shown, unbalanced
+from eomc.robots.inertias import has_nearest, indefinite, nearest, principal, shown, unbalanced
 from eomc.robots.robot import (
     LACK,
     Robot,
@@ -144,7 +144,7 @@ def mended(robot: Robot) -> Robot:
     bodies, words = [], []
     for body in robot.bodies:
         inertia = without_dust(body)
-        if indefinite(inertia) or unbalanced(inertia):
+        if (indefinite(inertia) or unbalanced(inertia)) and has_nearest(inertia):
             (low, _, high), new = principal(inertia)[0], nearest(inertia)
             words.append(
                 f"body {body.name}: its inertia {shown(inertia)} is that of no body (principal "

@@ -32,10 +32,27 @@ def indefinite(inertia: Inertia) -> str:
     moments, _ = principal(inertia)
     if moments[0] >= -TRIANGLE * max(map(abs, moments)):
         return ""
+    if not has_nearest(inertia):
+        listed = ", ".join(f"{moment:.4g}" for moment in moments)
+        return (
+            f"its principal moments of inertia are {listed} kg m^2, and no body has a negative "
+            "one: check the signs of the tensor in the file, or take it from the CAD model again"
+        )
     return (
         f"its smallest principal moment of inertia is {moments[0]:.4g} kg m^2, and no body has "
-        f"a negative one: correct it in the file, {shown(nearest(inertia))} would do"
+        f"a negative one: check its signs in the file, {shown(nearest(inertia))} would do"
     )
+
+
+def has_nearest(inertia: Inertia) -> bool:
+    """Return whether the nearest tensor of a body has anything of this one.
+
+    With a negative principal moment and fewer than two positive ones it is zero, that of a point:
+    signs were lost.
+    """
+    (small, middle, _), _ = principal(inertia)
+    tiny = TRIANGLE * max(map(abs, inertia))
+    return small >= -tiny or middle > tiny
 
 
 def unbalanced(inertia: Inertia) -> str:

@@ -250,6 +250,14 @@ class Robot:
         return {t.name: t.terms for t in self.tendons}.get(name, ((1.0, name),))
 
 
+def refused(fault: EomcError, left_out: Sequence[str]) -> EomcError:
+    """Return the fault with a note of what is not read of the file, which may be its cause."""
+    if left_out:
+        listed = "".join(f"\n  - {words}" for words in left_out)
+        fault.add_note(f"not read of this file, which may be the cause:{listed}")
+    return fault
+
+
 def moved(body: RobotBody, values: Sequence[float]) -> tuple[Vector, Matrix]:
     """Where the body's frame stands in its parent's: offset (m) and rotation, at `values`."""
     offset, rotation = body.offset, body.rotation

@@ -12,7 +12,7 @@ from eomc.base.errors import EomcError
 from eomc.base.texts import line, toml
 from eomc.robots import acting
 from eomc.robots.formulas import angle, length, less, number, total, vector
-from eomc.robots.inertias import indefinite, unbalanced
+from eomc.robots.inertias import has_nearest, indefinite, unbalanced
 from eomc.robots.massless import light_root, without_inertia
 from eomc.robots.robot import (
     BARE,
@@ -30,6 +30,7 @@ from eomc.robots.stops import DAMPING, DEPTHS, Stop, stops
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import CLOSINGS, JOINTS
 
+MENDED = ", as --mend-inertias writes"
 _NAME = 32  # characters of a name, so that what is made of it ("_torque", "_dot") fits too
 
 
@@ -47,7 +48,7 @@ def finished(robot: Robot) -> Robot:
             "--base free its root does"
         )
     faults = [
-        f"body {b.name}: {why}, as --mend-inertias writes"
+        f"body {b.name}: {why}" + (MENDED if has_nearest(b.inertia) else "")
         for b in robot.bodies
         if (why := indefinite(b.inertia))
     ]
@@ -55,7 +56,7 @@ def finished(robot: Robot) -> Robot:
         raise EomcError("\n".join(faults))
     robot = _named(robot)  # after the faults, which have the names that --lock takes
     found = tuple(
-        f"body {body.name}: {why}, as --mend-inertias writes; until then the scene is refused"
+        f"body {body.name}: {why}{MENDED}; until then the scene is refused"
         for body in robot.bodies
         if (why := unbalanced(body.inertia))
     )

@@ -16,7 +16,7 @@ from pathlib import Path
 from eomc.base import texts
 from eomc.base.errors import EomcError, Problem, SceneError
 from eomc.base.spatial import transposed
-from eomc.robots import xml
+from eomc.robots import schema, xml
 from eomc.robots.inertias import NO_INERTIA, rotated_inertia
 from eomc.robots.robot import (
     BARE,
@@ -28,6 +28,7 @@ from eomc.robots.robot import (
     RobotBody,
     free_motions,
     joined,
+    refused,
     settled,
 )
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_rpy, times, toward, unit
@@ -39,20 +40,36 @@ from eomc.scene.scope import ring_text, rings
 GRAVITY: Vector = (0.0, 0.0, -9.81)  # URDF has none: z is up in ROS
 
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-# what is read of a link and of a joint, each at most once, and the attributes that it may have
-_ATTRIBUTES = {
-    "inertial": set(),
-    "mass": {"value"},
-    "inertia": {"ixx", "iyy", "izz", "ixy", "ixz", "iyz"},
-    "origin": {"xyz", "rpy"},
-    "parent": {"link"},
-    "child": {"link"},
-    "axis": {"xyz"},
-    "dynamics": {"damping", "friction"},
-    "limit": {"lower", "upper", "effort", "velocity"},
-    "mimic": {"joint", "multiplier", "offset"},
-}
-_LINK_PARTS = ("inertial", "visual", "collision")
+# the parts of a link and of a joint, each at most once; * are not read, and are counted
+_SCHEMA = schema.parse(
+    """
+robot: name version
+ link: name type
+  inertial:
+   origin: xyz rpy
+   mass: value
+   inertia: ixx iyy izz ixy ixz iyz
+  visual: *
+  collision: *
+ joint: name type
+  origin: xyz rpy
+  parent: link
+  child: link
+  axis: xyz
+  dynamics: damping friction
+  limit: lower upper effort velocity
+  mimic: joint multiplier offset
+  safety_controller: *
+  calibration: *
+ material: *
+ transmission: *
+ gazebo: *
+ sensor: *
+""",
+    {},
+)
+_SKIPPED = {kind for kind, part in _SCHEMA.children.items() if part.skipped}
+_JOINT_SKIPPED = {"safety_controller", "calibration"}
 _JOINT_PARTS = ("origin", "parent", "child", "axis", "dynamics", "limit", "mimic")
 _SHAPES = ("mesh", "box", "cylinder", "sphere", "capsule")
 
@@ -63,7 +80,7 @@ def read(file: str | os.PathLike[str]) -> Robot:
     Raises SceneError with every fault of the robot, EomcError for what is not a URDF.
     """
     root, shown = xml.root(file), texts.line(str(file))
-    if any("xacro}" in tag.kind for tag in root.all()):
+    if any(tag.kind.startswith("xacro:") for tag in root.all()):
         raise EomcError(f"{shown}: {xml.RUN_XACRO}")
     if root.kind != "robot":
         raise EomcError(f"{shown}: not a URDF: its root element is <{root.kind}>, not <robot>")
@@ -94,8 +111,6 @@ class _Reader:
         self.shown = shown
         self.faults: list[Problem] = []
         self.lines: dict[str, int] = {}  # of links and joints, by key
-        self.strange: dict[str, dict[str, None]] = {}  # attributes that are not read, by tag
-        self.places: dict[str, dict[str, None]] = {}  # and where they stand
 
     def robot(self) -> Robot:
         """The robot. Raises SceneError with every fault."""
@@ -108,7 +123,7 @@ class _Reader:
         joints = self._coupled([j for j in read if j], elements)
         tree = self._tree(bodies, joints)
         if self.faults:
-            raise SceneError(self.faults)
+            raise refused(SceneError(self.faults), self._besides())
         name = self.root.get("name") or self.path.stem
         robot = Robot(
             name=name,
@@ -125,15 +140,11 @@ class _Reader:
         self.faults.append(Problem(message, key, self.shown, self.lines.get(key, 0)))
 
     def _parts(self, element: Tag, tags: Sequence[str], key: str) -> None:
-        """Report parts that are there twice; attributes that do not belong there are for later."""
+        """Report parts that are there more than once."""
         for tag in tags:
             parts = [*element.each(tag)]
             if len(parts) > 1:
                 self.say(key, f"it has {len(parts)} <{tag}>: leave the one that is meant")
-            for attribute in (a for part in parts for a in part.attributes):
-                if attribute not in _ATTRIBUTES[tag]:
-                    self.strange.setdefault(tag, {})[attribute] = None
-                    self.places.setdefault(tag, {})[key] = None
 
     # --- links
 
@@ -243,6 +254,8 @@ class _Reader:
             if lower or upper:
                 note, ends = f"{lower:g} to {upper:g}", (lower, upper)
                 start = min(max(0.0, lower), upper) if lower <= upper else 0.0
+        speed = 0.0 if limit is None else self._number(limit, "velocity", key)
+        note = joined(note, f"at most {speed:g} {of}/s" if speed > 0 else "")
         driven = (-effort, effort) if effort > 0 else UNLIMITED
         return (Motion(name, of, start, note, damping, friction, limits=ends, driven=driven),)
 
@@ -316,10 +329,13 @@ class _Reader:
         if self.faults:
             return []  # a joint at fault leaves its links alone, and they would seem roots
         if len(roots) > 1:
+            ends = {e.kind for e in self.root.children if e.kind.lower().endswith("joint")}
+            strange = ", ".join(f"<{kind}>" for kind in sorted(ends - {"joint"}))
+            why = f"; {strange} is not read, only <joint> is" if strange else ""
             self.say(
                 f"link {roots[1]}",
                 f"{len(roots)} links have no parent ({', '.join(roots[:8])}): a robot has one "
-                "root, connect the others to it by fixed joints",
+                f"root, connect the others to it by fixed joints{why}",
             )
         out: list[RobotBody] = []
         waiting = roots[:1]
@@ -365,7 +381,7 @@ class _Reader:
 
     def _besides(self) -> list[str]:
         """What the file has besides bodies and joints, in words."""
-        out = []
+        out = [*schema.strangers(self.root, _SCHEMA, "URDF")]
         links, joints = [*self.root.each("link")], [*self.root.each("joint")]
         for use, what in (("visual", "shapes to be seen"), ("collision", "contact between shapes")):
             parts = [shape for link in links for part in link.each(use) for shape in part.all()]
@@ -378,19 +394,16 @@ class _Reader:
             out.append(
                 "links with a shape but without <inertial>, taken as massless: " + ", ".join(bare)
             )
-        limited = [j for j in joints if j.first("limit") is not None and j.get("type") != "fixed"]
+        ends = [j for j in joints if j.first("limit") is not None and j.get("type") != "fixed"]
+        limited = [j for j in ends if j.get("type") not in ("planar", "floating")]
+        if several := [j.get("name") for j in ends if j not in limited]:
+            out.append(f"limits of planar and floating joints: {texts.listed(several)}")
         if limited:
             many = f"{len(limited)} {texts.plural('joint', len(limited))}"
             out.append(f"limits of {many}: their values are in the notes")
-        rest = Counter(e.kind for e in self.root.children if e.kind not in ("link", "joint"))
-        for parts, known in ((links, _LINK_PARTS), (joints, _JOINT_PARTS)):
-            rest.update(e.kind for part in parts for e in part.children if e.kind not in known)
+        rest = Counter(e.kind for e in self.root.children if e.kind in _SKIPPED)
+        rest.update(e.kind for j in joints for e in j.children if e.kind in _JOINT_SKIPPED)
         out += [f"<{tag}>, {n} {texts.plural('element', n)}" for tag, n in sorted(rest.items())]
-        for tag, those in self.strange.items():
-            first, *others = self.places[tag]
-            more = f" and {len(others)} more" if others else ""
-            what = f"attributes that URDF does not give <{tag}>: {', '.join(those)}"
-            out.append(f"{what} ({first}{more})")
         floating = [j.get("name") for j in joints if j.get("type") == "floating"
                     and j.first("dynamics") is not None]  # fmt: skip
         if floating:

@@ -22,13 +22,17 @@ LARGE = 1e100  # numbers beyond it, and sizes below 1/LARGE, overflow when they 
 
 @dataclass(frozen=True, eq=False)
 class Tag:
-    """An element of the file: what it is, where it stands, what it has and holds."""
+    """An element of the file: what it is, where it stands, what it has and holds.
+
+    text: what stands between its tags, blanks apart.
+    """
 
     kind: str
     attributes: dict[str, str]
     line: int
     file: Path
     children: list[Tag] = field(default_factory=list)
+    text: list[str] = field(default_factory=list)
 
     def get(self, key: str, default: str = "") -> str:
         """An attribute as it is written."""
@@ -58,9 +62,21 @@ class _Builder:
         self.parser: Any = None
         self.root: Tag | None = None
         self.stack: list[Tag] = []
+        self.prefixes: dict[str, str] = {}  # of namespaces, as the file declares them
+
+    def start_ns(self, prefix: str, uri: str) -> None:
+        """Store a prefix; that of xacro's namespace is always `xacro`."""
+        self.prefixes[uri] = "xacro" if uri.endswith("/xacro") else prefix
+
+    def written(self, name: str) -> str:
+        """Return a name as it is written in the file, from {namespace}name."""
+        uri, _, local = name[1:].rpartition("}") if name.startswith("{") else ("", "", name)
+        prefix = self.prefixes.get(uri, "xml" if uri.endswith("/XML/1998/namespace") else "")
+        return f"{prefix}:{local}" if prefix else local
 
     def start(self, kind: str, attributes: dict[str, str]) -> None:
-        tag = Tag(kind, dict(attributes), self.parser.parser.CurrentLineNumber, self.file)
+        mine = {self.written(key): value for key, value in attributes.items()}
+        tag = Tag(self.written(kind), mine, self.parser.parser.CurrentLineNumber, self.file)
         if self.stack:
             self.stack[-1].children.append(tag)
         self.root = self.root or tag
@@ -70,7 +86,8 @@ class _Builder:
         self.stack.pop()
 
     def data(self, text: str) -> None:
-        pass
+        if self.stack and (text := text.strip()):
+            self.stack[-1].text.append(text)
 
     def close(self) -> Tag | None:
         return self.root

@@ -8,11 +8,11 @@ from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 from eomc.robots.limits import both, through
-from eomc.robots.mjcf.attributes import ACTUATORS
-from eomc.robots.mjcf.file import Given, Report, missing, unknown
+from eomc.robots.mjcf.file import Given, Report, leave_unread, missing
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
 from eomc.robots.mjcf.ratios import damping, has_ratio, masses_at_start
+from eomc.robots.mjcf.schema import ACTUATORS
 from eomc.robots.mjcf.shortcuts import MEASURES
 from eomc.robots.mjcf.tendons import Tendons
 from eomc.robots.robot import UNLIMITED, Drive, Law, Motion, Range, RobotBody, Tendon, joined
@@ -53,9 +53,7 @@ def actuated(
     made: list[Actuator] = []
     for tag in tags:
         if tag.kind not in ACTUATORS:
-            reader.report.leave("elements that MJCF does not have", f"{tag.kind} in actuator")
             continue
-        unknown(tag, reader.report)
         a = reader.given(Placed(tag, "", STILL, ""), "actuator")
         on = a.get("joint", a.get("jointinparent", a.get("tendon")))
         name = a.get("name") or fresh(f"{on or 'no'}_{tag.kind}", named)
@@ -78,7 +76,9 @@ def _drive(
     if any(more):
         report.leave("damping in the square and cube of actuators", name)
     gear = (a.numbers("gear", 6, 1) or (1.0,))[0]
-    load = gear**2 * a.number("armature"), gear**2 * damps
+    disabled = reader.settings.disabled
+    load = gear**2 * a.number("armature"), 0.0 if "damper" in disabled else gear**2 * damps
+    off = "actuation" in disabled or a.number("group") in reader.settings.off_groups
     on = a.get("joint", a.get("jointinparent"))
     if on:
         if on not in joints:
@@ -96,13 +96,17 @@ def _drive(
         if tendon not in tendons.fixed:
             report.leave("actuators on tendons through space", name)
             return None
-        on = tendons.driven(tendon)
         tendons.fixed[tendon] = _loaded(tendons.fixed[tendon], *load)
+        if off and tendons.fixed[tendon].acts:
+            tendons.reads(tendon)
+        on = tendon if off else tendons.driven(tendon)
     else:
         report.leave("actuators on sites, bodies and slider-cranks", name)
         return None
-    if a.number("delay"):
-        report.leave("delays of actuators", name)
+    if off:
+        report.leave("actuators that the file disables (<flag>, actuatorgroupdisable)", name)
+        return None
+    leave_unread(a, "actuator", name)
     return Drive(name, on, gear)
 
 
@@ -133,6 +137,8 @@ def _lawful(drive: Drive, law: Law | None, a: Given, ends: Range, reader: Reader
         own, other = UNLIMITED, control
     elif dynamics == "integrator":
         own, other = active, control
+    if "clampctrl" in reader.settings.disabled:
+        own, other = (active if dynamics != "none" else UNLIMITED), UNLIMITED
     note = _noted(a.report, name, own, other, force)
     if law and dynamics != "none":
         report.leave(ACTIVATIONS, f"{name} ({dynamics})")
@@ -215,12 +221,11 @@ def started(
     """The joints and drives with the start of the key frame "home"; singular ones are reported."""
     out, drives = list(joints), [each.drive for each in actuators]
     for tag in (tag for section in root.each("keyframe") for tag in section.each("key")):
-        unknown(tag, report)
         a = Given(tag.attributes, tag, report)
         if a.get("name") != "home" or not {"qpos", "ctrl", "act"} & a.attributes.keys():
             report.leave("key frames", a.get("name"))
             continue
-        for key in ("qvel", "mpos", "mquat"):
+        for key in ("qvel", "mpos", "mquat", "plastic"):
             if any(a.numbers(key, 1_000_000, 0) or ()):
                 report.leave(BESIDES, key)
         out = _posed(a, joints)

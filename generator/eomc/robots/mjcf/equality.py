@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from eomc.base.spatial import apply, plus, scaled, transposed
 from eomc.robots import rotations
-from eomc.robots.mjcf.file import Given, missing, unknown
+from eomc.robots.mjcf.file import Given, missing
 from eomc.robots.mjcf.joints import Found, fresh
 from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader, pose_of, rounded
 from eomc.robots.mjcf.tendons import Tendons
@@ -75,7 +75,6 @@ def constrained(
     made = _Reading(tendons, _Ends(poses, anchors), joints, reader)
     for section in root.each("equality"):
         for tag in section.children:
-            unknown(tag, reader.report, section)
             made.read(tag)
     return tuple(made.loops), tuple(made.couplings)
 
@@ -105,6 +104,8 @@ class _Reading:
             report.leave("equality constraints of other kinds", f"{tag.kind} {name}")
         elif not a.is_true("active", True):
             report.leave("equality constraints that are not active", name)
+        elif "equality" in self.reader.settings.disabled:
+            report.leave("equality constraints that the file disables (<flag>)", name)
         else:
             self.taken.add(name)
             if tag.kind in ("connect", "weld"):
@@ -138,7 +139,6 @@ class _Reading:
             a.fault(what if name else "it needs both site1 and site2")
             return None
         self.reader.report.read("sites", name)
-        unknown(placed.tag, self.reader.report)
         site = placed.pose.of(pose_of(self.reader.given(placed, "site"), self.reader.settings))
         world = self.ends.of_file(placed.body).of(site)
         return placed.body, self.ends.point(placed.body, world.place), transposed(site.turn)

@@ -8,13 +8,13 @@ asked for included files; entities and document types are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from eomc.base.errors import Problem, SceneError
 from eomc.robots import xml
-from eomc.robots.mjcf.attributes import ACTUATORS, ORIENTATION, attributes
+from eomc.robots.mjcf.schema import ACTUATORS, FLAGS, OPTIONS, ORIENTATION
 from eomc.robots.mjcf.shortcuts import shortcut
 from eomc.robots.rotations import Vector
 from eomc.robots.xml import Tag
@@ -24,6 +24,25 @@ SHOWN = 12  # names in one line of what is left out
 
 # arrays of which an element may give the first numbers and leave the rest to its class
 PARTIAL = {"size", "gear", "stiffness", "damping", "gainprm", "biasprm", "dynprm"}
+
+# attributes of what is read that change the motion in MuJoCo, unless they have a neutral value
+_FRICTION_SOFTNESS = (
+    "the softness of friction (solreffriction, solimpfriction), which is exact here"
+)
+UNREAD = {
+    "joint": {
+        "springyield": "yield of the springs of joints",
+        "actuatorgravcomp": "compensated weights as forces of actuators (actuatorgravcomp)",
+        "solreffriction": _FRICTION_SOFTNESS,
+        "solimpfriction": _FRICTION_SOFTNESS,
+    },
+    "tendon": {
+        "springyield": "yield of the springs of tendons",
+        "frictionloss": "friction of tendons",
+    },
+    "actuator": {"delay": "delays of actuators"},
+}
+NEUTRAL = {"false", "auto"}  # and zero
 
 ONE_FILE = "let MuJoCo write the model as one file (MjSpec.to_xml)"  # a remedy
 
@@ -35,9 +54,13 @@ Classes = dict[str, dict[str, Attributes]]
 
 @dataclass
 class Report:
-    """What reading has found: faults, and what is left out, by kind, in the order found."""
+    """What reading has found: faults, and what is left out, by kind, in the order found.
+
+    strangers: what MJCF does not have, in words.
+    """
 
     faults: list[Problem] = field(default_factory=list)
+    strangers: tuple[str, ...] = ()
     left: dict[str, list[str]] = field(default_factory=dict)
 
     def leave(self, kind: str, name: str = "") -> None:
@@ -54,7 +77,7 @@ class Report:
 
     def lines(self) -> tuple[str, ...]:
         """What is left out, one line a kind; what has a name counts once."""
-        lines = []
+        lines = [*self.strangers]
         for kind, those in self.left.items():
             names = [*dict.fromkeys(name for name in those if name)]
             count = those.count("") + len(names)
@@ -130,6 +153,21 @@ class Given:
         return self.choice(key, BOOLEAN, BOOLEAN[default]) == "true"
 
 
+# the flags that change the motion of what is read, and what they disable
+EFFECTS = {
+    "gravity": ("gravity",),
+    "spring": ("spring",),
+    "damper": ("damper",),
+    "passive": ("spring", "damper"),  # of MuJoCo before 3.3.3
+    "actuation": ("actuation",),
+    "clampctrl": ("clampctrl",),
+    "equality": ("equality",),
+    "limit": ("limit",),
+    "frictionloss": ("frictionloss",),
+    "constraint": ("equality", "limit", "frictionloss"),
+}
+
+
 @dataclass(frozen=True)
 class Settings:
     """<compiler> and <option>, as far as they bear on masses and motion."""
@@ -144,6 +182,8 @@ class Settings:
     totalmass: float = -1.0
     balance: bool = False
     alignfree: bool = False
+    disabled: frozenset[str] = frozenset()  # of the values of EFFECTS
+    off_groups: Collection[float] = ()  # of actuators
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
     def angle(self, value: float) -> float:
@@ -218,45 +258,45 @@ def missing(kind: str, name: str, known: Iterable[str]) -> str:
     return f'there is no {kind} "{name}"{suggest(name, known)}'
 
 
-def unknown(tag: Tag, report: Report, around: Tag | None = None) -> None:
-    """Report the attributes of a tag that MJCF doesn't have. around: the tag that it stands in.
-
-    Without `around` what a tag has must not depend on where it stands.
-    """
-    known = attributes(tag.kind, around.kind if around else "")
-    place = f" in {called(around)}" if around else ""
-    for key in tag.attributes:
-        if known and key not in known:
-            report.leave("attributes that MJCF does not have", f"{key} of {called(tag)}{place}")
+def leave_unread(a: Given, kind: str, name: str) -> None:
+    """Report the attributes that change the motion in MuJoCo and are not read, as `UNREAD` has."""
+    for key, what in UNREAD[kind].items():
+        if any(word.strip("-+0.") for word in a.get(key).split() if word not in NEUTRAL):
+            a.report.leave(what, name)
 
 
 # ---- settings and defaults
 
 
 def settings_of(root: Tag, report: Report) -> Settings:
-    """<compiler> and <option>; of what is said twice, the last holds."""
+    """Return <compiler> and <option>; of what is given twice, the last value counts."""
     s = Settings()
+    disabled = dict.fromkeys(EFFECTS, False)  # by flag; one option keeps those of another
+    groups: set[float] = set()
     for tag in root.each("compiler"):
-        unknown(tag, report)
         s = _compiler(s, Given(tag.attributes, tag, report))
     for tag in root.each("option"):
-        unknown(tag, report)
         a = Given(tag.attributes, tag, report)
         s = replace(s, gravity=a.vector("gravity") or s.gravity)
+        groups.update(a.numbers("actuatorgroupdisable", 31, 0) or ())
         for key in a.attributes:
             if key in {"density", "viscosity", "wind"}:
                 if any(a.numbers(key, 3, 1) or ()):
                     report.leave("forces of the surrounding fluid", key)
-            elif key != "gravity" and key in attributes("option"):
+            elif key not in {"gravity", "actuatorgroupdisable"} and key in OPTIONS:
                 report.leave("options of MuJoCo's simulation", key)
         for flag in tag.each("flag"):
-            unknown(flag, report)
-            for key, value in flag.attributes.items():
-                if key == "gravity" and value == "disable":
-                    s = replace(s, gravity=(0.0, 0.0, 0.0))
-                elif key in attributes("flag"):
-                    report.leave("flags of MuJoCo's simulation", f"{key}={value}")
-    return s
+            f = Given(flag.attributes, flag, report)
+            for key in f.attributes:
+                if key in EFFECTS:
+                    disabled[key] = f.choice(key, ("enable", "disable")) == "disable"
+                elif key in FLAGS:
+                    report.leave("flags of MuJoCo's simulation", f"{key}={f.get(key)}")
+    those = [key for key, off in disabled.items() if off]
+    for key in those:
+        report.leave("switched off by <flag> of the file", key)
+    s = replace(s, disabled=frozenset(e for key in those for e in EFFECTS[key]), off_groups=groups)
+    return replace(s, gravity=(0.0, 0.0, 0.0)) if "gravity" in s.disabled else s
 
 
 def _compiler(s: Settings, a: Given) -> Settings:
@@ -301,9 +341,7 @@ def classes_of(root: Tag, report: Report) -> Classes:
         while waiting:
             tag, name = waiting.pop()
             own = classes[name]
-            unknown(tag, report)
             for child in tag.children:
-                unknown(child, report, tag)
                 kind = "actuator" if child.kind in ACTUATORS else child.kind
                 if kind != "default":
                     own[kind] = merged(own.get(kind, {}), child)

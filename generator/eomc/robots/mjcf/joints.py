@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from eomc.base.spatial import apply, plus, scaled
-from eomc.robots.mjcf.file import Given, Report, Settings, unknown
+from eomc.robots.mjcf.file import Given, Report, Settings, leave_unread
 from eomc.robots.mjcf.masses import STILL, Placed, Pose, Reader, direction, rounded
-from eomc.robots.robot import Motion, free_motions, joined
+from eomc.robots.robot import UNLIMITED, Motion, free_motions, joined
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector, from_axis_angle, unit, yaw_pitch_roll
 
 
@@ -18,6 +18,7 @@ class Found(NamedTuple):
 
     anchor: where it stands in the body's frame. zero: from the body's frame there to the frame in
     which the joint's coordinates are zero. armature: of all turns of a free or ball joint.
+    spring: its springdamper, a time constant (s) and a damping ratio; zeros where it has none.
     """
 
     name: str
@@ -28,8 +29,12 @@ class Found(NamedTuple):
     anchor: Vector
     zero: Pose
     armature: float
+    spring: tuple[float, float] = (0.0, 0.0)
 
 
+# what a flag of the file disables of a joint
+DISABLES = {"stiffness": "spring", "damping": "damper", "friction": "frictionloss"}
+LIMITS = "limits of joints, kept as notes"
 TYPES = ("hinge", "slide", "ball", "free")
 
 
@@ -39,7 +44,6 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
     The motions of free and ball joints get their names in _named.
     """
     report, settings, tag = reader.report, reader.settings, placed.tag
-    unknown(tag, report)
     free = tag.kind == "freejoint"
     a = reader.own(tag) if free else reader.given(placed, "joint")
     kind = "free" if free else a.choice("type", TYPES)
@@ -65,12 +69,16 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
     for key, number in own.items():
         if number < 0:
             a.fault(f"{key} must not be negative")
-    spring = a.numbers("springdamper", 2)
-    if spring and min(spring) > 0:
-        report.leave("stiffness and damping given by springdamper", name)
+    time, ratio = a.numbers("springdamper", 2) or (0.0, 0.0)
+    if time or ratio:
         own |= {"stiffness": 0.0, "damping": 0.0}
-    if a.number("springyield"):
-        report.leave("yield of the springs of joints", name)
+        if time <= 0 or ratio <= 0:
+            a.fault("springdamper is a time constant and a damping ratio, both positive")
+    spring = time, ratio
+    for key, effect in DISABLES.items():
+        if effect in settings.disabled:
+            own[key] = 0.0
+    leave_unread(a, "joint", name)
     note, ends, driven = _limits(a, kind, settings, name)
     anchor = plus(placed.pose.place, apply(placed.pose.turn, a.vector("pos") or ORIGIN))
     if kind == "free":
@@ -81,10 +89,12 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
         motions = tuple(
             replace(m, start=s, rest=s) for m, s in zip(free_motions(), start, strict=True)
         )
-        return _balled(Found(name, kind, kind, motions, (), ORIGIN, STILL, 0.0), own, report)
+        found = Found(name, kind, kind, motions, (), ORIGIN, STILL, 0.0, spring)
+        return _balled(found, own, report)
     if kind == "ball":
         motions = tuple(replace(m, note=joined(m.note, note)) for m in free_motions()[3:])
-        return _balled(Found(name, kind, "spherical", motions, (), anchor, STILL, 0.0), own, report)
+        found = Found(name, kind, "spherical", motions, (), anchor, STILL, 0.0, spring)
+        return _balled(found, own, report)
     axis = direction(a.numbers("axis", 3) or (0.0, 0.0, 1.0), "axis", a)
     if axis is None:
         return None
@@ -104,10 +114,10 @@ def joint_of(placed: Placed, name: str, pose: Pose, reader: Reader) -> Found | N
     )
     if turns:
         zero = Pose(ORIGIN, from_axis_angle(axis, -ref) if ref else IDENTITY)
-        return Found(name, kind, "revolute", (motion,), (axis,), anchor, zero, 0.0)
+        return Found(name, kind, "revolute", (motion,), (axis,), anchor, zero, 0.0, spring)
     # sliding does not depend on the place: at the body's origin the frames stay simple
     zero = Pose(scaled(axis, -ref) if ref else ORIGIN, IDENTITY)
-    return Found(name, kind, "prismatic", (motion,), (axis,), ORIGIN, zero, 0.0)
+    return Found(name, kind, "prismatic", (motion,), (axis,), ORIGIN, zero, 0.0, spring)
 
 
 def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
@@ -116,7 +126,8 @@ def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
     MuJoCo lets damping, friction and springs of turns act on the angular velocity and on the
     angle of the whole turn; per angle they are the same only near zero angles, which is reported.
     """
-    given = [key for key in ("damping", "friction", "stiffness") if own[key]]
+    springs = ("damping", "stiffness") if any(joint.spring) else ()
+    given = [key for key in ("damping", "friction", "stiffness") if own[key] or key in springs]
     if given:
         report.leave(
             f"{' and '.join(given)} of whole turns: here they act on each of the three angles, "
@@ -129,7 +140,7 @@ def _balled(joint: Found, own: dict[str, float], report: Report) -> Found:
             damping=own["damping"],
             friction=own["friction"],
             stiffness=own["stiffness"],
-            rest=m.rest if own["stiffness"] else 0.0,
+            rest=m.rest if "stiffness" in given else 0.0,
             armature=own["armature"] if m.unit == "m" else 0.0,
         )
         for m in joint.motions
@@ -144,10 +155,14 @@ def _limits(
     notes, ends, driven = [], Motion.limits, Motion.driven
     limits = a.numbers("range", 2)
     if limits and kind != "free" and limited(a, "limited", settings):
-        a.report.leave("limits of joints, kept as notes", name)
+        off = "limit" in settings.disabled
+        what = "joints whose limits the file disables (<flag>)" if off else LIMITS
+        a.report.leave(what, name)
         low, high = (settings.angle(v) if kind != "slide" else v for v in limits)
         of = "rad" if kind != "slide" else "m"
-        if kind == "ball":
+        if off:
+            ends = (low, high) if kind != "ball" else ends
+        elif kind == "ball":
             notes.append(f"turns by {high:.6g} rad at most")
         else:
             notes.append(f"from {low:.6g} to {high:.6g} {of}")
@@ -159,6 +174,11 @@ def _limits(
         notes.append(f"driven with {force[0]:.6g} to {force[1]:.6g} {newton}")
         driven = (force[0], force[1])
     return joined(*notes), ends, driven
+
+
+def unlimited(joint: Found) -> Found:
+    """Return the joint without limits of its positions."""
+    return joint._replace(motions=tuple(replace(m, limits=UNLIMITED) for m in joint.motions))
 
 
 def limited(a: Given, key: str, settings: Settings) -> bool:

@@ -17,7 +17,6 @@ from eomc.robots.inertias import (
     rotated_inertia,
     unbalanced,
 )
-from eomc.robots.mjcf.attributes import ORIENTATION
 from eomc.robots.mjcf.file import (
     Classes,
     Given,
@@ -25,12 +24,13 @@ from eomc.robots.mjcf.file import (
     Settings,
     merged,
     missing,
-    unknown,
 )
+from eomc.robots.mjcf.schema import ORIENTATION
 from eomc.robots.robot import RobotBody
 from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, times, toward, unit
 from eomc.robots.xml import Tag
 
+LEAST_MASS = 1e-15  # kg, mjMINVAL of MuJoCo's compiler
 ROUNDING = 1e-15  # what is smaller, relative to its neighbours, becomes zero
 
 
@@ -324,7 +324,6 @@ def rounded(x: float, size: float) -> float:
 def _inertial(placed: Placed, reader: Reader) -> Mass | None:
     """The mass that <inertial> gives, in its body's frame; None for a fault."""
     a = reader.own(placed.tag)
-    unknown(placed.tag, reader.report)
     if "mass" not in a or "pos" not in a:
         a.fault(f"the <inertial> of {placed.body} needs pos and mass")
         return None
@@ -351,12 +350,11 @@ def body_mass(tag: Tag, inner: Sequence[Placed], reader: Reader, still: bool) ->
     geoms = [p for p in inner if p.tag.kind == "geom"]
     for placed in inertials[1:]:
         reader.own(placed.tag).fault(f"{placed.body} has a second <inertial>; leave one")
-    if inertials and (how != "true" or not geoms):
-        mass, tag = _inertial(inertials[0], reader) or Mass(), inertials[0].tag
-    elif how == "false":
-        mass = Mass()
-    else:
+    mass = Mass()
+    if how == "true" or (how == "auto" and not inertials):
         mass = _sum([m for p in geoms if (m := _geom_mass(p, reader, still)) is not None])
+    if inertials and mass.mass < LEAST_MASS:  # of geoms, which then leave <inertial> as it is
+        mass, tag = _inertial(inertials[0], reader) or Mass(), inertials[0].tag
     return _bounded(mass, reader.own(tag), reader.settings)
 
 

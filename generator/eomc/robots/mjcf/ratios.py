@@ -1,9 +1,13 @@
-"""The damping of MJCF's servos that is given as a ratio, of what they move in the file's pose."""
+"""Damping and stiffness that MJCF gives as ratios and time constants, of what moves at the start.
+
+The start is the pose in which the file is written, as in MuJoCo's compiler.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from eomc.base import spatial
@@ -41,6 +45,40 @@ def damping(
         return 0.0
     mobility = float(J @ np.linalg.lstsq(masses, J, rcond=None)[0])
     return 2 * law.bias[2] * math.sqrt(law.kp / mobility) if mobility > 0 else 0.0
+
+
+def sprung(
+    joints: Sequence[Found],
+    bodies: Sequence[RobotBody],
+    tendons: Iterable[Tendon],
+    disabled: Collection[str],
+) -> list[Found]:
+    """Return the joints, springdamper as stiffness m/(t r)^2 and damping 2 m/t in its place.
+
+    t is the time constant, r the damping ratio, m the inverse of the mean of M^-1 along the
+    joint's coordinates. Damping by actuators adds to it. disabled: the effects that flags disable.
+    """
+    import numpy as np
+
+    if not any(any(joint.spring) for joint in joints):
+        return list(joints)
+    masses, rows = masses_at_start(bodies, joints, tendons)
+    if not np.isfinite(masses).all():  # masses that overflow
+        return list(joints)
+    mobilities = np.diag(np.linalg.lstsq(masses, np.eye(len(rows)), rcond=None)[0])
+    out = []
+    for joint in joints:
+        time, ratio = joint.spring
+        along = mobilities[[rows.index(m.name) for m in joint.motions]].mean()
+        if time and along > 0:
+            stiffness = 0.0 if "spring" in disabled else float(1 / (along * (time * ratio) ** 2))
+            damping = 0.0 if "damper" in disabled else float(2 / (along * time))
+            motions = (
+                replace(m, stiffness=stiffness, damping=m.damping + damping) for m in joint.motions
+            )
+            joint = joint._replace(motions=tuple(motions))
+        out.append(joint)
+    return out
 
 
 def masses_at_start(

@@ -18,13 +18,15 @@ from eomc.robots.mjcf.file import (
     classes_of,
     load,
     settings_of,
-    unknown,
 )
-from eomc.robots.mjcf.joints import Found, fresh, joint_of, named
+from eomc.robots.mjcf.joints import Found, fresh, joint_of, named, unlimited
 from eomc.robots.mjcf.masses import STILL, Mass, Placed, Pose, Reader
+from eomc.robots.mjcf.ratios import sprung
+from eomc.robots.mjcf.schema import SCHEMA
 from eomc.robots.mjcf.tendons import Tendons
-from eomc.robots.robot import Robot, RobotBody, joined
+from eomc.robots.robot import Robot, RobotBody, joined, refused
 from eomc.robots.rotations import IDENTITY, ORIGIN, Vector
+from eomc.robots.schema import strangers
 from eomc.robots.xml import Tag
 from eomc.scene.assembly import WORLD
 
@@ -47,7 +49,6 @@ KINDS = {
     "robot": "URDF",
     "mujocoinclude": "a part of a model: import the file that includes it, with --include",
 }
-READ = set("compiler option default worldbody tendon equality actuator keyframe".split())
 
 
 def read(path: str | Path, include: bool = False) -> Robot:
@@ -70,6 +71,7 @@ def read(path: str | Path, include: bool = False) -> Robot:
             f"the file's element is <{root.kind}>, which is {what}; MJCF has <mujoco>"
         )
         raise SceneError(report.faults)
+    report.strangers = strangers(root, SCHEMA, "MJCF")
     settings = settings_of(root, report)
     reader = Reader(settings, classes_of(root, report), report)
     bodies, joints, anchors = _bodies(root, reader)
@@ -78,10 +80,14 @@ def read(path: str | Path, include: bool = False) -> Robot:
     tendons = Tendons(root, joints, reader)
     loops, couplings = constrained(root, _moving(bodies, joints), joints, tendons, anchors, reader)
     joints, actuators = actuated(root, bodies, joints, tendons, reader)
+    if not report.faults:
+        joints = sprung(joints, bodies, tendons.fixed.values(), settings.disabled)
+    if "limit" in settings.disabled:  # after actuators, which may inherit them
+        joints = [unlimited(joint) for joint in joints]
     joints, drives = started(root, joints, actuators, report)
     _sections(root, report)
     if report.faults:
-        raise SceneError(report.faults)
+        raise refused(SceneError(report.faults), report.lines())
     name = root.get("model") or path.stem
     return Robot(
         name=name,
@@ -98,7 +104,6 @@ def read(path: str | Path, include: bool = False) -> Robot:
 
 def _geom_left_out(placed: Placed, reader: Reader) -> None:
     """Report that a geom's shape and contacts are left out."""
-    unknown(placed.tag, reader.report)
     a = reader.given(placed, "geom")
     touches = a.get("contype", "1") != "0" or a.get("conaffinity", "1") != "0"
     what = "contacts of geoms" if touches else "shapes of geoms without contact"
@@ -173,7 +178,9 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], di
         mass = masses.body_mass(tag, inner, reader, still and not own)
         chain, own, anchor = _chain(name, parent, still, pose, own, mass, names["body"], report)
         if own or not still:
-            chain[-1] = replace(chain[-1], lifted=a.number("gravcomp"))
+            passive = not {"spring", "damper"} <= settings.disabled  # as MuJoCo has it
+            lifted = a.number("gravcomp")
+            chain[-1] = replace(chain[-1], lifted=lifted if passive else 0.0)
         seen["body"].update(body.name for body in chain)
         bodies += chain
         anchors[name] = anchor
@@ -190,8 +197,6 @@ def _bodies(root: Tag, reader: Reader) -> tuple[list[RobotBody], list[Found], di
 def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Placed]:
     """What a body holds, frames resolved, in the file's order; what is not read is reported."""
     report = reader.report
-    if tag.kind == "body":
-        unknown(tag, report)
     found: list[Placed] = []
     reader.class_of(childclass, tag)
     waiting = [Placed(child, body, STILL, childclass) for child in reversed(tag.children)]
@@ -200,7 +205,6 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
         inner = placed.tag
         name = inner.get("name", inner.get("prefix"))
         if inner.kind == "frame":
-            unknown(inner, report)
             around = placed.pose.of(masses.pose_of(reader.own(inner), reader.settings))
             default = inner.get("childclass", placed.childclass)
             waiting += [Placed(child, body, around, default) for child in reversed(inner.children)]
@@ -211,9 +215,8 @@ def _contents(tag: Tag, body: str, childclass: str, reader: Reader) -> list[Plac
                 reader.sites[name] = placed
             report.leave(f"{inner.kind}s", name)
         elif inner.kind in GENERATORS:
-            report.leave(f"<{inner.kind}> and all that it adds, masses too", name or f"in {body}")
-        else:
-            report.leave("elements that MJCF does not have", f"{inner.kind} in {body}")
+            what = f"<{inner.kind}> and all that it adds, joints and masses too; {ONE_FILE}"
+            report.leave(what, name or f"in {body}")
     return found
 
 
@@ -312,8 +315,6 @@ def _sections(root: Tag, report: Report) -> None:
                 report.leave(SECTIONS[section.kind], _label(tag))
         elif section.kind in SETTINGS:
             report.leave("settings of MuJoCo's viewer and memory", section.kind)
-        elif section.kind not in READ:
-            report.leave("elements that MJCF does not have", section.kind)
 
 
 def _label(tag: Tag) -> str:

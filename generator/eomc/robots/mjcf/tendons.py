@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from eomc.robots.mjcf.file import Given, missing, unknown
+from eomc.robots.mjcf.file import Given, leave_unread, missing
 from eomc.robots.mjcf.joints import Found, fresh, limited
 from eomc.robots.mjcf.masses import STILL, Placed, Reader
 from eomc.robots.robot import Range, Tendon
@@ -26,7 +26,6 @@ class Tendons:
         taken = {m.name for joint in joints for m in joint.motions}
         for tag in self._tags:
             name = tag.get("name")
-            unknown(tag, reader.report)
             reader.report.leave(LEFT, f"{tag.kind} {name}".rstrip())
             terms = self._terms(tag) if tag.kind == "fixed" else None
             if not terms:
@@ -63,7 +62,6 @@ class Tendons:
         """The joints of a fixed tendon, each with its factor; none where it is no sum of these."""
         terms = []
         for each in tag.each("joint"):
-            unknown(each, self._reader.report, tag)
             a = self._reader.own(each)
             joint = a.get("joint")
             if joint not in self._joints:
@@ -89,8 +87,10 @@ class Tendons:
         for key, what in (("", "length"), ("actuatorfrc", "force")):
             if a.numbers(f"{key}range", 2) and limited(a, f"{key}limited", self._reader.settings):
                 report.leave(f"limits of {what} of tendons", name)
-        if a.number("frictionloss"):
-            report.leave("friction of tendons", name)
+        leave_unread(a, "tendon", name)
+        disabled = self._reader.settings.disabled
+        for key, effect in (("stiffness", "spring"), ("damping", "damper")):
+            own[key] = 0.0 if effect in disabled else own[key]
         return replace(
             tendon,
             stiffness=own["stiffness"],

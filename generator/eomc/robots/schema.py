@@ -1,0 +1,93 @@
+"""Which elements and attributes a format of robot files has, and what of a file it does not have.
+
+A format is an outline, a line for each element, indented by a blank a level:
+
+    joint: name type
+     origin: xyz rpy
+     safety_controller: *
+
+`*` stands for whatever the element holds: the reader skips it as a whole, and reports it itself.
+`@name` stands for a group of attributes that several elements share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from eomc.base import texts
+from eomc.robots.xml import Tag
+
+MAX_ENTRIES = 40  # in one line of a report, so that a hostile file prints no book
+
+
+@dataclass(frozen=True)
+class Element:
+    """The attributes and child elements that an element may have. skipped: not looked into."""
+
+    attributes: frozenset[str] = frozenset()
+    children: dict[str, Element] = field(default_factory=dict)
+    skipped: bool = False
+
+
+def parse(outline: str, groups: Mapping[str, str]) -> Element:
+    """Return the root element of an outline."""
+    top = Element()
+    stack = [top]
+    for line in outline.strip().splitlines():
+        kind, _, rest = line.strip().partition(":")
+        words = rest.split()
+        names = [n for w in words for n in (groups[w[1:]].split() if w[0] == "@" else [w])]
+        element = Element(frozenset(names) - {"*"}, skipped="*" in names)
+        depth = len(line) - len(line.lstrip())
+        del stack[depth + 1 :]
+        stack[-1].children[kind] = element
+        stack.append(element)
+    (root,) = top.children.values()
+    return root
+
+
+def strangers(root: Tag, element: Element, of: str) -> tuple[str, ...]:
+    """Return in words the elements, attributes and texts of a file that its format does not have.
+
+    of: what the format is called. Elements that it does not have are not looked into.
+    """
+    found: dict[str, dict[str, list[str]]] = {}  # kind of stranger -> what it is -> its places
+
+    def note(kind: str, what: str, place: str) -> None:
+        found.setdefault(kind, {}).setdefault(what, []).append(place)
+
+    waiting: list[tuple[Tag, Element, str]] = [(root, element, "")]
+    while waiting:
+        tag, known, around = waiting.pop()
+        name = tag.get("name")
+        mine = f' "{name}"' if name and known is not element else ""
+        for key in tag.attributes:
+            if key not in known.attributes:
+                note("attributes", f"{key} of {tag.kind}", mine or around)
+        if tag.text:
+            note("text", f"<{tag.kind}>", mine or around)
+        below_it = f" in {tag.kind}{mine or around}" if tag is not root else ""
+        inner: list[tuple[Tag, Element, str]] = []
+        for child in tag.children:
+            below = known.children.get(child.kind)
+            if below is None:
+                note("elements", f"{child.kind} in {tag.kind}", mine or around)
+            elif not below.skipped:
+                inner.append((child, below, below_it))
+        waiting += reversed(inner)
+    heads = {
+        "elements": f"elements that {of} does not have",
+        "attributes": f"attributes that {of} does not have",
+        "text": f"text between tags, where {of} has attributes",
+    }
+    return tuple(f"{heads[k]}: {_listed(found[k])}" for k in heads if k in found)
+
+
+def _listed(places: Mapping[str, list[str]]) -> str:
+    """Each entry with its first place, and how many there are besides."""
+    entries = [
+        f"{what}{where[0]}" + (f" (and {len(where) - 1} more)" if len(where) > 1 else "")
+        for what, where in places.items()
+    ]
+    return texts.listed(entries, MAX_ENTRIES)
