@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
+from eomc.base import texts
 from eomc.base.errors import EomcError
 from eomc.base.spatial import apply, plus, scaled
 from eomc.robots.inertias import NO_INERTIA, Inertia
@@ -253,7 +254,7 @@ class Robot:
 def refused(fault: EomcError, left_out: Sequence[str]) -> EomcError:
     """Return the fault with a note of what is not read of the file, which may be its cause."""
     if left_out:
-        listed = "".join(f"\n  - {words}" for words in left_out)
+        listed = "".join(f"\n  - {texts.line(words)}" for words in left_out)
         fault.add_note(f"not read of this file, which may be the cause:{listed}")
     return fault
 
