@@ -67,7 +67,8 @@ def in_c(
     out = np.zeros((n, *shape))
     q, qd, qdd, to = map(model._pointer, (*motion, out))
     function, p = getattr(model._lib, name), model._at[2]
-    return lambda: function(n, to, q, qd, 0.0, qdd, p), out
+    each = model._ffi.new("row_strides *", {"u": len(m.coordinates)})  # qdd in the place of inputs
+    return lambda: function(n, to, q, qd, 0.0, qdd, p, each), out
 
 
 def main() -> None:

@@ -22,16 +22,15 @@ def linearization(m: ModuleType, q: Any, qd: Any, t: float = 0.0, u: Any = None)
     model: Any = m._model
     n, nu = len(m.coordinates), len(m.inputs)
     made = [np.full((n, k), np.nan, m.dtype) for k in (n, n, nu)]
-    status = model._ffi.new("int *")
     held = None if u is None else np.ascontiguousarray(u, m.dtype)
     given = [np.ascontiguousarray(x, m.dtype) for x in (q, qd)]
-    done = model._lib.linearization(
+    found = model._lib.linearization(
         1, *map(model._pointer, made), *map(model._pointer, given), t, model._pointer(held),
-        model._pointer(model._p0), status,
+        model._pointer(model._p0), model._c[2],
     )  # fmt: skip
-    assert done == 1 - (status[0] != 0)
-    if status[0]:
-        raise ValueError(status[0])
+    assert found >> 3 == 1 - (found & 7 != 0)
+    if found & 7:
+        raise ValueError(found & 7)
     return made
 
 

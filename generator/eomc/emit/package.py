@@ -10,7 +10,7 @@ from eomc.emit import adaptive
 from eomc.emit.c_expression import DOUBLE
 from eomc.emit.c_function import cast, member
 from eomc.emit.c_names import Target
-from eomc.emit.evaluations import KINDS, refuses, takes_qdd, takes_t
+from eomc.emit.evaluations import KINDS, refuses, takes_qdd
 from eomc.emit.heading import stamp, words
 from eomc.emit.public import Public
 from eomc.emit.views import (
@@ -29,9 +29,6 @@ from eomc.runtime.package import CONSTRAINED
 from eomc.scene.formulas import folded, parse
 
 _OF_STEPS = ("Phi", "Gamma")
-TIMED = (
-    "energy jacobi tau power outputs constraints constraint_rates multipliers reactions"
-).split()  # what runs ask for at each of their rows
 ROWS = 200  # of main.c, about
 LINE = 88  # of the columns' names there
 FUNCTIONS = (
@@ -99,9 +96,9 @@ def _bound(target: Target) -> tuple[Bound, ...]:
         kind = KINDS[name]
         extents = {a.name: a.extent for a in function.arguments}
         rows = {kind.out: f"out + {extents[kind.out]}*k"} if kind.out else {}
-        if kind.given:
-            rows[kind.given] = f"u + {extents[kind.given]}*k"
-        call = function.call(**at, **rows)
+        if kind.given:  # in the place of inputs
+            rows[kind.given] = f"u + {member('own', 'u')}*k"
+        call = function.call(**(at | rows))
         solve = Public(target).acceleration.call(**at) if takes_qdd(target, name) else ""
         # what SciPy calls takes doubles alone
         alone = not kind.out and target.real is DOUBLE and not {"t", "u", "qdd"} & set(extents)
@@ -112,15 +109,21 @@ def _bound(target: Target) -> tuple[Bound, ...]:
     return tuple(found)
 
 
-def _parameters(target: Target) -> str:
+def _parameters(target: Target, place: str = "p") -> str:
     """The parameters, which come as plain numbers."""
-    return cast(f"{target.prefix}_params", "p") if target.needs_p else ""
+    return cast(f"{target.prefix}_params", place) if target.needs_p else ""
 
 
 def _rows(target: Target) -> dict[str, str]:
-    """q and qd of row k, and the parameters, which come as plain numbers."""
+    """The arguments of state k: q, qd, and what `row_strides` say of t, u and p."""
     NQ = f"{target.PREFIX}_NQ"
-    return {"q": f"q + {NQ}*k", "qd": f"qd + {NQ}*k", "p": _parameters(target)}
+    return {
+        "q": f"q + {NQ}*k",
+        "qd": f"qd + {NQ}*k",
+        "t": f"{member('own', 't')} ? {member('own', 't')}[k] : t",
+        "u": f"u ? u + {member('own', 'u')}*k : u",
+        "p": _parameters(target, f"(p + {member('own', 'p')}*k)"),
+    }
 
 
 def _methods(target: Target) -> tuple[BoundMethod, ...]:
@@ -138,7 +141,7 @@ def _methods(target: Target) -> tuple[BoundMethod, ...]:
                 status="&found",
             ),
             public.batch(name).call(p=p),
-            _derivative(target, name) if target.system.run.discretize else "",
+            *(_derivative(target, name) if target.system.run.discretize else ("", "", "")),
         )
         for name in target.system.run.methods
     )  # fmt: skip
@@ -157,11 +160,20 @@ def _adaptive(target: Target) -> BoundAdaptive | None:
     return BoundAdaptive(f"{run.name}_memory", call, bool(target.system.events), many)
 
 
-def _derivative(target: Target, method: str) -> str:
-    """The call of a step's derivatives."""
-    function = Public(target).derivative(method)
+def _derivative(target: Target, method: str) -> tuple[str, str, str]:
+    """The calls for a step's derivatives: at state k; of a later step, behind one by `_step`."""
+    function, rows = Public(target).derivative(method), _rows(target)
     out = {a.name: f"{a.name} + {a.extent}*k" for a in function.arguments if a.name in _OF_STEPS}
-    return function.call(**_rows(target), **out)
+    later = rows | {"q": "at", "qd": "moving"}
+    before, now = later, later
+    if target.driven:
+        before = later | {"t": f"({rows['t']}) + (step - 1)*h"}
+        now = later | {"t": f"({rows['t']}) + step*h"}
+    return (
+        function.call(**rows, **out),
+        Public(target).step(method).call(**before),
+        function.call(**now, Phi="A", Gamma="B"),
+    )
 
 
 def binding(target: Target) -> Binding:
@@ -181,6 +193,8 @@ def binding(target: Target) -> Binding:
         methods=_methods(target),
         adaptive=_adaptive(target),
         parameter_count=len(target.system.parameters),
+        input_count=len(target.system.inputs),
+        derivative_columns=max(2 * len(target.system.coordinates), len(target.system.inputs)),
     )
 
 
@@ -194,14 +208,6 @@ def declarations(bound: Binding) -> Declarations:
         bound.real, bound.evaluations, bound.project, bound.linearization, bound.batch,
         bound.methods, bound.adaptive,
     )  # fmt: skip
-
-
-def _timed(target: Target, name: str) -> bool:
-    if name == "jacobi" and name not in target.program:
-        name = "energy"  # which it is there
-    return name in target.program and (
-        takes_t(target, name) or (target.driven and takes_qdd(target, name))
-    )
 
 
 def _functions(target: Target) -> tuple[str, ...]:
@@ -272,7 +278,6 @@ def face(target: Target, extension: str) -> Face:
         modes=tuple((m.at, m.of) for m in s.modes),
         discrete=len(s.discrete),
         reactions=tuple(r.name for r in s.reactions),
-        timed=tuple(n for n in TIMED if _timed(target, n)),
         batch=s.run.batch,
         methods=tuple(METHODS[name] for name in s.run.methods),
         functions=_functions(target),

@@ -140,7 +140,10 @@ class Bound:
 
 @dataclass(frozen=True)
 class BoundMethod:
-    """A method in the binding, and the calls of its functions; derivative: if there is one."""
+    """A method in the binding, and the calls of its functions; derivative: if there is one.
+
+    step_between, derivative_between: of a step behind others, as a control period has them.
+    """
 
     name: str
     implicit: bool
@@ -148,6 +151,8 @@ class BoundMethod:
     run: str
     batch: str
     derivative: str
+    step_between: str
+    derivative_between: str
 
 
 @dataclass(frozen=True)
@@ -162,7 +167,10 @@ class BoundAdaptive:
 
 @dataclass(frozen=True)
 class Binding:
-    """python/binding.c.jinja. project, linearization: their calls, if there are."""
+    """python/binding.c.jinja. project, linearization: their calls, if there are.
+
+    derivative_columns: of the wider of Phi and Gamma.
+    """
 
     TEMPLATE: ClassVar[str] = "python/binding.c"
     prefix: str
@@ -176,6 +184,8 @@ class Binding:
     methods: tuple[BoundMethod, ...]
     adaptive: BoundAdaptive | None
     parameter_count: int
+    input_count: int
+    derivative_columns: int
 
 
 @dataclass(frozen=True)
@@ -239,7 +249,6 @@ class Face:
     modes: tuple[tuple[int, int], ...]
     discrete: int
     reactions: tuple[str, ...]
-    timed: tuple[str, ...]
     batch: bool
     methods: tuple[Method, ...]
     functions: tuple[str, ...]

@@ -88,7 +88,7 @@ class Arguments:
         self, extension: Any, *, name: str, title: str, dtype: str,
         coordinates: Mapping[str, str], parameters: Mapping[str, float],
         inputs: Mapping[str, str], outputs: Sequence[str], units: Mapping[str, str],
-        start: tuple[Sequence[float], Sequence[float]], timed: Sequence[str], digest: str,
+        start: tuple[Sequence[float], Sequence[float]], digest: str,
         frames: Sequence[str] = (), plane: bool = False, follows: Mapping[str, str] | None = None,
     ) -> None:  # fmt: skip
         # thirty attributes at most with those of Model: with more CPython 3.11 looks up each slowly
@@ -108,7 +108,7 @@ class Arguments:
         self._start = (self._constant(start[0]), self._constant(start[1]))
         self._p0 = self._constant(tuple(parameters.values()))
         self._at = tuple(self._pointer(x) for x in (*self._start, self._p0))
-        self._timed = frozenset(timed)
+        self._functions: dict[str, Any] = {}  # of a state: C function, shape, whether it reads qd
         if follows:
             self._follows = follows
         names = {
@@ -261,7 +261,33 @@ class Arguments:
             )
         return array
 
-    def _inputs(self, u: Any) -> Array | None:
+    def _parameter_rows(self, params: Any) -> Array:
+        """Parameters of many states or instances, a row each, (n, np); (1, np) for all."""
+        if params is None or isinstance(params, Params):
+            return self._parameters(params)[None]
+        if isinstance(params, (list, tuple)) and any(isinstance(p, Mapping) for p in params):
+            raise ValueError('params: give one dict of arrays, {"m": [1, 2]}, no list of dicts')
+        if not isinstance(params, Mapping):
+            array = self._numbers(params, "params")
+            if array.ndim == 2 and array.shape[1] == len(self.parameters):
+                return _finite(array, "params: not all numbers are finite: {}")
+            return self._parameters(params)[None]
+        params = named(params)
+        sizes = {name: np.size(value) for name, value in params.items() if np.ndim(value)}
+        count = max(sizes.values(), default=1)
+        table = np.tile(self._p0, (count, 1))
+        for name, value in params.items():
+            if name not in self.parameters:
+                self._parameters({name: 0.0})  # raises, with the names there are
+            column = self._numbers(value, f"params: {name}")
+            if np.ndim(value) > 1 or (np.ndim(value) and len(column) != count):
+                raise ValueError(f"params: {name} has shape {column.shape}, expected ({count},)")
+            words = f"params: {name} is not finite everywhere: {{}}"
+            table[:, self.parameters.index(name)] = _finite(column, words)
+        return table
+
+    def _inputs(self, u: Any, many: bool = False) -> Array | None:
+        """(nu,), or (n, nu) too where there may be many."""
         if u is None:
             return None
         if not self.nu:
@@ -269,7 +295,7 @@ class Arguments:
         if type(u) is not ndarray and isinstance(u, Mapping):
             u = self._by_name(u)
         u = u.reshape(1) if type(u) is ndarray and not u.ndim else u
-        return self._array(u, "u", self.nu, many=False)
+        return self._array(u, "u", self.nu, many)
 
     def _by_name(self, u: Mapping[Any, Any]) -> Array:
         """Inputs by name as arrays have them, (..., nu).
@@ -337,6 +363,81 @@ class Arguments:
         if not isinstance(out, (tuple, list)) or len(out) != 2:
             raise ValueError("out: expected a pair of arrays, (q, qd)")
         return self._out(out[0], shape, "out[0]"), self._out(out[1], shape, "out[1]")
+
+
+class StateArguments:
+    """t, u and parameters of one state or many, as C takes them: one for all states or one each.
+
+    rows: () or (n,). given: what a function takes in the place of u, (width,) or (n, width).
+    u_rows: the inputs, (nu,) or (n, nu), None for the signals. Raises ValueError.
+    """
+
+    def __init__(
+        self, model: Arguments, rows: tuple[int, ...], t: Any, u: Any, params: Any,
+        given: Array | None = None,
+    ) -> None:  # fmt: skip
+        address, real, null = model._c
+        self.t, self.times, self.own, self.u_rows = 0.0, None, null, None
+        if rows and np.ndim(t):
+            unmasked(t, "t")
+            if np.shape(t) != rows:
+                raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
+            self.times = _finite(model._numbers(t, "t"), "t: {} is not a finite number")
+        else:
+            self.t = as_number(t, "t")
+        if u is not None:
+            self.u_rows = model._inputs(u, many=bool(rows))
+            if self.u_rows is not None and self.u_rows.ndim == 2:
+                _check_rows("u", self.u_rows.shape, (*rows, model.nu))
+        acting = self.u_rows if given is None else given
+        self.u = null if acting is None else address(real, acting)
+        u_stride = acting.shape[-1] if acting is not None and acting.ndim == 2 else 0
+        p_stride = 0
+        if rows and isinstance(params, Mapping):
+            params = named(params)
+            for name in [name for name, value in params.items() if np.ndim(value)]:
+                unmasked(params[name], f"params: {name}")
+                _check_rows(f"params: {name}", np.shape(params[name]), rows)
+                p_stride = len(model.parameters)
+        elif rows and isinstance(params, ndarray) and params.ndim == 2:
+            _check_rows("params", params.shape, (*rows, len(model.parameters)))
+            p_stride = len(model.parameters)
+        table = model._parameter_rows(params) if p_stride else model._parameters(params)
+        self.p = address(real, table)
+        self._arrays = acting, table  # C reads them
+        if self.times is not None or u_stride or p_stride:
+            self.own = model._ffi.new("row_strides *", {"u": u_stride, "p": p_stride})
+            self._from_t = null if self.times is None else address(real, self.times)
+
+    def time(self, k: int) -> float:
+        """The time of state k."""
+        return self.t if self.times is None else float(self.times[k])
+
+    def at(self, k: int) -> tuple[float, Any, Any, Any]:
+        """The last arguments of a function in C, from state k on: t, u, p and strides."""
+        if not self.own:
+            return self.t, self.u, self.p, self.own
+        if self.times is not None:
+            self.own.t = self._from_t + k
+        u, p = (
+            x + stride * k if stride else x
+            for x, stride in ((self.u, self.own.u), (self.p, self.own.p))
+        )
+        return self.t, u, p, self.own
+
+
+def _check_rows(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if shape != expected:
+        raise ValueError(f"{name}: shape {shape}, expected {expected} for {expected[0]} states")
+
+
+def _finite(array: Array, words: str) -> Array:
+    """The array; a ValueError with these words and the place where a number is not finite."""
+    if not np.isfinite(array).all():
+        place = np.argwhere(~np.isfinite(array))[0].tolist()
+        number = array[tuple(place)]
+        raise ValueError(f"{words.format(number)}" + (f", at {place}" if place else ""))
+    return array
 
 
 def named(given: Mapping[Any, Any]) -> dict[str, Any]:

@@ -67,24 +67,19 @@ class Balance:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Rows t (n,), q, qd (n, nq) that tell a run's power, and the inputs in each piece of them."""
+    """Rows t (n,), q, qd (n, nq) that tell a run's power; u: its inputs, (nu,) or (n, nu)."""
 
     model: Stepping
     params: Array
     t: Array
     q: Array
     qd: Array
-    pieces: list[tuple[slice, Any]]
+    u: Array | None
 
-    def values(self, name: str, function: Callable[..., Any], **held: Any) -> Array:
-        """What a function of the states gives, (n, ...); u: its own in each piece unless given."""
-        found = []
-        for rows, u in self.pieces:
-            given = held or ({"u": u} if name == "power" else {})
-            t = self.t[rows]
-            for k, q, qd in self.model._by_time(name, t, self.q[rows], self.qd[rows]):
-                found.append(function(q, qd, t=float(t[k]), params=self.params, **given))
-        return np.concatenate(found).astype(float)
+    def values(self, function: Callable[..., Any], **held: Any) -> Array:
+        """What a function of the states gives, (n, ...)."""
+        found = function(self.q, self.qd, t=self.t, params=self.params, **held)
+        return np.asarray(found, float)
 
 
 def balance(run: Recorded) -> Balance | None:
@@ -97,12 +92,12 @@ def balance(run: Recorded) -> Balance | None:
     rows = _rows(run)
     if rows is None:
         return None
-    model, energy = run._model, rows.values("jacobi", run._model.jacobi)
+    model, energy = run._model, rows.values(run._model.jacobi)
     none = np.zeros(model.nu) if model.nu else None
-    power, rest = (rows.values("power", model.power, **how) for how in ({}, {"u": none}))
+    power, rest = (rows.values(model.power, u=u) for u in (rows.u, none))
     back = _turned_back(model)
     ahead, behind = (
-        rows.values("tau", lambda q, qd, way=way, **held: model.tau(*way(q, qd), **held), u=none)
+        rows.values(lambda q, qd, way=way, **held: model.tau(*way(q, qd), **held), u=none)
         for way in (lambda q, qd: (q, qd), back)
     )
     if not all(np.isfinite(x).all() for x in (power, rest, ahead, behind)):
@@ -138,7 +133,7 @@ def _rows(run: Recorded) -> _Rows | None:
     model, u = run._model, run._u
     if u is None or np.ndim(u) == 1:
         made = _in_steps(run) or _between_jumps(run)  # all its rows: few may look smooth and not be
-        return _Rows(model, run._params, *made, [(slice(None), u)])
+        return _Rows(model, run._params, *made, u)
     run = with_jumps(run)
     ends, values = _held(run)
     if not len(values):
@@ -154,9 +149,8 @@ def _rows(run: Recorded) -> _Rows | None:
         if first == len(t):  # it jumps at its end
             t, q, qd = np.append(t, t[-1:]), np.append(q, q[-1:], 0), np.append(qd, qd[-1:], 0)
         q[first], qd[first] = run.q[row], run.qd[row]
-    firsts = [*range(0, count * len(values), count), len(t)]
-    pieces = [(slice(*rows), x) for rows, x in zip(pairwise(firsts), values, strict=True)]
-    return _Rows(model, run._params, t, q, qd, pieces)
+    piece = np.minimum(np.arange(len(t)) // count, len(values) - 1)
+    return _Rows(model, run._params, t, q, qd, values[piece])
 
 
 def _cut(ends: Array, values: Array, at: Array) -> tuple[Array, Array]:

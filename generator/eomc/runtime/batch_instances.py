@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, Params, named, unmasked
+from .arguments import Array, unmasked
 from .model import LARGE, Model
 from .starts import started
 
@@ -80,33 +80,6 @@ class Instances(Model):
             if given.dtype in (self.dtype, np.float64) and given.flags.aligned:
                 return given
         return self._array(given, name, self.nq)
-
-    def _parameter_rows(self, params: Any) -> Array:
-        if params is None or isinstance(params, Params):
-            return self._parameters(params)[None]
-        if isinstance(params, (list, tuple)) and any(isinstance(p, Mapping) for p in params):
-            raise ValueError('params: give one dict of arrays, {"m": [1, 2]}, no list of dicts')
-        if not isinstance(params, Mapping):
-            array = self._numbers(params, "params")
-            if array.ndim == 2 and array.shape[1] == len(self.parameters):
-                if not np.isfinite(array).all():
-                    raise ValueError("params: not all numbers are finite")
-                return array
-            return self._parameters(params)[None]
-        params = named(params)
-        sizes = {name: np.size(value) for name, value in params.items() if np.ndim(value)}
-        count = max(sizes.values(), default=1)
-        table = np.tile(self._p0, (count, 1))
-        for name, value in params.items():
-            if name not in self.parameters:
-                self._parameters({name: 0.0})  # raises, with the names there are
-            column = self._numbers(value, f"params: {name}")
-            if np.ndim(value) > 1 or (np.ndim(value) and len(column) != count):
-                raise ValueError(f"params: {name} has shape {column.shape}, expected ({count},)")
-            if not np.isfinite(column).all():
-                raise ValueError(f"params: {name} is not finite everywhere")
-            table[:, self.parameters.index(name)] = column
-        return table
 
     def _input_rows(self, u: Any, steps: int | None) -> Array | None:
         """(batch or 1, steps or 1, nu); steps None: inputs are held over the run."""

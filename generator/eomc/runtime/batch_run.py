@@ -84,20 +84,13 @@ class BatchRun(Values, Fans, Columns):
 
     def _within(self, u: Array) -> Array:
         """Inputs (batch, n, nu) within the limits of their instances."""
-        if not self._model.has_limits:
-            return u
-        ends = (
-            [self._model._within(u, self._params[0])]
-            if len(self._params) == 1
-            else [self._model._within(u[k], p) for k, p in enumerate(self._params)]
-        )
-        return np.reshape(ends, u.shape)
+        return self._model._within(u, self._params)
 
     @property
     def _given(self) -> Array:
         """The inputs at each row, (batch, n, nu), whatever their limits."""
         if self._held is None:
-            return self._values("signal", self._model.signal, (self._model.nu,))
+            return self._values(self._model.signal, (self._model.nu,))
         found = np.broadcast_to(self._held, (*self.q.shape[:2], self._model.nu)).copy()
         found[np.isnan(self.q[..., 0])] = np.nan
         return found

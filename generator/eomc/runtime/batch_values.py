@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +12,7 @@ from .arguments import Array
 from .by_name import ByName
 from .facts import Facts
 
-_Rows = tuple[slice, slice]  # of instances and of times
+_ROWS = 2**16  # of all instances in one call: they share the processor's cache
 
 
 class Values:
@@ -29,12 +29,12 @@ class Values:
     @property
     def energy(self) -> Array:
         """K + P, (batch, n), J. What is conserved may be `jacobi` instead."""
-        return self._values("energy", self._model.energy, ())
+        return self._values(self._model.energy, ())
 
     @property
     def jacobi(self) -> Array:
         """qd.dK/dqd - K + P, (batch, n), J: the energy, where K is purely quadratic."""
-        return self._values("jacobi", self._model.jacobi, ())
+        return self._values(self._model.jacobi, ())
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
@@ -45,7 +45,7 @@ class Values:
         names = self._model.outputs
         if not names:
             return {}
-        found = self._driven("outputs", self._model.output, (len(names),))
+        found = self._driven(self._model.output, (len(names),))
         return dict(zip(names, np.ascontiguousarray(np.moveaxis(found, 2, 0)), strict=True))
 
     @property
@@ -54,7 +54,7 @@ class Values:
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "constraints", names,
-            lambda: self._values("constraints", model.constraints, (len(names),)),
+            lambda: self._values(model.constraints, (len(names),)),
         )  # fmt: skip
 
     @property
@@ -63,7 +63,7 @@ class Values:
         model, names = self._model, self._model.constraint_names
         return _by_name(
             "multipliers", names,
-            lambda: self._driven("multipliers", model._multipliers, (len(names),)),
+            lambda: self._driven(model._multipliers, (len(names),)),
         )  # fmt: skip
 
     @property
@@ -75,38 +75,34 @@ class Values:
         """
         model, loops = self._model, self._model.loops
         shape = (len(loops), 3 if model._plane else 6)
-        timed = min(model._timed & {"multipliers", "reactions"}, default="reactions")
-        return _by_name("reactions", loops, lambda: self._driven(timed, model._reactions, shape))
+        return _by_name("reactions", loops, lambda: self._driven(model._reactions, shape))
 
-    def _driven(self, name: str, function: Callable[..., Any], shape: tuple[int, ...]) -> Array:
+    def _driven(self, function: Callable[..., Any], shape: tuple[int, ...]) -> Array:
         """What a function of the state and the inputs gives at all rows."""
-        return self._values(name, function, shape, self._held)
+        return self._values(function, shape, None if self._held is None else {"u": self._held})
 
     def _values(
-        self, name: str, function: Callable[..., Any], shape: tuple[int, ...],
-        held: Array | None = None,
+        self, function: Callable[..., Any], shape: tuple[int, ...],
+        held: Mapping[str, Array] | None = None,
     ) -> Array:  # fmt: skip
-        """A function at all rows, (batch, n, ...), nan where these are; under inputs as held."""
-        found = np.full((*self.q.shape[:2], *shape), np.nan, self._model.dtype)
-        good: Any = np.isfinite(self.q).all(axis=-1) & np.isfinite(self.qd).all(axis=-1)
-        for at in self._groups(name == "signal" or name in self._model._timed, held):
-            here = good[at]
-            k, j = (part.start or 0 for part in at)
-            given: dict[str, Any] = {"params": self._params[min(k, len(self._params) - 1)]}
-            if held is not None:
-                given["u"] = held[min(k, len(held) - 1), min(j, held.shape[1] - 1)]
-            t = float(self.t[j])
-            found[at][here] = function(self.q[at][here], self.qd[at][here], t=t, **given)
-        return found
-
-    def _groups(self, timed: bool, held: Array | None) -> Iterator[_Rows]:
-        """Rows that can be evaluated in one call: of one time, parameters and inputs."""
+        """A function at all rows, (batch, n, ...), nan where these are; held: inputs, (..., nu)."""
         count, n = self.q.shape[:2]
-        alike = len(self._params) == 1 and (held is None or len(held) == 1)
-        steady = not timed and (held is None or held.shape[1] == 1)
-        for k in [slice(None)] if alike else [slice(k, k + 1) for k in range(count)]:
-            for j in [slice(None)] if steady else [slice(j, j + 1) for j in range(n)]:
-                yield k, j
+        found = np.full((count, n, *shape), np.nan, self._model.dtype)
+        good: Any = np.isfinite(self.q).all(axis=-1) & np.isfinite(self.qd).all(axis=-1)
+        t, each = np.broadcast_to(self.t, (count, n)), {"params": self._params[:, None]}
+        each |= held or {}
+        alike = {name: x.size == x.shape[-1] for name, x in each.items()}
+        for first in range(0, count, many := max(1, _ROWS // max(n, 1))):
+            at = slice(first, first + many)
+            here = good[at]
+            given = {
+                name: x[0, 0]
+                if alike[name]
+                else np.broadcast_to(x, (count, n, x.shape[-1]))[at][here]
+                for name, x in each.items()
+            }
+            found[at][here] = function(self.q[at][here], self.qd[at][here], t=t[at][here], **given)
+        return found
 
 
 def _by_name(what: str, names: Sequence[str], rows: Callable[[], Array]) -> ByName:

@@ -7,13 +7,12 @@ of others, psi(q, qd, t) = 0, which are linear in qd. nc: the number of rows, in
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, Parameters, as_number, not_one_of
+from .arguments import Array, Parameters, StateArguments, not_one_of
 from .by_name import ByName
 from .frames import Frames
 from .status import SAID, STATUS, MotionError, state_text
@@ -67,13 +66,12 @@ class Constrained(Frames):
         return self._of_rows("constraint_rates", q, qd, t, params)
 
     def _of_rows(self, name: str, q: ArrayLike, qd: ArrayLike, t: float, params: Any) -> Array:
-        found: Array = self._evaluate(name, (len(self._rows.names),), q, qd, t, None, params, None)
+        found: Array = self._evaluate(name, q, qd, t, None, params)
         return found
 
     def constraint_jacobian(self, q: ArrayLike, t: float = 0.0, params: Parameters = None) -> Array:
         """A, (nc, nq): dphi/dq of holonomic constraints, dpsi/dqd of others."""
-        shape = (len(self._rows.names), self.nq)
-        found: Array = self._evaluate("constraint_jacobian", shape, q, None, t, None, params, None)
+        found: Array = self._evaluate("constraint_jacobian", q, None, t, None, params)
         return found
 
     def tangent(
@@ -92,34 +90,26 @@ class Constrained(Frames):
                 f"tangent: {self.name} was built without derivatives: a scene asks with [run] "
                 "linearize = true, or discretize"
             )
-        shape = (len(self._rows.names), self.nq)
         A = self.constraint_jacobian(q, t=t, params=params)
-        slopes = self._evaluate("constraint_slopes", shape, q, qd, t, None, params, None)
-        if A.ndim == 2:
-            return self._kernel(A, slopes, q, qd)
-        each = zip(A, slopes, np.asarray(q), np.asarray(qd), strict=True)
-        found = [self._kernel(*one) for one in each]
-        if len({x.shape for x in found}) > 1:
-            few, many = (
-                pick(range(len(found)), key=lambda k: found[k].size) for pick in (min, max)
-            )
-            raise ValueError(
-                f"tangent: {found[few].shape[1]} changes keep the constraints at state {few}, "
-                f"{found[many].shape[1]} at state {many}: ask for each by itself"
-            )
-        return np.array(found) if found else np.empty((0, 2 * self.nq, 0))
-
-    def _kernel(self, A: Array, slopes: Array, q: ArrayLike, qd: ArrayLike) -> Array:
-        """The tangent of one state."""
-        of_q = A[: self._rows.holonomic]
+        slopes = self._evaluate("constraint_slopes", q, qd, t, None, params)
+        of_q = A[..., : self._rows.holonomic, :]
         whole = np.block([[of_q, np.zeros_like(of_q)], [slopes, A]])
         if not np.isfinite(whole).all():
-            where = state_text(np.asarray(q), np.asarray(qd))
+            k = tuple(np.argwhere(~np.isfinite(whole))[0, : whole.ndim - 2])
+            where = state_text(*(np.asarray(x)[k] for x in (q, qd)))
             raise MotionError(f"at {where}: a constraint's slope is not finite there", "not finite")
-        whole /= np.maximum(np.linalg.norm(whole, axis=1, keepdims=True), 1e-300)
+        whole /= np.maximum(np.linalg.norm(whole, axis=-1, keepdims=True), 1e-300)
         _, sizes, rows = np.linalg.svd(whole)
-        rank = int((sizes > 1e-9 * sizes[0]).sum()) if sizes.size else 0
-        return np.asarray(rows[rank:].T)
+        ranks = (sizes > 1e-9 * sizes[..., :1]).sum(axis=-1)
+        if not ranks.size:
+            return np.empty((0, 2 * self.nq, 0))
+        if np.any(ranks != ranks.flat[0]):
+            few, many = int(np.argmax(ranks)), int(np.argmin(ranks))
+            raise ValueError(
+                f"tangent: {2 * self.nq - ranks[few]} changes keep the constraints at state {few}, "
+                f"{2 * self.nq - ranks[many]} at state {many}: ask for each by itself"
+            )
+        return np.ascontiguousarray(np.swapaxes(rows[..., int(ranks.flat[0]) :, :], -1, -2))
 
     def multipliers(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
@@ -141,8 +131,7 @@ class Constrained(Frames):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
         """The same, nan where there are none: of rows of runs."""
-        shape = (len(self._rows.names),)
-        found: Array = self._evaluate("multipliers", shape, q, qd, t, u, params, None)
+        found: Array = self._evaluate("multipliers", q, qd, t, u, params)
         return found
 
     def reactions(
@@ -168,9 +157,8 @@ class Constrained(Frames):
     def _reactions_by(
         self, multipliers: Array, q: ArrayLike, qd: ArrayLike, t: float, params: Any
     ) -> Array:
-        shape = (len(self._rows.loops), 3 if self._plane else 6)
         each = np.ascontiguousarray(multipliers)
-        found: Array = self._evaluate("reactions", shape, q, qd, t, None, params, None, each)
+        found: Array = self._evaluate("reactions", q, qd, t, None, params, None, each)
         return found
 
     def project(
@@ -197,14 +185,10 @@ class Constrained(Frames):
         self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, held: Sequence[bool]
     ) -> tuple[Array, Array]:
         """The same; held: whether each of q and qd is, or empty."""
-        at, moving = (np.array(x, self.dtype, order="C") for x in self._state(q, qd))
-        flags = self._ffi.new("int[]", [int(x) for x in held]) if held else self._c[2]
-        found = self._lib.project(
-            at.size // self.nq, self._pointer(at), self._pointer(moving), as_number(t, "t"), flags,
-            self._given(None, params)[1],
-        )  # fmt: skip
-        if found & 7:
-            k, said = found >> 3, STATUS[found & 7]
+        at, moving, codes = self._projected_rows(q, qd, t, params, held)
+        if codes.any():
+            k = int(codes.nonzero()[0][0])
+            said = STATUS[codes[k]]
             where = state_text(at.reshape(-1, self.nq)[k], moving.reshape(-1, self.nq)[k])
             kept = [n for n, h in zip(self._states, held, strict=False) if h]
             kept = [n for n in kept if n.removesuffix("_dot") not in self.still]
@@ -214,6 +198,26 @@ class Constrained(Frames):
             )  # fmt: skip
             raise MotionError(f"from {where}: {what}", said)
         return at, moving
+
+    def _projected_rows(
+        self, q: ArrayLike, qd: ArrayLike, t: float, params: Any, held: Sequence[bool]
+    ) -> tuple[Array, Array, Array]:
+        """(q, qd, status): the same, with the status of each state; one that fails stays."""
+        at, moving = (np.array(x, self.dtype, order="C") for x in self._state(q, qd))
+        flags = self._ffi.new("int[]", [int(x) for x in held]) if held else self._c[2]
+        acts, n = StateArguments(self, at.shape[:-1], t, None, params), self.nq
+        codes, first = np.zeros(at.size // n, "i"), 0
+        from_q, from_qd = self._pointer(at), self._pointer(moving)
+        while first < len(codes):
+            now, _, p, own = acts.at(first)
+            found = self._lib.project(
+                len(codes) - first, from_q + n * first, from_qd + n * first, now, flags, p, own
+            )
+            first += found >> 3
+            if found & 7:
+                codes[first] = found & 7
+                first += 1
+        return at, moving, codes
 
     @property
     def _states(self) -> tuple[str, ...]:
@@ -229,16 +233,7 @@ class Constrained(Frames):
         """
         if not self._rows.names:
             return q, qd, None
-        if len(table) == 1:
-            with suppress(MotionError):  # else each by itself
-                return *self._begun(q, qd, t0, table[0]), None
-        q, qd = np.array(q, self.dtype), np.array(qd, self.dtype)
-        codes = np.zeros(len(q), "i")
-        for k, p in enumerate(np.broadcast_to(table, (len(q), table.shape[1]))):
-            try:
-                q[k], qd[k] = self._begun(q[k], qd[k], t0, p)
-            except MotionError as fault:
-                codes[k] = STATUS.index(fault.status)
+        q, qd, codes = self._begun_rows(q, qd, t0, table if len(table) > 1 else table[0])
         return q, qd, codes if codes.any() else None
 
     def _tell(self, run: Any, method: str, work: Any) -> None:
@@ -265,11 +260,30 @@ class Constrained(Frames):
         held = self._rows.held
         if not self._rows.modes or not np.shape(q)[-1:] == np.shape(qd)[-1:] == (self.nq,):
             return self._projected(q, qd, t0, params, held)
-        q = np.array(q, self.dtype)
-        q[..., [at for at, _ in self._rows.modes]] = 1  # where all slides no row of a mode holds
+        q = self._sliding(q)
         return self._projected(
             *self._in_modes(*self._projected(q, qd, t0, params, held)), t0, params, held
         )
+
+    def _begun_rows(
+        self, q: Array, qd: Array, t0: float, params: Any
+    ) -> tuple[Array, Array, Array]:
+        """The same of many states, with the status of each; one that fails stays as given."""
+        held = self._rows.held
+        if not self._rows.modes:
+            return self._projected_rows(q, qd, t0, params, held)
+        found_q, found_qd, first = self._projected_rows(self._sliding(q), qd, t0, params, held)
+        found_q, found_qd = self._in_modes(found_q, found_qd)
+        found_q, found_qd, codes = self._projected_rows(found_q, found_qd, t0, params, held)
+        codes = np.where(first, first, codes)
+        failed = (codes != 0)[:, None]
+        return np.where(failed, q, found_q), np.where(failed, qd, found_qd), codes
+
+    def _sliding(self, q: ArrayLike) -> Array:
+        """q in the modes in which all slides: no row of a mode holds."""
+        q = np.array(q, self.dtype)
+        q[..., [at for at, _ in self._rows.modes]] = 1
+        return q
 
     @property
     def still(self) -> tuple[str, ...]:

@@ -37,13 +37,15 @@ class ConstrainedRun:
     def constraints(self) -> Mapping[str, Array]:
         """What each constraint lacks along the run, (n,), by name: rounding."""
         names = self._model.constraint_names
-        return ByName("constraints", names, self._values("constraints").T if names else ())
+        return ByName(
+            "constraints", names, self._values(self._model.constraints).T if names else ()
+        )
 
     @property
     def multipliers(self) -> Mapping[str, Array]:
         """The multiplier of each constraint along the run, (n,), by name."""
         names = self._model.constraint_names
-        found = self._driven("multipliers", self._model._multipliers).T if names else ()
+        found = self._driven(self._model._multipliers).T if names else ()
         return ByName("multipliers", names, np.ascontiguousarray(found))
 
     @property
@@ -55,9 +57,7 @@ class ConstrainedRun:
         loops = self._model.loops
         if not loops:
             return ByName("reactions", (), ())
-        # their multipliers may depend on the time, by signals or rows, where they do not themselves
-        timed = self._model._timed & {"multipliers", "reactions"}
-        found = self._driven(min(timed, default="reactions"), self._model._reactions)
+        found = self._driven(self._model._reactions)
         return ByName("reactions", loops, np.moveaxis(found, -2, 0))
 
     @property

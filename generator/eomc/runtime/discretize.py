@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy import empty
 
-from .arguments import Array, as_number
-from .functions import for_each, row_times
+from .arguments import Array, StateArguments
+from .slices import slices
 from .status import SAID, STATUS, MotionError, state_text
 from .stepping import Stepping
+
+_STEPS = 20_000  # steps times coordinates cubed in one call, some ms at most
 
 
 def discretize(
@@ -19,8 +20,8 @@ def discretize(
 ) -> tuple[Array, Array]:  # fmt: skip
     """(Phi, Gamma) of a step, or where `hold` is given of so many under inputs that are held.
 
-    q, qd: (nq,) or (n, nq), checked; u, params: of all, or a row for each state.
-    Raises MotionError, ValueError.
+    q, qd: (nq,) or (n, nq), checked; t, u, params: of all, or a row for each state. With u None
+    the signals at the start of the period are held. Raises MotionError, ValueError.
     """
     if not hasattr(model._lib, f"{method}_derivative"):
         raise ValueError(
@@ -30,53 +31,33 @@ def discretize(
     rows, n = q.shape[:-1], model.nq
     Phi = empty((*rows, 2 * n, 2 * n), model.dtype)
     Gamma = empty((*rows, 2 * n, model.nu), model.dtype)
-    times = row_times(t, rows)
-    each = for_each(model, len(q), u, params) if rows else None
-    if times is None and hold is None and each is None:
-        _step(model, method, (Phi, Gamma), q, qd, h, as_number(t, "t"), u, params)
-        return Phi, Gamma
-    for k in np.ndindex(rows):
-        now = as_number(t if times is None else times[k], "t")
-        out, (u, params) = (Phi[k], Gamma[k]), (u, params) if each is None else each[k[0]]
-        if hold is None:
-            _step(model, method, out, q[k], qd[k], h, now, u, params)
-        else:
-            out[0][...], out[1][...] = _period(model, method, q[k], qd[k], h, hold, now, u, params)
-    return Phi, Gamma
-
-
-def _step(
-    model: Stepping, method: str, out: tuple[Array, Array], q: Array, qd: Array, h: float, t: float,
-    u: Any, params: Any,
-) -> None:  # fmt: skip
-    """Fill (Phi, Gamma) of one step from each state."""
-    derivative, status = getattr(model._lib, f"{method}_derivative"), model._ffi.new("int *")
-    Phi, Gamma = (model._pointer(x) if x.size else model._ffi.NULL for x in out)
-    inputs, p = model._given(u, params)
-    count, at, moving = q.size // model.nq, model._pointer(q), model._pointer(qd)
-    done = derivative(count, Phi, Gamma, at, moving, t, h, inputs, p, status)
-    if status[0]:
-        said = STATUS[status[0]]
-        where = state_text(*(x.reshape(-1, model.nq)[done] for x in (q, qd)))
-        what = "a derivative is not finite there" if said == "not finite" else SAID[said]
-        raise MotionError(f"no derivative of a step from t = {t:.9g}, {where}: {what}", said)
-
-
-def _period(
-    model: Stepping, method: str, q: Array, qd: Array, h: float, hold: int, t: float, u: Any,
-    params: Any,
-) -> tuple[Array, Array]:  # fmt: skip
-    """(Phi, Gamma) of `hold` steps from a state: u, or the signals at their start, held."""
-    n, held, K = model.nq, model._inputs(u), None
-    if held is None and model.nu:
-        held = model.signal(q, qd, t, params)
+    K = None
+    if hold is not None and u is None and model.nu:
+        u = model.signal(q, qd, t, params)
         if hasattr(model._lib, "signal_slopes"):
             K = model._feedback(q, qd, None, t, params)
-    Phi, Gamma = np.eye(2 * n, dtype=model.dtype), np.zeros((2 * n, model.nu), model.dtype)
-    for k in range(hold):
-        now = t + k * h
-        A, B = discretize(model, method, q, qd, h, None, now, held, params)
-        Phi, Gamma = A @ Phi, A @ Gamma + B
-        if k + 1 < hold:
-            q, qd = model.step(q, qd, h, now, held, params, method)
+    steps, acts = hold or 1, StateArguments(model, rows, t, u, params)
+    derivative, null = getattr(model._lib, f"{method}_derivative"), model._c[2]
+    to_Phi, to_Gamma, from_q, from_qd = (
+        model._pointer(x) if x.size else null for x in (Phi, Gamma, q, qd)
+    )
+    for k, many in slices(q.size // n, _STEPS // (steps * n**3) + 1):
+        now, held, p, own = acts.at(k)
+        found = derivative(
+            many, to_Phi + 4 * n**2 * k, to_Gamma + 2 * n * model.nu * k if model.nu else null,
+            from_q + n * k, from_qd + n * k, now, h, steps, held, p, own,
+        )  # fmt: skip
+        if found & 7:
+            done, step = divmod(found >> 3, steps)
+            _refuse(q.reshape(-1, n)[k + done], qd.reshape(-1, n)[k + done],
+                    acts.time(k + done), step, STATUS[found & 7])  # fmt: skip
     return (Phi if K is None else Phi + Gamma @ K), Gamma
+
+
+def _refuse(q: Array, qd: Array, t: float, step: int, said: str) -> None:
+    """Raise MotionError for a state from which a step has no derivative; step: how many before."""
+    what = "a derivative is not finite there" if said == "not finite" else SAID[said]
+    later = f" {step} steps later" if step else ""
+    raise MotionError(
+        f"no derivative of a step{later} from t = {t:.9g}, {state_text(q, qd)}: {what}", said
+    )

@@ -60,7 +60,7 @@ class Frames(Functions):
 
         Raises ValueError for a frame that the scene did not ask for.
         """
-        found = self._of("frame_poses", (3 if self._plane else 12,), frame, q, None, t, params)
+        found = self._of("frame_poses", 1, frame, q, None, t, params)
         if self._plane:
             return Pose(found[..., :2], found[..., 2])
         return Pose(found[..., :3], found[..., 3:].reshape(*found.shape[:-1], 3, 3))
@@ -70,7 +70,7 @@ class Frames(Functions):
         params: Parameters = None,
     ) -> Array:  # fmt: skip
         """The twist of a frame, (6,), in the plane (3,): m/s, rad/s."""
-        return self._of("frame_velocities", (self._width,), frame, q, qd, t, params)
+        return self._of("frame_velocities", 1, frame, q, qd, t, params)
 
     def frame_acceleration(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike | None = None, frame: str | None = None,
@@ -82,14 +82,13 @@ class Frames(Functions):
         """
         each = np.zeros(np.shape(q), self.dtype) if qdd is None else qdd
         given = self._like(each, "qdd", (self.nq,), q)
-        return self._of("frame_accelerations", (self._width,), frame, q, qd, t, params, given)
+        return self._of("frame_accelerations", 1, frame, q, qd, t, params, given)
 
     def jacobian(
         self, q: ArrayLike, frame: str | None = None, t: float = 0.0, params: Parameters = None
     ) -> Array:
         """J of a frame, (6, nq), in the plane (3, nq): J qd is its twist."""
-        shape = (self._width, self.nq)
-        return self._of("frame_jacobians", shape, frame, q, None, t, params)
+        return self._of("frame_jacobians", 2, frame, q, None, t, params)
 
     def frame_forces(
         self, q: ArrayLike, wrenches: Mapping[str, ArrayLike] | ArrayLike, t: float = 0.0,
@@ -99,8 +98,10 @@ class Frames(Functions):
 
         wrenches: by frame, (6,) or (n, 6) each, N and N m, in the plane 3; or all, (nf, 6).
         """
-        each = self._wrenches(wrenches, q)
-        return self._call("frame_forces", (self.nq,), q, None, t, params, each)
+        forces: Array = self._evaluate(
+            "frame_forces", q, None, t, None, params, None, self._wrenches(wrenches, q)
+        )
+        return forces
 
     def inverse_dynamics(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike,
@@ -116,15 +117,15 @@ class Frames(Functions):
         if f_ext is not None and not self.frames:
             raise ValueError("f_ext acts at frames: a scene has them by [run] frames = true")
         given = self._like(qdd, "qdd", (self.nq,), q)
-        found = self._call("inverse_dynamics", (self.nq,), q, qd, t, params, given)
+        found: Array = self._evaluate("inverse_dynamics", q, qd, t, None, params, None, given)
         return found if f_ext is None else found - self.frame_forces(q, f_ext, t=t, params=params)
 
     def momentum(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, params: Parameters = None
     ) -> Momentum:
         """Mass, centre of mass and momenta of all bodies that move, rotors of drives aside."""
-        d, turns = (2, 1) if self._plane else (3, 3)
-        x = self._call("momentum", (1 + 2 * d + turns,), q, qd, t, params)
+        d = 2 if self._plane else 3
+        x = self._evaluate("momentum", q, qd, t, None, params)
         angular = x[..., -1] if self._plane else x[..., 7:]
         return Momentum(x[..., 0], x[..., 1 : 1 + d], x[..., 1 + d : 1 + 2 * d], angular)
 
@@ -138,24 +139,17 @@ class Frames(Functions):
     def _width(self) -> int:
         return 3 if self._plane else 6
 
-    def _call(
-        self, name: str, shape: tuple[int, ...], q: ArrayLike, qd: ArrayLike | None, t: float,
-        params: Parameters, each: Array | None = None,
-    ) -> Array:  # fmt: skip
-        found: Array = self._evaluate(name, shape, q, qd, t, None, params, None, each)
-        return found
-
     def _of(
-        self, name: str, shape: tuple[int, ...], frame: str | None, q: ArrayLike,
-        qd: ArrayLike | None, t: float, params: Parameters, each: Array | None = None,
+        self, name: str, axes: int, frame: str | None, q: ArrayLike, qd: ArrayLike | None, t: float,
+        params: Parameters, given: Array | None = None,
     ) -> Array:  # fmt: skip
-        """One frame's part of a function of all."""
+        """One frame's part of a function of all frames, with so many axes for each."""
         if not (frame is None or frame in self.frames):
             raise ValueError(not_one_of("frame", frame, self.frames))
-        found = self._call(name, (len(self.frames), *shape), q, qd, t, params, each)
+        found: Array = self._evaluate(name, q, qd, t, None, params, None, given)
         if frame is None:
             return found
-        one: Array = found.take(self.frames.index(frame), axis=found.ndim - 1 - len(shape))
+        one: Array = found.take(self.frames.index(frame), axis=found.ndim - 1 - axes)
         return one
 
     def _like(self, x: ArrayLike, name: str, shape: tuple[int, ...], q: ArrayLike) -> Array:

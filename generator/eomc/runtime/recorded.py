@@ -102,7 +102,7 @@ class Recorded(ConstrainedRun, Columns):
     def energy(self) -> Array:
         """K + P along the run, (n,), J. What is conserved may be `jacobi` instead."""
         if self._energy is None:
-            self._energy = self._values("energy")
+            self._energy = self._values(self._model.energy)
         return self._energy
 
     @property
@@ -111,7 +111,7 @@ class Recorded(ConstrainedRun, Columns):
 
         Else, as in a frame that is turned, this is what is conserved where there is no power.
         """
-        return self._values("jacobi")
+        return self._values(self._model.jacobi)
 
     @cached_property
     def outputs(self) -> dict[str, Array]:
@@ -122,23 +122,17 @@ class Recorded(ConstrainedRun, Columns):
         model = self._model
         if not model.outputs:
             return {}
-        values = self._driven("outputs", model.output)
+        values = self._driven(model.output)
         return dict(zip(model.outputs, np.ascontiguousarray(values.T), strict=True))
 
-    def _driven(self, name: str, function: Callable[..., Any]) -> Array:
+    def _driven(self, function: Callable[..., Any]) -> Array:
         """What a function of the state and the inputs gives at each row."""
-        if self._u is None or (self._applied is None and self._u.ndim == 1):
-            return self._values(name, function, u=self._u)
-        return np.asarray(function(self.q, self.qd, self.t, self.u, self._params))
+        constant = self._u is None or (self._applied is None and self._u.ndim == 1)
+        return self._values(function, u=self._u if constant else self.u)
 
-    def _values(self, name: str, function: Callable[..., Any] | None = None, **held: Any) -> Array:
-        function = function or getattr(self._model, name)
-        times = self.t if len(self) else [self.t0]
-        values = [
-            np.atleast_1d(function(q, qd, t=float(times[k]), params=self._params, **held))
-            for k, q, qd in self._model._by_time(name, self.t, self.q, self.qd)
-        ]
-        return np.concatenate(values)
+    def _values(self, function: Callable[..., Any], **held: Any) -> Array:
+        """What a function of the state gives at each row, (n, ...)."""
+        return np.asarray(function(self.q, self.qd, t=self.t, params=self._params, **held))
 
     def _even(self) -> Recorded:
         """With rows equally far apart, as many as there are steps, or enough to draw it."""

@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, as_number
 from .constrained import Constrained
-from .drives import drive_forces, driven
+from .drives import Motion, drive_forces, driven
 from .equilibrium import Equilibrium, equilibrium
-from .functions import row_times
 from .starts import started
 
 
@@ -38,11 +37,9 @@ class Statics(Constrained):
         at, moving = self._state(q, qd)
         each = self._like(qdd, "qdd", (self.nq,), at)
         tau, found = np.empty_like(at), np.empty((*at.shape[:-1], len(self._rows.names)), at.dtype)
-        times = row_times(t, at.shape[:-1])
+        motion = Motion.of(self, at, moving, each, force, t, params)
         for k in np.ndindex(at.shape[:-1]):
-            now = as_number(t if times is None else times[k], "t")
-            state = at[k], moving[k], each[k].astype(float)
-            tau[k], found[k] = drive_forces(self, which, state, force[k].astype(float), now, params)
+            tau[k], found[k] = drive_forces(self, which, motion.at(k))
         return tau, found
 
     def equilibrium(

@@ -41,11 +41,10 @@ def report(of: Comparison) -> None:
 
 def _values(of: Comparison, module: Any, name: str, asked: System) -> float:
     """A function of all events beside its formulas, as far as these are the scene's."""
-    model, count = module._model, len(of.system.events)
+    model = module._model
 
     def found(s: State) -> Vector:
-        shape = (count, 2 * model.nq) if name == "jumps" else (count,)
-        args = (name, shape, s.q, s.qd, s.t, s.u, s.params, None)
-        return np.asarray(model._evaluate(*args), float).ravel()[: len(asked.outputs)]
+        values = model._evaluate(name, s.q, s.qd, s.t, s.u, s.params)
+        return np.asarray(values, float).ravel()[: len(asked.outputs)]
 
     return apart(of, module, Formulas(asked), found)

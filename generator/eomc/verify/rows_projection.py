@@ -165,7 +165,7 @@ class Projection:
         told = model._ffi.NULL if flags is None else model._ffi.new("int[]", flags)
         found = model._lib.project(
             1, model._pointer(q), model._pointer(qd), s.t, told,
-            model._pointer(parameters(model, s)),
+            model._pointer(parameters(model, s)), model._c[2],
         )  # fmt: skip
         kept = np.array_equal(before, np.array([q, qd]), equal_nan=True)
         return int(found & 7), kept, replace(s, q=q.astype(float), qd=qd.astype(float))

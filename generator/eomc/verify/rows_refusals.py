@@ -195,7 +195,7 @@ class Refusals:
         p = parameters(model, s)
         found = model._lib.acceleration(
             1, model._pointer(a), model._pointer(q), model._pointer(qd), s.t, model._pointer(u),
-            model._pointer(p),
+            model._pointer(p), model._c[2],
         ) & 7  # fmt: skip
         clean = bool(np.all(a == MARK)) if found else bool(np.all(np.isfinite(a)))
         return found, clean
@@ -336,7 +336,7 @@ class Refusals:
         p = parameters(model, s)
         refused = model._lib.multipliers(
             1, model._pointer(found), model._pointer(q), model._pointer(qd), s.t,
-            model._pointer(u), model._pointer(p),
+            model._pointer(u), model._pointer(p), model._c[2],
         )  # fmt: skip
         return bool(np.all(np.isnan(found) if refused else np.isfinite(found)))
 
@@ -360,16 +360,15 @@ class Refusals:
         """Whether the derivatives are finite, or were not written."""
         model, n = self.model, self.model.nq
         A_q, A_qd, B = (np.full((n, w), MARK, model.dtype) for w in (n, n, max(1, model.nu)))
-        status = model._ffi.new("int *")
         q, qd = (np.array(x, model.dtype) for x in (s.q, s.qd))
         p = parameters(model, s)
-        model._lib.linearization(
+        found = model._lib.linearization(
             1, *(model._pointer(x) for x in (A_q, A_qd, B, q, qd)), s.t,
             model._pointer(None if s.u is None else np.array(s.u, model.dtype)),
-            model._pointer(p), status,
+            model._pointer(p), model._c[2],
         )  # fmt: skip
         written = np.hstack([A_q, A_qd, *([B] if model.nu else [])])
-        return bool(np.all(written == MARK) if status[0] else np.all(np.isfinite(written)))
+        return bool(np.all(written == MARK) if found & 7 else np.all(np.isfinite(written)))
 
     def overflow(self, method: str) -> float:
         """Steps so long that the state leaves the finite numbers, or no stages are found."""

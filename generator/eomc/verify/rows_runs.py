@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from eomc.integrators.tableaux import METHODS
+from eomc.model.system import System, t
 from eomc.verify import derivatives
 from eomc.verify.comparison import Comparison
 from eomc.verify.finding import Finding, largest
@@ -105,6 +106,17 @@ def drive(
     return Driven(rows, done, status)
 
 
+def _reads_time(system: System) -> bool:
+    """Whether a formula of a system depends on the time by itself."""
+    parts = (
+        system.kinetic, system.potential, system.dissipation, *system.forces,
+        *(x for pair in system.applied for x in pair), *(i.signal for i in system.inputs),
+        *(x for _, x in system.definitions), *(o.formula for o in system.outputs),
+        *(c.formula for c in system.constraints),
+    )  # fmt: skip
+    return any(t in x.free_symbols for x in parts)
+
+
 class Runs:
     """The rows."""
 
@@ -131,7 +143,7 @@ class Runs:
             row("short steps", SHORT_LIMIT, unit, self.short)
         if np.any(self.sampler.angles):
             row("sines around the circle", SINES, rounding, self.sines)
-        if np.any(self.sampler.angles) or self.model._timed:
+        if np.any(self.sampler.angles) or _reads_time(self.check.system):
             row("angles far out", self.limit, f"units, of angles of {TURNS:.3g}", self.far)
         if self.model.nu and self.check.methods[0] == "rk4":
             row("inputs row by row", self.limit, rounding, self.inputs)
@@ -231,7 +243,7 @@ class Runs:
             s = e.state
             turns = 2 * np.pi * np.round(TURNS / 2 / np.pi) * self.sampler.angles
             held = bool(self.check.system.constraints)  # which do not hold at another time
-            t = LATE if self.model._timed and not held else 0.0
+            t = LATE if _reads_time(self.check.system) and not held else 0.0
             at = replace(s, q=s.q + turns * self.random.choice([-1, 1], len(s.q)), t=s.t + t)
             if held and not self.holds(at):
                 continue

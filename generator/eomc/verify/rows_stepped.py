@@ -85,11 +85,7 @@ def _steps(run: Any) -> Iterator[tuple[int, float, Vector]]:
 def _missing(of: Comparison, module: Any, run: Any, s: State) -> bool:
     """Whether what an event watches comes from clearly one side to the other, which is not told."""
     events = of.system.events
-    rows = zip(run.t, run.q, run.qd, strict=True)
-    values = np.array([
-        module._model._evaluate("events", (len(events),), q, qd, float(t), s.u, s.params, None)
-        for t, q, qd in rows
-    ])  # fmt: skip
+    values = module._model._evaluate("events", run.q, run.qd, run.t, s.u, s.params)
     for event, g in zip(events, values.T, strict=True):
         sides = np.where(np.abs(g) > CLEAR * np.abs(g).max(), np.sign(g), 0)
         told = run.events[event.name].t
