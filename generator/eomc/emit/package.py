@@ -194,7 +194,6 @@ def binding(target: Target) -> Binding:
         adaptive=_adaptive(target),
         parameter_count=len(target.system.parameters),
         input_count=len(target.system.inputs),
-        derivative_columns=max(2 * len(target.system.coordinates), len(target.system.inputs)),
     )
 
 

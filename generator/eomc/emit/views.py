@@ -167,10 +167,7 @@ class BoundAdaptive:
 
 @dataclass(frozen=True)
 class Binding:
-    """python/binding.c.jinja. project, linearization: their calls, if there are.
-
-    derivative_columns: of the wider of Phi and Gamma.
-    """
+    """python/binding.c.jinja. project, linearization: their calls, if there are."""
 
     TEMPLATE: ClassVar[str] = "python/binding.c"
     prefix: str
@@ -185,7 +182,6 @@ class Binding:
     adaptive: BoundAdaptive | None
     parameter_count: int
     input_count: int
-    derivative_columns: int
 
 
 @dataclass(frozen=True)

@@ -88,21 +88,28 @@ class Values:
         """A function at all rows, (batch, n, ...), nan where these are; held: inputs, (..., nu)."""
         count, n = self.q.shape[:2]
         found = np.full((count, n, *shape), np.nan, self._model.dtype)
-        good: Any = np.isfinite(self.q).all(axis=-1) & np.isfinite(self.qd).all(axis=-1)
         t, each = np.broadcast_to(self.t, (count, n)), {"params": self._params[:, None]}
         each |= held or {}
         alike = {name: x.size == x.shape[-1] for name, x in each.items()}
         for first in range(0, count, many := max(1, _ROWS // max(n, 1))):
             at = slice(first, first + many)
-            here = good[at]
+            q, qd = self.q[at], self.qd[at]
+            finite = np.isfinite(q).all(axis=-1) & np.isfinite(qd).all(axis=-1)
+            here: Any = ... if finite.all() else finite
             given = {
                 name: x[0, 0]
                 if alike[name]
-                else np.broadcast_to(x, (count, n, x.shape[-1]))[at][here]
+                else _rows(np.broadcast_to(x, (count, n, x.shape[-1]))[at][here])
                 for name, x in each.items()
             }
-            found[at][here] = function(self.q[at][here], self.qd[at][here], t=t[at][here], **given)
+            values = function(_rows(q[here]), _rows(qd[here]), t=t[at][here].ravel(), **given)
+            found[at][here] = values.reshape(found[at][here].shape)
         return found
+
+
+def _rows(x: Array) -> Array:
+    """(..., m) as rows, (n, m)."""
+    return x.reshape(-1, x.shape[-1]) if x.shape[-1] else x.reshape(int(np.prod(x.shape[:-1])), 0)
 
 
 def _by_name(what: str, names: Sequence[str], rows: Callable[[], Array]) -> ByName:

@@ -213,11 +213,13 @@ class Functions(Arguments):
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None, params: Parameters = None
     ) -> Array:
         """The inputs as they act at a state, (nu,): u, or the scene's signals, within limits."""
+        if self.has_limits:
+            return np.asarray(self._evaluate("applied", q, qd, t, u, params))
         at, moving = self._state(q, qd)
         rows = at.shape[:-1]
         held = StateArguments(self, rows, t, u, params).u_rows
         given = self.signal(at, moving, t, params) if held is None else held
-        return self._within(np.broadcast_to(given, (*rows, self.nu)), params)
+        return np.asarray(np.broadcast_to(given, (*rows, self.nu)))
 
     def _within(self, u: Array, params: Any) -> Array:
         """Inputs (..., nu) within their limits: what becomes of the largest and least numbers.
