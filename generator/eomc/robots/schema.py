@@ -7,6 +7,7 @@ A format is an outline, a line for each element, indented by a blank a level:
      safety_controller: *
 
 `*` stands for whatever the element holds: the reader skips it as a whole, and reports it itself.
+`+` stands for any child elements, of which the attributes of the element itself are checked alone.
 `@name` stands for a group of attributes that several elements share.
 """
 
@@ -23,11 +24,15 @@ MAX_ENTRIES = 40  # in one line of a report, so that a hostile file prints no bo
 
 @dataclass(frozen=True)
 class Element:
-    """The attributes and child elements that an element may have. skipped: not looked into."""
+    """The attributes and child elements that an element may have. skipped: not looked into.
+
+    is_open: any child elements may stand in it; they are not looked into.
+    """
 
     attributes: frozenset[str] = frozenset()
     children: dict[str, Element] = field(default_factory=dict)
     skipped: bool = False
+    is_open: bool = False
 
 
 def parse(outline: str, groups: Mapping[str, str]) -> Element:
@@ -38,7 +43,7 @@ def parse(outline: str, groups: Mapping[str, str]) -> Element:
         kind, _, rest = line.strip().partition(":")
         words = rest.split()
         names = [n for w in words for n in (groups[w[1:]].split() if w[0] == "@" else [w])]
-        element = Element(frozenset(names) - {"*"}, skipped="*" in names)
+        element = Element(frozenset(names) - {"*", "+"}, skipped="*" in names, is_open="+" in names)
         depth = len(line) - len(line.lstrip())
         del stack[depth + 1 :]
         stack[-1].children[kind] = element
@@ -69,7 +74,7 @@ def strangers(root: Tag, element: Element, of: str) -> tuple[str, ...]:
             note("text", f"<{tag.kind}>", mine or around)
         below_it = f" in {tag.kind}{mine or around}" if tag is not root else ""
         inner: list[tuple[Tag, Element, str]] = []
-        for child in tag.children:
+        for child in [] if known.is_open else tag.children:
             below = known.children.get(child.kind)
             if below is None:
                 note("elements", f"{child.kind} in {tag.kind}", mine or around)

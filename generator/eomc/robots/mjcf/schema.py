@@ -46,7 +46,7 @@ plugin: @drive @general plugin instance
 """  # noqa: E501
 ACTUATORS = frozenset(x.split(":")[0] for x in _ACTUATORS.strip().splitlines() if x[0] != " ")
 
-# Sections and elements with * say nothing about the motion, or are reported as a whole.
+# Sections and elements with * and + say nothing about the motion, or are reported as a whole.
 _OUTLINE = f"""
 mujoco: model
  compiler: alignfree angle assetdir autolimits balanceinertia boundinertia boundmass conflict convexhull coordinate discardvisual eulerseq exactmeshinertia fitaabb fusestatic inertiafromgeom inertiagrouprange meshdir passthrough savecanonical savecompiled saveinertial settotalmass strippath texturedir usethread
@@ -55,13 +55,13 @@ mujoco: model
   flag: actuation autoreset clampctrl constraint contact damper diagexact energy equality eulerdamp filterparent frictionloss fwdinv gravity invdiscrete ipc island limit midphase multiccd nativeccd override passive refsafe sensor sensornoise sleep speculative spring warmstart
  size: *
  statistic: *
- visual: *
- extension: *
- asset: *
- deformable: *
- contact: *
- sensor: *
- custom: *
+ visual: +
+ extension: +
+ asset: +
+ deformable: +
+ contact: +
+ sensor: +
+ custom: +
  default: class
   mesh: *
   texture: *
