@@ -98,7 +98,29 @@ x, x_dot, u = sympy.symbols("x x_dot u")
         (("a", {x: np.nan}, x_dot**2), {}, "start of x: must be a finite number"),
         (("a", [x], None), {}, "kinetic: None is not an expression"),
         (("a", [x], x_dot**2, x > 0), {}, "potential: x > 0 is not an expression"),
-        (("a", [x], x_dot**2, sympy.erf(x)), {}, "potential: erf can't be used: write tanh"),
+        (("a", [x], x_dot**2, sympy.erf(x)), {}, "potential: erf can't be used; functions are"),
+        (("a", [x], x_dot**2, u * x), {"inputs": [u]}, "potential: u is an input, and an energy"),
+        (("a", [x], u * x_dot**2), {"inputs": [u]}, "kinetic: u is an input, and an energy can't"),
+        (
+            ("a", [x], "d*x_dot**2"),
+            {"inputs": [u], "definitions": {"c": 2 * u, "d": "1 + c"}},
+            "kinetic: u is an input, and an energy can't depend on inputs",
+        ),
+        (
+            ("a", [x], x_dot**2),
+            {"inputs": [u], "dissipation": u * x_dot**2},
+            "dissipation: u is an input, and an energy can't depend on inputs",
+        ),
+        (
+            ("a", [x], x_dot**2),
+            {"inputs": {"F": "c", "u": 1}, "definitions": {"c": "2*u"}},
+            "signal of F: u is an input, and a signal can't depend on inputs",
+        ),
+        (
+            ("a", [x], x_dot**2),
+            {"inputs": {"F": "F"}},
+            "signal of F: F is an input, and a signal can't depend on inputs",
+        ),
         (("a", [x], x_dot**2, sympy.besselj(0, x)), {}, "besselj can't be used; functions are sin"),
         (("a", [x], x_dot**2), {"forces": {x: sympy.ceiling(x)}}, "force on x: ceiling can't"),
         (("a", [x], x_dot**2), {"forces": {x: sympy.Symbol("t")}}, r"not the time: write eomc\."),
@@ -163,6 +185,7 @@ def test_what_is_wrong_is_said(
     [
         ("method", "did you mean 'methods'"),
         ("V", "did you mean 'potential'"),
+        ("lagrangian", "kinetic=K and potential=P"),
         ("input", "did you mean 'inputs'"),
         ("gravity", "it has name, coordinates, kinetic, potential, parameters, .*, friction$"),
     ],
@@ -176,16 +199,17 @@ def test_names_and_formulas_as_text() -> None:
     """The same system as from symbols, and both may be mixed."""
     made = System.make(
         "texts", {"x": ("pi/2", 0.1), "theta": 0}, "m*x_dot**2/2 + m*dot(y)**2/2", "m*g*y + m*z",
-        parameters={"m": "1/2", "g": 9.81}, definitions={"y": "l*cos(theta)", "z": "abs(x)"},
-        inputs={"F": "sin(2*t)", "l": 2}, forces={"x": "F - max(x, 0)", "theta": 0},
+        parameters={"m": "1/2", "g": 9.81, "l": 2},
+        definitions={"y": "l*cos(theta)", "z": "abs(x)"},
+        inputs={"F": "sin(2*t)"}, forces={"x": "F - max(x, 0)", "theta": 0},
         units={"x": "m"}, dissipation="x_dot**2",
     )  # fmt: skip
     x, theta, m, g, y, z, F, l = sympy.symbols("x theta m g y z F l")  # noqa: E741
     x_dot, t = sympy.Symbol("x_dot"), sympy.Symbol("t", real=True)
     same = System.make(
         "texts", {x: (sympy.pi / 2, 0.1), theta: 0}, m * x_dot**2 / 2 + m * dot(y) ** 2 / 2,
-        m * g * y + m * z, parameters={m: 0.5, g: 9.81},
-        definitions={y: l * sympy.cos(theta), z: sympy.Abs(x)}, inputs={F: sympy.sin(2 * t), l: 2},
+        m * g * y + m * z, parameters={m: 0.5, g: 9.81, l: 2},
+        definitions={y: l * sympy.cos(theta), z: sympy.Abs(x)}, inputs={F: sympy.sin(2 * t)},
         forces={x: F - sympy.Max(x, 0)}, units={x: "m"}, dissipation=x_dot**2,
     )  # fmt: skip
     assert made == same and made.digest == same.digest

@@ -231,6 +231,13 @@ def test_limits_left_out_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert compared(LIMITED, 12)["power"] > 1e3 * rows_bodies.LIMIT
 
 
+def test_terms_linear_in_the_velocities_are_no_energy() -> None:
+    potential = '[energy]\npotential = "a*b + 0.3*arm_x*dot(arm_y) + way"\n'
+    text = LIMITED.replace("[forces]", f'way = "0.2*a_dot*sin(b)"\n{potential}[forces]')
+    off = compared(text, 4)
+    assert max(off.values()) < rows_bodies.LIMIT, off
+
+
 def test_quaternions_are_scipys() -> None:
     random = np.random.default_rng(3)
     a, b, x = random.normal(size=(5, 4)), random.normal(size=(5, 4)), random.normal(size=(5, 3))

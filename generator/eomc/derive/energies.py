@@ -14,11 +14,12 @@ from eomc.model.system import System, dot, symbol, t
 
 @dataclass
 class Energies:
-    """K, P, R and Q on the tape, with the points y_k and their velocities w_k = dot(y_k)."""
+    """K, P, a.qd, R and Q on the tape, with the points y_k and their velocities w_k = dot(y_k)."""
 
     tape: Tape
     kinetic: Expr
     potential: Expr
+    linear_potential: Expr
     dissipation: Expr
     forces: list[Expr]
     signals: list[Expr]
@@ -73,7 +74,8 @@ def on_tape(
 
     forces = system.forces or (S.Zero,) * len(system.coordinates)
     applied = [(dot(y), force) for y, force in system.applied]
-    ends = [kinetic, potential, system.dissipation, *forces, *(i.signal for i in system.inputs)]
+    ends = [kinetic, potential, system.linear_potential, system.dissipation, *forces]
+    ends += [i.signal for i in system.inputs]
     ends += [e for pair in applied for e in pair]
     ends += [row.formula for row in system.constraints]
     for defined, expr in needed(system.definitions, ends):
@@ -82,6 +84,7 @@ def on_tape(
         tape,
         value(kinetic),
         value(potential),
+        value(system.linear_potential),
         value(system.dissipation),
         [value(force) for force in forces],
         [value(i.signal) for i in system.inputs],

@@ -65,14 +65,16 @@ def equations(system: System, e: Energies, motion: Motion) -> Equations:
     euler = dict(zip(qd, qd, strict=True))
     jacobi = None
     if not motion.quadratic:
-        (twice,) = tape.forward([e.kinetic], euler)
-        jacobi = add(twice, -e.kinetic, e.potential)
-    explicit = tape.forward([e.kinetic, e.potential], {t: S.One})
+        twice, once = tape.forward([e.kinetic, e.linear_potential], euler)
+        jacobi = add(twice, -once, -e.kinetic, e.potential, e.linear_potential)
+        if e.linear_potential != 0 and jacobi == add(e.kinetic, e.potential):
+            jacobi = None
+    explicit = tape.forward([e.kinetic, e.potential, e.linear_potential], {t: S.One})
     (lost,) = tape.forward([e.dissipation], euler)
     works = [tape.define(force * v) for force, v in zip(e.forces, qd, strict=True)]
     moved = tape.forward([v for v, _ in e.applied], euler)
     works += [tape.define(f * v) for v, (_, f) in zip(moved, e.applied, strict=True)]
-    power = add(*works, -lost, explicit[1], -explicit[0])
+    power = add(*works, -lost, explicit[1], explicit[2], -explicit[0])
     return Equations(
         **vars(motion),
         tape=tape,

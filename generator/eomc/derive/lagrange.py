@@ -222,16 +222,17 @@ def inertial_forces(
 def _momenta(
     system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
 ) -> tuple[list[Expr], list[Expr]]:
-    """dF/dqd and dF/dw, and their rates; velocities without an acceleration are steady."""
+    """dL/dqd and dL/dw, and their rates; velocities without an acceleration are steady."""
     rates: dict[Symbol, Expr] = {**system.rates, t: S.One, **accelerations}
     wanted = [*system.qd, *e.points]
-    momenta = e.tape.gradient([(e.kinetic, S.One)], wanted, frozenset(e.points))
+    lagrangian = [(e.kinetic, S.One), (e.linear_potential, S.NegativeOne)]
+    momenta = e.tape.gradient(lagrangian, wanted, frozenset(e.points))
     return momenta, e.tape.forward(momenta, rates)
 
 
 def _lagrangian(e: Energies) -> list[tuple[Expr, Expr]]:
     """Seeds of the gradient of -L."""
-    return [(e.kinetic, S.NegativeOne), (e.potential, S.One)]
+    return [(e.kinetic, S.NegativeOne), (e.potential, S.One), (e.linear_potential, S.One)]
 
 
 def _lagrange(system: System, e: Energies) -> Motion:
@@ -261,7 +262,7 @@ def _lagrange(system: System, e: Energies) -> Motion:
     D = _mass_matrix(system, e, [*p, *p_w], projected)
 
     at_rest = dict.fromkeys(qd, S.Zero)
-    driven = t in tape.leaves_of([e.kinetic])
+    driven = t in tape.leaves_of([e.kinetic, e.linear_potential])
     quadratic = all(x == 0 for x in tape.substitute([e.kinetic, *p, *p_w], at_rest)) and not driven
     g = tape.gradient([(e.potential, S.One)], q) if quadratic else tape.substitute(bias, at_rest)
 
@@ -313,7 +314,7 @@ def _notes(
     notes = []
     if any(x != 0 for x in tape.substitute([*p, *p_w], at_rest)):
         notes.append(
-            "The part of K that is linear in the velocities, a(q, t).qd, gives gyroscopic forces: "
+            "The part of L that is linear in the velocities, a(q, t).qd, gives gyroscopic forces: "
             "its skew matrix is in C, da/dt in g."
         )
     if tape.substitute([e.kinetic], at_rest) != [S.Zero]:

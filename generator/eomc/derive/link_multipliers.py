@@ -79,6 +79,8 @@ def solution(system: System) -> Solution:
         raise UnsuitedError(f"{len(speeds)} velocities in K, more than {most}")
     if system.applied:
         raise UnsuitedError("forces at points")
+    if system.linear_potential != 0:
+        raise UnsuitedError("a potential with velocities")
     if system.discrete:
         raise UnsuitedError("parameters that jumps set")
     return _Links(system, on_tape(system, system.kinetic, system.potential)).solution()

@@ -17,7 +17,7 @@ def corners(system: System, kinds: tuple[Any, ...] = KINDS) -> str:
     """The functions in the scene that jump or bend, by name; "" where all is smooth."""
     s = system
     exprs = (
-        *(s.kinetic, s.potential, s.dissipation, *s.forces),
+        *(s.kinetic, s.potential, s.linear_potential, s.dissipation, *s.forces),
         *(e for x in s.applied for e in x),
         *(e for _, e in s.definitions),
         *(i.signal for i in s.inputs),

@@ -11,6 +11,7 @@ from eomc.base.errors import Problem, SceneError
 from eomc.model import algebra, constraints, growth, limits
 from eomc.model.crossing import crossing
 from eomc.model.discrete import discrete
+from eomc.model.generalized_potential import NotLinearError, split
 from eomc.model.loops import Closed
 from eomc.model.multibody import Builder, Terms
 from eomc.model.sticking import Friction, sticking
@@ -82,6 +83,19 @@ class _Formulas:
             builder.add_forces()
             made += builder.terms.later
         return made, builder.terms if builder else Terms()
+
+    def potential(self, definitions: Sequence[tuple[Symbol, Expr]]) -> tuple[Expr, Expr]:
+        """The potential energy of [energy], and what is linear in the velocities beside it."""
+        key, formula = "energy.potential", self.scene.potential
+        whole = self.value(key, formula)
+        if self.problems:  # a formula without a value is 0
+            return whole, sympy.S.Zero
+        velocities = [symbol(f"{c.name}_dot") for c in self.scene.coordinates]
+        try:
+            return split(whole, definitions, velocities)
+        except NotLinearError as fault:
+            self.problems.append(self.scene.problem(key, str(fault), formula))
+            return whole, sympy.S.Zero
 
     def inputs(self) -> Iterator[Input]:
         """The inputs with their signals and limits."""
@@ -201,7 +215,7 @@ def from_scene(scene: Scene) -> System:
     value = made.value
     definitions, more = made.definitions()
     kinetic = value("energy.kinetic", scene.kinetic)
-    potential = value("energy.potential", scene.potential)
+    potential, linear_potential = made.potential(definitions)
     start, rate = scene.start()
     forces = {name: value(f"forces.{name}", formula) for name, formula in scene.forces.items()}
     zero = sympy.S.Zero
@@ -219,6 +233,7 @@ def from_scene(scene: Scene) -> System:
         coordinates=coordinates,
         kinetic=kinetic_energy,
         potential=potential_energy,
+        linear_potential=linear_potential,
         dissipation=value("energy.dissipation", scene.dissipation) + more.dissipation,
         forces=tuple(
             sympy.Add(*(some.get(c.name, zero) for some in (more.forces, forces, rubs)))

@@ -15,6 +15,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError, Problem
 from eomc.model import constraints, given
 from eomc.model.algebra import UNDEFINED
+from eomc.model.generalized_potential import NotLinearError, split
 from eomc.model.mechanics import Made
 from eomc.model.pictured import pictured
 from eomc.model.pictured import text as formula_text
@@ -40,6 +41,12 @@ _OF_NUMBERS = (
     "a parameter's value is made of numbers; what depends on other parameters is a definition"
 )
 Ends = tuple[Expr | None, ...]  # the least and the largest value of an input
+
+
+def _input_in(expr: Expr, definitions: Sequence[tuple[Symbol, Expr]], inputs: Iterable[str]) -> str:
+    """The first input by name that an expression depends on, through definitions too, or ""."""
+    uses = expr.free_symbols.union(*(e.free_symbols for _, e in needed(definitions, [expr])))
+    return min((i for i in inputs if symbol(i) in uses), default="")
 
 
 class Maker:
@@ -159,10 +166,10 @@ class Maker:
         if picture is not None:
             names = given_inputs.values()
             drawn, drawn_text = pictured(picture, expression, made, declared, names, ordered)
-        given_energies = {"kinetic": kinetic, "potential": potential, "dissipation": dissipation}
-        energies = {role: expression(energy, role) for role, energy in given_energies.items()}
-        for role, energy in energies.items():
-            given.check_smooth(energy, role, dict(ordered), self.fixed.keys(), f"the {role} energy")
+        energies = self._energies(
+            {"kinetic": kinetic, "potential": potential, "dissipation": dissipation},
+            ordered, [c.qd for c in made], given_inputs.values(),
+        )  # fmt: skip
         made_of: dict[str, Any] = {
             "name": self.name,
             "coordinates": tuple(made),
@@ -171,7 +178,7 @@ class Maker:
                 expression(forces.get(given.name_of(c), 0), f"force on {c}") for c in starts
             ),
             "parameters": tuple(declared),
-            "inputs": tuple(self._inputs(pending, given_inputs, units, ends)),
+            "inputs": tuple(self._inputs(pending, given_inputs, units, ends, ordered)),
             "definitions": tuple(ordered),
             **self._constraints(rows, made, ordered, given_inputs.values(), units),
             "events": tuple(self._events(events, starts, declared)),
@@ -189,6 +196,24 @@ class Maker:
         return of(
             **made_of, digest=digest, renamed=tuple(self.renamed), pictured=drawn, own_symbols=own
         )
+
+    def _energies(
+        self, energies: Mapping[str, Any], definitions: Sequence[tuple[Symbol, Expr]],
+        velocities: Sequence[Symbol], inputs: Iterable[str],
+    ) -> dict[str, Expr]:  # fmt: skip
+        """The energies by their fields of the system; the potential in its parts."""
+        made = {role: self._expression(energy, role) for role, energy in energies.items()}
+        for role, energy in made.items():
+            if held := _input_in(energy, definitions, inputs):
+                why = f"{held} is an input, and an energy can't depend on inputs"
+                raise given.fault(role, f"{why}: let it act through forces")
+            what = f"the {role} energy"
+            given.check_smooth(energy, role, dict(definitions), self.fixed.keys(), what)
+        try:
+            made["potential"], linear = split(made["potential"], definitions, velocities)
+        except NotLinearError as why:
+            raise given.fault("potential", str(why)) from None
+        return made if linear == 0 else {**made, "linear_potential": linear}
 
     def _coordinate(self, one: Any, units: Mapping[Any, str]) -> Coordinate:
         """A coordinate, whose symbols are known from here on."""
@@ -269,9 +294,8 @@ class Maker:
                 raise EomcError(f"System.make: {role}: the name '{name}' is taken already")
             expr = self._expression(formula, role)
             given.check_smooth(expr, role, dict(ordered), self.fixed.keys(), "it")
-            uses = expr.free_symbols.union(*(e.free_symbols for _, e in needed(ordered, [expr])))
-            if held := sorted(s.name for s in uses & {symbol(i) for i in inputs}):
-                why = f"{held[0]} is an input, whose rate nobody knows: let it act through forces"
+            if held := _input_in(expr, ordered, inputs):
+                why = f"{held} is an input, whose rate is not known: let it act through forces"
                 raise given.fault(role, why)
             found.append(Constraint(name, expr, unit=units.get(name, "")))
 
@@ -293,11 +317,14 @@ class Maker:
 
     def _inputs(
         self, signals: Mapping[Any, Any], used: Mapping[Any, str], units: Mapping[Any, str],
-        limits: Mapping[str, Ends],
+        limits: Mapping[str, Ends], definitions: Sequence[tuple[Symbol, Expr]],
     ) -> Iterator[Input]:  # fmt: skip
         """The inputs by the names that are used."""
         for one, signal in signals.items():
-            name, value = given.name_of(one), self._expression(signal, f"signal of {one}")
+            name, role = given.name_of(one), f"signal of {one}"
+            value = self._expression(signal, role)
+            if held := _input_in(value, definitions, used.values()):
+                raise given.fault(role, f"{held} is an input, and a signal can't depend on inputs")
             ends = limits.get(name, (None, None))
             yield Input(used[one], units.get(name, ""), value, limits=ends)
 

@@ -29,7 +29,7 @@ _KNOWN = (sympy.Add, sympy.Mul, sympy.Pow, Symbol, sympy.Number, sympy.NumberSym
 _INSTEAD = {
     "asinh": "log(x + sqrt(x**2 + 1))",
     "acosh": "log(x + sqrt(x**2 - 1))", "atanh": "log((1 + x)/(1 - x))/2", "acot": "atan(1/x)",
-    "ITE": "Heaviside(x), Min or Max", "erf": "tanh(x)",
+    "ITE": "Heaviside(x), Min or Max",
     "floor": "a smooth function", "ceiling": "a smooth function", "Mod": "a smooth function",
     "Integral": "its value, by .doit()", "Sum": "its terms, by .doit()",
     "Product": "its factors, by .doit()", "sinc": "sin(x)/x",
@@ -52,16 +52,24 @@ def called(name: object, role: str) -> str:
 
 # what scenes, runs and newcomers call the arguments of System.make
 _CALLED = {
-    "method": "methods", "start": "coordinates", "L": "kinetic", "lagrangian": "kinetic",
-    "Lagrangian": "kinetic", "K": "kinetic", "T": "kinetic", "P": "potential", "V": "potential",
-    "params": "parameters", "loads": "forces", "tol": "tolerance", "event": "events",
+    "method": "methods", "start": "coordinates", "K": "kinetic", "T": "kinetic", "P": "potential",
+    "V": "potential", "params": "parameters", "loads": "forces", "tol": "tolerance",
+    "event": "events",
 }  # fmt: skip
+
+
+LAGRANGIAN = (
+    "give the Lagrangian L = K - P as kinetic=K and potential=P, where the potential can have "
+    "terms linear in the velocities"
+)
 
 
 def check_arguments(unknown: Iterable[str], known: Iterable[str]) -> None:
     """A TypeError where System.make has not such an argument, with what may be meant."""
     for name in unknown:
         known = [*known]
+        if name in ("L", "lagrangian", "Lagrangian"):
+            raise TypeError(f"System.make has no argument '{name}': {LAGRANGIAN}")
         near = formulas.suggest(_CALLED.get(name, name), known)
         raise TypeError(
             f"System.make has no argument '{name}'{near or ': it has ' + ', '.join(known)}"

@@ -33,28 +33,31 @@ LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision
 
 @dataclass(frozen=True)
 class Mechanics:
-    """d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, over named definitions.
+    """d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - P - a.qd, over named definitions.
 
     `definitions` are (symbol, expression) pairs, each over the symbols before it, t included;
-    `dot(e)` stands for de/dt. `forces` holds Q, one expression a coordinate; to it come the forces
-    F that are `applied` at positions y, pairs (y, F), each with F dy/dq. `constraints`: what is
-    zero, holonomic ones first; with A their derivatives along q (along qd, where not holonomic) and
-    multipliers lambda, A^T lambda stands beside Q; `reactions` are of the loops. `tree`: the bodies
-    that are held by joints, whose energies are part of K and P. `frames`: of bodies and points, in
-    space or in the `plane`. `digest` names what the system was
-    made from; `renamed` says which names C could not bear: (given, used) pairs. `scene`: what it
-    was read from, where it was. `pictured`: where it was made in Python with a picture, a scene of
-    its names and that alone. `closure`: what its constraints leave, once its start is assembled.
-    `modes`: of friction that sticks, the last coordinates. `discrete`: coordinates before them that
-    jumps alone change, which no derivative is taken along. `again`: `make` with what made it; other
-    arguments take the place of those. `own_symbols`: the symbols, functions of time and their
-    derivatives that the user gave to `make`, by the names that they have here.
+    `dot(e)` stands for de/dt. `linear_potential` is a(q, t).qd, what a generalized potential has
+    besides P (generalized_potential.py); it is no part of the energy. `forces` holds Q, one
+    expression a coordinate; to it come the forces F that are `applied` at positions y, pairs (y,
+    F), each with F dy/dq. `constraints`: what is zero, holonomic ones first; with A their
+    derivatives along q (along qd, where not holonomic) and multipliers lambda, A^T lambda stands
+    beside Q; `reactions` are of the loops. `tree`: the bodies that are held by joints, whose
+    energies are part of K and P. `frames`: of bodies and points, in space or in the `plane`.
+    `digest` names what the system was made from; `renamed` says which names C could not bear:
+    (given, used) pairs. `scene`: what it was read from, where it was. `pictured`: where it was made
+    in Python with a picture, a scene of its names and that alone. `closure`: what its constraints
+    leave, once its start is assembled. `modes`: of friction that sticks, the last coordinates.
+    `discrete`: coordinates before them that jumps alone change, which no derivative is taken along.
+    `again`: `make` with what made it; other arguments take the place of those. `own_symbols`: the
+    symbols, functions of time and their derivatives that the user gave to `make`, by the names that
+    they have here.
     """
 
     name: str
     coordinates: tuple[Coordinate, ...]
     kinetic: Expr
     potential: Expr = sympy.S.Zero
+    linear_potential: Expr = sympy.S.Zero
     dissipation: Expr = sympy.S.Zero
     forces: tuple[Expr, ...] = ()
     parameters: tuple[Parameter, ...] = ()
@@ -174,6 +177,7 @@ class Mechanics:
             *((f"definitions.{s}", e) for s, e in self.definitions),
             ("energy.kinetic", self.kinetic),
             ("energy.potential", self.potential),
+            ("energy.potential", self.linear_potential),
             ("energy.dissipation", self.dissipation),
             *((f"forces.{c.name}", e) for c, e in zip(self.coordinates, self.forces, strict=True)),
             *((f"inputs.{i.name}.signal", i.signal) for i in self.inputs),

@@ -47,7 +47,7 @@ __all__ = [
 
 
 class System(Mechanics):
-    """d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, made of a scene or, by `make`, of expressions.
+    """d/dt dL/dqd - dL/dq + dR/dqd = Q, made of a scene or, by `make`, of expressions.
 
     Its fields are those of `Mechanics`.
     """
@@ -68,7 +68,7 @@ class System(Mechanics):
         cls,
         name: str,
         coordinates: Sequence[Any] | Mapping[Any, Any],
-        kinetic: Any,
+        kinetic: Any = None,
         potential: Any = 0,
         *,
         parameters: Mapping[Any, float] | None = None,
@@ -102,7 +102,9 @@ class System(Mechanics):
         have them for expressions. With plain symbols the velocity of `theta` is the symbol
         `theta_dot`; with dynamicsymbols it is `theta.diff()`. parameters, inputs (to their default
         signal) and definitions are mappings from symbols, outputs from names; `theta_ddot`, or the
-        second derivative of a dynamicsymbol, is an acceleration there. constraints: mapping from
+        second derivative of a dynamicsymbol, is an acceleration there. potential: P, or a
+        generalized potential with terms linear in the velocities, such as e*B*(y*x_dot - x*y_dot)/2
+        of a charge in a magnetic field, which are no part of the energy. constraints: mapping from
         names to what is zero, over coordinates and t, or linear in the velocities; assembling the
         start moves coordinates without a start (None, or a list of coordinates alone) and those in
         `guess`. limits: mapping from inputs to pairs, the least and largest value that acts, None
@@ -122,6 +124,8 @@ class System(Mechanics):
         """
         asked = {key: x for key, x in locals().items() if key not in ("cls", "unknown")}
         given.check_arguments(unknown, asked)
+        if kinetic is None:
+            raise given.fault("kinetic", f"None is not an expression: {given.LAGRANGIAN}")
         run = given.run(
             h, duration, methods, real, batch, linearize, discretize, tolerance,
             bool(events or friction),

@@ -95,6 +95,7 @@ def _made_for(system: System) -> tuple[Any, ...]:
         system.parameters,
         system.definitions,
         system.kinetic,
+        system.linear_potential,
         system.tree,
     )
 

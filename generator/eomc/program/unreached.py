@@ -12,7 +12,10 @@ from eomc.scene.scene import Scene
 
 ENERGIES = frozenset({"kinetic_energy", "potential_energy", "energy", "jacobi", "power"})
 OUTPUTS = frozenset({"outputs", "output_slopes", "output_sensitivity"})
-OF_MOTION = ("kinetic", "potential", "dissipation")
+OF_MOTION = {  # the key of each expression
+    "kinetic": "kinetic", "potential": "potential", "linear_potential": "potential",
+    "dissipation": "dissipation",
+}  # fmt: skip
 
 
 def parameters(program: Program) -> list[Problem]:
@@ -39,7 +42,11 @@ def _place(system: System, parameter: Symbol) -> str:
         first = system.scene.used.get(parameter.name, [()])[0]
         return ".".join(first) if roots and roots <= {"energy", "forces"} else ""
     drawn = system.pictured and parameter.name in system.pictured.used
-    places = (f"energy.{e}" for e in OF_MOTION if _has(system, getattr(system, e), parameter))
+    places = (
+        f"energy.{key}"
+        for name, key in OF_MOTION.items()
+        if _has(system, getattr(system, name), parameter)
+    )
     return "" if drawn else next(places, "")
 
 

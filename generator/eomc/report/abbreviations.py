@@ -28,7 +28,9 @@ def of(found: Found) -> Found:
     n = range(found.D.rows)
     half = [found.D[i, j] for i in n for j in n[i:]]
     matrices = [getattr(found, name) for name in ("C", "g", "tau", "forces", "zero", "A")]
-    scalars = [found.kinetic, found.potential, found.jacobi, found.power]
+    scalars = [
+        found.kinetic, found.potential, found.jacobi, found.power, found.linear_potential,
+    ]  # fmt: skip
     coefficients = [c for terms in left for _, c in terms]
     formulas = [*coefficients, *half, *(e for m in matrices for e in m)]
     formulas += [e for e in scalars if e is not None]
@@ -40,10 +42,10 @@ def of(found: Found) -> Found:
     C, g, tau, forces, zero, A = (
         ImmutableMatrix(m.rows, m.cols, [next(new) for _ in m]) for m in matrices
     )
-    K, P, jacobi, power = (None if e is None else next(new) for e in scalars)
+    K, P, jacobi, power, U = (None if e is None else next(new) for e in scalars)
     return replace(
         found, D=D, C=C, g=g, tau=tau, forces=forces, zero=zero, A=A, kinetic=K, potential=P,
-        jacobi=jacobi, power=power, left=left, named=tuple(named),
+        jacobi=jacobi, power=power, linear_potential=U, left=left, named=tuple(named),
     )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ class Derived:
     potential: Expr
     jacobi: Expr | None
     power: Expr | None
+    linear_potential: Expr | None
     left: tuple[Terms, ...]  # of each scalar equation
     named: tuple[tuple[sympy.Symbol, Expr], ...] = ()  # abbreviations, in their order
     symbols: Mapping[str, Expr] = field(default_factory=dict)
@@ -51,7 +52,7 @@ class Derived:
             return form(e.xreplace(values))
 
         matrices = ("D", "C", "g", "tau", "forces", "zero", "A")
-        scalars = ("kinetic", "potential", "jacobi", "power")
+        scalars = ("kinetic", "potential", "linear_potential", "jacobi", "power")
         changed: dict[str, Any] = {name: getattr(self, name).applyfunc(new) for name in matrices}
         changed |= {name: new(e) for name in scalars if (e := getattr(self, name)) is not None}
         return replace(
@@ -70,8 +71,8 @@ class Derived:
 
     @property
     def L(self) -> Expr:
-        """K - P, the Lagrangian."""
-        return self.kinetic - self.potential
+        """The Lagrangian K - P - U, U the potential that is linear in the velocities."""
+        return self.kinetic - self.potential - (self.linear_potential or 0)
 
     @cached_property
     def scalar(self) -> tuple[sympy.Eq, ...]:

@@ -34,6 +34,7 @@ class Equations(Derived):
 
     With constraints, zero = 0 (m, 1), it is tau + A^T lambda, A (m, nq) and lambda (m,) symbols.
     D, C: (nq, nq); g, tau: (nq, 1), tau = forces - friction. kinetic, potential: K and P;
+    linear_potential: the part of a generalized potential that is linear in the velocities, or None;
     jacobi, power: Jacobi's integral and its rate, None where they say nothing more. `str` prints
     them, at most 100 columns wide; a notebook shows them typeset; long ones with names for what
     they share, `named` in those that are `set_out`.
@@ -158,12 +159,13 @@ def of(system: System) -> Equations:
     )
     conserved = sympy.expand(plain.jacobi - plain.energy) == 0
     jacobi, power = None if conserved else short(plain.jacobi), short(plain.power)
+    linear = readable(_energy(plain.linear_potential, system))
     left = tuple(_left(system, D, plain.bias[i], friction[i], i) for i in range(len(system.q)))
     made = Equations(
         system, D, C, g, tau, (plain.tau + plain.friction).applyfunc(readable),
         plain.constraints.applyfunc(readable), plain.constraint_jacobian.applyfunc(readable),
         readable(_energy(plain.kinetic, system)), readable(_energy(plain.potential, system)),
-        jacobi, power if power != 0 else None, left,
+        jacobi, power if power != 0 else None, linear if linear != 0 else None, left,
     )  # fmt: skip
     if _operations(made.set_out) > WRITTEN_OUT:
         raise too_long(system)

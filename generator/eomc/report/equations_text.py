@@ -25,6 +25,7 @@ GOES_ON = r"  & \quad "  # how a line begins that goes on with the last
 _MEANING = {
     "kinetic": "kinetic energy",
     "potential": "potential energy",
+    "linear_potential": "potential linear in the velocities",
     "L": "Lagrangian K - P",
     "D": "mass matrix",
     "C": "Coriolis matrix, Christoffel form",
@@ -34,7 +35,10 @@ _MEANING = {
     "jacobi": "Jacobi integral, conserved in place of K + P",
     "power": "power into the system",
 }
-_SYMBOL = {"kinetic": "K", "potential": "P", "jacobi": "h", "power": "power", "tau": "τ"}
+_SYMBOL = {
+    "kinetic": "K", "potential": "P", "linear_potential": "U", "jacobi": "h", "power": "power",
+    "tau": "τ",
+}  # fmt: skip
 _LATEX = {**_SYMBOL, "tau": r"\tau", "power": r"\dot h"}
 
 
@@ -43,6 +47,8 @@ def _values(found: Derived) -> dict[str, Expr | MatrixBase]:
     values = {name: getattr(found, name) for name in _MEANING}
     if found.named:
         values["L"] = sympy.Symbol("K") - sympy.Symbol("P")
+        if found.linear_potential is not None:
+            values["L"] -= sympy.Symbol("U")
     if not found.system.constraints:
         del values["A"]
     if all(e == 0 for e in found.tau):
@@ -75,6 +81,8 @@ def text(found: Derived) -> str:
         parts.append(section("where, here and below", made))
     for name, value in values.items():
         head = f"{_SYMBOL.get(name, name)}, {_MEANING[name]}"
+        if name == "L" and found.linear_potential is not None:
+            head += " - U"
         parts.append(section(head, list(_value_lines(write, name, value))))
     if system.outputs:
         made = []

@@ -91,9 +91,10 @@ def _declared(system: System) -> list[tuple[sympy.Symbol, Expr]] | None:
 
 def _energies(system: System) -> list[tuple[str, Expr]]:
     """Those that no recursion accounts for."""
+    linear = [("U", system.linear_potential)] if system.linear_potential != 0 else []
     if system.tree is None:
-        return [("K", system.kinetic), ("P", system.potential)]
-    beside = (("K'", system.tree.beside_kinetic), ("P'", system.tree.beside_potential))
+        return [("K", system.kinetic), ("P", system.potential), *linear]
+    beside = (("K'", system.tree.beside_kinetic), ("P'", system.tree.beside_potential), *linear)
     return [(name, e) for name, e in beside if e != 0]
 
 

@@ -376,13 +376,6 @@ class _Check(Checker):
                 "an energy can't depend on inputs: let them act through [forces]",
                 self.where(formula, INPUT),
             )
-        if key == "potential" and VELOCITY in kinds:
-            fault(
-                "the potential energy can't depend on velocities: parts linear in them "
-                "(magnetic, gyroscopic) belong in 'kinetic' with the sign changed, "
-                "friction in 'dissipation'",
-                self.where(formula, VELOCITY),
-            )
         if key == "kinetic" and VELOCITY not in kinds and sure and not self.bodies:
             velocities = " or ".join(f"{c}_dot" for c in self.doc.coordinates)
             remedy = f"use {velocities}, or dot(...) of a definition"

@@ -354,6 +354,15 @@ def say(error: Mapping[str, Any], path: tuple[str, ...]) -> str:
         return "missing: " + _MISSING.get(where, f"add {last} = ...")
     if kind == "value_error":
         return str(error["ctx"]["error"])
+    if (
+        kind == "extra_forbidden"
+        and path[0] == "energy"
+        and last in ("lagrangian", "Lagrangian", "L")
+    ):
+        return (
+            f"unknown key '{last}': give L = K - P as kinetic = K and potential = P, where the "
+            "potential can have terms linear in the velocities"
+        )
     if kind == "extra_forbidden":
         near = meant(path)
         remedy = f"; did you mean '{near}'?" if near else f": known are {', '.join(_keys(path))}"

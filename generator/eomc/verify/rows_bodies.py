@@ -184,6 +184,17 @@ class Line:
         """The value of a formula along the line."""
         return formulas.evaluate(formula, self.algebra, self.named)
 
+    def at_rest(self, formula: Formula) -> Any:
+        """The value of a formula where all velocities are zero: of a potential, the energy."""
+        known, algebra = self.known, self.algebra
+        self.known = {name: x for name, x in known.items() if name not in self.formulas}
+        self.known |= {f"{c.name}_dot": 0 * self.nodes for c in self.scene.coordinates}
+        self.algebra = {**algebra, "dot": lambda x: 0 * x}
+        try:
+            return self.of(formula)
+        finally:
+            self.known, self.algebra = known, algebra
+
     @cached_property
     def formulas(self) -> Mapping[str, Formula]:
         """Those of definitions and signals, each of which may hold the other."""
@@ -240,7 +251,7 @@ class Line:
         if name == "potential_energy":
             weights = sum(map(self.weight, self.assembly.bodies))
             springs = sum(map(self.spring, self.assembly.springs))
-            return self.here(self.of(self.scene.potential) + weights + springs)
+            return self.here(self.at_rest(self.scene.potential) + weights + springs)
         return self.here(self.forces()) - self.loss()
 
     @property

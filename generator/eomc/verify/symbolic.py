@@ -31,18 +31,19 @@ WRITTEN_OUT = 10_000  # some seconds of SymPy at five links
 
 @lru_cache(maxsize=16)
 def derive(system: System) -> Reference:
-    """D qdd + C qd + g = tau from d/dt dK/dqd - dK/dq + dP/dq + dR/dqd = Q, plainly.
+    """D qdd + C qd + g = tau from d/dt dL/dqd - dL/dq + dR/dqd = Q with L = K - U - P, plainly.
 
-    K is split by its degree in qd, K = K2 + a.qd + K0, and p = dK/dqd:
+    U is the linear part of a generalized potential. T = K - U is split by its degree in qd,
+    T = T2 + a.qd + T0, and p = dT/dqd:
 
-    - D = d2K/dqd2, symmetric, others call it M;
-    - bias = (dp/dq) qd + dp/dt - dK/dq + dP/dq, and g = bias at qd = 0;
+    - D = d2T/dqd2, symmetric, others call it M;
+    - bias = (dp/dq) qd + dp/dt - dT/dq + dP/dq, and g = bias at qd = 0;
     - C_ij = 1/2 sum_k (dD_ij/dq_k + dD_ik/dq_j - dD_jk/dq_i) qd_k (Christoffel; Spong, Hutchinson,
       Vidyasagar, Robot Modeling and Control, 2006, eq. 7.60) + (da_i/dq_j - da_j/dq_i) + dD_ij/dt,
       so that bias = C qd + g, and Ddot - 2C + dD/dt is skew-symmetric;
     - tau = Q - dR/dqd;
-    - jacobi = p.qd - K + P, which is K + P where K is purely quadratic, and changes at the rate
-      power = tau.qd - dL/dt, L = K - P at fixed q and qd; tau is without what constraints do;
+    - jacobi = p.qd - L, which is K + P where K is purely quadratic, and changes at the rate
+      power = tau.qd - dL/dt at fixed q and qd; tau is without what constraints do;
     - of constraints phi(q, t), then psi(q, qd, t): A = dphi/dq, then dpsi/dqd; rates
       A qd + dphi/dt, then psi; gamma = d(rates)/dt at qdd = 0, so that A qdd + gamma = 0.
 
@@ -53,12 +54,13 @@ def derive(system: System) -> Reference:
     expand = _expander(system)
     q, qd = system.q, ImmutableMatrix(system.qd)
     K, P, R = (expand(e) for e in (system.kinetic, system.potential, system.dissipation))
+    U = expand(system.linear_potential)
     rest = dict.fromkeys(system.qd, sympy.S.Zero)
 
     def gradient(e: Expr, xs: Sequence[sympy.Symbol]) -> ImmutableMatrix:
         return ImmutableMatrix([sympy.diff(e, x) for x in xs])
 
-    p = gradient(K, system.qd)
+    p = gradient(K - U, system.qd)
     D = ImmutableMatrix(p.jacobian(qd)).applyfunc(lambda e: _free_of(e, system.qd))
     a = p.xreplace(rest)
     n = range(len(q))
@@ -69,7 +71,7 @@ def derive(system: System) -> Reference:
         ]
         return sum(christoffel, a[i].diff(q[j]) - a[j].diff(q[i]) + D[i, j].diff(t))
 
-    bias = p.jacobian(q) * qd + p.diff(t) - gradient(K, q) + gradient(P, q)
+    bias = p.jacobian(q) * qd + p.diff(t) - gradient(K - U, q) + gradient(P, q)
     forces = system.forces or (sympy.S.Zero,) * len(q)
     friction = gradient(R, system.qd)
     tau = ImmutableMatrix([expand(e) for e in forces]) - friction
@@ -90,9 +92,10 @@ def derive(system: System) -> Reference:
         friction=friction,
         kinetic=K,
         potential=P,
+        linear_potential=U,
         energy=K + P,
-        jacobi=p.dot(qd) - K + P,
-        power=tau.dot(qd) - sympy.diff(K - P, t),
+        jacobi=p.dot(qd) - (K - U) + P,
+        power=tau.dot(qd) - sympy.diff(K - U - P, t),
         signals=ImmutableMatrix(len(system.u), 1, [expand(i.signal) for i in system.inputs]),
     )
 
@@ -119,11 +122,10 @@ def _rows(
 def written_out(system: System) -> System:
     """The same system without definitions, its energies in short forms: quick to derive from."""
     expand = _expander(system)
-    energies = (expand(e) for e in (system.kinetic, system.potential, system.dissipation))
-    kinetic, potential, dissipation = (by_rates(e, system.qd) for e in energies)
+    names = ("kinetic", "potential", "linear_potential", "dissipation")
+    energies = {name: by_rates(expand(getattr(system, name)), system.qd) for name in names}
     return replace(
-        system, kinetic=kinetic, potential=potential, dissipation=dissipation, definitions=(),
-        forces=tuple(map(expand, system.forces)),
+        system, **energies, definitions=(), forces=tuple(map(expand, system.forces)),
         applied=tuple((shorter(expand(y)), expand(force)) for y, force in system.applied),
         outputs=(),
         constraints=tuple(replace(c, formula=expand(c.formula)) for c in system.constraints),
@@ -165,7 +167,12 @@ def _written_out(system: System) -> float:
     for name, body in system.definitions:
         sizes[name], reach[name] = size(body), reach[body]
     rows = sum(size(c.formula) for c in system.constraints) * len(system.q)
-    return size(system.kinetic) * len(system.q) ** 2 + size(system.potential) + rows
+    return (
+        size(system.kinetic) * len(system.q) ** 2
+        + size(system.potential)
+        + size(system.linear_potential)
+        + rows
+    )
 
 
 def _expander(system: System) -> Callable[[Expr], Expr]:
@@ -222,6 +229,7 @@ class Reference(Answer):
     friction: ImmutableMatrix
     kinetic: Expr
     potential: Expr
+    linear_potential: Expr
     energy: Expr
     jacobi: Expr
     power: Expr

@@ -40,20 +40,21 @@ BLOCK = 2**16  # entries of (nq, nq) matrices, of so many states at once: what c
 
 _OF_VELOCITIES = {"v", "vs", *PAIRS}
 
-# what each answer takes of K, P, R, of every force Q and of every signal
+# what each answer takes of K, of T = K - a.qd with a.qd the linear potential, of P, R, of every
+# force Q and of every signal
 _WANTED: Mapping[str, Mapping[str, str]] = {
-    "D": {"K": "vv"},
-    "C": {"K": "vvs N"},
-    "g": {"K": "vs x", "P": "x"},
-    "bias": {"K": "vs x", "P": "x"},
+    "D": {"T": "vv"},
+    "C": {"T": "vvs N"},
+    "g": {"T": "vs x", "P": "x"},
+    "bias": {"T": "vs x", "P": "x"},
     "tau": {"Q": "value", "R": "v", "y": "x", "F": "value"},
     "kinetic": {"K": "value"},
     "potential": {"P": "value"},
     "energy": {"K": "value", "P": "value"},
-    "jacobi": {"K": "value v", "P": "value"},
-    "power": {"K": "x", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
+    "jacobi": {"T": "value v", "P": "value"},
+    "power": {"T": "x", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
     "signals": {"u": "value"},
-    "motion": {"K": "vs x vv", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
+    "motion": {"T": "vs x vv", "P": "x", "Q": "value", "R": "v", "y": "x", "F": "value"},
     "constraints": {"phi": "value", "psi": "value"},
     "constraint_jacobian": {"phi": "x", "psi": "v"},
     "constraint_rates": {"phi": "s", "psi": "value"},
@@ -64,7 +65,7 @@ _WANTED: Mapping[str, Mapping[str, str]] = {
 class Jets(Answer):
     """The equations of `system`, worked out at each state; the fields of `symbolic.derive`.
 
-    D = K_vv, bias = K_vs - K_q + P_q, and C = (c(qd) + c(0))/2 with c = K_vvs + N: that is
+    D = T_vv, bias = T_vs - T_q + P_q, and C = (c(qd) + c(0))/2 with c = T_vvs + N: that is
     Christoffel's 1/2 (Ddot + dp2_i/dq_j - dp2_j/dq_i) for p2 = D qd, the gyroscopic part
     da_i/dq_j - da_j/dq_i and the explicit dD/dt, as in `symbolic.derive`. No differences are
     taken: every value is good to a few roundings of its largest terms.
@@ -76,7 +77,7 @@ class Jets(Answer):
     def __init__(self, system: System) -> None:
         self.system = system
         self._list = made = _List(system)
-        degree = made.ops[made.roots["K"][0]].degree
+        degree = made.ops[made.roots["T"][0]].degree
         if degree > 2:
             raise EomcError(
                 "the kinetic energy is not quadratic in the velocities, or can't be seen to be: "
@@ -149,19 +150,19 @@ class Jets(Answer):
             return found
 
         def bias() -> Vector:
-            slope = part("P", "x", nq + 1) - part("K", "x", nq + 1)
-            return part("K", "vs", nq) + slope[:, :nq]
+            slope = part("P", "x", nq + 1) - part("T", "x", nq + 1)
+            return part("T", "vs", nq) + slope[:, :nq]
 
         match name:
             case "D":
-                found = part("K", "vv", nq, nq)
+                found = part("T", "vv", nq, nq)
             case "C":
-                c = part("K", "vvs", nq, nq) + part("K", "N", nq, nq)
+                c = part("T", "vvs", nq, nq) + part("T", "N", nq, nq)
                 found = (c[: b // 2] + c[b // 2 :]) / 2
             case "bias" | "g":
                 found = bias()
             case "motion":
-                D, b = part("K", "vv", nq, nq), tau() - bias()
+                D, b = part("T", "vv", nq, nq), tau() - bias()
                 found = np.concatenate([D, b[..., None]], axis=2)
             case "tau":
                 found = tau()
@@ -172,11 +173,11 @@ class Jets(Answer):
             case "energy":
                 found = part("K", "value", 1) + part("P", "value", 1)
             case "jacobi":
-                twice = np.sum(part("K", "v", nq) * state.qd, axis=1, keepdims=True)
-                found = twice - part("K", "value", 1) + part("P", "value", 1)
+                twice = np.sum(part("T", "v", nq) * state.qd, axis=1, keepdims=True)
+                found = twice - part("T", "value", 1) + part("P", "value", 1)
             case "power":
                 work = np.sum(tau() * state.qd, axis=1, keepdims=True)
-                explicit = part("K", "x", nq + 1) - part("P", "x", nq + 1)
+                explicit = part("T", "x", nq + 1) - part("P", "x", nq + 1)
                 found = work - explicit[:, nq:]
             case "constraints" | "constraint_jacobian" | "constraint_rates" | "gamma":
                 found = self._rows_of(name, jets, state)
@@ -249,7 +250,8 @@ class _List:
         for name, body in s.definitions:
             self.known[name] = self.node(body)
         forces = s.forces or (sympy.S.Zero,) * len(s.q)
-        roots = {"K": [s.kinetic], "P": [s.potential], "R": [s.dissipation], "Q": forces}
+        roots = {"K": [s.kinetic], "T": [s.kinetic - s.linear_potential], "P": [s.potential]}
+        roots |= {"R": [s.dissipation], "Q": [*forces]}
         roots |= {"u": [i.signal for i in s.inputs]}
         roots |= {"y": [y for y, _ in s.applied], "F": [force for _, force in s.applied]}
         roots |= {"phi": [c.formula for c in s.constraints if c.holonomic]}

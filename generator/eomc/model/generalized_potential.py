@@ -1,0 +1,72 @@
+"""Generalized potentials U(q, qd, t) = P(q, t) + a(q, t).qd, such as that of a magnetic field.
+
+The generalized force is Q = d/dt dU/dqd - dU/dq (Goldstein, Poole & Safko, *Classical Mechanics*,
+sec. 1.5), so that L = K - U. The linear part does no work: where K is quadratic in the velocities,
+qd.dL/dqd - L = K + P, without a.qd.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import sympy
+from sympy import Dummy, Expr, S, Symbol
+
+from eomc.model.symbols import dot, needed
+
+NOT_LINEAR = (
+    "the potential energy can contain velocities in linear terms only, such as those of a magnetic "
+    "field: inertia belongs in 'kinetic', friction in 'dissipation'"
+)
+
+
+class NotLinearError(ValueError):
+    """A potential that is not linear in the velocities."""
+
+
+def split(
+    potential: Expr, definitions: Sequence[tuple[Symbol, Expr]], velocities: Iterable[Symbol]
+) -> tuple[Expr, Expr]:
+    """Return P and a.qd of the potential P + a.qd. Raises NotLinearError.
+
+    dot(y) is a velocity too: where y depends on t explicitly, it is the whole velocity of y that
+    the linear part contains. Definitions stay as they are, but for those that contain velocities.
+    """
+    moving = {*velocities}
+    for name, e in definitions:
+        if e.free_symbols & moving or e.has(dot):
+            moving.add(name)
+
+    def moves(e: Expr) -> bool:
+        return bool(e.free_symbols & moving or e.has(dot))
+
+    terms = sympy.Add.make_args(potential)
+    still = sympy.Add(*(e for e in terms if not moves(e)))
+    rest = sympy.Add(*filter(moves, terms))
+    if rest == 0:
+        return potential, S.Zero
+    known: dict[Expr, Expr] = {}
+    for name, e in needed(definitions, [rest]):
+        if name in moving:
+            known[name] = e.xreplace(known)
+    rest = rest.xreplace(known)
+    rates = sorted(rest.atoms(dot), key=str)
+    outer = [e for e in rates if not any(other != e and other.has(e) for other in rates)]
+    stand_ins: dict[Expr, Expr] = {e: Dummy(real=True) for e in outer}
+    rest = rest.xreplace(stand_ins)
+    variables = [*(rest.free_symbols & {*velocities}), *stand_ins.values()]
+    variables.sort(key=str)
+    at_rest = dict.fromkeys(variables, S.Zero)
+    slopes = [_without(sympy.diff(rest, x), variables) for x in variables]
+    linear = sympy.Add(*(a * x for a, x in zip(slopes, variables, strict=True)))
+    back = {dummy: e for e, dummy in stand_ins.items()}
+    return still + rest.xreplace(at_rest), linear.xreplace(back)
+
+
+def _without(slope: Expr, variables: Sequence[Expr]) -> Expr:
+    """A slope in a form without the variables. Raises NotLinearError where there is none."""
+    for attempt in (lambda e: e, sympy.expand, sympy.simplify):
+        slope = attempt(slope)
+        if not slope.has(*variables):
+            return slope
+    raise NotLinearError(NOT_LINEAR)
