@@ -104,9 +104,9 @@ def test_linearize_is_the_slope_of_the_acceleration() -> None:
     np.testing.assert_allclose(np.hstack([A, B]), np.transpose(slopes), rtol=1e-7, atol=1e-7)
     with pytest.raises(ValueError, match="expected"):
         module.linearize(q[None, None], qd[None, None], u=u)
-    for slopes in (module.linearize, module.sensitivity):
-        with pytest.raises(TypeError, match="positional"):  # time and inputs have their names
-            slopes(q, qd, u)
+    for call in (module.linearize, module.sensitivity):  # t, then u, as of all functions
+        by_name = call(q, qd, t=0.5, u=u)
+        assert all(map(np.array_equal, call(q, qd, 0.5, u), by_name))
 
 
 @pytest.mark.slow
