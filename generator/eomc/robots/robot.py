@@ -43,7 +43,8 @@ class Motion:
     """A coordinate of a joint, in `unit` "rad" or "m"; where it `mimics` another, it is none.
 
     damping: N m s/rad or N s/m; friction: N m or N; armature: kg m^2 or kg; stiffness (N m/rad or
-    N/m) and rest: of the joint's own spring. note: its limits, in words. limits: where it ends.
+    N/m) and rest: of the joint's own spring. friction_width: rad/s or m/s, 0 for the default.
+    note: its limits, in words. limits: where it ends.
     driven: the least and largest force that drives it, N m or N, infinite where nobody says.
     """
 
@@ -53,6 +54,7 @@ class Motion:
     note: str = ""
     damping: float = 0.0
     friction: float = 0.0
+    friction_width: float = 0.0
     armature: float = 0.0
     stiffness: float = 0.0
     rest: float = 0.0
@@ -227,6 +229,7 @@ class Robot:
     """A tree of bodies, parents first; gravity in m/s^2; what the file has besides, in words.
 
     stopped: whether limits of joints are stops. limited: whether those of drives act on inputs.
+    method: of runs, "" for the default.
     """
 
     name: str
@@ -239,6 +242,7 @@ class Robot:
     couplings: tuple[Coupling, ...] = ()
     stopped: bool = False
     limited: bool = False
+    method: str = ""
     left_out: tuple[str, ...] = ()
 
     @property

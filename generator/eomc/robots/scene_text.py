@@ -26,6 +26,7 @@ from eomc.robots.robot import (
     without_dust,
 )
 from eomc.robots.rotations import SNAP, turns_of
+from eomc.robots.stiffness import with_stable_steps
 from eomc.robots.stops import DAMPING, DEPTHS, Stop, stops
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import CLOSINGS, JOINTS
@@ -73,7 +74,7 @@ def finished(robot: Robot) -> Robot:
             f'{texts.listed(rough, 4)}): "pi/2" in their place makes less code',
         )
     new = tuple(words for words in found if words not in robot.left_out)
-    return replace(robot, left_out=(*robot.left_out, *new))
+    return with_stable_steps(replace(robot, left_out=(*robot.left_out, *new)))
 
 
 def _rough(angle: float) -> bool:
@@ -220,6 +221,8 @@ def scene_text(robot: Robot) -> str:
     parts += [_table("[[loop]]", _gear(c)) for c in robot.couplings if _is_gear(c)]
     if rows := {c.name: _row(c) for c in robot.couplings if not _is_gear(c)}:
         parts.append(_table("[constraints]", rows))
+    if robot.method:
+        parts.append(_table("[run]", {"method": toml(robot.method)}))
     return "\n\n".join(parts) + "\n"
 
 
@@ -323,6 +326,8 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
         values = [number(getattr(m, key)) for m in body.motions]
         if any(value != "0" for value in values):
             entry[key] = values[0] if len(set(values)) == 1 else _each(values)
+    if width := max((m.friction_width for m in body.motions), default=0.0):
+        entry["friction_width"] = number(width)
     forces = [acting.force(m.name, robot) for m in body.motions]
     if any(force != "0" for force in forces):
         entry["actuator"] = _each([f if f == "0" else toml(f) for f in forces])

@@ -1,0 +1,267 @@
+"""Forces of a robot that are too stiff for a scene's default steps, and what the scene asks then.
+
+At rest at the start, M q'' + B q' + K q = 0 to first order, with the slope of smoothed friction,
+friction/width, in B. Its eigenvalues decide whether steps of fixed size are stable. The directions
+in which loops and couplings do not let the robot move are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eomc.base import texts
+from eomc.base.spatial import apply, cross, plus, rotated_inertia, scaled, tensor
+from eomc.integrators.tableaux import RK4
+from eomc.robots.robot import Coupling, Motion, Robot, RobotBody, RobotLoop, Terms
+from eomc.robots.rotations import IDENTITY, ORIGIN, Matrix, Vector, from_axis_angle, times
+from eomc.scene.assembly import WORLD
+from eomc.scene.joints import JOINTS
+from eomc.scene.scene import Run
+
+Array = NDArray[np.float64]
+
+FRICTION_WIDTH = 0.01  # m/s or rad/s, a scene's default
+OSCILLATION_LIMIT, DECAY_LIMIT = (x / Run.h for x in RK4.limits)  # rad/s, 1/s, by default
+# 1/s: friction whose velocities decay faster is smoothed over a wider range. Implicit steps to a
+# tolerance of 1e-11, which estimates of errors take, resolve this decay in double precision
+FRICTION_DECAY_LIMIT = 1e6
+
+
+@dataclass(frozen=True)
+class Element:
+    """A damper (N s/m or N m s/rad) and a spring (N/m or N m/rad) that act along J q."""
+
+    name: str
+    J: Array
+    damping: float
+    stiffness: float = 0.0
+
+    def is_stiff(self, inverse: Array) -> bool:
+        """Return whether it alone makes the default steps unstable; `inverse` is that of M."""
+        mobility = float(self.J @ inverse @ self.J)
+        oscillation = math.sqrt(self.stiffness * mobility)
+        return self.damping * mobility > DECAY_LIMIT or oscillation > OSCILLATION_LIMIT
+
+
+def with_stable_steps(robot: Robot) -> Robot:
+    """Return the robot with adaptive steps where the default steps are unstable at the start.
+
+    Friction that is too stiff for adaptive steps too has a wider range of velocities in which it is
+    smoothed. Both are reported.
+    """
+    if robot.method or not robot.motions:
+        return robot
+    rows = [m.name for m in robot.motions]
+    ways = allowed_velocities(robot, rows)
+    elements = _elements(robot, rows)
+    M = ways.T @ mass_matrix(robot, rows) @ ways
+    if not _is_regular(M):  # a motion without inertia, which `eomc build` reports
+        return robot
+    inverse = ways @ np.linalg.inv(M) @ ways.T
+    oscillation, decay = _fastest(inverse, elements)
+    if not (oscillation > OSCILLATION_LIMIT or decay > DECAY_LIMIT):
+        return robot
+    stiff = [e.name for e in elements if e.is_stiff(inverse)] or ["all forces together"]
+    rates = [f"velocities decay at up to {decay:.2g} 1/s"] * (decay > DECAY_LIMIT)
+    rates += [f"motions oscillate at up to {oscillation:.2g} rad/s"] * (
+        oscillation > OSCILLATION_LIMIT
+    )
+    words = (
+        f"stiff: {texts.listed(stiff, 6)}: at the start {' and '.join(rates)}, too fast for steps "
+        f'of rk4 of {Run.h:g} s; therefore [run] has method = "auto", steps that fit a tolerance'
+    )
+    if any(name.startswith(FRICTION) for name in stiff):
+        words += (
+            f". Friction is smoothed within velocities of {FRICTION_WIDTH:g}: a larger "
+            'friction_width makes it less stiff, friction = "stick" in [run] makes it exact'
+        )
+    robot = replace(robot, method="auto", left_out=(*robot.left_out, words))
+    return _widened(robot, inverse, rows)
+
+
+def _widened(robot: Robot, inverse: Array, rows: Sequence[str]) -> Robot:
+    """Return the robot with a `friction_width` for each friction above FRICTION_DECAY_LIMIT."""
+    bodies, wide = [], []
+    for body in robot.bodies:
+        motions = []
+        for m in body.motions:
+            J = _of_motion(m, rows)
+            width = float(f"{m.friction * float(J @ inverse @ J) / FRICTION_DECAY_LIMIT:.2g}")
+            if width > FRICTION_WIDTH:
+                m = replace(m, friction_width=width)
+                wide.append(f"{m.name} ({width:g} {m.unit}/s)")
+            motions.append(m)
+        bodies.append(replace(body, motions=tuple(motions)))
+    if not wide:
+        return robot
+    words = (
+        f"friction so large for what it moves that it is smoothed within a wider friction_width: "
+        f'{texts.listed(wide, 6)}; check its value, or take friction = "stick" in [run]'
+    )
+    return replace(robot, bodies=tuple(bodies), left_out=(*robot.left_out, words))
+
+
+def _is_regular(M: Array) -> bool:
+    """Return whether M is finite and positive definite beyond rounding, whatever the units."""
+    sizes = np.sqrt(np.abs(np.diag(M)))
+    if not len(M) or not np.isfinite(M).all() or not sizes.all():
+        return False
+    return bool(np.linalg.eigvalsh(M / np.outer(sizes, sizes)).min() > 1e-12)
+
+
+def _fastest(inverse: Array, elements: Sequence[Element]) -> tuple[float, float]:
+    """Return the largest |Im| and the fastest decay of the eigenvalues, rad/s and 1/s."""
+    B, K = np.zeros((2, *inverse.shape))
+    for e in elements:
+        B += e.damping * np.outer(e.J, e.J)
+        K += e.stiffness * np.outer(e.J, e.J)
+    zero = np.zeros_like(inverse)
+    rates = np.block([[zero, np.eye(len(zero))], [-inverse @ K, -inverse @ B]])
+    if not np.isfinite(rates).all():
+        return 0.0, 0.0
+    values = np.linalg.eigvals(rates)
+    return float(np.abs(values.imag).max()), float(-values.real.min())
+
+
+FRICTION = "friction of "  # the beginning of such an element's name
+
+
+def _elements(robot: Robot, rows: Sequence[str]) -> list[Element]:
+    """Return what damps and what pulls back."""
+    found = []
+    for m in (m for body in robot.bodies for m in body.motions):
+        J = _of_motion(m, rows)
+        found += [
+            Element(FRICTION + m.name, J, m.friction / FRICTION_WIDTH),
+            Element(f"damping of {m.name}", J, m.damping),
+            Element(f"the spring of {m.name}", J, 0.0, m.stiffness),
+        ]
+    for t in robot.tendons:
+        found.append(Element(f"tendon {t.name}", _of_sum(t.terms, rows), t.damping, t.stiffness))
+    for d in robot.drives:
+        if d.law:
+            J = d.gear * _of_sum(robot.along(d.coordinate), rows)
+            found.append(Element(f"servo {d.name}", J, max(d.law.kv, 0.0), max(d.law.kp, 0.0)))
+    return [e for e in found if e.damping or e.stiffness]
+
+
+def _of_motion(motion: Motion, rows: Sequence[str]) -> Array:
+    """Return the gradient of a joint's position over the coordinates."""
+    of = motion.mimics
+    return _of_sum([(of.gear, of.coordinate) if of else (1.0, motion.name)], rows)
+
+
+def _of_sum(terms: Terms | Sequence[tuple[float, str]], rows: Sequence[str]) -> Array:
+    """Return the gradient of a sum of coordinates over the coordinates."""
+    J = np.zeros(len(rows))
+    for by, q in terms:
+        J[rows.index(q)] += by
+    return J
+
+
+# --- masses and constraints -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rigid:
+    """A body's frame in the world at the start, and how the motions above it move it.
+
+    columns: of each motion the row of its coordinate, its angular velocity, and the velocity of a
+    point of the world that it carries along.
+    """
+
+    place: Vector
+    turn: Matrix
+    columns: tuple[tuple[int, Vector, Callable[[Vector], Vector]], ...] = ()
+
+    def point(self, at: Vector) -> Vector:
+        """Return a point of the body in the world."""
+        return plus(self.place, apply(self.turn, at))
+
+    def jacobians(self, at: Vector, n: int) -> tuple[Array, Array]:
+        """Return the Jacobians (3, n) of the velocity at a point of the world, and of turning."""
+        moves, turns = np.zeros((2, 3, n))
+        for row, turn, velocity in self.columns:
+            moves[:, row] += velocity(at)
+            turns[:, row] += turn
+        return moves, turns
+
+
+def rigid_bodies(bodies: Sequence[RobotBody], rows: Sequence[str]) -> dict[str, Rigid]:
+    """Return each body at the start by its name, and the world."""
+    found = {WORLD: Rigid(ORIGIN, IDENTITY)}
+    for body in bodies:
+        parent = found[body.parent]
+        place, turn = parent.point(body.offset), times(parent.turn, body.rotation)
+        columns, joint = [*parent.columns], JOINTS[body.joint]
+        axes = zip(joint.motions, joint.along(body.axes), body.motions, strict=True)
+        for kind, axis, m in axes:
+            gear = m.mimics.gear if m.mimics else 1.0
+            row = rows.index(m.mimics.coordinate if m.mimics else m.name)
+            rate = scaled(apply(turn, axis), gear)
+            if kind == "r":
+                columns.append((row, rate, _turning(rate, place)))
+                turn = times(turn, from_axis_angle(axis, m.start))
+            else:
+                columns.append((row, ORIGIN, _sliding(rate)))
+                place = plus(place, apply(turn, scaled(axis, m.start)))
+        found[body.name] = Rigid(place, turn, tuple(columns))
+    return found
+
+
+def _turning(rate: Vector, about: Vector) -> Callable[[Vector], Vector]:
+    return lambda at: cross(rate, plus(at, scaled(about, -1.0)))
+
+
+def _sliding(velocity: Vector) -> Callable[[Vector], Vector]:
+    return lambda at: velocity
+
+
+def mass_matrix(robot: Robot, rows: Sequence[str]) -> Array:
+    """Return M at the start, armatures included; `rows` are its coordinates."""
+    M = np.zeros((len(rows), len(rows)))
+    rigid = rigid_bodies(robot.bodies, rows)
+    for body in robot.bodies:
+        its = rigid[body.name]
+        moves, turns = its.jacobians(its.point(body.center), len(rows))
+        inertia = np.array(tensor(rotated_inertia(its.turn, body.inertia)))
+        M += body.mass * moves.T @ moves + turns.T @ inertia @ turns
+        for m in body.motions:
+            J = _of_motion(m, rows)
+            M += m.armature * np.outer(J, J)
+    for tendon in robot.tendons:
+        J = _of_sum(tendon.terms, rows)
+        M += tendon.armature * np.outer(J, J)
+    return M
+
+
+def allowed_velocities(robot: Robot, rows: Sequence[str]) -> Array:
+    """Return an orthonormal basis of the velocities that loops and couplings allow, (n, k)."""
+    starts = {m.name: m.start for m in robot.motions}
+    if not robot.loops and not robot.couplings:
+        return np.eye(len(rows))
+    rigid = rigid_bodies(robot.bodies, rows)
+    A = [_of_coupling(c, starts, rows)[None] for c in robot.couplings]
+    A += [_of_loop(loop, rigid, rows) for loop in robot.loops]
+    _, sizes, ways = np.linalg.svd(np.vstack(A))
+    return np.asarray(ways[int(np.sum(sizes > 1e-9 * sizes.max(initial=0.0))) :].T)
+
+
+def _of_coupling(c: Coupling, starts: dict[str, float], rows: Sequence[str]) -> Array:
+    """Return the gradient of a coupling at the start."""
+    x = sum(by * starts[q] for by, q in c.second) - c.at
+    slope = sum(k * a * x ** (k - 1) for k, a in enumerate(c.polynomial) if k)
+    return _of_sum(c.first, rows) - slope * _of_sum(c.second, rows)
+
+
+def _of_loop(loop: RobotLoop, rigid: dict[str, Rigid], rows: Sequence[str]) -> Array:
+    """Return the Jacobian of a loop's rows: of the difference of two velocities, of turning too."""
+    ends = zip((rigid[name] for name in loop.bodies), loop.points, strict=True)
+    pairs = [body.jacobians(body.point(at), len(rows)) for body, at in ends]
+    moves, turns = (one - other for one, other in zip(*pairs, strict=True))
+    return np.vstack([moves, turns]) if loop.joint == "weld" else moves
