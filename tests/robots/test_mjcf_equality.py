@@ -14,7 +14,7 @@ from eomc.model.symbols import needed
 from eomc.program.assembly import assembled
 from eomc.robots.edit import cut, lock
 from eomc.robots.robot import moved
-from eomc.robots.scene_text import scene_text
+from eomc.robots.scene_text import finished, scene_text
 from eomc.scene.read import parse
 
 INSIDE = """
@@ -182,6 +182,42 @@ def test_what_is_not_held_is_told(tmp_path: Path) -> None:
     assert reported(robot, "tendons through space", "on_cable")
     assert reported(robot, "solref, solimp", "soft")
     assert reported(robot, "of other kinds", "cloth")
+
+
+STILL = '<body name="{}" pos="0 {} 0"><geom size="0.1"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ('<weld body1="left" body2="right"/>', "weld_left_right"),
+        ('<weld body1="left"/>', "weld_left"),
+        ('<connect body1="left" body2="right" anchor="0 0 0.1"/>', "connect_left_right"),
+        ('<connect body1="rocker" body2="flange" anchor="0 0 0"/>', "connect_rocker_flange"),
+        ('<connect body1="crank" anchor="0 0 0"/>', "connect_crank"),  # a point of its axis
+        ('<joint joint1="q1" joint2="q1"/>', "joint_q1_q1"),
+        ('<weld body1="left" body2="right" relpose="0 0 1 1 0 0 0"/>',
+         "weld_left_right (open by 2.24 m)"),
+    ],
+)  # fmt: skip
+def test_constraints_that_no_motion_changes_are_left_out(
+    entry: str, said: str, tmp_path: Path
+) -> None:
+    flange = '<body name="flange" euler="0 0 90"><geom size="0.1"/></body></body>'
+    inside = INSIDE.replace('</body>\n<body name="wheel"', f'{flange}\n<body name="wheel"')
+    inside += STILL.format("left", 1) + STILL.format("right", 3)
+    robot = finished(model(tmp_path, inside, after=equality(entry, HARD[0])))
+    assert [loop.name for loop in robot.loops] == ["pin"]
+    assert not robot.couplings
+    assert reported(robot, "constraints that no motion changes", said)
+    assert finished(robot) == robot
+
+
+def test_a_loop_between_locked_bodies_is_left_out(tmp_path: Path) -> None:
+    robot = model(tmp_path, INSIDE, after=equality(HARD[0]))
+    locked = finished(lock(robot, {"q1": 0, "q2": 0.5, "q3": 0, "slip": 0}))
+    assert not locked.loops
+    assert reported(locked, "constraints that no motion changes", "pin (open by")
 
 
 def test_sites_that_are_used_are_not_left_out(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from eomc.robots.robot import (
 from eomc.robots.rotations import SNAP, turns_of
 from eomc.robots.stiffness import with_stable_steps
 from eomc.robots.stops import DAMPING, DEPTHS, Stop, stops
+from eomc.robots.void import without_void_constraints
 from eomc.scene.assembly import WORLD
 from eomc.scene.joints import CLOSINGS, JOINTS
 
@@ -41,6 +42,7 @@ def finished(robot: Robot) -> Robot:
     Raises EomcError where nothing moves, where a joint moves nothing that has mass, and for a
     tensor that is not positive semi-definite; one that breaks the triangle inequality is noted.
     """
+    robot = without_void_constraints(robot)
     bodies = tuple(replace(body, inertia=without_dust(body)) for body in robot.bodies)
     robot = _with_points(replace(robot, bodies=bodies))
     if not robot.motions:

@@ -246,20 +246,20 @@ def allowed_velocities(robot: Robot, rows: Sequence[str]) -> Array:
     if not robot.loops and not robot.couplings:
         return np.eye(len(rows))
     rigid = rigid_bodies(robot.bodies, rows)
-    A = [_of_coupling(c, starts, rows)[None] for c in robot.couplings]
-    A += [_of_loop(loop, rigid, rows) for loop in robot.loops]
+    A = [coupling_gradient(c, starts, rows)[None] for c in robot.couplings]
+    A += [loop_jacobian(loop, rigid, rows) for loop in robot.loops]
     _, sizes, ways = np.linalg.svd(np.vstack(A))
     return np.asarray(ways[int(np.sum(sizes > 1e-9 * sizes.max(initial=0.0))) :].T)
 
 
-def _of_coupling(c: Coupling, starts: dict[str, float], rows: Sequence[str]) -> Array:
+def coupling_gradient(c: Coupling, starts: dict[str, float], rows: Sequence[str]) -> Array:
     """Return the gradient of a coupling at the start."""
     x = sum(by * starts[q] for by, q in c.second) - c.at
     slope = sum(k * a * x ** (k - 1) for k, a in enumerate(c.polynomial) if k)
     return _of_sum(c.first, rows) - slope * _of_sum(c.second, rows)
 
 
-def _of_loop(loop: RobotLoop, rigid: dict[str, Rigid], rows: Sequence[str]) -> Array:
+def loop_jacobian(loop: RobotLoop, rigid: dict[str, Rigid], rows: Sequence[str]) -> Array:
     """Return the Jacobian of a loop's rows: of the difference of two velocities, of turning too."""
     ends = zip((rigid[name] for name in loop.bodies), loop.points, strict=True)
     pairs = [body.jacobians(body.point(at), len(rows)) for body, at in ends]
