@@ -531,3 +531,83 @@ def test_single_precision_takes_a_row_a_step(modules: Modules) -> None:
         )
         T = steps * h
         assert run.steps == steps and run.q[-1, 0] == pytest.approx(T + T**2 / 2, rel=1e-4)
+
+
+TOPS = """eomc = 1
+name = "tops"
+[coordinates]
+x = { rate = 1.0 }
+[parameters]
+ends = 9
+marks = 9
+turns = 9
+[energy]
+kinetic = "x_dot**2/2"
+potential = "x**2/2"
+[[event]]
+name = "end"
+when = "x - ends"
+direction = "rising"
+action = "stop"
+[[event]]
+name = "mark"
+when = "x - marks"
+direction = "rising"
+[[event]]
+name = "turn"
+when = "x - turns"
+direction = "rising"
+action = "jump"
+x_dot = "-x_dot/2"
+[run]
+h = 0.05
+duration = 20
+tolerance = 1e-9
+"""
+MISSED = (
+    r"tops: this motion is not resolved: event '{}' at t = 1\.526\d+ s.*shorter steps, was missed"
+)
+
+
+@pytest.fixture(scope="module")
+def tops(modules: Modules) -> ModuleType:
+    """x = sin t, with events at heights that parameters set."""
+    return modules.unoptimised(TOPS)
+
+
+@pytest.mark.parametrize("h", [0.6, 0.8])
+@pytest.mark.parametrize(
+    ("height", "name"), [("ends", "end"), ("marks", "mark"), ("turns", "turn")]
+)
+def test_an_event_that_steps_pass_over_is_reported(
+    tops: ModuleType, h: float, height: str, name: str
+) -> None:
+    """x exceeds 0.999 from t = 1.526 to 1.616, between two steps."""
+    run = tops.simulate(h=h, params={height: 0.999})
+    with pytest.warns(RuntimeWarning, match=MISSED.format(name)):
+        error = run.estimate()
+    assert not error.resolved and list(error.missed) == [name] and not len(run.events[name].t)
+    assert error.missed[name][0] == pytest.approx(math.asin(0.999), abs=1e-3)
+    if height == "ends":  # the motion ends before the run does
+        assert np.isinf(error.q[-1]).all() and error.digits["x"] == 0
+
+
+@pytest.mark.parametrize("how", [{"h": 0.05}, {"h": 0.05, "times": [0.5, 1.0, 9.0]}, {"tol": 1e-6}])
+def test_events_that_are_detected_are_resolved(tops: ModuleType, how: dict[str, Any]) -> None:
+    exact = math.asin(0.999)
+    for height, name in (("ends", "end"), ("marks", "mark"), ("turns", "turn")):
+        run = tops.simulate(params={height: 0.999}, **how)
+        error = run.estimate()
+        assert error.resolved and not error.missed and np.max(error.q) < 1e-4
+        late = abs(run.events[name].t[0] - exact)
+        assert error.events[name][0] == pytest.approx(late, rel=0.1, abs=1e-11)
+
+
+def test_an_event_at_the_end_is_not_missed(tops: ModuleType) -> None:
+    """Of two runs one may end a rounding before it."""
+    end = math.asin(0.5)
+    for part in (0.0, 1e-15, -1e-15):
+        for height in ("ends", "marks"):
+            how = {"duration": end + part, "tol": 1e-9}
+            error = tops.simulate(params={height: 0.5}, estimate=True, **how).error
+            assert error.resolved and np.max(error.q) < 1e-9

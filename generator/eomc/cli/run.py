@@ -286,6 +286,8 @@ def _error(done: Run) -> dict[str, Any] | None:
         "observed_order": _finite(error.observed),
         "amplification": _finite(error.amplification),
         "verdict": error.verdict,
+        "events": {name: [*map(_finite, t.tolist())] for name, t in error.events.items()},
+        "missed_events": {name: t.tolist() for name, t in error.missed.items()},
     }
 
 
@@ -389,7 +391,8 @@ def _print_error(module: Any, error: Estimate, done: Run) -> None:
     how = f"in shorter steps; order {error.order}, {seen}"
     if hasattr(done, "tol"):
         how = "with a hundredth of the tolerance" if done.tol else "in steps a quarter as long"
-    say(f"  error at the end about {q:.1g} in q, {qd:.1g} in qd (from the same run {how})")
+    size = f"about {q:.1g} in q, {qd:.1g} in qd" if max(q, qd) < math.inf else "unknown"
+    say(f"  error at the end {size} (from the same run {how})")
     digits = ", ".join(f"{name} {error.digits[name]:.0f}" for name in module.coordinates)
     grown = f"; a difference at the start has become {error.amplification:.2g} times as large"
     if max(error.digits.values()) < 0.5 or not math.isfinite(error.amplification):

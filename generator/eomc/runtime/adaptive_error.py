@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,17 @@ from .periods import Periods
 from .status import FULL, REMEDY
 
 ORDER = 16
+WHOLE = ("ok", "accumulated")  # the statuses of runs that came as far as their motion goes
 _TENTH = 0.1  # of a coordinate's scale: a result more wrong than that is none
 _FULL = 0.01  # of a scale: a difference that has become so large grows no more as it did
 _LITTLE = 4.0  # roundings, by which a start is moved where more fills the scale
 _TAIL = 40  # a part of the rows, over which a difference does not vanish
 _FINER = 100.0  # the tolerance over that of the run by which an error is found
 _LEAST = 512  # steps of that, at least
+_LATER = 10  # steps, at least, in which a finer run looks for the event that ends the run
+_SHIFT = 4.0  # times that differences of states last, by which the same event may be moved
+_EDGE = 1e-9  # of a span: times so near an end are at it
+_ZENO = 0.01  # of the time to an accumulation point: jumps that are nearer differ in number
 _LONGER = 100  # times the steps, which a moved start takes at most
 
 
@@ -37,56 +43,35 @@ def error_of(
     """
     if own.status == FULL:
         raise MemoryError(f"estimate: {REMEDY}")
-    model, x = own._model, own.x.astype(float)
-    u: Any = Periods(own._u, own._period, own._periods) if own._period else own._u
+    model, again = own._model, _Again(own, run, progress)
+    x, begin = again.x, np.ravel(own._begin).astype(float)
     eps, least = float(np.finfo(model.dtype).eps) / 2, LEAST[model.dtype.itemsize]
     scale = scales(x, float(np.ptp(own.t)), eps, len(model.still))
     size = max(1e4 * eps, 100 * own.tol)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], x.shape[1])
-
-    # rows beside a jump may be on either side of it in another run
-    jumps = np.isin(own.t, own.t[1:][np.diff(own.t) == 0])
-    kept = np.flatnonzero(~jumps & (own.t > own.t0))
-    beside = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(x))))
-
-    def again(tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
-        nq, out, start = model.nq, np.full_like(x, np.nan), start.astype(model.dtype)
-        out[own.t == own.t0] = start
-        if len(kept):
-            made = run(
-                model, start[:nq], start[nq:], own.t0, float(own.t[-1]), tol, own.t[kept], u,
-                own._params, h_most, progress, own._stiff, steps, own._by,
-            )  # fmt: skip
-            if made.status == "interrupted":
-                raise KeyboardInterrupt
-            out[kept[: len(made)]] = made.x
-            if own.stopped and made.stopped == own.stopped:  # a hair sooner or later
-                found = made.events[own.stopped]
-                out[-1] = np.concatenate([found.q[-1], found.qd[-1]])
-        return out[beside]
-
-    begin = np.ravel(own._begin).astype(float)
-    tol, shorter = _finer(own, least)
-    finer = again(tol, begin, shorter)
-    if own.status == "ok" and not np.isfinite(finer).all():  # short ones near singular positions
-        finer = again(tol, begin, own._h_most)
+    finer, other = again.finer(begin, least)
     modes, moves = np.array(model._rows.modes, int).reshape(-1, 2), moving(model)
     moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0  # nor is what sticks moved
-    x = x[beside]
+    x = x[again.beside]
 
     def grown(base: Array, size: float, tol: float) -> Array:
         """What a start moved by one scale would become at each row, if that were little."""
         moved = begin + moves * size * scale * signs  # where that is another motion, not to its end
         most = _LONGER * (own.steps + own.rejected) + _LONGER**2
-        return _filled(np.abs(again(tol, moved, own._h_most, most) - base)) / size
+        return _filled(np.abs(again(tol, moved, own._h_most, most)[0] - base)) / size
 
     rows = grown(x, size, own.tol)
     left, rounding = np.where(np.isfinite(finer), np.abs(x - finer), np.inf), eps * np.abs(x)
+    events = _Events.compare(own, other, left, scale)
+    if events.end is not None:
+        left[-1] = np.abs(x[-1] - events.end)
+    elif not events.stops:
+        left[-1] = np.inf
     if len(own._happened[0]) or (left > _TENTH * scale).any():
         # flights between jumps may be exact by any tolerance: what rounding makes of them tells
         full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _FULL)
         if full.any():  # where so little fills the scale, rounding fills a quarter of it
-            near = grown(again(least, begin, own._h_most), _LITTLE * eps, least)
+            near = grown(again(least, begin, own._h_most)[0], _LITTLE * eps, least)
             rows = np.where(full[:, None], np.maximum(rows, near), rows)
         rounding = np.maximum(rounding, eps * rows)
     exact = [*modes[:, 0], *(model.nq + modes[:, 0])]
@@ -101,8 +86,167 @@ def error_of(
     return Estimate(
         error[:, : model.nq], error[:, model.nq :], end, right,
         model.orders[own._by] if own._by else ORDER, float("nan"),
-        amplification, _verdict(own, left / scale, rounding / scale, amplification),
+        amplification, _verdict(own, left / scale, rounding / scale, amplification, events),
+        events.errors, events.missed,
     )  # fmt: skip
+
+
+class _Again:
+    """A run once more, by another tolerance, in other steps or from another start."""
+
+    def __init__(
+        self, own: Fitted, run: Callable[..., Fitted], progress: Callable[[int, int], None] | None
+    ) -> None:
+        self.own, self.run, self.progress = own, run, progress
+        self.u: Any = Periods(own._u, own._period, own._periods) if own._period else own._u
+        self.x = own.x.astype(float)
+        # rows beside a jump may be on either side of it in another run
+        jumps = np.isin(own.t, own.t[1:][np.diff(own.t) == 0])
+        self.kept = np.flatnonzero(~jumps & (own.t > own.t0))
+        self.beside = np.maximum.accumulate(np.where(jumps, 0, np.arange(len(self.x))))
+        self.reached = float(own.events[own.stopped].t[-1] if own.stopped else own.t[-1])
+
+    def __call__(
+        self, tol: float, start: Array, h_most: float, steps: float = np.inf,
+        end: float | None = None,
+    ) -> tuple[Array, Fitted | None]:  # fmt: skip
+        """The states at the rows, nan where the run has none, and the run itself."""
+        own, nq = self.own, self.own._model.nq
+        out, start = np.full_like(self.x, np.nan), start.astype(own._model.dtype)
+        out[own.t == own.t0] = start
+        if not len(self.kept):
+            return out[self.beside], None
+        made = self.run(
+            own._model, start[:nq], start[nq:], own.t0, float(own.t[-1]) if end is None else end,
+            tol, own.t[self.kept], self.u, own._params, h_most, self.progress, own._stiff, steps,
+            own._by,
+        )  # fmt: skip
+        if made.status == "interrupted":
+            raise KeyboardInterrupt
+        out[self.kept[: len(made)]] = made.x
+        if own.stopped and made.stopped == own.stopped and own.t[-1] == self.reached:
+            found = made.events[own.stopped]  # a hair sooner or later
+            out[-1] = np.concatenate([found.q[-1], found.qd[-1]])
+        return out[self.beside], made
+
+    def finer(self, begin: Array, least: float) -> tuple[Array, Fitted | None]:
+        """The same by a finer run."""
+        own, end = self.own, None
+        if own.stopped:  # shorter steps may detect that event later, or not at all
+            end = min(own._t_end, self.reached + max(self.reached - own.t0, _LATER * own.h))
+        tol, shorter = _finer(own, least)
+        rows, made = self(tol, begin, shorter, end=end)
+        if own.status == "ok" and made is not None and made.status not in WHOLE:
+            # short ones near singular positions
+            rows, made = self(tol, begin, own.h / 2 if own._by else own._h_most, end=end)
+        return rows, made
+
+
+@dataclass(frozen=True)
+class _Events:
+    """How the events of a run differ from those of a finer one.
+
+    errors: by name |t - t of the finer run| of each event of the run, s, inf of those that the
+    finer run does not detect. missed: by name the times of those that the finer run alone detects.
+    false: the times of those that the run alone detects. stops: whether both runs end in the same
+    way. end: the last state of a finer run that stops at the end of the run.
+    """
+
+    errors: dict[str, Array]
+    missed: dict[str, Array]
+    false: dict[str, Array]
+    stops: bool
+    end: Array | None
+
+    @classmethod
+    def compare(cls, own: Fitted, other: Fitted | None, left: Array, scale: Array) -> _Events:
+        """Pair the events of both runs up to where their states differ by a tenth of the motion.
+
+        Two events are the same one if they are nearest to one another, and not further apart than
+        a step, or than the difference of the states lasts. left: this difference at the rows.
+        """
+        names = own._model.events
+        if other is None or not names:
+            return cls({}, {}, {}, True, None)
+        reached, came = (float(r.events[r.stopped].t[-1] if r.stopped else r.t[-1])
+                         for r in (own, other))  # fmt: skip
+        apart = np.where(np.isfinite(left), left, 0.0) / scale
+        wrong = np.flatnonzero((left > _TENTH * scale).any(axis=1))
+        alike = slice(0, wrong[0] if len(wrong) else len(left))
+        speed = np.max(np.abs(own.qd.astype(float)), axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            late = np.max(left[alike, : len(speed)], axis=0, initial=0.0) / speed
+        shift = _SHIFT * float(np.max(late[np.isfinite(late)], initial=0.0))
+        gap = max(own.h, min(shift, _TENTH * abs(reached - own.t0)))
+        # an event so near the end of a run may be just behind that of the other
+        edge = abs(reached - own.t0) * max(float(np.max(apart[alike], initial=0.0)), _EDGE)
+        until = float(own.t[wrong[0]]) if len(wrong) else reached - edge
+        whole = (r.limit - _ZENO * (r.limit - r.t0) for r in (own, other) if r.limit == r.limit)
+        until = min(until, *whole, np.inf)
+        # that friction sticks is a part of the state, and so of its error
+        coordinates = (own._model.coordinates[k] for _, k in own._model._rows.modes)
+        stick = {f"{c}_{what}" for c in coordinates for what in ("stops", "slips")}
+        errors, missed, false = {}, {}, {}
+        for name in names:
+            a, b = (r.events[name].t.astype(float) for r in (own, other))
+            mine, others = _paired(a, b, gap)
+            errors[name] = np.full(len(a), np.inf)
+            errors[name][mine] = np.abs(a[mine] - b[others])
+            if name not in stick:
+                alone = np.delete(b, others), np.delete(a, mine)
+                missed[name] = alone[0][alone[0] <= until]
+                false[name] = alone[1][alone[1] <= min(until, came - edge)]
+        at_end = bool(other.stopped) and not own.stopped and came >= reached - edge
+        before_end = bool(own.stopped) and not other.stopped and came <= reached + edge
+        same = own.stopped == other.stopped and (
+            not own.stopped or bool(np.isfinite(errors[own.stopped][-1]))
+        )
+        found = other.events[other.stopped] if at_end else None
+        return cls(
+            errors,
+            {name: t for name, t in missed.items() if len(t)},
+            {name: t for name, t in false.items() if len(t)},
+            same or at_end or before_end or other.status not in WHOLE,
+            None if found is None else np.concatenate([found.q[-1], found.qd[-1]]).astype(float),
+        )
+
+    def words(self, own: Fitted) -> list[str]:
+        """What was missed, and what was detected in vain, a sentence each."""
+        finer, remedy = "shorter steps", "a smaller h"
+        if not own._by:
+            finer, remedy = "a tighter tolerance", "a tighter tolerance, or a shorter h_most"
+        found = []
+        if self.missed:
+            found.append(f"{_listed(self.missed)}, detected by {finer}, was missed: take {remedy}")
+        if self.false:
+            found.append(f"{_listed(self.false)}, is not detected by {finer}: take {remedy}")
+        if not (self.stops or found):
+            found.append(f"{finer} end the run elsewhere: take {remedy}")
+        return found
+
+
+def _listed(events: dict[str, Array]) -> str:
+    """The first of some events, and how many more there are."""
+    name = min(events, key=lambda each: float(events[each][0]))
+    more = sum(map(len, events.values())) - 1
+    return f"event '{name}' at t = {events[name][0]:.9g} s{f' (and {more} more)' if more else ''}"
+
+
+def _paired(a: Array, b: Array, gap: float) -> tuple[Array, Array]:
+    """The indices of those times of a and b that are nearest to one another, within a gap."""
+    if len(a) == len(b) and (np.abs(a - b) <= gap).all():
+        return np.arange(len(a)), np.arange(len(b))
+    if not (len(a) and len(b)):
+        return np.empty(0, int), np.empty(0, int)
+
+    def nearest(some: Array, to: Array) -> Array:
+        k = np.clip(np.searchsorted(some, to), 1, max(len(some) - 1, 1))
+        k = np.minimum(k, len(some) - 1)
+        return np.asarray(np.where(np.abs(some[k - 1] - to) <= np.abs(some[k] - to), k - 1, k))
+
+    at = nearest(b, a)
+    mutual = (nearest(a, b)[at] == np.arange(len(a))) & (np.abs(a - b[at]) <= gap)
+    return np.flatnonzero(mutual), at[mutual]
 
 
 def _finer(own: Fitted, least: float) -> tuple[float, float]:
@@ -126,11 +270,14 @@ def _filled(rows: Array) -> Array:
     return found
 
 
-def _verdict(own: Fitted, left: Array, rounding: Array, amplification: float) -> str:
+def _verdict(
+    own: Fitted, left: Array, rounding: Array, amplification: float, events: _Events
+) -> str:
     """What speaks against the run; its differences, and rounding, relative to the scales."""
     words = []
-    if own.status not in ("ok", "accumulated"):
+    if own.status not in WHOLE:
         words.append(f"the run stopped at t = {own.t[-1]:.6g} s")
+    words += (told := events.words(own))
     lost, wrong = (np.asarray((x > _TENTH).any(axis=1)) for x in (rounding, left))
     if lost[-1]:
         words.append(
@@ -138,7 +285,7 @@ def _verdict(own: Fitted, left: Array, rounding: Array, amplification: float) ->
             f"rounding with it; no run in {own._model.dtype} means anything from "
             f"t = {own.t[int(np.argmax(lost))]:.4g} s on"
         )
-    if wrong.any():
+    if wrong.any() and not (told and np.isinf(left[wrong]).all()):
         row = int(np.argmax(wrong))
         words.append(
             f"the error exceeds a tenth of the motion from t = {own.t[row]:.4g} s on: take a "

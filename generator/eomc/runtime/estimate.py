@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,9 @@ class Estimate:
     amplification: by what a tiny difference at the start has grown at the end, positions relative
     to the largest of them, velocities likewise; at least, where it is as large as the motion.
     verdict: why the motion is not resolved, in words, or "".
+    events: by name the error in time of each event of the run, (n,), s; inf where a finer run does
+    not detect the event. missed: by name the times of events that a finer run detects and this one
+    does not, (n,), s.
     """
 
     q: Array
@@ -47,6 +50,8 @@ class Estimate:
     observed: float
     amplification: float
     verdict: str
+    events: Mapping[str, Array] = field(default_factory=dict)
+    missed: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def resolved(self) -> bool:
