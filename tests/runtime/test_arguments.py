@@ -132,7 +132,6 @@ BAD_RUNS = [
         {"q0": [[1, 2]]},
         r"q0: shape \(1, 2\), expected one state, \(2,\).*simulate_batch takes many",
     ),
-    ({"q0": {"x": 1}}, "q0: {'x': 1} is not an array of numbers: give them in order, x, theta"),
     ({"qd0": [NAN, 0]}, r"qd0: .*nan.* is not finite"),
     ({"q0": MASKED, "steps": 1}, r"q0: 1 of 2 numbers are masked: fill them in"),
     ({"u": np.ma.masked_less([0.0, 1.0], 0.5), "steps": 2}, r"u: 1 of 2 numbers are masked"),

@@ -190,6 +190,69 @@ def test_a_step_of_many_is_the_first_of_their_run(count: int) -> None:
         assert np.array_equal(qd, runs.qd[:, 1])
 
 
+@pytest.mark.parametrize("count", [5, 2500])
+def test_several_steps_in_one_call_are_those_of_a_run(count: int) -> None:
+    """Under inputs that are held; in threads where they are many."""
+    m = module("cartpole_driven")
+    q, qd = starts(m, count)
+    u = np.linspace(-1, 1, count)[:, None]
+    runs = m.simulate_batch(q, qd, steps=12, every=4, u=u, t0=0.3)
+    for row in (1, 2, 3):
+        assert not m.step_batch(q, qd, t=0.3, u=u, steps=4).any()
+        assert np.array_equal(q, runs.q[:, row]) and np.array_equal(qd, runs.qd[:, row])
+    assert not m.step_batch(q, qd, steps=0).any() and np.array_equal(q, runs.q[:, 3])
+
+
+def test_of_several_steps_the_state_before_the_one_that_fails_is_left() -> None:
+    m = module("cartpole")
+    q, qd = np.array([[0.0, 0.1], [0.0, 0.4]]), np.array([[0.0, 0.0], [0.0, 0.4]])
+    with pytest.warns(RuntimeWarning):
+        run = m.simulate(q[1], qd[1], h=3.0, steps=300)
+    assert run.status == "not finite" and 0 < run.steps < 300
+    failed = m.step_batch(q, qd, 3.0, steps=300)
+    assert m.STATUS[failed[1]] == "not finite" and np.isfinite(q).all()
+
+
+@pytest.mark.parametrize("count", [3, 25_000])
+@pytest.mark.parametrize("name", ["kapitza_pendulum", "cartpole"])
+def test_each_may_have_a_time_of_its_own(name: str, count: int) -> None:
+    """As a step of each by itself from its time; of scenes without an explicit time any."""
+    m = module(name)
+    q, qd = starts(m, count)
+    times = np.random.default_rng(2).uniform(0, 3, count)
+    times[1::2] = times[0]  # some share a time
+    expected = [m.simulate(q[k], qd[k], 0.001, steps=2, t0=times[k]) for k in range(3)]
+    failed = m.step_batch(q, qd, 0.001, times, steps=2)
+    assert not failed.any()
+    for k in range(3):
+        np.testing.assert_allclose(q[k], expected[k].q[-1], rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(qd[k], expected[k].qd[-1], rtol=1e-12, atol=1e-13)
+    q, qd = starts(m, count)
+    m.step_batch(q, qd, 0.001, 0.7, steps=2)
+    other_q, other_qd = starts(m, count)
+    m.step_batch(other_q, other_qd, 0.001, np.full(count, 0.7), steps=2)
+    assert np.array_equal(q, other_q) and np.array_equal(qd, other_qd)
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ({"t": [0.0, 1.0]}, r"t: shape \(2,\), expected one number or \(3,\)"),
+        ({"t": [0.0, 1.0, np.nan]}, "t: nan is not a finite number, at .2."),
+        ({"t": "x"}, "t: 'x' is not a number"),
+        ({"steps": -1}, "steps: -1 is not a whole number"),
+        ({"steps": 1.5}, "steps: 1.5 is not a whole number"),
+    ],
+)
+def test_wrong_times_and_numbers_of_steps_are_refused(how: dict[str, Any], words: str) -> None:
+    m = module("cartpole")
+    q, qd = starts(m, 3)
+    before = q.copy()
+    with pytest.raises(ValueError, match=words):
+        m.step_batch(q, qd, **how)
+    assert np.array_equal(q, before)
+
+
 def test_a_step_of_very_many_is_that_of_few() -> None:
     """From 20,000 on there are threads, and looks at Ctrl-C; who can not go on stays as it was."""
     m = module("cartpole_driven")

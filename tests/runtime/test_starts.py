@@ -1,4 +1,4 @@
-"""Starts that are formulas of parameters follow those that a run is given."""
+"""Where runs start: by formulas of the parameters that they are given, and by name."""
 
 from __future__ import annotations
 
@@ -84,6 +84,98 @@ def test_each_of_a_batch_starts_where_its_own_say(
         np.testing.assert_allclose(runs.q[k, 0, :3], q, rtol=1e-15)
         np.testing.assert_allclose(runs.qd[k, 0, :3], qd, rtol=1e-15)
     assert (runs.q[0, 0] == hangs.start[0]).all()  # its parameters are the scene's: to the last bit
+
+
+# --- by name --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", [{}, {"h": 0.01}, {"h": 0.01, "times": [0.0, 0.05]}])
+def test_values_by_name_leave_the_others_as_the_scene_has_them(
+    hangs: ModuleType, scene: Scene, how: dict
+) -> None:
+    params = {"k": 60.0, "v": 1.5}
+    q, qd = scene.start(params)
+    run = hangs.simulate({"x": 0.5}, {"theta": 0.7, "r_dot": 0.1}, params=params, **how)
+    assert run.q[0] == pytest.approx([*q[:2], 0.5, 2.0], rel=1e-15)  # a jump sets the last
+    assert run.qd[0] == pytest.approx([0.1, 0.7, *qd[2:], 0.0], rel=1e-15)
+    run = hangs.simulate({sympy.Symbol("load"): 3.0, "r": 2}, **how)
+    assert run.q[0].tolist() == [2.0, *hangs.start[0][1:3], 3.0]
+    assert run.qd[0].tolist() == hangs.start[1].tolist()
+
+
+@pytest.mark.parametrize("how", [{}, {"h": 0.01}])
+def test_values_by_name_of_each_in_a_batch(hangs: ModuleType, scene: Scene, how: dict) -> None:
+    runs = hangs.simulate_batch({"x": [1.0, 2.0, 3.0]}, {"x": 0.5}, params=MANY, **how)
+    for k in range(3):
+        q, qd = scene.start({name: float(values[k]) for name, values in MANY.items()})
+        assert runs.q[k, 0] == pytest.approx([*q[:2], k + 1.0, 2.0], rel=1e-15)
+        assert runs.qd[k, 0] == pytest.approx([*qd[:2], 0.5, 0.0], rel=1e-15)
+    runs = hangs.simulate_batch({"x": 4.0}, {"theta": np.array([0.1, 0.2])}, **how)
+    assert runs.q[:, 0, 2].tolist() == [4.0, 4.0] and runs.qd[:, 0, 1].tolist() == [0.1, 0.2]
+    assert len(hangs.simulate_batch({"x": 4.0}, **how)) == 1
+
+
+def test_a_formula_of_what_is_given_by_name_is_not_asked_for(hangs: ModuleType) -> None:
+    with pytest.raises(ValueError, match=r"params: the start of r, .* is not finite"):
+        hangs.simulate({"x": 1.0}, params={"k": 0.0}, steps=1, h=0.01)
+    assert hangs.simulate({"r": 1.0}, params={"k": 0.0}, steps=1, h=0.01).q[0, 0] == 1.0
+
+
+def test_other_starts_by_name(hangs: ModuleType) -> None:
+    q, qd = hangs.start
+    q[2], qd[1] = 0.5, 0.7
+    assert hangs.advice({"x": 0.5}, {"theta": 0.7}, h=10.0) == hangs.advice(q, qd, h=10.0)
+    found = hangs.equilibrium({"x": 0.0, "theta": 0.0}, {"theta": 0.7}, free=["r"])
+    assert found.q[1:].tolist() == [0.0, 0.0, 2.0] and found.qd.tolist() == [0.0, 0.7, 0.0, 0.0]
+    # k (r - l0) - m g - (m + load) r theta_dot^2 = 0
+    assert found.q[0] == pytest.approx((30 + 9.81) / (30 - 3 * 0.49), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("q0", "qd0", "words"),
+    [
+        ({"z": 1.0}, None, r"^q0: 'z' is not one of r, theta, x, load"),
+        ({"Theta": 1.0}, None, r"^q0: .*did you mean 'theta'"),
+        ({"x_dot": 1.0}, None, r"^q0: 'x_dot' is a velocity: give it in qd0"),
+        (None, {"load": 1.0}, r"^qd0: 'load' is not one of r, theta, x$"),
+        (None, {"x": 1.0, "x_dot": 1.0}, r"^qd0: 'x' is given twice, as 'x' and as 'x_dot'"),
+        ({"x": "1"}, None, r"^q0: x: '1' is not a number"),
+        ({"x": float("nan")}, None, r"^q0: x: nan is not a finite number"),
+        ({"x": [1.0, 2.0]}, None, r"^q0: x: \[1.0, 2.0\] is not a number"),
+    ],
+)
+def test_wrong_names_and_values_are_refused(
+    hangs: ModuleType, q0: dict, qd0: dict, words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        hangs.simulate(q0, qd0, steps=1)
+
+
+@pytest.mark.parametrize(
+    ("q0", "qd0", "params", "words"),
+    [
+        ({"x": [1.0, 2.0]}, {"x": [1.0, 2.0, 3.0]}, None, "qd0: x: 3 .* where q0: x has 2"),
+        ({"x": [1.0, 2.0]}, None, MANY, "q0: x: 2 instances where params has 3"),
+        ({"x": [1.0, np.inf]}, None, None, "q0: x: not all numbers are finite"),
+        ({"x": [[1.0]]}, None, None, "q0: x: .* is not a number"),
+        ({"x": [1.0, 2.0]}, np.zeros((3, 4)), None, "qd0: 3 instances where q0 has 2"),
+    ],
+)
+def test_values_of_other_batches_are_refused(
+    hangs: ModuleType, q0: dict, qd0: object, params: object, words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        hangs.simulate_batch(q0, qd0, params=params, steps=1, h=0.01)
+
+
+def test_a_start_by_name_is_assembled(modules: Modules) -> None:
+    rod = modules("pendulum_xy")
+    by_name, array = rod.simulate({"x": 0.6}, steps=1), rod.start[0]
+    array[0] = 0.6
+    assert by_name == rod.simulate(array, rod.start[1], steps=1)
+
+
+# --- what has no value ----------------------------------------------------------------------------
 
 
 def test_a_start_without_a_value_is_refused(hangs: ModuleType, scene: Scene) -> None:

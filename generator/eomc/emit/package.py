@@ -140,7 +140,13 @@ def _methods(target: Target) -> tuple[BoundMethod, ...]:
                 qd_rows=f"qd_rows + {NQ}*(row + 1)", p=p, memory=memory,
                 status="&found",
             ),
-            public.batch(name).call(p=p),
+            public.batch(name).call(
+                count="many", q=f"q + {NQ}*base", qd=f"qd + {NQ}*base", t0="t[t_instance*base]",
+                u="u ? u + u_instance*base : u",
+                q_rows=f"q_rows ? q_rows + {NQ}*row_count*base : q_rows",
+                qd_rows=f"qd_rows ? qd_rows + {NQ}*row_count*base : qd_rows",
+                p=f"{p} + p_instance*base", done="done + base", status="status + base",
+            ),
             *(_derivative(target, name) if target.system.run.discretize else ("", "", "")),
         )
         for name in target.system.run.methods
@@ -194,6 +200,7 @@ def binding(target: Target) -> Binding:
         adaptive=_adaptive(target),
         parameter_count=len(target.system.parameters),
         input_count=len(target.system.inputs),
+        timed=any(a.name == "t0" for a in public.batch(target.system.run.methods[0]).arguments),
     )
 
 

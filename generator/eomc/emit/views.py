@@ -182,6 +182,7 @@ class Binding:
     adaptive: BoundAdaptive | None
     parameter_count: int
     input_count: int
+    timed: bool  # whether steps depend on the time
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ class SteppedRun(AdaptiveRun):
 
 
 def simulate(
-    model: Stepping, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
+    model: Stepping, q0: Any, qd0: Any, duration: float | None, u: Any,
     params: Any, t0: float, progress: Callable[[int, int], None] | None, times: ArrayLike | None,
     control_period: float | None, tol: float | None, h_most: float | None, stiff: bool,
     fixed: tuple[Any, ...],
@@ -168,7 +168,7 @@ def simulate(
 
 
 def plain(
-    model: Stepping, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
+    model: Stepping, q0: Any, qd0: Any, duration: float | None, u: Any,
     params: Any, t0: float, tol: float | None, count: int,
 ) -> AdaptiveRun | None:  # fmt: skip
     """A run with nothing unusual in one call, of count rows at most; None: it goes another way.

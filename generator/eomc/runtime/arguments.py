@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from .package import Defaults, meant, of_a_start, reduced
 
 Array = NDArray[Any]
+Start = ArrayLike | Mapping[str, ArrayLike] | None  # positions or velocities, also by name
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 
 _FEW = 32  # numbers that Python looks at sooner than NumPy
@@ -216,10 +217,10 @@ class Arguments:
             raise ValueError(f"qd: shape {moving.shape} with q of shape {at.shape}")
         return at, moving
 
-    def _from(self, x0: ArrayLike, name: str) -> tuple[Array, Any]:
+    def _from(self, x0: Any, name: str) -> tuple[Array, Any]:
         """A start, (nq,), and what C reads it from."""
         if (numbers := self._listed(x0, self._shape)) is not None:
-            return x0, numbers  # type: ignore[return-value]  # an array, as was seen
+            return x0, numbers  # an array, as was seen
         x = self._numbers(x0, name)
         if x.ndim == 2 and x.shape[1] == self.nq:
             raise ValueError(
@@ -377,13 +378,9 @@ class StateArguments:
         given: Array | None = None,
     ) -> None:  # fmt: skip
         address, real, null = model._c
-        self.t, self.times, self.own, self.u_rows = 0.0, None, null, None
-        if rows and np.ndim(t):
-            unmasked(t, "t")
-            if np.shape(t) != rows:
-                raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
-            self.times = _finite(model._numbers(t, "t"), "t: {} is not a finite number")
-        else:
+        self.t, self.own, self.u_rows = 0.0, null, None
+        self.times = row_times(model, t, rows)
+        if self.times is None:
             self.t = as_number(t, "t")
         if u is not None:
             self.u_rows = model._inputs(u, many=bool(rows))
@@ -424,6 +421,16 @@ class StateArguments:
             for x, stride in ((self.u, self.own.u), (self.p, self.own.p))
         )
         return self.t, u, p, self.own
+
+
+def row_times(model: Arguments, t: Any, rows: tuple[int, ...]) -> Array | None:
+    """A time for each row, (n,); None where there is one for all. Raises ValueError."""
+    if not (rows and np.ndim(t)):
+        return None
+    unmasked(t, "t")
+    if np.shape(t) != rows:
+        raise ValueError(f"t: shape {np.shape(t)}, expected one number or {rows}")
+    return _finite(model._numbers(t, "t"), "t: {} is not a finite number")
 
 
 def _check_rows(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:

@@ -17,10 +17,12 @@ from . import batch_adaptive, batch_fixed
 from .adaptive_arguments import as_progress, fits
 from .arguments import (
     Array,
+    Start,
     as_count,
     as_number,
     as_period,
     as_step_size,
+    row_times,
     unmasked,
 )
 from .batch_instances import Instances
@@ -43,7 +45,7 @@ class BatchModel(Instances):
         return super()._kinds | {x.__name__: x for x in own}
 
     def simulate_batch(
-        self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
+        self, q0: Start = None, qd0: Start = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
         params: Any = None, u: ArrayLike | None = None, threads: int | None = None,
         method: str | None = None, *, t0: float = 0.0, control_period: float | None = None,
@@ -109,16 +111,39 @@ class BatchModel(Instances):
         return run
 
     def step_batch(
-        self, q: Array, qd: Array, h: float | None = None, t: float = 0.0,
+        self, q: Array, qd: Array, h: float | None = None, t: ArrayLike = 0.0,
         u: ArrayLike | None = None, params: Any = None,
         out: tuple[Array, Array] | None = None, threads: int | None = None,
-        method: str | None = None,
+        method: str | None = None, *, steps: int = 1,
     ) -> Array:  # fmt: skip
-        """One step of many instances, q and qd (batch, nq) in place, or from them into `out`.
+        """Make steps of many instances, in place.
 
-        Returns the status of each, (batch,) integers: 0 where the step was made; elsewhere
-        STATUS[number] says why it was not, and the state is as it was. u, params: as in
-        `simulate_batch`.
+        Parameters
+        ----------
+        q, qd : (batch, nq) arrays
+            The states, which are overwritten unless `out` is given.
+        h : float, optional
+            The step size, s; by default that of the scene.
+        t : float or (batch,) array
+            The time at the start, s, of all instances or of each.
+        u : (nu,) or (batch, nu) array, or dict, optional
+            Inputs, held over all steps; by default the scene's signals.
+        params : optional
+            As in `simulate_batch`.
+        out : pair of (batch, nq) arrays, optional
+            Where the new states are written.
+        threads : int, optional
+            The number of threads; by default one for each processor.
+        method : str, optional
+            The method; by default the first of the scene.
+        steps : int
+            The number of steps of size h.
+
+        Returns
+        -------
+        (batch,) array of integers
+            The status of each instance: 0 if all steps were made, else `STATUS[number]` says why
+            one could not be made; the state is then that before this step.
         """
         if not isinstance(method, (str, NoneType)) or method not in self._batch_steps:
             self._method(method)  # raises, with those there are
@@ -134,7 +159,10 @@ class BatchModel(Instances):
         views = q.base is not None or qd.base is not None
         if count and (q is qd or (views and np.may_share_memory(q, qd))):
             raise ValueError("qd: lies in the memory of q, where q is to be written")
-        h, t = self.h if h is None else as_step_size(h, self.dtype), as_number(t, "t")
+        h, steps = self.h if h is None else as_step_size(h, self.dtype), as_count(steps, "steps", 0)
+        times = row_times(self, t, (count,))
+        if times is None:
+            t = as_number(t, "t")
         held = None if u is None else self._input_rows(u, 1)
         table = None if params is None else self._parameter_rows(params)
         for name, given in (("params", table), ("u", held)):
@@ -142,16 +170,19 @@ class BatchModel(Instances):
                 raise ValueError(f"{name}: {len(given)} instances where q has {count}")
         if threads is not None:
             as_count(threads, "threads", 1)
-        if count >= WORTH or count * self.nq > 8 * WORTH:
+        if count * steps >= WORTH or count * steps * self.nq > 8 * WORTH:
             table, step = self._parameter_rows(params), self._stepper(method, "batch")
-            work = Work(self, step, q, qd, h, t, 1, 0, held, table, None, None)
-            work.run(threads, None)
+            begin = t if times is None else times
+            work = Work(self, step, q, qd, h, begin, steps, 0, held, table, None, None)
+            if not work.run(threads, None):
+                raise KeyboardInterrupt
             return work.status
         # too few for threads, or for a look at Ctrl-C: straight into C
         address, real, null = self._c
         status = np.empty(count, "i")
         self._batch_steps[method](
-            count, address(real, q), address(real, qd), t, h,
+            count, address(real, q), address(real, qd),
+            [t] if times is None else address(real, times), int(times is not None), h, steps,
             null if held is None else address(real, held),
             self.nu if held is not None and len(held) > 1 else 0,
             self._at[2] if table is None else address(real, table),

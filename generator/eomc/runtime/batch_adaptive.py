@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from .adaptive_arguments import as_end, as_limits, as_times
 from .adaptive_memory import room_for
-from .arguments import Array, as_number, as_step_size
+from .arguments import Array, Start, as_number, as_step_size
 from .batch_instances import Instances
 from .batch_run import BatchRun, stuck
 from .batch_work import all_of, as_threads
@@ -157,7 +157,7 @@ class AdaptiveBatchRun(BatchRun):
 
 
 def simulate(
-    model: Instances, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None,
+    model: Instances, q0: Start, qd0: Start, duration: float | None,
     params: Any, u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float | None, times: ArrayLike | None,
     h_most: float | None, stiff: bool, control_period: float | None, fixed: tuple[Any, ...],
@@ -179,7 +179,7 @@ def simulate(
 
 
 def stepped(
-    model: Instances, q0: ArrayLike | None, qd0: ArrayLike | None, h: float | None,
+    model: Instances, q0: Start, qd0: Start, h: float | None,
     duration: float | None, steps: int | None, every: int, params: Any, u: ArrayLike | None,
     threads: int | None, method: str | None, t0: float,
     progress: Callable[[int, int], None] | None, times: ArrayLike | None,
@@ -196,7 +196,7 @@ def stepped(
 
 
 def _run(
-    model: Instances, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any,
+    model: Instances, q0: Start, qd0: Start, params: Any,
     u: ArrayLike | None, threads: int | None, t0: float,
     progress: Callable[[int, int], None] | None, tol: float, rows: Any, most: float,
     stiff: bool, period: float, span: float, method: str = "",

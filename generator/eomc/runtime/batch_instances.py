@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, unmasked
 from .model import LARGE, Model
-from .starts import started
+from .starts import is_by_name, started
 
 
 class Instances(Model):
@@ -30,7 +30,7 @@ class Instances(Model):
         raise NotImplementedError
 
     def _instances(
-        self, q0: ArrayLike | None, qd0: ArrayLike | None, params: Any, u: Any,
+        self, q0: Any, qd0: Any, params: Any, u: Any,
         steps: int | None, t0: float | None = None,
     ) -> tuple[tuple[Array, Array], Array, Array | None, Array | None]:  # fmt: skip
         """((q, qd), parameters, inputs), one row an instance; a single one serves for all.
@@ -40,8 +40,8 @@ class Instances(Model):
         can't be assembled there, else None.
         """
         start, table = self._start, self._parameter_rows(params)
-        if params is not None and self._follows:
-            q0, qd0 = started(self, q0, qd0, table)
+        if (params is not None and self._follows) or is_by_name(q0, qd0):
+            q0, qd0 = started(self, q0, qd0, table, many_values=True)
         q = self._rows_of(start[0] if q0 is None else self._completed(q0, 0), "q0")
         qd = self._rows_of(start[1] if qd0 is None else self._completed(qd0, 1), "qd0")
         held = self._input_rows(u, steps)

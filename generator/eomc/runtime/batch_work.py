@@ -27,12 +27,13 @@ class Work:
     """One batch: groups of instances, each taken through all its steps in pieces."""
 
     def __init__(
-        self, model: Instances, step: Any, q: Array, qd: Array, h: float, t0: float,
+        self, model: Instances, step: Any, q: Array, qd: Array, h: float, t0: Any,
         steps: int, every: int, held: Array | None, table: Array, q_rows: Array | None,
         qd_rows: Array | None, starts: tuple[Array, Array] | None = None,
     ) -> None:  # fmt: skip
         self.model, self.step, self.count = model, step, len(q)
         self.h, self.t0, self.steps, self.every = h, t0, steps, every
+        self.begin = np.atleast_1d(np.asarray(t0, model.dtype))  # the time of all, or of each
         self.first = 0  # the step that `run` begins with
         self.held, self.table = held, table
         self.starts = starts
@@ -104,7 +105,8 @@ class Work:
         end = at + count
         q, qd, q_rows, qd_rows = self._places(at)
         done, status = (x + at for x in self.ends)
-        each = len(self.table) > 1
+        each, times = len(self.table) > 1, len(self.begin) > 1
+        begin = pointer(self.begin[at:end] if times else self.begin)
         table = pointer(self.table[at:end] if each else self.table)
         u, u_instance, u_step = null, 0, 0
         if self.held is not None:
@@ -119,9 +121,9 @@ class Work:
             many = min(many, self.steps - first)
             begun = perf_counter()
             failed = self.step(
-                count, q, qd, self.t0, self.h, first, many, u + first * u_step if u_step else u,
-                u_instance, u_step, self.every, q_rows, qd_rows, self.rows, table,
-                1 if each else 0, done, status,
+                count, q, qd, begin, int(times), self.h, first, many,
+                u + first * u_step if u_step else u, u_instance, u_step, self.every,
+                q_rows, qd_rows, self.rows, table, 1 if each else 0, done, status,
             )  # fmt: skip
             spent = perf_counter() - begun
             self.failed |= failed

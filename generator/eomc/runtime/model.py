@@ -20,6 +20,7 @@ from .adaptive_arguments import as_progress, fits
 from .arguments import (
     Array,
     Parameters,
+    Start,
     as_count,
     as_flag,
     as_number,
@@ -34,7 +35,7 @@ from .package import warn
 from .shown import with_events
 from .slices import longer
 from .stability import advice
-from .starts import started
+from .starts import is_by_name, started
 from .status import STATUS, Interrupted
 from .stepping import Stepping
 from .trajectory import Run
@@ -87,7 +88,7 @@ class Model(Stepping):
         return discretize(self, self._method(method), at, moving, h, hold, t, u, params)
 
     def simulate(
-        self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
+        self, q0: Start = None, qd0: Start = None, h: float | None = None,
         duration: float | None = None, steps: int | None = None, every: int = 1,
         u: Inputs = None, params: Parameters = None, method: str | None = None, *, t0: float = 0.0,
         control_period: float | None = None, out: tuple[Array, Array] | None = None,
@@ -112,7 +113,7 @@ class Model(Stepping):
         if events is not None or unknown:
             other, given = with_events(self.simulate, dict(locals()))
             return cast(Run, other.simulate(**given))
-        if params is not None and self._follows:
+        if (params is not None and self._follows) or is_by_name(q0, qd0):
             q0, qd0 = started(self, q0, qd0, self._parameters(params))
         usual = (out is None and progress is None and control_period is None and not estimate
                  and times is None and type(t0) is float and isfinite(t0))  # fmt: skip
@@ -190,7 +191,7 @@ class Model(Stepping):
             warn(f"{self.name}: {whose}{words}")
 
     def advice(
-        self, q0: ArrayLike | None = None, qd0: ArrayLike | None = None, h: float | None = None,
+        self, q0: Start = None, qd0: Start = None, h: float | None = None,
         u: ArrayLike | None = None, params: Parameters = None, method: str | None = None, *,
         t0: float = 0.0,
     ) -> str | None:  # fmt: skip

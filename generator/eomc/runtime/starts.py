@@ -1,4 +1,4 @@
-"""Starts that are formulas of parameters, where these have other values than in the scene."""
+"""Where a run starts: by name, and by the scene's formulas of parameters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .arguments import Array
+from .arguments import Array, as_number, named, not_one_of
 from .constrained import Constrained
 
 _OPERATORS: Mapping[type, Callable[..., Any]] = {
@@ -27,18 +27,35 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = {
 }  # fmt: skip
 
 
-def started(model: Constrained, q0: Any, qd0: Any, p: Array) -> tuple[Any, Any]:
-    """(q0, qd0); in place of None (..., nq), where the scene starts at parameters (..., np).
+def is_by_name(q0: Any, qd0: Any) -> bool:
+    """Whether positions or velocities are given by name."""
+    return hasattr(q0, "keys") or hasattr(qd0, "keys")
 
-    Raises ValueError where a formula has no finite value there.
+
+def started(
+    model: Constrained, q0: Any, qd0: Any, p: Array, many_values: bool = False
+) -> tuple[Any, Any]:
+    """Complete a start: what is not given is where the scene starts at the parameters.
+
+    q0, qd0: arrays, which are returned as they are, mappings from names of coordinates, or None.
+    p: (np,), or (n, np), for which the result has n rows; many_values: mappings may have (n,) then.
+    Raises ValueError for unknown names, and where a formula has no finite value.
     """
-    many = p.shape[:-1]
-    starts = (np.tile(x, (*many, 1)) for x in model._start)
-    found = [own if x is None else x for x, own in zip((q0, qd0), starts, strict=True)]
+    given = [values_by_name(model, x, half, many_values) for half, x in enumerate((q0, qd0))]
+    many = _instances(given, p.shape[:-1])
+    p = np.broadcast_to(p, (*many, p.shape[-1]))
+    found = [
+        x if named_values is None else np.tile(own, (*many, 1))
+        for x, own, named_values in zip((q0, qd0), model._start, given, strict=True)
+    ]
+    for x, named_values in zip(found, given, strict=True):
+        for name, value in (named_values or {}).items():
+            x[..., model.coordinates.index(name)] = value
     values = {name: p[..., k].astype(float) for k, name in enumerate(model.parameters)}
     for name, text in model._follows.items():
         half, at = divmod(model._states.index(name), model.nq)
-        if (q0, qd0)[half] is not None:
+        named_values = given[half]
+        if named_values is None or model.coordinates[at] in named_values:
             continue
         tree = ast.parse(text, mode="eval").body
         own = [n.id for n in ast.walk(tree) if isinstance(n, ast.Name)]
@@ -53,6 +70,52 @@ def started(model: Constrained, q0: Any, qd0: Any, p: Array) -> tuple[Any, Any]:
             )
         found[half][..., at][moved] = value[moved]
     return found[0], found[1]
+
+
+def _instances(
+    given: list[dict[str, Array] | None], of_parameters: tuple[int, ...]
+) -> tuple[int, ...]:
+    """The shape of a start: that of the parameters, or of values by name of many instances."""
+    found = {of_parameters: "params"} if of_parameters != (1,) else {}
+    for what, values in zip(("q0", "qd0"), given, strict=True):
+        for name, value in (values or {}).items():
+            if value.size > 1:
+                found.setdefault(value.shape, f"{what}: {name}")
+    if len(found) > 1:
+        (one, whose), (other, its) = list(found.items())[:2]
+        raise ValueError(f"{its}: {other[0]} instances where {whose} has {one[0]}")
+    return next(iter(found), of_parameters)
+
+
+def values_by_name(
+    model: Constrained, x: Any, half: int, many: bool = False
+) -> dict[str, Array] | None:
+    """The values of a mapping by coordinate; {} of None, and None of an array.
+
+    Velocities have the name of the coordinate, or that with _dot.
+    """
+    if x is None:
+        return {}
+    if not hasattr(x, "keys"):
+        return None
+    what, found = ("q0", "qd0")[half], dict[str, Array]()
+    moving = [name for name in model.coordinates if name not in model.still]
+    known = moving if half else model.coordinates
+    for key, value in named(x).items():
+        name = key.removesuffix("_dot") if half and key not in known else key
+        if name not in known:
+            if not half and key.removesuffix("_dot") in moving:
+                raise ValueError(f"q0: '{key}' is a velocity: give it in qd0")
+            raise ValueError(not_one_of(what, key, known))
+        if name in found:
+            raise ValueError(f"{what}: '{name}' is given twice, as '{name}' and as '{name}_dot'")
+        if many and np.ndim(value) == 1:
+            found[name] = model._numbers(value, f"{what}: {name}")
+            if not np.isfinite(found[name]).all():
+                raise ValueError(f"{what}: {name}: not all numbers are finite")
+        else:
+            found[name] = np.array(as_number(value, f"{what}: {name}"))
+    return found
 
 
 def _value(node: ast.expr, values: Mapping[str, Any]) -> Any:

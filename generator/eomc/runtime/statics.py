@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, Parameters, as_number
+from .arguments import Array, Parameters, Start, as_number
 from .constrained import Constrained
 from .drives import Motion, drive_forces, driven
 from .equilibrium import Equilibrium, equilibrium
-from .starts import started
+from .starts import started, values_by_name
 
 
 class Statics(Constrained):
@@ -43,17 +43,17 @@ class Statics(Constrained):
         return tau, found
 
     def equilibrium(
-        self, q: ArrayLike | None = None, qd: ArrayLike = 0.0, t: float = 0.0, u: Any = None,
+        self, q: Start = None, qd: Start = 0.0, t: float = 0.0, u: Any = None,
         params: Parameters = None, *, free: Collection[str] | None = None,
     ) -> Equilibrium:  # fmt: skip
         """Find a state and inputs at which q̈ = 0, by Newton's method from a guess.
 
         Parameters
         ----------
-        q : (nq,) array, optional
-            The guess of the positions; by default the start of the scene.
-        qd : float or (nq,) array
-            The velocities, 0 by default.
+        q : (nq,) array or dict, optional
+            The guess of the positions; what is not given is the start of the scene.
+        qd : float, (nq,) array or dict
+            The velocities, 0 where they are not given.
         t : float
             The time, s.
         u : (nu,) array or dict, optional
@@ -81,8 +81,16 @@ class Statics(Constrained):
             raise ValueError(
                 f"free: {free!r} is no list of names: {', '.join((*self._states, *self.inputs))}"
             )
-        lone = not isinstance(qd, (list, tuple)) and not np.ndim(qd)
-        moving = np.full(self.nq, as_number(qd, "qd")) if lone else self._completed(qd, 1)
+        rates: Any = qd
+        by_name = values_by_name(self, rates, 1)
+        if by_name is not None:
+            moving = np.zeros(self.nq)
+            for name, value in by_name.items():
+                moving[self.coordinates.index(name)] = value
+        elif not isinstance(rates, (list, tuple)) and not np.ndim(rates):
+            moving = np.full(self.nq, as_number(rates, "qd"))
+        else:
+            moving = self._completed(rates, 1)
         q = self._completed(q, 0)
         at, moving = self._one(*started(self, q, moving, self._parameters(params)))
         moves = [name for name in self.coordinates if name not in self.still]

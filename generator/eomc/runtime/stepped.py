@@ -19,7 +19,7 @@ from .stepping import Stepping
 
 
 def simulate(
-    model: Stepping, q0: ArrayLike | None, qd0: ArrayLike | None, duration: float | None, u: Any,
+    model: Stepping, q0: Any, qd0: Any, duration: float | None, u: Any,
     params: Any, t0: float, progress: Callable[[int, int], None] | None, times: ArrayLike | None,
     control_period: float | None, fixed: tuple[Any, ...], look: Callable[..., None],
 ) -> SteppedRun:  # fmt: skip
