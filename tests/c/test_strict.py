@@ -16,7 +16,10 @@ from c.test_plain import NAMES, WISHES, generated, kit, made
 from compilers import STRICT, clang, compiled, run
 from conftest import ROOT, needs, tiers
 
+import eomc
 from eomc.base.errors import EomcError
+from eomc.model import from_scene as system
+from eomc.scene import read as scene
 from eomc.toolchain import compiler, sizes
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -175,20 +178,61 @@ def test_sizes_need_a_compiler_that_makes_objects(tmp_path: Path) -> None:
 # --- MISRA ----------------------------------------------------------------------------------------
 
 
+EVENTFUL = """eomc = 1
+name = "eventful"
+[coordinates]
+y = { start = 1.0 }
+z = { start = 0.2 }
+[parameters]
+e = 0.8
+[inputs]
+force = { signal = "0.5*sin(2*t)", limits = [-2, 2] }
+[energy]
+kinetic = "y_dot**2/2 + z_dot**2/2"
+potential = "9.81*y + z**2/2"
+[forces]
+z = "force"
+[outputs]
+height = "2*y + z_dot"
+[[event]]
+name = "impact"
+when = "y"
+direction = "falling"
+action = "jump"
+y_dot = "-e*y_dot"
+[run]
+tolerance = 1e-9
+linearize = true
+discretize = true
+"""
+
+
+BY_VERSION = ("2.4", "7.3", "12.2", "13.5", "14.1", "21.15")  # found by some versions only
+
+
+def eventful() -> dict[str, str]:
+    """The C of a scene with limits, an output, a jump and adaptive steps."""
+    return dict(eomc.sources(system.from_scene(scene.parse(EVENTFUL, "eventful.toml"))).files)
+
+
 @pytest.mark.slow
 def test_misra_rules_are_kept_but_for_those_that_are_told(tmp_path: Path) -> None:
-    """By cppcheck's addon, over all scenes; docs/c.md has those that are not, and why."""
+    """By cppcheck's addon, over all scenes; docs/c.md has those that are not, and why.
+
+    Which rules are found depends on the addon's version, but none that the page does not name.
+    """
     cppcheck, text = needs("cppcheck"), (ROOT / "docs" / "c.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| ([\d., ]+) \| (?:required|advisory) \|", text, re.MULTILINE)
+    rows = re.findall(r"^\| ([\d., ]+?)(?: ¹)? \| (?:required|advisory) \|", text, re.MULTILINE)
     told = {rule for row in rows for rule in row.split(", ")}
     found = set()
-    for name in [*NAMES, *WISHES]:
-        title = made(name).name
+    for name in [*NAMES, *WISHES, "eventful"]:
+        title = name if name == "eventful" else made(name).name
+        files = eventful() if name == "eventful" else generated(name)
         for end in "hc":
             file = f"{title}.{end}"
-            (tmp_path / file).write_text(generated(name)[file], encoding="utf-8")
+            (tmp_path / file).write_text(files[file], encoding="utf-8")
         words = ["--addon=misra", "--enable=style", "--std=c99", "--suppress=misra-config"]
         done = run(cppcheck, *words, f"{title}.c", cwd=tmp_path)
         assert done.returncode == 0 and "error" not in done.stderr, done.stderr
         found |= set(re.findall(r"\[misra-c2012-([\d.]+)\]", done.stderr))
-    assert found == told
+    assert found <= told and told - found <= {*BY_VERSION}
