@@ -306,8 +306,43 @@ def test_a_joint_that_nothing_resists_is_refused_by_name() -> None:
          "axis": [1, 0], "mass": 1.0},
     ]  # fmt: skip
     made = made_of(trees.text(bodies, [0, "-g"], trees.PARAMETERS))
-    with pytest.raises(EomcError, match=r"(first|second).* has no inertia"):
-        program.inertia(built(made))
+    with pytest.raises(EomcError, match=r"nothing resists first, second .* 'b0' has no inertia"):
+        built(made)
+
+
+@pytest.mark.parametrize("count", [3, 9])  # by Lagrange too, and by Newton and Euler alone
+@pytest.mark.parametrize(
+    ("joint", "axes", "together"),
+    [
+        ("revolute", [[0, 1, 0], [0, 1, 0]], "a0, a1"),
+        ("prismatic", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], "a0, a1, a3"),
+    ],
+)
+def test_joints_that_move_nothing_together_are_named(
+    joint: str, axes: list[list[float]], together: str, count: int
+) -> None:
+    """Massless bodies between joints, behind a chain of heavy links and at its end."""
+    heavy = {"mass": "m", "center": [0.3, 0.1, 0], "inertia": [0.1, 0.2, 0.25]}
+    bodies: list[dict[str, Any]] = [
+        {
+            "name": f"h{k}",
+            "joint": "revolute",
+            "coordinates": f"q{k}",
+            "axis": [0, k % 2, 1],
+            **heavy,
+        }
+        | ({"parent": f"h{k - 1}"} if k else {})
+        for k in range(count)
+    ]
+    for k, axis in enumerate(axes):
+        parent = f"b{k - 1}" if k else f"h{count - 1}"
+        bodies.append(
+            {"name": f"b{k}", "parent": parent, "joint": joint, "coordinates": f"a{k}",
+             "axis": axis} | (heavy if k == len(axes) - 1 else {})
+        )  # fmt: skip
+    made = made_of(trees.text(bodies, [0, 0, "-g"], trees.PARAMETERS))
+    with pytest.raises(EomcError, match=f"nothing resists {together} as they move together"):
+        built(made)
 
 
 def test_a_coordinate_that_no_joint_has_is_refused_at_its_line() -> None:

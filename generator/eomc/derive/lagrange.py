@@ -40,6 +40,9 @@ LAGRANGE_DEFINITIONS = 12  # of a tree's world coordinates: beyond, recursion al
 MOST_ROWS = 16  # coordinates from which D is computed column by column, where nothing needs it
 
 
+MASSLESS = "a motion that nothing resists"  # why there is no way by articulated bodies
+
+
 @dataclass(frozen=True)
 class Derivation:
     """The equations of motion by each way that may be worth its while.
@@ -178,8 +181,8 @@ def _by_articulated_bodies(system: System, recursion: Recursion, rest: Motion) -
     at = {link.q: k for k, link in enumerate(links)}
     try:
         found, pivots = accelerations(recursion, [rest.balance[q.index(link.q)] for link in links])
-    except MasslessError as fault:
-        no_inertia(system, links[fault.link].q.name)
+    except MasslessError:  # D is singular, from which `program.inertia` finds the motion
+        return MASSLESS
     order = tuple(q.index(link.q) for link in reversed(links))
     return Solution(recursion.tape, tuple(found[at[x]] for x in q), order, pivots)
 

@@ -12,7 +12,7 @@ from eomc.base.texts import listed
 from eomc.derive import outputs
 from eomc.derive.frames import motions
 from eomc.derive.inverse_dynamics import inverse_dynamics
-from eomc.derive.lagrange import Derivation
+from eomc.derive.lagrange import MASSLESS, Derivation
 from eomc.derive.ldl import Solution
 from eomc.derive.linearize import STICKS, linearization, sensitivity
 from eomc.derive.momentum import momentum
@@ -79,6 +79,8 @@ def build(derived: Derivation) -> Program:
         )
         for name in next(iter(found.values())).outputs
     }
+    if derived.articulated == MASSLESS:  # D is singular everywhere: accelerations have no formula
+        inertia(Program(system, functions, (), ()))
     best, taken, passed_over = accelerations(material)
     functions["acceleration"] = best
     for made in _derivatives(system, taken):
@@ -301,6 +303,12 @@ def inertia(program: Program) -> list[Problem]:
             f"D is not positive definite: '{weak}' has no inertia of its own. Give it a mass, "
             "or leave out a coordinate that others determine"
         )
+        if len(found) > 1:
+            message = (
+                f"D is not positive definite: nothing resists {listed(found)} as they move "
+                "together. Give what lies between them mass and inertia, or leave out a coordinate "
+                "that others determine"
+            )
         read = program["D" if "D" in program else "D_column"].uses
         if wrong := [
             f"{p.name} = {p.value:g}" for p in s.parameters if p.value <= 0 and p.name in read
