@@ -6,6 +6,8 @@ import subprocess
 import sys
 from types import ModuleType
 
+import pytest
+
 import eomc
 
 PUBLIC = {"System", "build", "dot", "equations", "export_fmu", "load", "read", "sources"}
@@ -25,3 +27,13 @@ def test_neither_import_nor_dir_imports_sympy() -> None:
 def test_dir_of_a_module_lists_its_functions_and_no_files(driven: ModuleType) -> None:
     names = {name for name in dir(driven) if not name.startswith("__")}
     assert names == set(driven.__all__) and {"simulate", "start", "defaults"} <= names
+
+
+def test_notebooks_show_the_message_of_an_error_alone(driven: ModuleType) -> None:
+    """IPython asks errors for the lines in place of the traceback."""
+    with pytest.raises(eomc.EomcError) as fault:
+        eomc.load("nowhere.toml")
+    assert fault.value._render_traceback_() == [f"{fault.type.__name__}: {fault.value}"]
+    with pytest.raises(driven.MotionError) as stop:
+        driven.step([0, 0.4], [0, 1e200], h=1.0)
+    assert stop.value._render_traceback_() == [f"MotionError: {stop.value}"]

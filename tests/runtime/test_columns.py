@@ -345,6 +345,10 @@ def test_what_they_are_given(run: Any, batch: ModuleType, monkeypatch: pytest.Mo
     )
     assert (attributes["scene"], attributes["h"]) == ("cartpole_driven", run.h)
     assert (attributes["method"], len(attributes["digest"])) == (run.method, 64)
+    swept = batch.simulate_batch(steps=4, params={"m_c": [1.0, 2.0, 3.0], "l": 2.5})
+    axes, values, units = swept.to_xarray()[1]["m_c"]
+    assert (axes, values.tolist(), units) == ("instance", [1.0, 2.0, 3.0], {"units": "kg"})
+    assert set(swept.to_xarray()[1]) == {"t", "m_c"} and set(runs.to_xarray()[1]) == {"t"}
 
 
 # --- in a line ------------------------------------------------------------------------------------

@@ -19,6 +19,10 @@ class EomcError(Exception):
     def __str__(self) -> str:
         return texts.lines(super().__str__())
 
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows: the message alone, without the calls inside the package."""
+        return [f"{type(self).__name__}: {self}"]
+
 
 class FolderError(EomcError):
     """A folder of builds that can't be written; the remedy is Python's, the command has its own."""

@@ -129,7 +129,10 @@ class Columns:
         return pandas.DataFrame({n: c.ravel() for n, c in columns.items()}, index=index)
 
     def to_xarray(self) -> Any:
-        """An xarray.Dataset of the columns over t, of a batch over instance and t; with units."""
+        """An xarray.Dataset of the columns over t, of a batch over instance and t; with units.
+
+        Parameters that differ between the instances of a batch are coordinates over instance.
+        """
         xarray = imported("xarray", "to_xarray")
         model, columns = self._model, self.to_dict()
         units = dict(model.units)
@@ -141,7 +144,20 @@ class Columns:
         }
         attributes = {name: getattr(self, name) for name in ("h", "method")}
         attributes |= {"scene": model.name, "digest": model.digest}
-        return xarray.Dataset(variables, coords={"t": t}, attrs=attributes)
+        coordinates = {"t": t} | self._swept(units, {*variables, *self._axes})
+        return xarray.Dataset(variables, coords=coordinates, attrs=attributes)
+
+    def _swept(self, units: dict[str, str], taken: set[str]) -> dict[str, Any]:
+        """Parameters that differ, over instance, by name; as params_NAME if that is taken."""
+        if self._params.ndim == 1 or len(self._params) == 1:
+            return {}
+        return {
+            f"params_{name}" if name in taken else name: (
+                "instance", values, {"units": units[name]} if name in units else {},
+            )
+            for name, values in self.params.items()
+            if np.ptp(values) > 0
+        }  # fmt: skip
 
 
 def imported(package: str, function: str) -> Any:

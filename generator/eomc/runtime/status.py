@@ -39,6 +39,10 @@ class MotionError(ArithmeticError):
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("status.MotionError", str(self), self.status)
 
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows: the message alone, without the calls inside the package."""
+        return [f"{type(self).__name__}: {self}"]
+
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C during a simulation; `run` holds what was done until then."""
@@ -49,6 +53,10 @@ class Interrupted(KeyboardInterrupt):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced("status.Interrupted", self.run)
+
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows: the message alone, without the calls inside the package."""
+        return [f"{type(self).__name__}: {self}"]
 
 
 def state_text(q: Array, qd: Array) -> str:
