@@ -87,5 +87,5 @@ def test_systems_made_in_python_tell_it_too() -> None:
         picture={"points": {"tip": [x + seen, 0]}, "dots": ["tip"]},
     )  # fmt: skip
     told = warned(system)
-    assert [p.key for p in told] == ["energy.kinetic", "energy.potential"]
+    assert [p.key for p in told] == ["kinetic", "potential"]
     assert "'m' reaches no" in str(told[0]) and "'shift' reaches no" in str(told[1])

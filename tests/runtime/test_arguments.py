@@ -246,6 +246,7 @@ def test_masks_may_be_in_the_middle_of_their_import(
     ("given", "words"),
     [
         ({"tols": 1e-9}, "simulate has no argument 'tols'; did you mean 'tol'?"),
+        ({"t": 10}, "simulate has no argument 't'; did you mean 'duration'?"),
         ({"step": 0.01, "steps": 3}, "simulate has no argument 'step'; did you mean 'h'?"),
         ({"Duration": 1.0}, "simulate has no argument 'Duration'; did you mean 'duration'?"),
         ({"g": 1.6}, "simulate has no argument 'g': write params={'g': ...}"),

@@ -49,6 +49,9 @@ def test_tables_that_do_not_fit_are_refused_by_name() -> None:
         "u: not all numbers are finite": lambda: m.step_batch(q0, qd0, u=[nan]),
         "u: 'push' is not an array of": lambda: m.step_batch(q0, qd0, u="push"),
         "u: 'Force' is not one of force; did you": lambda: m.step_batch(q0, qd0, u={"Force": 1}),
+        "step all instances by step_batch in a loop": lambda: m.simulate_batch(
+            q0, qd0, u=lambda t, q, qd: [0.0]
+        ),
         "u: 20 instances where q0 has 5: a table over time": lambda: m.simulate_batch(
             q0, qd0, steps=20, u=np.zeros((20, 1))
         ),

@@ -88,7 +88,7 @@ def test_what_is_held_is_a_list_of_names(module: ModuleType) -> None:
 
 def test_what_a_scene_has_to_ask_for_is_told(quickly_compiled: None, tmp_path: Path) -> None:
     module = eomc.load(replace(rod(), reactions=()), tmp_path)
-    with pytest.raises(ValueError, match=r"a scene asks with .run. linearize = true"):
+    with pytest.raises(ValueError, match=r"build it with .run. linearize = true"):
         module.tangent(*module.start)
     with pytest.raises(AttributeError, match=r"reactions: rod_named has no \[\[loop\]\]"):
         module.reactions(*module.start)

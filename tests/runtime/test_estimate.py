@@ -352,7 +352,7 @@ def test_the_scenes_start_within_their_limits() -> None:
 
 
 def test_linearize_says_how_to_get_it(cartpole: ModuleType) -> None:
-    with pytest.raises(ValueError, match=r"a scene asks with \[run\] linearize = true"):
+    with pytest.raises(ValueError, match=r"build it with \[run\] linearize = true"):
         cartpole.linearize([0, 1], [0, 0])
 
 

@@ -7,8 +7,10 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -116,6 +118,52 @@ print(cartpole.__file__)
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()).parent == folder
+
+
+@pytest.fixture(scope="module")
+def made(modules: Modules) -> ModuleType:
+    """A module of a System without any option."""
+    return modules.unoptimised(System.make("made", {"x": 1}, "x_dot**2/2", "x**2/2"))
+
+
+@pytest.mark.parametrize(
+    ("call", "argument"),
+    [
+        (lambda m: m.linearize([0], [0]), "linearize=True"),
+        (lambda m: m.discretize([0], [0]), "discretize=True"),
+        (lambda m: m.sensitivity([0], [0]), 'linearize="parameters"'),
+        (lambda m: m.simulate(method="euler"), "methods="),
+        (lambda m: m.simulate(tol=1e-6), "tolerance=1e-9"),
+        (lambda m: m.output([0], [0]), "outputs="),
+        (lambda m: m.simulate_batch([[0]]), "batch=True"),
+        (lambda m: m.inverse_dynamics([0], [0], [0]), "inverse_dynamics=True"),
+        (lambda m: m.constraints([0]), "constraints="),
+        (lambda m: m.momentum([0], [0]), "which System.make has not"),
+        (lambda m: m.pose([0], "tip"), "which System.make has not"),
+    ],
+)
+def test_what_a_system_was_built_without_is_an_argument_of_make(
+    made: ModuleType, call: Callable[[ModuleType], Any], argument: str
+) -> None:
+    with pytest.raises((ValueError, AttributeError)) as fault:
+        call(made)
+    assert argument in str(fault.value)
+    assert "System.make" in str(fault.value)
+
+
+def test_what_a_scene_was_built_without_is_a_key_of_run(cartpole: ModuleType) -> None:
+    for call in (cartpole.linearize, cartpole.discretize):
+        with pytest.raises(ValueError, match=r"\[run\] (linearize|discretize) = true") as fault:
+            call([0, 0], [0, 0])
+        assert "System.make" not in str(fault.value)
+
+
+def test_a_system_has_inverse_dynamics_where_it_is_asked_for(modules: Modules) -> None:
+    system = System.make(
+        "inverse", {"x": 1}, "m*x_dot**2/2", "x**2/2", parameters={"m": 2}, inverse_dynamics=True
+    )
+    found = modules.unoptimised(system).inverse_dynamics([0.5], [0.0], [3.0])
+    assert found == pytest.approx([6.5])
 
 
 def test_a_module_from_sympy_expressions() -> None:

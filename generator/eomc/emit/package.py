@@ -36,7 +36,7 @@ FUNCTIONS = (
     "limits linearize load_run output potential_energy power rhs sensitivity signal simulate "
     "simulate_batch step step_batch tau"
 ).split()
-ASKED = {  # what only scenes have that ask for it in [run]
+ASKED = {  # functions by the option that brings them
     "frames": ("pose", "frame_velocity", "frame_acceleration", "jacobian", "frame_forces"),
     "inverse_dynamics": ("inverse_dynamics", "drive_forces"),
     "momentum": ("momentum",),
@@ -288,4 +288,5 @@ def face(target: Target, extension: str) -> Face:
         methods=tuple(METHODS[name] for name in s.run.methods),
         functions=_functions(target),
         asked=tuple(x for x in ASKED.items() if not getattr(s.run, x[0])),
+        made_in_python=s.scene is None,
     )

@@ -250,6 +250,7 @@ class Face:
     methods: tuple[Method, ...]
     functions: tuple[str, ...]
     asked: tuple[tuple[str, tuple[str, ...]], ...]
+    made_in_python: bool
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from eomc.base import names
 from eomc.base.errors import EomcError
 from eomc.integrators.tableaux import METHODS
 from eomc.model import algebra, growth
+from eomc.model.mechanics import in_words_of_python
 from eomc.model.symbols import dot, symbol
 from eomc.scene import formulas
 from eomc.scene.formulas import FormulaError
@@ -97,7 +98,8 @@ def from_text(text: str, role: str, known: Mapping[str, Symbol], rule: str = "")
         growth.size(formula, {})
         return algebra.expression(formula, known)
     except FormulaError as wrong:
-        raise fault(role, f"'{text if len(text) <= 80 else text[:79] + '…'}' {wrong}") from None
+        shown = text if len(text) <= 80 else text[:79] + "…"
+        raise fault(role, f"'{shown}' {in_words_of_python(str(wrong))}") from None
 
 
 def undeclared(
@@ -135,6 +137,9 @@ def check_functions(expr: Expr, role: str) -> None:
         part = queue.pop()
         if not isinstance(part, _KNOWN):
             name = type(part).__name__
+            if name in formulas.NOT_ELEMENTARY:
+                why = in_words_of_python(formulas.NOT_ELEMENTARY[name])
+                raise fault(role, f"{name} can't be used: {why}")
             instead = f": write {_INSTEAD[name]}" if name in _INSTEAD else ""
             known = ", ".join(f.__name__ for f in _FUNCTIONS)
             raise fault(role, f"{name} can't be used{instead}; functions are {known}")
@@ -232,7 +237,7 @@ def symbol_of(given: Any, role: str) -> Any:
 
 def run(
     h: Any, duration: Any, methods: Any, real: Any, batch: Any, linearize: Any, discretize: Any,
-    tolerance: Any, events: bool,
+    tolerance: Any, events: bool, inverse_dynamics: Any,
 ) -> Run:  # fmt: skip
     """How the system is run. Raises EomcError where that is not possible."""
     for name, value in (("h", h), ("duration", duration)):
@@ -247,7 +252,8 @@ def run(
     methods = tuple(m for m in methods if m != "auto") or ("rk4",)
     if real not in REALS:
         raise fault("real", f"known are {', '.join(REALS)}, here {real!r}")
-    for name, value in (("batch", batch), ("discretize", discretize)):
+    flags = {"batch": batch, "discretize": discretize, "inverse_dynamics": inverse_dynamics}
+    for name, value in flags.items():
         if not isinstance(value, bool):
             raise fault(name, f"must be True or False, here {value!r}")
     if not isinstance(linearize, bool) and linearize != "parameters":
@@ -260,4 +266,4 @@ def run(
     elif events:
         tolerance = OF_EVENTS[real]
     plain = (float(h), float(duration), methods, real, batch, linearize, discretize)
-    return Run(*plain, tolerance=tolerance)
+    return Run(*plain, tolerance=tolerance, inverse_dynamics=inverse_dynamics)

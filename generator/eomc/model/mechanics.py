@@ -5,6 +5,7 @@ Knows nothing of where it comes from, of TOML or of C.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -29,6 +30,31 @@ from eomc.model.tree import Frame, Tree
 from eomc.scene.scene import Run, Scene
 
 LEAST_FLOAT, LARGEST_FLOAT = 2.0**-126, 2.0**128 - 2.0**104  # of full precision, in C
+
+
+_TABLES = "constants constraints coordinates definitions energy forces inputs outputs parameters"
+_TABLE = re.compile(rf"\[({_TABLES.replace(' ', '|')})\]")
+
+
+def in_words_of_python(message: str) -> str:
+    """Return a message about tables of a scene with the arguments of System.make in their place.
+
+    >>> in_words_of_python("split it with [definitions]")
+    'split it with definitions'
+    """
+    return _TABLE.sub(r"\1", message)
+
+
+def argument_of(key: str) -> str:
+    """Return the argument of System.make that corresponds to a key of a scene.
+
+    >>> argument_of("run.method"), argument_of("energy.kinetic"), argument_of("parameters.m")
+    ('methods', 'kinetic', 'parameters.m')
+    """
+    table, _, last = key.partition(".")
+    if table not in ("run", "energy") or not last:
+        return key
+    return {"method": "methods"}.get(last, last)
 
 
 @dataclass(frozen=True)
@@ -128,6 +154,7 @@ class Mechanics:
     def problem(self, key: str, message: str, severity: str = "error") -> Problem:
         """A problem at a key such as `energy.kinetic`, with its line where there is a scene."""
         if self.place is None:
+            message, key = in_words_of_python(message), argument_of(key)
             return Problem(message, key, f"System {self.name}", severity=severity)
         return self.place(key, message, severity=severity)
 

@@ -88,6 +88,7 @@ class System(Mechanics):
         batch: bool = False,
         linearize: bool | str = False,
         discretize: bool = False,
+        inverse_dynamics: bool = False,
         limits: Mapping[Any, Sequence[Any]] | None = None,
         events: Mapping[str, Any] | None = None,
         tolerance: float | None = None,
@@ -128,7 +129,7 @@ class System(Mechanics):
             raise given.fault("kinetic", f"None is not an expression: {given.LAGRANGIAN}")
         run = given.run(
             h, duration, methods, real, batch, linearize, discretize, tolerance,
-            bool(events or friction),
+            bool(events or friction), inverse_dynamics,
         )  # fmt: skip
         maker = from_sympy.Maker(name)
         system = maker.make(

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, as_flag, as_number, as_step_size, unmasked
 from .facts import Facts
+from .package import option
 
 LEAST = {8: 1e-15, 4: 5e-7}  # tolerances, by bytes of a number
 LOOSEST = 1e-2
@@ -34,7 +35,7 @@ def as_limits(
     if model.tolerance is None:
         raise ValueError(
             f"tol: {model.name} was built without adaptive steps, to which tol, h_most and stiff "
-            "belong: add tolerance = 1e-9 under [run] of its scene"
+            f"belong: build it with {option('tolerance', '1e-9')}"
         )
     if not all(map(is_, fixed, FIXED.values())):
         for name, value in zip(FIXED, fixed, strict=True):

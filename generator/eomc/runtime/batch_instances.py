@@ -88,7 +88,10 @@ class Instances(Model):
         if not self.nu:
             raise ValueError("u: this scene has no inputs")
         if callable(u):
-            raise ValueError("u: a Python function can't be called for many at once: give a table")
+            raise ValueError(
+                "u: a Python function can't be called for many at once: give a table, or step all "
+                "instances by step_batch in a loop that computes u from their states"
+            )
         if type(u) is not np.ndarray and isinstance(u, Mapping):
             u = self._by_name(u)
         if type(u) is np.ndarray and u.dtype is self.dtype and u.flags.carray:

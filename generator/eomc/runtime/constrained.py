@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from .arguments import Array, Parameters, StateArguments, not_one_of
 from .by_name import ByName
 from .frames import Frames
+from .package import option
 from .status import SAID, STATUS, MotionError, state_text
 
 AT_REST, SLOWEST = 1e-12, 1e-18  # of the largest velocity; m/s or rad/s
@@ -87,8 +88,8 @@ class Constrained(Frames):
         """
         if not hasattr(self._lib, "constraint_slopes"):
             raise ValueError(
-                f"tangent: {self.name} was built without derivatives: a scene asks with [run] "
-                "linearize = true, or discretize"
+                f"tangent: {self.name} was built without derivatives: build it with "
+                f"{option('linearize')}, or discretize"
             )
         A = self.constraint_jacobian(q, t=t, params=params)
         slopes = self._evaluate("constraint_slopes", q, qd, t, None, params)

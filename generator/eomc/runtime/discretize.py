@@ -7,6 +7,7 @@ from typing import Any
 from numpy import empty
 
 from .arguments import Array, StateArguments
+from .package import option
 from .slices import slices
 from .status import SAID, STATUS, MotionError, state_text
 from .stepping import Stepping
@@ -25,8 +26,7 @@ def discretize(
     """
     if not hasattr(model._lib, f"{method}_derivative"):
         raise ValueError(
-            f"discretize: {model.name} was built without it: a scene asks with [run] "
-            "discretize = true"
+            f"discretize: {model.name} was built without it: build it with {option('discretize')}"
         )
     rows, n = q.shape[:-1], model.nq
     Phi = empty((*rows, 2 * n, 2 * n), model.dtype)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 from .constrained import Rows
-from .package import MODEL, reduced
+from .package import MODEL, option, reduced
 from .statics import Statics
 
 _MANY = 1000  # steps from which a run is not taken in one call
@@ -73,7 +73,7 @@ class Facts(Statics):
         if not isinstance(method, str) or method not in self.methods:
             raise ValueError(
                 f"method: {method!r} is not in this module, which has {', '.join(self.methods)}: "
-                "a scene asks for several with a list, [run] method = [...]"
+                f"build it with a list of several, {option('method', '[...]')}"
             )
         return method
 

@@ -14,6 +14,7 @@ from .arguments import Array
 from .begun import infinite_at_start
 from .by_name import ByName
 from .happened import Happened
+from .package import is_made_in_python, option
 from .periods import held_at
 from .recorded import LEFT_OUT
 from .status import SAID, state_text
@@ -27,15 +28,22 @@ STOPPED = (
     "looser tolerance"
 )
 REMEDIES = (
-    'take friction = "stick" in [run]',
+    "take {}",
     "give its coordinate friction = in place of the force",  # where the scene has that
 )
+
+
+def _friction() -> str:
+    """How friction that sticks is written."""
+    return (
+        "System.make(..., friction={...})" if is_made_in_python() else option("friction", '"stick"')
+    )
 
 
 def said(model: Stepping, status: str, fixed: str) -> str:
     """Why steps by a tolerance, or fixed ones of a method, could not go on."""
     if status == "no convergence" and not fixed:
-        return STOPPED.format(REMEDIES[bool(model._rows.modes)])
+        return STOPPED.format(REMEDIES[bool(model._rows.modes)].format(_friction()))
     return SAID[status]
 
 

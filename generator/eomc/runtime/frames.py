@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from .arguments import Array, Parameters, not_one_of
 from .functions import Functions
-from .package import reduced
+from .package import option, reduced
 
 
 class Pose(NamedTuple):
@@ -115,7 +115,7 @@ class Frames(Functions):
         Under constraints it is tau + A^T lambda; `drive_forces` parts them.
         """
         if f_ext is not None and not self.frames:
-            raise ValueError("f_ext acts at frames: a scene has them by [run] frames = true")
+            raise ValueError(f"f_ext acts at frames: build it with {option('frames')}")
         given = self._like(qdd, "qdd", (self.nq,), q)
         found: Array = self._evaluate("inverse_dynamics", q, qd, t, None, params, None, given)
         return found if f_ext is None else found - self.frame_forces(q, f_ext, t=t, params=params)

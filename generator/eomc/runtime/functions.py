@@ -15,6 +15,7 @@ from numpy import empty
 from numpy.typing import ArrayLike
 
 from .arguments import Arguments, Array, Parameters, StateArguments, as_flag, as_number
+from .package import named_outputs, option
 from .slices import slices
 from .status import SAID, STATUS, MotionError, state_text
 
@@ -248,7 +249,7 @@ class Functions(Arguments):
         nan where one needs accelerations and D is singular. Raises ValueError where there are none.
         """
         if not self.outputs:
-            raise ValueError(f"output: {self.name} has none: a scene names them in [outputs]")
+            raise ValueError(f"output: {self.name} has none: {named_outputs()}")
         values: Array = self._evaluate("outputs", q, qd, t, u, params, out)
         return values
 
@@ -307,16 +308,15 @@ class Functions(Arguments):
         """
         if not self.has_slopes:
             raise ValueError(
-                f"linearize: {self.name} was built without it: a scene asks with [run] "
-                "linearize = true"
+                f"linearize: {self.name} was built without it: build it with {option('linearize')}"
             )
         outputs, closed = as_flag(outputs, "outputs"), as_flag(closed, "closed")
         if outputs and not self.outputs:
-            raise ValueError(f"linearize: {self.name} has no outputs: name them in [outputs]")
+            raise ValueError(f"linearize: {self.name} has no outputs: {named_outputs()}")
         if outputs and not hasattr(self._lib, "output_slopes"):
             raise ValueError(
-                f"linearize: {self.name} was built without derivatives of its outputs: a scene "
-                "asks with [run] linearize = true"
+                f"linearize: {self.name} was built without derivatives of its outputs: build it "
+                f"with {option('linearize')}"
             )
         at, moving = self._state(q, qd)
         A, B = self._slopes(at, moving, u, t, params)
@@ -376,8 +376,8 @@ class Functions(Arguments):
         """
         if not hasattr(self._lib, "sensitivity"):
             raise ValueError(
-                f"sensitivity: {self.name} was built without it: a scene with parameters asks with "
-                '[run] linearize = "parameters"'
+                f"sensitivity: {self.name} was built without it: build it, with parameters, with "
+                + option("linearize", '"parameters"')
             )
         E: Array = self._evaluate("sensitivity", q, qd, t, u, params)
         if not np.isfinite(E).all():

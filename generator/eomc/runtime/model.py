@@ -31,7 +31,7 @@ from .arguments import (
 from .discretize import discretize
 from .facts import CHUNK, SOME
 from .laws import Law, Sampled, called_each_step
-from .package import warn
+from .package import option, warn
 from .shown import with_events
 from .slices import longer
 from .stability import advice
@@ -60,7 +60,7 @@ class Model(Stepping):
         model, kind, kept = saved.read(self, file)
         if (of := model._kinds.get(kind)) is None:
             raise ValueError(
-                f"{file}: is a run of many at once, which a scene has by [run] batch = true"
+                f"{file}: is a run of many at once: build the module with {option('batch')}"
             )
         return of._of_kept(model, kept)
 

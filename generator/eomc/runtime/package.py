@@ -151,6 +151,34 @@ class Unreadable:
     __hash__ = object.__hash__
 
 
+_ONLY_OF_SCENES = ("frames", "momentum")  # options that concern bodies
+_SPELLED = {"true": "True", "method": "methods"}  # of [run], as System.make has it
+
+
+def option(key: str, value: str = "true") -> str:
+    """Return the option that a module is built with, as its user writes it.
+
+    That is a key of [run] for a scene, an argument for a System.
+    """
+    if not is_made_in_python():
+        return f"[run] {key} = {value}"
+    if key in _ONLY_OF_SCENES:
+        return f"[run] {key} = {value} of a scene with bodies, which System.make has not"
+    return f"System.make(..., {_SPELLED.get(key, key)}={_SPELLED.get(value, value)})"
+
+
+def named_outputs() -> str:
+    """Return where the user names the outputs of a module."""
+    where = "System.make(..., outputs={...})" if is_made_in_python() else "[outputs]"
+    return f"name them in {where}"
+
+
+def is_made_in_python() -> bool:
+    """Whether this package is built from a System that `System.make` returned."""
+    package = import_module(str(__package__))
+    return bool(getattr(package, "_made_in_python", False))
+
+
 def meant(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'm_c'?"` where a known name is close, else the empty string."""
     import difflib  # of use here alone
@@ -175,7 +203,8 @@ def of_a_start(model: Any, name: str) -> str:
 _CALLED = {
     "dt": "h", "step": "h", "step_size": "h", "stepsize": "h", "timestep": "h", "rtol": "tol",
     "atol": "tol", "eps": "tol", "max_step": "h_most", "t_eval": "times", "tmax": "duration",
-    "t_end": "duration", "t_final": "duration", "t_span": "duration", "x0": "q0", "v0": "qd0",
+    "t": "duration", "t_end": "duration", "t_final": "duration", "t_span": "duration",
+    "x0": "q0", "v0": "qd0",
 }  # fmt: skip
 
 
@@ -220,9 +249,11 @@ class Package(ModuleType):
         """Raises AttributeError: of what only scenes with constraints have, with the reason."""
         model = self.__dict__.get("_model")
         if model is not None and name in _CONSTRAINED:
-            what = "[[loop]]" if hasattr(model, name) and model.constraint_names else (
-                "constraints: a scene has them by [constraints] or [[loop]]"
+            there = "System.make(..., constraints={...})" if is_made_in_python() else (
+                "a scene has them by [constraints] or [[loop]]"
             )  # fmt: skip
+            closed = hasattr(model, name) and model.constraint_names
+            what = "[[loop]]" if closed else f"constraints: {there}"
             raise AttributeError(f"{name}: {model.name} has no {what}")
         own = self.__dict__.get("__getattr__", super().__getattribute__)
         return own(name)

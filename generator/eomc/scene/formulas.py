@@ -91,13 +91,19 @@ _FOREIGN: Mapping[type, str] = {
     ast.Lambda: "'lambda' is not used in formulas",
 }
 
+_NO_FORM = "it has no exact form in the functions of formulas"
+NOT_ELEMENTARY: Mapping[str, str] = {
+    "erf": f"{_NO_FORM}; the force -2*exp(-x**2)/sqrt(pi) of a potential erf(x) has one: [forces]",
+    "erfc": f"{_NO_FORM}; the force 2*exp(-x**2)/sqrt(pi) of a potential erfc(x) has one: [forces]",
+    "gamma": _NO_FORM,
+}
 _INSTEAD: Mapping[str, str] = {
+    **NOT_ELEMENTARY,
     "pow": "write a**b",
     **dict.fromkeys(("radians", "deg2rad", "deg", "degrees"), "write 30 degrees as 30*pi/180"),
     **{name: f"write 1/{of}(...)" for name, of in (("sec", "cos"), ("csc", "sin"), ("cot", "tan"))},
     "cbrt": "write x**(1/3) where x is positive",
     "Piecewise": "write heaviside(a - b), min or max",
-    **dict.fromkeys(("erf", "erfc", "gamma"), "take a function that there is, such as tanh"),
 }
 
 _ALLOWED = "numbers, names, + - * / **, parentheses and functions"
