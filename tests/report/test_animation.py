@@ -36,6 +36,11 @@ def values(packed, shape=(-1,)):
     return packed["middle"] + levels.reshape(shape) * packed["scale"]
 
 
+def times(given):
+    """The times of the rows of a run on a page."""
+    return np.frombuffer(base64.b64decode(given["rows"]), dtype="<f8")
+
+
 def test_nothing_is_asked_of_a_network():
     text = page(scene("cartpole"))
     assert "default-src 'none'" in text
@@ -68,7 +73,7 @@ def test_positions_are_those_of_the_run_to_the_stated_resolution():
     (own,) = [m for m in shown.marks if m.kind == "box"]
     assert np.abs(moving[:, box[1:]] - shown.points[:, own.points]).max() <= d["moving"]["scale"]
     assert d["moving"]["scale"] < 1e-4
-    assert np.abs(values(given["rows"]) - run.t).max() <= given["rows"]["scale"]
+    assert np.array_equal(times(given), run.t)
     _, (theta,), (energy,) = given["panels"]
     assert np.abs(values(theta) - run.q[:, 1]).max() <= theta["scale"] and energy["scale"] == 1
 
@@ -83,13 +88,13 @@ def test_ten_seconds_are_less_than_a_megabyte(made):
     text = page(made(), seconds=10.0, rows=10_001)
     assert len(text) < 1_000_000
     given = data(text)["runs"][0]
-    assert given["smooth"] and len(values(given["rows"])) >= 500
+    assert given["smooth"] and len(times(given)) >= 500
 
 
 def test_long_runs_are_thinned_and_the_page_says_to_what():
     text = page(chain(), seconds=100.0, rows=100_001)
     assert len(text) < 1_000_000
-    count = len(values(data(text)["runs"][0]["rows"]))
+    count = len(times(data(text)["runs"][0]))
     assert f"{count} rows, {(count - 1) / 100:.3g} a second" in text
 
 
@@ -100,7 +105,7 @@ def test_it_plays_in_real_time_unless_that_would_be_nothing_to_see():
 
 def test_a_run_of_one_row_and_what_is_not_finite():
     text = page(scene("cartpole"), rows=1)
-    assert len(values(data(text)["runs"][0]["rows"])) == 1
+    assert len(times(data(text)["runs"][0])) == 1
     packed = animation._packed(np.array([1.0, np.nan, 3.0]))
     assert np.frombuffer(base64.b64decode(packed["data"]), "<i2").tolist() == [
         -32767,
@@ -190,8 +195,8 @@ def batch():
 
 def rows_of(batch, text):
     """The rows of a batch that a page shows."""
-    times = values(data(text)["runs"][0]["rows"])
-    return np.rint(np.interp(times, batch.t, np.arange(len(batch.t)))).astype(int)
+    shown = times(data(text)["runs"][0])
+    return np.rint(np.interp(shown, batch.t, np.arange(len(batch.t)))).astype(int)
 
 
 def test_instances_of_a_batch_are_over_each_other(batch, tmp_path):
@@ -253,10 +258,10 @@ def test_unknown_curves_of_a_batch_are_refused(batch):
 def test_a_batch_by_tolerance_moves_at_its_times(modules):
     text = (SCENES / "cartpole.toml").read_text().replace('"cartpole"', '"fitted_poles"')
     many = modules.unoptimised(text.replace("[run]\n", "[run]\nbatch = true\ntolerance = 1e-6\n"))
-    times, lengths = np.arange(61) / 60, np.linspace(1.0, 2.0, 3)
-    runs = many.simulate_batch(params={"l": lengths}, times=times, tol=1e-6)
+    lengths = np.linspace(1.0, 2.0, 3)
+    runs = many.simulate_batch(params={"l": lengths}, times=np.arange(61) / 60, tol=1e-6)
     given = data(runs.animate(instances=[2, 0]).page)["runs"][0]
-    assert np.abs(values(given["rows"]) - runs.t).max() <= given["rows"]["scale"]
+    assert np.array_equal(times(given), runs.t)
     (first, _) = given["panels"][1]
     assert np.abs(values(first) - runs.q[2, :, 1]).max() <= first["scale"]
 
@@ -361,3 +366,82 @@ def test_pages_need_no_matplotlib(monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert page(scene("cartpole"))
+
+
+BOUNCING = """eomc = 1
+name = "bouncing"
+[coordinates]
+y = { unit = "m", start = 1.0 }
+x = { unit = "m", start = "X0", rate = 0.5 }
+[parameters]
+X0 = 2e6
+[inputs]
+wind = { unit = "N" }
+[energy]
+kinetic = "(x_dot**2 + y_dot**2)/2"
+potential = "9.81*y"
+[forces]
+x = "wind"
+[[event]]
+name = "impact"
+when = "y"
+direction = "falling"
+action = "jump"
+y_dot = "-0.8*y_dot"
+[picture]
+points = { ball = ["x - X0", "y"] }
+dots = ["ball"]
+[run]
+h = 0.01
+duration = 2.0
+"""
+
+
+@pytest.fixture(scope="module")
+def ball(modules):
+    return modules.unoptimised(BOUNCING)
+
+
+def test_adaptive_runs_are_interpolated_and_keep_both_rows_of_a_jump(ball):
+    run = ball.simulate(tol=1e-9, duration=2.0)
+    given = data(run.animate().page)["runs"][0]
+    rows, impacts = times(given), run.events["impact"].t
+    assert len(run.t) < 50 and len(rows) >= 600 and given["smooth"]
+    even = np.diff(np.unique(rows))
+    assert even.max() < 1 / 60
+    for t in impacts:
+        assert np.count_nonzero(rows == t) == 2
+    ((y,), (x,), *_) = given["panels"]
+    first = np.searchsorted(rows, impacts[0], side="right")
+    exact = 1 - 9.81 * rows[:first] ** 2 / 2
+    assert np.abs(values(y)[:first] - exact).max() <= y["scale"] + 1e-9
+    assert np.abs(values(x) - (2e6 + 0.5 * rows)).max() <= x["scale"] + 1e-9
+
+
+def test_inputs_that_are_held_are_drawn_as_stairs(ball):
+    table = np.arange(20.0)[:, None] % 3
+    held = ball.simulate(h=0.01, duration=1.0, u=table, control_period=0.05)
+    own = ball.simulate(h=0.01, duration=1.0)
+    for run, stairs in ((held, True), (own, False)):
+        panels = data(run.animate().page)["runs"][0]["panels"]
+        (wind,) = panels[2]
+        assert wind["stairs"] is stairs and not panels[0][0]["stairs"]
+
+
+def test_a_notebook_shows_the_page_as_high_as_it_is(ball):
+    shown = ball.simulate(h=0.01, duration=0.1).animate()._repr_html_()
+    height = float(re.search(r"height:([0-9.]+)em", shown)[1])
+    assert height >= animation.PANEL_HEIGHT * 4 and "scrollHeight" in shown
+
+
+@pytest.mark.parametrize("how", [{"h": 0.01}, {"tol": 1e-9}])
+def test_a_picture_at_a_time_is_an_array_of_pixels(ball, how):
+    run = ball.simulate(duration=1.0, **how)
+    image = run.render(0.333)
+    assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
+    assert image.std() > 0
+    several = run.render([0.0, 0.333])
+    assert np.array_equal(several[1], image) or np.abs(several[1].astype(int) - image).mean() < 2
+    assert not np.array_equal(several[0], several[1])
+    with pytest.raises(ValueError, match="the run goes from 0 s to 1 s"):
+        run.render(2.0)

@@ -27,8 +27,10 @@ from eomc.runtime.written import replacing
 
 Array = NDArray[np.float64]
 
-FRAMES = 60  # rows a second of the motion, at most
-SMOOTH = 25  # rows a second from which positions between two rows are those between their points
+FRAMES = 60  # rows a second of playing, at most
+INTERPOLATED = 600  # rows of an adaptive run, at least
+SMOOTH = 25  # rows a second of playing from which positions are interpolated linearly between rows
+PANEL_HEIGHT = 9.5  # em, of a panel of curves with its caption
 BYTES = 650_000  # of positions and curves before they are written as text, at most
 LEVELS = 32_767  # of a quantity from its middle to its ends
 FILMS = (".gif", ".mp4")
@@ -38,9 +40,13 @@ SHORT, LONG = 1.0, 60.0  # s that the motion is played in, where not in real tim
 
 @dataclass(frozen=True)
 class Animation:
-    """A page that plays a motion; notebooks show it, `save` writes it."""
+    """A page that plays a motion; notebooks show it, `save` writes it.
+
+    panels: the number of panels of curves below each other.
+    """
 
     page: str = field(repr=False)
+    panels: int = 0
 
     def save(self, file: str | os.PathLike[str]) -> None:
         """Write the page. Raises EomcError where it can't be written."""
@@ -48,10 +54,12 @@ class Animation:
             new.write_text(self.page, encoding="utf-8")
 
     def _repr_html_(self) -> str:
-        """The page in a frame of its own."""
+        """The page in a frame of its own, as high as the page."""
         inside = html.escape(self.page)
-        style = "width:100%;height:34em;border:0"
-        return f'<iframe style="{style}" title="motion" srcdoc="{inside}"></iframe>'
+        height = max(34.0, 7 + PANEL_HEIGHT * self.panels)
+        style = f"width:100%;height:{height:g}em;border:0"
+        fit = "this.style.height=this.contentDocument.documentElement.scrollHeight+4+'px'"
+        return f'<iframe style="{style}" title="motion" onload="{fit}" srcdoc="{inside}"></iframe>'
 
 
 def animate(
@@ -105,7 +113,8 @@ def shown(
 
         film.write(reels, Path(file), title)
         return None
-    made = Animation(page(reels, title))
+    count = max(len(list(reel.panels(np.zeros(1, dtype=int)))) for reel in reels)
+    made = Animation(page(reels, title), count)
     if file is not None:
         made.save(file)
     return made
@@ -144,14 +153,18 @@ class _Shown:
     """One run on the page."""
 
     def __init__(self, reel: Reel, count: int) -> None:
-        self.reel, t = reel, reel.t
-        last = len(t) - 1
-        spacing = (t[last] - t[0]) / last if last else 1.0
-        step = max(round(1 / (FRAMES * spacing)), 1) if spacing > 0 else 1
         made = reel.drawing(np.zeros(1, dtype=int))
         width = made.points[0].size if made else 0
-        most = max(BYTES // (2 * (width + reel.curves) * count), 2)  # rows
-        step = max(step, -(-last // most))
+        most = max(BYTES // (2 * (width + reel.curves + 4) * count), 2)  # rows; a time has 8 bytes
+        lasting = float(reel.t[-1] - reel.t[0])
+        self.speed = _speed(lasting)
+        even = min(max(int(FRAMES / self.speed * lasting) + 1, INTERPOLATED), most)
+        resampled = reel.resample(even)
+        self.reel, t = reel, reel.t
+        last = len(t) - 1
+        spacing = lasting / last if last else 1.0
+        step = max(round(self.speed / (FRAMES * spacing)), 1) if spacing > 0 else 1
+        step = 1 if resampled else max(step, -(-last // most))
         self.index = np.unique(np.append(np.arange(0, last + 1, step), last))
         self.rows = t[self.index]
         self.drawing = reel.drawing(self.index)
@@ -166,11 +179,14 @@ class _Shown:
     def data(self) -> dict[str, Any]:
         return {
             "t": [float(self.rows[0]), float(self.rows[-1])],
-            "rows": _packed(self.rows),
-            "smooth": bool(self.rate >= SMOOTH),
+            "rows": base64.b64encode(self.rows.astype("<f8").tobytes()).decode("ascii"),
+            "smooth": bool(self.rate * self.speed >= SMOOTH),
             "drawing": _drawn(self.drawing) if self.drawing else None,
             "many": len(self.reel.key),
-            "panels": [[_packed(line.values) for line in p.lines] for p in self.panels],
+            "panels": [
+                [_packed(line.values) | {"stairs": line.stairs} for line in p.lines]
+                for p in self.panels
+            ],
         }
 
     def words(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from subprocess import CalledProcessError
 from typing import TYPE_CHECKING, Any, cast
@@ -12,10 +13,13 @@ from numpy.typing import NDArray
 
 from eomc.base import texts
 from eomc.base.errors import EomcError
+from eomc.report.drawing import drawing
 from eomc.report.marks import Drawing
+from eomc.report.origin import Source, system_of
 from eomc.report.picture import frame, seen, shapes, still
 from eomc.report.reel import Reel
 from eomc.report.style import COLOURS, INK, colours
+from eomc.runtime.columns import imported
 from eomc.runtime.written import replacing
 
 if TYPE_CHECKING:
@@ -26,6 +30,7 @@ Pixels = NDArray[np.uint8]
 
 RATES = {".gif": 25, ".mp4": 50}  # pictures a second; a GIF counts in hundredths of a second
 MOST = 1500  # pictures
+VIEWED = 400  # rows of a run that the view of a single picture has room for, at most
 SIZE, DPI = 4.8, 100  # inches of a run, dots an inch
 WHITE = 248  # from which on it is white: Pillow finds the nearest colour to four values or so
 
@@ -70,6 +75,32 @@ def write(reels: Sequence[Reel], file: Path, title: str | None) -> None:
         except (OSError, CalledProcessError) as fault:
             words = getattr(fault, "strerror", None) or str(fault)
             raise EomcError(f"{shown}: can't be written ({words})") from None
+
+
+def render(run: Any, t: Any, scene: Source | None) -> Pixels:
+    """Draw the mechanism at the times `t`, in a view with room for the whole motion.
+
+    Returns pixels (height, width, 3), or (n, height, width, 3) for times (n,). Raises EomcError if
+    the scene has no shape, ImportError without matplotlib.
+    """
+    imported("matplotlib", "render")
+    wanted = np.asarray(run.t[-1] if t is None else t, dtype=float)
+    reel = Reel(system_of(run, scene), run)
+    q, _ = run(wanted.ravel())
+    rows = np.unique(np.linspace(0, len(reel.t) - 1, VIEWED).astype(int))
+    times = np.concatenate([wanted.ravel(), reel.t[rows]])
+    states = np.concatenate([q, np.asarray(run.q)[rows]]).astype(float)
+    drawn = drawing(reel.system, times, states)
+    if drawn is None:
+        raise EomcError(
+            f"render: {reel.system.name} says nothing about its shape: add [picture] to the scene"
+        )
+    order = np.argsort(times, kind="stable")
+    place = np.argsort(order)[: wanted.size]
+    ordered = replace(drawn, points=drawn.points[order])
+    pictures = Pictures([reel], [ordered], times[order], None)
+    found = np.stack([pictures.at(int(k))[..., :3] for k in place])
+    return found if wanted.ndim else found[0]
 
 
 def _gif(pictures: Pictures, file: Path) -> None:

@@ -26,10 +26,14 @@ TOLD = 2  # parameters by which instances differ, named beside them
 
 @dataclass(frozen=True)
 class Line:
-    """One curve: its name and its values at the rows that are shown."""
+    """A curve: its name and its values at the rows that are shown.
+
+    stairs: whether it is an input that is held constant from one row to the next.
+    """
 
     name: str
     values: Array
+    stairs: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,15 @@ class Reel:
         """How many there are, about."""
         return 2 * len(self.system.q) + 1
 
+    def resample(self, count: int) -> bool:
+        """Replace the rows of an adaptive run by `count` interpolated ones; whether it is one."""
+        run = self.run
+        if not (hasattr(run, "_evenly") and len(run) > 1 and run.t[-1] > run.t[0]):
+            return False
+        self.run = run._evenly(count)
+        self.t = np.asarray(self.run.t, dtype=float)
+        return True
+
     def drawing(self, rows: Rows) -> Drawing | None:
         """What is drawn at some rows; None where the scene says nothing of its shape."""
         return drawing(self.system, self.t[rows], np.asarray(self.run.q, dtype=float)[rows])
@@ -70,7 +83,8 @@ class Reel:
             for o in system.outputs
         ]
         u = np.asarray(run.u, dtype=float)[rows] if system.inputs else np.empty((len(rows), 0))
-        lines += [(i.unit, Line(i.name, u[:, k])) for k, i in enumerate(system.inputs)]
+        held = getattr(run, "_u", None) is not None
+        lines += [(i.unit, Line(i.name, u[:, k], held)) for k, i in enumerate(system.inputs)]
         units = dict.fromkeys(unit for unit, _ in lines)
         apart = len(lines) <= PANELS - 1 and len(lines) <= COLOURS
         for unit in units:

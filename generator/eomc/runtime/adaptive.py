@@ -79,6 +79,18 @@ class AdaptiveRun(Fitted):
             return self
         return self._with(np.linspace(self.t[0], self.t[-1], _DRAWN + 1)[1:-1])
 
+    def _evenly(self, count: int) -> AdaptiveRun:
+        """Interpolate the run at `count` equidistant times, with both rows of each jump."""
+        steps: AdaptiveRun = with_jumps(self)
+        jumps = np.flatnonzero(np.diff(steps.t) == 0)
+        own = np.unique(np.concatenate([[0], jumps, jumps + 1, [len(steps) - 1]]))
+        times = np.linspace(steps.t[0], steps.t[-1], count)
+        times = times[~np.isin(times, steps.t[own])]
+        whole = np.concatenate([steps.t[own], times])
+        order = np.argsort(whole, kind="stable")
+        both = zip((steps.q[own], steps.qd[own]), self(times), strict=True)
+        return self._at(whole[order], np.array([np.concatenate(x)[order] for x in both]))
+
     def _with(self, times: Array) -> AdaptiveRun:
         """Itself, with rows at some times within among its own."""
         whole = np.concatenate([self.t, times])

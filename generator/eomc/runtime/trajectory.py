@@ -132,6 +132,33 @@ class Run(Recorded):
         page = by_eomc("report.animation")
         return page.animate([self, *others], file, scene=scene, title=title)
 
+    def render(self, t: ArrayLike | None = None, *, scene: Any = None) -> Array:
+        """Draw the mechanism at a time within the run.
+
+        Parameters
+        ----------
+        t : float or (n,) array, optional
+            Time in s; the end of the run by default. States between rows are interpolated.
+        scene : path, optional
+            The scene, where the module was not loaded by `eomc.load`.
+
+        Returns
+        -------
+        (height, width, 3) or (n, height, width, 3) array of uint8
+            RGB pixels. The view is the same for all times of a run.
+
+        Raises
+        ------
+        ImportError
+            Without eomc or matplotlib.
+        EomcError
+            If the scene says nothing about its shape.
+        ValueError
+            If a time lies outside of the run.
+        """
+        pixels: Array = by_eomc("report.film").render(self, t, scene)
+        return pixels
+
     def estimate(self, progress: Callable[[int, int], None] | None = None) -> Estimate:
         """The run's own error, by doing it again in shorter steps; kept in `error`.
 
