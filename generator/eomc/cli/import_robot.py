@@ -34,11 +34,15 @@ from eomc.cli.terminal import say, shown
 )
 @click.option("--stops", is_flag=True, help="Let limits of joints push back, as stops do.")
 @click.option("--limits", is_flag=True, help="Let limits of drives act, as limits of inputs.")
+@click.option(
+    "--parameters", type=click.Choice(["masses"]),
+    help="Make the masses parameters, with a payload at each tip.",
+)  # fmt: skip
 @click.option("--include", is_flag=True, help="Open what <include> names, in the file's folder.")
 def command(
     file: Path, out: Path | None, name: str | None, locks: Sequence[str], root: str, tip: str,
     base: str | None, no_drives: bool, mend_inertias: bool, stops: bool, limits: bool,
-    include: bool,
+    parameters: str | None, include: bool,
 ) -> None:  # fmt: skip
     """Write the scene of a robot file, URDF or MJCF, and say what it leaves out.
 
@@ -51,6 +55,7 @@ def command(
     from eomc.base import names
     from eomc.robots import edit, scene_text, urdf, xml
     from eomc.robots.limits import limited
+    from eomc.robots.masses import with_masses
     from eomc.robots.mjcf import read
     from eomc.robots.robot import refused
     from eomc.scene.toml_text import MAX_BYTES
@@ -80,6 +85,8 @@ def command(
             robot = edit.stopped(robot)
         if limits:
             robot = limited(robot)
+        if parameters:
+            robot = with_masses(robot, tip)
         robot = scene_text.finished(robot)
     except EomcError as fault:
         raise refused(fault, robot.left_out) from None

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from eomc.base.texts import toml
 from eomc.robots.formulas import less, number, total
-from eomc.robots.robot import UNLIMITED, Drive, Law, Robot, Tendon, joined
+from eomc.robots.robot import UNLIMITED, Drive, Law, Robot, RobotBody, Tendon, joined
 
 _FORCES = {"rad": "N m", "m": "N"}  # by a coordinate's unit
 _SUM = 50  # terms of a sum at most: each nests the formula deeper, which bears 150
@@ -53,7 +53,7 @@ def energies(robot: Robot) -> dict[str, str]:
     rates = [(t, f"dot({t.name})**2/2") for t in robot.tendons]
     borne = [b for b in robot.bodies if b.lifted and b.mass]
     weights = [
-        (g, _sum([(b.lifted * b.mass, f"{b.name}_{axis}") for b in borne]))
+        (g, _sum([_weight(b, axis) for b in borne]))
         for g, axis in zip(robot.gravity, "xyz", strict=True)
         if g and borne
     ]
@@ -63,6 +63,13 @@ def energies(robot: Robot) -> dict[str, str]:
         "dissipation": [(t.damping, rate) for t, rate in rates if t.damping],
     }
     return {key: _long(total(terms)) for key, terms in sums.items() if terms}
+
+
+def _weight(body: RobotBody, axis: str) -> tuple[float, str]:
+    """The part of a body's mass that is borne, as a factor, times a place."""
+    if body.parameter:
+        return body.lifted, f"{body.parameter}*{body.name}_{axis}"
+    return body.lifted * body.mass, f"{body.name}_{axis}"
 
 
 def force(coordinate: str, robot: Robot) -> str:

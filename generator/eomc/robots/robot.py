@@ -71,7 +71,9 @@ class RobotBody:
     its coordinates and its unit `axes` in the joint's frame. offset (m) and rotation: the joint's
     frame in the parent's, v_parent = offset + rotation v_joint. mass: kg. center: m, in the
     body's frame. inertia: kg m^2, of the centre of mass, along the body's axes. point: whether it
-    only marks a place on its parent. lifted: the share of its weight that a force takes.
+    only marks a place on its parent. lifted: the share of its weight that a force takes. rotor:
+    what of the diagonal of the inertia is a joint's armature, kg m^2. parameter: what its mass is
+    called in the scene, "" where that is a number.
     """
 
     name: str
@@ -87,6 +89,8 @@ class RobotBody:
     note: str = ""
     point: bool = False
     lifted: float = 0.0
+    rotor: float = 0.0
+    parameter: str = ""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from eomc.base.texts import line, toml
 from eomc.robots import acting
 from eomc.robots.formulas import angle, length, less, number, total, vector
 from eomc.robots.inertias import has_nearest, indefinite, unbalanced
+from eomc.robots.masses import inertia_text, parameters
 from eomc.robots.massless import light_root, without_inertia
 from eomc.robots.robot import (
     BARE,
@@ -89,7 +90,7 @@ def _with_points(robot: Robot) -> Robot:
     found: list[RobotBody] = []
     carried: set[str] = set()
     for body in reversed(robot.bodies):  # children come before parents
-        bare = not body.mass and not any(body.inertia)
+        bare = not body.mass and not any(body.inertia) and not body.parameter
         point = body.joint == "fixed" and bare and body.name not in carried
         note = "" if point and body.note == BARE else body.note
         found.append(replace(body, point=point, note=note))
@@ -141,7 +142,13 @@ def _named(robot: Robot) -> Robot:
             for m in body.motions
         )
         note = _renamed(body.name, name, body.note)
-        out.append(replace(body, name=name, parent=bodies[body.parent], motions=motions, note=note))
+        parameter = fit(body.parameter, "") if body.parameter else ""
+        out.append(
+            replace(
+                body, name=name, parent=bodies[body.parent], motions=motions, note=note,
+                parameter=parameter,
+            )
+        )  # fmt: skip
     rows = [f"_{kind}" for joint in CLOSINGS.values() for kind in joint.space]
     loops = tuple(
         replace(loop, name=fit(loop.name, "", *rows), bodies=(bodies[one], bodies[other]))
@@ -198,7 +205,7 @@ def scene_text(robot: Robot) -> str:
         _table("[coordinates]", {m.name: _coordinate(m, robot) for m in robot.motions}),
     ]
     found = stops(robot) if robot.stopped else []
-    numbers = acting.gains(robot)
+    numbers = parameters(robot) | acting.gains(robot)
     for unit in (unit for unit in DEPTHS if any(s.unit == unit for s in found)):
         deep, soft = _stop_names(unit)
         numbers[deep] = _depth(unit)
@@ -317,13 +324,12 @@ def _entry(body: RobotBody, robot: Robot) -> dict[str, str]:
         entry["rotation"] = _turns(turns)
     if body.axes and body.axes != JOINTS[body.joint].defaults:
         entry["axis"] = _each([vector(axis) for axis in body.axes])
-    if body.mass:
-        entry["mass"] = number(body.mass)
+    if body.mass or body.parameter:
+        entry["mass"] = toml(body.parameter) if body.parameter else number(body.mass)
     if any(body.center):
         entry["center"] = vector(body.center)
     if any(body.inertia):
-        kept = body.inertia if any(body.inertia[3:]) else body.inertia[:3]
-        entry["inertia"] = f"[{', '.join(map(number, kept))}]"
+        entry["inertia"] = inertia_text(body)
     for key in ("armature", "damping", "friction"):
         values = [number(getattr(m, key)) for m in body.motions]
         if any(value != "0" for value in values):

@@ -298,6 +298,7 @@ def _moving(bodies: Sequence[RobotBody], joints: Sequence[Found]) -> tuple[Robot
                 body,
                 motions=joint.motions,
                 inertia=six([xx + a, yy + a, zz + a, *rest]),
+                rotor=a,
                 note=joined(body.note, note),
             )
         out.append(body)
