@@ -187,7 +187,7 @@ def test_jumps_and_stops_act_in_each() -> None:
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"u": np.ones((1, 5, 1)), "control_period": 0.1}, r"or \(batch, [0-9]{3}, 1\)$"),
+        ({"u": np.ones((1, 5, 1)), "control_period": 0.1}, r"or \(batch, [0-9]{3}, 1\), a row"),
         ({"control_period": 0.1, "tol": 1e-6}, "a batch follows the signals: give u, a row a"),
         ({"control_period": 0.0, "u": 1.0}, "control_period: 0 is not a period"),
         ({"u": np.ones((1, 5, 1))}, r"u: shape \(1, 5, 1\).*take control_period=, in s"),

@@ -198,3 +198,79 @@ def test_a_duration_beside_them_may_be_longer(modules: Modules) -> None:
     run = kepler.simulate(times=[0, 0.3], duration=1.0, h=0.01)
     assert run == kepler.simulate(times=[0, 0.3], h=0.01)
     assert kepler.simulate(times=[0.1 + 0.2], duration=0.3, h=0.01).t[-1] == 0.1 + 0.2
+
+
+LATE = """eomc = 1
+name = "late"
+[coordinates]
+x = { start = 1.0 }
+[inputs]
+force = {}
+[energy]
+kinetic = "x_dot**2/2"
+potential = "x**2/2"
+[forces]
+x = "force"
+[[event]]
+name = "up"
+when = "x_dot"
+direction = "rising"
+[run]
+h = 0.01
+duration = 1.0
+tolerance = 1e-9
+batch = true
+"""
+HOW = [{"h": 0.01}, {"tol": 1e-9}]
+
+
+@pytest.fixture(scope="module")
+def late(modules: Modules) -> dict[bool, Any]:
+    """An oscillator under a force, with events and without."""
+    event = LATE.index("[[event]]"), LATE.index("[run]")
+    plain = LATE[: event[0]] + LATE[event[1] :].replace("late", "late_plain")
+    return {True: modules.unoptimised(LATE), False: modules.unoptimised(plain)}
+
+
+@pytest.mark.parametrize("events", [False, True])
+def test_a_start_so_late_that_time_does_not_resolve_the_steps_is_refused(
+    late: dict[bool, Any], events: bool
+) -> None:
+    m, q = late[events], [[1.0], [2.0]]
+    for t0 in (1e16, -1e16, 1e300):
+        with pytest.raises(ValueError, match=r"^h: 0\.01 s is less than what time resolves at "):
+            m.simulate(t0=t0, h=0.01)
+        with pytest.raises(ValueError, match=r"^h: 0\.01 s is less than what time resolves at "):
+            m.simulate(t0=t0, h=0.01, steps=5)
+        with pytest.raises(ValueError, match=r"^h: 0\.01 s is less than what time resolves at "):
+            m.simulate_batch(q, [[0.0], [0.0]], t0=t0, h=0.01)
+        with pytest.raises(ValueError, match=r"^t0: time resolves .* too coarse for steps within "):
+            m.simulate(t0=t0, tol=1e-9)
+        with pytest.raises(ValueError, match=r"^t0: time resolves .* too coarse for steps within "):
+            m.simulate_batch(q, [[0.0], [0.0]], t0=t0, tol=1e-9)
+    for how in HOW:
+        run = m.simulate(t0=1e9, **how)
+        assert run.status == "ok" and run.q[-1, 0] == pytest.approx(np.cos(1.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("events", [False, True])
+@pytest.mark.parametrize("how", HOW)
+def test_a_table_for_the_duration_beside_times_that_end_earlier_is_taken(
+    late: dict[bool, Any], events: bool, how: dict[str, float]
+) -> None:
+    """Rows of the table behind the last of the times are not needed; other numbers are refused."""
+    m, u = late[events], np.linspace(-1, 1, 20)[:, None]
+    whole = {**how, "duration": 0.4, "control_period": 0.02}
+    exact = m.simulate(u=u, **whole)(0.33)[0]
+    cut = {**whole, "times": [0.1, 0.33]}
+    for table in (u, u[:17], u.ravel(), u.tolist(), {"force": u[:, 0]}):
+        np.testing.assert_allclose(m.simulate(u=table, **cut).q[-1], exact, atol=1e-12)
+    for table in (u[:12], u[:18]):
+        with pytest.raises(ValueError, match=r"^u: 1[28] rows for .*duration="):
+            m.simulate(u=table, **cut)
+    q, qd = [[1.0]] * 3, [[0.0]] * 3
+    for table in (u[None], u[None, :17], np.tile(u, (3, 1, 1)), {"force": u[None, :, 0]}):
+        runs = m.simulate_batch(q, qd, u=table, **cut)
+        np.testing.assert_allclose(runs.q[:, -1], [exact] * 3, atol=1e-12)
+    with pytest.raises(ValueError, match=r"^u: shape \(1, 12, 1\), expected .*duration="):
+        m.simulate_batch(q, qd, u=u[None, :12], **cut)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from .adaptive_arguments import as_end, as_limits, as_times, as_tolerance
 from .adaptive_error import error_of
 from .adaptive_memory import Kept, Rows
-from .arguments import Array, as_number
+from .arguments import Array, as_number, check_time
 from .balance import with_jumps
 from .dense import within
 from .estimate import Estimate
@@ -170,7 +170,8 @@ def simulate(
     else:
         rows = as_times(times, t0, model.dtype, duration)
         first, end = int(rows[0] == t0), float(rows[-1])
-    held = as_acting(model, u, control_period, end - t0, params)
+        check_time(model.dtype, t0, end - t0)
+    held = as_acting(model, u, control_period, end - t0, params, duration)
     asked = None if rows is None else rows[first:]
     found = run(model, q, qd, t0, end, tol, asked, held, p, most, progress, stiff)
     if first:

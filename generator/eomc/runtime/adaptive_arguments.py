@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arguments import Array, as_flag, as_number, as_step_size, unmasked
+from .arguments import Array, as_flag, as_number, as_step_size, check_time, unmasked
 from .facts import Facts
 from .package import option
 
@@ -70,6 +70,7 @@ def as_end(model: Facts, t0: float, duration: float | None) -> float:
     span = model.duration if duration is None else as_number(duration, "duration")
     if span < 0:
         raise ValueError(f"duration: {span:g} is not a time in s")
+    check_time(model.dtype, t0, span)
     end = float(t0 + span)
     return end if model.dtype.itemsize == 8 else float(model.dtype.type(end))
 

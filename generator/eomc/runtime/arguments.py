@@ -6,6 +6,7 @@ argument.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,6 +23,7 @@ Array = NDArray[Any]
 Start = ArrayLike | Mapping[str, ArrayLike] | None  # positions or velocities, also by name
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 
+FEWEST_TIMES = 256  # numbers in the span of a run, from which a tolerance can choose steps
 _FEW = 32  # numbers that Python looks at sooner than NumPy
 
 
@@ -492,6 +494,48 @@ def as_step_size(h: Any, dtype: np.dtype[Any], name: str = "h") -> float:
             f"{name}: {size:g} is not a {what}{why}: give a number of seconds greater than 0"
         )
     return size
+
+
+def cut_table(u: Any, nu: int, whole: int, count: int, axis: int = 0) -> Any:
+    """Return the first `count` rows of a table of inputs that has `whole` of them, else u itself.
+
+    axis: where the rows of an array with the inputs last are, 1 for the table of a batch.
+    """
+    if u is None or callable(u) or whole <= count:
+        return u
+    if isinstance(u, Mapping):
+        return {name: cut_table(x, 0, whole, count, axis) for name, x in u.items()}
+    try:
+        shape = np.shape(u)
+    except ValueError:  # no array; what takes it says so
+        return u
+    column = nu == 0 or (nu == 1 and axis == 0)  # values of one input
+    if len(shape) not in ({axis + 1} if nu == 0 else {axis + 2, axis + 2 - column}):
+        return u
+    if shape[axis] != whole:
+        return u
+    rows = u if isinstance(u, ndarray) else np.asarray(u)
+    return rows[:, :count] if axis else rows[:count]
+
+
+def check_time(dtype: np.dtype[Any], t0: float, span: float, h: float | None = None) -> None:
+    """Raise ValueError where numbers do not resolve the steps of a run from t0 over a span.
+
+    h: the size of fixed steps; None: a tolerance determines the steps.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        least = float(np.spacing(dtype.type(abs(t0) + abs(span))))
+    least = least if least < math.inf else math.inf
+    if span and h is not None and h < least:
+        raise ValueError(
+            f"h: {h:g} s is less than what time resolves at {t0 + span:g} s, {least:.2g} s: take "
+            "a smaller t0, or a larger h"
+        )
+    if span and h is None and not abs(span) >= FEWEST_TIMES * least:
+        raise ValueError(
+            f"t0: time resolves {least:.2g} s at {t0 + span:g} s, which is too coarse for steps "
+            f"within {span:g} s: take a smaller t0, or a longer duration"
+        )
 
 
 def as_period(period: Any, h: float) -> int:

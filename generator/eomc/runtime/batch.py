@@ -20,7 +20,6 @@ from .arguments import (
     Start,
     as_count,
     as_number,
-    as_period,
     as_step_size,
     row_times,
     unmasked,
@@ -89,7 +88,7 @@ class BatchModel(Instances):
             at, steps = as_asked(self, times, t0, h, duration, steps, every, None)
         steps = self._steps(h, duration if at is None else None, steps)
         every = min(as_count(every, "every", 1), RARELY)
-        hold = min(as_period(control_period, h), max(steps, 2))
+        u, hold = self._steps_and_table(t0, h, steps, u, control_period, duration, at, 1)
         batch_adaptive.no_signals(self, u, control_period)
         starts, table, held, codes = self._instances(q0, qd0, params, u, -(-steps // hold), t0)
         if held is not None and hold > 1 and held.shape[1] > 1:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from .adaptive_arguments import as_end, as_limits, as_times
 from .adaptive_memory import room_for
-from .arguments import Array, Start, as_number, as_step_size
+from .arguments import Array, Start, as_number, as_step_size, check_time, cut_table
 from .batch_instances import Instances
 from .batch_run import BatchRun, stuck
 from .batch_work import all_of, as_threads
@@ -165,6 +165,7 @@ def simulate(
     """`simulate_batch` by a tolerance, and whether it is whole, not cut off by Ctrl-C."""
     tol, most = as_limits(model, tol, h_most, stiff, fixed)
     t0 = as_number(t0, "t0")
+    length = duration
     if times is None:
         end = as_end(model, t0, duration)
         times, duration = [t0, end] if end > t0 else [t0], None
@@ -173,6 +174,9 @@ def simulate(
     if control_period is not None:
         period = as_step_size(control_period, model.dtype, "control_period")
     span = float(rows[-1]) - t0
+    check_time(model.dtype, t0, span)
+    if period and length is not None:
+        u = cut_table(u, model.nu, periods_in(length, period), periods_in(span, period), 1)
     return _run(
         model, q0, qd0, params, u, threads, t0, progress, tol, rows, most, stiff, period, span
     )
@@ -190,6 +194,8 @@ def stepped(
     method, t0 = model._method(method), as_number(t0, "t0")
     rows, span = as_rows(model, times, t0, h, duration, steps, every, listed=True)
     period = as_hold(u, control_period, h) or 0.0
+    if period and duration is not None:
+        u = cut_table(u, model.nu, periods_in(duration, period), periods_in(span, period), 1)
     return _run(
         model, q0, qd0, params, u, threads, t0, progress, 0.0, rows, h, False, period, span, method
     )

@@ -103,7 +103,8 @@ class Instances(Model):
         if array.ndim != 3 or array.shape[2] != self.nu or array.shape[1] not in (1, steps):
             shapes, wide = f"({self.nu},), (batch, {self.nu})", f"(batch, {steps}, {self.nu})"
             table = ": rows, each held over a control period, take control_period=, in s"
-            over = f" or {wide}" if steps else table
+            rows = ", a row for each step or control period of duration="
+            over = f" or {wide}{rows}" if steps else table
             raise ValueError(f"u: shape {np.shape(u)}, expected {shapes}{over}")
         at = self._pointer(array)
         for k in range(0, array.size, LARGE):

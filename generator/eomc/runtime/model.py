@@ -99,16 +99,16 @@ class Model(Stepping):
         """A trajectory by fixed steps of size h, or by steps that fit a tolerance; the loop in C.
 
         q0, qd0 (nq,), h, duration: the scene's where not given; steps instead of duration. method:
-        of `methods`, the first where None; "auto": by a tolerance. every: rows are after every so
-        many steps, and the ends. u: None, the scene's signals; (nu,), constant; (steps, nu), held
-        over a step each; a dict of all inputs by name, numbers or (steps,); a function u(t, q, qd),
-        asked before each step, slow. control_period: in s, of fixed steps a whole number: once in
-        it the function is asked, a row taken, or the signals read. out: (q, qd), arrays for rows.
-        progress: called with (done, steps). estimate: find `run.error`, in nine times the time.
-        tol: what adaptive steps err by, of their way; [run] tolerance, where h, steps and method
-        are not given. times: (n,) ascending: the rows, within duration. h_most: of adaptive steps,
-        s. stiff: begin by Newton's method. events: more, by name a formula or an [[event]]. A run
-        that can't go on warns; Ctrl-C raises Interrupted.
+        of `methods`; "auto": by a tolerance. every: rows are after every so many steps, and the
+        ends. u: None, the scene's signals; (nu,), constant; (steps, nu), held over a step each; a
+        dict of all inputs by name, numbers or (steps,); a function u(t, q, qd), called before each
+        step. control_period: in s, of fixed steps a whole number: once in it the function is asked,
+        a row taken, or the signals read. out: (q, qd), arrays for rows. progress: called with
+        (done, steps). estimate: find `run.error`. tol: what adaptive steps err by, of their way;
+        [run] tolerance, where h, steps and method are not given. times: (n,) ascending: the rows,
+        within duration. h_most: of adaptive steps, s. stiff: begin by Newton's method. events:
+        more, by name a formula or an [[event]]. A run that can't go on warns; Ctrl-C raises
+        Interrupted.
         """
         if events is not None or unknown:
             other, given = with_events(self.simulate, dict(locals()))
@@ -143,8 +143,8 @@ class Model(Stepping):
         if params is not None:
             p = self._parameters(params).copy()
             at_p = self._pointer(p)
+        usual = usual and abs(t0) <= 1e6 * h  # all else goes the long way
         if usual and u is duration is None and type(steps) is type(every) is int and every > 0:
-            # few steps, nothing unusual: all else, and what fails, goes the long way
             _, run, short, stages, _, _ = self._loops[method]
             if 0 <= steps <= short >= every and (steps < SOME or (method, h) in self._warned):
                 address, real, null = self._c
@@ -158,7 +158,7 @@ class Model(Stepping):
         at, steps = timed.as_asked(self, times, t0, h, duration, steps, every, out)
         steps = self._steps(h, duration if at is None else None, steps)
         every = min(as_count(every, "every", 1), RARELY)
-        hold = min(as_period(control_period, h), max(steps, 2))  # a period may be beyond the run
+        u, hold = self._steps_and_table(t0, h, steps, u, control_period, duration, at)
         if u is None and control_period is not None and self.nu:
             u = Sampled(self, params)
         if steps >= SOME and (method, h) not in self._warned:
@@ -303,5 +303,8 @@ class Model(Stepping):
             return None, array, 0
         if len(array) != -(-steps // hold):
             what = "step" if hold == 1 else f"control period of {hold} steps"
-            raise ValueError(f"u: {len(array)} rows for {steps} steps: give one row a {what}")
+            raise ValueError(
+                f"u: {len(array)} rows for {steps} steps: give one row a {what}, or the duration= "
+                "or steps= that the rows cover"
+            )
         return None, array if hold == 1 else np.repeat(array, hold, axis=0)[:steps], self.nu

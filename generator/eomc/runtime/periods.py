@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .arguments import Array, as_step_size, machine_memory
+from .arguments import Array, as_step_size, cut_table, machine_memory
 from .facts import Facts
 from .laws import Sampled, asked
 from .status import PART
@@ -38,9 +38,13 @@ def held_at(times: Array, t0: float, period: float, values: Array) -> Array:
 
 
 def as_acting(
-    model: Facts, u: Any, control_period: float | None, span: float, params: Any
-) -> Array | Periods | None:
-    """The inputs of a run by a tolerance as `Acting` takes them, or a ValueError."""
+    model: Facts, u: Any, control_period: float | None, span: float, params: Any,
+    duration: float | None = None,
+) -> Array | Periods | None:  # fmt: skip
+    """The inputs of a run by a tolerance as `Acting` takes them, or a ValueError.
+
+    duration: which a table may cover instead of the span, s.
+    """
     period = None
     if control_period is not None:
         period = as_step_size(control_period, model.dtype, "control_period")
@@ -51,6 +55,8 @@ def as_acting(
     if not model.nu:
         raise ValueError("u: this scene has no inputs")
     if not callable(u):
+        if period is not None and duration is not None:
+            u = cut_table(u, model.nu, periods_in(duration, period), periods_in(span, period))
         if isinstance(u, Mapping):
             u = model._by_name(u)
         rows = model._numbers(u, "u")
@@ -66,7 +72,8 @@ def as_acting(
             )
         if len(rows) != (count := periods_in(span, period)):
             raise ValueError(
-                f"u: {len(rows)} rows for {count} control periods of {period:g} s: give a row each"
+                f"u: {len(rows)} rows for {count} control periods of {period:g} s: give a row "
+                f"each, or duration={len(rows) * period:g}"
             )
         u = rows.copy()
     if period is None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from . import adaptive
 from .adaptive import SteppedRun
 from .adaptive_arguments import as_times
-from .arguments import Array, as_count, as_number, as_period, as_step_size
+from .arguments import Array, as_count, as_number, as_period, as_step_size, check_time
 from .facts import SOME
 from .laws import called_each_step
 from .periods import as_acting
@@ -41,7 +41,7 @@ def simulate(
     hold = as_hold(u, control_period, h)
     if callable(u) and hold == h:
         called_each_step(model)
-    held = as_acting(model, u, hold, span, params)
+    held = as_acting(model, u, hold, span, params, duration)
     if span >= SOME * h and (method, h) not in model._warned:
         look(q, qd, h, t0, held if isinstance(held, np.ndarray) else None, p, method)
     first = 0 if rows is None else int(rows[0] == t0)
@@ -68,14 +68,11 @@ def as_rows(
             name = "every" if steps is None else "steps"
             raise ValueError(f"{name}: times say where rows are; give one or the other")
         found = as_times(times, t0, model.dtype, duration)
+        check_time(model.dtype, t0, float(found[-1]) - t0, h)
         return found, float(found[-1]) - t0
     count = model._steps(h, duration, steps)
     span = count * h
-    if count and h < (least := float(np.spacing(model.dtype.type(abs(t0) + span)))):
-        raise ValueError(
-            f"h: {h:g} s is less than what time resolves at {t0 + span:g} s, {least:.2g} s, and "
-            "events are told by it: take a smaller t0, or a larger h"
-        )
+    check_time(model.dtype, t0, span, h)
     if every == 1 and not listed:
         return None, span
     return (t0 + h * np.append(np.arange(0, count, every), count)).astype(model.dtype), span

@@ -5,10 +5,19 @@ from __future__ import annotations
 from math import ceil
 from typing import Any
 
-from numpy import empty
+from numpy import dtype, empty
 from numpy.typing import ArrayLike
 
-from .arguments import Array, Parameters, as_count, as_number, as_step_size
+from .arguments import (
+    Array,
+    Parameters,
+    as_count,
+    as_number,
+    as_period,
+    as_step_size,
+    check_time,
+    cut_table,
+)
 from .facts import Facts
 from .package import warn
 from .stability import beyond_end
@@ -71,6 +80,25 @@ class Stepping(Facts):
             )
         # the first multiple of h that is not before the duration, rounding aside
         return ceil(time / h * (1 - 1e-12))
+
+    def _steps_and_table(
+        self, t0: float, h: float, steps: int, u: Any, control_period: float | None,
+        duration: float | None, times: Array | None, axis: int = 0,
+    ) -> tuple[Any, int]:  # fmt: skip
+        """Inputs, and over how many steps a row of them is held.
+
+        A table for the duration is cut where the last of the times is earlier. Raises ValueError
+        where times t0 + k h are not apart: in single precision at the start alone, as rows have
+        times in double precision.
+        """
+        if steps:
+            check_time(self.dtype, t0, h, h)
+            check_time(dtype(float), t0, steps * h, h)
+        hold = min(as_period(control_period, h), max(steps, 2))  # a period may be beyond the run
+        if times is not None and duration is not None:
+            count = -(-self._steps(h, duration, None) // hold)
+            u = cut_table(u, self.nu, count, -(-steps // hold), axis)
+        return u, hold
 
     def _trajectory(self, *_: Any) -> Any:
         """A run by fixed steps from checked arguments, as `Model` makes it."""
