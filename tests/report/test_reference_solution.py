@@ -180,12 +180,25 @@ def test_a_motion_that_sticks_at_a_jump_is_refused(tmp_path: Path) -> None:
         reference_solution.of(case_system("coulomb_friction"), rows=4, root=tmp_path)
 
 
+@pytest.mark.slow
+def test_names_of_parameters_and_irrational_numbers_do_not_matter(tmp_path: Path) -> None:
+    x, x_dot, e, mpf, size = sympy.symbols("x x_dot e mpf size")
+    system = System.make(
+        "named", {x: 0.1}, e * x_dot**2 / 2, sympy.E * x**2 / 2 + mpf * sympy.cos(sympy.pi * x),
+        parameters={e: 2, mpf: 0.7}, inputs={size: sympy.exp(1) * e}, forces={x: size},
+    )  # fmt: skip
+    made = reference_solution.of(system, 0.5, 16, tmp_path)
+    assert made.plain is not None and min(made.plain[:2]) > 30
+
+
 def test_quad_literals_hold_more_digits_than_a_double() -> None:
     assert c_expression.number(sympy.Rational(1, 10), c_expression.QUAD) == "(1.0q/10.0q)"
     assert c_expression.number(sympy.Integer(3), c_expression.QUAD) == "3.0q"
     assert c_expression.number(sympy.pi, c_expression.QUAD).startswith(
         "3.14159265358979323846264338327950288"
     )
+    copy = replace(c_expression.QUAD)  # as plain functions have it
+    assert c_expression.number(sympy.pi, copy) == c_expression.number(sympy.pi, c_expression.QUAD)
     text = c_expression.number(sympy.Float(0.1), c_expression.QUAD)  # the double that it is
     assert abs(Fraction(text[:-1]) - Fraction(0.1)) < Fraction(1, 10**38)
 

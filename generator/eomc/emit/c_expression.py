@@ -76,7 +76,7 @@ def number(value: Expr, real: Real = DOUBLE) -> str:
     >>> number(sympy.Rational(8, 3)), number(sympy.Rational(1, 100)), number(sympy.pi)
     ('(8.0/3.0)', '0.01', '3.141592653589793')
     """
-    if real is QUAD:
+    if real.name == QUAD.name:
         return _quad(value)
     if value.is_Rational:
         nearest = _nearest(value)

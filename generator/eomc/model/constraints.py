@@ -13,6 +13,7 @@ from sympy import Expr, Symbol
 
 from eomc.model import loops
 from eomc.model.loops import Closed
+from eomc.model.numeric import compiled
 from eomc.model.symbols import Constraint, Coordinate, dot, needed, t
 
 NEAR = 1e-9  # m, or rad: a row that is off by less is zero
@@ -174,7 +175,7 @@ class Rows:
         if any(e.has(*BENDING) for e in (*wanted, *(formula for _, formula in known))):
             return [None] * len(closed.rows)  # such a row may be level for a while
         names = [*self.values, t, *(c.q for c in self.coordinates)]
-        of = sympy.lambdify(names, wanted, "math", cse=lambda e: (known, e))
+        of = compiled(names, wanted, "math", known)
         draw, found = random.Random(1), list[list[float]]()
         for _ in range(PLACES):
             p = [x + 0.1 * draw.uniform(-1, 1) * (abs(x) or 1.0) for x in self.values.values()]

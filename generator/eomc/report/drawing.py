@@ -16,6 +16,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
+from eomc.model.numeric import compiled
 from eomc.model.system import System, dot
 from eomc.model.system import t as time
 from eomc.report import sketch
@@ -119,7 +120,7 @@ def _positions(
         if not rates and used & coordinates and used <= coordinates | {time}:
             chosen.append(pair)
     flat = [of[name] for pair in chosen for name in pair]
-    values = sympy.lambdify((time, *system.q), flat, "numpy", cse=True)(times, *q.T)
+    values = compiled((time, *system.q), flat, "numpy")(times, *q.T)
     columns = [np.broadcast_to(v, times.shape).astype(float) for v in values]
     return {pair: np.column_stack(columns[2 * k : 2 * k + 2]) for k, pair in enumerate(chosen)}
 

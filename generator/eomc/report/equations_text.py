@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import sympy
 from sympy import Expr, MatrixBase
+from sympy.core.function import Application
 from sympy.printing.str import StrPrinter
 
 from eomc.base import texts
@@ -238,12 +239,25 @@ def latex_sum(write: Typesetter, symbol: str, value: Expr) -> list[str]:
 
 
 class _Exact(StrPrinter):  # type: ignore[misc]
-    """Fractions that stand alone as Rational(1, 10): for Python 1/10 is 0.1."""
+    """Fractions that stand alone as Rational(1, 10): for Python 1/10 is 0.1.
+
+    names: the variables of symbols whose own names are those of functions.
+    """
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        super().__init__()
+        self.names = names
 
     def _print_Rational(self, value: sympy.Rational) -> str:
         return str(value) if value.is_Integer else f"Rational({value.p}, {value.q})"
 
     _print_Half = _print_Rational
+
+    def _print_Exp1(self, _: Expr) -> str:
+        return "exp(1)"  # a parameter may be called E
+
+    def _print_Symbol(self, one: sympy.Symbol) -> str:
+        return self.names.get(one.name, one.name)
 
 
 def python(found: Derived) -> str:
@@ -258,27 +272,36 @@ def python(found: Derived) -> str:
         *(p.symbol for p in system.parameters),
         t,
     ]
-    names = ", ".join(s.name for s in symbols)
-    title = texts.docstring(title_of(system))
+    values = _values(found)
+    called = {f.func.__name__ for e in (*values.values(), *found.right) for f in _functions(e)}
+    reserved = {"Matrix", "Eq", "Rational", "symbols", "exp", "sqrt", *called}
+    variables = {s.name: s.name for s in symbols}
+    for name in variables.keys() & reserved:
+        while variables[name] in reserved | (variables.keys() - {name}):
+            variables[name] += "_"
+    written = _Exact(variables).doprint
+    names, title = ", ".join(s.name for s in symbols), texts.docstring(title_of(system))
     force = "tau + A^T lambda" if system.constraints else "tau"
     lines = [
         f'"""{title}: D qdd + C qd + g = {force}, as SymPy matrices."""',
         "",
         "from sympy import *",
         "",
-        f'{names} = symbols("{names}", real=True)',
+        f'{", ".join(variables.values())} = symbols("{names}", real=True)',
     ]
-    taken = {s.name for s in symbols}
-    for name, value in _values(found).items():
+    taken = {*variables.values()}
+    for name, value in values.items():
         is_matrix = isinstance(value, MatrixBase)
-        made = _Exact().doprint(value.tolist() if is_matrix else value)
+        made = written(value.tolist() if is_matrix else value)
         made = f"Matrix({made})" if is_matrix else made
         lines.append(f"{name + '_' if name in taken else name} = {made}")
-    pairs = ", ".join(
-        f"Eq({_Exact().doprint(e.lhs)}, {_Exact().doprint(e.rhs)})" for e in found.scalar
-    )
+    pairs = ", ".join(f"Eq({written(e.lhs)}, {written(e.rhs)})" for e in found.scalar)
     lines.append(f"{'scalar_' if 'scalar' in taken else 'scalar'} = [{pairs}]")
     return "\n".join(lines)
+
+
+def _functions(value: Expr | MatrixBase) -> set[Expr]:
+    return value.atoms(Application)  # type: ignore[no-any-return]
 
 
 # --- costs ----------------------------------------------------------------------------------------

@@ -39,6 +39,7 @@ from eomc.emit.render import show
 from eomc.emit.views import Quad
 from eomc.model.corners import corners
 from eomc.model.discrete import constant
+from eomc.model.numeric import compiled
 from eomc.model.system import System
 from eomc.model.system import t as time_symbol
 from eomc.program import program
@@ -339,8 +340,8 @@ class _Plain:
         exact = [e.xreplace({f: sympy.Rational(f) for f in e.atoms(sympy.Float)}) for e in parts]
         self.n, self.m = len(system.coordinates), len(system.inputs)
         self.parameters = [mpmath.mpf(p.value) for p in system.parameters]
-        self.values = sympy.lambdify(symbols, exact, modules="mpmath", cse=True)
-        self.signals = sympy.lambdify(symbols, list(r.signals), modules="mpmath", cse=True)
+        self.values = compiled(symbols, exact, "mpmath")
+        self.signals = compiled(symbols, list(r.signals), "mpmath")
 
     def acceleration(self, q: list[Any], qd: list[Any], t: Any) -> list[Any]:
         """Qdd from D qdd = tau - bias + A^T lambda."""

@@ -17,6 +17,7 @@ import numpy as np
 import sympy
 from sympy import Expr, Symbol
 
+from eomc.model.numeric import compiled
 from eomc.model.system import System, dot, symbol, t
 from eomc.verify import derivatives
 from eomc.verify.comparison import Comparison
@@ -177,7 +178,7 @@ class Formulas:
             stand_ins = [sympy.Dummy() for _ in rates]
             bare = e.xreplace(dict(zip(rates, stand_ins, strict=True)))
             symbols = sorted(bare.free_symbols - set(stand_ins), key=str)
-            f = sympy.lambdify([*symbols, *stand_ins], bare, modules=[_NAMES, "mpmath"])
+            f = compiled([*symbols, *stand_ins], bare, [_NAMES, "mpmath"])
             self._compiled[e] = f, symbols, [d.args[0] for d in rates]
         return self._compiled[e]
 

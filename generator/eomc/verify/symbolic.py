@@ -1,7 +1,7 @@
 """The independent answer: Euler-Lagrange as a textbook writes it, in SymPy, NumPy and plain Python.
 
 It starts from the `System` and shares nothing else with the compiled way: definitions are
-substituted, everything is differentiated as it stands, evaluated in doubles with `lambdify`,
+substituted, everything is differentiated as it stands, evaluated in doubles,
 solved with NumPy and stepped in a Python loop. Slow, short, and meant to be believed.
 """
 
@@ -20,6 +20,7 @@ from sympy import Expr, ImmutableMatrix
 
 from eomc.base.errors import EomcError
 from eomc.model.discrete import constant
+from eomc.model.numeric import compiled
 from eomc.model.system import System, dot, t
 from eomc.verify.discrete import Discrete
 from eomc.verify.oracle import MATRICES, SCALARS, Answer, Values, Vector, by_rows
@@ -308,9 +309,7 @@ class Reference(Answer):
             system, expr = self.system, getattr(self, name)
             symbols = (*system.q, *system.qd, t, *system.u, *(p.symbol for p in system.parameters))
             entries = [expr] if name in SCALARS else expr.flat()
-            self._functions[name] = sympy.lambdify(
-                symbols, entries, modules=[_NAMED, "math"], cse=True
-            )
+            self._functions[name] = compiled(symbols, entries, [_NAMED, "math"])
         return self._functions[name]
 
 
