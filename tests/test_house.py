@@ -125,7 +125,7 @@ def test_pictures_and_events_alone_are_asked_of_eomc_beside_a_built_module() -> 
     assert asking == ["runtime.shown"]
 
 
-MODULE, FUNCTION = 900, 80  # lines
+MODULE, FUNCTION = 900, 80  # lines; of functions without their docstrings
 
 
 def test_rooms_are_small() -> None:
@@ -133,4 +133,5 @@ def test_rooms_are_small() -> None:
         assert path.read_text(encoding="utf-8").count("\n") <= MODULE, name
         for node in nodes(name):
             if isinstance(node, ast.FunctionDef) and node.end_lineno is not None:
-                assert node.end_lineno - node.lineno < FUNCTION, f"{name}: {node.name}"
+                start = (node.body[0].end_lineno or 0) if ast.get_docstring(node) else node.lineno
+                assert node.end_lineno - start < FUNCTION, f"{name}: {node.name}"

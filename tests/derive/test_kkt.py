@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sympy
 
-from eomc.derive.constraints import _faded
+from eomc.derive.constraints import _pivot_limit
 from eomc.derive.lagrange import derive
 from eomc.model.symbols import symbol
 from eomc.model.system import Constraint, System
@@ -99,9 +99,9 @@ def test_a_correction_moves_onto_the_rows_with_the_least_change_in_the_metric_of
 
 def test_a_row_with_a_number_in_it_never_fades() -> None:
     x, zero, one = symbol("x1"), sympy.S.Zero, sympy.S.One
-    assert _faded([x, zero], 1e-5) == sympy.Float("1e-05")
-    assert _faded([zero, zero], 1e-5) == sympy.Float("1e-05")
-    assert _faded([x, -one], 1e-5) == _faded([zero, one], 1e-5) == 0
+    assert _pivot_limit([x, zero], 1e-5) == sympy.Float("1e-05")
+    assert _pivot_limit([zero, zero], 1e-5) == sympy.Float("1e-05")
+    assert _pivot_limit([x, -one], 1e-5) == _pivot_limit([zero, one], 1e-5) == 0
 
 
 def test_a_pivot_that_varies_is_checked_where_its_entry_of_D_is_a_number() -> None:

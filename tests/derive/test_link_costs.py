@@ -104,7 +104,7 @@ def test_masses_of_any_size(
     size: float, n: int, longest: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Products of pivots stay in the range of a double; only ratios of masses count."""
-    monkeypatch.setattr(ldl, "LONGEST", longest)
+    monkeypatch.setattr(ldl, "MAX_PIVOTS_PER_PRODUCT", longest)
     made = made_of(links([k - 1 for k in range(n)], equal=False))
     ours, state = by_multipliers(made), states(made)[0] | {"b": 0.0, "s": 0.0, "u": 0.0}
     scaled = {**state, **{f"m{k}": size * state[f"m{k}"] for k in range(n)}}

@@ -229,7 +229,7 @@ def test_joints_with_several_coordinates(joint: str, number: int) -> None:
 @pytest.mark.slow
 def test_lagrange_over_world_coordinates_says_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """That route is not tried where there are many of them, since it costs more."""
-    monkeypatch.setattr(lagrange, "LAGRANGE_DEFINITIONS", 1000)
+    monkeypatch.setattr(lagrange, "MAX_LAGRANGE_DEFINITIONS", 1000)
     for joint in ("cylindrical", "universal"):
         made = made_of(held(joint, 2, axis=AXES[joint], damping="c"))
         assert lagrange.derive(made).lagrange
@@ -448,7 +448,9 @@ def test_grouping_inertias_saves_work_and_changes_no_motion(
 ) -> None:
     made = made_of(trees.arm(3))
     grouped = every_route(made, accelerations)
-    monkeypatch.setattr(Recursion, "_grouped", lambda r: [r._own(link) for link in r.links])
+    monkeypatch.setattr(
+        Recursion, "_grouped", lambda r: [r._link_inertia(link) for link in r.links]
+    )
     plain = every_route(made, accelerations)
     for route in ("composite", "articulated"):
         one, other = (found["acceleration", route] for found in (grouped, plain))

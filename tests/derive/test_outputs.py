@@ -51,16 +51,16 @@ def test_rates_are_by_the_chain_rule(text: str) -> None:
 
 def test_slopes_are_made_where_they_are_asked_for() -> None:
     system = from_scene(parse(HEAD + 'a = "dot(y)*x_ddot"\n', "one.toml"))
-    assert outputs(system, sloped=False).slopes == ((),)
+    assert outputs(system, with_derivatives=False).slopes == ((),)
     assert "output_slopes" not in program.build(lagrange.derive(system))
-    (row,) = outputs(system, sloped=True).slopes
+    (row,) = outputs(system, with_derivatives=True).slopes
     assert len(row) == 3
 
 
 def test_a_rate_of_what_jumps_is_refused() -> None:
     system = from_scene(parse(HEAD + 'a = "dot(sign(x))"\n', "one.toml"))
     with pytest.raises(SceneError, match="outputs: a derivative of something that jumps"):
-        outputs(system, sloped=False)
+        outputs(system, with_derivatives=False)
 
 
 def test_from_symbols_and_from_dynamicsymbols() -> None:

@@ -1,9 +1,10 @@
-"""Accelerations of a tree without its mass matrix: articulated bodies.
+"""Accelerations of a kinematic tree by the articulated-body algorithm, without the mass matrix.
 
-Each joint is eliminated on the way inwards: what is beyond it resists the parent with its
-inertia less what the joint gives way. Source: Featherstone, *Rigid Body Dynamics Algorithms*,
-ch. 7. Here the forces at qdd = 0 (newton_euler.py) hold all that velocities and gravity do, so no
-term of theirs is left: each link's wrench is that force plus its inertia times what qdd adds.
+The joints are eliminated from the leaves to the base. Seen from its parent, a link resists with its
+articulated inertia I^A less U U^T/d, the share that the joint does not transmit, where U = I^A s
+for the joint axis s and d = s . U. Source: Featherstone, *Rigid Body Dynamics Algorithms*, ch. 7.
+Here the forces at qdd = 0 (newton_euler.py) already contain gravity and all velocity terms, so the
+articulated bias forces need no velocity terms of their own.
 """
 
 from __future__ import annotations
@@ -20,29 +21,47 @@ from eomc.derive.vectors import AXES, ZERO, Vector
 from eomc.model.exact import Matrix
 
 Rows = list[list[Expr]]
-Column = tuple[Sequence[Expr], Sequence[Expr]]  # of an inertia along a joint: moment, force
+Column = tuple[Sequence[Expr], Sequence[Expr]]  # U = I s of a joint axis s: moment, force
 Pairs = tuple[tuple[Expr, Expr], ...]
 
 
 class MasslessError(Exception):
-    """Nothing resists the motion of a joint."""
+    """Raised where a joint has no inertia along its axis (d = 0). `link`: the index of its link."""
 
     def __init__(self, link: int) -> None:
         self.link = link
 
 
 def accelerations(recursion: Recursion, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
-    """qdd by link, and each pivot paired with a value of its size without cancellation.
+    """Solve for the joint accelerations by the articulated-body algorithm.
 
-    drive: the generalized forces by link, less what is not the tree's. Raises MasslessError where
-    a joint moves nothing.
+    Parameters
+    ----------
+    recursion : Recursion
+        The tree with its inertias, on a tape.
+    drive : sequence of Expr
+        Generalized force along each joint, less the forces of everything that is not part of the
+        tree.
+
+    Returns
+    -------
+    qdd : list of Expr
+        The acceleration along each joint.
+    pivots : tuple of (Expr, Expr)
+        Each pivot d with a quantity of the size of the terms that it was computed from, against
+        which cancellation can be judged.
+
+    Raises
+    ------
+    MasslessError
+        If a joint has no inertia along its axis.
     """
     return _Articulated(recursion).solve(drive)
 
 
 @dataclass
 class _Inertia:
-    """An articulated inertia: moment = J alpha + H a, force = H^T alpha + M a."""
+    """Articulated inertia about a point: moment = J alpha + H a, force = H^T alpha + M a."""
 
     J: Rows
     H: Rows
@@ -50,7 +69,7 @@ class _Inertia:
 
 
 class _Articulated:
-    """The sweep inwards, which eliminates, and the one outwards."""
+    """State of the algorithm: the inward pass eliminates the joints, the outward pass gives qdd."""
 
     def __init__(self, recursion: Recursion) -> None:
         self.r = recursion
@@ -58,101 +77,108 @@ class _Articulated:
 
     def solve(self, drive: Sequence[Expr]) -> tuple[list[Expr], Pairs]:
         r, n = self.r, self.r.n
-        given = r.forces(r.speed, [S.Zero] * n)
-        f, m = list(given.force), list(given.moment)
-        bodies = [self._rigid(x) for x in r.inertia]
+        at_rest = r.forces(r.speed, [S.Zero] * n)
+        f, m = list(at_rest.force), list(at_rest.moment)
+        bodies = [self._rigid_body_inertia(x) for x in r.inertia]
         size: list[Expr] = [S.Zero] * n
         pivots: list[tuple[Expr, Expr]] = []
         inverse: list[Expr] = [S.Zero] * n
         columns: list[Column] = [(ZERO, ZERO)] * n
-        left: list[Expr] = [S.Zero] * n
+        joint_force: list[Expr] = [S.Zero] * n
         for k in reversed(range(n)):
             link, body, a = self.links[k], bodies[k], self.links[k].axis
             if link.turns:
                 u_m, u_f = body.J[a], body.H[a]
             else:
                 u_m, u_f = [row[a] for row in body.H], body.M[a]
-            own = (u_m if link.turns else u_f)[a]
-            d = r.add(own, r.armature[k])
+            along_axis = (u_m if link.turns else u_f)[a]
+            d = r.add(along_axis, r.armature[k])
             if d == 0:
                 raise MasslessError(k)
-            known = r.tape.stage_of(d) <= Stage.PARAMETER
-            pivots.append((d, d if known else r.add(d, size[k])))
+            is_constant = r.tape.stage_of(d) <= Stage.PARAMETER
+            pivots.append((d, d if is_constant else r.add(d, size[k])))
             inverse[k] = r.define(1 / d)
             columns[k] = (u_m, u_f)
-            left[k] = r.add(drive[k], r.minus((m if link.turns else f)[k][a]))
+            joint_force[k] = r.add(drive[k], r.minus((m if link.turns else f)[k][a]))
             if link.parent < 0:
                 continue
-            reduced = self._reduced(k, body, columns[k], inverse[k])
-            ratio = r.times(left[k], inverse[k])
+            reduced = self._without_joint_motion(k, body, columns[k], inverse[k])
+            ratio = r.times(joint_force[k], inverse[k])
             m[k] = r.plus(m[k], r.scaled(u_m, ratio))
             f[k] = r.plus(f[k], r.scaled(u_f, ratio))
             p = link.parent
-            size[p] = r.add(size[p], self._size(k, body))
-            bodies[p] = self._sum(bodies[p], self._carried(k, reduced))
+            size[p] = r.add(size[p], self._unreduced_size(k, body))
+            bodies[p] = self._sum(bodies[p], self._to_parent_frame(k, reduced))
             force, moment = r.inwards(k, f[k]), r.inwards(k, m[k])
             f[p] = r.plus(f[p], force)
             m[p] = r.plus(m[p], moment, r.cross(r.arm[k], force))
-        return self._outwards(columns, inverse, left), tuple(pivots)
+        return self._outwards(columns, inverse, joint_force), tuple(pivots)
 
     def _outwards(
-        self, columns: Sequence[Column], inverse: Sequence[Expr], left: Sequence[Expr]
+        self, columns: Sequence[Column], inverse: Sequence[Expr], joint_force: Sequence[Expr]
     ) -> list[Expr]:
-        """qdd_k = (u - U . a) / d on the way outwards."""
+        """Return qdd_k = (u_k - U_k . a)/d_k; a: the parent's spatial acceleration in frame k."""
         r = self.r
         out: list[Expr] = []
         alphas: list[Vector] = []
         origins: list[Vector] = []
         for k, link in enumerate(self.links):
-            alpha, at = ZERO, ZERO
+            alpha, acceleration = ZERO, ZERO
             if (p := link.parent) >= 0:
                 alpha = r.outwards(k, alphas[p])
-                at = r.outwards(k, r.plus(origins[p], r.cross(alphas[p], r.arm[k])))
+                acceleration = r.outwards(k, r.plus(origins[p], r.cross(alphas[p], r.arm[k])))
             u_m, u_f = columns[k]
-            rest = r.add(left[k], r.minus(r.dot(u_m, alpha)), r.minus(r.dot(u_f, at)))
-            qdd = r.times(rest, inverse[k])
+            remaining = r.add(
+                joint_force[k], r.minus(r.dot(u_m, alpha)), r.minus(r.dot(u_f, acceleration))
+            )
+            qdd = r.times(remaining, inverse[k])
             out.append(qdd)
-            own = r.on_axis(k, qdd)
-            alphas.append(r.plus(alpha, own) if link.turns else alpha)
-            origins.append(at if link.turns else r.plus(at, own))
+            relative = r.on_axis(k, qdd)
+            alphas.append(r.plus(alpha, relative) if link.turns else alpha)
+            origins.append(acceleration if link.turns else r.plus(acceleration, relative))
         return out
 
-    def _size(self, k: int, body: _Inertia) -> Expr:
-        """The size of what k hands on unreduced, to a parent without inertia of its own.
+    def _unreduced_size(self, k: int, body: _Inertia) -> Expr:
+        """Return the scale of link k's inertia if its parent has none of its own, else 0.
 
-        With some along its joint no pivot can vanish.
+        A parent with inertia or armature along its joint has a pivot that cannot vanish.
         """
         r, p = self.r, self.links[k].parent
         parent = self.links[p]
-        own = parent.inertia[parent.axis] if parent.turns else parent.mass
-        if own != 0 or r.armature[p] != 0:
+        along_axis = parent.inertia[parent.axis] if parent.turns else parent.mass
+        if along_axis != 0 or r.armature[p] != 0:
             return S.Zero
         mass = [body.M[i][i] for i in range(3)]
         if not parent.turns:
             return r.add(*mass)
-        across = r.dot(r.arm[k], r.arm[k])
-        return r.add(*(body.J[i][i] for i in range(3)), *(r.times(across, m) for m in mass))
+        distance_squared = r.dot(r.arm[k], r.arm[k])
+        return r.add(
+            *(body.J[i][i] for i in range(3)), *(r.times(distance_squared, m) for m in mass)
+        )
 
-    def _rigid(self, x: Inertia) -> _Inertia:
+    def _rigid_body_inertia(self, x: Inertia) -> _Inertia:
+        """Return the articulated inertia of a single rigid body."""
         hx, hy, hz = x.moment
-        less = self.r.minus
-        H = [[S.Zero, less(hz), hy], [hz, S.Zero, less(hx)], [less(hy), hx, S.Zero]]
+        minus = self.r.minus
+        H = [[S.Zero, minus(hz), hy], [hz, S.Zero, minus(hx)], [minus(hy), hx, S.Zero]]
         J = [[x.entry(i, j) for j in range(3)] for i in range(3)]
         M = [[x.mass if i == j else S.Zero for j in range(3)] for i in range(3)]
         return _Inertia(J, H, M)
 
-    def _reduced(self, k: int, body: _Inertia, column: Column, inverse: Expr) -> _Inertia:
-        """I - U U^T / d; without armature exactly zero along the joint."""
+    def _without_joint_motion(
+        self, k: int, body: _Inertia, column: Column, inverse: Expr
+    ) -> _Inertia:
+        """Return I - U U^T/d. Without armature, the entries along the joint are exactly zero."""
         r, link = self.r, self.links[k]
         u_m, u_f = column
         w_m, w_f = r.scaled(u_m, inverse), r.scaled(u_f, inverse)
 
-        def less(old: Expr, a: Expr, b: Expr) -> Expr:
+        def minus_product(old: Expr, a: Expr, b: Expr) -> Expr:
             return r.add(old, r.minus(r.times(a, b)))
 
-        J = self._symmetric(lambda i, j: less(body.J[i][j], w_m[i], u_m[j]))
-        M = self._symmetric(lambda i, j: less(body.M[i][j], w_f[i], u_f[j]))
-        H = [[less(body.H[i][j], w_m[i], u_f[j]) for j in range(3)] for i in range(3)]
+        J = self._symmetric(lambda i, j: minus_product(body.J[i][j], w_m[i], u_m[j]))
+        M = self._symmetric(lambda i, j: minus_product(body.M[i][j], w_f[i], u_f[j]))
+        H = [[minus_product(body.H[i][j], w_m[i], u_f[j]) for j in range(3)] for i in range(3)]
         if r.armature[k] == 0:
             a = link.axis
             for i in range(3):
@@ -163,28 +189,34 @@ class _Articulated:
         return _Inertia(J, H, M)
 
     def _symmetric(self, entry: Callable[[int, int], Expr]) -> Rows:
+        """Return the symmetric 3 x 3 matrix with the given upper triangle."""
         rows = [[S.Zero] * 3 for _ in range(3)]
         for i, j in combinations_with_replacement(range(3), 2):
             rows[i][j] = rows[j][i] = entry(i, j)
         return rows
 
-    def _sum(self, one: _Inertia, other: _Inertia) -> _Inertia:
+    def _sum(self, first: _Inertia, second: _Inertia) -> _Inertia:
+        """Return the sum of two inertias about the same origin in the same frame."""
         add = self.r.add
 
-        def both(a: Rows, b: Rows) -> Rows:
+        def add_matrices(a: Rows, b: Rows) -> Rows:
             return [list(map(add, p, q)) for p, q in zip(a, b, strict=True)]
 
-        return _Inertia(both(one.J, other.J), both(one.H, other.H), both(one.M, other.M))
+        return _Inertia(
+            add_matrices(first.J, second.J),
+            add_matrices(first.H, second.H),
+            add_matrices(first.M, second.M),
+        )
 
-    def _carried(self, k: int, x: _Inertia) -> _Inertia:
-        """To the parent's frame and about its origin."""
+    def _to_parent_frame(self, k: int, x: _Inertia) -> _Inertia:
+        """Transform an inertia from link k's frame to its parent's frame and origin."""
         r = self.r
         if self.links[k].turns:
-            x = _Inertia(*(self._by_angle(k, m) for m in (x.J, x.H, x.M)))
+            x = _Inertia(*(self._rotate_by_joint(k, m) for m in (x.J, x.H, x.M)))
         R = r.rotation[k]
         if not all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
             x = _Inertia(
-                *(self._rotated(R, m, same) for m, same in ((x.J, True), (x.H, False), (x.M, True)))
+                *(self._rotate(R, m, same) for m, same in ((x.J, True), (x.H, False), (x.M, True)))
             )
         arm = r.arm[k]
         if arm == ZERO:
@@ -198,8 +230,8 @@ class _Articulated:
         )
         return _Inertia(J, H, x.M)
 
-    def _by_angle(self, k: int, m: Rows) -> Rows:
-        """R m R^T for the joint's angle."""
+    def _rotate_by_joint(self, k: int, m: Rows) -> Rows:
+        """Return R m R^T, where R is the rotation by joint k's angle."""
         r = self.r
         i, j = AXES[self.links[k].axis]
         a = self.links[k].axis
@@ -220,9 +252,10 @@ class _Articulated:
         out[i][a], out[j][a] = rotated(m[i][a], m[j][a])
         return out
 
-    def _rotated(self, R: Matrix, m: Rows, symmetric: bool) -> Rows:
+    def _rotate(self, R: Matrix, m: Rows, symmetric: bool) -> Rows:
+        """Return R m R^T."""
         r = self.r
-        columns = list(zip(*(r.apply(R, row) for row in m), strict=True))  # of m R^T
+        columns = list(zip(*(r.apply(R, row) for row in m), strict=True))  # columns of m R^T
         if symmetric:
             return self._symmetric(lambda i, j: r.dot(R[i], columns[j]))
         return [[r.dot(row, column) for column in columns] for row in R]

@@ -1,4 +1,6 @@
-"""Atoms, which a tape's definitions are made of: a number, a name, or a number times a name."""
+"""Atoms, from which the definitions of a tape are made: a number, a name, or a number times a
+name.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ from sympy import Expr, Mul, S, Symbol
 
 
 def split(atom: Expr) -> tuple[Expr, Symbol | None]:
-    """(number, name) of what `define` returned; the name is None where it is a number."""
+    """Split an atom into (number, name). The name is None if the atom is a number."""
     if atom.is_Symbol:
         return S.One, atom
     if atom.is_number:
@@ -20,34 +22,38 @@ def split(atom: Expr) -> tuple[Expr, Symbol | None]:
 
 
 def is_negative(number: Expr) -> bool:
-    """Whether a number is below zero; of fractions without asking SymPy, which takes long."""
+    """Return True if a number is negative. Fractions are decided by their numerator, which is
+    faster than SymPy's test.
+    """
     return bool(number.p < 0 if number.is_Rational else number.is_negative)
 
 
 class Sums(Protocol):
-    """Where sums are kept: their weights and constants by name, and which names are no sums."""
+    """What `expand_sums` reads of a tape: weights and constant of each sum by name, and the
+    leaves.
+    """
 
     leaves: dict[Symbol, Any]
     weights: dict[Symbol, dict[Symbol, Expr]]
     constant: dict[Symbol, Expr]
 
 
-def written_out(
+def expand_sums(
     weights: dict[Symbol, Expr], constant: Expr, sums: Sums
 ) -> tuple[dict[Symbol, Expr], Expr]:
-    """A sum with sums of leaves in it written out where it gets shorter: q1 + (q2 - q1) = q2.
+    """Substitute nested sums of leaves in a sum where this makes it shorter: q1 + (q2 - q1) = q2.
 
-    Far out it would be off by roundings that q2 has not.
+    Besides being shorter, the result avoids a rounding error that is large where q1 is large.
     """
     for symbol, weight in weights.items():
         inner = sums.weights.get(symbol)
         if not inner or inner.keys().isdisjoint(weights) or inner.keys() - sums.leaves.keys():
             continue
-        found = {name: w for name, w in weights.items() if name is not symbol}
+        expanded = {name: w for name, w in weights.items() if name is not symbol}
         for name, w in inner.items():
-            found[name] = found.get(name, S.Zero) + weight * w
-        found = {name: w for name, w in found.items() if w != 0}
-        rest = constant + weight * sums.constant[symbol]
-        if len(found) + (rest != 0) < len(weights) + (constant != 0):
-            return written_out(found, S.Zero if rest == 0 else rest, sums)
+            expanded[name] = expanded.get(name, S.Zero) + weight * w
+        expanded = {name: w for name, w in expanded.items() if w != 0}
+        new_constant = constant + weight * sums.constant[symbol]
+        if len(expanded) + (new_constant != 0) < len(weights) + (constant != 0):
+            return expand_sums(expanded, S.Zero if new_constant == 0 else new_constant, sums)
     return weights, constant

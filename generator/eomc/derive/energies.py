@@ -1,4 +1,4 @@
-"""K, P, R and Q of a system on a tape, with the points whose rates they hold."""
+"""Kinetic and potential energy, dissipation and generalized forces of a system on a tape."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from eomc.model.system import System, dot, symbol, t
 
 @dataclass
 class Energies:
-    """K, P, a.qd, R and Q on the tape, with the points y_k and their velocities w_k = dot(y_k)."""
+    """Energies and forces on a tape: K, P, a . qd, R, Q, and the points y_k with velocities w_k =
+    dot(y_k).
+    """
 
     tape: Tape
     kinetic: Expr
@@ -23,63 +25,68 @@ class Energies:
     dissipation: Expr
     forces: list[Expr]
     signals: list[Expr]
-    points: dict[Symbol, Expr]  # w -> y
-    applied: list[tuple[Expr, Expr]]  # the velocity of a position, and the force there
-    rows: list[Expr]  # of constraints
+    points: dict[Symbol, Expr]  # velocity w of a point -> its position y
+    applied: list[tuple[Expr, Expr]]  # (velocity of a point, force applied there)
+    rows: list[Expr]  # residuals of the constraints
 
 
-def directions(system: System) -> dict[Symbol, Symbol]:
-    """The entries of a direction in (q, qd, u), by what each goes along."""
+def tangent_symbols(system: System) -> dict[Symbol, Symbol]:
+    """Return a symbol for the component of a direction along each of q, qd and u."""
     return {x: symbol(f"{x.name}{ALONG}") for x in (*system.q, *system.qd, *system.u)}
 
 
-def leaves(system: System, *more: Symbol) -> dict[Symbol, Stage]:
-    """t, parameters, inputs, coordinates, velocities, and what else changes as these do."""
-    found: dict[Symbol, Stage] = {t: Stage.TIME}
-    found |= {p.symbol: Stage.PARAMETER for p in system.parameters}
-    found |= dict.fromkeys(system.u, Stage.TIME)
-    found |= dict.fromkeys(system.q, Stage.POSITION)
-    return found | dict.fromkeys((*system.qd, *more), Stage.VELOCITY)
+def leaves(system: System, *velocities: Symbol) -> dict[Symbol, Stage]:
+    """Return the stage of each symbol that is not defined by others: t, parameters, inputs, q, qd,
+    `more`.
+    """
+    stages: dict[Symbol, Stage] = {t: Stage.TIME}
+    stages |= {p.symbol: Stage.PARAMETER for p in system.parameters}
+    stages |= dict.fromkeys(system.u, Stage.TIME)
+    stages |= dict.fromkeys(system.q, Stage.POSITION)
+    return stages | dict.fromkeys((*system.qd, *velocities), Stage.VELOCITY)
 
 
-def on_tape(
+def energies_on_tape(
     system: System, kinetic: Expr, potential: Expr, accelerations: bool = False
 ) -> Energies:
-    """K and P, with the system's dissipation, forces and signals, and what they are made of."""
-    more = system.qdd if accelerations else directions(system).values()
+    """Write K and P, and the system's dissipation, forces, signals and constraints, to a new tape.
+
+    Raises EomcError where a formula needs the time derivative of a velocity or an input.
+    """
+    more = system.qdd if accelerations else tangent_symbols(system).values()
     tape = Tape(leaves(system, *more), frozenset(system.q) - system.rates.keys())
     rates: dict[Symbol, Expr] = {**system.rates, t: S.One}
-    known: dict[Symbol, Expr] = {}
+    definitions: dict[Symbol, Expr] = {}
     points: dict[Symbol, Expr] = {}
 
     def value(expr: Expr) -> Expr:
         velocities = {}
-        for moving in sorted(expr.atoms(dot), key=str):
-            position = tape.define(_position(system, moving).xreplace(known))
-            held = tape.leaves_of([position]) & {*system.qd, *system.u}
-            if held:
+        for derivative in sorted(expr.atoms(dot), key=str):
+            position = tape.define(_position(system, derivative).xreplace(definitions))
+            unknown = tape.leaves_of([position]) & {*system.qd, *system.u}
+            if unknown:
                 raise EomcError(
-                    f"{system.file or system.name}: {moving} is the rate of something that "
-                    f"depends on {', '.join(sorted(map(str, held)))}: only t, coordinates and "
+                    f"{system.file or system.name}: {derivative} is the rate of something that "
+                    f"depends on {', '.join(sorted(map(str, unknown)))}: only t, coordinates and "
                     "parameters have known rates"
                 )
             (velocity,) = tape.forward([position], rates)
-            inside = moving.args[0]
+            inside = derivative.args[0]
             name = f"{inside}_dot" if inside.is_Symbol else f"w{len(points) + 1}"
             velocity = tape.named(velocity, name)
             if velocity in tape.parts and tape.stage[velocity] is Stage.VELOCITY:
                 points.setdefault(velocity, position)
-            velocities[moving] = velocity
-        return tape.define(expr.xreplace(velocities).xreplace(known))
+            velocities[derivative] = velocity
+        return tape.define(expr.xreplace(velocities).xreplace(definitions))
 
     forces = system.forces or (S.Zero,) * len(system.coordinates)
     applied = [(dot(y), force) for y, force in system.applied]
-    ends = [kinetic, potential, system.linear_potential, system.dissipation, *forces]
-    ends += [i.signal for i in system.inputs]
-    ends += [e for pair in applied for e in pair]
-    ends += [row.formula for row in system.constraints]
-    for defined, expr in needed(system.definitions, ends):
-        known[defined] = tape.named(value(expr), defined.name)
+    formulas = [kinetic, potential, system.linear_potential, system.dissipation, *forces]
+    formulas += [i.signal for i in system.inputs]
+    formulas += [e for pair in applied for e in pair]
+    formulas += [row.formula for row in system.constraints]
+    for defined, expr in needed(system.definitions, formulas):
+        definitions[defined] = tape.named(value(expr), defined.name)
     return Energies(
         tape,
         value(kinetic),
@@ -94,11 +101,12 @@ def on_tape(
     )
 
 
-def _position(system: System, moving: dot) -> Expr:
-    (inside,) = moving.args
-    if inside.has(dot):
+def _position(system: System, derivative: dot) -> Expr:
+    """Return y of dot(y). Raises EomcError if y contains a time derivative."""
+    (argument,) = derivative.args
+    if argument.has(dot):
         raise EomcError(
-            f"{system.file or system.name}: {moving} would hold accelerations, which are what is "
-            "solved for"
+            f"{system.file or system.name}: {derivative} would hold accelerations, which are what "
+            "is solved for"
         )
-    return inside
+    return argument

@@ -1,4 +1,4 @@
-"""The equations of motion as values on a tape, and what follows from D, bias, K and P."""
+"""The equations of motion as expressions on a tape: C, the energy integral and its rate."""
 
 from __future__ import annotations
 
@@ -11,21 +11,33 @@ from sympy import Expr, S, Symbol
 
 from eomc.base.errors import SceneError
 from eomc.derive.constraints import Constraints, constraints
-from eomc.derive.energies import Energies, directions
+from eomc.derive.energies import Energies, tangent_symbols
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import Tape
 from eomc.model.system import System, symbol, t
 
-WRITTEN_OUT = 2500  # names on the tape, about, from which C is computed column by column
+# Matrices with more names on the tape than this are not unrolled: they are given as the product
+# with a symbolic direction, from which the C code computes one column per call.
+UNROLLED_SIZE_LIMIT = 2500
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What Lagrange's equations give, as atoms of a tape; shapes as in the field: D, C (nq, nq).
+    """Terms of D qdd + bias = tau as atoms of a tape, with bias = C qd + g.
 
-    D: by rows, or where that would be long a single column, D e, for a direction e whose entries
-    are `directions`. g: the part of bias at rest. balance: b in D qdd = b. notes: where unusual
-    terms of K went.
+    Attributes
+    ----------
+    D : (nq, nq) or (1, nq)
+        Mass matrix by rows. Where that would be long, one row: D v for the direction v whose
+        entries are `tangent_symbols(system)`.
+    bias, g, tau : (nq,)
+        C qd + g; its part at rest; generalized forces.
+    balance : (nq,)
+        b = tau - bias in D qdd = b.
+    quadratic : bool
+        Whether K is a quadratic form of the velocities.
+    notes : tuple of str
+        Where unusual terms of K appear in the equations.
     """
 
     D: Rows
@@ -33,16 +45,29 @@ class Motion:
     g: Vector
     tau: Vector
     balance: Vector
-    quadratic: bool  # K is so in the velocities, with nothing else and without explicit time
+    quadratic: bool  # K = qd . D(q) . qd/2, without lower terms and explicit time
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Equations(Motion):
-    """The equations of motion. C: as D; kinetic, potential: K and P.
+    """The equations of motion of a system.
 
-    jacobi: p.qd - K + P, what is conserved without forces and explicit time; None where it is
-    K + P. power: d(jacobi)/dt without what constraints do; 0 for a conservative system.
+    Attributes
+    ----------
+    C : (nq, nq) or (1, nq)
+        Coriolis matrix, in the same form as D.
+    signals : (nu,)
+        Values of the inputs.
+    kinetic, potential : Expr
+        Energies K and P.
+    jacobi : Expr or None
+        Jacobi's integral p . qd - K + P, which is conserved without forces and explicit time. None
+        where it equals K + P.
+    power : Expr
+        d(jacobi)/dt without the power of constraint forces; 0 for a conservative system.
+    rows : Constraints or None
+        The constraint equations.
     """
 
     tape: Tape
@@ -56,25 +81,29 @@ class Equations(Motion):
 
 
 def equations(system: System, e: Energies, motion: Motion) -> Equations:
-    """The equations with what follows from D, bias, K and P: C, p.qd - K + P and its rate."""
+    """Complete D, bias, K and P to the equations of motion: C, Jacobi's integral and its time
+    derivative.
+    """
     tape, qd = e.tape, system.qd
 
     def add(*terms: Expr) -> Expr:
         return tape.define(sympy.Add(*terms))
 
-    euler = dict(zip(qd, qd, strict=True))
+    velocities = dict(zip(qd, qd, strict=True))
     jacobi = None
     if not motion.quadratic:
-        twice, once = tape.forward([e.kinetic, e.linear_potential], euler)
+        twice, once = tape.forward([e.kinetic, e.linear_potential], velocities)
         jacobi = add(twice, -once, -e.kinetic, e.potential, e.linear_potential)
         if e.linear_potential != 0 and jacobi == add(e.kinetic, e.potential):
             jacobi = None
     explicit = tape.forward([e.kinetic, e.potential, e.linear_potential], {t: S.One})
-    (lost,) = tape.forward([e.dissipation], euler)
-    works = [tape.define(force * v) for force, v in zip(e.forces, qd, strict=True)]
-    moved = tape.forward([v for v, _ in e.applied], euler)
-    works += [tape.define(f * v) for v, (_, f) in zip(moved, e.applied, strict=True)]
-    power = add(*works, -lost, explicit[1], explicit[2], -explicit[0])
+    (dissipated,) = tape.forward([e.dissipation], velocities)
+    powers = [tape.define(force * v) for force, v in zip(e.forces, qd, strict=True)]
+    velocities_of_points = tape.forward([v for v, _ in e.applied], velocities)
+    powers += [
+        tape.define(f * v) for v, (_, f) in zip(velocities_of_points, e.applied, strict=True)
+    ]
+    power = add(*powers, -dissipated, explicit[1], explicit[2], -explicit[0])
     return Equations(
         **vars(motion),
         tape=tape,
@@ -89,28 +118,29 @@ def equations(system: System, e: Energies, motion: Motion) -> Equations:
 
 
 def _coriolis(system: System, tape: Tape, bias: Sequence[Expr], quadratic: bool) -> Rows:
-    """C = (J(qd) + J(0))/2 with J = d(bias)/dqd, or C e where that would be long.
+    """Return C = (J(qd) + J(0))/2 with J = d(bias)/dqd, or C v for a direction v where C would be
+    long.
 
-    The part of bias that is quadratic in qd is sum_jk c_ijk qd_j qd_k with Christoffel's symbols
-    of the first kind, symmetric in j and k, so half its Jacobian is the Christoffel form of C.
-    The linear part (gyroscopic terms, explicit time in D) is J(0) qd and goes in whole.
+    The part of bias that is quadratic in qd is sum_jk c_ijk qd_j qd_k with Christoffel's symbols of
+    the first kind, symmetric in j and k, so half its Jacobian is the Christoffel form of C. The
+    linear part (gyroscopic terms, explicit time in D) is J(0) qd and enters with the factor 1.
     """
     at_rest = dict.fromkeys(system.qd, S.Zero)
 
     def column(seeds: Mapping[Symbol, Expr]) -> list[Expr]:
-        slope = tape.forward(bias, seeds)
-        still = [S.Zero] * len(slope) if quadratic else tape.substitute(slope, at_rest)
-        return [tape.define((a + b) / 2) for a, b in zip(slope, still, strict=True)]
+        derivative = tape.forward(bias, seeds)
+        at_zero = [S.Zero] * len(derivative) if quadratic else tape.substitute(derivative, at_rest)
+        return [tape.define((a + b) / 2) for a, b in zip(derivative, at_zero, strict=True)]
 
-    if len(bias) * len(tape.live(bias)) > WRITTEN_OUT:
-        entries = directions(system)
+    if len(bias) * len(tape.live(bias)) > UNROLLED_SIZE_LIMIT:
+        entries = tangent_symbols(system)
         return (tuple(column({qd: entries[q] for q, qd in zip(system.q, system.qd, strict=True)})),)
     columns = [column({velocity: S.One}) for velocity in system.qd]
     return tuple(tuple(column[i] for column in columns) for i in range(len(columns)))
 
 
-def no_inertia(system: System, name: str) -> NoReturn:
-    """Raise SceneError for a coordinate that nothing resists."""
+def raise_no_inertia(system: System, name: str) -> NoReturn:
+    """Raise a SceneError for a coordinate without inertia, with the remedy that fits the scene."""
     links = system.tree.links if system.tree else ()
     body = next((link.name for link in links if symbol(name) in link.q.free_symbols), "")
     if body:

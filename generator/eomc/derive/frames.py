@@ -1,10 +1,11 @@
-"""Frames of bodies and points on a tape: poses, velocities, accelerations, Jacobians.
+"""Poses, velocities, accelerations and Jacobians of frames on a tape.
 
-One sweep outwards along the world's axes: R_k and o_k of each link, then omega, the velocity of its
-origin, and their rates. Frames of bodies placed by formulas are differentiated. A Jacobian takes
-rates to the velocity of the frame's origin and the angular velocity, both along the world's axes
-(Pinocchio calls that LOCAL_WORLD_ALIGNED); its transpose takes a force there and a moment to
-generalized forces, which one sweep inwards does for all frames.
+One pass from the base to the leaves gives, along the world's axes, the rotation matrix R_k, origin
+o_k, angular velocity and velocity of each link and their time derivatives. Frames of bodies placed
+by formulas are differentiated instead. The Jacobian of a frame maps qd to the velocity of its
+origin and its angular velocity along the world's axes (LOCAL_WORLD_ALIGNED in Pinocchio). Its
+transpose maps a force and a moment to generalized forces; one pass from the leaves to the base does
+this for all frames.
 
 Source: Featherstone, *Rigid Body Dynamics Algorithms*, ch. 2 to 4.
 """
@@ -25,16 +26,23 @@ from eomc.model.symbols import needed, symbol
 from eomc.model.system import System, t
 from eomc.model.tree import Frame, Tree
 
-Twist = tuple[Vector, Vector]  # of a frame's origin and about it: velocity and omega, force, moment
+Twist = tuple[Vector, Vector]  # (velocity, angular velocity) or (force, moment)
 
 
 @dataclass(frozen=True)
 class Motions:
-    """Of frames, atoms of a tape, each frame's behind the other's.
+    """Kinematics of all requested frames as atoms of a tape, one frame after the other.
 
-    poses: in space position and rotation matrix by rows (12), in the plane x, y, angle (3).
-    velocities, accelerations: linear, angular (6; 3). jacobians: the same over the rates, by rows.
-    forces: (nq,), the generalized forces of `wrenches`.
+    Attributes
+    ----------
+    poses
+        Position (3) and rotation matrix by rows (9) of each frame; in the plane x, y, angle.
+    velocities, accelerations
+        Linear (3) and angular (3) of each frame; in the plane x, y, angle.
+    jacobians
+        By rows, (6, nq) for each frame; (3, nq) in the plane.
+    forces : (nq,)
+        Generalized forces of the wrenches `wrenches(system)` at the frames.
     """
 
     tape: Tape
@@ -46,9 +54,9 @@ class Motions:
 
 
 def wrenches(system: System) -> list[Symbol]:
-    """The entries of forces and moments at the frames that are asked for, along the world's axes.
+    """Return symbols for the force and moment at each requested frame, along the world's axes.
 
-    No name of a scene's ends in an underscore.
+    They end in an underscore, so no name of a scene coincides with them.
     """
     entries = "fx fy mz" if system.plane else "fx fy fz mx my mz"
     count = len(system.asked)
@@ -56,45 +64,61 @@ def wrenches(system: System) -> list[Symbol]:
 
 
 def motions(system: System) -> Motions:
-    """Those of the frames that the system asks for."""
-    given = wrenches(system)
-    tape = Tape(leaves(system, *system.qdd) | dict.fromkeys(given, Stage.TIME))
-    sweep = Sweep(tape, system, system.asked)
-    frames = [sweep.frame(f) for f in sweep.frames]
+    """Derive the kinematics of the frames that the system requests."""
+    entries = wrenches(system)
+    tape = Tape(leaves(system, *system.qdd) | dict.fromkeys(entries, Stage.TIME))
+    kinematics = Sweep(tape, system, system.asked)
+    frames = [kinematics.frame(f) for f in kinematics.frames]
     jacobians: list[Expr] = []
     for frame in frames:
-        columns = [sweep.flat(*twist) for twist in frame.jacobian]
-        jacobians += [column[i] for i in range(sweep.width) for column in columns]
-    acting = [sweep.twist(given[k : k + sweep.width]) for k in range(0, len(given), sweep.width)]
+        columns = [kinematics.flat(*twist) for twist in frame.jacobian]
+        jacobians += [column[i] for i in range(kinematics.width) for column in columns]
+    applied = [
+        kinematics.twist(entries[k : k + kinematics.width])
+        for k in range(0, len(entries), kinematics.width)
+    ]
     return Motions(
         tape,
-        [x for frame in frames for x in sweep.pose(frame)],
-        [x for frame in frames for x in sweep.flat(*frame.moving)],
-        [x for frame in frames for x in sweep.flat(*frame.accelerating)],
+        [x for frame in frames for x in kinematics.pose(frame)],
+        [x for frame in frames for x in kinematics.flat(*frame.velocity)],
+        [x for frame in frames for x in kinematics.flat(*frame.acceleration)],
         jacobians,
-        sweep.forces(frames, acting),
+        kinematics.forces(frames, applied),
     )
 
 
 @dataclass(frozen=True)
-class Held:
-    """A frame: where it is held, where it is, its motion, and what each rate adds to that.
+class FrameKinematics:
+    """A frame with its pose, velocity, acceleration and Jacobian along the world's axes.
 
-    rotation: by rows; in the plane with its angle.
+    Attributes
+    ----------
+    link : int
+        Index of the link that it is fixed to; -1 for a frame placed by formulas.
+    arm, at : Vector
+        Position relative to the link's origin, and in the world.
+    rotation : sequence of Vector
+        Rotation matrix by rows.
+    angle : Expr
+        Angle in the plane; 0 in space.
+    velocity, acceleration : Twist
+        Linear and angular velocity, and acceleration.
+    jacobian : sequence of Twist
+        Velocities for a unit rate of each coordinate.
     """
 
     link: int
-    arm: Vector  # from the link's origin, along the world's axes
+    arm: Vector
     at: Vector
     rotation: Sequence[Vector]
     angle: Expr
-    moving: Twist
-    accelerating: Twist
+    velocity: Twist
+    acceleration: Twist
     jacobian: Sequence[Twist]
 
 
 class Sweep(Links):
-    """Links and frames along the world's axes. d, width: entries of a place and of a twist."""
+    """Kinematics of links along the world's axes. d, width: entries of a position, a twist."""
 
     def __init__(self, tape: Tape, system: System, frames: Sequence[Frame]) -> None:
         super().__init__(tape, system.tree or Tree((), (), ZERO, ZERO))
@@ -107,22 +131,23 @@ class Sweep(Links):
         }
         self.joint_accelerations = self.by_link(
             dict(zip(system.q, system.qdd, strict=True))
-        )  # without drift
-        self.columns: list[Sequence[Vector]] = []  # of R_k, link k's frame in the world
+        )  # without the terms that are quadratic in velocities
+        self.columns: list[Sequence[Vector]] = []  # columns of R_k
         self.origin: list[Vector] = []
-        self.step: list[Vector] = []  # from the parent's origin
+        self.step: list[Vector] = []  # from the parent's origin to the link's
         for k, link in enumerate(self.links):
-            self._place(k, link.parent)
+            self._append_pose(k, link.parent)
         self.spin: list[Vector] = []
         self.velocity: list[Vector] = []
         self.turning: list[Vector] = []  # d omega/dt
         self.acceleration: list[Vector] = []
         for k, link in enumerate(self.links):
-            self._move(k, link.parent)
+            self._append_motion(k, link.parent)
 
-    def _place(self, k: int, p: int) -> None:
-        link, fixed = self.links[k], self.rotation[k]
-        columns = [(fixed[0][j], fixed[1][j], fixed[2][j]) for j in range(3)]
+    def _append_pose(self, k: int, p: int) -> None:
+        """Append R_k and the origin of link k, from those of its parent p."""
+        link, rotation = self.links[k], self.rotation[k]
+        columns = [(rotation[0][j], rotation[1][j], rotation[2][j]) for j in range(3)]
         step = self.arm[k]
         if p >= 0:
             columns = [self.world(p, column) for column in columns]
@@ -130,58 +155,65 @@ class Sweep(Links):
         if link.turns:
             c, s = self.cosine[k], self.sine[k]
             i, j = AXES[link.axis]
-            one, other = columns[i], columns[j]
-            columns[i] = self.plus(self.scaled(one, c), self.scaled(other, s))
-            columns[j] = self.plus(self.scaled(other, c), self.scaled(one, self.minus(s)))
+            x, y = columns[i], columns[j]
+            columns[i] = self.plus(self.scaled(x, c), self.scaled(y, s))
+            columns[j] = self.plus(self.scaled(y, c), self.scaled(x, self.minus(s)))
         self.columns.append(columns)
         self.step.append(step)
         self.origin.append(self.plus(self.origin[p], step) if p >= 0 else step)
 
-    def _move(self, k: int, p: int) -> None:
+    def _append_motion(self, k: int, p: int) -> None:
+        """Append velocity and acceleration of link k, from those of its parent p."""
         link, axis, r = self.links[k], self.axis(k), self.step[k]
-        own = self.scaled(axis, self.speed[k])
-        faster = self.scaled(axis, self.add(self.joint_accelerations[k], self.drift[k]))
+        relative = self.scaled(axis, self.speed[k])
+        relative_acceleration = self.scaled(
+            axis, self.add(self.joint_accelerations[k], self.drift[k])
+        )
         v = a = omega = alpha = ZERO
         if p >= 0:
             omega, alpha = self.spin[p], self.turning[p]
-            v, a = self.carried((self.velocity[p], omega), (self.acceleration[p], alpha), r)
-        swept = self.cross(omega, own)
+            v, a = self.propagate((self.velocity[p], omega), (self.acceleration[p], alpha), r)
+        coriolis = self.cross(omega, relative)
         if link.turns:
-            alpha = self.plus(alpha, faster, swept)
-            omega = self.plus(omega, own)
+            alpha = self.plus(alpha, relative_acceleration, coriolis)
+            omega = self.plus(omega, relative)
         else:
-            v = self.plus(v, own)
-            a = self.plus(a, faster, self.scaled(swept, S(2)))
+            v = self.plus(v, relative)
+            a = self.plus(a, relative_acceleration, self.scaled(coriolis, S(2)))
         self.spin.append(omega)
         self.turning.append(alpha)
         self.velocity.append(v)
         self.acceleration.append(a)
 
     def world(self, k: int, v: Vector) -> Vector:
-        """A vector of link k's frame along the world's axes."""
+        """Transform a vector from link k's frame to the world's axes."""
         return self.plus(*(self.scaled(c, x) for c, x in zip(self.columns[k], v, strict=True)))
 
     def axis(self, k: int) -> Vector:
-        """The axis of link k along the world's."""
+        """Return the joint axis of link k along the world's axes."""
         return self.columns[k][self.links[k].axis]
 
-    def carried(self, moving: Twist, accelerating: Twist, r: Vector) -> Twist:
-        """Velocity and acceleration of what is `r` away on the same body."""
+    def propagate(self, moving: Twist, accelerating: Twist, r: Vector) -> Twist:
+        """Return velocity and acceleration of the point at `r` from the reference point on the same
+        body.
+        """
         (v, omega), (a, alpha) = moving, accelerating
-        across = self.cross(omega, r)
+        rotational = self.cross(omega, r)
         return (
-            self.plus(v, across),
-            self.plus(a, self.cross(alpha, r), self.cross(omega, across)),
+            self.plus(v, rotational),
+            self.plus(a, self.cross(alpha, r), self.cross(omega, rotational)),
         )
 
     # --- frames ----------------------------------------------------------------------------------
 
     def flat(self, linear: Vector, angular: Vector) -> Sequence[Expr]:
-        """What counts of both."""
+        """Return the entries of a twist or wrench: 6 in space; x, y and the angular entry in the
+        plane.
+        """
         return (*linear[:2], angular[2]) if self.plane else (*linear, *angular)
 
     def twist(self, entries: Sequence[Expr]) -> Twist:
-        """The other way."""
+        """Return the (linear, angular) pair of the entries that `flat` returns."""
         if self.plane:
             x, y, turn = entries
             return (x, y, S.Zero), (S.Zero, S.Zero, turn)
@@ -190,31 +222,32 @@ class Sweep(Links):
 
     @cached_property
     def known(self) -> Mapping[Symbol, Expr]:
-        """What formulas of frames name."""
-        ends = [e for f in self.frames for e in self._formulas(f)]
+        """The atoms of all definitions that occur in formulas of frames."""
+        formulas = [formula for f in self.frames for formula in self._formulas(f)]
         known: dict[Symbol, Expr] = {}
-        for name, e in needed(self.system.definitions, ends):
-            known[name] = self.tape.named(e.xreplace(known), name.name)
+        for name, formula in needed(self.system.definitions, formulas):
+            known[name] = self.tape.named(formula.xreplace(known), name.name)
         return known
 
     def _formulas(self, f: Frame) -> Sequence[Expr]:
+        """Return the formulas of a frame's placement."""
         placed = (*f.offset, *(x for row in f.rotation for x in row)) if f.link < 0 else ()
         return (*placed, f.angle) if self.plane else placed
 
     def value(self, e: Expr) -> Expr:
-        """The atom of a formula over definitions."""
+        """Return the atom of a formula that may contain definitions."""
         return self.define(e.xreplace(self.known))
 
-    def pose(self, frame: Held) -> Sequence[Expr]:
-        """Position and rotation; in the plane position and angle."""
+    def pose(self, frame: FrameKinematics) -> Sequence[Expr]:
+        """Return position and rotation matrix; in the plane position and angle."""
         if self.plane:
             return (*frame.at[:2], frame.angle)
         return (*frame.at, *(x for row in frame.rotation for x in row))
 
-    def frame(self, f: Frame) -> Held:
-        """A frame with its motion."""
+    def frame(self, f: Frame) -> FrameKinematics:
+        """Compute the kinematics of a frame."""
         if f.link < 0:
-            return self._placed(f)
+            return self._frame_by_formulas(f)
         k = f.link
         arm = self.world(k, self.vector(f.offset))
         at = self.plus(self.origin[k], arm)
@@ -223,22 +256,27 @@ class Sweep(Links):
         ]
         omega, alpha = self.spin[k], self.turning[k]
         moving, accelerating = (self.velocity[k], omega), (self.acceleration[k], alpha)
-        v, a = self.carried(moving, accelerating, arm)
-        by: dict[Symbol, Twist] = dict.fromkeys(self.system.q, (ZERO, ZERO))
-        away = arm
+        v, a = self.propagate(moving, accelerating, arm)
+        jacobian: dict[Symbol, Twist] = dict.fromkeys(self.system.q, (ZERO, ZERO))
+        lever = arm
         while k >= 0:
             link, axis = self.links[k], self.axis(k)
-            twist = (self.cross(axis, away), axis) if link.turns else (axis, ZERO)
-            for q, slope in self.slopes[k].items():
-                linear, angular = (self.scaled(x, slope) for x in twist)
-                by[q] = (self.plus(by[q][0], linear), self.plus(by[q][1], angular))
-            k, away = link.parent, self.plus(away, self.step[k])
+            twist = (self.cross(axis, lever), axis) if link.turns else (axis, ZERO)
+            for q, derivative in self.slopes[k].items():
+                linear, angular = (self.scaled(x, derivative) for x in twist)
+                jacobian[q] = (
+                    self.plus(jacobian[q][0], linear),
+                    self.plus(jacobian[q][1], angular),
+                )
+            k, lever = link.parent, self.plus(lever, self.step[k])
         rows = list(zip(*columns, strict=True))
         angle = self.value(f.angle) if self.plane else S.Zero
-        return Held(f.link, arm, at, rows, angle, (v, omega), (a, alpha), [*by.values()])
+        return FrameKinematics(
+            f.link, arm, at, rows, angle, (v, omega), (a, alpha), [*jacobian.values()]
+        )
 
-    def _placed(self, f: Frame) -> Held:
-        """A body placed by formulas, or what does not move."""
+    def _frame_by_formulas(self, f: Frame) -> FrameKinematics:
+        """Compute the kinematics of a frame that is placed by formulas, or fixed in the world."""
         tape, (x, y, z) = self.tape, map(self.value, f.offset)
         rows = [self.vector([self.value(e) for e in row]) for row in f.rotation]
         angle = self.value(f.angle) if self.plane else S.Zero
@@ -246,39 +284,39 @@ class Sweep(Links):
         if self.plane:
             (turn,) = tape.forward([angle], self.along)
             omega = (S.Zero, S.Zero, turn)
-        else:  # of dR/dt R^T
-            moved = [tape.forward(row, self.along) for row in rows]
-            wx, wy, wz = (self.dot(moved[j], rows[i]) for i, j in AXES)
+        else:  # omega from the skew matrix dR/dt R^T
+            rotation_rates = [tape.forward(row, self.along) for row in rows]
+            wx, wy, wz = (self.dot(rotation_rates[j], rows[i]) for i, j in AXES)
             omega = (wx, wy, wz)
         a = tape.forward([vx, vy, vz], self.along)
         alpha = tape.forward(omega, self.along)
-        over = [tape.gradient([(e, S.One)], self.system.qd) for e in (vx, vy, vz, *omega)]
-        jacobian = [((c[0], c[1], c[2]), (c[3], c[4], c[5])) for c in zip(*over, strict=True)]
+        gradients = [tape.gradient([(e, S.One)], self.system.qd) for e in (vx, vy, vz, *omega)]
+        jacobian = [((c[0], c[1], c[2]), (c[3], c[4], c[5])) for c in zip(*gradients, strict=True)]
         accelerating = (a[0], a[1], a[2]), (alpha[0], alpha[1], alpha[2])
         moving = (vx, vy, vz), omega
-        return Held(-1, ZERO, (x, y, z), rows, angle, moving, accelerating, jacobian)
+        return FrameKinematics(-1, ZERO, (x, y, z), rows, angle, moving, accelerating, jacobian)
 
     # --- forces ----------------------------------------------------------------------------------
 
-    def forces(self, frames: Sequence[Held], acting: Sequence[Twist]) -> list[Expr]:
-        """The generalized forces of forces and moments at frames: sums inwards, on each axis."""
+    def forces(self, frames: Sequence[FrameKinematics], wrenches: Sequence[Twist]) -> list[Expr]:
+        """Project wrenches at frames onto the coordinates: generalized forces sum_k J_k^T w_k."""
         force, moment = [[ZERO] * self.n for _ in range(2)]
-        found: dict[Symbol, list[Expr]] = {q: [] for q in self.system.q}
-        for frame, (f, m) in zip(frames, acting, strict=True):
+        generalized: dict[Symbol, list[Expr]] = {q: [] for q in self.system.q}
+        for frame, (f, m) in zip(frames, wrenches, strict=True):
             k = frame.link
             if k >= 0:
                 force[k] = self.plus(force[k], f)
                 moment[k] = self.plus(moment[k], m, self.cross(frame.arm, f))
             else:
                 for q, (v, omega) in zip(self.system.q, frame.jacobian, strict=True):
-                    found[q] += [self.dot(v, f), self.dot(omega, m)]
-        along = [S.Zero] * self.n
+                    generalized[q] += [self.dot(v, f), self.dot(omega, m)]
+        joint_forces = [S.Zero] * self.n
         for k in reversed(range(self.n)):
             link = self.links[k]
-            along[k] = self.dot(self.axis(k), (moment if link.turns else force)[k])
+            joint_forces[k] = self.dot(self.axis(k), (moment if link.turns else force)[k])
             if (p := link.parent) >= 0:
                 force[p] = self.plus(force[p], force[k])
                 moment[p] = self.plus(moment[p], moment[k], self.cross(self.step[k], force[k]))
-        for q, projected in self.projected(along).items():
-            found[q].append(projected)
-        return [self.add(*terms) for terms in found.values()]
+        for q, projected in self.projected(joint_forces).items():
+            generalized[q].append(projected)
+        return [self.add(*terms) for terms in generalized.values()]

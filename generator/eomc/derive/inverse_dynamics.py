@@ -1,7 +1,7 @@
-"""Inverse dynamics on a tape: the generalized forces of a motion, D qdd + bias, without D.
+"""Inverse dynamics on a tape: D qdd + bias for given accelerations, without forming D.
 
-Along a tree by Newton and Euler (newton_euler.py), of what is written as K and P by Lagrange's
-operator at the given accelerations.
+Trees of bodies by the recursive Newton-Euler algorithm (newton_euler.py); energies that are written
+as K and P by Lagrange's operator.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from sympy import Expr, S
 
-from eomc.derive.energies import on_tape
+from eomc.derive.energies import energies_on_tape
 from eomc.derive.lagrange import inertial_forces
 from eomc.derive.newton_euler import Recursion
 from eomc.derive.tape import Tape
@@ -18,16 +18,22 @@ from eomc.model.system import System
 
 
 def inverse_dynamics(system: System) -> tuple[Tape, Sequence[Expr]]:
-    """tau = D qdd + C qd + g, (nq,), over q, qd, qdd and t."""
+    """Derive tau = D qdd + C qd + g, (nq,), as a function of q, qd, qdd and t. Returns the tape and
+    tau.
+    """
     tree = system.tree
     energies = (tree.beside_kinetic, tree.beside_potential) if tree else None
-    e = on_tape(system, *(energies or (system.kinetic, system.potential)), accelerations=True)
+    energies_ = energies_on_tape(
+        system, *(energies or (system.kinetic, system.potential)), accelerations=True
+    )
     accelerations = dict(zip(system.qd, system.qdd, strict=True))
-    found = [[x] for x in inertial_forces(system, e, accelerations)]
+    terms_of = [[x] for x in inertial_forces(system, energies_, accelerations)]
     if tree:
-        r = Recursion(e.tape, tree)
-        along = r.by_link(dict(zip(system.q, system.qdd, strict=True)))
-        whole = r.projected(r.inverse_dynamics(along))
-        for terms, q in zip(found, system.q, strict=True):
-            terms.append(whole.get(q, S.Zero))
-    return e.tape, [e.tape.total(x for x in terms if x is not S.Zero) for terms in found]
+        r = Recursion(energies_.tape, tree)
+        joint_accelerations = r.by_link(dict(zip(system.q, system.qdd, strict=True)))
+        tree_forces = r.projected(r.inverse_dynamics(joint_accelerations))
+        for terms, q in zip(terms_of, system.q, strict=True):
+            terms.append(tree_forces.get(q, S.Zero))
+    return energies_.tape, [
+        energies_.tape.total(x for x in terms if x is not S.Zero) for terms in terms_of
+    ]

@@ -1,17 +1,19 @@
-"""Euler and Lagrange over a tape: D, C, g, bias, generalized forces and accelerations.
+"""Lagrange's equations on a tape: D, C, g, bias, generalized forces and accelerations.
 
 With K, P and R as programs over named positions, the equations of motion
 
     D(q) qdd + bias(q, qd, t) = tau,    bias = C qd + g,    tau = Q - dR/dqd
 
-follow by sweeps (tape.py). What a scene writes as dot(y) is treated as a velocity w of its own:
-since d(ydot)/dq = d/dt (dy/dq), Lagrange's operator is the same in any coordinates, so
+follow by automatic differentiation (tape.py). What a scene writes as dot(y) is an independent
+velocity w: since d(ydot)/dq = d/dt (dy/dq), Lagrange's operator has the same form in any
+coordinates, so
 
     bias_i = d/dt(dF/dqd_i) - dF/dq_i + dP/dq_i + sum_k d/dt(dF/dw_k) dy_k/dq_i
 
-with K = F(q, qd, w, t) and d/dt taken at qdd = 0: the inertial forces of the points, projected
-by one backward sweep over their positions. That is the operation count of recursive Newton and
-Euler, without the terms that cancel when K is differentiated as a function of q and qd.
+with K = F(q, qd, w, t) and d/dt taken at qdd = 0. The last term is the inertial forces of the
+points, projected by one reverse pass over their positions. This has the operation count of the
+recursive Newton-Euler algorithm, and avoids terms that cancel when K is differentiated as a
+function of q and qd.
 """
 
 from __future__ import annotations
@@ -27,60 +29,68 @@ from eomc.base.errors import Problem, SceneError
 from eomc.derive import link_multipliers
 from eomc.derive.articulated_body import MasslessError, accelerations
 from eomc.derive.constraints import Constraints, constraints
-from eomc.derive.energies import Energies, directions, on_tape
-from eomc.derive.equations import Equations, Motion, equations, no_inertia
-from eomc.derive.ldl import Rows, Solution, Vector, Way, solve, work
+from eomc.derive.energies import Energies, energies_on_tape, tangent_symbols
+from eomc.derive.equations import Equations, Motion, equations, raise_no_inertia
+from eomc.derive.ldl import Rows, Solution, SolveResult, Vector, count_operations, solve
 from eomc.derive.newton_euler import Recursion
-from eomc.derive.tape import RoughError, Stage, Tape
+from eomc.derive.tape import NotDifferentiableError, Stage, Tape
 from eomc.model.symbols import needed
 from eomc.model.system import System, t
 from eomc.model.tree import Tree
 
-LAGRANGE_DEFINITIONS = 12  # of a tree's world coordinates: beyond, recursion always needs less
-MOST_ROWS = 16  # coordinates from which D is computed column by column, where nothing needs it
-
-
-MASSLESS = "a motion that nothing resists"  # why there is no way by articulated bodies
+# Up to this many world coordinates of a tree, Lagrange's method may need fewer operations than the
+# recursive algorithms, so both are derived.
+MAX_LAGRANGE_DEFINITIONS = 12
+# With more coordinates D is given as a product with a direction, unless elimination needs it whole.
+MAX_UNROLLED_COORDINATES = 16
+# The reason why articulated bodies are not used.
+MASSLESS = "a motion that nothing resists"
 
 
 @dataclass(frozen=True)
 class Derivation:
-    """The equations of motion by each way that may be worth its while.
+    """The equations of motion by each method that may lead to the fastest code.
 
-    lagrange: over the program of K and P; newton_euler: recursively, where there are bodies on
-    joints; None where that way was not gone. The rest are the accelerations, each by one way of
-    solving D qdd = b: Lagrange's D by L D L^T, D of composite bodies by L D L^T, articulated
-    bodies, link multipliers; or why it was not tried, or None where there is nothing to try, as
-    where there are constraints (kkt.py).
+    Attributes
+    ----------
+    lagrange : Equations or None
+        By differentiation of K and P; None where that method was not used.
+    newton_euler : Equations or None
+        By the recursive algorithms; None without bodies on joints.
+    ldl, composite, articulated, multipliers : SolveResult
+        Accelerations by L D L^T of Lagrange's D, by L D L^T of D from composite bodies, by
+        articulated bodies, and by link multipliers. A str gives the reason why a method was not
+        used. None where a method does not apply, as with constraints (see kkt.py).
     """
 
     system: System
     lagrange: Equations | None
     newton_euler: Equations | None
-    ldl: Way
-    composite: Way
-    articulated: Way
-    multipliers: Way
+    ldl: SolveResult
+    composite: SolveResult
+    articulated: SolveResult
+    multipliers: SolveResult
 
 
 def derive(system: System) -> Derivation:
-    """The equations of motion of `system`.
+    """Derive the equations of motion of `system` by all methods that apply.
 
     Raises SceneError where K is not quadratic in the velocities or a coordinate has no inertia.
-    Source: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral); C from
+
+    Sources: Greenwood, *Advanced Dynamics*, sec. 2.1 (Lagrange) and 2.3 (Jacobi's integral); C from
     Spong, Hutchinson & Vidyasagar, *Robot Modeling and Control*, sec. 6.3.
     """
     lagrange = newton_euler = articulated = composite = multipliers = None
     places = len(needed(system.definitions, (system.kinetic, system.potential)))
-    ldl: Way = f"{places} world coordinates to differentiate"
+    ldl: SolveResult = f"{places} world coordinates to differentiate"
     try:
-        if system.tree is None or places <= LAGRANGE_DEFINITIONS:
+        if system.tree is None or places <= MAX_LAGRANGE_DEFINITIONS:
             lagrange, ldl, multipliers = _by_lagrange(system)
         if system.tree is not None:
             newton_euler, articulated, composite = _by_newton_euler(system, system.tree)
         if lagrange is None and not system.constraints:
             multipliers = _by_multipliers(system)
-    except RoughError:  # P and R are differentiated once, K and constraints twice
+    except NotDifferentiableError:  # P and R are differentiated once, K and constraints twice
         if rough := _rough_rows(system):
             raise SceneError(rough) from None
         message = (
@@ -92,13 +102,13 @@ def derive(system: System) -> Derivation:
 
 
 def _rough_rows(system: System) -> list[Problem]:
-    """What is to be said of constraints with corners."""
-    problems, still = [], replace(system, kinetic=S.Zero, potential=S.Zero, tree=None)
+    """Return the problems of constraints that have no second derivative."""
+    problems, without_energies = [], replace(system, kinetic=S.Zero, potential=S.Zero, tree=None)
     for row in system.constraints:
-        alone = replace(still, constraints=(row,))
+        alone = replace(without_energies, constraints=(row,))
         try:
-            constraints(alone, on_tape(alone, S.Zero, S.Zero))
-        except RoughError:
+            constraints(alone, energies_on_tape(alone, S.Zero, S.Zero))
+        except NotDifferentiableError:
             key = f"loop.{row.loop}" if row.loop else f"constraints.{row.name}"
             message = (
                 "abs, min and max have corners, and constraints are differentiated twice: write "
@@ -108,146 +118,163 @@ def _rough_rows(system: System) -> list[Problem]:
     return problems
 
 
-def _by_lagrange(system: System) -> tuple[Equations, Way, Way]:
-    """The equations, and accelerations by L D L^T and by multipliers."""
-    e = on_tape(system, system.kinetic, system.potential)
+def _by_lagrange(system: System) -> tuple[Equations, SolveResult, SolveResult]:
+    """Return the equations, and the accelerations by L D L^T and by link multipliers."""
+    e = energies_on_tape(system, system.kinetic, system.potential)
     motion = _lagrange(system, e)
     if system.constraints:
-        made = equations(system, e, motion)
-        _refuse_massless(system, motion.D, made.rows)
-        return made, None, None
+        result = equations(system, e, motion)
+        _refuse_massless(system, motion.D, result.rows)
+        return result, None, None
     _refuse_massless(system, motion.D)
-    multipliers, operations = _by_multipliers(system), work(motion.D)
-    ldl: Way = f"{operations} flops for elimination alone"
+    multipliers, operations = _by_multipliers(system), count_operations(motion.D)
+    ldl: SolveResult = f"{operations} flops for elimination alone"
     if (
         not isinstance(multipliers, Solution)
-        or len(system.q) <= MOST_ROWS
+        or len(system.q) <= MAX_UNROLLED_COORDINATES
         or operations <= _length(multipliers)
     ):
         ldl = solve(e.tape, motion.D, motion.balance)
     return equations(system, e, motion), ldl, multipliers
 
 
-def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, Way, Way]:
-    """Newton and Euler for the tree, Lagrange for the rest; articulated and composite bodies."""
-    e = on_tape(system, tree.beside_kinetic, tree.beside_potential)
+def _by_newton_euler(system: System, tree: Tree) -> tuple[Equations, SolveResult, SolveResult]:
+    """Return the equations, and the accelerations by articulated and by composite bodies.
+
+    Bodies on joints by the recursive Newton-Euler algorithm, all other energies by Lagrange's
+    method.
+    """
+    e = energies_on_tape(system, tree.beside_kinetic, tree.beside_potential)
     tape, q = e.tape, system.q
     rest = _lagrange(system, e)
     recursion = Recursion(tape, tree)
 
-    def placed(by_link: Sequence[Expr]) -> list[Expr]:
-        found = recursion.projected(by_link)
-        return [found.get(x, S.Zero) for x in q]
+    def by_coordinate(by_link: Sequence[Expr]) -> list[Expr]:
+        projected = recursion.projected(by_link)
+        return [projected.get(x, S.Zero) for x in q]
 
-    bias = placed(recursion.bias())
+    bias = by_coordinate(recursion.bias())
     motion = replace(
         rest,
         bias=_sums(tape, rest.bias, bias),
-        g=_sums(tape, rest.g, placed(recursion.gravity_forces())),
+        g=_sums(tape, rest.g, by_coordinate(recursion.gravity_forces())),
         balance=_sums(tape, rest.balance, [-x for x in bias]),
     )
     constrained = bool(system.constraints)
     articulated = None if constrained else _by_articulated_bodies(system, recursion, rest)
-    operations = recursion.elimination()
-    long = isinstance(articulated, Solution) and operations > _length(articulated)
-    if long and len(q) > MOST_ROWS:
-        along = recursion.by_link(directions(system))
-        D: Rows = (tuple(placed(recursion.mass_times(along))),)
+    operations = recursion.count_elimination_operations()
+    use_articulated = isinstance(articulated, Solution) and operations > _length(articulated)
+    if use_articulated and len(q) > MAX_UNROLLED_COORDINATES:
+        direction = recursion.by_link(tangent_symbols(system))
+        D: Rows = (tuple(by_coordinate(recursion.mass_times(direction))),)
     else:
-        columns = zip(*map(placed, recursion.mass_matrix()), strict=True)
-        whole = [*map(placed, columns)]  # by column; of symmetric entries one is kept
-        rows = [[whole[min(i, j)][max(i, j)] for j in range(len(q))] for i in range(len(q))]
+        columns = zip(*map(by_coordinate, recursion.mass_matrix()), strict=True)
+        matrix = [
+            *map(by_coordinate, columns)
+        ]  # by column; only one of two symmetric entries is used
+        rows = [[matrix[min(i, j)][max(i, j)] for j in range(len(q))] for i in range(len(q))]
         D = tuple(_sums(tape, *pair) for pair in zip(rest.D, rows, strict=True))
         if not constrained:
             _refuse_massless(system, D)
-    composite: Way = None if constrained else f"{operations} flops for elimination alone"
-    if not long and not constrained:
+    composite: SolveResult = None if constrained else f"{operations} flops for elimination alone"
+    if not use_articulated and not constrained:
         composite = solve(tape, D, motion.balance)
     e.kinetic = tape.total([e.kinetic, recursion.kinetic_energy()])
     e.potential = tape.total([e.potential, recursion.potential_energy()])
-    made = equations(system, e, replace(motion, D=D))
+    result = equations(system, e, replace(motion, D=D))
     if constrained:
-        _refuse_massless(system, D, made.rows)
-    return made, articulated, composite
+        _refuse_massless(system, D, result.rows)
+    return result, articulated, composite
 
 
-def _by_articulated_bodies(system: System, recursion: Recursion, rest: Motion) -> Way:
-    """The accelerations where all inertia is the tree's, and joints have their own coordinates."""
+def _by_articulated_bodies(system: System, recursion: Recursion, rest: Motion) -> SolveResult:
+    """Return accelerations by articulated bodies if all inertia belongs to joints with one
+    coordinate each.
+    """
     q, links = system.q, recursion.links
     if not recursion.plain:
         return "joints that move together"
     if len(links) < len(q) or any(x != 0 for column in rest.D for x in column):
         return None
-    at = {link.q: k for k, link in enumerate(links)}
+    link_of = {link.q: k for k, link in enumerate(links)}
     try:
-        found, pivots = accelerations(recursion, [rest.balance[q.index(link.q)] for link in links])
-    except MasslessError:  # D is singular, from which `program.inertia` finds the motion
+        qdd, pivots = accelerations(recursion, [rest.balance[q.index(link.q)] for link in links])
+    except MasslessError:  # D is singular; `program.inertia` reports the motion without inertia
         return MASSLESS
     order = tuple(q.index(link.q) for link in reversed(links))
-    return Solution(recursion.tape, tuple(found[at[x]] for x in q), order, pivots)
+    return Solution(recursion.tape, tuple(qdd[link_of[x]] for x in q), order, pivots)
 
 
-def _by_multipliers(system: System) -> Way:
+def _by_multipliers(system: System) -> SolveResult:
+    """Return accelerations by link multipliers, or the reason why they do not apply."""
     try:
         return link_multipliers.solution(system)
-    except link_multipliers.UnsuitedError as why:
-        return str(why)
+    except link_multipliers.UnsuitedError as reason:
+        return str(reason)
 
 
 def _length(solution: Solution) -> int:
-    """The names that a solution depends on, about its operations."""
+    """Return the number of definitions that the accelerations depend on, about their operation
+    count.
+    """
     return len(solution.tape.live(solution.acceleration))
 
 
 def _refuse_massless(system: System, D: Rows, rows: Constraints | None = None) -> None:
-    """Raise SceneError where a coordinate is neither in D nor in a row."""
+    """Raise SceneError where a coordinate occurs neither in D nor in a constraint."""
     for k, (c, row) in enumerate(zip(system.coordinates, D, strict=True)):
-        held = rows is not None and any(row[k] != 0 for row in rows.jacobian)
-        if all(entry == 0 for entry in row) and not held:
-            no_inertia(system, c.name)
+        is_constrained = rows is not None and any(row[k] != 0 for row in rows.jacobian)
+        if all(entry == 0 for entry in row) and not is_constrained:
+            raise_no_inertia(system, c.name)
 
 
-def _sums(tape: Tape, one: Sequence[Expr], other: Sequence[Expr]) -> Vector:
-    return tuple(tape.total(pair) for pair in zip(one, other, strict=True))
+def _sums(tape: Tape, first: Sequence[Expr], second: Sequence[Expr]) -> Vector:
+    """Return the sums of corresponding entries."""
+    return tuple(tape.total(pair) for pair in zip(first, second, strict=True))
 
 
 def inertial_forces(
     system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
 ) -> list[Expr]:
-    """D qdd + bias of K and P on a tape, by Lagrange's operator. accelerations: by velocity."""
+    """Derive D qdd + bias of energies on a tape by Lagrange's operator. accelerations: by velocity
+    symbol.
+    """
     tape, q = e.tape, system.q
-    moving = _momenta(system, e, accelerations)[1]
-    seeds = [*_lagrangian(e), *zip(e.points.values(), moving[len(q) :], strict=True)]
-    back = tape.gradient(seeds, q, frozenset(e.points))
-    return [tape.total(x) for x in zip(moving[: len(q)], back, strict=True)]
+    momentum_rates = _momenta(system, e, accelerations)[1]
+    seeds = [*_lagrangian(e), *zip(e.points.values(), momentum_rates[len(q) :], strict=True)]
+    projected = tape.gradient(seeds, q, frozenset(e.points))
+    return [tape.total(x) for x in zip(momentum_rates[: len(q)], projected, strict=True)]
 
 
 def _momenta(
     system: System, e: Energies, accelerations: Mapping[Symbol, Expr]
 ) -> tuple[list[Expr], list[Expr]]:
-    """dL/dqd and dL/dw, and their rates; velocities without an acceleration are steady."""
+    """Return dL/dqd and dL/dw, and their time derivatives. The rate of a velocity not in
+    `accelerations` is 0.
+    """
     rates: dict[Symbol, Expr] = {**system.rates, t: S.One, **accelerations}
-    wanted = [*system.qd, *e.points]
+    velocities = [*system.qd, *e.points]
     lagrangian = [(e.kinetic, S.One), (e.linear_potential, S.NegativeOne)]
-    momenta = e.tape.gradient(lagrangian, wanted, frozenset(e.points))
+    momenta = e.tape.gradient(lagrangian, velocities, frozenset(e.points))
     return momenta, e.tape.forward(momenta, rates)
 
 
 def _lagrangian(e: Energies) -> list[tuple[Expr, Expr]]:
-    """Seeds of the gradient of -L."""
+    """Return -L = P - K as (output, seed) pairs of a gradient."""
     return [(e.kinetic, S.NegativeOne), (e.potential, S.One), (e.linear_potential, S.One)]
 
 
 def _lagrange(system: System, e: Energies) -> Motion:
+    """Derive D, bias, g, tau and b = tau - bias of the energies on a tape."""
     tape, q, qd = e.tape, system.q, system.qd
     w = list(e.points)
     stop = frozenset(w)
 
-    momenta, moving = _momenta(system, e, {})
+    momenta, momentum_rates = _momenta(system, e, {})
     p, p_w = momenta[: len(q)], momenta[len(q) :]
-    p_dot, p_w_dot = moving[: len(q)], moving[len(q) :]
-    against = [(e.dissipation, S.One), *((v, -force) for v, force in e.applied)]
-    friction = tape.gradient(against, [*qd, *w], stop)
+    p_dot, p_w_dot = momentum_rates[: len(q)], momentum_rates[len(q) :]
+    dissipative = [(e.dissipation, S.One), *((v, -force) for v, force in e.applied)]
+    friction = tape.gradient(dissipative, [*qd, *w], stop)
     r, r_w = friction[: len(q)], friction[len(q) :]
 
     def projected(at_points: list[Expr], *energies: tuple[Expr, Expr]) -> list[Expr]:
@@ -265,19 +292,23 @@ def _lagrange(system: System, e: Energies) -> Motion:
     D = _mass_matrix(system, e, [*p, *p_w], projected)
 
     at_rest = dict.fromkeys(qd, S.Zero)
-    driven = t in tape.leaves_of([e.kinetic, e.linear_potential])
-    quadratic = all(x == 0 for x in tape.substitute([e.kinetic, *p, *p_w], at_rest)) and not driven
+    depends_on_time = t in tape.leaves_of([e.kinetic, e.linear_potential])
+    quadratic = (
+        all(x == 0 for x in tape.substitute([e.kinetic, *p, *p_w], at_rest)) and not depends_on_time
+    )
     g = tape.gradient([(e.potential, S.One)], q) if quadratic else tape.substitute(bias, at_rest)
 
-    # D qdd = b, the forces projected in one sweep
+    # b in D qdd = b, with all forces projected in one reverse pass
     if e.dissipation == 0 and not e.applied:
         b = [add(force, -c) for force, c in zip(e.forces, bias, strict=True)]
     else:
         seeds = [add(i, f) for i, f in zip(p_w_dot, r_w, strict=True)]
-        whole = projected(seeds, *lagrangian)
+        forces = projected(seeds, *lagrangian)
         b = [
-            add(force, -inertia, -drag, -rest)
-            for force, inertia, drag, rest in zip(e.forces, p_dot, r, whole, strict=True)
+            add(force, -inertia, -drag, -inertia_and_potential)
+            for force, inertia, drag, inertia_and_potential in zip(
+                e.forces, p_dot, r, forces, strict=True
+            )
         ]
     notes = _notes(tape, e, p, p_w, at_rest, D)
     return Motion(D, tuple(bias), tuple(g), tuple(tau), tuple(b), quadratic, notes)
@@ -286,19 +317,19 @@ def _lagrange(system: System, e: Energies) -> Motion:
 def _mass_matrix(
     system: System, e: Energies, momenta: list[Expr], projected: Callable[[list[Expr]], list[Expr]]
 ) -> Rows:
-    """D_ij = d(dF/dqd_i)/dqd_j + sum_k d(dF/dw_k)/dqd_j dy_k/dq_i, a column a sweep."""
+    """Return D_ij = d(dF/dqd_i)/dqd_j + sum_k d(dF/dw_k)/dqd_j dy_k/dq_i, one column per pass."""
     tape, n = e.tape, len(system.q)
-    whole: list[list[Expr]] = []
+    columns: list[list[Expr]] = []
     for velocity in system.qd:
         column = tape.forward(momenta, {velocity: S.One})
         at_points = projected(column[n:])
-        whole.append([tape.define(a + b) for a, b in zip(column[:n], at_points, strict=True)])
-    # D is symmetric, and one half of it may cost less than the other
-    halves = [
-        [[whole[side(i, j)][other(i, j)] for j in range(n)] for i in range(n)]
-        for side, other in ((min, max), (max, min))
+        columns.append([tape.define(a + b) for a, b in zip(column[:n], at_points, strict=True)])
+    # D is symmetric, and its two triangles may differ in cost
+    triangles = [
+        [[columns[row_of(i, j)][column_of(i, j)] for j in range(n)] for i in range(n)]
+        for row_of, column_of in ((min, max), (max, min))
     ]
-    D = min(halves, key=lambda half: len(tape.live(entry for row in half for entry in row)))
+    D = min(triangles, key=lambda half: len(tape.live(entry for row in half for entry in row)))
     for i, j in product(range(n), repeat=2):
         if tape.stage_of(D[i][j]) >= Stage.VELOCITY:
             message = (
@@ -313,7 +344,7 @@ def _mass_matrix(
 def _notes(
     tape: Tape, e: Energies, p: list[Expr], p_w: list[Expr], at_rest: dict[Symbol, Expr], D: Rows
 ) -> tuple[str, ...]:
-    """Where terms of K went that are not quadratic in the velocities."""
+    """Return where terms of K that are not quadratic in the velocities appear in the equations."""
     notes = []
     if any(x != 0 for x in tape.substitute([*p, *p_w], at_rest)):
         notes.append(

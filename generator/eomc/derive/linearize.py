@@ -1,4 +1,4 @@
-"""Derivatives of the accelerations: along the state and inputs, along the parameters."""
+"""Derivatives of the accelerations with respect to state, inputs and parameters."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from sympy import Expr, S, Symbol
 
 from eomc.base.errors import SceneError
-from eomc.derive.energies import directions
-from eomc.derive.equations import WRITTEN_OUT
+from eomc.derive.energies import tangent_symbols
+from eomc.derive.equations import UNROLLED_SIZE_LIMIT
 from eomc.derive.ldl import Rows, Vector
-from eomc.derive.tape import RoughError, Tape
+from eomc.derive.tape import NotDifferentiableError, Tape
 from eomc.model.system import System
 
-# that accelerations jump, and what makes them smooth; by formulas, by friction that sticks
+# (cause, remedy) of discontinuous accelerations: in formulas, and by stick-slip friction
 JUMPS = (
     "the accelerations jump (sign or heaviside of a coordinate or velocity)",
     "make them smooth, say tanh(x/width)",
@@ -25,25 +25,32 @@ STICKS = (
 
 
 def linearization(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
-    """[da/dq, da/dqd, da/du] at held inputs, (nq, 2 nq + nu), of accelerations a on the tape.
+    """Return [da/dq, da/dqd, da/du], (nq, 2 nq + nu), for accelerations a on the tape at constant
+    inputs.
 
-    By rows, or where that would be long a single column, the derivative along a direction whose
-    entries are `directions`. Raises SceneError where the accelerations jump.
+    By rows, or where that would be long one row: the derivative along the direction whose entries
+    are `tangent_symbols`. Raises SceneError where the accelerations jump.
     """
-    entries = directions(system)
-    if len(entries) * len(tape.live(accelerations)) > WRITTEN_OUT:
+    entries = tangent_symbols(system)
+    if len(entries) * len(tape.live(accelerations)) > UNROLLED_SIZE_LIMIT:
         return (_slopes(system, tape, accelerations, [entries])[0],)
     columns = _slopes(system, tape, accelerations, [{x: S.One} for x in entries])
     return tuple(zip(*columns, strict=True))
 
 
-def along(system: System, tape: Tape, values: Sequence[Expr]) -> Vector:
-    """The derivatives of values of the state along a direction, `directions`. Raises likewise."""
-    return _slopes(system, tape, values, [directions(system)])[0]
+def directional_derivatives(system: System, tape: Tape, values: Sequence[Expr]) -> Vector:
+    """Return the derivatives of functions of the state along the direction `tangent_symbols`.
+
+    Raises SceneError where a function jumps.
+    """
+    return _slopes(system, tape, values, [tangent_symbols(system)])[0]
 
 
 def sensitivity(system: System, tape: Tape, accelerations: Sequence[Expr]) -> Rows:
-    """da/dp at held inputs, (nq, np), of accelerations a on the tape. Raises as linearization."""
+    """Return da/dp, (nq, np), for accelerations a on the tape at constant inputs.
+
+    Raises SceneError where the accelerations jump.
+    """
     entries = [{p.symbol: S.One} for p in system.parameters]
     return tuple(zip(*_slopes(system, tape, accelerations, entries), strict=True))
 
@@ -52,12 +59,12 @@ def _slopes(
     system: System,
     tape: Tape,
     accelerations: Sequence[Expr],
-    along: Sequence[Mapping[Symbol, Expr]],
+    directions: Sequence[Mapping[Symbol, Expr]],
 ) -> list[Vector]:
-    """The derivatives of accelerations along each of some directions."""
+    """Return the derivatives of accelerations along each of the given directions."""
     try:
-        return [tuple(tape.forward(accelerations, entries)) for entries in along]
-    except RoughError:
+        return [tuple(tape.forward(accelerations, entries)) for entries in directions]
+    except NotDifferentiableError:
         jump, smooth = STICKS if system.modes else JUMPS
         message = (
             f"{jump}, so they have no derivatives: {smooth}, or do without linearize and the "

@@ -1,18 +1,18 @@
 """Accelerations of point masses on links by link multipliers (tensions), without D.
 
-Where K = sum m ydot^2/2, positions are sums y = A e + d(t) of increments, and each increment is a
-function of one angle: x2 = l1 sin a1 + l2 sin a2 has sin a1 and sin a2. So e = B (y - d) with B
-sparse, and edd = u phidd + beta for a group of increments of one angle phi = sum c_i q_i.
-What holds a group together is a force along n, perpendicular to its u:
+Suppose K = sum m ydot^2/2, and the positions are sums y = A e + d(t) of increments e, each a
+function of one angle: x2 = l1 sin a1 + l2 sin a2 has the increments sin a1 and sin a2. Then e = B
+(y - d) with B sparse, and edd = u phidd + beta for a group of increments of one angle phi = sum c_i
+q_i. The constraint forces within a group act along n, perpendicular to its u:
 
     M ydd = F + B^T (N^T lambda + U f),    N edd = N beta,    edd = B (ydd - ddd)
     S lambda = N (beta - B (M^-1 F - ddd) - T U f),    S = N T N^T,    T = B M^-1 B^T
     phidd = u . (edd - beta)/u.u
 
-with F at the points and f = (generalized force on phi)/u.u. S has an entry for each two links that
-meet in a mass: it is tridiagonal for a chain, and for a tree as sparse. It is what is left of the
-equations with constraint forces as unknowns once the masses are eliminated (Baraff, "Linear-time
-dynamics using Lagrange multipliers", SIGGRAPH 1996).
+where F are the forces at the points and f = (generalized force on phi)/u.u. S has one entry per
+pair of links that share a mass: it is tridiagonal for a chain, and as sparse for a tree. It remains
+when the masses are eliminated from the equations with constraint forces as unknowns (Baraff,
+"Linear-time dynamics using Lagrange multipliers", SIGGRAPH 1996).
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from sympy.polys.matrices import DomainMatrix
 from sympy.polys.matrices.exceptions import DMNonInvertibleMatrixError
 
 from eomc.derive.atoms import is_negative, split
-from eomc.derive.energies import Energies, on_tape
+from eomc.derive.energies import Energies, energies_on_tape
 from eomc.derive.ldl import Pairs, Solution, Vector, solve
 from eomc.derive.tape import Stage
 from eomc.derive.vectors import Vectors
 from eomc.model.system import System, dot, t
 
-Row = dict[int, Expr]  # the entries of a sparse row that are not zero, by column
+Row = dict[int, Expr]  # nonzero entries of a sparse row, by column
 
 
 class UnsuitedError(Exception):
-    """Why the system is none of point masses on links."""
+    """Raised with the reason why a system does not consist of point masses on links."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A position with the kinetic energy mass*speed^2/2."""
+    """A position with kinetic energy mass*speed^2/2."""
 
     place: Expr
     speed: Symbol
@@ -51,29 +51,31 @@ class Point:
 
 @dataclass(frozen=True)
 class Group:
-    """Increments of one angle, sum direction_i q_i: their slopes along it and beta.
+    """Increments of one angle phi = sum direction_i q_i: edd = slopes phidd + beta.
 
-    across: the rows n with n . slopes = 0.
+    across: rows n with n . slopes = 0.
     """
 
     direction: tuple[Expr, ...]
     members: tuple[int, ...]
     slopes: tuple[Expr, ...]
     beta: tuple[Expr, ...]
-    across: tuple[tuple[Expr, ...], ...]
+    perpendicular: tuple[tuple[Expr, ...], ...]
 
 
-def is_prompt(system: System) -> bool:
-    """Whether multipliers are eliminated so that little is waited for, see ldl.solve.
+def prefer_short_chains(system: System) -> bool:
+    """Return True if short dependency chains are preferred to few operations, see `ldl.solve`.
 
-    Many computed at once don't wait, and products of pivots would leave the range of a float.
+    In batches, several states are computed in parallel and hide latencies; in single precision,
+    products of pivots would exceed the range of a float.
     """
     return system.run.real == "double" and not system.run.batch
 
 
 def solution(system: System) -> Solution:
-    """qdd by the multipliers. Raises UnsuitedError where the system is not of this kind."""
-    most = 2 * len(system.q)  # velocities; with more there are more multipliers than coordinates
+    """Derive qdd by link multipliers. Raises UnsuitedError where the system is not of this kind."""
+    # With more velocities there would be more multipliers than coordinates.
+    most = 2 * len(system.q)
     speeds = system.kinetic.atoms(dot) | (system.kinetic.free_symbols & {*system.qd})
     if len(speeds) > most:
         raise UnsuitedError(f"{len(speeds)} velocities in K, more than {most}")
@@ -83,11 +85,11 @@ def solution(system: System) -> Solution:
         raise UnsuitedError("a potential with velocities")
     if system.discrete:
         raise UnsuitedError("parameters that jumps set")
-    return _Links(system, on_tape(system, system.kinetic, system.potential)).solution()
+    return _Links(system, energies_on_tape(system, system.kinetic, system.potential)).solution()
 
 
 class _Links(Vectors):
-    """The points, increments and groups of a system, and the equations of its multipliers."""
+    """Points, increments and groups of a system, and the equations of its multipliers."""
 
     def __init__(self, system: System, e: Energies) -> None:
         super().__init__(e.tape)
@@ -97,7 +99,7 @@ class _Links(Vectors):
         self.divisors: list[Expr] = []
         self.points = self._points()
         places = [self._sum_of(p.place) for p in self.points]
-        # an increment has the sign with which it first stands, so that neighbours are alike
+        # An increment takes the sign of its first occurrence, so that its neighbours have the same.
         signs: dict[Symbol, Expr] = {}
         for b, c in (pair for place in places for pair in place.items()):
             if self.tape.stage[b] > Stage.TIME:
@@ -118,7 +120,7 @@ class _Links(Vectors):
     # --- points ----------------------------------------------------------------------------------
 
     def _points(self) -> list[Point]:
-        """What has kinetic energy, which must be a sum of masses times squares of velocities."""
+        """Return the point masses. Raises UnsuitedError where K is not sum m_k w_k^2/2."""
         e, q = self.e, self.system.q
         speeds, places = [*e.points, *self.system.qd], [*e.points.values(), *q]
         stop, kinetic = frozenset(e.points), [(e.kinetic, S.One)]
@@ -132,6 +134,7 @@ class _Links(Vectors):
         ]
 
     def _mass(self, momentum: Expr, speed: Symbol) -> Expr:
+        """Return m of momentum = m speed."""
         factor, symbol = split(momentum)
         rhs = self.tape.rhs(symbol) if symbol in self.tape.parts else S.One
         if symbol == speed:
@@ -145,16 +148,18 @@ class _Links(Vectors):
     # --- increments ------------------------------------------------------------------------------
 
     def _sum_of(self, atom: Expr) -> dict[Symbol, Expr]:
-        """The atom as a sum of names known after the parameters, each times what these decide.
+        """Write the atom as a linear combination of names, with coefficients that depend on
+        parameters only.
 
-        What depends on parameters alone does not move, and is left out.
+        Terms that depend on parameters only do not move and are left out.
         """
-        for symbol in self.tape.live([atom]):  # in order, so that nothing recurses
+        for symbol in self.tape.live([atom]):  # in order, which avoids recursion
             if symbol not in self.sums:
                 self.sums[symbol] = self._terms(symbol)
         return self._scaled_sum(atom)
 
     def _scaled_sum(self, atom: Expr) -> dict[Symbol, Expr]:
+        """Return the linear combination of an atom whose name has been processed."""
         factor, symbol = split(atom)
         if symbol is None or self.tape.stage[symbol] <= Stage.PARAMETER:
             return {}
@@ -162,6 +167,7 @@ class _Links(Vectors):
         return {b: self.tape.scaled(factor, c) for b, c in known.items()}
 
     def _terms(self, symbol: Symbol) -> dict[Symbol, Expr]:
+        """Return the linear combination of a name, from those in its definition."""
         tape, rhs = self.tape, self.tape.rhs(symbol)
         if rhs.is_Add:
             parts: dict[Symbol, list[Expr]] = {}
@@ -171,23 +177,31 @@ class _Links(Vectors):
             sums = {b: tape.total(cs) for b, cs in parts.items()}
             return {b: c for b, c in sums.items() if c != 0}
         if rhs.is_Mul and tape.stage[symbol] > Stage.PARAMETER:
-            late = [f for f in rhs.args if tape.stage_of(tape.define(f)) > Stage.PARAMETER]
-            early = tape.define(Mul(*(f for f in rhs.args if f not in late)))
-            inner = self._scaled_sum(tape.define(Mul(*late))) if len(late) < len(rhs.args) else {}
-            return {b: tape.times(early, c) for b, c in inner.items()} or {symbol: S.One}
+            variable = [f for f in rhs.args if tape.stage_of(tape.define(f)) > Stage.PARAMETER]
+            coefficient = tape.define(Mul(*(f for f in rhs.args if f not in variable)))
+            combination = (
+                self._scaled_sum(tape.define(Mul(*variable)))
+                if len(variable) < len(rhs.args)
+                else {}
+            )
+            return {b: tape.times(coefficient, c) for b, c in combination.items()} or {
+                symbol: S.One
+            }
         return {symbol: S.One}
 
     def _groups(self) -> list[Group]:
-        """The increments by the angle that they depend on; as many angles as coordinates."""
+        """Group the increments by the angle that they depend on. There must be one angle per
+        coordinate.
+        """
         members: dict[tuple[Expr, ...], dict[int, Expr]] = {}
         for a, increment in enumerate(self.increments):
             slopes = [split(x) for x in self.tape.gradient([(increment, S.One)], self.system.q)]
-            on = [k for k, (factor, _) in enumerate(slopes) if factor != 0]
-            last, name = slopes[on[-1]]
-            if any(slopes[k][1] != name for k in on):
-                found = ", ".join(self.system.q[k].name for k in on)
+            used = [k for k, (factor, _) in enumerate(slopes) if factor != 0]
+            last, name = slopes[used[-1]]
+            if any(slopes[k][1] != name for k in used):
+                names = ", ".join(self.system.q[k].name for k in used)
                 raise UnsuitedError(
-                    f"a position depends on {found} otherwise than on a sum of them"
+                    f"a position depends on {names} otherwise than on a sum of them"
                 )
             direction = tuple(factor / last for factor, _ in slopes)
             if not all(c.is_Rational for c in direction):
@@ -199,17 +213,20 @@ class _Links(Vectors):
             raise UnsuitedError("no links")
         if len(members) != n:
             raise UnsuitedError(f"positions depend on {len(members)} angles, of {n} coordinates")
-        return [self._group(direction, found) for direction, found in members.items()]
+        return [self._group(direction, slopes_by) for direction, slopes_by in members.items()]
 
-    def _group(self, direction: tuple[Expr, ...], found: Mapping[int, Expr]) -> Group:
-        tape, system, slopes = self.tape, self.system, tuple(found.values())
+    def _group(self, direction: tuple[Expr, ...], slopes_by_member: Mapping[int, Expr]) -> Group:
+        """Return the group of increments with the angle sum direction_i q_i."""
+        tape, system, slopes = self.tape, self.system, tuple(slopes_by_member.values())
         rates = {**system.rates, t: S.One}
-        speeds = tape.forward([self.increments[a] for a in found], rates)
+        speeds = tape.forward([self.increments[a] for a in slopes_by_member], rates)
         beta = tuple(tape.forward(speeds, rates))
-        return Group(direction, tuple(found), slopes, beta, self._across(slopes))
+        return Group(
+            direction, tuple(slopes_by_member), slopes, beta, self._perpendicular_rows(slopes)
+        )
 
-    def _across(self, slopes: Sequence[Expr]) -> tuple[tuple[Expr, ...], ...]:
-        """A basis of what is perpendicular to the slopes."""
+    def _perpendicular_rows(self, slopes: Sequence[Expr]) -> tuple[tuple[Expr, ...], ...]:
+        """Return a basis of the rows perpendicular to the slopes."""
         if len(slopes) == 2:
             return ((self.minus(slopes[1]), slopes[0]),)
         constant = [k for k, x in enumerate(slopes) if self.tape.stage_of(x) <= Stage.PARAMETER]
@@ -217,99 +234,103 @@ class _Links(Vectors):
             if len(slopes) == 1:
                 raise UnsuitedError("a position that depends on an angle along one direction only")
             raise UnsuitedError(f"{len(slopes)} increments on one angle, none of them steady")
-        one = constant[0]
-        self.divisors.append(slopes[one])
+        pivot = constant[0]
+        self.divisors.append(slopes[pivot])
         return tuple(
             tuple(
-                S.One if j == k else self.tape.define(-x / slopes[one]) if j == one else S.Zero
+                S.One if j == k else self.tape.define(-x / slopes[pivot]) if j == pivot else S.Zero
                 for j in range(len(slopes))
             )
             for k, x in enumerate(slopes)
-            if k != one
+            if k != pivot
         )
 
     def _inverse(self, rows: Sequence[Row]) -> list[Row]:
-        """B with e = B (y - d), the increments found one after another from y = A e + d."""
+        """Return B of e = B (y - d), by forward substitution in y = A e + d."""
         tape = self.tape
         if len(rows) != len(self.increments):
             raise UnsuitedError(f"{len(rows)} velocities in K, {len(self.increments)} increments")
-        left, B = dict(enumerate(rows)), dict[int, Row]()
-        while left:
-            news = ((k, [a for a in row if a not in B]) for k, row in left.items())
-            k, new = next(((k, new) for k, new in news if len(new) == 1), (-1, []))
-            if not new:
+        remaining, B = dict(enumerate(rows)), dict[int, Row]()
+        while remaining:
+            unknowns_of_rows = ((k, [a for a in row if a not in B]) for k, row in remaining.items())
+            k, unknown = next(
+                ((k, unknown) for k, unknown in unknowns_of_rows if len(unknown) == 1), (-1, [])
+            )
+            if not unknown:
                 raise UnsuitedError("positions that do not follow one from another")
-            row = left.pop(k)
+            row = remaining.pop(k)
             parts: dict[int, list[Expr]] = {k: [S.One]}
             for a, c in row.items():
                 for j, b in B.get(a, {}).items():
                     parts.setdefault(j, []).append(self.minus(tape.times(c, b)))
-            self.divisors.append(row[new[0]])
-            inverse = tape.define(1 / row[new[0]])
-            made = {j: tape.times(inverse, tape.total(cs)) for j, cs in parts.items()}
-            B[new[0]] = {j: c for j, c in made.items() if c != 0}
+            self.divisors.append(row[unknown[0]])
+            inverse = tape.define(1 / row[unknown[0]])
+            coefficients = {j: tape.times(inverse, tape.total(cs)) for j, cs in parts.items()}
+            B[unknown[0]] = {j: c for j, c in coefficients.items() if c != 0}
         return [B[a] for a in range(len(rows))]
 
     # --- forces and masses -----------------------------------------------------------------------
 
     def _forces(self) -> tuple[list[Expr], list[Expr]]:
-        """Forces at the points, and on the coordinates that are none."""
+        """Return the forces at points, and the generalized forces on coordinates that are not
+        points.
+        """
         e, tape, q, qd = self.e, self.tape, self.system.q, self.system.qd
         places, speeds = [split(p.place) for p in self.points], [p.speed for p in self.points]
         names = [name for _, name in places if name]
-        pull = tape.gradient([(e.potential, S.One)], [*names, *q], frozenset(names))
+        gradient = tape.gradient([(e.potential, S.One)], [*names, *q], frozenset(names))
         drag = tape.gradient([(e.dissipation, S.One)], [*speeds, *qd], frozenset(speeds))
         loads = dict(zip(q, e.forces, strict=True))
         n = len(names)
-        at = [
+        at_points = [
             tape.total(
                 [loads.get(name, S.Zero), self.minus(tape.define(p / factor)), self.minus(r)]
             )
-            for (factor, _), name, p, r in zip(places, names, pull[:n], drag[:n], strict=True)
+            for (factor, _), name, p, r in zip(places, names, gradient[:n], drag[:n], strict=True)
         ]
-        on = [
+        on_coordinates = [
             S.Zero if x in names else tape.total([loads[x], self.minus(p), self.minus(r)])
-            for x, p, r in zip(q, pull[n:], drag[n:], strict=True)
+            for x, p, r in zip(q, gradient[n:], drag[n:], strict=True)
         ]
-        return at, on
+        return at_points, on_coordinates
 
-    def _free(self, forces: Sequence[Expr]) -> list[Expr]:
-        """B (M^-1 F - ddd): edd without multipliers and forces on angles."""
+    def _accelerations_without_multipliers(self, forces: Sequence[Expr]) -> list[Expr]:
+        """Return B (M^-1 F - ddd): the part of edd without multipliers and generalized forces."""
         tape, free = self.tape, []
         for point, force, terms in zip(self.points, forces, self.driven, strict=True):
             rates = tape.forward(tape.forward(list(terms), {t: S.One}), {t: S.One})
-            lost = [
+            drift = [
                 self.minus(tape.times(c, r)) for c, r in zip(terms.values(), rates, strict=True)
             ]
-            free.append(tape.total([tape.define(force / point.mass), *lost]))
+            free.append(tape.total([tape.define(force / point.mass), *drift]))
         return [tape.total([tape.times(b, free[k]) for k, b in row.items()]) for row in self.B]
 
     def _flexibility(self) -> tuple[dict[tuple[int, int], Expr], Expr]:
-        """T/unit where it is not zero, T = B M^-1 B^T, and the unit, which all entries share."""
+        """Return the nonzero entries of T/unit, T = B M^-1 B^T, and the common factor `unit`."""
         tape = self.tape
-        ease = [tape.define(1 / p.mass) for p in self.points]
-        on: dict[int, list[int]] = {}  # the increments that a point is in
+        inverse_masses = [tape.define(1 / p.mass) for p in self.points]
+        increments_of: dict[int, list[int]] = {}  # increments by point
         for a, row in enumerate(self.B):
             for k in row:
-                on.setdefault(k, []).append(a)
+                increments_of.setdefault(k, []).append(a)
         parts: dict[tuple[int, int], list[Expr]] = {}
-        for k, found in on.items():
-            for a, b in product(found, repeat=2):
-                both = tape.times(self.B[a][k], self.B[b][k])
-                parts.setdefault((a, b), []).append(tape.times(both, ease[k]))
+        for k, increments in increments_of.items():
+            for a, b in product(increments, repeat=2):
+                product_ = tape.times(self.B[a][k], self.B[b][k])
+                parts.setdefault((a, b), []).append(tape.times(product_, inverse_masses[k]))
         T = {place: x for place, xs in parts.items() if (x := tape.total(xs)) != 0}
         units = {split(x)[1] for x in T.values()}
-        unit = units.pop() if len(units) == 1 else None
-        if unit is None:
+        factor = units.pop() if len(units) == 1 else None
+        if factor is None:
             return T, S.One
-        return {place: split(x)[0] for place, x in T.items()}, unit
+        return {place: split(x)[0] for place, x in T.items()}, factor
 
-    def _through(self, g: int, x: Vector, h: int, y: Vector) -> Expr:
-        """x . T y/unit of a row x on group g and a row y on group h."""
-        one, other = self.groups[g].members, self.groups[h].members
-        T = [[self.T.get((a, b), S.Zero) for b in other] for a in one]
-        if len(one) == len(other):  # most masses resist alike in all directions
-            first, size = T[0][0], range(len(one))
+    def _product(self, g: int, x: Vector, h: int, y: Vector) -> Expr:
+        """Return x . T y/unit for a row x of group g and a row y of group h."""
+        rows, columns = self.groups[g].members, self.groups[h].members
+        T = [[self.T.get((a, b), S.Zero) for b in columns] for a in rows]
+        if len(rows) == len(columns):  # most masses are the same in all directions
+            first, size = T[0][0], range(len(rows))
             if all(T[i][j] == (first if i == j else 0) for i, j in product(size, size)):
                 return self.tape.times(first, self.dot(x, y))
         return self.dot(x, [self.dot(row, y) for row in T])
@@ -317,63 +338,65 @@ class _Links(Vectors):
     # --- the multipliers -------------------------------------------------------------------------
 
     def solution(self) -> Solution:
-        """qdd; each of its pivots belongs to a multiplier, or is what something was divided by."""
+        """Solve for qdd. Its pivots are those of S and all quantities that were divided by."""
         tape, groups, near = self.tape, self.groups, self.near
         forces, loads = self._forces()
-        free = self._free(forces)
-        back = self._back()
+        free = self._accelerations_without_multipliers(forces)
+        coordinates_of = self._coordinates_of_angles()
         slopes = [g.slopes for g in groups]
         squares = [self.dot(u, u) for u in slopes]
-        pushes = [
+        angle_forces = [
             tape.define(self.unit * load / square)
-            for load, square in zip(self._through_rows(back, loads), squares, strict=True)
+            for load, square in zip(self._on_angles(coordinates_of, loads), squares, strict=True)
         ]
-        rows = [(g, n) for g, group in enumerate(groups) for n in group.across]
+        rows = [(g, n) for g, group in enumerate(groups) for n in group.perpendicular]
 
-        def given(g: int, x: Vector) -> list[Expr]:
-            """x . edd for a row x on group g, without the multipliers' part."""
-            pushed = [
-                tape.times(self._through(g, x, h, slopes[h]), push)
-                for h, push in enumerate(pushes)
-                if push != 0 and (g, h) in near
+        def known_part(g: int, x: Vector) -> list[Expr]:
+            """Return x . edd for a row x of group g, without the part of the multipliers."""
+            force_terms = [
+                tape.times(self._product(g, x, h, slopes[h]), force)
+                for h, force in enumerate(angle_forces)
+                if force != 0 and (g, h) in near
             ]
-            return [self.dot(x, [free[a] for a in groups[g].members]), *pushed]
+            return [self.dot(x, [free[a] for a in groups[g].members]), *force_terms]
 
         matrix = tuple(
-            tuple(self._through(g, x, h, y) if (g, h) in near else S.Zero for h, y in rows)
+            tuple(self._product(g, x, h, y) if (g, h) in near else S.Zero for h, y in rows)
             for g, x in rows
         )
-        right = [
-            tape.total([self.dot(x, groups[g].beta), *map(self.minus, given(g, x))])
+        rhs = [
+            tape.total([self.dot(x, groups[g].beta), *map(self.minus, known_part(g, x))])
             for g, x in rows
         ]
-        solved = solve(tape, matrix, right, kept=tape.whole, prompt=is_prompt(self.system))
-        turning = []
+        solved = solve(
+            tape, matrix, rhs, opaque=tape.opaque, short_chains=prefer_short_chains(self.system)
+        )
+        angle_accelerations = []
         for g, (u, square) in enumerate(zip(slopes, squares, strict=True)):
-            drawn = [
-                tape.times(self._through(g, u, h, y), multiplier)
+            multiplier_terms = [
+                tape.times(self._product(g, u, h, y), multiplier)
                 for (h, y), multiplier in zip(rows, solved.acceleration, strict=True)
                 if (g, h) in near
             ]
-            whole = [*drawn, *given(g, u), self.minus(self.dot(u, groups[g].beta))]
-            turning.append(tape.define(tape.total(whole) / square))
+            terms = [*multiplier_terms, *known_part(g, u), self.minus(self.dot(u, groups[g].beta))]
+            angle_accelerations.append(tape.define(tape.total(terms) / square))
         acceleration = tuple(
-            tape.total([tape.scaled(c, x) for c, x in zip(row, turning, strict=True)])
-            for row in back
+            tape.total([tape.scaled(c, x) for c, x in zip(row, angle_accelerations, strict=True)])
+            for row in coordinates_of
         )
         names = [max(k for k, c in enumerate(groups[g].direction) if c != 0) for g, _ in rows]
         by_row = tuple(names[k] for k in solved.order)
         return Solution(tape, acceleration, by_row, (*solved.pivots, *self._nonzero()), "S")
 
-    def _through_rows(self, back: Sequence[Vector], loads: Sequence[Expr]) -> list[Expr]:
-        """Forces on the angles from those on the coordinates."""
+    def _on_angles(self, coordinates_of: Sequence[Vector], loads: Sequence[Expr]) -> list[Expr]:
+        """Convert generalized forces on coordinates to forces on the angles."""
         return [
             self.tape.total([self.tape.scaled(c, x) for c, x in zip(column, loads, strict=True)])
-            for column in zip(*back, strict=True)
+            for column in zip(*coordinates_of, strict=True)
         ]
 
-    def _back(self) -> list[Vector]:
-        """The coordinates by the angles: the inverse of the directions."""
+    def _coordinates_of_angles(self) -> list[Vector]:
+        """Return the matrix that gives coordinates from angles: the inverse of the directions."""
         n = len(self.groups)
         rows = [[QQ(int(c.p), int(c.q)) for c in g.direction] for g in self.groups]
         try:
@@ -383,7 +406,9 @@ class _Links(Vectors):
         return [tuple(inverse.to_Matrix().row(i)) for i in range(n)]
 
     def _nonzero(self) -> Pairs:
-        """Masses, which must be positive, and squares of what parameters divide by."""
+        """Return what must be positive: the masses, and squares of the parameters that are divided
+        by.
+        """
         tape = self.tape
-        found = [p.mass for p in self.points] + [tape.times(x, x) for x in self.divisors]
-        return tuple((x, x) for x in dict.fromkeys(found) if not x.is_number)
+        values = [p.mass for p in self.points] + [tape.times(x, x) for x in self.divisors]
+        return tuple((x, x) for x in dict.fromkeys(values) if not x.is_number)

@@ -1,4 +1,4 @@
-"""The frames of a tree's links on a tape: sines, arms, vectors from one frame to the next."""
+"""Frames of a tree's links on a tape: joint rotations, offsets and transformations of vectors."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from eomc.model.tree import Tree
 
 
 class Links(Vectors):
-    """Links on a tape, parents first."""
+    """The links of a tree on a tape, parents before children."""
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
         super().__init__(tape)
         self.links = tree.links
         self.n = len(tree.links)
-        # of each joint how far it has moved, how fast, how its rate changes where all qdd = 0, and
-        # its slopes over the coordinates
+        # joint displacement s_k(q), its rate, its second derivative at qdd = 0, and ds_k/dq
         rates = dict(tree.rates)
         self.moved = [self.define(x.q) for x in self.links]
         self.speed = tape.forward(self.moved, rates)
@@ -31,9 +30,9 @@ class Links(Vectors):
             {q: tape.forward([moved], {q: S.One})[0] for q in rates if q in x.q.free_symbols}
             for x, moved in zip(self.links, self.moved, strict=True)
         ]
-        both = [*zip(self.links, self.moved, strict=True)]
-        self.cosine = [self.define(sympy.cos(s)) if x.turns else S.One for x, s in both]
-        self.sine = [self.define(sympy.sin(s)) if x.turns else S.Zero for x, s in both]
+        pairs = [*zip(self.links, self.moved, strict=True)]
+        self.cosine = [self.define(sympy.cos(s)) if x.turns else S.One for x, s in pairs]
+        self.sine = [self.define(sympy.sin(s)) if x.turns else S.Zero for x, s in pairs]
         self.rotation: list[Matrix] = [
             tuple(self.vector(row) for row in x.rotation)  # type: ignore[misc]
             for x in self.links
@@ -45,19 +44,19 @@ class Links(Vectors):
     @property
     def plain(self) -> bool:
         """Whether each joint has a coordinate of its own."""
-        by = {link.q for link in self.links if link.q.is_Symbol}
-        return len(by) == self.n
+        coordinates = {link.q for link in self.links if link.q.is_Symbol}
+        return len(coordinates) == self.n
 
     def projected(self, by_link: Iterable[Expr]) -> dict[Symbol, Expr]:
-        """Forces along joints as forces along coordinates: sum_k ds_k/dq f_k."""
+        """Convert forces along joints to generalized forces: sum_k ds_k/dq f_k."""
         terms: dict[Symbol, list[Expr]] = {}
         for slopes, force in zip(self.slopes, by_link, strict=True):
             for q, slope in slopes.items():
                 terms.setdefault(q, []).append(self.times(slope, force))
-        return {q: self.add(*those) for q, those in terms.items()}
+        return {q: self.add(*forces) for q, forces in terms.items()}
 
     def by_link(self, direction: Mapping[Symbol, Expr]) -> list[Expr]:
-        """A direction along the coordinates as one along the joints: sum_q ds_k/dq v_q."""
+        """Convert a direction of the coordinates to one of the joints: sum_q ds_k/dq v_q."""
         return [
             self.add(*(self.times(slope, direction[q]) for q, slope in slopes.items()))
             for slopes in self.slopes
@@ -66,7 +65,9 @@ class Links(Vectors):
     # --- frames ----------------------------------------------------------------------------------
 
     def turn(self, k: int, v: Vector, back: bool = False) -> Vector:
-        """A vector of link k's frame in the joint's frame; `back`: the other way."""
+        """Rotate a vector of link k's frame by the joint's angle; by the negative angle with
+        `back`.
+        """
         if not self.links[k].turns:
             return v
         c, s = self.cosine[k], self.sine[k]
@@ -78,15 +79,15 @@ class Links(Vectors):
         return (out[0], out[1], out[2])
 
     def inwards(self, k: int, v: Vector) -> Vector:
-        """A vector of link k's frame in its parent's frame."""
+        """Transform a vector from link k's frame to its parent's frame."""
         return self.apply(self.rotation[k], self.turn(k, v))
 
     def outwards(self, k: int, v: Vector) -> Vector:
-        """A vector of the parent's frame in link k's frame."""
+        """Transform a vector from the parent's frame to link k's frame."""
         return self.turn(k, self.apply(transposed(self.rotation[k]), v), back=True)
 
     def _arm(self, k: int) -> Vector:
-        """From the parent's origin to link k's, in the parent's frame."""
+        """Return the vector from the parent's origin to link k's, in the parent's frame."""
         link = self.links[k]
         offset = self.vector(link.offset)
         if link.turns:
@@ -95,13 +96,13 @@ class Links(Vectors):
         return self.plus(offset, slide)
 
     def on_axis(self, k: int, x: Expr) -> Vector:
-        """A vector along link k's axis."""
+        """Return the vector of length x along link k's joint axis."""
         v = list(ZERO)
         v[self.links[k].axis] = x
         return (v[0], v[1], v[2])
 
     def angular_velocities(self, rates: Sequence[Expr]) -> list[Vector]:
-        """omega of each link in its frame."""
+        """Return the angular velocity of each link in its own frame."""
         out: list[Vector] = []
         for k, link in enumerate(self.links):
             w = self.outwards(k, out[link.parent]) if link.parent >= 0 else ZERO
@@ -109,7 +110,9 @@ class Links(Vectors):
         return out
 
     def velocities(self, rates: Sequence[Expr], spin: Sequence[Vector]) -> list[Vector]:
-        """Those of each link's origin, in its frame. spin: the angular ones."""
+        """Return the velocity of each link's origin in its own frame. spin: the angular
+        velocities.
+        """
         out: list[Vector] = []
         for k, link in enumerate(self.links):
             v = ZERO

@@ -1,4 +1,4 @@
-"""Mass, centre of mass and momenta of all bodies that move, on a tape."""
+"""Total mass, centre of mass and momenta of all moving bodies, on a tape."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from eomc.model.system import System
 
 
 def momentum(system: System) -> tuple[Tape, Sequence[Expr]]:
-    """Mass, its centre, momentum, and that about the centre; in the plane m, x, y, px, py, L.
+    """Derive mass, centre of mass, momentum and angular momentum about the centre of mass.
 
-    Along the world's axes, without the rotors of drives. Raises SceneError where nothing that moves
-    has mass.
+    All along the world's axes, without the rotors of drives; in the plane m, x, y, px, py, L.
+    Raises SceneError if no moving body has mass. Returns the tape and the values.
     """
     tape = Tape(leaves(system, *system.qdd))
     sweep = _Masses(tape, system, [f for f in system.frames if f.mass != 0])
@@ -34,28 +34,36 @@ def momentum(system: System) -> tuple[Tape, Sequence[Expr]]:
 
 
 class _Masses(Sweep):
+    """Masses and momenta of the bodies."""
+
     def parts(self) -> Iterator[tuple[Expr, Vector, Vector, Vector]]:
-        """Of each link and body: mass, its moment, momentum and that about the world's origin."""
+        """Yield mass, first moment, momentum and angular momentum about the world's origin of each
+        body.
+        """
         for k, link in enumerate(self.links):
             yield self.part(
                 self.origin[k], self.columns[k], self.velocity[k], self.spin[k],
                 self.define(link.mass), self.world(k, self.vector(link.moment)), link.inertia,
             )  # fmt: skip
         for f in self.frames:
-            held = self.frame(f)
-            columns = list(zip(*held.rotation, strict=True))
-            yield self.part(held.at, columns, *held.moving, self.define(f.mass), ZERO, f.inertia)
+            frame_state = self.frame(f)
+            columns = list(zip(*frame_state.rotation, strict=True))
+            yield self.part(
+                frame_state.at, columns, *frame_state.velocity, self.define(f.mass), ZERO, f.inertia
+            )
 
     def part(
         self, at: Vector, columns: Sequence[Vector], v: Vector, omega: Vector, mass: Expr,
         moment: Vector, inertia: Sequence[Expr],
     ) -> tuple[Expr, Vector, Vector, Vector]:  # fmt: skip
-        """moment, along the world's axes, and inertia are about the point `at`."""
+        """Return the same quantities for one body. `moment` (along the world's axes) and `inertia`
+        refer to the point `at`.
+        """
         tensor = [[S.Zero] * 3 for _ in range(3)]
         for (i, j), entry in zip(ENTRIES, inertia, strict=True):
             tensor[i][j] = tensor[j][i] = self.define(entry)
-        inside = self.apply(tensor, self.apply(columns, omega))
-        turning = self.plus(*(self.scaled(c, x) for c, x in zip(columns, inside, strict=True)))
+        spin_in_body = self.apply(tensor, self.apply(columns, omega))
+        spin = self.plus(*(self.scaled(c, x) for c, x in zip(columns, spin_in_body, strict=True)))
         linear = self.plus(self.scaled(v, mass), self.cross(omega, moment))
-        angular = self.plus(turning, self.cross(moment, v), self.cross(at, linear))
+        angular = self.plus(spin, self.cross(moment, v), self.cross(at, linear))
         return mass, self.plus(self.scaled(at, mass), moment), linear, angular

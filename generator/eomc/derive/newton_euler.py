@@ -1,10 +1,10 @@
-"""The recursive algorithms over a tape: a tree of bodies, joint by joint, in the links' own frames.
+"""Recursive Newton-Euler and composite-body algorithms on a tape, in the links' own frames.
 
-What is zero or a number at generation time folds away on the tape, so the plane, parallel axes
-and links without mass need no code of their own. With all qdd = 0, one sweep outwards gives the
-velocities, the accelerations and the forces that each link needs (Newton and Euler); then
+Zeros and numbers that are known at generation time vanish on the tape, so the plane, parallel axes
+and massless links need no code of their own. With all qdd = 0, one outward pass computes the
+velocities, accelerations and forces of each link (Newton and Euler). Then
 
-- bias: those forces, summed inwards and projected on the joints;
+- bias: these forces are summed inwards and projected onto the joints;
 - composite bodies: D from the inertia of everything beyond a joint.
 
 articulated_body.py solves for the accelerations without D. Sources: Featherstone, *Rigid Body
@@ -30,9 +30,10 @@ from eomc.model.tree import Link, Tree
 
 @dataclass(frozen=True)
 class Inertia:
-    """Mass, its moment and its inertia (symmetric, by (i, j) with i <= j) about a frame's origin.
+    """Mass, first moment and inertia (symmetric, by (i, j) with i <= j) about a frame's origin.
 
-    As Gautier and Khalil group it: what a joint can't tell from its parent's is there.
+    Grouped as by Gautier and Khalil: parameters that have the same effect on the motion as those of
+    the parent are moved to the parent.
     """
 
     mass: Expr
@@ -40,7 +41,7 @@ class Inertia:
     inertia: Mapping[tuple[int, int], Expr]
 
     def entry(self, i: int, j: int) -> Expr:
-        """I_ij"""
+        """Return I_ij."""
         return self.inertia.get((min(i, j), max(i, j)), S.Zero)
 
     @property
@@ -49,81 +50,83 @@ class Inertia:
         return [[self.entry(i, j) for j in range(3)] for i in range(3)]
 
     def is_zero(self) -> bool:
-        """Whether there is none at all."""
+        """Return True if mass, first moment and inertia are all zero."""
         return self.mass == 0 and self.moment == ZERO and not any(self.inertia.values())
 
 
 @dataclass
 class _Forces:
-    """Force and moment about the origin that each link needs, in its frame."""
+    """Force on each link and moment about its origin, in its own frame."""
 
     force: list[Vector]
     moment: list[Vector]
 
 
 class Recursion(Links):
-    """A tree on a tape: grouped inertias and the sweeps."""
+    """A tree on a tape: grouped inertias and the recursive algorithms."""
 
     def __init__(self, tape: Tape, tree: Tree) -> None:
         super().__init__(tape, tree)
         self.gravity = self.vector(tree.gravity)
-        self.still = self.vector(tree.still)
+        self.fixed_moment = self.vector(tree.still)  # first moment of mass fixed in the world
         self.armature = [self.define(x.armature) for x in self.links]
         self.inertia = self._grouped()
 
     # --- inertial parameters ---------------------------------------------------------------------
 
-    def _own(self, link: Link) -> Inertia:
-        """What moves with a link, as it is."""
+    def _link_inertia(self, link: Link) -> Inertia:
+        """Return a link's inertia as given in the scene."""
         inertia = dict(zip(ENTRIES, map(self.define, link.inertia), strict=True))
         return Inertia(self.define(link.mass), self.vector(link.moment), inertia)
 
-    def _sum(self, one: Inertia, other: Inertia) -> Inertia:
-        if one.is_zero() or other.is_zero():
-            return one if other.is_zero() else other
-        keys = sorted({*one.inertia, *other.inertia})
+    def _sum(self, a: Inertia, b: Inertia) -> Inertia:
+        """Return the sum of two inertias about the same origin in the same frame."""
+        if a.is_zero() or b.is_zero():
+            return a if b.is_zero() else b
+        keys = sorted({*a.inertia, *b.inertia})
         return Inertia(
-            self.add(one.mass, other.mass),
-            self.plus(one.moment, other.moment),
-            {k: self.add(one.inertia.get(k, S.Zero), other.inertia.get(k, S.Zero)) for k in keys},
+            self.add(a.mass, b.mass),
+            self.plus(a.moment, b.moment),
+            {k: self.add(a.inertia.get(k, S.Zero), b.inertia.get(k, S.Zero)) for k in keys},
         )
 
     def _grouped(self) -> list[Inertia]:
-        """Each link's inertia without what makes no difference on it, which its parent gets.
+        """Group each link's inertial parameters: move those without a separate effect to the
+        parent.
 
-        Mass on the axis of a turning link, with equal moments across it and none about it, moves
-        as if it were the parent's; so does all inertia of a sliding link. Gautier & Khalil, IEEE
-        Trans. Robotics and Automation 6(3), 1990.
+        Mass on the axis of a revolute joint, with equal moments of inertia across the axis and none
+        about it, acts as if it belonged to the parent; so does the whole inertia tensor of a
+        prismatic link. Gautier & Khalil, IEEE Trans. Robotics and Automation 6(3), 1990.
         """
-        own = [self._own(link) for link in self.links]
+        inertias = [self._link_inertia(link) for link in self.links]
         for k in reversed(range(self.n)):
-            link, mine = self.links[k], own[k]
+            link, own = self.links[k], inertias[k]
             i, j = AXES[link.axis]
             a = link.axis
             if link.turns:
-                across = mine.entry(j, j)
-                given = Inertia(
-                    mine.mass, self.on_axis(k, mine.moment[a]), {(i, i): across, (j, j): across}
+                across = own.entry(j, j)
+                moved = Inertia(
+                    own.mass, self.on_axis(k, own.moment[a]), {(i, i): across, (j, j): across}
                 )
-                moment = list(mine.moment)
+                moment = list(own.moment)
                 moment[a] = S.Zero
-                kept = dict(mine.inertia)
-                kept[i, i] = self.add(mine.entry(i, i), self.minus(across))
-                kept[j, j] = S.Zero
-                own[k] = Inertia(S.Zero, (moment[0], moment[1], moment[2]), kept)
-                there = self._carried(k, given, rotated=False)
+                remaining = dict(own.inertia)
+                remaining[i, i] = self.add(own.entry(i, i), self.minus(across))
+                remaining[j, j] = S.Zero
+                inertias[k] = Inertia(S.Zero, (moment[0], moment[1], moment[2]), remaining)
+                at_parent = self._to_parent_frame(k, moved, rotated=False)
             else:
-                own[k] = Inertia(mine.mass, mine.moment, {})
-                given = Inertia(S.Zero, ZERO, mine.inertia)
-                there = self._rotated(self.rotation[k], given)
+                inertias[k] = Inertia(own.mass, own.moment, {})
+                moved = Inertia(S.Zero, ZERO, own.inertia)
+                at_parent = self._rotate(self.rotation[k], moved)
             if link.parent >= 0:
-                own[link.parent] = self._sum(own[link.parent], there)
+                inertias[link.parent] = self._sum(inertias[link.parent], at_parent)
             else:
-                self.still = self.plus(self.still, there.moment)
-        return own
+                self.fixed_moment = self.plus(self.fixed_moment, at_parent.moment)
+        return inertias
 
-    def _rotated(self, R: Matrix, x: Inertia) -> Inertia:
-        """The same in a frame that R takes vectors to."""
+    def _rotate(self, R: Matrix, x: Inertia) -> Inertia:
+        """Return the inertia in a frame rotated by R: R I R^T and R h."""
         if all(R[i][j] == (i == j) for i in range(3) for j in range(3)):
             return x
         half = [self.apply(R, row) for row in x.tensor]  # (R I)^T, I symmetric
@@ -132,11 +135,11 @@ class Recursion(Links):
         inertia = {(i, j): self.dot(R[j], columns[i]) for i, j in pairs}
         return Inertia(x.mass, self.apply(R, x.moment), inertia)
 
-    def _carried(self, k: int, x: Inertia, rotated: bool = True) -> Inertia:
-        """An inertia of link k, about its origin, in the parent's frame and about its origin."""
+    def _to_parent_frame(self, k: int, x: Inertia, rotated: bool = True) -> Inertia:
+        """Transform an inertia from link k's frame to its parent's frame and origin."""
         if rotated and self.links[k].turns:
-            x = self._by_angle(k, x)
-        x = self._rotated(self.rotation[k], x)
+            x = self._rotate_by_joint(k, x)
+        x = self._rotate(self.rotation[k], x)
         r = self.arm[k]
         if r == ZERO:
             return x
@@ -145,12 +148,12 @@ class Recursion(Links):
         twice = self._double(self.dot(g, r))
         inertia = {}
         for i, j in combinations_with_replacement(range(3), 2):
-            more = self.minus(self.add(self.times(g[i], r[j]), self.times(r[i], g[j])))
-            inertia[i, j] = self.add(x.entry(i, j), more, twice if i == j else S.Zero)
+            change = self.minus(self.add(self.times(g[i], r[j]), self.times(r[i], g[j])))
+            inertia[i, j] = self.add(x.entry(i, j), change, twice if i == j else S.Zero)
         return Inertia(x.mass, self.plus(x.moment, shift), inertia)
 
-    def _by_angle(self, k: int, x: Inertia) -> Inertia:
-        """Rotated by the joint's angle."""
+    def _rotate_by_joint(self, k: int, x: Inertia) -> Inertia:
+        """Rotate an inertia by joint k's angle."""
         i, j = AXES[self.links[k].axis]
         a = self.links[k].axis
         inertia = dict(x.inertia)
@@ -170,13 +173,15 @@ class Recursion(Links):
         return Inertia(x.mass, self.turn(k, x.moment), inertia)
 
     def _double(self, x: Expr) -> Expr:
+        """Return 2 x."""
         return self.tape.scaled(S(2), x)
 
     def half_turn(self, k: int, first: Expr, second: Expr, across: Expr) -> tuple[Expr, Expr]:
-        """(t, c e) of a rotated 2 x 2 matrix [[first, b], [b', second]], across = b + b'.
+        """Return (t, c e) for rotating the 2 x 2 matrix [[first, b], [b', second]], with across = b
+        + b'.
 
-        With e = s (first - second) + c across, t = s e: first - t, second + t, and the entries off
-        the diagonal change by c e - across.
+        With e = s (first - second) + c across and t = s e, the diagonal becomes first - t, second +
+        t, and the off-diagonal entries change by c e - across.
         """
         c, s = self.cosine[k], self.sine[k]
         e = self.add(self.times(s, self.add(first, self.minus(second))), self.times(c, across))
@@ -185,9 +190,11 @@ class Recursion(Links):
     # --- outwards: velocities, accelerations, forces ---------------------------------------------
 
     def forces(
-        self, rates: Sequence[Expr], wishes: Sequence[Expr], gravity: bool = True
+        self, rates: Sequence[Expr], joint_accelerations: Sequence[Expr], gravity: bool = True
     ) -> _Forces:
-        """What moves the links with the given rates and joint accelerations (`wishes`)."""
+        """Return the force and moment that each link needs for given joint rates and
+        accelerations.
+        """
         out = _Forces([], [])
         spin = self.angular_velocities(rates)
         alphas: list[Vector] = []
@@ -196,54 +203,63 @@ class Recursion(Links):
         fall: Vector = self.scaled(self.gravity, S.NegativeOne) if gravity else ZERO
         for k, link in enumerate(self.links):
             p, r = link.parent, self.arm[k]
-            alpha, at = (alphas[p], origins[p]) if p >= 0 else (ZERO, fall)
+            alpha, acceleration = (alphas[p], origins[p]) if p >= 0 else (ZERO, fall)
             if p >= 0 and r != ZERO:
-                at = self.plus(at, self.apply(matrices[p], r))
-            alpha, at = self.outwards(k, alpha), self.outwards(k, at)
-            turning = self.outwards(k, spin[p]) if p >= 0 else ZERO
-            own = self.on_axis(k, rates[k])
+                acceleration = self.plus(acceleration, self.apply(matrices[p], r))
+            alpha, acceleration = self.outwards(k, alpha), self.outwards(k, acceleration)
+            parent_spin = self.outwards(k, spin[p]) if p >= 0 else ZERO
+            relative = self.on_axis(k, rates[k])
             if link.turns:
-                alpha = self.plus(alpha, self.cross(turning, own), self.on_axis(k, wishes[k]))
+                alpha = self.plus(
+                    alpha,
+                    self.cross(parent_spin, relative),
+                    self.on_axis(k, joint_accelerations[k]),
+                )
             else:
-                twice = self.cross(turning, own)
-                at = self.plus(at, self.scaled(twice, S(2)), self.on_axis(k, wishes[k]))
+                coriolis = self.cross(parent_spin, relative)
+                acceleration = self.plus(
+                    acceleration,
+                    self.scaled(coriolis, S(2)),
+                    self.on_axis(k, joint_accelerations[k]),
+                )
             alphas.append(alpha)
-            origins.append(at)
+            origins.append(acceleration)
             squares = self._squares(spin[k])
             U = self._acceleration_matrix(alpha, squares)
             matrices.append(U)
             x = self.inertia[k]
-            out.force.append(self.plus(self.scaled(at, x.mass), self.apply(U, x.moment)))
-            out.moment.append(self._moment(x, spin[k], alpha, at, U))
+            out.force.append(self.plus(self.scaled(acceleration, x.mass), self.apply(U, x.moment)))
+            out.moment.append(self._moment(x, spin[k], alpha, acceleration, U))
         return out
 
     def _squares(self, w: Vector) -> dict[tuple[int, int], Expr]:
+        """Return the products w_i w_j, i <= j."""
         pairs = combinations_with_replacement(range(3), 2)
         return {(i, j): self.times(w[i], w[j]) for i, j in pairs}
 
     def _acceleration_matrix(
         self, alpha: Vector, ww: Mapping[tuple[int, int], Expr]
     ) -> list[list[Expr]]:
-        """U = [alpha] + [omega][omega]: a point at r has the acceleration a + U r."""
+        """Return U = [alpha] + [omega][omega]: a point at r has the acceleration a + U r."""
         U = [[S.Zero] * 3 for _ in range(3)]
         for a, (i, j) in enumerate(AXES):
             U[a][a] = self.minus(self.add(ww[i, i], ww[j, j]))
-            both = ww[min(i, j), max(i, j)]
-            U[i][j] = self.add(both, self.minus(alpha[a]))
-            U[j][i] = self.add(both, alpha[a])
+            product = ww[min(i, j), max(i, j)]
+            U[i][j] = self.add(product, self.minus(alpha[a]))
+            U[j][i] = self.add(product, alpha[a])
         return U
 
     def _moment(
-        self, x: Inertia, w: Vector, alpha: Vector, at: Vector, U: list[list[Expr]]
+        self, x: Inertia, w: Vector, alpha: Vector, acceleration: Vector, U: list[list[Expr]]
     ) -> Vector:
-        """h x a + I alpha + omega x I omega, with the entries of U in it."""
-        arm = self.cross(x.moment, at)
+        """Return h x a + I alpha + omega x I omega, expressed by the entries of U."""
+        moment_of_force = self.cross(x.moment, acceleration)
         out = []
         for a, (i, j) in enumerate(AXES):
             ww = self.times(w[i], w[j])
             out.append(
                 self.add(
-                    arm[a],
+                    moment_of_force[a],
                     self.times(x.entry(a, a), alpha[a]),
                     self.times(self.add(x.entry(j, j), self.minus(x.entry(i, i))), ww),
                     self.minus(self.times(x.entry(a, i), U[j][a])),
@@ -256,7 +272,9 @@ class Recursion(Links):
     # --- inwards: joint forces -------------------------------------------------------------------
 
     def joint_forces(self, forces: _Forces) -> list[Expr]:
-        """The forces along the joints, by link: the moments' and forces' own components."""
+        """Return the force along each joint: the sum of the forces beyond it, projected onto its
+        axis.
+        """
         f, n = list(forces.force), list(forces.moment)
         out: list[Expr] = [S.Zero] * self.n
         for k in reversed(range(self.n)):
@@ -269,39 +287,42 @@ class Recursion(Links):
         return out
 
     def bias(self) -> list[Expr]:
-        """C qd + g, by link."""
-        return self._moving(self.drift)
+        """Return C qd + g, by link."""
+        return self._forces_for(self.drift)
 
-    def inverse_dynamics(self, wishes: Sequence[Expr]) -> list[Expr]:
-        """D qdd + C qd + g, by link. wishes: the accelerations along the joints, qdd, by link."""
-        return self._moving([self.add(*pair) for pair in zip(wishes, self.drift, strict=True)])
+    def inverse_dynamics(self, joint_accelerations: Sequence[Expr]) -> list[Expr]:
+        """Return D qdd + C qd + g, by link, for the accelerations qdd along the joints."""
+        return self._forces_for(
+            [self.add(*pair) for pair in zip(joint_accelerations, self.drift, strict=True)]
+        )
 
     def gravity_forces(self) -> list[Expr]:
-        """g, by link."""
+        """Return g, by link."""
         rest = [S.Zero] * self.n
         return self.joint_forces(self.forces(rest, rest))
 
     def mass_times(self, direction: Sequence[Expr]) -> list[Expr]:
-        """D v for a direction v, by link, without D."""
+        """Return D v, by link, without forming D."""
         forces = self.forces([S.Zero] * self.n, direction, gravity=False)
         return self._with_rotors(forces, direction)
 
-    def _moving(self, faster: Sequence[Expr]) -> list[Expr]:
-        return self._with_rotors(self.forces(self.speed, faster), faster)
+    def _forces_for(self, joint_accelerations: Sequence[Expr]) -> list[Expr]:
+        """Return the joint forces at the current rates for given total joint accelerations."""
+        return self._with_rotors(self.forces(self.speed, joint_accelerations), joint_accelerations)
 
-    def _with_rotors(self, forces: _Forces, wishes: Sequence[Expr]) -> list[Expr]:
-        """The forces along the joints, with those that armatures need."""
-        found = zip(self.joint_forces(forces), self.armature, wishes, strict=True)
-        return [self.add(x, self.times(a, v)) for x, a, v in found]
+    def _with_rotors(self, forces: _Forces, joint_accelerations: Sequence[Expr]) -> list[Expr]:
+        """Return the joint forces, including those that the armatures need."""
+        terms = zip(self.joint_forces(forces), self.armature, joint_accelerations, strict=True)
+        return [self.add(x, self.times(a, v)) for x, a, v in terms]
 
     # --- D by composite bodies -------------------------------------------------------------------
 
     def mass_matrix(self) -> list[list[Expr]]:
-        """D, by links; zero between branches."""
+        """Return D by links, with zeros between branches, by the composite-body algorithm."""
         beyond = list(self.inertia)
         for k in reversed(range(self.n)):
             if (p := self.links[k].parent) >= 0:
-                beyond[p] = self._sum(beyond[p], self._carried(k, beyond[k]))
+                beyond[p] = self._sum(beyond[p], self._to_parent_frame(k, beyond[k]))
         D: list[list[Expr]] = [[S.Zero] * self.n for _ in range(self.n)]
         for k, link in enumerate(self.links):
             x, a = beyond[k], link.axis
@@ -317,12 +338,12 @@ class Recursion(Links):
                 force, moment = self.inwards(i, force), self.inwards(i, moment)
                 moment = self.plus(moment, self.cross(self.arm[i], force))
                 i = p
-                along = (moment if self.links[i].turns else force)[self.links[i].axis]
-                D[k][i] = D[i][k] = along
+                projected = (moment if self.links[i].turns else force)[self.links[i].axis]
+                D[k][i] = D[i][k] = projected
         return D
 
-    def elimination(self) -> int:
-        """Operations to factor D, which is zero between branches, and to solve with it."""
+    def count_elimination_operations(self) -> int:
+        """Return the operations to factor D and solve with it, using its zeros between branches."""
         depth = [0] * self.n
         for k, link in enumerate(self.links):
             depth[k] = depth[link.parent] + 1 if link.parent >= 0 else 0
@@ -331,7 +352,7 @@ class Recursion(Links):
     # --- energies --------------------------------------------------------------------------------
 
     def kinetic_energy(self) -> Expr:
-        """K of the tree."""
+        """Return the kinetic energy of the tree."""
         rates = self.speed
         spin = self.angular_velocities(rates)
         terms: list[Expr] = []
@@ -347,15 +368,17 @@ class Recursion(Links):
         return self.add(*terms)
 
     def potential_energy(self) -> Expr:
-        """P of the tree in gravity: -g . (sum of mass times position)."""
+        """Return the potential energy of the tree in gravity: -g . sum(mass times position)."""
         mass = [x.mass for x in self.inertia]
         moment = [x.moment for x in self.inertia]
-        total = self.still
+        total = self.fixed_moment
         for k in reversed(range(self.n)):
-            at = self.plus(self.inwards(k, moment[k]), self.scaled(self.arm[k], mass[k]))
+            moment_at_parent = self.plus(
+                self.inwards(k, moment[k]), self.scaled(self.arm[k], mass[k])
+            )
             if (p := self.links[k].parent) >= 0:
                 mass[p] = self.add(mass[p], mass[k])
-                moment[p] = self.plus(moment[p], at)
+                moment[p] = self.plus(moment[p], moment_at_parent)
             else:
-                total = self.plus(total, at)
+                total = self.plus(total, moment_at_parent)
         return self.minus(self.dot(self.gravity, total))

@@ -1,4 +1,4 @@
-"""Outputs on a tape: formulas over the state, the inputs and the accelerations."""
+"""Outputs on a tape: formulas of state, inputs and accelerations, and their derivatives."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sympy import Expr, S, Symbol
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive.energies import leaves
 from eomc.derive.ldl import Rows, Vector
-from eomc.derive.tape import RoughError, Tape
+from eomc.derive.tape import NotDifferentiableError, Tape
 from eomc.model.symbols import MULTIPLIER, Output, dot, needed
 from eomc.model.system import System, t
 
@@ -19,8 +19,14 @@ from eomc.model.system import System, t
 class Outputs:
     """Outputs and their derivatives as atoms of a tape.
 
-    values: (ny,). slopes: with respect to q, qd, u and qdd, (ny, 3 nq + nu). sensitivity: with
-    respect to the parameters, the others held, (ny, np).
+    Attributes
+    ----------
+    values : (ny,)
+        The outputs.
+    slopes : (ny, 3 nq + nu)
+        Derivatives with respect to q, qd, u and qdd.
+    sensitivity : (ny, np)
+        Derivatives with respect to the parameters, all others constant.
     """
 
     tape: Tape
@@ -31,22 +37,31 @@ class Outputs:
 
 def outputs(
     system: System,
-    sloped: bool,
-    more: Sequence[Symbol] = (),
-    beside: tuple[Tape, Mapping[Symbol, Expr]] | None = None,
+    with_derivatives: bool,
+    extra_symbols: Sequence[Symbol] = (),
+    base: tuple[Tape, Mapping[Symbol, Expr]] | None = None,
 ) -> Outputs:
-    """The system's outputs, with slopes where it is `sloped`. more: what they read besides.
+    """Derive the system's outputs, and their derivatives if `with_derivatives`.
 
-    beside: a tape that they go on, with what some symbols are there. Raises SceneError where a
-    derivative is needed that does not exist.
+    Parameters
+    ----------
+    extra_symbols
+        Symbols that outputs may contain in addition to those of the system.
+    base
+        A tape to continue, with the atoms of some symbols on it. A new tape by default.
+
+    Raises
+    ------
+    SceneError
+        Where a derivative is needed that does not exist.
     """
-    given = leaves(system, *system.qdd, *more)
-    tape, known = beside or (Tape(given), {})
-    tape.leaves |= given  # which one that solves for accelerations has not
-    tape.stage |= given
+    stages = leaves(system, *system.qdd, *extra_symbols)
+    tape, known = base or (Tape(stages), {})
+    tape.leaves |= stages  # a tape that solves for accelerations has no symbols for them
+    tape.stage |= stages
     try:
-        return _outputs(system, sloped, tape, dict(known))
-    except RoughError:
+        return _outputs(system, with_derivatives, tape, dict(known))
+    except NotDifferentiableError:
         message = (
             "a derivative of something that jumps is needed (sign or heaviside, in dot(...) or for "
             "linearize): make it smooth, say tanh(x/width)"
@@ -55,45 +70,48 @@ def outputs(
 
 
 def signal_slopes(system: System) -> Outputs:
-    """The signals as outputs, with their slopes along q, qd and qdd. Raises as `outputs` does."""
+    """Derive the inputs' signals as outputs, with derivatives along q, qd and qdd."""
     signals = tuple(Output(i.name, i.signal) for i in system.inputs)
-    return outputs(replace(system, outputs=signals, inputs=()), sloped=True)
+    return outputs(replace(system, outputs=signals, inputs=()), with_derivatives=True)
 
 
-def _outputs(system: System, sloped: bool, tape: Tape, known: dict[Symbol, Expr]) -> Outputs:
+def _outputs(
+    system: System, with_derivatives: bool, tape: Tape, definitions: dict[Symbol, Expr]
+) -> Outputs:
+    """Derive outputs on a given tape, with the atoms of known symbols. Raises RoughError."""
     state = (*system.q, *system.qd)
     multipliers = {c.multiplier for c in system.constraints}
     rates = {**system.rates, **dict(zip(system.qd, system.qdd, strict=True)), t: S.One}
 
     def value(expr: Expr) -> Expr:
-        """The expression's atom; dot(...) by the chain rule, from the innermost."""
-        found: dict[Expr, Expr] = {}
-        for moving in expr.atoms(dot):
-            if held := sorted(map(str, moving.free_symbols & multipliers)):
-                name = held[0].removesuffix(MULTIPLIER)
+        """Return the atom of an expression; dot(...) by the chain rule, innermost first."""
+        rates_of: dict[Expr, Expr] = {}
+        for derivative in expr.atoms(dot):
+            if unknown_multipliers := sorted(map(str, derivative.free_symbols & multipliers)):
+                name = unknown_multipliers[0].removesuffix(MULTIPLIER)
                 raise EomcError(
                     f"{system.file or system.name}: dot(...) holds lambda_{name}, the multiplier "
                     "of a constraint, whose rate is not known"
                 )
-            position = value(moving.args[0])
+            position = value(derivative.args[0])
             if unknown := tape.leaves_of([position]) & {*system.u, *system.qdd}:
                 raise EomcError(
-                    f"{system.file or system.name}: {moving} is the rate of something that depends "
-                    f"on {', '.join(sorted(map(str, unknown)))}, whose rate is not known"
+                    f"{system.file or system.name}: {derivative} is the rate of something that "
+                    f"depends on {', '.join(sorted(map(str, unknown)))}, whose rate is not known"
                 )
-            (found[moving],) = tape.forward([position], rates)
-        return tape.define(expr.xreplace(found).xreplace(known))
+            (rates_of[derivative],) = tape.forward([position], rates)
+        return tape.define(expr.xreplace(rates_of).xreplace(definitions))
 
     for defined, expr in needed(system.definitions, [o.formula for o in system.outputs]):
-        known[defined] = tape.named(value(expr), defined.name)
+        definitions[defined] = tape.named(value(expr), defined.name)
     values = tuple(tape.named(value(o.formula), o.name) for o in system.outputs)
-    if not sloped:
+    if not with_derivatives:
         return Outputs(tape, values, ((),) * len(values))
     parameters = system.parameters if system.run.linearize == "parameters" else ()
-    along = (*state, *system.u, *system.qdd, *(p.symbol for p in parameters))
-    kept, tape.still = tape.still, frozenset()  # outputs have slopes along discrete variables
-    rows = [tuple(tape.gradient([(y, S.One)], along)) for y in values]
-    tape.still = kept
-    first = len(along) - len(parameters)
-    slopes, sensitivity = (tuple(row[:first] for row in rows), tuple(row[first:] for row in rows))
+    variables = (*state, *system.u, *system.qdd, *(p.symbol for p in parameters))
+    saved, tape.constant_leaves = tape.constant_leaves, frozenset()  # discrete variables count here
+    rows = [tuple(tape.gradient([(y, S.One)], variables)) for y in values]
+    tape.constant_leaves = saved
+    count = len(variables) - len(parameters)
+    slopes, sensitivity = (tuple(row[:count] for row in rows), tuple(row[count:] for row in rows))
     return Outputs(tape, values, slopes, sensitivity)

@@ -1,9 +1,9 @@
-"""A list of small named definitions that can be differentiated without being expanded.
+"""A list of small named definitions that is differentiated without being expanded.
 
-Symbolic mechanics explodes where nested definitions are written out before they are
-differentiated. Here each definition keeps its name, and the chain rule runs along the list:
+Symbolic expressions of mechanics become huge if nested definitions are expanded before
+differentiation. On a tape each definition keeps its name, and the chain rule runs along the list:
 forwards for a directional derivative, backwards for a gradient (Griewank & Walther, *Evaluating
-Derivatives*, 2nd ed., ch. 3). Equal expressions get one name, so nothing is written twice.
+Derivatives*, 2nd ed., ch. 3). Equal expressions get the same name, so nothing is computed twice.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import sympy
 from sympy import Add, Expr, Mul, Pow, S, Symbol, tanh
 
 from eomc.base.errors import EomcError
-from eomc.derive.atoms import is_negative, split, written_out
+from eomc.derive.atoms import expand_sums, is_negative, split
 
-_ROUGH = (sympy.DiracDelta, sympy.Derivative, sympy.Subs)
+_NOT_DIFFERENTIABLE = (sympy.DiracDelta, sympy.Derivative, sympy.Subs)
 
 
-class RoughError(EomcError):
-    """A derivative of something that jumps is needed."""
+class NotDifferentiableError(EomcError):
+    """Raised where the derivative of a discontinuous function is needed."""
 
 
 class Stage(IntEnum):
-    """When a value becomes known; a value is as late as the latest that it is made of."""
+    """The binding time of a value: the latest of those that it depends on."""
 
     NUMBER = 0
     PARAMETER = 1
@@ -34,20 +34,29 @@ class Stage(IntEnum):
     VELOCITY = 4
 
 
-Powers = dict[Symbol, Expr]  # {name: exponent}, a product
-_Late = tuple[tuple[Symbol, Expr], ...]  # powers of names known after the parameters
+Powers = dict[Symbol, Expr]  # a product as {name: exponent}
+_Varying = tuple[tuple[Symbol, Expr], ...]  # powers of names that do not depend on parameters alone
 
 
 class Tape:
-    """Definitions in order, each a sum, a product or a function of names before it.
+    """Definitions in order, each a sum, a product or a function of earlier names.
 
-    `define` takes any expression and returns what stands for it: a number, a name, or a number
-    times a name. Right-hand sides are in a normal form: a sum of such atoms; a product of powers
-    of names; one function of atoms.
+    `define` takes any expression and returns its atom: a number, a name, or a number times a name.
+    Right-hand sides are in a normal form: a sum of atoms, a product of powers of names, or one
+    function of atoms.
+
+    Parameters
+    ----------
+    leaves : mapping of Symbol to Stage
+        The symbols that are not defined by others.
+    still : set of Symbol
+        Leaves that count as constant: all gradients along them are 0.
     """
 
-    def __init__(self, leaves: Mapping[Symbol, Stage], still: Set[Symbol] = frozenset()) -> None:
-        self.leaves, self.still = dict(leaves), still  # along these every gradient is 0
+    def __init__(
+        self, leaves: Mapping[Symbol, Stage], constant_leaves: Set[Symbol] = frozenset()
+    ) -> None:
+        self.leaves, self.constant_leaves = dict(leaves), constant_leaves
         self.stage: dict[Symbol, Stage] = dict(leaves)
         self.hint: dict[Symbol, str] = {}
         self.parts: dict[Symbol, tuple[Symbol, ...]] = {}  # names in each right-hand side
@@ -56,10 +65,10 @@ class Tape:
         self.constant: dict[Symbol, Expr] = {}  # of names that are sums
         self._number: dict[Symbol, int] = {}
         self._known: dict[object, Symbol] = {}  # by right-hand side, sums and products by content
-        self._solid: set[Symbol] = set()  # names that stay whole inside products
-        self._rhs: dict[Symbol, Expr] = {}  # of functions, and of others where they were asked for
-        self._late: dict[Symbol, tuple[_Late, Expr]] = {}
-        self.squares: dict[Symbol, Symbol] = {}  # sin(a) <-> cos(a), where both are there
+        self._opaque: set[Symbol] = set()  # names that are not expanded inside products
+        self._rhs: dict[Symbol, Expr] = {}  # of functions; of sums and products once `rhs` built it
+        self._varying: dict[Symbol, tuple[_Varying, Expr]] = {}
+        self.squares: dict[Symbol, Symbol] = {}  # sin(a) <-> cos(a), where both exist
         self._cosh: dict[Symbol, Expr] = {}  # names that are the cosh of an atom
         self._partial: dict[tuple[Symbol, Symbol], Expr] = {}
         self._pairs: dict[tuple[Symbol, Symbol], Expr] = {}
@@ -68,62 +77,61 @@ class Tape:
     # --- definitions ---------------------------------------------------------------------------
 
     def define(self, expr: Expr) -> Expr:
-        """What stands for `expr`: a number, a name, or a number times a name."""
+        """Return the atom of `expr`: a number, a name, or a number times a name."""
         if expr.is_Symbol or expr.is_number:
             return expr
         if expr.is_Add:
             return self.total(self.define(term) for term in expr.args)
         if expr.is_Mul or expr.is_Pow:
             return self._product(Mul.make_args(expr))
-        made = expr.func(*(self.define(arg) for arg in expr.args))
-        if made.is_Symbol or made.is_number:
-            return made
-        if made.is_Add or made.is_Mul or made.is_Pow:  # sin(-a) has become -sin(a)
-            return self.define(made)
-        found = self._name(made)
-        if isinstance(made, sympy.cosh):
-            self._cosh[found] = made.args[0]
+        result = expr.func(*(self.define(arg) for arg in expr.args))
+        if result.is_Symbol or result.is_number:
+            return result
+        if result.is_Add or result.is_Mul or result.is_Pow:  # sin(-a) has become -sin(a)
+            return self.define(result)
+        name = self._name(result)
+        if isinstance(result, sympy.cosh):
+            self._cosh[name] = result.args[0]
         for one, other in ((sympy.sin, sympy.cos), (sympy.cos, sympy.sin)):
-            if isinstance(made, one) and (partner := self._known.get(other(made.args[0]))):
-                self.squares |= {found: partner, partner: found}
-        return found
+            if isinstance(result, one) and (partner := self._known.get(other(result.args[0]))):
+                self.squares |= {name: partner, partner: name}
+        return name
 
     def named(self, expr: Expr, name: str) -> Expr:
-        """Define `expr` under a name that is kept whole; numbers and leaves stay what they are."""
+        """Define `expr` under a name that products do not expand. Numbers and leaves are returned
+        as they are.
+        """
         atom = self.define(expr)
         factor, symbol = split(atom)
         if symbol is None or (factor == 1 and symbol in self.leaves):
             return atom
         if factor != 1:
             symbol = self._name(atom)
-        self._solid.add(symbol)
+        self._opaque.add(symbol)
         self.hint.setdefault(symbol, name)
         return symbol
 
-    def whole(self, atom: Expr) -> Expr:
-        """The atom as a name, or minus a name, that is kept whole inside products."""
+    def opaque(self, atom: Expr) -> Expr:
+        """Return the atom as a name, or minus a name, that products do not expand."""
         factor, symbol = split(atom)
         if symbol is None:
             return atom
         if abs(factor) != 1:
             factor, symbol = S.One, self._name(atom)
-        self._solid.add(symbol)
+        self._opaque.add(symbol)
         return self.scaled(factor, symbol)
 
     def stage_of(self, atom: Expr) -> Stage:
-        """The binding time of what `define` returned."""
+        """Return the binding time of an atom."""
         symbol = split(atom)[1]
         return Stage.NUMBER if symbol is None else self.stage[symbol]
 
     def is_sine(self, symbol: Symbol) -> bool:
-        """Whether the name stands for a sine."""
+        """Return True if the name stands for a sine."""
         return isinstance(self._rhs.get(symbol), sympy.sin)
 
     def rhs(self, symbol: Symbol) -> Expr:
-        """What a name stands for, as SymPy has it; the tape itself keeps sums and products apart.
-
-        Raises KeyError for a leaf.
-        """
+        """Return the definition of a name as a SymPy expression. Raises KeyError for a leaf."""
         if symbol not in self._rhs:
             if symbol in self.weights:
                 terms = [self.scaled(w, name) for name, w in self.weights[symbol].items()]
@@ -135,34 +143,36 @@ class Tape:
         return self._rhs[symbol]
 
     def _name(self, rhs: Expr) -> Symbol:
-        found = self._known.get(rhs)
-        if found is None:
-            if rhs.has(*_ROUGH):
-                raise RoughError("a derivative of something that jumps is needed")
-            found = self._new(rhs, self._ordered(rhs.free_symbols))
-            self._rhs[found] = rhs
-        return found
+        """Return the name of a function of atoms, a new one where it is not defined yet."""
+        name = self._known.get(rhs)
+        if name is None:
+            if rhs.has(*_NOT_DIFFERENTIABLE):
+                raise NotDifferentiableError("a derivative of something that jumps is needed")
+            name = self._new(rhs, self._ordered(rhs.free_symbols))
+            self._rhs[name] = rhs
+        return name
 
     def _new(self, key: object, parts: tuple[Symbol, ...]) -> Symbol:
-        found = Symbol(f"_{len(self.parts):06d}", real=True)
-        self._known[key] = found
-        self._number[found] = len(self.parts)
-        self.parts[found] = parts
-        self.stage[found] = max(self.stage[s] for s in self.parts[found])
-        return found
+        """Add a definition with the given key, which depends on the names `parts`."""
+        name = Symbol(f"_{len(self.parts):06d}", real=True)
+        self._known[key] = name
+        self._number[name] = len(self.parts)
+        self.parts[name] = parts
+        self.stage[name] = max(self.stage[s] for s in self.parts[name])
+        return name
 
     def _ordered(self, names: Iterable[Symbol]) -> tuple[Symbol, ...]:
-        """Leaves by name, then names as they were made."""
+        """Sort names: leaves alphabetically, then definitions in order."""
         return tuple(sorted(names, key=lambda s: (self._number.get(s, -1), s.name)))
 
     def _powers_of(self, symbol: Symbol) -> Powers:
-        """The symbol as a product of powers: its factors where it is one, itself elsewhere."""
-        if symbol in self._solid:
+        """Return the symbol as a product of powers: its factors if it is a product, else itself."""
+        if symbol in self._opaque:
             return {symbol: S.One}
         return self.powers.get(symbol) or {symbol: S.One}
 
     def scaled(self, number: Expr, atom: Expr) -> Expr:
-        """A number times an atom."""
+        """Return a number times an atom."""
         factor, symbol = split(atom)
         factor = number if factor is S.One else number * factor
         if symbol is None or factor is S.Zero:
@@ -174,6 +184,7 @@ class Tape:
         return self._atoms[factor, symbol]
 
     def _product(self, factors: Iterable[Expr]) -> Expr:
+        """Return the atom of a product of expressions."""
         number: Expr = S.One
         powers: dict[Symbol, Expr] = {}
         for factor in factors:
@@ -195,20 +206,20 @@ class Tape:
             if not (exponent.is_Integer or coefficient.is_positive):
                 coefficient, symbol = S.One, self._name(coefficient * symbol)
             number *= coefficient**exponent
-            whole = self._powers_of(symbol) if exponent.is_Integer else {symbol: S.One}
-            for name, power in whole.items():
+            factors_ = self._powers_of(symbol) if exponent.is_Integer else {symbol: S.One}
+            for name, power in factors_.items():
                 powers[name] = powers.get(name, S.Zero) + power * exponent
         if number == 0:
             return S.Zero
         return self.scaled(number, self._of_powers(powers))
 
     def _of_powers(self, powers: Powers) -> Expr:
-        """What stands for a product of powers of names."""
+        """Return the atom of a product of powers of names."""
         powers = {name: power for name, power in powers.items() if power is not S.Zero}
         for cosh, x in [(name, self._cosh[name]) for name in powers if name in self._cosh]:
             sinh = self._known.get(sympy.sinh(x))
             n = min(powers[sinh], -powers[cosh]) if sinh in powers else S.Zero
-            if n.is_Integer and n > 0:  # tanh, which does not overflow: a slope of log(cosh(x))
+            if n.is_Integer and n > 0:  # tanh, which does not overflow, as in d log(cosh(x))/dx
                 rest = self._of_powers(powers | {sinh: powers[sinh] - n, cosh: powers[cosh] + n})
                 return self.times(rest, self._of_powers({self.define(tanh(x)): n}))
         if not powers:
@@ -216,18 +227,18 @@ class Tape:
         if len(powers) == 1 and S.One in powers.values():
             return next(iter(powers))
         key = ("product", frozenset(powers.items()))
-        if (found := self._known.get(key)) is None:
-            found = self._new(key, self._ordered(powers))
-            self.powers[found] = powers
-        return found
+        if (result := self._known.get(key)) is None:
+            result = self._new(key, self._ordered(powers))
+            self.powers[result] = powers
+        return result
 
-    def times(self, one: Expr, other: Expr) -> Expr:
-        """The product of two atoms."""
-        (a, x), (b, y) = split(one), split(other)
+    def times(self, first: Expr, second: Expr) -> Expr:
+        """Return the product of two atoms."""
+        (a, x), (b, y) = split(first), split(second)
         if x is None:
-            return self.scaled(a, other)
+            return self.scaled(a, second)
         if y is None:
-            return self.scaled(b, one)
+            return self.scaled(b, first)
         if (x, y) not in self._pairs:
             powers = dict(self._powers_of(x))
             for name, power in self._powers_of(y).items():
@@ -239,7 +250,7 @@ class Tape:
         return self.scaled(a * b, product)
 
     def total(self, atoms: Iterable[Expr]) -> Expr:
-        """The sum of atoms."""
+        """Return the sum of atoms."""
         weights: dict[Symbol, Expr] = {}
         constant: Expr = S.Zero
         for atom in atoms:
@@ -251,7 +262,7 @@ class Tape:
             else:
                 weights[symbol] = factor
         weights = {symbol: w for symbol, w in weights.items() if w is not S.Zero}
-        weights, constant = written_out(weights, constant, self)
+        weights, constant = expand_sums(weights, constant, self)
         if len(weights) + (constant is not S.Zero) < 2:
             return constant if not weights else self.scaled(*weights.popitem()[::-1])
         if self._can_gather(weights, constant):
@@ -260,17 +271,21 @@ class Tape:
         return self._of_weights(weights, constant)
 
     def _of_total(self, total: Expr) -> Expr:
-        """The same of what may be something else: 1 + sqrt(2) is an Add to SymPy, and a number."""
+        """Return the atom of a gathered sum, which may be a number: SymPy writes 1 + sqrt(2) as
+        Add.
+        """
         return self._of_terms(total) if total.is_Add and not total.is_number else total
 
     def _of_terms(self, total: Expr) -> Expr:
-        """What stands for a sum of atoms as SymPy has it."""
+        """Return the atom of a SymPy sum of atoms."""
         numbers = [term for term in total.args if term.is_number]  # 1/4 and sqrt(2), say
         terms = [split(term) for term in total.args if not term.is_number]
         return self._of_weights({name: weight for weight, name in terms if name}, Add(*numbers))
 
     def _of_weights(self, weights: dict[Symbol, Expr], constant: Expr) -> Expr:
-        """What stands for a sum of weighted names; most weights in it are positive."""
+        """Return the atom of a weighted sum of names, normalized so that most weights are
+        positive.
+        """
         names = self._ordered(weights)
         last = weights[min(reversed(names), key=lambda name: self.stage[name])]
         negative = sum(map(is_negative, (constant, *weights.values())))
@@ -284,98 +299,105 @@ class Tape:
             weights = {name: weights[name] / sign for name in names}
             constant = constant / sign
         key = ("sum", frozenset(weights.items()), constant)
-        if (found := self._known.get(key)) is None:
-            found = self._new(key, names)
-            self.weights[found] = {name: weights[name] for name in names}
-            self.constant[found] = constant
-        return self.scaled(sign, found)
+        if (symbol := self._known.get(key)) is None:
+            symbol = self._new(key, names)
+            self.weights[symbol] = {name: weights[name] for name in names}
+            self.constant[symbol] = constant
+        return self.scaled(sign, symbol)
 
     def _can_gather(self, weights: Mapping[Symbol, Expr], constant: Expr) -> bool:
-        """Whether terms differ in parameters' work alone, or are squares that may add up."""
-        seen: set[_Late] = {()} if constant is not S.Zero else set()
+        """Return True if terms differ in parameter-only factors alone, or have squares of sine or
+        cosine.
+        """
+        varying: set[_Varying] = {()} if constant is not S.Zero else set()
         for symbol in weights:
-            late = self._split_late(symbol)[0]
-            if late in seen or any(e == 2 and n in self.squares for n, e in late):
+            factors = self._split_varying(symbol)[0]
+            if factors in varying or any(e == 2 and n in self.squares for n, e in factors):
                 return True
-            seen.add(late)
+            varying.add(factors)
         return False
 
-    def _split_late(self, symbol: Symbol) -> tuple[_Late, Expr]:
-        """The factors that are known after the parameters, and the product of the rest."""
-        if symbol not in self._late:
+    def _split_varying(self, symbol: Symbol) -> tuple[_Varying, Expr]:
+        """Split a product into factors that vary and the product of those that depend on parameters
+        only.
+        """
+        if symbol not in self._varying:
             powers = self._powers_of(symbol)
-            early = [n for n in powers if self.stage[n] <= Stage.PARAMETER]
-            late = tuple((n, powers[n]) for n in self._ordered(powers) if n not in early)
-            self._late[symbol] = (late, Mul(*(Pow(n, powers[n]) for n in early)))
-        return self._late[symbol]
+            constant = [n for n in powers if self.stage[n] <= Stage.PARAMETER]
+            varying = tuple((n, powers[n]) for n in self._ordered(powers) if n not in constant)
+            self._varying[symbol] = (varying, Mul(*(Pow(n, powers[n]) for n in constant)))
+        return self._varying[symbol]
 
     def _gather(self, total: Expr) -> Expr:
-        """a x + b x = (a + b) x where a, b are parameters' work; a sin2 + a cos2 = a."""
+        """Combine a x + b x = (a + b) x for parameter-only a and b, and a sin^2 + a cos^2 = a."""
         if not total.is_Add:
             return total
-        groups: dict[_Late, list[Expr]] = {}
+        groups: dict[_Varying, list[Expr]] = {}
         for term in total.args:
             factor, symbol = split(term)
-            late, early = self._split_late(symbol) if symbol is not None else ((), S.One)
-            groups.setdefault(late, []).append(factor * early)
+            varying, constant = self._split_varying(symbol) if symbol is not None else ((), S.One)
+            groups.setdefault(varying, []).append(factor * constant)
         weights = {
-            late: self.define(parts[0])
+            varying: self.define(parts[0])
             if len(parts) == 1
             else self._of_total(Add(*map(self.define, parts)))
-            for late, parts in groups.items()
+            for varying, parts in groups.items()
         }
         merged = self._pythagoras(weights)
         if len(merged) == len(total.args):
             return total
         return Add(
             *(
-                self._product([*Mul.make_args(weight), *(Pow(n, e) for n, e in late)])
-                for late, weight in merged.items()
+                self._product([*Mul.make_args(weight), *(Pow(n, e) for n, e in varying)])
+                for varying, weight in merged.items()
             )
         )
 
-    def _pythagoras(self, weights: dict[_Late, Expr]) -> dict[_Late, Expr]:
+    def _pythagoras(self, weights: dict[_Varying, Expr]) -> dict[_Varying, Expr]:
+        """Replace pairs a sin^2 x + a cos^2 x by a."""
         again = True
         while again:
             again = False
-            for late, weight in list(weights.items()):
-                for name, power in late:
-                    other = self.squares.get(name)
-                    if other is None or power != 2 or late not in weights:
+            for varying, weight in list(weights.items()):
+                for name, power in varying:
+                    partner = self.squares.get(name)
+                    if partner is None or power != 2 or varying not in weights:
                         continue
-                    rest = tuple(part for part in late if part[0] != name)
-                    powers = dict((*rest, (other, power)))
+                    rest = tuple(part for part in varying if part[0] != name)
+                    powers = dict((*rest, (partner, power)))
                     twin = tuple((n, powers[n]) for n in self._ordered(powers))
-                    if twin != late and weights.get(twin) == weight:
-                        del weights[late], weights[twin]
+                    if twin != varying and weights.get(twin) == weight:
+                        del weights[varying], weights[twin]
                         sum_ = Add(weight, weights.get(rest, S.Zero))
                         weights[rest] = self._of_total(sum_)
                         again = True
-        return {late: weight for late, weight in weights.items() if weight != 0}
+        return {varying: weight for varying, weight in weights.items() if weight != 0}
 
     # --- derivatives -----------------------------------------------------------------------------
 
     def live(self, atoms: Iterable[Expr], stop: Set[Symbol] = frozenset()) -> list[Symbol]:
-        """The names that `atoms` depend on, in order; what stands behind `stop` is left out."""
-        found: set[Symbol] = set()
+        """Return the names that `atoms` depend on, in order. Definitions of names in `stop` are not
+        followed.
+        """
+        names: set[Symbol] = set()
         queue = [s for atom in atoms for s in atom.free_symbols]
         while queue:
             symbol = queue.pop()
-            if symbol in self.parts and symbol not in found:
-                found.add(symbol)
+            if symbol in self.parts and symbol not in names:
+                names.add(symbol)
                 if symbol not in stop:
                     queue.extend(self.parts[symbol])
-        return sorted(found, key=self._number.__getitem__)
+        return sorted(names, key=self._number.__getitem__)
 
     def leaves_of(self, atoms: Iterable[Expr]) -> set[Symbol]:
-        """The leaves that `atoms` depend on."""
+        """Return the leaves that `atoms` depend on."""
         atoms = list(atoms)
         parts = (self.parts[n] for n in self.live(atoms))
-        seen = {s for atom in atoms for s in atom.free_symbols}.union(*parts)
-        return seen & self.leaves.keys()
+        symbols = {s for atom in atoms for s in atom.free_symbols}.union(*parts)
+        return symbols & self.leaves.keys()
 
     def partial(self, symbol: Symbol, part: Symbol) -> Expr:
-        """d rhs(symbol)/d part, as `define` returns it."""
+        """Return the partial derivative of a definition with respect to a name in it."""
         key = (symbol, part)
         if key not in self._partial:
             if symbol in self.weights:
@@ -384,18 +406,18 @@ class Tape:
                 powers = dict(self.powers[symbol])
                 power = powers[part]
                 powers[part] = power - 1
-                whole: Powers = {}
-                for name, e in powers.items():  # whole powers of products become theirs
+                expanded: Powers = {}
+                for name, e in powers.items():  # integer powers of products are expanded
                     inside = self._powers_of(name) if e.is_Integer else {name: S.One}
                     for n, inner in inside.items():
-                        whole[n] = whole.get(n, S.Zero) + inner * e
-                self._partial[key] = self.scaled(power, self._of_powers(whole))
+                        expanded[n] = expanded.get(n, S.Zero) + inner * e
+                self._partial[key] = self.scaled(power, self._of_powers(expanded))
             else:
                 self._partial[key] = self.define(self.rhs(symbol).diff(part))
         return self._partial[key]
 
     def forward(self, outputs: Sequence[Expr], seeds: Mapping[Symbol, Expr]) -> list[Expr]:
-        """sum_k d(output)/d(leaf_k) seed_k, for each output."""
+        """Return the directional derivatives sum_k d(output)/d(leaf_k) seed_k (forward mode)."""
         tangent: dict[Symbol, Expr] = dict(seeds)
         for symbol in self.live(outputs):
             terms = [
@@ -416,9 +438,10 @@ class Tape:
         wrt: Sequence[Symbol],
         stop: Set[Symbol] = frozenset(),
     ) -> list[Expr]:
-        """sum_k seed_k d(output_k)/d(name), for each name in `wrt`; (output, seed) pairs are given.
+        """Return sum_k seed_k d(output_k)/d(name) for each name in `wrt` (reverse mode).
 
-        Names in `stop` count as independent: nothing is passed on to what they are made of.
+        `outputs` are (output, seed) pairs. Names in `stop` are independent variables: their
+        definitions are not differentiated.
         """
         terms: dict[Symbol, list[Expr]] = {}
         for output, seed in outputs:
@@ -430,14 +453,14 @@ class Tape:
                 continue
             adjoint = self.total(terms[symbol])
             for part in self.parts[symbol]:
-                if part in self.still:
+                if part in self.constant_leaves:
                     continue
                 slope = self.partial(symbol, part)
                 terms.setdefault(part, []).append(self.times(slope, adjoint))
-        return [self.total(() if x in self.still else terms.get(x, ())) for x in wrt]
+        return [self.total(() if x in self.constant_leaves else terms.get(x, ())) for x in wrt]
 
     def substitute(self, outputs: Sequence[Expr], values: Mapping[Symbol, Expr]) -> list[Expr]:
-        """The outputs with `values` in place of leaves."""
+        """Return the outputs with leaves replaced by `values`."""
         new: dict[Symbol, Expr] = dict(values)
         for symbol in self.live(outputs):
             changed = {part: new[part] for part in self.parts[symbol] if part in new}

@@ -1,4 +1,4 @@
-"""Vectors of space whose entries are atoms of a tape."""
+"""Vectors in space with atoms of a tape as entries."""
 
 from __future__ import annotations
 
@@ -11,58 +11,58 @@ from eomc.derive.tape import Tape
 Vector = tuple[Expr, Expr, Expr]
 
 ZERO: Vector = (S.Zero, S.Zero, S.Zero)
-AXES = ((1, 2), (2, 0), (0, 1))  # the other two of each axis, in their turning order
+AXES = ((1, 2), (2, 0), (0, 1))  # for each axis, the other two in cyclic order
 
 
 class Vectors:
-    """Sums and products that leave out what is zero."""
+    """Sums and products of vectors on a tape that leave out zeros."""
 
     def __init__(self, tape: Tape) -> None:
         self.tape = tape
 
     def define(self, e: Expr) -> Expr:
-        """The atom of an expression."""
+        """Return the atom of an expression."""
         return self.tape.define(e)
 
     def add(self, *terms: Expr) -> Expr:
-        """Their sum."""
+        """Return the sum of the terms."""
         return self.tape.total([x for x in terms if x is not S.Zero])
 
     def times(self, a: Expr, b: Expr) -> Expr:
-        """a b"""
+        """Return a b."""
         return S.Zero if a is S.Zero or b is S.Zero else self.tape.times(a, b)
 
     def minus(self, a: Expr) -> Expr:
-        """-a"""
+        """Return -a."""
         return self.tape.scaled(S.NegativeOne, a)
 
     def vector(self, v: Sequence[Expr]) -> Vector:
-        """The atoms of a vector."""
+        """Return the vector with the atoms of v as entries."""
         x, y, z = map(self.define, v)
         return (x, y, z)
 
     def plus(self, *vectors: Sequence[Expr]) -> Vector:
-        """Their sum."""
+        """Return the sum of the vectors."""
         x, y, z = (self.add(*parts) for parts in zip(*vectors, strict=True))
         return (x, y, z)
 
     def dot(self, a: Sequence[Expr], b: Sequence[Expr]) -> Expr:
-        """a . b"""
+        """Return a . b."""
         return self.add(*(self.times(x, y) for x, y in zip(a, b, strict=True)))
 
     def cross(self, a: Sequence[Expr], b: Sequence[Expr]) -> Vector:
-        """a x b"""
+        """Return a x b."""
         x, y, z = (
             self.add(self.times(a[i], b[j]), self.minus(self.times(a[j], b[i]))) for i, j in AXES
         )
         return (x, y, z)
 
     def apply(self, R: Sequence[Sequence[Expr]], v: Sequence[Expr]) -> Vector:
-        """R v"""
+        """Return R v."""
         x, y, z = (self.dot(row, v) for row in R)
         return (x, y, z)
 
     def scaled(self, v: Sequence[Expr], x: Expr) -> Vector:
-        """x v"""
+        """Return x v."""
         a, b, c = (self.times(e, x) for e in v)
         return (a, b, c)

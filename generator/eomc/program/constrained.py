@@ -12,7 +12,7 @@ from eomc.derive.constraints import rate_terms
 from eomc.derive.equations import Equations
 from eomc.derive.lagrange import Derivation
 from eomc.derive.ldl import Pairs, Vector
-from eomc.derive.linearize import along
+from eomc.derive.linearize import directional_derivatives
 from eomc.model.symbols import Output
 from eomc.model.system import System
 from eomc.program.admissible import Candidate, weight
@@ -41,7 +41,7 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
         yield lower("rate_terms", e.tape, terms, system.names)
     if system.run.discretize:
         moves = values[: 2 * len(system.q)]
-        both = [*moves, *along(system, e.tape, moves)]
+        both = [*moves, *directional_derivatives(system, e.tape, moves)]
         yield lower("projection_along", e.tape, both, system.names, checks=pivots)
     if system.reactions:
         yield _reactions(system)
@@ -83,7 +83,9 @@ def _reactions(system: System) -> Function:
     values = [x for r in system.reactions for x in r.values]
     named = tuple(Output(f"reaction_{k}", x) for k, x in enumerate(values))
     multipliers = [c.multiplier for c in system.constraints]
-    made = outputs.outputs(replace(system, outputs=named), sloped=False, more=multipliers)
+    made = outputs.outputs(
+        replace(system, outputs=named), with_derivatives=False, extra_symbols=multipliers
+    )
     return lower("reactions", made.tape, made.values, system.names)
 
 

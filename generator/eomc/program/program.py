@@ -145,7 +145,7 @@ def _outputs(system: System, taken: Candidate) -> Iterator[Function]:
     read = {x for o in system.outputs for x in o.formula.free_symbols}
     known = (taken.tape, held) if read & held.keys() else None
     checks = taken.checks if known else ()
-    made = outputs.outputs(system, sloped=system.run.sloped, beside=known)
+    made = outputs.outputs(system, with_derivatives=system.run.sloped, base=known)
     labels = [o.name for o in system.outputs]
     yield lower("outputs", made.tape, made.values, system.names, checks=checks, labels=labels)
     if rows := [x for row in made.slopes for x in row]:
@@ -179,7 +179,7 @@ def _events(system: System, taken: Candidate) -> Iterator[Function]:
         named = tuple(Output(f"{name}_{k}", value) for k, value in enumerate(formulas))
         read = {x for f in formulas for x in f.free_symbols}
         known = (taken.tape, held) if read & held.keys() else None
-        found = outputs.outputs(replace(system, outputs=named), sloped=False, beside=known)
+        found = outputs.outputs(replace(system, outputs=named), with_derivatives=False, base=known)
         yield lower(name, found.tape, found.values, system.names)
 
 

@@ -15,8 +15,8 @@ from sympy import Expr
 from eomc.derive import kkt
 from eomc.derive.equations import Equations
 from eomc.derive.lagrange import Derivation
-from eomc.derive.ldl import Rows, Way, solve
-from eomc.derive.link_multipliers import is_prompt
+from eomc.derive.ldl import Rows, SolveResult, solve
+from eomc.derive.link_multipliers import prefer_short_chains
 from eomc.derive.tape import Tape
 from eomc.model.system import System
 from eomc.program.polynomial import Expander
@@ -77,7 +77,7 @@ class Route:
 
     name: str
     sentence: str
-    accelerations: Callable[[Material], Way] = lambda _: None
+    accelerations: Callable[[Material], SolveResult] = lambda _: None
     functions: Callable[[Material], Functions | None] = lambda _: None
     solved: Callable[[System, str], str] = _by_ldl
     penalty: float = 1.0
@@ -85,10 +85,10 @@ class Route:
 
 def _power(e: Equations) -> Expr:
     """Into the system, with what constraints do that time moves: lambda A qd."""
-    if e.rows is None or not any(e.rows.moved):
+    if e.rows is None or not any(e.rows.drift):
         return e.power
     multipliers = kkt.accelerations(e.tape, e.D, e.balance, e.rows).multipliers
-    works = [e.tape.times(x, v) for x, v in zip(multipliers, e.rows.moved, strict=True)]
+    works = [e.tape.times(x, v) for x, v in zip(multipliers, e.rows.drift, strict=True)]
     return e.tape.total([e.power, *works])
 
 
@@ -132,14 +132,14 @@ def _rotated(material: Material) -> Functions | None:
     return None if short is None else replace(plain, outputs={"C": short})
 
 
-def _expanded(material: Material) -> Way:
+def _expanded(material: Material) -> SolveResult:
     if material.expanded is None:
         return None
     rows = material.lagrange.rows if material.lagrange else None
     return kkt.accelerations(*material.expanded, rows) if rows else solve(*material.expanded)
 
 
-def _cancelled(material: Material) -> Way:
+def _cancelled(material: Material) -> SolveResult:
     if material.expander is None or material.expanded is None:
         return None
     rows = material.lagrange.rows if material.lagrange else None
@@ -149,7 +149,7 @@ def _cancelled(material: Material) -> Way:
     return solve(*material.expanded, short)
 
 
-def _constrained(e: Equations | None) -> Way:
+def _constrained(e: Equations | None) -> SolveResult:
     """Under constraints, over equations as they are."""
     return kkt.accelerations(e.tape, e.D, e.balance, e.rows) if e and e.rows else None
 
@@ -165,7 +165,7 @@ def _by_multipliers(system: System, order: str) -> str:
     fractions = "Along a chain s = N/M: s_k is N there, and S_k is M times the entry it was. "
     return (
         "a = qdd by link multipliers (tensions), S = N T N^T = L diag(s) L^T, eliminated in the "
-        f"order of the links of {order}. {fractions if is_prompt(system) else ''}"
+        f"order of the links of {order}. {fractions if prefer_short_chains(system) else ''}"
         "Every mass must be positive."
     )
 
