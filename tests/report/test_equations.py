@@ -353,6 +353,14 @@ def test_the_symbols_of_a_systems_equations_are_the_users(assumptions: dict[str,
     assert m * v**2 / 2 - m * x**2 == eomc.equations(plain).L
 
 
+def test_velocities_of_positive_coordinates_have_either_sign() -> None:
+    r = sympy.Symbol("r", positive=True)
+    for v in (eomc.dot(r), sympy.Symbol("r_dot", real=True)):
+        made = eomc.System.make("mass", [r], v**2 / 2, r**2, forces={r: -v * sympy.Abs(v)})
+        found = eomc.equations(made)
+        assert found.tau.subs({r: 1, found.symbols["r_dot"]: -2})[0] == 4
+
+
 def test_names_given_as_text_are_plain_symbols() -> None:
     made = eomc.System.make("mass", ["x"], "m*x_dot**2/2", "k*x**2/2", parameters={"m": 1, "k": 1})
     assert eomc.equations(made).g.subs({"k": 2, "x": 3})[0] == 6

@@ -59,6 +59,7 @@ class Maker:
             raise EomcError(f"System.make: name: {why}")
         self.name = name
         self.map: dict[Any, Expr] = {}
+        self.used: dict[str, Expr] = {}  # symbols of the user's expressions, by their names
         self.taken: dict[str, Any] = {}
         self.renamed: list[tuple[str, str]] = []
         self.fixed: dict[Symbol, bool] = {}  # parameters, and whether they are never negative
@@ -81,6 +82,8 @@ class Maker:
             known = {s.name: s for s in self.known}
             value = given.from_text(value, role, known, rule)
         expr = given.expression(value, role)
+        if not isinstance(value, str):
+            self.used |= {s.name: s for s in expr.free_symbols}
         expr = expr.replace(
             lambda e: isinstance(e, sympy.Derivative),
             lambda e: e if isinstance(e.expr, AppliedUndef) else e.doit(),
@@ -190,7 +193,7 @@ class Maker:
         }
         self.frictions = list(self._frictions(friction, starts, declared))
         as_text = {one for group in as_given for one in group if isinstance(one, str)}
-        own = _own_symbols(self.taken, starts, as_text)
+        own = _own_symbols(self.taken, starts, as_text, self.used)
         whole = sympy.srepr(sorted(made_of.items())) + drawn_text + str(self.frictions or "")
         digest = hashlib.sha256(whole.encode()).hexdigest()
         return of(
@@ -439,15 +442,17 @@ class Maker:
 
 
 def _own_symbols(
-    used: Mapping[str, Any], coordinates: Iterable[Any], as_text: Collection[str]
-) -> dict[str, Expr]:
+    declared: Mapping[str, Any], coordinates: Iterable[Any], as_text: Collection[str],
+    used: Mapping[str, Expr],
+) -> dict[str, Expr]:  # fmt: skip
     """Return the user's symbols of coordinates, their derivatives, and all other quantities.
 
-    used: what was declared, by the name that it has in the system. Names that were given as text
-    (`as_text`) have no symbol of the user.
+    declared: by the name that each has in the system. Names that were given as text (`as_text`)
+    have no symbol of the user. used: the symbols of the user's expressions, by their names. A
+    velocity that has none there is real where its coordinate is, and has either sign.
     """
     moving, found = {*coordinates}, dict[str, Expr]()
-    for name, one in used.items():
+    for name, one in declared.items():
         if given.name_of(one) in as_text:
             continue
         found[name] = one
@@ -457,5 +462,6 @@ def _own_symbols(
             found[f"{name}_dot"], found[f"{name}_ddot"] = one.diff(time), one.diff(time, 2)
         elif one in moving:
             for order in ("_dot", "_ddot"):
-                found[name + order] = Symbol(f"{one}{order}", **one.assumptions0)
+                rate = Symbol(f"{one}{order}", real=one.is_real)
+                found[name + order] = used.get(rate.name, rate)
     return found
