@@ -38,10 +38,12 @@ linearize = true
 
 
 class Wrong:
-    """The module with something added to outputs, or to C."""
+    """The module with something added to outputs, to C, or to derivatives by parameters."""
 
-    def __init__(self, module: ModuleType, output: float = 0.0, C: float = 0.0) -> None:
-        self._module, self._output, self._C = module, output, C
+    def __init__(
+        self, module: ModuleType, output: float = 0.0, C: float = 0.0, F: float = 0.0
+    ) -> None:
+        self._module, self._output, self._C, self._F = module, output, C, F
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._module, name)
@@ -52,6 +54,10 @@ class Wrong:
     def linearize(self, *state: Any, **how: Any) -> Any:
         A, B, *CD = self._module.linearize(*state, **how)
         return A, B, *([CD[0] + self._C, CD[1]] if CD else [])
+
+    def sensitivity(self, *state: Any, **how: Any) -> Any:
+        E, F = self._module.sensitivity(*state, **how)
+        return E, F + self._F
 
 
 @pytest.mark.parametrize(
@@ -145,3 +151,14 @@ def test_an_output_that_cancels_against_an_acceleration_passes(modules: Modules)
     comparison = Comparison(made, module, np.random.default_rng(0), None)
     rows_outputs.report(comparison)
     assert {row.name: row.passed for row in comparison.rows} == {"outputs": True}
+
+
+@pytest.mark.parametrize("wrong", [{}, {"F": 1e-7}])
+def test_wrong_derivatives_by_parameters_fail(modules: Modules, wrong: dict[str, float]) -> None:
+    text = CANCELLING.replace('"k*x + x_ddot"', '"k*x**2 + k*x_ddot"\nside = "k*x"')
+    text += '[run]\nlinearize = "parameters"\n'
+    made, module = from_scene(parse(text, "test.toml")), modules.unoptimised(text)
+    comparison = Comparison(made, Wrong(module, **wrong), np.random.default_rng(0), None)
+    rows_outputs.report(comparison)
+    found = {row.name: row.passed for row in comparison.rows}
+    assert found == {"outputs": True, "outputs: C, D": True, "outputs: by parameters": not wrong}

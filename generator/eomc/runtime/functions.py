@@ -46,6 +46,7 @@ FUNCTIONS: Mapping[str, StateFunction] = {
     "outputs": StateFunction(lambda m: (len(m.outputs),)),
     "output_slopes": StateFunction(lambda m: (len(m.outputs), 3 * m.nq + m.nu)),
     "sensitivity": StateFunction(lambda m: (m.nq, len(m.parameters))),
+    "output_sensitivity": StateFunction(lambda m: (len(m.outputs), len(m.parameters))),
     "frame_poses": StateFunction(
         lambda m: (len(m.frames), 3 if m._plane else 12), of_velocity=False
     ),
@@ -368,11 +369,32 @@ class Functions(Arguments):
 
     def sensitivity(
         self, q: ArrayLike, qd: ArrayLike, t: float = 0.0, u: Any = None,
-        params: Parameters = None,
-    ) -> Array:  # fmt: skip
-        """dqdd/dp at a state, (nq, np), parameters in their order; exact derivatives, u held.
+        params: Parameters = None, *, outputs: bool = False,
+    ) -> Any:  # fmt: skip
+        """Derivatives of the accelerations, and of the outputs, with respect to the parameters.
 
-        Raises MotionError where a derivative is not finite, ValueError where the module lacks them.
+        Parameters
+        ----------
+        q, qd : (nq,) or (n, nq) array_like
+            State, or several.
+        t, u, params
+            As in `acceleration`. Inputs are held constant.
+        outputs : bool, optional
+            Whether to return the derivatives of the outputs too.
+
+        Returns
+        -------
+        E : (nq, np) array
+            ∂q̈/∂p, a column for each parameter in its order; (n, nq, np) for n states.
+        F : (ny, np) array, if `outputs`
+            dy/dp of the outputs y at a constant state, through the accelerations too.
+
+        Raises
+        ------
+        MotionError
+            If a derivative is not finite.
+        ValueError
+            If the module was built without these derivatives, or has no outputs.
         """
         if not hasattr(self._lib, "sensitivity"):
             raise ValueError(
@@ -384,7 +406,13 @@ class Functions(Arguments):
             k = np.argwhere(~np.isfinite(E))[0, : E.ndim - 2]
             where = state_text(*(np.asarray(x)[tuple(k)] for x in (q, qd)))
             raise MotionError(f"at {where}: a derivative is not finite there", "not finite")
-        return E
+        if not as_flag(outputs, "outputs"):
+            return E
+        if not self.outputs:
+            raise ValueError(f"sensitivity: {self.name} has no outputs: {named_outputs()}")
+        slopes = self._evaluate("output_slopes", q, qd, t, u, params)
+        by_qdd = slopes[..., 2 * self.nq + self.nu :]
+        return E, self._evaluate("output_sensitivity", q, qd, t, u, params) + by_qdd @ E
 
     def rhs(self, t: float, x: ArrayLike, u: Any = None, params: Parameters = None) -> Array:
         """d[q; qd]/dt = [qd; qdd], (2 nq,), as scipy.integrate.solve_ivp calls it."""

@@ -44,6 +44,9 @@ def report(of: Comparison) -> None:
         if of.system.run.sloped:
             unit, slopes = "of the largest derivative", partial(_slopes, of, module, formulas)
             of.row(f"{form}outputs: C, D", limit, unit, slopes)
+            if of.system.run.linearize == "parameters" and of.system.parameters:
+                by_parameters = partial(_slopes, of, module, formulas, by_parameters=True)
+                of.row(f"{form}outputs: by parameters", limit, unit, by_parameters)
 
 
 def _values(of: Comparison, module: Any, formulas: Formulas) -> float:
@@ -77,22 +80,29 @@ def apart(
     return of.largest(error, STATES)
 
 
-def _slopes(of: Comparison, module: Any, formulas: Formulas) -> float:
-    """C and D beside differences of the outputs, through the module's own A and B."""
+def _slopes(of: Comparison, module: Any, formulas: Formulas, by_parameters: bool = False) -> float:
+    """Compare C and D, or dy/dp, with differences of the outputs, through A, B or E."""
 
     def error(e: Expected) -> float:
         s = _held(of, module, e.state)
         n, held = len(s.q), {"u": s.u, "t": s.t, "params": s.params}
-        A, B, C, D = (
-            np.asarray(x, float) for x in module.linearize(s.q, s.qd, outputs=True, **held)
-        )
-        slopes, m = formulas.slopes(s, *_solved(module, s)), len(s.u) if s.u is not None else 0
-        own, by_qdd, by_force = np.split(slopes, [2 * n + m, 3 * n + m], axis=1)
-        solved, found = np.hstack([A[n:], B[n:]]), np.hstack([C, D])
+        if by_parameters:
+            solved, found = (
+                np.asarray(x, float) for x in module.sensitivity(s.q, s.qd, outputs=True, **held)
+            )
+        else:
+            A, B, C, D = (
+                np.asarray(x, float) for x in module.linearize(s.q, s.qd, outputs=True, **held)
+            )
+            solved, found = np.hstack([A[n:], B[n:]]), np.hstack([C, D])
+        slopes, m = formulas.slopes(s, *_solved(module, s), by_parameters), found.shape[1]
+        own, by_qdd, by_force = np.split(slopes, [m, m + n], axis=1)
         least: Vector = np.full(
             (1, 1), np.inf
         )  # of all widths of differences: what is wrong is so at each
-        for forces in _of_multipliers(of, s) if formulas.multipliers else [by_force[:0]]:
+        for forces in (
+            _of_multipliers(of, s, by_parameters) if formulas.multipliers else [by_force[:0]]
+        ):
             exact, sizes = own + by_qdd @ solved, abs(own) + abs(by_qdd) @ abs(solved)
             if formulas.multipliers:
                 exact, sizes = exact + by_force @ forces, sizes + abs(by_force) @ abs(forces)
@@ -103,12 +113,15 @@ def _slopes(of: Comparison, module: Any, formulas: Formulas) -> float:
     return of.largest(error, 2)
 
 
-def _of_multipliers(of: Comparison, s: State) -> Iterator[Vector]:
-    """Their slopes along q, qd and u, (nc, 2 nq + nu), by differences of several widths."""
-    n = len(s.q)
+def _of_multipliers(of: Comparison, s: State, by_parameters: bool) -> Iterator[Vector]:
+    """Derivatives of the multipliers, by differences of several widths.
+
+    With respect to q, qd and u, (nc, 2 nq + nu), or to the parameters, (nc, np).
+    """
+    first = 2 * len(s.q) + len(of.system.inputs)
     given = (of.reference, s, of.sampler.scale, of.sampler.defaults, "multipliers")
     for slopes, _ in derivatives.by_differences(*given):
-        yield slopes[:, : 2 * n + len(of.system.inputs)]
+        yield slopes[:, first:] if by_parameters else slopes[:, :first]
 
 
 def _solved(module: Any, s: State) -> tuple[Vector, Vector]:
@@ -145,12 +158,21 @@ class Formulas:
         with mpmath.workdps(DIGITS):
             return np.array([float(y) for y in self._values(self._given(s, qdd, forces))])
 
-    def slopes(self, s: State, qdd: Vector, forces: Vector = _NONE) -> Vector:
-        """(ny, 3 nq + nu): along q, qd, u, qdd, by differences; along multipliers that are read."""
+    def slopes(
+        self, s: State, qdd: Vector, forces: Vector = _NONE, by_parameters: bool = False
+    ) -> Vector:
+        """Derivatives of the outputs by differences, (ny, 3 nq + nu + nc).
+
+        With respect to q, qd, u, q̈ and the multipliers that are read; to parameters in place of q,
+        qd, u where `by_parameters`.
+        """
         system = self.system
+        own = (*system.q, *system.qd, *system.u)
+        if by_parameters:
+            own = tuple(p.symbol for p in system.parameters)
         with mpmath.workdps(DIGITS):
             given, columns = self._given(s, qdd, forces), []
-            for x in (*system.q, *system.qd, *system.u, *system.qdd, *self.multipliers):
+            for x in (*own, *system.qdd, *self.multipliers):
                 ends = [self._values({**given, x: given[x] + h}) for h in (WIDTH, -WIDTH)]
                 columns.append([float((a - b) / (2 * WIDTH)) for a, b in zip(*ends, strict=True)])
         return np.array(columns).T
