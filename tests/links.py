@@ -14,7 +14,7 @@ from eomc.model.system import System, dot, symbol
 from eomc.program import program
 from eomc.program.ir import Function
 from eomc.program.lower import lower
-from eomc.program.routes import Material
+from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
 from eomc.verify.taylor import Jets
 
@@ -33,7 +33,7 @@ def by_multipliers(made: System) -> Function:
 
 def cheapest(made: System) -> tuple[Function, Mapping[str, str]]:
     """The acceleration by the route that is taken, and why others were not tried."""
-    best, _, passed_over = program.accelerations(Material(lagrange.derive(made)))
+    best, _, passed_over = program.accelerations(RouteInputs(lagrange.derive(made)))
     return best, passed_over
 
 

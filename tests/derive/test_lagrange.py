@@ -29,7 +29,7 @@ from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.program.ir import Call
 from eomc.program.program import Program
-from eomc.program.routes import Material
+from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
 from eomc.verify import check
 from eomc.verify.symbolic import Reference
@@ -301,7 +301,7 @@ def arrow(n: int) -> System:
 
 def test_zeros_of_the_mass_matrix_are_not_computed() -> None:
     """D of the arrow is eliminated from its tips without fill: so much more for each body."""
-    found = (program.accelerations(Material(derive(arrow(n))))[0] for n in (3, 4, 5))
+    found = (program.accelerations(RouteInputs(derive(arrow(n))))[0] for n in (3, 4, 5))
     flops = [acceleration.cost.flops for acceleration in found]
     assert flops[2] - flops[1] == flops[1] - flops[0]
     ldl = derive(arrow(3)).ldl

@@ -28,7 +28,7 @@ from eomc.program import program
 from eomc.program.interpret import evaluate
 from eomc.program.ir import Function
 from eomc.program.program import Program
-from eomc.program.routes import Material
+from eomc.program.routes import RouteInputs
 from eomc.scene.read import parse
 from eomc.verify import check, symbolic
 from eomc.verify.oracle import Answer
@@ -60,7 +60,7 @@ def built_from(text: str) -> Program:
 
 def accelerations(made: System) -> Function:
     """By their cheapest route; nothing else is made."""
-    return program.accelerations(Material(lagrange.derive(made)))[0]
+    return program.accelerations(RouteInputs(lagrange.derive(made)))[0]
 
 
 @cache

@@ -18,7 +18,7 @@ from eomc.model.system import Constraint, System, symbol, t
 from eomc.program import ranks
 from eomc.program.assembly import assembled
 from eomc.program.manifold import Manifold, Place
-from eomc.program.walks import walk
+from eomc.program.walks import random_walk
 from eomc.scene.read import parse
 
 NAMES = list(constrained.cases())
@@ -414,8 +414,8 @@ def test_a_walk_stays_on_the_rows(name: str) -> None:
     manifold = Manifold(made)
     place = manifold.place(start_of(made)[0])
     assert place is not None
-    found = list(walk(manifold, place, ranks.POSITIONS))
-    assert len(found) == (ranks.POSITIONS if made.closure and made.closure.freedoms else 0)
+    found = list(random_walk(manifold, place, ranks.SAMPLE_COUNT))
+    assert len(found) == (ranks.SAMPLE_COUNT if made.closure and made.closure.freedoms else 0)
     for there in found:
         assert np.max(np.abs(there.phi)) < 1e-14 * (1 + np.max(np.abs(there.q)))
     far = np.ptp([p.q for p in found], axis=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from sympy import Expr, cos, expand, sin, symbols
 
-from eomc.program.factors import powers_alone
+from eomc.program.factors import has_only_repeated_factors
 
 x, y, length = symbols("x y l")
 
@@ -21,7 +21,7 @@ x, y, length = symbols("x y l")
     ],
 )
 def test_a_product_of_powers_is_seen_written_out(formula: Expr) -> None:
-    assert powers_alone(expand(formula), {x, y})
+    assert has_only_repeated_factors(expand(formula), {x, y})
 
 
 @pytest.mark.parametrize(
@@ -38,4 +38,4 @@ def test_a_product_of_powers_is_seen_written_out(formula: Expr) -> None:
 )
 def test_others_are_left_alone(formula: Expr) -> None:
     """Where one factor is there once, or a parameter is squared; what is long is not looked at."""
-    assert not powers_alone(formula, {x, y})
+    assert not has_only_repeated_factors(formula, {x, y})

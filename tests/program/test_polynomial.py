@@ -7,18 +7,18 @@ from fractions import Fraction
 import pytest
 from sympy import S
 
-from eomc.program.polynomial import MOST_BITS, MOST_EXPONENT, TooLargeError, _bounded
+from eomc.program.polynomial import MAX_BITS, MAX_EXPONENT, TooLargeError, _bounded
 
 
 def test_long_exponents_and_numbers_are_not_multiplied_out() -> None:
     """Beyond a bound they would take minutes and gigabytes."""
-    most, one = Fraction(MOST_EXPONENT), Fraction(1)
-    fits = {(("x", -most), ("y", most)): S(2) ** (MOST_BITS - 2)}
+    most, one = Fraction(MAX_EXPONENT), Fraction(1)
+    fits = {(("x", -most), ("y", most)): S(2) ** (MAX_BITS - 2)}
     assert _bounded(fits) == fits
     for monomial, number in (
         ((("x", most + 1), ("y", one)), S.One),
         ((("x", one), ("y", -most - 1)), S.One),
-        ((("x", one),), S(2) ** MOST_BITS),
+        ((("x", one),), S(2) ** MAX_BITS),
     ):
         with pytest.raises(TooLargeError):
             _bounded({monomial: number})

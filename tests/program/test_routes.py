@@ -18,21 +18,21 @@ from eomc.program import admissible
 from eomc.program.interpret import evaluate, nearby
 from eomc.program.ir import Cost, Function
 from eomc.program.lower import lower
-from eomc.program.routes import ROUTES, Material
+from eomc.program.routes import ROUTES, RouteInputs
 
 SCENES = ("simple_pendulum", "cartpole", "cartpole_bodies", "suspension")
 
 
 @cache
 def solutions(scene: str) -> dict[str, Solution]:
-    material = Material(derive(scene_system(scene)))
+    material = RouteInputs(derive(scene_system(scene)))
     ways = {route.name: route.accelerations(material) for route in ROUTES.values()}
     return {name: way for name, way in ways.items() if isinstance(way, Solution)}
 
 
 def test_each_is_good_for_something() -> None:
     used = {name for scene in SCENES for name in solutions(scene)}
-    material = Material(derive(scene_system("cartpole_bodies")))
+    material = RouteInputs(derive(scene_system("cartpole_bodies")))
     used |= {r.name for r in ROUTES.values() if r.functions(material)}
     assert used == ROUTES.keys()
 
@@ -56,7 +56,7 @@ def test_all_agree_in_forty_digits(scene: str) -> None:
 
 def test_rotations_there_and_back_cancel_in_c() -> None:
     """Of a box that tumbles; another entry than by Newton and Euler, and the same number."""
-    material = Material(derive(scene_system("tumbling_box")))
+    material = RouteInputs(derive(scene_system("tumbling_box")))
     plain, short = (ROUTES[name].functions(material) for name in ("newton-euler", "rotated"))
     assert plain is not None and short is not None
     made = [lower("C", f.tape, f.outputs["C"]) for f in (plain, short)]

@@ -153,7 +153,7 @@ def test_parts_are_the_whole() -> None:
     """What stands in the first part hangs on neither time, inputs nor velocities."""
     accelerations = Accelerations(odd_target())
     function, parts = accelerations.whole, accelerations.parts
-    assert parts is not None and len(accelerations.angles) >= two_point.FEWEST
+    assert parts is not None and len(accelerations.angles) >= two_point.MIN_ANGLES
     sines = {name for a in accelerations.angles for name in (a.sine, a.cosine)}
     early = {"phase", "m", *(a.name for a in function.early)}
     assert parts.configuration.uses <= {"x", "a", "b", "c", "d", "e"} | sines | early
@@ -183,7 +183,7 @@ def test_what_is_known_last_comes_last() -> None:
     function = odd_target().program["acceleration"]
     body = tuple(Assignment(name, value, Stage.VELOCITY) for name, value in values.items())
     outputs = (Operand(S.One, "sum"), Operand(S.One, "both"))
-    made = two_point._last_come_last(replace(function, body=body, outputs=outputs))
+    made = two_point._sort_by_latency(replace(function, body=body, outputs=outputs))
     found = {a.name: a.value for a in made.body}
     assert found["sum"] == Sum((u, late, last))
     assert found["both"] == Sum(((S.NegativeOne, "then"), (S.One, "soon")))

@@ -19,7 +19,7 @@ from eomc.model.from_scene import from_scene
 from eomc.model.system import System
 from eomc.program.interpret import evaluator, nearby
 from eomc.program.lower import lower
-from eomc.program.routes import ROUTES, Material
+from eomc.program.routes import ROUTES, RouteInputs
 from eomc.scene.read import parse
 from eomc.verify import symbolic
 
@@ -88,7 +88,7 @@ SOLVED = ["cartpole", "heavy_top", "tumbling_box", "rods3"]
 def test_pivots_are_schur_complements_of_D(name: str) -> None:
     """Beside the diagonal entries that they were; by the articulated route beside a trace."""
     made = chain(3) if name == "rods3" else variant(name)
-    reference, material = symbolic.of(made), Material(lagrange.derive(made))
+    reference, material = symbolic.of(made), RouteInputs(lagrange.derive(made))
     ways = {r.name: r.accelerations(material) for r in ROUTES.values()}
     solved = {r: way for r, way in ways.items() if isinstance(way, Solution) and way.matrix == "D"}
     assert solved

@@ -47,9 +47,9 @@ def command(scene: Path, as_json: bool) -> None:
             "qd": {f"{c.name}_dot": c.rate for c in system.coordinates},
         }
         lines.append(system.closure.table())
-        if nearest := singular.nearest(system):
-            counted["constraints"]["nearest_singular"] = vars(nearest)
-            lines.append(str(nearest))
+        if closest_singularity := singular.closest_singularity(system):
+            counted["constraints"]["nearest_singular"] = vars(closest_singularity)
+            lines.append(str(closest_singularity))
         start = (f"{c.name} = {c.start:.9g}" for c in system.coordinates)
         lines.append(f"  assembled start: {', '.join(start)}")
     say(json.dumps(counted, indent=1) if as_json else "\n".join(lines))

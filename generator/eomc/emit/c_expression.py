@@ -15,7 +15,7 @@ from eomc.base.errors import EomcError
 from eomc.derive.atoms import is_negative
 from eomc.derive.tape import Stage
 from eomc.program.ir import Call, Function, Operand, Product, Sum, Value, rename
-from eomc.program.trig import pair_of
+from eomc.program.trig import names_of_pair
 
 MOST_INLINE = 5  # operations; longer expressions get a name of their own
 SEVERAL = 3  # angles from which on sines are taken side by side
@@ -339,7 +339,7 @@ def _sincos(
     if not real.reach:
         made = {n: stored.get(n, f"const {real.name} {n}") for n in names.values()}
         return [f"{made[n]} = {f}{suffix}({argument});" for f, n in names.items()]
-    one, other = pair_of(names)
+    one, other = names_of_pair(names)
     local = [n for n in (one, other) if n not in stored]
     both = ", ".join(f"&{stored.get(n, n)}" for n in (one, other))
     return [

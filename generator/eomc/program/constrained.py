@@ -1,4 +1,4 @@
-"""What scenes with constraints compute besides: the rows, multipliers, reactions, corrections."""
+"""Functions that systems with constraints have in addition: constraints, multipliers, reactions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from eomc.program.lower import lower
 
 
 def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
-    """Those of a system with constraints. taken: its accelerations."""
+    """Yield the additional functions of a system with constraints. taken: its accelerations."""
     system = derived.system
     if not system.constraints:
         return
@@ -33,25 +33,31 @@ def functions(derived: Derivation, taken: Candidate) -> Iterator[Function]:
         labels=names,
     )  # fmt: skip
     e, values, pivots, correction = min(
-        (_correction(system, e) for e in _both(derived)), key=lambda found: weight(found[-1].cost)
+        (_correction(system, e) for e in _all_equations(derived)),
+        key=lambda candidate: weight(candidate[-1].cost),
     )
     assert e.rows is not None
     yield correction
     if terms := rate_terms(e.tape, e.rows, system.qd):
         yield lower("rate_terms", e.tape, terms, system.names)
     if system.run.discretize:
-        moves = values[: 2 * len(system.q)]
-        both = [*moves, *directional_derivatives(system, e.tape, moves)]
-        yield lower("projection_along", e.tape, both, system.names, checks=pivots)
+        corrections = values[: 2 * len(system.q)]
+        values_and_derivatives = [
+            *corrections,
+            *directional_derivatives(system, e.tape, corrections),
+        ]
+        yield lower("projection_along", e.tape, values_and_derivatives, system.names, checks=pivots)
     if system.reactions:
         yield _reactions(system)
     if system.run.sloped:
-        slopes = [x for r in e.rows.rates for x in e.tape.gradient([(r, S.One)], system.q)]
-        yield lower("constraint_slopes", e.tape, slopes, system.names)
+        gradients = [x for r in e.rows.rates for x in e.tape.gradient([(r, S.One)], system.q)]
+        yield lower("constraint_slopes", e.tape, gradients, system.names)
 
 
 def of_rows(derived: Derivation) -> Iterator[Function]:
-    """The rows, their Jacobian and their rates: what assembling a start needs, besides D."""
+    """Yield residuals, Jacobian and rates of the constraints, which the assembly of a start
+    needs.
+    """
     system, e = derived.system, _equations(derived)
     assert e.rows is not None
     names = [c.name for c in system.constraints]
@@ -63,36 +69,41 @@ def of_rows(derived: Derivation) -> Iterator[Function]:
 
 
 def _equations(derived: Derivation) -> Equations:
-    """The equations that the rows stand beside: the shorter ones, where there are two."""
-    return min(_both(derived), key=lambda e: len(e.tape.live([x for row in e.D for x in row])))
+    """Return the equations with the constraints: the shorter ones if there are two."""
+    return min(
+        _all_equations(derived), key=lambda e: len(e.tape.live([x for row in e.D for x in row]))
+    )
 
 
-def _both(derived: Derivation) -> list[Equations]:
+def _all_equations(derived: Derivation) -> list[Equations]:
+    """Return the equations of motion by Lagrange and by Newton-Euler, where they exist."""
     return [e for e in (derived.lagrange, derived.newton_euler) if e is not None]
 
 
 def _correction(system: System, e: Equations) -> tuple[Equations, Vector, Pairs, Function]:
-    """What steps lack for the rows to hold, by these equations; the pivots; the function of it."""
+    """Derive the projection onto the constraints: the equations, corrections, pivots and the
+    function.
+    """
     assert e.rows is not None
     values, pivots = kkt.projection(e.tape, e.D, e.rows, system.q)
     return e, values, pivots, lower("projection", e.tape, values, system.names, checks=pivots)
 
 
 def _reactions(system: System) -> Function:
-    """Forces and moments in the loops, over the multipliers."""
+    """Return the function of forces and moments in the loops, which depend on the multipliers."""
     values = [x for r in system.reactions for x in r.values]
-    named = tuple(Output(f"reaction_{k}", x) for k, x in enumerate(values))
+    formulas = tuple(Output(f"reaction_{k}", x) for k, x in enumerate(values))
     multipliers = [c.multiplier for c in system.constraints]
-    made = outputs.outputs(
-        replace(system, outputs=named), with_derivatives=False, extra_symbols=multipliers
+    derived = outputs.outputs(
+        replace(system, outputs=formulas), with_derivatives=False, extra_symbols=multipliers
     )
-    return lower("reactions", made.tape, made.values, system.names)
+    return lower("reactions", derived.tape, derived.values, system.names)
 
 
 def weighted(
     functions: Mapping[str, Function], system: System, values: Mapping[str, float]
 ) -> list[tuple[float, list[float]]]:
-    """Weights and entries of the rows beside a singular D. Raises as `evaluate`."""
+    """Return (weight, gradient) of the constraints that make D regular. Raises as `evaluate`."""
     closure = system.closure
     if closure is None or not closure.weights:
         return []

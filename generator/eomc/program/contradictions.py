@@ -1,4 +1,4 @@
-"""Why a start can't be assembled: the rows and held values that contradict, and by how much."""
+"""Diagnosis of a start that cannot be assembled: inconsistent constraints and fixed values."""
 
 from __future__ import annotations
 
@@ -13,61 +13,79 @@ from eomc.base.errors import Problem
 from eomc.base.texts import listed
 from eomc.model.symbols import Constraint
 from eomc.model.system import System
-from eomc.program.factors import powers_alone
+from eomc.program.factors import has_only_repeated_factors
 from eomc.program.manifold import RANK_TOLERANCE, Flags, Frame, Manifold, Place, Vector
 
-PART = 0.01  # of the row that is furthest from zero: a row contradicts
-MOST = 12  # held values that are let go one by one
-FAR = 3  # values that a message proposes
-FEW, SMALL = 8, 24  # rows that are left out one by one, and coordinates of a system where they are
-PLACES = 6  # beside one, at which rows are compared
+VIOLATED_FRACTION = 0.01  # residuals below this fraction of the largest one are not reported
+MAX_RELEASED_VALUES = 12  # fixed values that are released one by one
+MAX_PROPOSALS = 3  # values that a message proposes
+# Inconsistent constraints are reduced to a minimal set up to this number and system size.
+MAX_CONSTRAINTS, MAX_COORDINATES = 8, 24
+SAMPLE_COUNT = 6  # nearby configurations at which constraints are compared
 ALONE = "None changes alone: leave one out, or correct a formula or a parameter"
 BY_ITSELF = "each thing that is zero by itself, x and y for x**2 + y**2"
-LONGEST = 60  # characters of a formula that a message writes out
-NEAR = 0.1  # of the coordinates' size: how far beside
+MAX_FORMULA_LENGTH = 60  # characters of a formula in a message
+SAMPLE_DISTANCE = 0.1  # of these configurations, relative to the largest coordinate
 
 
 def key(row: Constraint) -> str:
-    """Where a scene has the row."""
+    """Return the scene key of a constraint."""
     return f"loop.{row.loop}" if row.loop else f"constraints.{row.name}"
 
 
-def of_positions(manifold: Manifold, free: Flags, stuck: Place) -> Iterator[Problem]:
-    """What is wrong with a start. stuck: where assembling it ended."""
+def of_positions(manifold: Manifold, free: Flags, configuration: Place) -> Iterator[Problem]:
+    """Report why the positions cannot be assembled. stuck: the configuration where assembly
+    ended.
+    """
     system = manifold.system
-    step = Frame(stuck, free, manifold.holonomic).exactly_onto(stuck.phi)
-    nearer = manifold.place(stuck.q + step, stuck.t)
-    stuck = nearer if nearer is not None and nearer.off <= stuck.off else stuck
-    off = np.abs(stuck.phi / stuck.sizes)
-    rows = [k for k in manifold.holonomic if off[k] > PART * np.max(off)]
+    step = Frame(configuration, free, manifold.holonomic).exactly_onto(configuration.phi)
+    nearer = manifold.place(configuration.q + step, configuration.t)
+    configuration = (
+        nearer if nearer is not None and nearer.off <= configuration.off else configuration
+    )
+    residuals = np.abs(configuration.phi / configuration.sizes)
+    rows = [k for k in manifold.holonomic if residuals[k] > VIOLATED_FRACTION * np.max(residuals)]
     involved = [k for k in np.flatnonzero(free == 0) if np.any(manifold.reads[rows, k])]
-    ways: list[tuple[float, str]] = []
-    for k in involved[:MOST]:
-        found = _closed(manifold, free | (np.arange(len(free)) == k), stuck)
-        if found is not None:
+    proposals: list[tuple[float, str]] = []
+    for k in involved[:MAX_RELEASED_VALUES]:
+        released = _assemble_near(manifold, free | (np.arange(len(free)) == k), configuration)
+        if released is not None:
             c = system.coordinates[k]
-            ways.append((abs(found.q[k] - c.start), f"{c.name} {_to(c.start, found.q[k])}"))
+            proposals.append(
+                (
+                    abs(released.q[k] - c.start),
+                    f"{c.name} {_required_value(c.start, released.q[k])}",
+                )
+            )
     row = system.constraints[rows[0]]
-    held = listed([f"{system.coordinates[k].name} = {stuck.q[k]:.6g}" for k in involved])
-    others = _beside(system.constraints, rows)
-    if ways:
-        told = ", or ".join(text for _, text in sorted(ways)[:FAR])
+    fixed_values = listed(
+        [f"{system.coordinates[k].name} = {configuration.q[k]:.6g}" for k in involved]
+    )
+    others = _together_with(system.constraints, rows)
+    if proposals:
+        proposed = ", or ".join(text for _, text in sorted(proposals)[:MAX_PROPOSALS])
         message = (
-            f"can't be zero{others} with {held} held: {told}. Correct a start, or let it move: "
-            "guess = true"
+            f"can't be zero{others} with {fixed_values} held: {proposed}. Correct a start, or "
+            "let it move: guess = true"
         )
     else:
-        whole = _closed(manifold, np.ones(len(free), dtype=bool), stuck) if involved else None
-        if whole is not None:
-            moved = [
-                f"{system.coordinates[k].name} {_to(stuck.q[k], whole.q[k])}" for k in involved
+        assembled = (
+            _assemble_near(manifold, np.ones(len(free), dtype=bool), configuration)
+            if involved
+            else None
+        )
+        if assembled is not None:
+            changes = [
+                f"{system.coordinates[k].name} "
+                f"{_required_value(configuration.q[k], assembled.q[k])}"
+                for k in involved
             ]
             message = (
-                f"can't be zero{others} with {held} held, nor with one of them let go: together "
-                f"{', '.join(moved)}. Correct them, or let them move: guess = true"
+                f"can't be zero{others} with {fixed_values} held, nor with one of them let go: "
+                f"together {', '.join(changes)}. Correct them, or let them move: guess = true"
             )
         else:
-            yield _apart(manifold, rows, stuck)
+            yield _inconsistent(manifold, rows, configuration)
             return
     yield system.problem(key(row), message)
 
@@ -75,204 +93,251 @@ def of_positions(manifold: Manifold, free: Flags, stuck: Place) -> Iterator[Prob
 def of_rates(
     manifold: Manifold, free: Flags, place: Place, q: Sequence[Any], rates: Vector
 ) -> Iterator[Problem]:
-    """What is wrong with the rates of a start. rates: those that leave the rows least off."""
+    """Report initial velocities that violate the constraints; `rates` minimise the residual."""
     system = manifold.system
-    if clash := _clash(manifold, place):
-        yield _apart_in_time(manifold, clash, place)
+    if clash := _inconsistent_set(manifold, place):
+        yield _inconsistent_rates(manifold, clash, place)
         return
-    off = np.abs(manifold.value("constraint_rates", place.q, rates, 0.0) / place.sizes)
-    rows = [k for k in manifold.rows if off[k] > PART * np.max(off)]
+    residuals = np.abs(manifold.value("constraint_rates", place.q, rates, 0.0) / place.sizes)
+    rows = [k for k in manifold.rows if residuals[k] > VIOLATED_FRACTION * np.max(residuals)]
     involved = [k for k in np.flatnonzero(free == 0) if np.any(place.A[rows, k] != 0)]
-    ways: list[tuple[float, str]] = []
-    for k in involved[:MOST]:
-        found, held = manifold.rates(place, list(q), rates, free | (np.arange(len(free)) == k))
+    proposals: list[tuple[float, str]] = []
+    for k in involved[:MAX_RELEASED_VALUES]:
+        new_rates, consistent = manifold.rates(
+            place, list(q), rates, free | (np.arange(len(free)) == k)
+        )
         rate = system.coordinates[k].rate
-        if held:
+        if consistent:
             name = f"{system.coordinates[k].name}_dot"
-            ways.append((abs(float(found[k]) - rate), f"{name} {_to(rate, float(found[k]))}"))
-    row, others = system.constraints[rows[0]], _beside(system.constraints, rows)
-    given = listed([f"{system.coordinates[k].name}_dot = {rates[k]:.6g}" for k in involved])
-    if ways:
-        told = ", or ".join(text for _, text in sorted(ways)[:FAR])
+            proposals.append(
+                (
+                    abs(float(new_rates[k]) - rate),
+                    f"{name} {_required_value(rate, float(new_rates[k]))}",
+                )
+            )
+    row, others = system.constraints[rows[0]], _together_with(system.constraints, rows)
+    fixed_values = listed([f"{system.coordinates[k].name}_dot = {rates[k]:.6g}" for k in involved])
+    if proposals:
+        proposed = ", or ".join(text for _, text in sorted(proposals)[:MAX_PROPOSALS])
         message = (
-            f"changes at the start{others}, with {given} held: {told}. Correct a rate, or leave "
-            "it out, and it follows"
+            f"changes at the start{others}, with {fixed_values} held: {proposed}. Correct "
+            "a rate, or leave it out, and it follows"
         )
     else:
         message = (
-            f"changes at the start{others}, with {given} held, nor does one of them alone mend it: "
-            "leave them out, and they follow"
+            f"changes at the start{others}, with {fixed_values} held, nor does one of "
+            "them alone mend it: leave them out, and they follow"
         )
     yield system.problem(key(row), message)
 
 
-def _apart(manifold: Manifold, rows: Sequence[int], stuck: Place) -> Problem:
-    """Rows that no positions near make zero together, whatever is held."""
+def _inconsistent(manifold: Manifold, rows: Sequence[int], configuration: Place) -> Problem:
+    """Report constraints that cannot be satisfied together near the start, whatever values are
+    fixed.
+    """
     constraints = manifold.system.constraints
-    rows = _needed(manifold, rows, stuck)
-    left = ", ".join(f"{constraints[k].name} is {stuck.phi[k]:.2g}" for k in rows[:FAR])
-    row, others = constraints[rows[0]], _beside(constraints, rows)
-    if len(rows) > 1 and _alike(manifold, rows, stuck):
-        why = f"contradicts {_names(constraints, rows[1:])}: where they are least, {left}. {ALONE}"
+    rows = _needed(manifold, rows, configuration)
+    residuals = ", ".join(
+        f"{constraints[k].name} is {configuration.phi[k]:.2g}" for k in rows[:MAX_PROPOSALS]
+    )
+    row, others = constraints[rows[0]], _together_with(constraints, rows)
+    if len(rows) > 1 and _alike(manifold, rows, configuration):
+        message = (
+            f"contradicts {_names(constraints, rows[1:])}: where they are least, {residuals}. "
+            f"{ALONE}"
+        )
     else:
         leave = ", leave one out," if others else ""
-        why = (
-            f"can't be zero{others} near the start: the search for a position ends where {left}. "
-            f"Correct a formula or a parameter{leave} or start closer to a position that closes"
+        message = (
+            f"can't be zero{others} near the start: the search for a position ends where "
+            f"{residuals}. Correct a formula or a parameter{leave} or start closer to a position "
+            "that closes"
         )
-    return manifold.system.problem(key(row), why)
+    return manifold.system.problem(key(row), message)
 
 
-def _apart_in_time(manifold: Manifold, rows: Sequence[int], place: Place) -> Problem:
-    """Rows that no rates keep at zero, whatever is held."""
+def _inconsistent_rates(manifold: Manifold, rows: Sequence[int], place: Place) -> Problem:
+    """Report constraints that no velocities satisfy, whatever values are fixed."""
     constraints = manifold.system.constraints
-    row, others = constraints[rows[0]], _beside(constraints, rows)
+    row, others = constraints[rows[0]], _together_with(constraints, rows)
     if len(rows) > 1 and _alike(manifold, rows, place):
-        why = f"contradicts {_names(constraints, rows[1:])}: no rates keep them zero. {ALONE}"
+        message = f"contradicts {_names(constraints, rows[1:])}: no rates keep them zero. {ALONE}"
     else:
-        why = (
+        message = (
             f"changes at the start{others}, and no rates mend it: the start is a singular "
             "position. Start beside it, or correct a formula"
         )
-    return manifold.system.problem(key(row), why)
+    return manifold.system.problem(key(row), message)
 
 
-def _needed(manifold: Manifold, rows: Sequence[int], stuck: Place) -> list[int]:
-    """Rows that contradict, without those that nothing depends on."""
-    system, free = manifold.system, np.ones(len(stuck.q), dtype=bool)
-    if not 2 < len(rows) <= FEW or len(free) > SMALL:
+def _needed(manifold: Manifold, rows: Sequence[int], configuration: Place) -> list[int]:
+    """Reduce inconsistent constraints to those that are needed for the inconsistency."""
+    system, free = manifold.system, np.ones(len(configuration.q), dtype=bool)
+    if not 2 < len(rows) <= MAX_CONSTRAINTS or len(free) > MAX_COORDINATES:
         return list(rows)
 
-    def closes(some: Sequence[int]) -> bool:
-        alone = Manifold(replace(system, constraints=tuple(system.constraints[k] for k in some)))
-        return _closed(alone, free, stuck) is not None
+    def is_consistent(subset: Sequence[int]) -> bool:
+        """Return True if the given constraints can be satisfied together."""
+        manifold_of_some = Manifold(
+            replace(system, constraints=tuple(system.constraints[k] for k in subset))
+        )
+        return _assemble_near(manifold_of_some, free, configuration) is not None
 
-    return _fewest(rows, closes)
+    return _fewest(rows, is_consistent)
 
 
 def _fewest(rows: Sequence[int], hold: Callable[[Sequence[int]], bool]) -> list[int]:
-    """Rows without those that the others fail to hold without, the last of them first."""
-    kept = list(rows)
+    """Remove constraints, the last first, as long as the remaining ones do not satisfy `hold`."""
+    remaining = list(rows)
     for k in reversed(rows):
-        fewer = [i for i in kept if i != k]
-        if fewer and not hold(fewer):
-            kept = fewer
-    return kept
+        candidate = [i for i in remaining if i != k]
+        if candidate and not hold(candidate):
+            remaining = candidate
+    return remaining
 
 
-def _clash(manifold: Manifold, place: Place) -> list[int]:
-    """Rows that no rates keep at zero, none of them without need; none where some rates do."""
+def _inconsistent_set(manifold: Manifold, place: Place) -> list[int]:
+    """Return a minimal set of constraints that no velocities satisfy; empty if some velocities
+    do.
+    """
     A = Frame(place, np.ones(len(place.q), dtype=bool), manifold.rows).B
-    aim = manifold.value("constraint_rates", place.q, 0 * place.q, place.t) / place.sizes
+    rates = manifold.value("constraint_rates", place.q, 0 * place.q, place.t) / place.sizes
 
-    def kept(rows: Sequence[int]) -> bool:
+    def is_consistent(rows: Sequence[int]) -> bool:
+        """Return True if some velocities satisfy the given constraints."""
         U, s, _ = np.linalg.svd(A[rows], full_matrices=False)
-        within = U[:, s > RANK_TOLERANCE]
-        left = aim[rows] - within @ (within.T @ aim[rows])
-        return bool(np.linalg.norm(left) <= RANK_TOLERANCE * np.linalg.norm(aim))
+        basis = U[:, s > RANK_TOLERANCE]
+        residual = rates[rows] - basis @ (basis.T @ rates[rows])
+        return bool(np.linalg.norm(residual) <= RANK_TOLERANCE * np.linalg.norm(rates))
 
-    return [] if kept(manifold.rows) else _fewest(manifold.rows, kept)
+    return [] if is_consistent(manifold.rows) else _fewest(manifold.rows, is_consistent)
 
 
 def _alike(manifold: Manifold, rows: Sequence[int], place: Place) -> bool:
-    """Whether the rows depend on each other beside a place too."""
+    """Return True if the constraints are also dependent at nearby configurations."""
     free, random = np.ones(len(place.q), dtype=bool), np.random.default_rng(5)
-    reach = NEAR * (float(np.max(np.abs(place.q))) or 1.0)
-    for _ in range(PLACES):
-        beside = manifold.place(place.q + reach * random.normal(size=len(free)), place.t)
-        if beside is not None and len(rows) <= len(free):
-            if Frame(beside, free, rows).parts[1][-1] > RANK_TOLERANCE:
+    distance = SAMPLE_DISTANCE * (float(np.max(np.abs(place.q))) or 1.0)
+    for _ in range(SAMPLE_COUNT):
+        nearby = manifold.place(place.q + distance * random.normal(size=len(free)), place.t)
+        if nearby is not None and len(rows) <= len(free):
+            if Frame(nearby, free, rows).parts[1][-1] > RANK_TOLERANCE:
                 return False
     return True
 
 
 def powers(system: System) -> list[int]:
-    """Rows that their formulas alone show to have no slope where they hold.
+    """Return constraints whose formulas show that their gradient vanishes wherever they hold.
 
-    A power above 1, or a sum of even ones, with numbers before them; a power that is written out.
+    These are powers above 1, sums of even powers with coefficients of one sign, and expanded
+    powers.
     """
-    found, moving = [], {*system.q}
+    indices, coordinates = [], {*system.q}
     for k, c in enumerate(system.constraints):
         terms = [term.as_coeff_Mul() for term in Add.make_args(c.formula)]
         exponents = [power.as_base_exp()[1] for _, power in terms]
         signs = {bool(factor > 0) for factor, _ in terms}
-        alike = len(signs) == 1 and all(e.is_even and e > 0 for e in exponents)
-        alone = len(terms) == 1 and exponents[0].is_number and exponents[0] > 1
-        if c.holonomic and (alone or alike or (not c.loop and powers_alone(c.formula, moving))):
-            found.append(k)
-    return found
+        same_sign_even = len(signs) == 1 and all(e.is_even and e > 0 for e in exponents)
+        single_power = len(terms) == 1 and exponents[0].is_number and exponents[0] > 1
+        if c.holonomic and (
+            single_power
+            or same_sign_even
+            or (not c.loop and has_only_repeated_factors(c.formula, coordinates))
+        ):
+            indices.append(k)
+    return indices
 
 
 def of_slopes(system: System, flat: Sequence[int]) -> Iterator[Problem]:
-    """What is wrong with rows that have no slope where they hold: with all, where none is told."""
+    """Report constraints whose gradient vanishes wherever they hold; all constraints if `flat` is
+    empty.
+    """
     for row in [system.constraints[k] for k in flat]:
         base, power = row.formula.as_coeff_Mul()[1].as_base_exp()
-        if power == 1 and powers_alone(row.formula, {*system.q}):  # of one that is written out
+        if power == 1 and has_only_repeated_factors(
+            row.formula, {*system.q}
+        ):  # of one that is written out
             base, power = sqf_part(row.formula), Integer(2)
-        simple = power.is_number and power != 1 and not base.is_Number and len(str(base)) < LONGEST
-        instead = f"{base} for {row.formula}" if simple else BY_ITSELF
-        why = f"has no slope where it holds, and so no force: write {instead}"
-        yield system.problem(key(row), why)
+        simple = (
+            power.is_number
+            and power != 1
+            and not base.is_Number
+            and len(str(base)) < MAX_FORMULA_LENGTH
+        )
+        alternative = f"{base} for {row.formula}" if simple else BY_ITSELF
+        message = f"has no slope where it holds, and so no force: write {alternative}"
+        yield system.problem(key(row), message)
     if not flat:
-        why = f"have no slope where they hold, and so no force: write {BY_ITSELF}"
-        yield system.problem("constraints", why)
+        message = f"have no slope where they hold, and so no force: write {BY_ITSELF}"
+        yield system.problem("constraints", message)
 
 
-def of_inertia(system: System, loose: Sequence[int]) -> Problem:
-    """What moves without inertia, and without a row that holds it."""
-    names = [system.coordinates[k].name for k in loose]
-    why = (
+def of_inertia(system: System, unresisted: Sequence[int]) -> Problem:
+    """Report coordinates that move without inertia and without a constraint that fixes them."""
+    names = [system.coordinates[k].name for k in unresisted]
+    message = (
         f"{listed(names)} {'can move' if len(names) == 1 else 'can move together'} without moving "
         "anything that has mass or inertia, and no row holds "
         f"{'it' if len(names) == 1 else 'them'}: give what moves a mass, or add a row"
     )
-    return system.problem(f"coordinates.{names[0]}", why)
+    return system.problem(f"coordinates.{names[0]}", message)
 
 
 def of_values(manifold: Manifold, q: Vector) -> Iterator[Problem]:
-    """What has no value, or no slope, at a start."""
-    system, n = manifold.system, 0
+    """Report expressions that have no value, or no gradient, at a start."""
+    system, count = manifold.system, 0
     for k, c in enumerate(system.constraints):
-        alone = Manifold(replace(system, constraints=(c,)))
-        what = ("constraints", "value"), ("constraint_jacobian", "slope")
-        for name, called in what:
-            if not np.all(np.isfinite(alone.value(name, q, 0 * q, 0.0))):
-                at = _written(manifold, np.flatnonzero(manifold.reads[k]), q)
-                why = f"has no {called} at {at}: start where it has one, or guess closer to it"
-                yield system.problem(key(c), why)
-                n += 1
+        manifold_of_one = Manifold(replace(system, constraints=(c,)))
+        functions = ("constraints", "value"), ("constraint_jacobian", "slope")
+        for name, quantity in functions:
+            if not np.all(np.isfinite(manifold_of_one.value(name, q, 0 * q, 0.0))):
+                position = _values_text(manifold, np.flatnonzero(manifold.reads[k]), q)
+                message = (
+                    f"has no {quantity} at {position}: start where it has one, or guess closer "
+                    "to it"
+                )
+                yield system.problem(key(c), message)
+                count += 1
                 break
-    if not n:
-        at = _written(manifold, range(len(q)), q)
-        yield system.problem("energy.kinetic", f"has no value at the start, {at}: start elsewhere")
+    if not count:
+        position = _values_text(manifold, range(len(q)), q)
+        yield system.problem(
+            "energy.kinetic", f"has no value at the start, {position}: start elsewhere"
+        )
 
 
-def _written(manifold: Manifold, some: Iterable[int], q: Vector) -> str:
-    names = [(manifold.system.coordinates[k].name, q[k]) for k in some]
+def _values_text(manifold: Manifold, indices: Iterable[int], q: Vector) -> str:
+    """Return "q1 = 1 and q2 = 2" for the given coordinates."""
+    names = [(manifold.system.coordinates[k].name, q[k]) for k in indices]
     return listed([f"{name} = {value:.6g}" for name, value in names])
 
 
-def _closed(manifold: Manifold, free: Flags, stuck: Place) -> Place | None:
-    """Where the rows hold with those coordinates free, close to where they do not."""
+def _assemble_near(manifold: Manifold, free: Flags, configuration: Place) -> Place | None:
+    """Return a configuration close to `stuck` that satisfies the constraints with `free`
+    coordinates.
+    """
     for strict in (True, False):
-        found, held = manifold.descend(stuck.q, free, stuck.t, strict)
-        if held and found is not None:
-            return found
+        result, converged = manifold.descend(configuration.q, free, configuration.t, strict)
+        if converged and result is not None:
+            return result
     return None
 
 
-def _beside(constraints: Sequence[Constraint], rows: Sequence[int]) -> str:
+def _together_with(constraints: Sequence[Constraint], rows: Sequence[int]) -> str:
+    """Return " together with ..." for the constraints after the first."""
     return f" together with {_names(constraints, rows[1:])}" if len(rows) > 1 else ""
 
 
 def _names(constraints: Sequence[Constraint], rows: Sequence[int]) -> str:
+    """Return the names of constraints as a list in words."""
     return listed([constraints[k].name for k in rows])
 
 
-def _to(before: float, after: float) -> str:
-    """The value it would need, with digits enough to show the difference."""
+def _required_value(before: float, after: float) -> str:
+    """Return the required value, with enough digits to differ from the value before."""
     for digits in range(4, 18):
-        one, other = f"{before:.{digits}g}", f"{after:.{digits}g}"
-        if one != other and abs(float(other) - after) < 0.05 * abs(after - before):
+        shown_before, shown_after = f"{before:.{digits}g}", f"{after:.{digits}g}"
+        if shown_before != shown_after and abs(float(shown_after) - after) < 0.05 * abs(
+            after - before
+        ):
             break
-    return f"would have to be {other} ({after - before:+.2g})"
+    return f"would have to be {shown_after} ({after - before:+.2g})"

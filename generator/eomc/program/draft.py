@@ -1,4 +1,4 @@
-"""Right-hand sides of one function, while they are being put in order."""
+"""Assignments of one function while they are simplified and put in order."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from eomc.derive.tape import Stage
 from eomc.program.ir import Assignment, Operand, Product, Sum, Value, renamed_value
 
 
-class Draft:
-    """Values by name, with the stage and the wished-for name of each."""
+class ScheduleBuilder:
+    """Right-hand sides by name, with the binding time and the preferred name of each."""
 
     def __init__(self) -> None:
         self.values: dict[str, Value] = {}
@@ -20,14 +20,14 @@ class Draft:
         self.made = 0
 
     def new(self, value: Value) -> str:
-        """The name of a value, made up where it has none."""
+        """Return the name of a value, adding it under a new name if it has none."""
         if value not in self.known:
             self.made += 1
             self.put(f"_n{self.made:06d}", value)
         return self.known[value]
 
     def put(self, name: str, value: Value) -> None:
-        """Set what a name stands for."""
+        """Set the right-hand side of a name."""
         old = self.values.get(name)
         if old is not None:
             if old == value:
@@ -39,18 +39,18 @@ class Draft:
         self.stages[name] = self.stage(value)
 
     def stage(self, value: Value) -> Stage:
-        """When a value becomes known."""
+        """Return the binding time of a value."""
         return max((self.stages[n] for n in value.names), default=Stage.NUMBER)
 
     def uses(self, ends: Iterable[Operand]) -> Counter[str]:
-        """How often each name is read."""
+        """Count how often each name is read."""
         uses: Counter[str] = Counter(o.name for o in ends if o.name)
         for value in self.values.values():
             uses.update(value.names)
         return uses
 
     def drop(self, ends: Iterable[Operand]) -> None:
-        """Remove what no end needs; replace plain aliases by what they stand for."""
+        """Remove values that no output depends on."""
         needed: set[str] = set()
         queue = [o.name for o in ends if o.name]
         while queue:
@@ -62,13 +62,13 @@ class Draft:
         self.known = {v: n for n, v in reversed(self.values.items())}
 
     def sort(self) -> None:
-        """Definitions before their uses, stages anew."""
+        """Put definitions before their uses and update their binding times."""
         self.values = {name: self.values[name] for name in _in_order(self.values)}
         for name, value in self.values.items():
             self.stages[name] = self.stage(value)
 
     def assignments(self, ends: list[Operand]) -> list[Assignment]:
-        """The values by stage and then in order; aliases are gone."""
+        """Return the assignments by binding time, without aliases."""
         aliases: dict[str, Operand] = {}
         for name, value in self.values.items():
             single: Operand | None = None
@@ -80,6 +80,7 @@ class Draft:
                 aliases[name] = aliases.get(single.name, single)
 
         def real(name: str) -> str:
+            """Return the name that an alias stands for."""
             return aliases[name].name if name in aliases else name
 
         for name, value in list(self.values.items()):
@@ -95,16 +96,16 @@ class Draft:
 
 
 def _in_order(values: Mapping[str, Value]) -> list[str]:
-    """Names so that each stands after those it is made of, otherwise as they came."""
-    done: dict[str, None] = {}
+    """Sort names topologically, otherwise in the given order."""
+    sorted_names: dict[str, None] = {}
     for start in values:
         stack = [start]
         while stack:
             name = stack[-1]
-            missing = [n for n in values[name].names if n in values and n not in done]
+            missing = [n for n in values[name].names if n in values and n not in sorted_names]
             if missing:
                 stack.extend(reversed(missing))
             else:
-                done.setdefault(name)
+                sorted_names.setdefault(name)
                 stack.pop()
-    return list(done)
+    return list(sorted_names)

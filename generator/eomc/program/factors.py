@@ -1,4 +1,4 @@
-"""Whether a formula is a product of powers, seen without factoring it."""
+"""Detection of products of powers without factoring."""
 
 from __future__ import annotations
 
@@ -8,59 +8,60 @@ from typing import Any
 
 from sympy import QQ, Expr, ring
 
-LARGEST = 10**6  # of the numbers that stand for what is no sum, product or power
-MOST = 60  # the degree of a polynomial that is looked at
+MAX_RANDOM = 10**6  # of the random numbers that replace variables and functions
+MAX_DEGREE = 60  # of a polynomial that is factored
 
 
-def powers_alone(formula: Expr, moving: Set[Expr]) -> bool:
-    """Whether each factor of a formula that depends on `moving` is there more than once.
+def has_only_repeated_factors(formula: Expr, moving: Set[Expr]) -> bool:
+    """Return True if every factor of a formula that depends on `moving` occurs at least twice.
 
-    Looked at on a random line through all that it is a polynomial in, coordinates and functions of
-    them: there the factors of one and another are alike, but for lines that chance hardly finds
-    (Hilbert's irreducibility), and a polynomial in one variable tells by its derivative. A sum of
-    squares that is written out is no product, and is not seen; nor is one of a high degree.
+    The formula is restricted to a random line through the space of its variables and function
+    values. Different factors remain different there with probability 1 (Hilbert's irreducibility
+    theorem), and square-free decomposition of a polynomial in one variable is cheap. Expanded sums
+    of squares and polynomials of high degree are not detected.
     """
     try:
-        _, factors = _Line(moving).of(formula).sqf_list()
+        _, factors = _Line(moving).restrict(formula).sqf_list()
     except OverflowError:
         return False
     return bool(factors) and all(times > 1 for _, times in factors)
 
 
 def _bounded(degree: int) -> None:
-    """Raise OverflowError where a polynomial would take long."""
-    if degree > MOST:
+    """Raise OverflowError if the degree of a polynomial is too high."""
+    if degree > MAX_DEGREE:
         raise OverflowError
 
 
 class _Line:
-    """Polynomials along a random line, in its parameter."""
+    """Polynomials in the parameter s of a random line."""
 
     def __init__(self, moving: Set[Expr]) -> None:
         self.moving, self.draw = moving, random.Random(11)
         self.ring, self.s = ring("s", QQ)
         self.known: dict[Expr, Any] = {}
 
-    def of(self, e: Expr) -> Any:
-        """What an expression is on the line."""
+    def restrict(self, e: Expr) -> Any:
+        """Return the restriction of an expression to the line."""
         if e not in self.known:
-            self.known[e] = self._made(e)
+            self.known[e] = self._compute(e)
         return self.known[e]
 
-    def _made(self, e: Expr) -> Any:
+    def _compute(self, e: Expr) -> Any:
+        """Compute the restriction of an expression to the line."""
         if e.is_Rational:
             return self.ring(QQ.from_sympy(e))
         if e.is_Add:
-            return sum((self.of(x) for x in e.args), self.ring(0))
+            return sum((self.restrict(x) for x in e.args), self.ring(0))
         if e.is_Mul:
-            product, factors = self.ring(1), [self.of(x) for x in e.args]
+            product, factors = self.ring(1), [self.restrict(x) for x in e.args]
             _bounded(sum(f.degree() for f in factors if f))
             for x in factors:
                 product *= x
             return product
         if e.is_Pow and e.exp.is_Integer and e.exp > 0:
-            base = self.of(e.base)
+            base = self.restrict(e.base)
             _bounded(max(base.degree(), 1) * int(e.exp))
             return base ** int(e.exp)
-        start, slope = (self.draw.randint(1, LARGEST) for _ in range(2))
+        start, slope = (self.draw.randint(1, MAX_RANDOM) for _ in range(2))
         return start + (slope * self.s if e.free_symbols & self.moving else self.ring(0))

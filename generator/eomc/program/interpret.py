@@ -1,4 +1,4 @@
-"""Functions evaluated in Python, in doubles or in forty digits, and states to evaluate them at."""
+"""Evaluation of functions in Python, in doubles or 40 digits, and states to evaluate them at."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from eomc.model.system import System, t
 from eomc.program.ir import Function, Operand, Product, Sum, Value
 from eomc.scene import formulas
 
-DIFFERENCE = 2.0**-20  # relative step of a difference: six digits are enough for an error bound
+DIFFERENCE = 2.0**-20  # relative step of finite differences; six digits suffice for error bounds
 
 _DOUBLES: Mapping[str, Callable[..., Any]] = {
     **formulas.NUMERIC,
@@ -28,7 +28,7 @@ _DOUBLES: Mapping[str, Callable[..., Any]] = {
 
 @cache
 def context() -> Any:
-    """The numbers of 40 digits, mpmath's."""
+    """Return the mpmath context with 40 digits."""
     mp = mpmath.mp.clone()
     mp.dps = 40
     return mp
@@ -36,7 +36,7 @@ def context() -> Any:
 
 @cache
 def _many_digits() -> Mapping[str, Callable[..., Any]]:
-    """The same in 40 digits."""
+    """Return the functions of `_DOUBLES` for 40 digits."""
     mp = context()
     return {
         **_DOUBLES,
@@ -49,11 +49,28 @@ def _many_digits() -> Mapping[str, Callable[..., Any]]:
 def evaluate(
     function: Function, values: Mapping[str, float], exact: bool = False, unit: float = 2.0**-52
 ) -> tuple[list[float], bool]:
-    """The results of a function, and whether every pivot is positive, beyond rounding by `unit`.
+    """Evaluate a function.
 
-    values: coordinates, velocities, parameters, inputs and t by name. In Python floats, or in 40
-    digits and then rounded where `exact`. Raises ArithmeticError or ValueError where a result is
-    not a finite, real number.
+    Parameters
+    ----------
+    values
+        Coordinates, velocities, parameters, inputs and t by name.
+    exact
+        Compute in 40 digits and round the results, instead of in doubles.
+    unit
+        Unit of rounding, from which the tolerance of the pivots follows.
+
+    Returns
+    -------
+    results : list of float
+        The outputs.
+    regular : bool
+        Whether all pivots are positive beyond rounding.
+
+    Raises
+    ------
+    ArithmeticError, ValueError
+        If a result is not a finite real number.
     """
     return evaluator(function, exact, unit)(values)
 
@@ -61,13 +78,14 @@ def evaluate(
 def evaluator(
     function: Function, exact: bool = False, unit: float = 2.0**-52
 ) -> Callable[[Mapping[str, float]], tuple[list[float], bool]]:
-    """`evaluate` of one function for many states: its numbers are converted once."""
+    """Return `evaluate` for one function and many states, with its numbers converted once."""
     run, atom = _steps(function, _many_digits() if exact else _DOUBLES)
     outputs = [atom(o) for o in function.outputs]
     checks = [(atom(pivot), atom(diagonal)) for pivot, diagonal in function.checks]
     tolerance = 8 * unit * max(1, len(checks))
 
-    def evaluated(values: Mapping[str, float]) -> tuple[list[float], bool]:
+    def evaluate_at(values: Mapping[str, float]) -> tuple[list[float], bool]:
+        """Evaluate the function at one state."""
         known = run(values)
         try:
             results = [float(c * known[n]) for c, n in outputs]
@@ -80,33 +98,37 @@ def evaluator(
             for (c, n), (e, m) in checks
         )
 
-    return evaluated
+    return evaluate_at
 
 
 def exact_evaluator(function: Function) -> Callable[[Mapping[str, Any]], list[Any]]:
-    """The results of a function in 40 digits, not rounded; values: floats or such numbers by name.
+    """Return a function that evaluates `function` in 40 digits without rounding the results.
 
-    Raises ArithmeticError or ValueError where a result is not a finite, real number.
+    The values by name are floats or mpmath numbers. Raises ArithmeticError or ValueError where a
+    result is not a finite real number.
     """
     mp = context()
     run, atom = _steps(function, _many_digits())
     outputs = [atom(o) for o in function.outputs]
 
-    def evaluated(values: Mapping[str, Any]) -> list[Any]:
+    def evaluate_at(values: Mapping[str, Any]) -> list[Any]:
+        """Evaluate the function at one state."""
         known = run(values)
         results = [mp.mpmathify(c * known[n]) for c, n in outputs]
         if not all(isinstance(x, mp.mpf) and mp.isfinite(x) for x in results):
             raise ValueError(f"{function.name} is not finite and real")
         return results
 
-    return evaluated
+    return evaluate_at
 
 
 def _steps(
-    function: Function, of: Mapping[str, Callable[..., Any]]
+    function: Function, arithmetic: Mapping[str, Callable[..., Any]]
 ) -> tuple[Callable[[Mapping[str, Any]], dict[str, Any]], Callable[[Operand], tuple[Any, str]]]:
-    """What carries the assignments out, in the algebra `of`, and what converts an operand."""
-    number = lru_cache(maxsize=None)(of["number"])  # most are 1 and -1
+    """Return a function that runs the assignments in the arithmetic `of`, and one that converts
+    operands.
+    """
+    number = lru_cache(maxsize=None)(arithmetic["number"])  # most numbers are 1 or -1
 
     def atom(o: Operand) -> tuple[Any, str]:
         return number(o.coefficient), o.name
@@ -116,45 +138,49 @@ def _steps(
         v = a.value
         if isinstance(v, Sum):
             terms = [(number(w), n) for w, n in v.terms]
-            steps.append((a.name, _added, number(v.constant), terms))
+            steps.append((a.name, _add, number(v.constant), terms))
         elif isinstance(v, Product):
-            steps.append((a.name, _multiplied, number(v.coefficient), v.factors))
+            steps.append((a.name, _multiply, number(v.coefficient), v.factors))
         else:
-            steps.append((a.name, _called, of[v.function], [atom(o) for o in v.args]))
+            steps.append((a.name, _call, arithmetic[v.function], [atom(o) for o in v.args]))
 
     def run(values: Mapping[str, Any]) -> dict[str, Any]:
         known: dict[str, Any] = {"": 1, **values}  # a number alone has no name
-        for name, do, first, rest in steps:
-            known[name] = do(known, first, rest)
+        for name, operation, first, arguments in steps:
+            known[name] = operation(known, first, arguments)
         return known
 
     return run, atom
 
 
-def _added(known: Mapping[str, Any], constant: Any, terms: Sequence[tuple[Any, str]]) -> Any:
+def _add(known: Mapping[str, Any], constant: Any, terms: Sequence[tuple[Any, str]]) -> Any:
+    """Return constant + sum(weight * value)."""
     return sum([w * known[n] for w, n in terms], constant)
 
 
-def _multiplied(known: Mapping[str, Any], coefficient: Any, factors: Sequence[str]) -> Any:
+def _multiply(known: Mapping[str, Any], coefficient: Any, factors: Sequence[str]) -> Any:
+    """Return coefficient * product(values)."""
     return math.prod([known[n] for n in factors], start=coefficient)
 
 
-def _called(known: Mapping[str, Any], do: Callable[..., Any], args: Sequence[Any]) -> Any:
-    return do(*[c * known[n] for c, n in args])
+def _call(known: Mapping[str, Any], operation: Callable[..., Any], args: Sequence[Any]) -> Any:
+    """Return a function of operands."""
+    return operation(*[c * known[n] for c, n in args])
 
 
 def rounding_evaluator(function: Function) -> Callable[[Mapping[str, float]], list[float]]:
-    """The first-order bound of the rounding error of each result, over the unit of rounding.
+    """Return a function that bounds the rounding error of each result, in units of rounding.
 
-    sum over v of |d result/d v| |v|, where v are the inputs, the numbers, the terms of sums and all
-    intermediate values (Higham, Accuracy and Stability of Numerical Algorithms, section 3.1), by
-    one backward sweep for each result. Raises as `evaluate`.
+    To first order, the bound is sum |d result/d v| |v| over all inputs, numbers, terms of sums and
+    intermediate values v (Higham, *Accuracy and Stability of Numerical Algorithms*, sec. 3.1), by
+    one reverse pass per result. Raises as `evaluate`.
     """
     run, atom = _steps(function, _DOUBLES)
     outputs = [atom(o) for o in function.outputs]
-    steps = [(a.name, *_linear(a.value)) for a in (*function.early, *function.body)]
+    steps = [(a.name, *_linearize(a.value)) for a in (*function.early, *function.body)]
 
     def bound(known: Mapping[str, float], coefficient: float, name: str) -> float:
+        """Return the bound for the result coefficient * name."""
         slopes, total = {name: coefficient}, 0.0
         for value, size, partials in reversed(steps):
             slope = slopes.pop(value, 0.0)
@@ -164,23 +190,26 @@ def rounding_evaluator(function: Function) -> Callable[[Mapping[str, float]], li
                     slopes[argument] = slopes.get(argument, 0.0) + slope * partial
         return total + sum(abs(slope * known[n]) for n, slope in slopes.items())
 
-    def evaluated(values: Mapping[str, float]) -> list[float]:
+    def evaluate_at(values: Mapping[str, float]) -> list[float]:
+        """Evaluate the bounds at one state."""
         known = run(values)
-        found = [bound(known, c, n) for c, n in outputs]
-        if not all(map(math.isfinite, found)):
+        bounds = [bound(known, c, n) for c, n in outputs]
+        if not all(map(math.isfinite, bounds)):
             raise ValueError(f"{function.name} is not finite")
-        return found
+        return bounds
 
-    return evaluated
+    return evaluate_at
 
 
-def _linear(
+def _linearize(
     value: Value,
 ) -> tuple[
     Callable[[Mapping[str, float]], float],
     Callable[[Mapping[str, float]], list[tuple[str, float]]],
 ]:
-    """The size of the terms of a right-hand side, and its partial derivatives by its names."""
+    """Return functions for the scale of a right-hand side (sum of |terms|) and its partial
+    derivatives.
+    """
     if isinstance(value, Sum):
         constant = abs(float(value.constant))
         terms = [(name, float(w)) for w, name in value.terms]
@@ -195,33 +224,35 @@ def _linear(
                 for k, n in enumerate(factors)
             ]
 
-        return lambda x: abs(_multiplied(x, coefficient, factors)), partials
+        return lambda x: abs(_multiply(x, coefficient, factors)), partials
     function = _DOUBLES[value.function]
     arguments = [(float(a.coefficient), a.name) for a in value.args]
 
-    def called(x: Mapping[str, float]) -> float:
-        return abs(float(_called(x, function, arguments)))
+    def magnitude(x: Mapping[str, float]) -> float:
+        return abs(float(_call(x, function, arguments)))
 
     def differences(x: Mapping[str, float]) -> list[tuple[str, float]]:
-        points, found = [c * x[n] for c, n in arguments], list[tuple[str, float]]()
-        middle = function(*points)
+        points, partials_ = [c * x[n] for c, n in arguments], list[tuple[str, float]]()
+        value_ = function(*points)
         for k, (c, n) in enumerate(arguments):
             step = DIFFERENCE * (abs(points[k]) or 1.0)
             for signed in (step, -step):  # one side may lie outside the domain
-                moved = [y + signed * (i == k) for i, y in enumerate(points)]
+                shifted = [y + signed * (i == k) for i, y in enumerate(points)]
                 with suppress(ArithmeticError, ValueError):
-                    found.append((n, c * (function(*moved) - middle) / signed))
+                    partials_.append((n, c * (function(*shifted) - value_) / signed))
                     break
-        return found
+        return partials_
 
-    return called, differences
+    return magnitude, differences
 
 
 def nearby(system: System, k: int) -> dict[str, float]:
-    """Values by name of the k-th of some states around the start (0: the start itself)."""
+    """Return values by name at the k-th of a series of states around the start, which is state
+    0.
+    """
     out = {p.name: p.value for p in system.parameters} | {t.name: 0.0}
     for i, c in enumerate(system.coordinates):
-        # steps in directions that have nothing to do with one another, short as they are printed
+        # Steps in unrelated directions, rounded to few digits because they are printed.
         out[c.name] = (
             float(f"{c.start + 0.37 * k * math.sin(1.0 + i + 2.3 * k):.6g}") if k else c.start
         )

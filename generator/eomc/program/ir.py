@@ -1,7 +1,6 @@
-"""The small language that programs are written in.
+"""Intermediate representation: functions as lists of sums, products and calls over names.
 
-A function is a list of sums, products and calls over names; what depends on parameters alone comes
-first. Knows nothing of mechanics or C.
+Assignments that depend on parameters only come first. Independent of mechanics and of C.
 """
 
 from __future__ import annotations
@@ -17,46 +16,46 @@ from eomc.derive.tape import Stage
 
 @dataclass(frozen=True)
 class Sum:
-    """sum of coefficient times name, plus a constant."""
+    """constant + sum of coefficient times name."""
 
     terms: tuple[tuple[Expr, str], ...]
     constant: Expr = S.Zero
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names on this right-hand side, repeated as often as they stand there."""
+        """The names on this right-hand side, repeated as often as they occur."""
         return tuple([n for _, n in self.terms])
 
 
 @dataclass(frozen=True)
 class Product:
-    """coefficient times a product of names, repeated for whole powers."""
+    """coefficient times a product of names; integer powers are repeated names."""
 
     coefficient: Expr
     factors: tuple[str, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """As of a sum."""
+        """The names on this right-hand side, repeated as often as they occur."""
         return self.factors
 
 
 @dataclass(frozen=True)
 class Call:
-    """A function of atoms: "reciprocal", "sqrt", "pow" or one of the scene's functions."""
+    """A function of atoms: "reciprocal", "sqrt", "pow" or one of the functions of scenes."""
 
     function: str
     args: tuple[Operand, ...]
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """As of a sum."""
+        """The names on this right-hand side, repeated as often as they occur."""
         return tuple([a.name for a in self.args if a.name])
 
 
 @dataclass(frozen=True)
 class Operand:
-    """A number times a name; the name is empty for a number alone."""
+    """A number times a name. The name is empty for a number alone."""
 
     coefficient: Expr
     name: str = ""
@@ -67,7 +66,7 @@ Value = Sum | Product | Call
 
 @dataclass(frozen=True)
 class Assignment:
-    """name = value, known from `stage` on; `named` where the name says what it is."""
+    """name = value, with its binding time. `named`: the name is meaningful to a reader."""
 
     name: str
     value: Value
@@ -77,7 +76,7 @@ class Assignment:
 
 @dataclass(frozen=True)
 class Cost:
-    """Operations of one call, those that depend on parameters alone left out."""
+    """Operations of one call, without those that depend on parameters only."""
 
     adds: int = 0
     multiplications: int = 0
@@ -98,16 +97,28 @@ class Cost:
             (self.sincos, "sincos"),
             (self.calls, "other call"),
         ]
-        found = [f"{n} {what}{'s' if n > 1 and what != 'sincos' else ''}" for n, what in parts if n]
-        return ", ".join(found) or "no arithmetic"
+        shown = [f"{n} {kind}{'s' if n > 1 and kind != 'sincos' else ''}" for n, kind in parts if n]
+        return ", ".join(shown) or "no arithmetic"
 
 
 @dataclass(frozen=True)
 class Function:
     """One function of the generated code.
 
-    `early` depends on parameters alone, `body` on the rest; `outputs` are the results, row-major
-    where they are a matrix. `checks` are (pivot, diagonal) pairs that must be positive.
+    Attributes
+    ----------
+    early
+        Assignments that depend on parameters only.
+    body
+        All other assignments.
+    outputs
+        The results; matrices by rows.
+    checks
+        (pivot, diagonal) pairs; all pivots must be positive.
+    cost
+        Operations of one call.
+    route, routes
+        The route that was selected, and the cost of each route.
     """
 
     name: str
@@ -121,25 +132,26 @@ class Function:
 
     @cached_property
     def uses(self) -> frozenset[str]:
-        """Every name that the function reads."""
-        made = {a.name for a in (*self.early, *self.body)}
-        read = {n for a in (*self.early, *self.body) for n in a.value.names}
-        ends = [*self.outputs, *(o for pair in self.checks for o in pair)]
-        return frozenset(read | {o.name for o in ends if o.name}) - made
+        """All names that the function reads and does not compute."""
+        computed = {a.name for a in (*self.early, *self.body)}
+        names = {n for a in (*self.early, *self.body) for n in a.value.names}
+        results = [*self.outputs, *(o for pair in self.checks for o in pair)]
+        return frozenset(names | {o.name for o in results if o.name}) - computed
 
 
-def rename(function: Function, new: Mapping[str, str]) -> Function:
-    """The function with other names for some of its values."""
+def rename(function: Function, new_names: Mapping[str, str]) -> Function:
+    """Return the function with some of its values renamed."""
 
-    def real(name: str) -> str:
-        return new.get(name, name)
+    def new_name(name: str) -> str:
+        return new_names.get(name, name)
 
     def operand(o: Operand) -> Operand:
-        return replace(o, name=real(o.name)) if o.name else o
+        return replace(o, name=new_name(o.name)) if o.name else o
 
     def renamed(items: Iterable[Assignment]) -> tuple[Assignment, ...]:
         return tuple(
-            Assignment(real(a.name), renamed_value(a.value, real), a.stage, a.named) for a in items
+            Assignment(new_name(a.name), renamed_value(a.value, new_name), a.stage, a.named)
+            for a in items
         )
 
     return replace(
@@ -152,7 +164,7 @@ def rename(function: Function, new: Mapping[str, str]) -> Function:
 
 
 def renamed_value(value: Value, real: Callable[[str], str]) -> Value:
-    """A right-hand side with other names."""
+    """Return a right-hand side with its names replaced."""
     if isinstance(value, Sum):
         return Sum(tuple((w, real(n)) for w, n in value.terms), value.constant)
     if isinstance(value, Product):

@@ -1,4 +1,6 @@
-"""From the tape to the ir: one function, read, tidied (tidy.py), counted and named for people."""
+"""Lowering from a tape to the intermediate representation: simplify, count operations and name
+values.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from sympy import Expr, S, Symbol
 
 from eomc.derive.atoms import split
 from eomc.derive.tape import Stage, Tape
-from eomc.program.draft import Draft
+from eomc.program.draft import ScheduleBuilder
 from eomc.program.ir import Assignment, Call, Cost, Function, Operand, Product, Sum, Value, rename
 from eomc.program.tidy import tidy
 
@@ -24,11 +26,15 @@ def lower(
     checks: Sequence[tuple[Expr, Expr]] = (),
     labels: Sequence[str] = (),
 ) -> Function:
-    """The function that computes `outputs`, and whose `checks` must be positive.
+    """Return the function that computes `outputs`, with `checks` that must be positive.
 
-    reserved: names that no value gets, whether the function reads them or not: values of several
-    functions may lie in one struct with parameters. labels: names for outputs, then for pivots and
-    diagonal entries, where they have none.
+    Parameters
+    ----------
+    reserved
+        Names that no value may have. They include names that the function does not read, since
+        values of several functions may share a struct with parameters.
+    labels
+        Names for the outputs, then for pivots and diagonal entries, where they have none.
     """
     ends = [*outputs, *(atom for pair in checks for atom in pair)]
     work = _Reader(tape)
@@ -56,20 +62,21 @@ def lower(
     return _renamed(function, work.hints, reserved)
 
 
-class _Reader(Draft):
-    """Values as they stand on a tape."""
+class _Reader(ScheduleBuilder):
+    """Values that are read from a tape."""
 
     def __init__(self, tape: Tape) -> None:
         super().__init__()
         self.tape = tape
 
     def take(self, symbol: Symbol) -> None:
+        """Add the definition of a symbol."""
         tape = self.tape
         if symbol in tape.weights:
             terms = tuple((w, self.leaf(name)) for name, w in tape.weights[symbol].items())
             self.put(symbol.name, Sum(terms, tape.constant[symbol]))
         elif symbol in tape.powers:
-            # plain factors first, then powers, as SymPy sorts them
+            # factors without exponent first, then powers, as SymPy sorts them
             powers = sorted(
                 tape.powers[symbol].items(), key=lambda p: (p[1] is not S.One, p[0].name)
             )
@@ -87,18 +94,20 @@ class _Reader(Draft):
             self.hints[symbol.name] = self.tape.hint[symbol]
 
     def operand(self, atom: Expr) -> Operand:
+        """Return the operand of an atom."""
         factor, symbol = split(atom)
         if symbol is None:
             return Operand(factor)
         return Operand(factor, self.leaf(symbol))
 
     def leaf(self, symbol: Symbol) -> str:
-        """The symbol's name; a leaf's stage is kept."""
+        """Return the symbol's name, and record the binding time of a leaf."""
         if symbol in self.tape.leaves:
             self.stages[symbol.name] = self.tape.leaves[symbol]
         return str(symbol.name)
 
     def _product(self, rhs: Expr) -> Value:
+        """Return the value of a product of powers."""
         coefficient: Expr = S.One
         factors: list[str] = []
         for factor in sympy.Mul.make_args(rhs):
@@ -113,27 +122,30 @@ class _Reader(Draft):
         return self._plain(Product(coefficient, tuple(factors)))
 
     def _plain(self, product: Product) -> Value:
-        """The product, or what its one factor stands for."""
+        """Return the product, or the definition of its only factor."""
         if len(product.factors) == 1 and product.coefficient == 1:
             return self.values.get(product.factors[0], product)
         return product
 
     def _power(self, base: Operand, exponent: Expr) -> list[str]:
-        """Whole powers as repeated factors, halves by a square root, the rest by pow."""
-        twice = 2 * exponent
-        if not twice.is_Integer or abs(twice) > 16:
+        """Return factors of a power: repeated for integers, a square root for halves, else a call
+        of pow.
+        """
+        doubled = 2 * exponent
+        if not doubled.is_Integer or abs(doubled) > 16:
             return [self.new(Call("pow", (base, Operand(exponent))))]
-        whole, half = divmod(abs(int(twice)), 2)
+        whole, half = divmod(abs(int(doubled)), 2)
         if exponent > 0:
             root = [self.new(Call("sqrt", (base,)))] if half else []
             return [base.name] * whole + root
         if not half:
             return [self.new(Call("reciprocal", (base,)))] * whole
-        root_of = self.new(Call("sqrt", (base,)))
-        return [self.new(Call("reciprocal", (Operand(S.One, root_of),)))] * (2 * whole + 1)
+        root_ = self.new(Call("sqrt", (base,)))
+        return [self.new(Call("reciprocal", (Operand(S.One, root_),)))] * (2 * whole + 1)
 
 
 def _cost(body: Sequence[Assignment], outputs: Sequence[Operand]) -> Cost:
+    """Count the operations of assignments and outputs."""
     adds = muls = divs = calls = 0
     angles = set()
     for a in body:
@@ -157,53 +169,56 @@ def _cost(body: Sequence[Assignment], outputs: Sequence[Operand]) -> Cost:
 
 
 def _renamed(function: Function, hints: Mapping[str, str], reserved: frozenset[str]) -> Function:
-    """Names for people: those of the scene, sin_theta and the like, w1, w2, ... for the rest."""
+    """Give readable names to values: those of the scene, sin_theta and the like, else w1, w2,
+    ...
+    """
     assigned: dict[str, str] = {}
-    taken = {*function.uses, *reserved}
+    used_names = {*function.uses, *reserved}
 
-    def give(name: str, wish: str) -> None:
-        used = wish
-        while used in taken:
-            used += "_"
-        taken.add(used)
-        assigned[name] = used
+    def assign_name(name: str, preferred: str) -> None:
+        """Assign a name, with underscores appended until it is unused."""
+        name_ = preferred
+        while name_ in used_names:
+            name_ += "_"
+        used_names.add(name_)
+        assigned[name] = name_
 
-    everything = (*function.early, *function.body)
-    for a in everything:
+    assignments = (*function.early, *function.body)
+    for a in assignments:
         if a.name in hints:
-            give(a.name, hints[a.name])
+            assign_name(a.name, hints[a.name])
     count = 0
-    plain: set[str] = set()  # names that say nothing
-    for a in everything:
+    plain: set[str] = set()  # names without a meaning
+    for a in assignments:
         if a.name in assigned:
             continue
-        wish = ""
+        preferred = ""
         if isinstance(a.value, Call) and len(a.value.args) == 1:
             arg = a.value.args[0]
             inner = assigned.get(arg.name, arg.name)
             if arg.coefficient == 1 and inner not in plain:
-                wish = {"reciprocal": f"inv_{inner}"}.get(
+                preferred = {"reciprocal": f"inv_{inner}"}.get(
                     a.value.function, f"{a.value.function}_{inner}"
                 )
             elif len(parts := _leaves(function, arg)) > 1:
-                wish = f"{a.value.function}_{'_'.join(parts)}"
-        if not wish:
+                preferred = f"{a.value.function}_{'_'.join(parts)}"
+        if not preferred:
             count += 1
-            wish = f"w{count}"
-            plain.add(wish)
-        give(a.name, wish)
+            preferred = f"w{count}"
+            plain.add(preferred)
+        assign_name(a.name, preferred)
 
-    telling = {name for name, used in assigned.items() if used.rstrip("_") not in plain}
+    meaningful = {name for name, name_ in assigned.items() if name_.rstrip("_") not in plain}
     marked = replace(
         function,
-        early=tuple(replace(a, named=a.name in telling) for a in function.early),
-        body=tuple(replace(a, named=a.name in telling) for a in function.body),
+        early=tuple(replace(a, named=a.name in meaningful) for a in function.early),
+        body=tuple(replace(a, named=a.name in meaningful) for a in function.body),
     )
     return rename(marked, assigned)
 
 
 def _leaves(function: Function, arg: Operand) -> tuple[str, ...]:
-    """The names in a sum of two or three, for sin_q1_q2; nothing where the argument is more."""
+    """Return the names in a sum of two or three terms, for sin_q1_q2; () for other arguments."""
     for a in (*function.early, *function.body):
         if a.name == arg.name and isinstance(a.value, Sum) and len(a.value.terms) <= 3:
             names = a.value.names

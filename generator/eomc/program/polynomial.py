@@ -1,8 +1,8 @@
-"""Sums and products on a tape, multiplied out, cancelled and factored again.
+"""Expansion of expressions on a tape into polynomials, cancellation and factoring.
 
-A sweep keeps definitions whole, which is what makes large systems possible, but terms that
-cancel between definitions stay. For small systems it pays to multiply out: this is the second
-route, taken where it counts fewer operations (program.py).
+Derivatives along a tape keep definitions whole, which makes large systems possible, but terms that
+cancel between definitions remain. For small systems, expanding them is a second route, which is
+used where it needs fewer operations (program.py).
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 from eomc.derive.atoms import split
 from eomc.derive.tape import Stage, Tape
 
-Exponent = int | Fraction  # whole ones are ints, of which the hash is quick
+Exponent = int | Fraction  # integers are int, which hashes faster
 Monomial = tuple[tuple[str, Exponent], ...]  # sorted by name
 Polynomial = dict[Monomial, Expr]
 
-MOST_TERMS = 64  # of one polynomial
-MOST_IN_ALL = 160  # of the outputs of one function
-MOST_EXPONENT = 2**20
-MOST_BITS = 900  # of a coefficient: a double holds it
-MOST_ON_THE_WAY = 8 * MOST_TERMS  # before terms have cancelled
+MAX_TERMS = 64  # of one polynomial
+MAX_TOTAL_TERMS = 160  # of all outputs of a function
+MAX_EXPONENT = 2**20
+MAX_BITS = 900  # of a coefficient, so that it is in the range of a double
+MAX_INTERMEDIATE_TERMS = 8 * MAX_TERMS  # before cancellation
 
 
 class TooLargeError(Exception):
-    """The polynomial has more terms than the limit: not worth multiplying out."""
+    """Raised where a polynomial has too many terms to be worth expanding."""
 
 
 class Expander:
-    """Multiplies out what stands on a tape; what it has found once serves every function."""
+    """Expands definitions of a tape to polynomials, which are stored and used by every function."""
 
     def __init__(self, tape: Tape) -> None:
         self.tape = tape
@@ -41,56 +41,61 @@ class Expander:
         self.symbols: dict[str, Symbol] = {}
 
     def expand(self, outputs: Sequence[Expr]) -> list[Expr] | None:
-        """The outputs as polynomials in leaves and functions; None where they grow too large.
+        """Expand the outputs to polynomials in leaves and functions; None where they become too
+        large.
 
-        sin^2 + cos^2 = 1 is used wherever it shortens a sum.
+        sin^2 + cos^2 = 1 is applied wherever it shortens a sum.
         """
         try:
             polynomials = [self.atom(output) for output in outputs]
         except TooLargeError:
             return None
-        if sum(map(len, polynomials)) > MOST_IN_ALL:
+        if sum(map(len, polynomials)) > MAX_TOTAL_TERMS:
             return None
         return [self.built(polynomial) for polynomial in polynomials]
 
     def short(self, atom: Expr) -> Expr:
-        """The atom multiplied out where that leaves few terms, so that cancellations are seen."""
+        """Expand an atom if that leaves few terms, so that terms cancel; else return it
+        unchanged.
+        """
         if (out := self.expand([atom])) is not None and len(self.atom(atom)) <= 8:
             return out[0]
         return atom
 
     def atom(self, atom: Expr) -> Polynomial:
-        """The polynomial of what `Tape.define` returned."""
+        """Return the polynomial of an atom."""
         factor, symbol = split(atom)
         if symbol is None:
             return {(): factor} if factor != 0 else {}
         return {m: factor * c for m, c in self.symbol(symbol).items()}
 
     def symbol(self, symbol: Symbol) -> Polynomial:
-        """The polynomial of a name. Raises TooLargeError."""
+        """Return the polynomial of a name. Raises TooLargeError."""
         if symbol not in self.known:
             live = self.tape.live([symbol])
             if not self.large.isdisjoint(live):
                 raise TooLargeError
-            for name in live:  # in order, so that nothing recurses deeply
+            for name in live:  # in order, which avoids deep recursion
                 if name not in self.known:
                     try:
-                        self.known[name] = self._reduced(self._of(name))
+                        self.known[name] = self._reduced(self._expand_definition(name))
                     except TooLargeError:
                         self.large.add(name)
                         raise
-            self.known.setdefault(symbol, self._whole(symbol))
+            self.known.setdefault(symbol, self._as_variable(symbol))
         return self.known[symbol]
 
-    def _whole(self, symbol: Symbol) -> Polynomial:
+    def _as_variable(self, symbol: Symbol) -> Polynomial:
+        """Return the polynomial of a name that is not expanded."""
         self.symbols[symbol.name] = symbol
         return {((symbol.name, 1),): S.One}
 
-    def _of(self, name: Symbol) -> Polynomial:
+    def _expand_definition(self, name: Symbol) -> Polynomial:
+        """Expand the definition of a name."""
         rhs = self.tape.rhs(name)
         named = name in self.tape.hint and self.tape.stage[name] <= Stage.PARAMETER
         if named or not (rhs.is_Add or rhs.is_Mul or rhs.is_Pow):
-            return self._whole(name)
+            return self._as_variable(name)
         if rhs.is_Add:
             total: Polynomial = {}
             for term in rhs.args:
@@ -103,9 +108,9 @@ class Expander:
             if factor.is_number:
                 out = {m: c * factor for m, c in out.items()}
             elif not (base.is_Symbol and exponent.is_number):
-                return self._whole(name)
+                return self._as_variable(name)
             elif exponent.is_Integer and exponent > 0 and len(self.symbol(base)) != 1:
-                if exponent > MOST_TERMS:
+                if exponent > MAX_TERMS:
                     raise TooLargeError
                 for _ in range(int(exponent)):
                     out = self._times(out, self.symbol(base))
@@ -114,7 +119,9 @@ class Expander:
         return out
 
     def _power(self, base: Symbol, exponent: Expr) -> Polynomial:
-        """A power that is not a whole positive one: spread over a product, kept on a sum."""
+        """Return a power with a negative or fractional exponent, distributed over products but not
+        sums.
+        """
         inner = self.symbol(base)
         if not exponent.is_Rational:
             raise TooLargeError
@@ -127,12 +134,13 @@ class Expander:
         self.symbols[base.name] = base
         return {((base.name, power),): S.One}
 
-    def _times(self, one: Polynomial, other: Polynomial) -> Polynomial:
-        if len(one) * len(other) > MOST_ON_THE_WAY:
+    def _times(self, a: Polynomial, b: Polynomial) -> Polynomial:
+        """Return the product of two polynomials."""
+        if len(a) * len(b) > MAX_INTERMEDIATE_TERMS:
             raise TooLargeError
         out: Polynomial = {}
-        for m1, c1 in one.items():
-            for m2, c2 in other.items():
+        for m1, c1 in a.items():
+            for m2, c2 in b.items():
                 powers = dict(m1)
                 for n, e in m2:
                     powers[n] = powers.get(n, 0) + e
@@ -141,7 +149,7 @@ class Expander:
         return _bounded({m: c for m, c in out.items() if c != 0})
 
     def _reduced(self, polynomial: Polynomial) -> Polynomial:
-        """With sin^2 = 1 - cos^2, and back again where that leaves a - a cos^2."""
+        """Substitute sin^2 = 1 - cos^2, and back where that leaves a - a cos^2."""
         squared = {n for m in polynomial for n, e in m if e >= 2 and e.denominator == 1}
         for name in sorted(squared):
             twin = self.tape.squares.get(self.symbols[name])
@@ -150,28 +158,31 @@ class Expander:
                 sine = self.tape.is_sine(self.symbols[name])
                 pair = (name, twin.name) if sine else (twin.name, name)
                 polynomial = _with_square(_without_square(polynomial, *pair), *pair)
-        if len(polynomial) > MOST_TERMS:
+        if len(polynomial) > MAX_TERMS:
             raise TooLargeError
         return polynomial
 
     # --- back on the tape ------------------------------------------------------------------------
 
     def built(self, polynomial: Polynomial) -> Expr:
-        """The polynomial on the tape, parameters collected, common factors taken out."""
-        late: dict[Monomial, list[Expr]] = {}
+        """Write a polynomial to the tape with parameters collected and common factors extracted."""
+        coefficients: dict[Monomial, list[Expr]] = {}
         for monomial, c in polynomial.items():
-            early = [p for p in monomial if self._stage(p[0]) <= Stage.PARAMETER]
-            rest = tuple(p for p in monomial if p not in early)
-            late.setdefault(rest, []).append(c * self._expr(early))
-        return self._factored({m: self.tape.define(Add(*cs)) for m, cs in late.items()})
+            constant = [p for p in monomial if self._stage(p[0]) <= Stage.PARAMETER]
+            varying = tuple(p for p in monomial if p not in constant)
+            coefficients.setdefault(varying, []).append(c * self._expr(constant))
+        return self._factored({m: self.tape.define(Add(*cs)) for m, cs in coefficients.items()})
 
     def _stage(self, name: str) -> Stage:
+        """Return the binding time of a name."""
         return self.tape.stage[self.symbols[name]]
 
     def _expr(self, powers: Iterable[tuple[str, Exponent]]) -> Expr:
+        """Return a product of powers as an expression."""
         return Mul(*(Pow(self.symbols[n], Rational(e.numerator, e.denominator)) for n, e in powers))
 
     def _factored(self, terms: Mapping[Monomial, Expr]) -> Expr:
+        """Factor a polynomial: extract the most frequent factor, recursively."""
         counts = Counter(n for m in terms for n, e in m if e >= 1 and e.denominator == 1)
         best = max(counts, key=lambda n: (counts[n], -self._stage(n), n), default="")
         if counts[best] < 2:
@@ -189,22 +200,22 @@ class Expander:
 
 
 def _bounded(polynomial: Polynomial) -> Polynomial:
-    """The polynomial. Raises TooLargeError where numbers or exponents have grown long."""
+    """Return the polynomial. Raises TooLargeError where coefficients or exponents are too long."""
     for monomial, c in polynomial.items():
         _short(c)
-        if any(abs(e.numerator) > MOST_EXPONENT for _, e in monomial):
+        if any(abs(e.numerator) > MAX_EXPONENT for _, e in monomial):
             raise TooLargeError
     return polynomial
 
 
 def _short(number: Expr, power: Exponent = 1) -> None:
-    """Raises TooLargeError where a power of the number would be long."""
-    if number.is_Rational and (number.p.bit_length() + number.q.bit_length()) * power > MOST_BITS:
+    """Raise TooLargeError where a power of the number would be too long."""
+    if number.is_Rational and (number.p.bit_length() + number.q.bit_length()) * power > MAX_BITS:
         raise TooLargeError
 
 
 def _shifted(monomial: Monomial, by: Mapping[str, int]) -> Monomial:
-    """The monomial with other exponents."""
+    """Return the monomial with exponents changed by `by`."""
     powers = dict(monomial)
     for name, e in by.items():
         powers[name] = powers.get(name, 0) + e
@@ -212,11 +223,14 @@ def _shifted(monomial: Monomial, by: Mapping[str, int]) -> Monomial:
 
 
 def _monomial(powers: Mapping[str, Exponent]) -> Monomial:
+    """Return the monomial with the given powers."""
     return tuple(sorted((n, e) for n, e in powers.items() if e))
 
 
 def _without_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomial:
-    """sin^2 -> 1 - cos^2. Raises TooLargeError: each pair of powers may double what is there."""
+    """Substitute sin^2 = 1 - cos^2. Raises TooLargeError, since each substitution may double the
+    terms.
+    """
     while True:
         out: Polynomial = {}
         changed = False
@@ -233,12 +247,12 @@ def _without_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomia
         polynomial = {m: c for m, c in out.items() if c != 0}
         if not changed:
             return polynomial
-        if len(polynomial) > MOST_ON_THE_WAY:
+        if len(polynomial) > MAX_INTERMEDIATE_TERMS:
             raise TooLargeError
 
 
 def _with_square(polynomial: Polynomial, sine: str, cosine: str) -> Polynomial:
-    """a - a cos^2 -> a sin^2"""
+    """Substitute a - a cos^2 = a sin^2."""
     polynomial = dict(polynomial)
     for monomial in sorted(m for m in polynomial if dict(m).get(cosine, 0) >= 2):
         low = _shifted(monomial, {cosine: -2})

@@ -1,4 +1,4 @@
-"""Everything that the generated code computes, each function by its cheapest route."""
+"""All functions of the generated code, each by its cheapest route."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from eomc.program.admissible import Candidate, cheapest
 from eomc.program.interpret import evaluator, nearby
 from eomc.program.ir import Call, Function
 from eomc.program.lower import lower
-from eomc.program.routes import ROUTES, Material
+from eomc.program.routes import ROUTES, RouteInputs
 
 TIME = t.name
 _READERS = {
@@ -34,15 +34,23 @@ _READERS = {
     "bias": "and inertial forces here depend on",
     "acceleration": "and here they depend on",
 }
-MOST_IMPLICIT = 360  # accelerations of all stages: their matrix, on the stack, is a megabyte
+MAX_IMPLICIT_UNKNOWNS = 360  # of all stages; their matrix takes a megabyte of stack
 
 
 @dataclass(frozen=True)
 class Program:
-    """Everything that the generated code computes.
+    """All functions of the generated code of a system.
 
-    order: in which the accelerations eliminate coordinates. passed_over: routes to them that were
-    not tried, and why. notes: where unusual terms of K went.
+    Attributes
+    ----------
+    functions
+        The functions by name.
+    notes
+        Where unusual terms of K appear in the equations.
+    order
+        Coordinates in order of elimination.
+    passed_over
+        Routes to the accelerations that were not used, with the reason.
     """
 
     system: System
@@ -59,70 +67,81 @@ class Program:
 
     @property
     def solved(self) -> str:
-        """How D qdd = tau - bias is solved, in words."""
+        """A sentence that says how D qdd = tau - bias is solved."""
         names = ", ".join(self.system.coordinates[k].name for k in self.order)
         return ROUTES[self["acceleration"].route].solved(self.system, names)
 
 
 def build(derived: Derivation) -> Program:
-    """The program of a system's equations: each function by its cheapest route.
+    """Build the program of a system's equations, each function by its cheapest route.
 
-    Raises SceneError where [run] asks for what this system can't have.
+    Raises SceneError where [run] requests something that is not possible for this system.
     """
-    system, material = derived.system, Material(derived)
-    found = {r.name: f for r in ROUTES.values() if (f := r.functions(material))}
+    system, material = derived.system, RouteInputs(derived)
+    by_route = {r.name: f for r in ROUTES.values() if (f := r.functions(material))}
     functions = {
         name: cheapest(
             name,
             system,
-            {r: Candidate(f.tape, f.outputs[name]) for r, f in found.items() if name in f.outputs},
+            {
+                r: Candidate(f.tape, f.outputs[name])
+                for r, f in by_route.items()
+                if name in f.outputs
+            },
         )
-        for name in next(iter(found.values())).outputs
+        for name in next(iter(by_route.values())).outputs
     }
     if derived.articulated == MASSLESS:  # D is singular everywhere: accelerations have no formula
         inertia(Program(system, functions, (), ()))
     best, taken, passed_over = accelerations(material)
     functions["acceleration"] = best
-    for made in _derivatives(system, taken):
-        functions[made.name] = replace(made, route=best.route)
-    more = (
+    for function in _derivatives(system, taken):
+        functions[function.name] = replace(function, route=best.route)
+    additional = (
         *constrained.functions(derived, taken),
         *_outputs(system, taken),
         *_events(system, taken),
         *_applied(system),
         *_signal_slopes(system, functions),
     )
-    functions |= {made.name: made for made in (*more, *_asked(system))}
+    functions |= {function.name: function for function in (*additional, *_requested(system))}
     if all(o.coefficient == 0 for o in functions["tau"].outputs):
         del functions["tau"]
-    notes = next(f.notes for f in found.values())
-    whole = Program(system, functions, notes, taken.order, passed_over)
-    if unsuited := _unsuited(whole):
+    notes = next(f.notes for f in by_route.values())
+    program = Program(system, functions, notes, taken.order, passed_over)
+    if unsuited := _unsuited(program):
         raise SceneError(unsuited)
-    return whole
+    return program
 
 
-def accelerations(material: Material) -> tuple[Function, Candidate, dict[str, str]]:
-    """By their cheapest route; what that is made of; routes that were not tried, and why."""
-    ways = {r.name: r.accelerations(material) for r in ROUTES.values()}
+def accelerations(material: RouteInputs) -> tuple[Function, Candidate, dict[str, str]]:
+    """Return the accelerations by their cheapest route, its candidate, and the routes not used,
+    with reasons.
+    """
+    solutions = {r.name: r.accelerations(material) for r in ROUTES.values()}
     system = material.derived.system
-    candidates = {r: _solving(way, system) for r, way in ways.items() if isinstance(way, Solution)}
+    candidates = {
+        r: _solving(way, system) for r, way in solutions.items() if isinstance(way, Solution)
+    }
     best = cheapest("acceleration", system, candidates)
-    passed_over = {route: why for route, why in ways.items() if isinstance(why, str)}
+    passed_over = {route: reason for route, reason in solutions.items() if isinstance(reason, str)}
     return best, candidates[best.route], passed_over
 
 
 def _solving(solution: Solution, system: System) -> Candidate:
+    """Return the candidate of a solution, with names for accelerations and pivots."""
     names = [c.name for c in system.coordinates]
     labels = [f"{name}_ddot" for name in names]
-    pair = (solution.matrix.lower(), solution.matrix)
-    labels += [f"{what}_{names[k]}" for k in solution.order for what in pair]
-    found = (solution.acceleration, solution.pivots, labels, solution.order, solution.multipliers)
-    return Candidate(solution.tape, *found, solution.parts)
+    matrix_names = (solution.matrix.lower(), solution.matrix)
+    labels += [f"{matrix_name}_{names[k]}" for k in solution.order for matrix_name in matrix_names]
+    values = (solution.acceleration, solution.pivots, labels, solution.order, solution.multipliers)
+    return Candidate(solution.tape, *values, solution.parts)
 
 
 def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
-    """The derivatives of the accelerations that [run] or a method needs, by the route taken."""
+    """Yield the derivatives of the accelerations that [run] or a method needs, by the selected
+    route.
+    """
     run, names = system.run, system.names
     if run.sloped or any(METHODS[name].newton for name in run.methods):
         rows = linearization(system, taken.tape, taken.outputs)
@@ -135,56 +154,61 @@ def _derivatives(system: System, taken: Candidate) -> Iterator[Function]:
 
 
 def _outputs(system: System, taken: Candidate) -> Iterator[Function]:
-    """The outputs, and their derivatives where those of the accelerations are asked for.
+    """Yield the outputs, and their derivatives where those of the accelerations are requested.
 
-    taken: the accelerations, on whose tape multipliers are; accelerations are given all the same.
+    taken: the accelerations. Their tape has the multipliers that outputs may contain; accelerations
+    in outputs remain arguments.
     """
     if not system.outputs:
         return
-    held = dict(zip((c.multiplier for c in system.constraints), taken.multipliers, strict=False))
-    read = {x for o in system.outputs for x in o.formula.free_symbols}
-    known = (taken.tape, held) if read & held.keys() else None
+    multipliers = dict(
+        zip((c.multiplier for c in system.constraints), taken.multipliers, strict=False)
+    )
+    symbols = {x for o in system.outputs for x in o.formula.free_symbols}
+    known = (taken.tape, multipliers) if symbols & multipliers.keys() else None
     checks = taken.checks if known else ()
-    made = outputs.outputs(system, with_derivatives=system.run.sloped, base=known)
+    derived = outputs.outputs(system, with_derivatives=system.run.sloped, base=known)
     labels = [o.name for o in system.outputs]
-    yield lower("outputs", made.tape, made.values, system.names, checks=checks, labels=labels)
-    if rows := [x for row in made.slopes for x in row]:
-        yield lower("output_slopes", made.tape, rows, system.names, checks=checks)
-    if rows := [x for row in made.sensitivity for x in row]:
-        yield lower("output_sensitivity", made.tape, rows, system.names, checks=checks)
+    yield lower("outputs", derived.tape, derived.values, system.names, checks=checks, labels=labels)
+    if rows := [x for row in derived.slopes for x in row]:
+        yield lower("output_slopes", derived.tape, rows, system.names, checks=checks)
+    if rows := [x for row in derived.sensitivity for x in row]:
+        yield lower("output_sensitivity", derived.tape, rows, system.names, checks=checks)
 
 
 def _events(system: System, taken: Candidate) -> Iterator[Function]:
-    """What crosses zero where events are, and the states behind their jumps.
+    """Yield the event functions, and the states after jumps.
 
-    taken: the accelerations, on whose tape is what friction that sticks depends on.
+    taken: the accelerations. Their tape has the quantities that stick-slip friction depends on.
     """
     if not system.events:
         return
     state, values = [x.name for x in (*system.q, *system.qd)], []
     for e in system.events:
-        to = dict(e.jump)
-        values += [to.get(name, symbol(name)) for name in state]
+        jump_values = dict(e.jump)
+        values += [jump_values.get(name, symbol(name)) for name in state]
     jumps = any(e.action == "jump" for e in system.events)
-    held = {
+    switched_parts = {
         x: value
-        for k, made in taken.parts.items()
-        for x, value in zip(system.constraints[k].parts, made, strict=True)
+        for k, values_of_parts in taken.parts.items()
+        for x, value in zip(system.constraints[k].parts, values_of_parts, strict=True)
     }
     begins = [S.NegativeOne if e.begins is None else e.begins for e in system.events]
-    asked = {"events": [e.when for e in system.events]}
-    asked |= {"begins": begins} if any(e.begins is not None for e in system.events) else {}
-    asked |= {"jumps": values} if jumps else {}
-    for name, formulas in asked.items():
-        named = tuple(Output(f"{name}_{k}", value) for k, value in enumerate(formulas))
-        read = {x for f in formulas for x in f.free_symbols}
-        known = (taken.tape, held) if read & held.keys() else None
-        found = outputs.outputs(replace(system, outputs=named), with_derivatives=False, base=known)
-        yield lower(name, found.tape, found.values, system.names)
+    formulas_of = {"events": [e.when for e in system.events]}
+    formulas_of |= {"begins": begins} if any(e.begins is not None for e in system.events) else {}
+    formulas_of |= {"jumps": values} if jumps else {}
+    for name, formulas in formulas_of.items():
+        formula_outputs = tuple(Output(f"{name}_{k}", value) for k, value in enumerate(formulas))
+        symbols = {x for f in formulas for x in f.free_symbols}
+        known = (taken.tape, switched_parts) if symbols & switched_parts.keys() else None
+        derived = outputs.outputs(
+            replace(system, outputs=formula_outputs), with_derivatives=False, base=known
+        )
+        yield lower(name, derived.tape, derived.values, system.names)
 
 
-def _asked(system: System) -> Iterator[Function]:
-    """What [run] asks for besides: of frames, inverse dynamics, momenta."""
+def _requested(system: System) -> Iterator[Function]:
+    """Yield the functions that [run] requests: frames, inverse dynamics and momenta."""
     frames = [f.name for f in system.asked]
     if frames:
         found = motions(system)
@@ -204,12 +228,12 @@ def _asked(system: System) -> Iterator[Function]:
 
 
 def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterator[Function]:
-    """[du/dq, du/dqd] of signals that answer the state, where these don't jump."""
+    """Yield [du/dq, du/dqd] of signals that depend on the state, where the derivatives exist."""
     state = {x.name for x in (*system.q, *system.qd)}
     if not system.run.sloped or not ("signal" in functions and functions["signal"].uses & state):
         return
     try:
-        made = outputs.signal_slopes(system)
+        derived = outputs.signal_slopes(system)
     except SceneError:  # there is no derivative
         if not system.run.discretize:
             return
@@ -218,68 +242,72 @@ def _signal_slopes(system: System, functions: Mapping[str, Function]) -> Iterato
             "have no derivatives: make it smooth, say tanh(x/width), or do without discretize"
         )
         raise SceneError([system.problem("run.discretize", message)]) from None
-    rows = [x for row in made.slopes for x in row[: len(state)]]
-    yield lower("signal_slopes", made.tape, rows, system.names)
+    rows = [x for row in derived.slopes for x in row[: len(state)]]
+    yield lower("signal_slopes", derived.tape, rows, system.names)
 
 
 def _applied(system: System) -> Iterator[Function]:
-    """The inputs within their limits, where there are limits."""
+    """Yield the inputs saturated to their limits, where there are limits."""
     if all(i.limited == i.symbol for i in system.inputs):
         return
     leaves = {p.symbol: Stage.PARAMETER for p in system.parameters}
     tape = Tape(leaves | dict.fromkeys(system.u, Stage.TIME))
-    within = [tape.define(i.limited) for i in system.inputs]
+    saturated = [tape.define(i.limited) for i in system.inputs]
     labels = [f"{i.name}_limited" for i in system.inputs]
-    yield lower("applied", tape, within, system.names, labels=labels)
+    yield lower("applied", tape, saturated, system.names, labels=labels)
 
 
 def _unsuited(program: Program) -> list[Problem]:
-    """What [run] asks for and this system can't have."""
-    s, out = program.system, []
+    """Return problems for requests of [run] that are not possible for this system."""
+    s, problems = program.system, []
     implicit = [name for name in s.run.methods if METHODS[name].implicit]
     if implicit and s.run.batch:
         message = f"'{implicit[0]}' is for one trajectory: leave out batch = true, or that method"
-        out.append(s.problem("run.batch", message))
+        problems.append(s.problem("run.batch", message))
     for name in (name for name in implicit if METHODS[name].newton or s.run.discretize):
         size = METHODS[name].stages * len(s.q)
-        if size > MOST_IMPLICIT:
+        if size > MAX_IMPLICIT_UNKNOWNS:
             message = (
-                f"'{name}' would solve for {size} numbers at once, more than {MOST_IMPLICIT}: take "
-                "an explicit method, or one with fewer stages"
+                f"'{name}' would solve for {size} numbers at once, more than "
+                f"{MAX_IMPLICIT_UNKNOWNS}: take an explicit method, or one with fewer stages"
             )
-            out.append(s.problem("run.method", message))
-    swept = [name for name in implicit if METHODS[name].sweeps]
-    if swept and (jumps := _jumps(program)):
+            problems.append(s.problem("run.method", message))
+    by_fixed_sweeps = [name for name in implicit if METHODS[name].sweeps]
+    if by_fixed_sweeps and (jumps := _jumps(program)):
         message = (
-            f"'{swept[0]}' needs smooth accelerations, and {jumps} of a coordinate or velocity "
-            "jumps: make it smooth, say tanh(x/width), or take 'rk4' or 'dp8'"
+            f"'{by_fixed_sweeps[0]}' needs smooth accelerations, and {jumps} of a coordinate or "
+            "velocity jumps: make it smooth, say tanh(x/width), or take 'rk4' or 'dp8'"
         )
         if s.modes:
             message = (
-                f"'{swept[0]}' needs smooth accelerations, and {STICKS[0]}: {STICKS[1]}, or take "
-                "'rk4' or 'dp8'"
+                f"'{by_fixed_sweeps[0]}' needs smooth accelerations, and {STICKS[0]}: {STICKS[1]}, "
+                "or take 'rk4' or 'dp8'"
             )
-        out.append(s.problem("run.method", message))
+        problems.append(s.problem("run.method", message))
     velocities = {x.name for x in s.qd}
-    read = {
+    velocities_read = {
         name: sorted(program[name].uses & velocities)
         for name in ("signal", "tau", "bias", "acceleration")
         if name in program
     }
-    if "verlet" in s.run.methods and (read["acceleration"] or read.get("signal")):
-        name = next(name for name, names in read.items() if names)
-        found = ", ".join(read[name])
+    if "verlet" in s.run.methods and (
+        velocities_read["acceleration"] or velocities_read.get("signal")
+    ):
+        name = next(name for name, names in velocities_read.items() if names)
+        names_read = ", ".join(velocities_read[name])
         message = (
             f"'verlet' needs accelerations that depend on positions and time alone, "
-            f"{_READERS[name]} {found}. "
+            f"{_READERS[name]} {names_read}. "
             "Take 'rk4', 'dp8' or 'gauss4'"
         )
-        out.append(s.problem("run.method", message))
-    return out
+        problems.append(s.problem("run.method", message))
+    return problems
 
 
 def _jumps(program: Program) -> str:
-    """A function in the accelerations that jumps on the way; the empty string where none does."""
+    """Return a discontinuous function that the accelerations depend on; the empty string if
+    none.
+    """
     for name in ("acceleration", "signal"):
         for a in program[name].body if name in program else ():
             if isinstance(a.value, Call) and a.stage >= Stage.POSITION:
@@ -289,74 +317,78 @@ def _jumps(program: Program) -> str:
 
 
 def inertia(program: Program) -> list[Problem]:
-    """A warning where D is not positive definite at the start.
+    """Return a warning if D is not positive definite at the start.
 
-    Raises SceneError where it is so at states around the start as well: no motion can be computed.
+    Raises SceneError if D is not positive definite at states around the start either.
     """
     s = program.system
-    found = _without_inertia(program, 0)
-    if not found:
+    unresisted = _without_inertia(program, 0)
+    if not unresisted:
         return []
-    weak = found[-1]
+    coordinate = unresisted[-1]
     if all(_without_inertia(program, k) for k in range(1, 6)):
         message = (
-            f"D is not positive definite: '{weak}' has no inertia of its own. Give it a mass, "
-            "or leave out a coordinate that others determine"
+            f"D is not positive definite: '{coordinate}' has no inertia of its own. Give it a "
+            "mass, or leave out a coordinate that others determine"
         )
-        if len(found) > 1:
+        if len(unresisted) > 1:
             message = (
-                f"D is not positive definite: nothing resists {listed(found)} as they move "
+                f"D is not positive definite: nothing resists {listed(unresisted)} as they move "
                 "together. Give what lies between them mass and inertia, or leave out a coordinate "
                 "that others determine"
             )
-        read = program["D" if "D" in program else "D_column"].uses
-        if wrong := [
-            f"{p.name} = {p.value:g}" for p in s.parameters if p.value <= 0 and p.name in read
+        names = program["D" if "D" in program else "D_column"].uses
+        if nonpositive := [
+            f"{p.name} = {p.value:g}" for p in s.parameters if p.value <= 0 and p.name in names
         ]:
             message = (
-                f"D is not positive definite, '{weak}' has no inertia, at {', '.join(wrong)}: "
+                f"D is not positive definite, '{coordinate}' has no inertia, at "
+                f"{', '.join(nonpositive)}: "
                 "masses and moments of inertia are positive"
             )
-        elif body := _massless(s, found):
+        elif body := _massless(s, unresisted):
             message = (
-                f"D is not positive definite: nothing resists {listed(found)} as they move "
+                f"D is not positive definite: nothing resists {listed(unresisted)} as they move "
                 f"together, '{body}' has no inertia of its own. Give it mass and inertia, or fix it"
             )
             raise SceneError([s.problem(f"body.{body}", message)])
         raise SceneError([s.problem("energy.kinetic", message)])
     message = (
-        f"D is not positive definite at the start, '{weak}' has no inertia there: "
+        f"D is not positive definite at the start, '{coordinate}' has no inertia there: "
         "start elsewhere, or choose coordinates that are regular there"
     )
     return [s.problem("energy.kinetic", message, "warning")]
 
 
 def matrix(program: Program, name: str, values: Mapping[str, float]) -> list[list[float]]:
-    """D or C at the given values by name, in Python floats, (nq, nq). Raises as `evaluate` does."""
+    """Return D or C, (nq, nq), at the given values by name, in Python floats. Raises as
+    `evaluate`.
+    """
     names = [c.name for c in program.system.coordinates]
     n = len(names)
     if name in program:
         flat, _ = evaluator(program[name])(values)
         return [flat[n * i : n * i + n] for i in range(n)]
     column, columns = evaluator(program[f"{name}_column"]), []
-    for one in names:
-        unit = {f"{other}{ALONG}": float(other == one) for other in names}
+    for coordinate in names:
+        unit = {f"{other}{ALONG}": float(other == coordinate) for other in names}
         columns.append(column({**values, **unit})[0])
     return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _massless(system: System, names: Sequence[str]) -> str:
-    """The first body without mass that moves by several such coordinates, or ""."""
+    """Return the first massless body that moves with several of the given coordinates, or ""."""
     links = system.tree.links if system.tree and len(names) > 1 else ()
-    heavy = {link.name for link in links if any((link.mass, *link.inertia, link.armature))}
-    moved = (link.name for link in links if {x.name for x in link.q.free_symbols} & {*names})
-    return next((name for name in moved if name not in heavy), "")
+    with_inertia = {link.name for link in links if any((link.mass, *link.inertia, link.armature))}
+    moving = (link.name for link in links if {x.name for x in link.q.free_symbols} & {*names})
+    return next((name for name in moving if name not in with_inertia), "")
 
 
 def _without_inertia(program: Program, k: int) -> list[str]:
-    """Coordinates that can move together without inertia at the k-th state, [] where D is regular.
+    """Return coordinates that can move together without inertia at the k-th state; [] where D is
+    regular.
 
-    The last is the first without a positive pivot in D.
+    The last one is the first without a positive pivot.
     """
     names = [c.name for c in program.system.coordinates]
     n = len(names)
@@ -374,17 +406,17 @@ def _without_inertia(program: Program, k: int) -> list[str]:
     A = [list(row) for row in D]
     for i in range(n):
         if not A[i][i] > 8 * n * 2.0**-52 * D[i][i]:
-            return _together(A, i, names)
+            return _null_motion(A, i, names)
         for j in range(i + 1, n):
             factor = A[j][i] / A[i][i]
             A[j] = [a - factor * b for a, b in zip(A[j], A[i], strict=True)]
     return []
 
 
-def _together(A: Sequence[Sequence[float]], i: int, names: Sequence[str]) -> list[str]:
-    """Names of what moves where D qd = 0, as pivot i is nothing. A: D eliminated up to it."""
+def _null_motion(A: Sequence[Sequence[float]], i: int, names: Sequence[str]) -> list[str]:
+    """Return the coordinates that move in the null vector of D. A: D eliminated up to pivot i."""
     qd = [0.0] * i + [1.0]
     for j in reversed(range(i)):
         qd[j] = -sum(A[j][k] * qd[k] for k in range(j + 1, i + 1)) / A[j][j]
-    most = max(map(abs, qd))
-    return [name for name, x in zip(names, qd, strict=False) if abs(x) > 1e-9 * most or x == 1]
+    largest = max(map(abs, qd))
+    return [name for name, x in zip(names, qd, strict=False) if abs(x) > 1e-9 * largest or x == 1]

@@ -1,8 +1,8 @@
-"""The rank of constraints on the positions that they leave, and the rows that are solved for.
+"""Rank of the constraints, and the selection of independent equations.
 
-A rank at the start says little: a flat or symmetric one looks redundant. Nor does one where rows do
-not hold: there they are hardly ever redundant. So ranks are taken along a walk on the positions
-that the rows leave, at places that hold them in forty digits.
+The rank at the start is not reliable: constraints may look redundant at a flat or symmetric
+configuration, and hardly ever look redundant where they do not hold. So ranks are computed along a
+random walk on the constraint manifold, at configurations that satisfy the constraints to 40 digits.
 """
 
 from __future__ import annotations
@@ -17,33 +17,59 @@ import numpy as np
 
 from eomc.program.interpret import context
 from eomc.program.manifold import NO_MASS, RANK_TOLERANCE, Frame, Manifold, Place, Vector
-from eomc.program.walks import along, walk
+from eomc.program.walks import random_walk, trace_branch
 
-POSITIONS = 12  # beside the start
-MANY, FEWER = 24, 3  # rows of a large system; positions of one whose rank is full at the start
-SAME = 1e-20  # of a row: it is a sum of others in forty digits
-NEARLY = 1e-12  # the same of rows that hold in doubles alone
-GOOD = 1e-2  # of the singular value of all rows: what that of the kept ones is at least
-BETTER = 1.02  # times another set's: a set is better
-BESIDE, REACH = 3, 0.1  # places beside the start, and how far, of the coordinates' size
-KNOWN = 1e-7  # of the coordinates: how well a place that holds a square is known
-FLAT = 1e-6  # of the slope beside: a row has none
-MIXED = 12  # rows that sums are made of, at most
-ALONG, TRIED, REFINED = 150, 1000, 20  # places along a motion; sums that are tried, how often
-MIXED_WELL = 0.03  # of sums: their least singular value on the rows' own
-MOST_SETS = 4000  # that are tried; beyond, rows are left out one by one
+SAMPLE_COUNT = 12  # configurations besides the start
+# Fewer samples suffice for many constraints whose rank is full at the start.
+MANY_CONSTRAINTS, FEW_SAMPLES = 24, 3
+EXACT_TOLERANCE = 1e-20  # relative residual of a linear combination in 40 digits
+DOUBLE_TOLERANCE = 1e-12  # the same where the constraints hold in double precision only
+MIN_SINGULAR_RATIO = 1e-2  # least singular value of the selected equations over that of all
+IMPROVEMENT = 1.02  # a set is preferred if its least singular value is larger by this factor
+# Nearby configurations at which gradients are compared: number, relative distance.
+NEARBY_COUNT, NEARBY_DISTANCE = 3, 0.1
+POSITION_TOLERANCE = (
+    1e-7  # relative accuracy of a configuration that satisfies a squared constraint
+)
+ZERO_GRADIENT_RATIO = 1e-6  # a gradient below this fraction of those nearby is zero
+MAX_SUMMED_CONSTRAINTS = 12  # constraints that sums are formed of
+# Search for sums: configurations along the motion, random candidates, refinements.
+PATH_SAMPLES, CANDIDATES, REFINEMENTS = 150, 1000, 20
+MIN_SUM_SINGULAR_VALUE = 0.03  # on the span of the constraints, for sums to be accepted
+MAX_SETS = 4000  # sets that are compared; with more, constraints are dropped one by one
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """rank: of all rows, almost everywhere. left_out: rows that others imply. shared: rows without
-    a force of their own. good: whether some set of rows will do everywhere that was looked at.
-    sums: where none does, sums of `shared` that do, the weights of all rows in each.
-    sigma: smallest over largest singular value that counts, at the start and at the worst place.
-    weights: of the rows, that make D regular with them; none where it is so by itself. slopes: of
-    each row the largest A D^-1 A^T. latest: the time of the last position, s.
-    flat: rows without a slope wherever they hold. loose: coordinates that no inertia and no row
-    holds.
+    """The rank of the constraints and the equations to solve with.
+
+    Attributes
+    ----------
+    rank : int
+        Rank of all constraints almost everywhere.
+    left_out : tuple of int
+        Constraints that others imply.
+    shared : tuple of int
+        Constraints whose multipliers are not unique.
+    good : bool
+        Whether some set of equations is independent at all sampled configurations.
+    sigma : (float, float)
+        Smallest over largest nonzero singular value, at the start and at the worst configuration.
+    positions : int
+        Number of sampled configurations.
+    weights : tuple of float
+        Weight of each constraint that makes D regular; empty where D is regular.
+    slopes : tuple of float
+        Largest A D^-1 A^T of each constraint.
+    latest : float
+        Time of the last configuration, s.
+    flat : tuple of int
+        Constraints whose gradient vanishes wherever they hold.
+    loose : tuple of int
+        Coordinates that neither inertia nor a constraint fixes.
+    sums : tuple of tuple of float
+        Where `good` is false for single constraints, weighted sums of `shared` that are
+        independent.
     """
 
     rank: int
@@ -61,7 +87,7 @@ class Ranks:
 
 
 def ranks(manifold: Manifold, start: Place) -> Ranks:
-    """Of the rows around an assembled start."""
+    """Compute the rank of the constraints around an assembled start."""
     found, places = _ranks(manifold, start)
     singular = any(place.singular for place in places)
     weights = tuple(start.weights.tolist()) if singular else ()
@@ -70,45 +96,60 @@ def ranks(manifold: Manifold, start: Place) -> Ranks:
     slopes = np.where(slopes > 0, slopes, (manifold.usual * np.max(scale)) ** 2)
     latest = max(place.t for place in places)
     return replace(
-        found, weights=weights, slopes=tuple(slopes.tolist()), latest=latest, loose=_loose(places)
+        found,
+        weights=weights,
+        slopes=tuple(slopes.tolist()),
+        latest=latest,
+        loose=_unresisted(places),
     )
 
 
-def _loose(places: Sequence[Place]) -> tuple[int, ...]:
-    """The coordinates along which, at every place, rows leave a way that moves no mass."""
-    found: tuple[int, ...] = ()
+def _unresisted(places: Sequence[Place]) -> tuple[int, ...]:
+    """Return coordinates that can move without inertia and without violating constraints,
+    everywhere.
+    """
+    indices: tuple[int, ...] = ()
     for place in places:
         diagonal = np.diag(place.D)
         scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         A = place.A / place.sizes[:, None] * scale
         _, s, V = np.linalg.svd(A)
-        ways = V[int(np.sum(s > RANK_TOLERANCE * np.max(s, initial=0))) :]
-        if not len(ways):
+        null_space = V[int(np.sum(s > RANK_TOLERANCE * np.max(s, initial=0))) :]
+        if not len(null_space):
             return ()
-        values, vectors = np.linalg.eigh(ways @ (scale[:, None] * place.D * scale) @ ways.T)
-        least = int(np.argmin(np.abs(values)))
-        if abs(values[least]) > NO_MASS:
+        values, vectors = np.linalg.eigh(
+            null_space @ (scale[:, None] * place.D * scale) @ null_space.T
+        )
+        smallest = int(np.argmin(np.abs(values)))
+        if abs(values[smallest]) > NO_MASS:
             return ()
-        way = np.abs(vectors[:, least] @ ways)
-        found = tuple(np.flatnonzero(way > 1e-6 * np.max(way)).tolist())
-    return found
+        direction = np.abs(vectors[:, smallest] @ null_space)
+        indices = tuple(np.flatnonzero(direction > 1e-6 * np.max(direction)).tolist())
+    return indices
 
 
 def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
-    """Without weights and slopes, and the places that were looked at."""
+    """Compute the ranks without weights and slopes. Returns them and the sampled configurations."""
     free = np.ones(len(start.q), dtype=bool)
-    first = Frame(start, free, manifold.rows)
-    sure = len(first.parts[1]) == len(manifold.rows) and first.parts[1][-1] > RANK_TOLERANCE
-    positions = FEWER if sure and len(manifold.rows) > MANY else POSITIONS
-    rest = [Frame(place, free, manifold.rows) for place in walk(manifold, start, positions)]
-    frames, places = [first, *rest], [start, *(f.place for f in rest)]
+    first_frame = Frame(start, free, manifold.rows)
+    full_rank = (
+        len(first_frame.parts[1]) == len(manifold.rows)
+        and first_frame.parts[1][-1] > RANK_TOLERANCE
+    )
+    positions = FEW_SAMPLES if full_rank and len(manifold.rows) > MANY_CONSTRAINTS else SAMPLE_COUNT
+    others = [
+        Frame(place, free, manifold.rows) for place in random_walk(manifold, start, positions)
+    ]
+    frames, places = [first_frame, *others], [start, *(f.place for f in others)]
     if flat := _flat(manifold, places):
         return Ranks(0, (), (), False, (0.0, 0.0), len(places), flat=flat), places
     counts = [int(np.sum(f.parts[1] > RANK_TOLERANCE)) for f in frames]
     rank, m = max(counts), len(manifold.rows)
     regular = [f for f, n in zip(frames, counts, strict=True) if n == rank]
-    ends = [(float(f.parts[1][rank - 1]), float(f.parts[1][0])) if rank else (1, 1) for f in frames]
-    ratios = [least / most if most else 0.0 for least, most in ends]
+    extremes = [
+        (float(f.parts[1][rank - 1]), float(f.parts[1][0])) if rank else (1, 1) for f in frames
+    ]
+    ratios = [smallest / largest if largest else 0.0 for smallest, largest in extremes]
     ratios = [x if x > RANK_TOLERANCE else 0.0 for x in ratios]
     sigma = (ratios[0], min(ratios))
     if rank == m:
@@ -117,184 +158,201 @@ def _ranks(manifold: Manifold, start: Place) -> tuple[Ranks, list[Place]]:
         return Ranks(0, (), tuple(range(m)), False, (0.0, 0.0), len(places)), places
     null = [np.linalg.svd(f.B)[0][:, rank:] for f in regular]
     shared = np.flatnonzero(np.max([np.linalg.norm(u, axis=1) for u in null], axis=0) > 1e-6)
-    left_out, score = _chosen([f.B for f in regular], rank, shared.tolist())
-    found = Ranks(rank, (), tuple(shared.tolist()), True, sigma, len(places))
+    left_out, score = _select_dropped([f.B for f in regular], rank, shared.tolist())
+    result = Ranks(rank, (), tuple(shared.tolist()), True, sigma, len(places))
 
-    def good(nearly: bool) -> bool:
-        some = [f.place for f in regular[:3]]
-        return score >= GOOD and all(_implied(manifold, x, left_out, nearly) for x in some)
+    def is_good(nearly: bool) -> bool:
+        """Return True if the selected equations are independent and imply the others."""
+        samples = [f.place for f in regular[:3]]
+        return score >= MIN_SINGULAR_RATIO and all(
+            _implied(manifold, x, left_out, nearly) for x in samples
+        )
 
-    if good(nearly=False):
-        return replace(found, left_out=left_out), places
+    if is_good(nearly=False):
+        return replace(result, left_out=left_out), places
     if sums := _sums(manifold, start, rank, shared.tolist()):
         idle = tuple(k for k in shared.tolist() if not any(row[k] for row in sums))
-        return replace(found, left_out=idle, sums=sums), places
-    if good(nearly=True):
-        return replace(found, left_out=left_out), places
-    return replace(found, good=False), places
+        return replace(result, left_out=idle, sums=sums), places
+    if is_good(nearly=True):
+        return replace(result, left_out=left_out), places
+    return replace(result, good=False), places
 
 
 def _sums(
     manifold: Manifold, start: Place, rank: int, shared: list[int]
 ) -> tuple[tuple[float, ...], ...]:
-    """Sums of the rows `shared`, as many as these are worth, that are solved for in their place.
+    """Find weighted sums of the constraints `shared` that are independent along the motion.
 
-    A set of rows is singular somewhere along most motions of linkages in space, since its
-    determinant changes its sign; of some sums it does not. They are found by chance, and then made
-    better, over places all along the motion. None where that leads to no good ones.
+    For most spatial linkages every set of single constraints becomes singular somewhere, since its
+    determinant changes sign; for some sums it does not. Candidates are drawn at random and then
+    refined, over configurations all along the motion. Empty where the search fails.
     """
     m, count = len(manifold.rows), len(shared) - (len(manifold.rows) - rank)
-    if manifold.timed or not set(shared) <= set(manifold.holonomic) or len(shared) > MIXED:
+    if (
+        manifold.timed
+        or not set(shared) <= set(manifold.holonomic)
+        or len(shared) > MAX_SUMMED_CONSTRAINTS
+    ):
         return ()
-    places = [start, *islice(along(manifold, start), ALONG)]
-    usual = np.max([place.slopes for place in places], axis=0)[shared]
-    usual = np.where(usual > 0, usual, np.inf)
+    places = [start, *islice(trace_branch(manifold, start), PATH_SAMPLES)]
+    scales = np.max([place.slopes for place in places], axis=0)[shared]
+    scales = np.where(scales > 0, scales, np.inf)
     free, spans = np.ones(len(start.q), dtype=bool), list[Vector]()
     for place in places:
-        B = Frame(place, free, manifold.rows).B[shared] * (place.sizes[shared] / usual)[:, None]
+        B = Frame(place, free, manifold.rows).B[shared] * (place.sizes[shared] / scales)[:, None]
         U, s, _ = np.linalg.svd(B)
         if s[count - 1] > RANK_TOLERANCE * s[0]:
             U = U[:, :count]
             if spans and np.linalg.det(spans[-1].T @ U) < 0:  # turned as the last one is
                 U[:, 0] *= -1
             spans.append(U)
-    score, found = _best(np.array(spans), np.random.default_rng(5))
-    if score < MIXED_WELL:
+    score, weights = _best(np.array(spans), np.random.default_rng(5))
+    if score < MIN_SUM_SINGULAR_VALUE:
         return ()
     sums = np.zeros((count, m))
-    sums[:, shared] = [[float(f"{x:.3g}") for x in row] for row in found / usual]
+    sums[:, shared] = [[float(f"{x:.3g}") for x in row] for row in weights / scales]
     return tuple(map(tuple, sums.tolist()))
 
 
 def _best(spans: Vector, random: np.random.Generator) -> tuple[float, Vector]:
-    """Weights (count, n) of sums whose least singular value on all spans (k, n, count) is most.
+    """Find weights (count, n) of sums that maximise the least singular value on all spans (k, n,
+    count).
 
-    And that value; -1 where determinants on some have other signs than on others.
+    Returns that value and the weights; -1 where the determinant changes sign.
     """
     _, n, count = spans.shape
 
     def best(about: Vector, width: float, many: int) -> tuple[float, Vector]:
-        near = about + width * random.normal(size=(many, count, n))
-        tried = np.linalg.qr(near.transpose(0, 2, 1))[0].transpose(0, 2, 1)
-        on = tried[:, None] @ spans
-        least = np.linalg.svd(on, compute_uv=False)[..., -1].min(axis=1)
-        signs = np.sign(np.linalg.det(on)).sum(axis=1)
+        """Return the best of `many` random candidates around `about`."""
+        candidates_ = about + width * random.normal(size=(many, count, n))
+        candidates = np.linalg.qr(candidates_.transpose(0, 2, 1))[0].transpose(0, 2, 1)
+        projected = candidates[:, None] @ spans
+        least = np.linalg.svd(projected, compute_uv=False)[..., -1].min(axis=1)
+        signs = np.sign(np.linalg.det(projected)).sum(axis=1)
         score = np.where(np.abs(signs) == len(spans), least, -1.0)
-        return float(score.max()), tried[int(np.argmax(score))]
+        return float(score.max()), candidates[int(np.argmax(score))]
 
-    score, found = best(np.zeros((count, n)), 1.0, TRIED)
+    score, weights = best(np.zeros((count, n)), 1.0, CANDIDATES)
     width = 0.3
-    for _ in range(REFINED):
-        more, better = best(found, width, TRIED // 10)
-        if more > score:
-            score, found = more, better
+    for _ in range(REFINEMENTS):
+        new_score, new_weights = best(weights, width, CANDIDATES // 10)
+        if new_score > score:
+            score, weights = new_score, new_weights
         else:
             width /= 2
-    return score, found
+    return score, weights
 
 
 def _flat(manifold: Manifold, places: Sequence[Place]) -> tuple[int, ...]:
-    """Rows of positions whose slope is nothing where they hold, beside that next to it.
+    """Return holonomic constraints whose gradient vanishes where they hold, compared with nearby
+    gradients.
 
-    They are squares, or other powers. Where one has no slope at the start alone, that is singular.
+    Such constraints are squares or other powers. A gradient that vanishes at the start only is a
+    singular configuration.
     """
     start, random = places[0], np.random.default_rng(29)
     sizes = [*start.q, *(c.start for c in manifold.system.coordinates)]
     flat = list(manifold.holonomic) if len(places) > 1 else []
     for place in places:
         if flat:
-            # a walk from a singular position ends near it, where slopes grow with the way gone
-            span = sizes if place is start else place.q - start.q
-            reach = REACH * (float(np.max(np.abs(span))) or 1.0)
-            # nearer, slopes beside are as small as what is left where a square counts as zero
-            reach = max(reach, KNOWN * float(np.max(np.abs(place.q))))
-            q = [place.q + reach * random.normal(size=len(place.q)) for _ in range(BESIDE)]
-            found = [p for p in (manifold.place(x, place.t) for x in q) if p is not None]
-            beside = np.max([p.slopes for p in found], axis=0, initial=0.0)
-            flat = [k for k in flat if place.slopes[k] < FLAT * beside[k]]
-    return tuple(k for k in flat if not _held_by_others(manifold, start, k, flat))
+            # Near a singular configuration, gradients grow with the distance from it.
+            extent = sizes if place is start else place.q - start.q
+            distance = NEARBY_DISTANCE * (float(np.max(np.abs(extent))) or 1.0)
+            # Closer, nearby gradients would be as small as the remaining residual of a square.
+            distance = max(distance, POSITION_TOLERANCE * float(np.max(np.abs(place.q))))
+            q = [place.q + distance * random.normal(size=len(place.q)) for _ in range(NEARBY_COUNT)]
+            nearby = [p for p in (manifold.place(x, place.t) for x in q) if p is not None]
+            gradients = np.max([p.slopes for p in nearby], axis=0, initial=0.0)
+            flat = [k for k in flat if place.slopes[k] < ZERO_GRADIENT_RATIO * gradients[k]]
+    return tuple(k for k in flat if not _is_implied_in_loop(manifold, start, k, flat))
 
 
-def _held_by_others(manifold: Manifold, start: Place, row: int, flat: Sequence[int]) -> bool:
-    """Whether a row of a loop is zero wherever the rows are that are not flat.
+def _is_implied_in_loop(manifold: Manifold, start: Place, row: int, flat: Sequence[int]) -> bool:
+    """Return True if a constraint of a loop holds wherever the other constraints hold.
 
-    A row that a person wrote is reported all the same: it may be meant otherwise.
+    A constraint written by the user is reported in any case, since it may be a mistake.
     """
     system = manifold.system
     if not system.constraints[row].loop:
         return False
-    kept = tuple(c for k, c in enumerate(system.constraints) if k not in flat)
-    if not kept:
+    others = tuple(c for k, c in enumerate(system.constraints) if k not in flat)
+    if not others:
         return False
-    alone = Manifold(replace(system, constraints=kept))
-    there = alone.place(start.q, start.t)
-    if there is None:
+    reduced = Manifold(replace(system, constraints=others))
+    start_on_reduced = reduced.place(start.q, start.t)
+    if start_on_reduced is None:
         return False
-    found = [manifold.place(x.q, x.t) for x in walk(alone, there, FEWER)]
-    off = [abs(x.phi[row]) for x in found if x is not None]
-    return bool(off) and max(off) <= KNOWN * float(manifold.usual[row])
+    configurations = [
+        manifold.place(x.q, x.t) for x in random_walk(reduced, start_on_reduced, FEW_SAMPLES)
+    ]
+    residuals = [abs(x.phi[row]) for x in configurations if x is not None]
+    return bool(residuals) and max(residuals) <= POSITION_TOLERANCE * float(manifold.usual[row])
 
 
-def _chosen(
-    matrices: Sequence[Vector], rank: int, some: Sequence[int]
+def _select_dropped(
+    matrices: Sequence[Vector], rank: int, removable: Sequence[int]
 ) -> tuple[tuple[int, ...], float]:
-    """The rows of `some` to leave out, and how well the rest does at the worst of the matrices.
+    """Select the constraints of `some` to drop, and return them with the quality of the rest.
 
-    Each (m, nq), its rows of length 1. Well: their smallest singular value over that of all rows.
-    Of sets that are as good, the one that leaves the last rows out.
+    matrices: Jacobians (m, nq) with rows of length 1. The quality is the smallest singular value of
+    the remaining rows over that of all rows, at the worst matrix. Among equally good sets, the last
+    constraints are dropped.
     """
     m = len(matrices[0])
     every = range(m)
-    whole = [float(np.linalg.svd(B, compute_uv=False)[rank - 1]) for B in matrices]
+    full_values = [float(np.linalg.svd(B, compute_uv=False)[rank - 1]) for B in matrices]
 
-    def score(out: Sequence[int], relative: bool) -> float:
-        kept = [k for k in every if k not in out]
-        found = (float(np.linalg.svd(B[kept], compute_uv=False)[rank - 1]) for B in matrices)
-        return min(s / w if relative else s for s, w in zip(found, whole, strict=True))
+    def score(removed: Sequence[int], relative: bool) -> float:
+        remaining = [k for k in every if k not in removed]
+        score_of_set = (
+            float(np.linalg.svd(B[remaining], compute_uv=False)[rank - 1]) for B in matrices
+        )
+        return min(s / w if relative else s for s, w in zip(score_of_set, full_values, strict=True))
 
     def best(sets: Iterator[tuple[int, ...]]) -> tuple[int, ...]:
-        chosen, most = tuple[int, ...](), 0.0
-        for out in sets:
-            found = score(out, False)
-            if not chosen or found > BETTER * most:
-                chosen, most = out, found
-        return chosen
+        dropped, best_score = tuple[int, ...](), 0.0
+        for removed in sets:
+            score_of_set = score(removed, False)
+            if not dropped or score_of_set > IMPROVEMENT * best_score:
+                dropped, best_score = removed, score_of_set
+        return dropped
 
-    spare, backwards = m - rank, sorted(some, reverse=True)
-    if comb(len(backwards), spare) <= MOST_SETS:
-        chosen = best(combinations(backwards, spare))
+    surplus, last_first = m - rank, sorted(removable, reverse=True)
+    if comb(len(last_first), surplus) <= MAX_SETS:
+        dropped = best(combinations(last_first, surplus))
     else:
-        chosen = ()
-        for _ in range(spare):
-            chosen = best((*chosen, k) for k in backwards if k not in chosen)
-    return tuple(sorted(chosen)), score(chosen, True)
+        dropped = ()
+        for _ in range(surplus):
+            dropped = best((*dropped, k) for k in last_first if k not in dropped)
+    return tuple(sorted(dropped)), score(dropped, True)
 
 
-def _implied(manifold: Manifold, place: Place, out: Sequence[int], nearly: bool) -> bool:
-    """Whether the gradients of rows `out` are sums of the others', in forty digits.
+def _implied(manifold: Manifold, place: Place, removed: Sequence[int], allow_double: bool) -> bool:
+    """Return True if the gradients of constraints `out` are linear combinations of the others, to
+    40 digits.
 
-    nearly: or as doubles tell, where rows of numbers that are given in doubles agree no better.
+    nearly: accept double precision where the constraints hold in double precision only.
     """
     mp, n = context(), len(place.q)
     free = np.ones(n, dtype=bool)
-    q, held = manifold.polished(place, free)
-    if not held and not (nearly and manifold.rounded(place)):
+    q, exact = manifold.polished(place, free)
+    if not exact and not (allow_double and manifold.rounded(place)):
         return False
-    same = SAME if held else NEARLY
+    tolerance = EXACT_TOLERANCE if exact else DOUBLE_TOLERANCE
     flat = manifold.exactly("constraint_jacobian", q, [0] * n, place.t)
     rows = [flat[k * n : (k + 1) * n] for k in manifold.rows]
-    kept = [k for k in manifold.rows if k not in out]
-    A = np.array([[float(x) for x in rows[k]] for k in kept])
+    remaining = [k for k in manifold.rows if k not in removed]
+    A = np.array([[float(x) for x in rows[k]] for k in remaining])
     size = np.linalg.norm(A, axis=1)
-    into = np.linalg.pinv((A / size[:, None]).T) / size[:, None]
-    for k in (k for k in out if np.any(place.A[k])):
-        left: list[Any] = [mp.mpf(x) for x in rows[k]]
+    inverse = np.linalg.pinv((A / size[:, None]).T) / size[:, None]
+    for k in (k for k in removed if np.any(place.A[k])):
+        residual: list[Any] = [mp.mpf(x) for x in rows[k]]
         for _ in range(6):
-            weights = (into @ np.array([float(x) for x in left])).tolist()
-            for w, row in zip(weights, (rows[i] for i in kept), strict=True):
+            weights = (inverse @ np.array([float(x) for x in residual])).tolist()
+            for w, row in zip(weights, (rows[i] for i in remaining), strict=True):
                 if w:
-                    left = [x - mp.mpf(w) * y for x, y in zip(left, row, strict=True)]
-        whole = max(abs(x) for x in rows[k])
-        if max(abs(x) for x in left) > same * whole:
+                    residual = [x - mp.mpf(w) * y for x, y in zip(residual, row, strict=True)]
+        size_of_row = max(abs(x) for x in rows[k])
+        if max(abs(x) for x in residual) > tolerance * size_of_row:
             return False
     return True

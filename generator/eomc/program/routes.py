@@ -1,7 +1,8 @@
-"""The registry of routes: every way to compute what the equations of motion say.
+"""The registry of routes: the methods by which the functions of the equations of motion are
+derived.
 
-A new route is a function of the `Material`, here or in derive/, and its entry in `ROUTES`; which
-route a function takes is decided by admissible.py.
+To add a route, write a function of `RouteInputs` here or in derive/ and an entry of `ROUTES`.
+admissible.py selects the route of each function.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from eomc.derive.tape import Tape
 from eomc.model.system import System
 from eomc.program.polynomial import Expander
 
-SHORT = 120  # names on a tape that C depends on: it is worth multiplying out
+MAX_EXPANDED_DEFINITIONS = 120  # definitions that C depends on, up to which it is expanded
 
 
-class Material:
-    """What routes are made of: a derivation, and Lagrange's equations multiplied out."""
+class RouteInputs:
+    """Inputs of all routes: a derivation, and Lagrange's equations expanded."""
 
     def __init__(self, derived: Derivation) -> None:
         self.derived = derived
@@ -34,22 +35,24 @@ class Material:
 
     @cached_property
     def expanded(self) -> tuple[Tape, Rows, Sequence[Expr]] | None:
-        """D and b of D qdd = b, multiplied out on a tape; None where they grow too large."""
+        """D and b of D qdd = b, expanded on the tape; None where they become too large."""
         if self.lagrange is None or self.expander is None:
             return None
         D, n = self.lagrange.D, len(self.lagrange.bias)
         lower = [(i, j) for i in range(n) for j in range(i + 1)]
-        both = self.expander.expand([*(D[i][j] for i, j in lower), *self.lagrange.balance])
-        if both is None:
+        entries_and_forces = self.expander.expand(
+            [*(D[i][j] for i, j in lower), *self.lagrange.balance]
+        )
+        if entries_and_forces is None:
             return None
-        entries = dict(zip(lower, both, strict=False))
+        entries = dict(zip(lower, entries_and_forces, strict=False))
         rows = tuple(tuple(entries[max(i, j), min(i, j)] for j in range(n)) for i in range(n))
-        return self.lagrange.tape, rows, both[len(lower) :]
+        return self.lagrange.tape, rows, entries_and_forces[len(lower) :]
 
 
 @dataclass(frozen=True)
 class Functions:
-    """Results of functions by name, on a tape; notes: where unusual terms of K went."""
+    """Outputs of functions by name, on a tape; notes: where unusual terms of K appear."""
 
     tape: Tape
     outputs: Mapping[str, Sequence[Expr]]
@@ -57,6 +60,7 @@ class Functions:
 
 
 def _by_ldl(system: System, order: str) -> str:
+    """Describe elimination by L D L^T."""
     if system.constraints:
         return (
             "a = qdd by L diag(d) L^T of the KKT matrix [[D, A^T], [A, 0]], eliminated in the "
@@ -67,79 +71,100 @@ def _by_ldl(system: System, order: str) -> str:
 
 @dataclass(frozen=True)
 class Route:
-    """One way to the accelerations, to the other functions, or to both.
+    """A method for the accelerations, for the other functions, or for both.
 
-    sentence: what it is, for people. accelerations: qdd, or why it is passed over, or None where
-    there is nothing to try; functions: None likewise. solved: how D qdd = tau - bias is solved,
-    for a comment, with the order in which coordinates are eliminated. penalty: a factor on its
-    weight, for what operations do not count.
+    Attributes
+    ----------
+    sentence
+        A description for users.
+    accelerations
+        Returns qdd; a str gives the reason why the route is not used; None where it does not apply.
+    functions
+        Returns the other functions; None where the route does not apply.
+    solved
+        Returns a sentence for a comment that says how D qdd = tau - bias is solved, from the system
+        and the order of elimination.
+    penalty
+        A factor on the operation count for disadvantages that it does not include.
     """
 
     name: str
     sentence: str
-    accelerations: Callable[[Material], SolveResult] = lambda _: None
-    functions: Callable[[Material], Functions | None] = lambda _: None
+    accelerations: Callable[[RouteInputs], SolveResult] = lambda _: None
+    functions: Callable[[RouteInputs], Functions | None] = lambda _: None
     solved: Callable[[System, str], str] = _by_ldl
     penalty: float = 1.0
 
 
 def _power(e: Equations) -> Expr:
-    """Into the system, with what constraints do that time moves: lambda A qd."""
+    """Return the power supplied to the system, including that of moving constraints, lambda . A
+    qd.
+    """
     if e.rows is None or not any(e.rows.drift):
         return e.power
     multipliers = kkt.accelerations(e.tape, e.D, e.balance, e.rows).multipliers
-    works = [e.tape.times(x, v) for x, v in zip(multipliers, e.rows.drift, strict=True)]
-    return e.tape.total([e.power, *works])
+    powers = [e.tape.times(x, v) for x, v in zip(multipliers, e.rows.drift, strict=True)]
+    return e.tape.total([e.power, *powers])
 
 
 def _functions(e: Equations | None) -> Functions | None:
+    """Return all functions of the equations of motion other than the accelerations."""
     if e is None:
         return None
-    wanted: dict[str, Sequence[Expr]] = {
+    outputs: dict[str, Sequence[Expr]] = {
         name if len(rows) == len(e.g) else f"{name}_column": [x for row in rows for x in row]
         for name, rows in (("D", e.D), ("C", e.C))
     }
-    wanted |= {"g": e.g, "bias": e.bias, "tau": e.tau}
-    wanted |= {"kinetic_energy": [e.kinetic], "potential_energy": [e.potential]}
-    wanted["energy"] = [e.tape.define(e.kinetic + e.potential)]
+    outputs |= {"g": e.g, "bias": e.bias, "tau": e.tau}
+    outputs |= {"kinetic_energy": [e.kinetic], "potential_energy": [e.potential]}
+    outputs["energy"] = [e.tape.define(e.kinetic + e.potential)]
     if e.jacobi is not None:
-        wanted["jacobi"] = [e.jacobi]
+        outputs["jacobi"] = [e.jacobi]
     if (power := _power(e)) != 0:
-        wanted["power"] = [power]
+        outputs["power"] = [power]
     if e.signals:
-        wanted["signal"] = e.signals
-    return Functions(e.tape, wanted, e.notes)
+        outputs["signal"] = e.signals
+    return Functions(e.tape, outputs, e.notes)
 
 
-def _expanded_functions(material: Material) -> Functions | None:
+def _expanded_functions(material: RouteInputs) -> Functions | None:
+    """Return the functions by Lagrange, expanded."""
     plain = _functions(material.lagrange)
     if plain is None or material.expander is None:
         return None
     expand = material.expander.expand
-    found = {name: expand(outputs) for name, outputs in plain.outputs.items()}
-    outputs = {name: short for name, short in found.items() if short is not None}
+    expanded = {name: expand(outputs) for name, outputs in plain.outputs.items()}
+    outputs = {
+        name: polynomials for name, polynomials in expanded.items() if polynomials is not None
+    }
     return replace(plain, outputs=outputs)
 
 
-def _rotated(material: Material) -> Functions | None:
-    """C along a short tree, where rotations there and back cancel by sin^2 + cos^2 = 1."""
+def _rotated(material: RouteInputs) -> Functions | None:
+    """Return C of a short tree, expanded: rotations that cancel are removed by sin^2 + cos^2 =
+    1.
+    """
     plain = _functions(material.derived.newton_euler)
     if plain is None or "C" not in plain.outputs:
         return None
     C, tape = plain.outputs["C"], plain.tape
     names = [x for entry in C for x in entry.free_symbols]
-    short = Expander(tape).expand(C) if len(tape.live(names)) <= SHORT else None
-    return None if short is None else replace(plain, outputs={"C": short})
+    expanded_C = (
+        Expander(tape).expand(C) if len(tape.live(names)) <= MAX_EXPANDED_DEFINITIONS else None
+    )
+    return None if expanded_C is None else replace(plain, outputs={"C": expanded_C})
 
 
-def _expanded(material: Material) -> SolveResult:
+def _expanded(material: RouteInputs) -> SolveResult:
+    """Return the accelerations by elimination in the expanded equations."""
     if material.expanded is None:
         return None
     rows = material.lagrange.rows if material.lagrange else None
     return kkt.accelerations(*material.expanded, rows) if rows else solve(*material.expanded)
 
 
-def _cancelled(material: Material) -> SolveResult:
+def _cancelled(material: RouteInputs) -> SolveResult:
+    """Return the accelerations, expanded again after each step of the elimination."""
     if material.expander is None or material.expanded is None:
         return None
     rows = material.lagrange.rows if material.lagrange else None
@@ -150,11 +175,12 @@ def _cancelled(material: Material) -> SolveResult:
 
 
 def _constrained(e: Equations | None) -> SolveResult:
-    """Under constraints, over equations as they are."""
+    """Return the constrained accelerations from equations that are not expanded."""
     return kkt.accelerations(e.tape, e.D, e.balance, e.rows) if e and e.rows else None
 
 
 def _by_articulated_bodies(_: System, order: str) -> str:
+    """Describe the articulated-body algorithm."""
     return (
         "a = qdd by articulated bodies (Featherstone), the pivots d being those of "
         f"D = L diag(d) L^T, eliminated in the order {order}."
@@ -162,6 +188,7 @@ def _by_articulated_bodies(_: System, order: str) -> str:
 
 
 def _by_multipliers(system: System, order: str) -> str:
+    """Describe elimination by link multipliers."""
     fractions = "Along a chain s = N/M: s_k is N there, and S_k is M times the entry it was. "
     return (
         "a = qdd by link multipliers (tensions), S = N T N^T = L diag(s) L^T, eliminated in the "
@@ -203,7 +230,7 @@ ROUTES: Mapping[str, Route] = {
             "link multipliers: the tensions of links between point masses",
             lambda m: m.derived.multipliers,
             solved=_by_multipliers,
-            penalty=1.25,  # D bears massless links: that is worth a fifth
+            penalty=1.25,  # D allows massless links, which justifies 25 % more operations
         ),
     )
 }

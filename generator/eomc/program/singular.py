@@ -1,4 +1,6 @@
-"""How near a linkage with one freedom comes to a singular position, all along its way."""
+"""Search for the configuration closest to a singularity, for mechanisms with one degree of
+freedom.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +13,26 @@ import numpy as np
 from eomc.model import discrete, sticking
 from eomc.model.system import System
 from eomc.program.manifold import Flags, Frame, Manifold, Place, Vector
-from eomc.program.walks import along, moved
+from eomc.program.walks import step_on_manifold, trace_branch
 
-PLACES = 120  # each way from the start
-STEP = 0.1  # from one to the next, at most, in coordinates' own units
-REFINED = 40  # steps of the golden section
-NOUGHT = 1e-6  # of the largest singular value: the least one is none
-AS_NEAR = 1.0001  # times the least: a place is as near
-EVEN = 0.999  # times that beside: as good as no change
-ROUND = 1e-7  # of the largest coordinate: as good as 0
+MAX_CONFIGURATIONS = 120  # in each direction from the start
+MAX_STEP = 0.1  # between configurations, in the units of the coordinates
+GOLDEN_SECTION_STEPS = 40
+ZERO_TOLERANCE = 1e-6  # singular values below this fraction of the largest one count as 0
+TIE_RATIO = 1.0001  # configurations within this ratio of the least value are equally close
+FLAT_RATIO = 0.999  # a minimum must be below this ratio of its larger neighbour
+ZERO_COORDINATE_TOLERANCE = 1e-7  # relative to the largest coordinate
 GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
-class Nearest:
-    """sigma: smallest over largest singular value that counts, 0 at a singular position; q there.
+class ClosestSingularity:
+    """The configuration closest to a singularity.
 
-    Rows in units of the largest inverse inertia that they have on the way, coordinates in the
-    metric of D, so that a row without a slope counts too.
+    sigma: smallest over largest nonzero singular value of the constraint Jacobian, 0 at a singular
+    configuration. q: the coordinates there. Constraints are scaled by their largest inverse inertia
+    along the motion and coordinates by the metric of D, so that a constraint whose gradient
+    vanishes is detected.
     """
 
     sigma: float
@@ -39,11 +43,11 @@ class Nearest:
         return f"  sigma_min/sigma_max {self.sigma:.3g} at the worst on its way: {where}"
 
 
-def nearest(system: System) -> Nearest | None:
-    """The place along the motion of an assembled system; None of one with more freedoms than one.
+def closest_singularity(system: System) -> ClosestSingularity | None:
+    """Find the configuration closest to a singularity along the motion of an assembled system.
 
-    None too where rows are of rates or depend on the time: positions are then no one way. Of places
-    that are as near the one that is reached first.
+    None for more than one degree of freedom, and for constraints that depend on velocities or time.
+    Among equally close configurations, the one that is reached first is returned.
     """
     system = discrete.constant(sticking.without(system) if system.modes else system)
     manifold, rows = Manifold(system), system.constraints
@@ -53,53 +57,65 @@ def nearest(system: System) -> Nearest | None:
     start = manifold.place(np.array([c.start for c in system.coordinates], float))
     if start is None:
         return None
-    ways = [[start, *islice(along(manifold, start, STEP, to), PLACES)] for to in (1, -1)]
-    usual = np.max([place.slopes for way in ways for place in way], axis=0)
-    usual = np.where(usual > 0, usual, 1.0)
+    branches = [
+        [start, *islice(trace_branch(manifold, start, MAX_STEP, to), MAX_CONFIGURATIONS)]
+        for to in (1, -1)
+    ]
+    scales = np.max([place.slopes for way in branches for place in way], axis=0)
+    scales = np.where(scales > 0, scales, 1.0)
     free = np.ones(len(start.q), dtype=bool)
 
     def sigma(place: Place | None) -> float:
+        """Return the ratio of singular values at a configuration."""
         if place is None:
             return np.inf
         frame = Frame(place, free, manifold.rows)
-        s = np.linalg.svd(frame.B * (place.sizes / usual)[:, None], compute_uv=False)
+        s = np.linalg.svd(frame.B * (place.sizes / scales)[:, None], compute_uv=False)
         return float(s[rank - 1] / s[0])
 
-    found = [(0, sigma(start), start)]
-    for way in ways:
+    candidates = [(0, sigma(start), start)]
+    for way in branches:
         values = [sigma(place) for place in way]
-        found += [(k, *pair) for k, pair in enumerate(zip(values, way, strict=True))]
+        candidates += [(k, *pair) for k, pair in enumerate(zip(values, way, strict=True))]
         for k in range(1, len(way) - 1):
-            beside = values[k - 1], values[k + 1]
-            if values[k] <= min(beside) and values[k] < EVEN * max(beside):
+            neighbours = values[k - 1], values[k + 1]
+            if values[k] <= min(neighbours) and values[k] < FLAT_RATIO * max(neighbours):
                 ends = (way[k - 1].q - way[k].q, way[k + 1].q - way[k].q)
-                found.append((k, *_least(manifold, sigma, way[k], ends, free)))
-    least = max(min(value for _, value, _ in found), NOUGHT)
-    _, best, at = min((x for x in found if x[1] <= AS_NEAR * least), key=lambda x: x[0])
-    size = max(np.max(np.abs(place.q)) for _, _, place in found)
-    q = np.where(np.abs(at.q) > ROUND * size, at.q, 0.0)
-    named = dict(zip((c.name for c in system.coordinates), q.tolist(), strict=True))
-    return Nearest(best if best > NOUGHT else 0.0, named)
+                candidates.append((k, *_least(manifold, sigma, way[k], ends, free)))
+    least = max(min(value for _, value, _ in candidates), ZERO_TOLERANCE)
+    _, least_sigma, closest = min(
+        (x for x in candidates if x[1] <= TIE_RATIO * least), key=lambda x: x[0]
+    )
+    size = max(np.max(np.abs(place.q)) for _, _, place in candidates)
+    q = np.where(np.abs(closest.q) > ZERO_COORDINATE_TOLERANCE * size, closest.q, 0.0)
+    coordinates = dict(zip((c.name for c in system.coordinates), q.tolist(), strict=True))
+    return ClosestSingularity(least_sigma if least_sigma > ZERO_TOLERANCE else 0.0, coordinates)
 
 
 def _least(
     manifold: Manifold, sigma: Callable[[Place | None], float], middle: Place,
     ends: tuple[Vector, Vector], free: Flags,
 ) -> tuple[float, Place]:  # fmt: skip
-    """The least sigma between a place's neighbours, by golden section, and its place."""
+    """Minimise sigma between a configuration's neighbours by golden-section search."""
 
-    def there(s: float) -> Place | None:
-        """From one neighbour, -1, over the middle, 0, to the other, 1."""
-        return moved(manifold, middle, abs(s) * ends[int(s > 0)], 0.0, free) if s else middle
+    def configuration(s: float) -> Place | None:
+        """Return the configuration at s, from one neighbour (-1) over the middle (0) to the other
+        (1).
+        """
+        return (
+            step_on_manifold(manifold, middle, abs(s) * ends[int(s > 0)], 0.0, free)
+            if s
+            else middle
+        )
 
     low, high = -1.0, 1.0
-    tried = {s: sigma(there(s)) for s in (-(GOLDEN**3), GOLDEN**3)}
-    for _ in range(REFINED):
-        one, other = sorted(s for s in tried if low < s < high)
-        if tried[one] < tried[other]:
-            high, more = other, other - GOLDEN * (other - low)
+    values = {s: sigma(configuration(s)) for s in (-(GOLDEN**3), GOLDEN**3)}
+    for _ in range(GOLDEN_SECTION_STEPS):
+        first, second = sorted(s for s in values if low < s < high)
+        if values[first] < values[second]:
+            high, new_point = second, second - GOLDEN * (second - low)
         else:
-            low, more = one, one + GOLDEN * (high - one)
-        tried[more] = sigma(there(more))
-    s = min(tried, key=lambda s: tried[s])
-    return tried[s], there(s) or middle
+            low, new_point = first, first + GOLDEN * (high - first)
+        values[new_point] = sigma(configuration(new_point))
+    s = min(values, key=lambda s: values[s])
+    return values[s], configuration(s) or middle

@@ -1,4 +1,4 @@
-"""Fewer operations: common factors out, parameters' work first, repeated pairs named once."""
+"""Reduction of operations: common factors, parameter-only terms and common subexpressions."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from sympy import Expr, S
 
 from eomc.derive.atoms import is_negative
 from eomc.derive.tape import Stage
-from eomc.program.draft import Draft
+from eomc.program.draft import ScheduleBuilder
 from eomc.program.ir import Operand, Product, Sum
 
 Term = tuple[Expr, str]  # (weight, name)
-_Pair = tuple[str, str, Expr]  # (name, name, weight of the second over that of the first)
+_Pair = tuple[str, str, Expr]  # (name, name, ratio of the second weight to the first)
 
 
-def tidy(d: Draft, ends: list[Operand]) -> None:
-    """Fewer operations for the same results."""
+def tidy(d: ScheduleBuilder, ends: list[Operand]) -> None:
+    """Reduce the operations of a function without changing its results."""
     _scale(d, ends)
     d.drop(ends)
     _absorb(d, ends)
@@ -36,16 +36,18 @@ def tidy(d: Draft, ends: list[Operand]) -> None:
     d.drop(ends)
 
 
-def _scale(d: Draft, ends: list[Operand]) -> None:
-    """Numbers in front of results become part of a product, where they may cost nothing."""
+def _scale(d: ScheduleBuilder, ends: list[Operand]) -> None:
+    """Move numeric factors of results into products, where they may be absorbed."""
     for k, o in enumerate(ends):
         if o.name in d.values and abs(o.coefficient) != 1:
             sign = S.NegativeOne if is_negative(o.coefficient) else S.One
             ends[k] = Operand(sign, d.new(Product(abs(o.coefficient), (o.name,))))
 
 
-def _absorb(d: Draft, ends: Iterable[Operand]) -> None:
-    """A product used once, by a product or a sum, goes into it; so do coefficients."""
+def _absorb(d: ScheduleBuilder, ends: Iterable[Operand]) -> None:
+    """Merge products that are used once into the product or sum that uses them, with
+    coefficients.
+    """
     uses = d.uses(ends)
     for name, value in list(d.values.items()):
         if isinstance(value, Product):
@@ -74,8 +76,11 @@ def _absorb(d: Draft, ends: Iterable[Operand]) -> None:
             d.put(name, Sum(tuple(terms), value.constant))
 
 
-def _factor(d: Draft, ends: Iterable[Operand], least: Stage) -> None:
-    """a x + b x = (a + b) x for x known from `least` on; the products serve nothing else."""
+def _factor(d: ScheduleBuilder, ends: Iterable[Operand], least: Stage) -> None:
+    """Replace a x + b x by (a + b) x, for x with a binding time of `least` or later.
+
+    Only products that are used once are factored.
+    """
     queue = [n for n, v in d.values.items() if isinstance(v, Sum)]
     uses = d.uses(ends)
     while queue:
@@ -93,33 +98,33 @@ def _factor(d: Draft, ends: Iterable[Operand], least: Stage) -> None:
         best = max(counts, key=lambda f: (counts[f], -d.stages[f], f), default=None)
         if best is None or counts[best] < 2:
             continue
-        taken, rest = [], []
+        factored, other_terms = [], []
         for weight, term in value.terms:
             product = inside.get(term)
             if product is None or best not in product.factors:
-                rest.append((weight, term))
+                other_terms.append((weight, term))
                 continue
             factors = list(product.factors)
             factors.remove(best)
-            taken.append((weight * product.coefficient, tuple(factors)))
+            factored.append((weight * product.coefficient, tuple(factors)))
         terms, constant = [], S.Zero
-        for weight, factors_left in taken:
+        for weight, factors_left in factored:
             if not factors_left:
                 constant += weight
             elif len(factors_left) == 1:
                 terms.append((weight, factors_left[0]))
             else:
                 sign = S.NegativeOne if is_negative(weight) else S.One
-                made = d.new(Product(abs(weight), factors_left))
-                uses[made] += 1
-                terms.append((sign, made))
+                product_name = d.new(Product(abs(weight), factors_left))
+                uses[product_name] += 1
+                terms.append((sign, product_name))
         bracket = Sum(tuple(terms), constant)
         inner_name = d.new(bracket)
         uses[inner_name] += 1
-        if rest or value.constant != 0:
-            whole = d.new(Product(S.One, (best, inner_name)))
-            uses[whole] += 1
-            d.put(name, Sum((*rest, (S.One, whole)), value.constant))
+        if other_terms or value.constant != 0:
+            product_of_bracket = d.new(Product(S.One, (best, inner_name)))
+            uses[product_of_bracket] += 1
+            d.put(name, Sum((*other_terms, (S.One, product_of_bracket)), value.constant))
             queue.append(name)
         else:
             d.put(name, Product(S.One, (best, inner_name)))
@@ -127,29 +132,31 @@ def _factor(d: Draft, ends: Iterable[Operand], least: Stage) -> None:
     d.sort()
 
 
-def _hoist(d: Draft) -> None:
-    """What parameters alone decide inside a later sum or product gets a name of its own."""
+def _hoist(d: ScheduleBuilder) -> None:
+    """Give names to parameter-only parts of later sums and products, so that they are
+    precomputed.
+    """
     for name, value in list(d.values.items()):
         if d.stages[name] <= Stage.PARAMETER:
             continue
         if isinstance(value, Product):
-            early = [f for f in value.factors if d.stages[f] <= Stage.PARAMETER]
+            constant = [f for f in value.factors if d.stages[f] <= Stage.PARAMETER]
             sign = S.NegativeOne if is_negative(value.coefficient) else S.One
-            if early and (len(early) > 1 or abs(value.coefficient) != 1):
-                late = [f for f in value.factors if f not in early]
-                made = d.new(Product(abs(value.coefficient), tuple(sorted(early))))
-                d.put(name, Product(sign, (made, *late)))
+            if constant and (len(constant) > 1 or abs(value.coefficient) != 1):
+                varying = [f for f in value.factors if f not in constant]
+                precomputed = d.new(Product(abs(value.coefficient), tuple(sorted(constant))))
+                d.put(name, Product(sign, (precomputed, *varying)))
         elif isinstance(value, Sum):
-            early_terms = [p for p in value.terms if d.stages[p[1]] <= Stage.PARAMETER]
-            if len(early_terms) > 1 or (early_terms and value.constant != 0):
-                late_terms = [p for p in value.terms if p not in early_terms]
-                made = d.new(Sum(tuple(early_terms), value.constant))
-                d.put(name, Sum(((S.One, made), *late_terms)))
+            constant_terms = [p for p in value.terms if d.stages[p[1]] <= Stage.PARAMETER]
+            if len(constant_terms) > 1 or (constant_terms and value.constant != 0):
+                varying_terms = [p for p in value.terms if p not in constant_terms]
+                precomputed = d.new(Sum(tuple(constant_terms), value.constant))
+                d.put(name, Sum(((S.One, precomputed), *varying_terms)))
     d.sort()
 
 
-def _share_products(d: Draft) -> None:
-    """The most frequent pair of factors gets a name, again and again."""
+def _share_products(d: ScheduleBuilder) -> None:
+    """Name the most frequent pair of factors, repeatedly."""
     items: dict[str, list[Term]] = {
         n: [(S.One, f) for f in v.factors]
         for n, v in d.values.items()
@@ -163,8 +170,8 @@ def _share_products(d: Draft) -> None:
     d.sort()
 
 
-def _share_sums(d: Draft) -> None:
-    """The most frequent pair of terms gets a name, up to a sign."""
+def _share_sums(d: ScheduleBuilder) -> None:
+    """Name the most frequent pair of terms up to sign, repeatedly."""
     items: dict[str, list[Term]] = {
         n: list(v.terms)
         for n, v in d.values.items()
@@ -179,52 +186,52 @@ def _share_sums(d: Draft) -> None:
 
 
 def _pairs(terms: Sequence[Term]) -> set[_Pair]:
-    """Pairs of terms whose weights are one or minus one."""
+    """Return the pairs of terms whose weights are 1 or -1."""
     plain = sorted((x, w) for w, x in terms if w in (S.One, S.NegativeOne))
     return {(x, y, S.One if v == w else S.NegativeOne) for (x, v), (y, w) in combinations(plain, 2)}
 
 
 def _share(
     items: dict[str, list[Term]],
-    made_of: Callable[[str, str, Expr], str],
+    define_pair: Callable[[str, str, Expr], str],
     stages: Mapping[str, Stage],
 ) -> None:
-    """Give the pair that most items have in common a name of its own, until none is shared."""
+    """Name the pair that most items have in common, until no pair is shared."""
     index: dict[_Pair, set[str]] = {}
     heap: list[tuple[int, int, str, str, int, _Pair]] = []
 
     def enter(name: str) -> None:
         for pair in _pairs(items[name]):
-            where = index.setdefault(pair, set())
-            where.add(name)
-            if len(where) > 1:
+            users = index.setdefault(pair, set())
+            users.add(name)
+            if len(users) > 1:
                 push(pair)
 
     def push(pair: _Pair) -> None:
         x, y, ratio = pair
-        late = max(stages[x], stages[y])
-        heappush(heap, (-len(index[pair]), late, x, y, int(ratio), pair))
+        stage = max(stages[x], stages[y])
+        heappush(heap, (-len(index[pair]), stage, x, y, int(ratio), pair))
 
     for name in items:
         enter(name)
     while heap:
         count, *_, pair = heappop(heap)
-        where = index[pair]
-        if len(where) != -count:
-            if len(where) > 1:
+        users = index[pair]
+        if len(users) != -count:
+            if len(users) > 1:
                 push(pair)
             continue
         x, y, ratio = pair
-        made = made_of(x, y, ratio)
-        for name in sorted(where):
+        pair_name = define_pair(x, y, ratio)
+        for name in sorted(users):
             terms = items[name]
-            if name == made:
+            if name == pair_name:
                 continue
             for other in _pairs(terms):
                 index[other].discard(name)
             weight = next(w for w, n in terms if n == x)
             terms.remove((weight, x))
             terms.remove((weight * ratio, y))
-            terms.append((weight, made))
+            terms.append((weight, pair_name))
             enter(name)
-        where.clear()
+        users.clear()

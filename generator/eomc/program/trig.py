@@ -1,7 +1,7 @@
-"""Sines and cosines apart from the rest of a function, so that they can be had at other times.
+"""Separation of sines and cosines from a function, so that they can be computed at other times.
 
-RK4 computes them at places that are known when a step begins, and turns them from there by the
-little that is missing: that shortens the chain of operations which a small scene waits for.
+RK4 computes them at configurations that are known at the beginning of a step and rotates them by
+the small remaining angle. This shortens the dependency chain that limits the speed of small scenes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from eomc.program.ir import Assignment, Call, Function, Operand, Sum, Value
 
 @dataclass(frozen=True)
 class Angle:
-    """An angle, offset + sum of coefficient times coordinate; the names of its sine and cosine."""
+    """An angle, offset + sum of coefficient times coordinate, and the names of its sine and
+    cosine.
+    """
 
     terms: tuple[tuple[Expr, str], ...]
     offset: Expr
@@ -25,25 +27,27 @@ class Angle:
 
 
 def apart(function: Function, coordinates: Collection[str]) -> tuple[tuple[Angle, ...], Function]:
-    """The angles that depend on coordinates alone, and the function that reads their sines."""
+    """Separate the angles that depend on coordinates only. Returns them and the function without
+    them.
+    """
     values = {a.name: a.value for a in function.body}
-    found: dict[tuple[Operand, ...], dict[str, str]] = {}
+    by_argument: dict[tuple[Operand, ...], dict[str, str]] = {}
     for a in function.body:
         if isinstance(a.value, Call) and a.value.function in ("sin", "cos"):
             if _terms(a.value.args[0], values, coordinates) is not None:
-                found.setdefault(a.value.args, {})[a.value.function] = a.name
-    if not found:
+                by_argument.setdefault(a.value.args, {})[a.value.function] = a.name
+    if not by_argument:
         return (), function
     angles = []
-    for args, names in found.items():
+    for args, names in by_argument.items():
         terms, offset = _terms(args[0], values, coordinates) or ((), S.Zero)
-        angles.append(Angle(terms, offset, *pair_of(names)))
-    gone = {name for names in found.values() for name in names.values()}
-    return tuple(angles), _without(function, gone)
+        angles.append(Angle(terms, offset, *names_of_pair(names)))
+    separated = {name for names in by_argument.values() for name in names.values()}
+    return tuple(angles), _without(function, separated)
 
 
-def pair_of(names: Mapping[str, str]) -> tuple[str, str]:
-    """Names for the sine and the cosine of an angle, of which one may be needed only."""
+def names_of_pair(names: Mapping[str, str]) -> tuple[str, str]:
+    """Return names for sine and cosine of an angle, of which only one may exist."""
     sine = names.get("sin") or names["cos"].replace("cos", "sin") + "_"
     return sine, names.get("cos") or names["sin"].replace("sin", "cos") + "_"
 
@@ -51,23 +55,27 @@ def pair_of(names: Mapping[str, str]) -> tuple[str, str]:
 def _terms(
     angle: Operand, values: Mapping[str, Value], coordinates: Collection[str]
 ) -> tuple[tuple[tuple[Expr, str], ...], Expr] | None:
-    """An angle as a sum over coordinates and a number; None where it is something else."""
+    """Return an angle as (terms over coordinates, constant); None where it has another form."""
     if angle.name in coordinates:
         return ((angle.coefficient, angle.name),), S.Zero
-    made = values.get(angle.name)
-    if not isinstance(made, Sum) or not all(name in coordinates for _, name in made.terms):
+    definition = values.get(angle.name)
+    if not isinstance(definition, Sum) or not all(
+        name in coordinates for _, name in definition.terms
+    ):
         return None
     k = angle.coefficient
-    return tuple((k * c, name) for c, name in made.terms), k * made.constant
+    return tuple((k * c, name) for c, name in definition.terms), k * definition.constant
 
 
-def _without(function: Function, gone: Collection[str]) -> Function:
-    """The function without those values, which come from outside then, and what they alone need."""
+def _without(function: Function, separated: Collection[str]) -> Function:
+    """Return the function without the given values, which become inputs, and values that only they
+    need.
+    """
     ends = [*function.outputs, *(o for pair in function.checks for o in pair)]
     needed = {o.name for o in ends}
     body: list[Assignment] = []
     for a in reversed(function.body):
-        if a.name not in gone and a.name in needed:
+        if a.name not in separated and a.name in needed:
             body.append(a)
             needed.update(a.value.names)
     return replace(function, body=tuple(reversed(body)))

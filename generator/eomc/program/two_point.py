@@ -1,9 +1,9 @@
-"""The two-point form of an acceleration: a configuration part for two points, a velocity part.
+"""The acceleration split into position-dependent and velocity-dependent parts, for RK4.
 
-What a configuration q alone decides, D and its factors above all, RK4 needs at q and q + h/2 qd
-when a step begins, and at its other two configurations as soon as two accelerations are there. So
-that part is written once, as loops over two configurations in vector registers; the rest, the
-velocity part, follows stage by stage.
+RK4 needs the terms that depend on the configuration q only, above all D and its factors, at q and q
++ h/2 qd at the beginning of a step, and at its two other configurations once two accelerations are
+known. That part is therefore evaluated for two configurations at once in vector registers. The
+velocity-dependent part follows stage by stage.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from eomc.program import outline
 from eomc.program.ir import Assignment, Function, Operand, Product, Sum, rename
 from eomc.program.trig import Angle
 
-FEWEST = 5  # angles from which on it pays
-SUM, PRODUCT, QUOTIENT = 4, 3, 13  # cycles until their results are there, about
-SHORT = 400  # operations of a step up to which its parts are inlined
+MIN_ANGLES = 5  # from which the split is faster
+SUM, PRODUCT, QUOTIENT = 4, 3, 13  # approximate latencies in cycles
+MAX_INLINED_OPERATIONS = 400  # of a step, up to which its parts are inlined
 
 
 @dataclass(frozen=True)
 class Parts:
-    """configuration: gives the values that `velocity` reads of it, by their names `handed`.
+    """The two parts of an acceleration, both without expressions that depend on parameters only.
 
-    What parameters alone decide is in neither.
+    handed: names of the values that `configuration` computes and `velocity` reads.
     """
 
     configuration: Function
@@ -40,36 +40,39 @@ class Parts:
 
     @property
     def short(self) -> bool:
-        """Whether both are inlined, by the operations of a step."""
+        """Whether both parts are inlined, by the operations of a step."""
         weight = 2 * outline.weight(self.configuration) + 4 * outline.weight(self.velocity)
-        return weight <= SHORT
+        return weight <= MAX_INLINED_OPERATIONS
 
 
 def apart(rest: Function, angles: Sequence[Angle], system: System, fixed: Set[str]) -> Parts | None:
-    """The two parts of an acceleration that reads the sines of `angles`; None: they bring nothing.
+    """Split an acceleration that reads the sines of `angles`; None where a split has no advantage.
 
-    fixed: what parameters alone decide.
+    fixed: names of values that depend on parameters only.
     """
-    if not angles or not (len(angles) >= FEWEST or outline.is_large(rest)):
+    if not angles or not (len(angles) >= MIN_ANGLES or outline.is_large(rest)):
         return None
     sines = {name for a in angles for name in (a.sine, a.cosine)}
-    place = {*(c.name for c in system.coordinates), *sines}
+    positional = {*(c.name for c in system.coordinates), *sines}
     first: list[Assignment] = []
     for a in rest.body:
-        if place.issuperset(set(a.value.names) - fixed):
-            place.add(a.name)
+        if positional.issuperset(set(a.value.names) - fixed):
+            positional.add(a.name)
             first.append(a)
-    made = {a.name for a in first}
-    late, more = _without_factors([a for a in rest.body if a.name not in made], place, fixed)
-    first += more
+    first_names = {a.name for a in first}
+    later, factors = _without_factors(
+        [a for a in rest.body if a.name not in first_names], positional, fixed
+    )
+    first += factors
     checks = [
-        (made.issuperset({o.name for o in pair if o.name} - fixed), pair) for pair in rest.checks
+        (first_names.issuperset({o.name for o in pair if o.name} - fixed), pair)
+        for pair in rest.checks
     ]
     velocity = replace(
-        rest, body=tuple(late), checks=tuple(pair for early, pair in checks if not early)
+        rest, body=tuple(later), checks=tuple(pair for early, pair in checks if not early)
     )
-    read = velocity.uses
-    handed = tuple(a.name for a in first if a.name in read)
+    used = velocity.uses
+    handed = tuple(a.name for a in first if a.name in used)
     configuration = replace(
         rest,
         name="configuration",
@@ -79,40 +82,45 @@ def apart(rest: Function, angles: Sequence[Angle], system: System, fixed: Set[st
     )
     if 4 * outline.weight(configuration) < outline.weight(velocity):
         return None
-    new = _numbered(configuration, handed, system.names)
-    configuration, velocity = rename(configuration, new), rename(velocity, new)
-    handed = tuple(new.get(name, name) for name in handed)
-    named = frozenset(handed)
-    configuration = outline.with_names(configuration, named)
-    return Parts(_last_come_last(configuration), _last_come_last(velocity), handed)
+    new_names = _numbered(configuration, handed, system.names)
+    configuration, velocity = rename(configuration, new_names), rename(velocity, new_names)
+    handed = tuple(new_names.get(name, name) for name in handed)
+    names = frozenset(handed)
+    configuration = outline.with_names(configuration, names)
+    return Parts(_sort_by_latency(configuration), _sort_by_latency(velocity), handed)
 
 
 def _without_factors(
-    late: Sequence[Assignment], place: Set[str], fixed: Set[str]
+    later: Sequence[Assignment], positional: Set[str], fixed: Set[str]
 ) -> tuple[list[Assignment], list[Assignment]]:
-    """Products with one factor of all that the configuration decides in them; and these factors."""
-    made: dict[Product, str] = {}
-    out = []
-    for a in late:
+    """Combine the position-dependent factors of each product. Returns the assignments and these
+    factors.
+    """
+    name_of_factor: dict[Product, str] = {}
+    assignments = []
+    for a in later:
         if isinstance(a.value, Product):
-            known = [f for f in a.value.factors if f in place or f in fixed]
+            known = [f for f in a.value.factors if f in positional or f in fixed]
             sign, size = a.value.coefficient, S.One
             if abs(sign) != 1:
                 sign, size = (-S.One, -sign) if is_negative(sign) else (S.One, sign)
-            if not place.isdisjoint(known) and (size != 1 or len(known) > 1):
+            if not positional.isdisjoint(known) and (size != 1 or len(known) > 1):
                 factor = Product(size, tuple(known))
-                name = made.setdefault(factor, f"_f{len(made)}")
-                rest = [f for f in a.value.factors if f not in known]
-                a = replace(a, value=Product(sign, (name, *rest)))
-        out.append(a)
-    return out, [Assignment(name, value, Stage.POSITION) for value, name in made.items()]
+                name = name_of_factor.setdefault(factor, f"_f{len(name_of_factor)}")
+                others = [f for f in a.value.factors if f not in known]
+                a = replace(a, value=Product(sign, (name, *others)))
+        assignments.append(a)
+    return assignments, [
+        Assignment(name, value, Stage.POSITION) for value, name in name_of_factor.items()
+    ]
 
 
-def _last_come_last(function: Function) -> Function:
-    """The function with the terms of its sums in the order in which they are known.
+def _sort_by_latency(function: Function) -> Function:
+    """Sort the terms of sums by the time when they are available.
 
-    What is known last waits for one operation then: a b + c d is taken as a b + (c d), with one
-    operation behind a b, so of the first two the later stands first.
+    The term that is available last then delays the result by one operation only. Since a b + c d is
+    computed as a b + (c d), with one operation after a b, the later of the first two terms comes
+    first.
     """
     uses = Counter(n for a in function.body for n in a.value.names)
     uses.update(o.name for o in function.outputs)
@@ -124,7 +132,9 @@ def _last_come_last(function: Function) -> Function:
         if isinstance(value, Sum):
 
             def known(term: tuple[Expr, str]) -> tuple[int, bool]:
-                """When a term's last operand is known, and whether a product is left to do."""
+                """Return when a term's last operand is available, and whether it needs a
+                multiplication.
+                """
                 weight, name = term
                 if isinstance(inner := values.get(name), Product):
                     return max(ready.get(n, 0) for n in inner.factors), True
@@ -146,8 +156,8 @@ def _last_come_last(function: Function) -> Function:
 def _numbered(
     function: Function, handed: Sequence[str], reserved: frozenset[str]
 ) -> dict[str, str]:
-    """k1, k2, ... for values that have no name of their own and are handed on."""
-    own = {a.name for a in function.body if a.named}
-    taken = {*function.uses, *reserved, *(a.name for a in function.body)}
-    fresh = (name for n in count(1) if (name := f"k{n}") not in taken)
-    return dict(zip((name for name in handed if name not in own), fresh, strict=False))
+    """Return names k1, k2, ... for values that are passed on and have no meaningful name."""
+    meaningful = {a.name for a in function.body if a.named}
+    used = {*function.uses, *reserved, *(a.name for a in function.body)}
+    new_names = (name for n in count(1) if (name := f"k{n}") not in used)
+    return dict(zip((name for name in handed if name not in meaningful), new_names, strict=False))

@@ -1,4 +1,4 @@
-"""Parameters that energies and forces have, and no equation of motion."""
+"""Parameters that occur in energies or forces but in no equation of motion."""
 
 from __future__ import annotations
 
@@ -12,31 +12,33 @@ from eomc.scene.scene import Scene
 
 ENERGIES = frozenset({"kinetic_energy", "potential_energy", "energy", "jacobi", "power"})
 OUTPUTS = frozenset({"outputs", "output_slopes", "output_sensitivity"})
-OF_MOTION = {  # the key of each expression
+SCENE_KEYS = {  # scene key of each expression
     "kinetic": "kinetic", "potential": "potential", "linear_potential": "potential",
     "dissipation": "dissipation",
 }  # fmt: skip
 
 
 def parameters(program: Program) -> list[Problem]:
-    """A warning of each parameter without which the scene would move alike, such as M in M x_dot/2.
+    """Return a warning for each parameter that has no effect on the motion, such as M in M x_dot/2.
 
-    What something else has too, such as an output, a start or a body, is of use.
+    Parameters that are used elsewhere, as in an output, a start or a body, are not reported.
     """
     s = program.system
-    beside = ENERGIES | OUTPUTS if s.scene else ENERGIES  # a scene says which outputs name it
-    read = {x for f in program.functions.values() if f.name not in beside for x in f.uses}
-    found = []
+    excluded = ENERGIES | OUTPUTS if s.scene else ENERGIES  # a scene says which outputs name it
+    used = {x for f in program.functions.values() if f.name not in excluded for x in f.uses}
+    problems = []
     for p in s.parameters:
-        key = "" if p.name in read else _place(s, p.symbol)
+        key = "" if p.name in used else _key_of(s, p.symbol)
         if key:
-            message = f"'{p.name}' reaches no equation of motion: {_why(s, p.symbol)}"
-            found.append(s.problem(key, message, "warning"))
-    return found
+            message = f"'{p.name}' reaches no equation of motion: {_reason(s, p.symbol)}"
+            problems.append(s.problem(key, message, "warning"))
+    return problems
 
 
-def _place(system: System, parameter: Symbol) -> str:
-    """The key where it stands first; "" where something beside energies and forces has it."""
+def _key_of(system: System, parameter: Symbol) -> str:
+    """Return the key where a parameter first occurs; "" if it occurs outside of energies and
+    forces.
+    """
     if system.scene:
         roots = _tables(system.scene, parameter.name)
         first = system.scene.used.get(parameter.name, [()])[0]
@@ -44,29 +46,30 @@ def _place(system: System, parameter: Symbol) -> str:
     drawn = system.pictured and parameter.name in system.pictured.used
     places = (
         f"energy.{key}"
-        for name, key in OF_MOTION.items()
+        for name, key in SCENE_KEYS.items()
         if _has(system, getattr(system, name), parameter)
     )
     return "" if drawn else next(places, "")
 
 
 def _tables(scene: Scene, name: str) -> set[str]:
-    """The tables in which a name stands, itself or by a definition that has it."""
-    found, queue = set[tuple[str, ...]](), [name]
+    """Return the tables in which a name occurs, directly or through definitions."""
+    paths, queue = set[tuple[str, ...]](), [name]
     while queue:
-        new = {*scene.used.get(queue.pop(), ())} - found
-        found |= new
+        new = {*scene.used.get(queue.pop(), ())} - paths
+        paths |= new
         queue += [path[1] for path in new if path[0] == "definitions"]
-    return {path[0] for path in found} - {"definitions"}
+    return {path[0] for path in paths} - {"definitions"}
 
 
 def _has(system: System, expression: Expr, name: Symbol) -> bool:
-    whole = (expression, *(e for _, e in needed(system.definitions, [expression])))
-    return any(name in e.free_symbols for e in whole)
+    """Return True if an expression contains a symbol, directly or through definitions."""
+    expressions = (expression, *(e for _, e in needed(system.definitions, [expression])))
+    return any(name in e.free_symbols for e in expressions)
 
 
-def _why(system: System, parameter: Symbol) -> str:
-    """Why no equation has it, and the remedy."""
+def _reason(system: System, parameter: Symbol) -> str:
+    """Return the reason why no equation contains the parameter, and the remedy."""
     for term in Add.make_args(expand(system.kinetic)):
         if _has(system, term, parameter):
             rates = {*system.qd} & term.free_symbols | term.atoms(dot)

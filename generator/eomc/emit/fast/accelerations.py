@@ -39,7 +39,7 @@ class Accelerations:
     @cached_property
     def staged(self) -> tuple[Function, Function]:
         """What parameters alone decide, as a function of its own; and the rest."""
-        first, rest = outline.staged(self.whole, self.own)
+        first, rest = outline.split_precomputed(self.whole, self.own)
         more = [self._correction_parts[0]] if self._correction_parts else []
         names = [o.name for f in (first, *more) for o in f.outputs]
         others = ("signal", "rate_terms")  # what else steps read parameters for
@@ -60,7 +60,7 @@ class Accelerations:
         whole = self.target.program.functions.get("projection")
         if whole is None:
             return None
-        first, rest = outline.staged(whole, self.own)
+        first, rest = outline.split_precomputed(whole, self.own)
         own = {a.name: f"rows_{a.name}" for a in first.early}
         return rename(first, own), rename(rest, own)
 

@@ -50,7 +50,7 @@ class Steppers:
     def predicted(self) -> bool:
         """Whether RK4 predicts the angles of one trajectory."""
         s = self.accelerations
-        few = 0 < len(s.angles) < two_point.FEWEST
+        few = 0 < len(s.angles) < two_point.MIN_ANGLES
         free = not (self.two_point or s.target.system.constraints)
         return few and s.target.real is DOUBLE and free
 
