@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from sympy import Expr, S, Symbol
+from sympy import Expr, Rational, S, Symbol
 
 from eomc.base.errors import SceneError
 from eomc.derive.energies import tangent_symbols
@@ -12,6 +12,10 @@ from eomc.derive.equations import UNROLLED_SIZE_LIMIT
 from eomc.derive.ldl import Rows, Vector
 from eomc.derive.tape import NotDifferentiableError, Tape
 from eomc.model.system import System
+
+# the bound of roots that are differentiated: far below any root but 0, its reciprocal is finite and
+# the square of that overflows
+LEAST_ROOT = {"double": Rational(1, 2**1000), "float": Rational(1, 2**120)}
 
 # (cause, remedy) of discontinuous accelerations: in formulas, and by stick-slip friction
 JUMPS = (
@@ -63,7 +67,8 @@ def _slopes(
 ) -> list[Vector]:
     """Return the derivatives of accelerations along each of the given directions."""
     try:
-        return [tuple(tape.forward(accelerations, entries)) for entries in directions]
+        least = LEAST_ROOT[system.run.real]
+        return [tuple(tape.forward(accelerations, entries, least)) for entries in directions]
     except NotDifferentiableError:
         jump, smooth = STICKS if system.modes else JUMPS
         message = (

@@ -10,6 +10,7 @@ from sympy import Expr, S, Symbol
 from eomc.base.errors import EomcError, SceneError
 from eomc.derive.energies import leaves
 from eomc.derive.ldl import Rows, Vector
+from eomc.derive.linearize import LEAST_ROOT
 from eomc.derive.tape import NotDifferentiableError, Tape
 from eomc.model.symbols import MULTIPLIER, Output, dot, needed
 from eomc.model.system import System, t
@@ -110,7 +111,8 @@ def _outputs(
     parameters = system.parameters if system.run.linearize == "parameters" else ()
     variables = (*state, *system.u, *system.qdd, *(p.symbol for p in parameters))
     saved, tape.constant_leaves = tape.constant_leaves, frozenset()  # discrete variables count here
-    rows = [tuple(tape.gradient([(y, S.One)], variables)) for y in values]
+    least = LEAST_ROOT[system.run.real]
+    rows = [tuple(tape.gradient([(y, S.One)], variables, least=least)) for y in values]
     tape.constant_leaves = saved
     count = len(variables) - len(parameters)
     slopes, sensitivity = (tuple(row[:count] for row in rows), tuple(row[count:] for row in rows))

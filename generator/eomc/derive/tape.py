@@ -8,7 +8,8 @@ Derivatives*, 2nd ed., ch. 3). Equal expressions get the same name, so nothing i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
 from enum import IntEnum
 
 import sympy
@@ -17,6 +18,7 @@ from sympy import Add, Expr, Mul, Pow, S, Symbol, tanh
 from eomc.base.errors import EomcError
 from eomc.derive.atoms import expand_sums, is_negative, split
 
+_CORNERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.Heaviside, sympy.sign)
 _NOT_DIFFERENTIABLE = (sympy.DiracDelta, sympy.Derivative, sympy.Subs)
 
 
@@ -36,6 +38,24 @@ class Stage(IntEnum):
 
 Powers = dict[Symbol, Expr]  # a product as {name: exponent}
 _Varying = tuple[tuple[Symbol, Expr], ...]  # powers of names that do not depend on parameters alone
+
+
+@dataclass(frozen=True)
+class RootSlope:
+    """The derivative of s**p with 0 < p < 1, p s**(p - 1), bounded by p/least where s is 0.
+
+    It is multiplied by the derivative of s. Where s is 0 and smooth, or constant nearby, that
+    derivative is 0, and for p >= 1/2 so is the product, since s is of second order. For p < 1/2 the
+    derivative of the root is infinite, unless a factor of the root is 0: `at_zero` is added along
+    each of the `leaves`. The derivative of a root of |x| is infinite too: it is taken along x, with
+    the sign of one side at 0. What is left of the bound in a result makes it infinite, see
+    `Tape._overflowing`.
+    """
+
+    slope: Expr
+    along: Symbol
+    at_zero: Expr = S.Zero
+    leaves: tuple[Symbol, ...] = ()
 
 
 class Tape:
@@ -73,6 +93,8 @@ class Tape:
         self._partial: dict[tuple[Symbol, Symbol], Expr] = {}
         self._pairs: dict[tuple[Symbol, Symbol], Expr] = {}
         self._atoms: dict[tuple[Expr, Symbol], Expr] = {}
+        self._root_slopes: dict[tuple[Symbol, Symbol, Expr], RootSlope | None] = {}
+        self._bounded: set[Symbol] = set()  # divisors of the derivatives of roots
 
     # --- definitions ---------------------------------------------------------------------------
 
@@ -406,42 +428,44 @@ class Tape:
                 powers = dict(self.powers[symbol])
                 power = powers[part]
                 powers[part] = power - 1
-                expanded: Powers = {}
-                for name, e in powers.items():  # integer powers of products are expanded
-                    inside = self._powers_of(name) if e.is_Integer else {name: S.One}
-                    for n, inner in inside.items():
-                        expanded[n] = expanded.get(n, S.Zero) + inner * e
-                self._partial[key] = self.scaled(power, self._of_powers(expanded))
+                self._partial[key] = self.scaled(power, self._product_of(powers))
             else:
                 self._partial[key] = self.define(self.rhs(symbol).diff(part))
         return self._partial[key]
 
-    def forward(self, outputs: Sequence[Expr], seeds: Mapping[Symbol, Expr]) -> list[Expr]:
-        """Return the directional derivatives sum_k d(output)/d(leaf_k) seed_k (forward mode)."""
+    def forward(
+        self, outputs: Sequence[Expr], seeds: Mapping[Symbol, Expr], least: Expr | None = None
+    ) -> list[Expr]:
+        """Return the directional derivatives sum_k d(output)/d(leaf_k) seed_k (forward mode).
+
+        With `least`, the derivatives of roots are bounded, see `RootSlope`.
+        """
         tangent: dict[Symbol, Expr] = dict(seeds)
         for symbol in self.live(outputs):
             terms = [
-                self.times(self.partial(symbol, part), tangent[part])
-                for part in self.parts[symbol]
+                self.times(slope, tangent[part])
+                for slope, part in self._slopes(symbol, least)
                 if part in tangent
             ]
             if terms and (sum_ := self.total(terms)) != 0:
                 tangent[symbol] = sum_
-        return [
+        derivatives = [
             self.scaled(factor, tangent[symbol]) if symbol in tangent else S.Zero
             for factor, symbol in map(split, outputs)
         ]
+        return [self._overflowing(x, least) for x in derivatives]
 
     def gradient(
         self,
         outputs: Sequence[tuple[Expr, Expr]],
         wrt: Sequence[Symbol],
         stop: Set[Symbol] = frozenset(),
+        least: Expr | None = None,
     ) -> list[Expr]:
         """Return sum_k seed_k d(output_k)/d(name) for each name in `wrt` (reverse mode).
 
         `outputs` are (output, seed) pairs. Names in `stop` are independent variables: their
-        definitions are not differentiated.
+        definitions are not differentiated. `least` as in `forward`.
         """
         terms: dict[Symbol, list[Expr]] = {}
         for output, seed in outputs:
@@ -452,12 +476,124 @@ class Tape:
             if symbol in stop or symbol not in terms:
                 continue
             adjoint = self.total(terms[symbol])
-            for part in self.parts[symbol]:
-                if part in self.constant_leaves:
-                    continue
-                slope = self.partial(symbol, part)
-                terms.setdefault(part, []).append(self.times(slope, adjoint))
-        return [self.total(() if x in self.constant_leaves else terms.get(x, ())) for x in wrt]
+            for slope, part in self._slopes(symbol, least):
+                if part not in self.constant_leaves:
+                    terms.setdefault(part, []).append(self.times(slope, adjoint))
+        gradient = (self.total(() if x in self.constant_leaves else terms.get(x, ())) for x in wrt)
+        return [self._overflowing(x, least) for x in gradient]
+
+    def _slopes(self, symbol: Symbol, least: Expr | None) -> Iterator[tuple[Expr, Symbol]]:
+        """Yield the partial derivatives of a definition, each with the name that it belongs to."""
+        for part in self.parts[symbol]:
+            root = None if least is None else self._root_slope(symbol, part, least)
+            if root is None:
+                yield self.partial(symbol, part), part
+                continue
+            yield root.slope, root.along
+            for leaf in root.leaves:
+                yield root.at_zero, leaf
+
+    def _root_slope(self, symbol: Symbol, part: Symbol, least: Expr) -> RootSlope | None:
+        """Return `_derive_root_slope`, computed once."""
+        key = (symbol, part, least)
+        if key not in self._root_slopes:
+            self._root_slopes[key] = self._derive_root_slope(symbol, part, least)
+        return self._root_slopes[key]
+
+    def _derive_root_slope(self, symbol: Symbol, part: Symbol, least: Expr) -> RootSlope | None:
+        """Return the bounded derivative of a power of `part`, or None where none is needed."""
+        if self.stage[part] < Stage.POSITION or symbol in self.weights:
+            return self._log_slope(symbol, part, least)
+        if symbol in self.powers:
+            power, rest = self.powers[symbol][part], dict(self.powers[symbol])
+            del rest[part]
+            if power.is_Integer or not 0 < power < 1:
+                return None
+            while (inner := self.powers.get(part)) and len(inner) == 1:  # sqrt(x**3), a root of one
+                ((below, exponent),) = inner.items()
+                if exponent.is_even:
+                    break
+                part, power = below, power * exponent
+            if power >= 1:
+                slope = self._product([self._product_of(rest), Pow(part, power - 1)])
+                return RootSlope(self.scaled(power, slope), part)
+            base = self._rhs.get(part)
+            corner = isinstance(base, (sympy.Abs, sympy.Max, sympy.Min))
+            names = self.live([part])
+            within = {n for n in names if isinstance(self._rhs.get(n), _CORNERS)}
+            if power < 0 or self._is_positive(part) or any(map(self._is_root, names)):
+                return None
+            if not corner and within and (power < S.Half or self._has_abs(within)):
+                return None
+            root, size = Pow(part, 1 - power), self.scaled(power, self._product_of(rest))
+        else:
+            raised, base = self._rhs[symbol], self._rhs.get(part)
+            corner = isinstance(base, (sympy.Abs, sympy.Max, sympy.Min))
+            if not (raised.is_Pow and corner and part in raised.base.free_symbols):
+                return None
+            power, within = raised.exp, {part}
+            root = Pow(raised.base, 1 - power)
+            size = self.define(power * split(raised.base)[0])
+        divisor = self.define(sympy.Max(self.define(root), least))
+        self._bounded.add(divisor)
+        slope, leaves = self.times(size, self._of_powers({divisor: S.NegativeOne})), []
+        if isinstance(base, sympy.Abs):
+            factor, inside = split(base.args[0])
+            if inside is None:
+                return None
+            side = self.define(sympy.sign(self.define(base.args[0] + least)))
+            return RootSlope(self.times(self.scaled(factor, side), slope), inside)
+        at_zero: Expr = S.Zero
+        if not within and power < S.Half:
+            leaves = [x for x in self.leaves_of([part]) if self.stage[x] >= Stage.POSITION]
+            flat = self.define(1 - sympy.sign(part))
+            at_zero = self.times(slope, flat)
+        return RootSlope(slope, part, at_zero, self._ordered(leaves))
+
+    def _log_slope(self, symbol: Symbol, part: Symbol, least: Expr) -> RootSlope | None:
+        """Return b**n log(b), the derivative along a parameter n in an exponent, 0 where b is 0."""
+        raised = self._rhs.get(symbol, S.Zero)
+        if not raised.is_Pow or part in raised.base.free_symbols:
+            return None
+        if self.stage_of(raised.base) < Stage.POSITION:
+            return None
+        slope = symbol * sympy.log(sympy.Max(raised.base, least)) * raised.exp.diff(part)
+        return RootSlope(self.define(slope), part)
+
+    def _product_of(self, powers: Powers) -> Expr:
+        """Return the atom of a product of powers, integer powers of products expanded."""
+        whole: Powers = {}
+        for name, e in powers.items():
+            inside = self._powers_of(name) if e.is_Integer else {name: S.One}
+            for n, inner in inside.items():
+                whole[n] = whole.get(n, S.Zero) + inner * e
+        return self._of_powers(whole)
+
+    def _is_positive(self, symbol: Symbol) -> bool:
+        """Return True if the name is a sum of a positive number and even powers."""
+        terms = self.weights.get(symbol)
+        if not terms or not self.constant[symbol].is_positive:
+            return False
+        return all(
+            weight.is_positive and all(e.is_even for e in self._powers_of(name).values())
+            for name, weight in terms.items()
+        )
+
+    def _is_root(self, name: Symbol) -> bool:
+        """Return True if the name is a product with a power that is no integer."""
+        return any(not e.is_Integer for e in self.powers.get(name, {}).values())
+
+    def _has_abs(self, names: Iterable[Symbol]) -> bool:
+        """Return True if one of the names is an absolute value."""
+        return any(isinstance(self._rhs[n], sympy.Abs) for n in names)
+
+    def _overflowing(self, atom: Expr, least: Expr | None) -> Expr:
+        """Return the atom, which overflows where a bound of `RootSlope` has met no factor of 0."""
+        if least is None or self._bounded.isdisjoint(self.live([atom])):
+            return atom
+        limit = least ** sympy.Rational(3, 5)
+        beyond = self.define(sympy.Max(1, self.define(sympy.Abs(atom)) * limit))
+        return self.times(atom, self.define(beyond**4))
 
     def substitute(self, outputs: Sequence[Expr], values: Mapping[Symbol, Expr]) -> list[Expr]:
         """Return the outputs with leaves replaced by `values`."""
