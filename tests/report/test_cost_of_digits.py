@@ -126,10 +126,20 @@ def test_what_is_recommended_is_the_quickest_that_is_good_enough() -> None:
 
 
 def test_a_difference_of_an_oscillator_does_not_grow() -> None:
-    """x and x_dot have the scales 1 and 3: the norm of a turn is at most |cos| + |sin|."""
+    """In the norm of its energy it is turned only."""
     g = measured().growth
     assert not g.wild and g.horizon == math.inf
-    assert g.amplification[-1] == pytest.approx(math.sqrt(2), rel=0.02)
+    assert g.amplification[-1] == pytest.approx(1, rel=0.1)
+
+
+def test_what_grows_as_the_motion_does_is_not_chaos() -> None:
+    """x'' = x for 40 s: differences grow by e^40, and so does x, which keeps all its digits."""
+    t = np.linspace(0, 40, 65)
+    running = linearised._judged(t, np.exp(t), 1e-3 * np.expm1(t), 1e-3 * np.exp(t))
+    assert not running.wild and running.horizon == math.inf
+    bounded = linearised._judged(t, np.exp(t), np.ones(65), np.ones(65))
+    assert bounded.wild and bounded.rate == pytest.approx(1)
+    assert bounded.horizon == pytest.approx(math.log(0.1 * 2**53), abs=40 / 64)
 
 
 @pytest.mark.usefixtures("quickly_compiled")

@@ -15,7 +15,7 @@ from conftest import ROOT, Modules, tiers
 
 import eomc
 from eomc.model.system import System
-from eomc.runtime import estimate
+from eomc.runtime import estimate, growth
 
 SPRING = """
 eomc = 1
@@ -90,7 +90,7 @@ def test_error_along_the_way_and_at_the_end(modules: Modules, every: int) -> Non
     assert error.end == {"x": error.q[-1, 0], "x_dot": error.qd[-1, 0]}
     assert error.digits["x"] == pytest.approx(-math.log10(error.end["x"]), abs=0.01)
     assert error.order == 4 and error.observed == pytest.approx(4, abs=0.05)
-    assert error.amplification == pytest.approx(1.2, abs=0.3)  # a rotation of (1, 1) or (1, -1)
+    assert error.amplification == pytest.approx(1, abs=0.1)
     assert error.resolved and error.verdict == ""
 
 
@@ -115,6 +115,74 @@ def test_its_text_is_a_line(cartpole: ModuleType) -> None:
 def test_no_step_no_error(cartpole: ModuleType) -> None:
     error = cartpole.simulate(steps=0, estimate=True).error
     assert not error.q.any() and error.resolved
+
+
+LINEAR = """
+eomc = 1
+name = "linear"
+[coordinates]
+x = { start = "place + 1e-3", rate = 1e-3 }
+y = { start = "-place" }
+[parameters]
+place = 0
+k = 1.0
+[energy]
+kinetic = "x_dot**2/2 + 500*y_dot**2"
+potential = "k*(x - place)**2/2 + 5e6*(y + place)**2"
+[run]
+h = 0.005
+duration = 10.0
+tolerance = 1e-9
+"""
+
+
+@pytest.fixture(scope="module")
+def linear(modules: Modules) -> ModuleType:
+    """x of 1 rad/s where k is 1, and y at rest, of 100 rad/s, about places that are parameters."""
+    return modules.unoptimised(LINEAR)
+
+
+@pytest.mark.parametrize("place", [0.0, 1.0, -1e3])
+@pytest.mark.parametrize("how", [{"h": 0.005}, {"tol": 1e-9}, {"tol": 1e-9, "times": [4.0]}])
+def test_a_difference_of_oscillators_does_not_grow(
+    linear: ModuleType, place: float, how: dict[str, Any]
+) -> None:
+    """Their flow is a rotation, wherever the origin is and whatever moves."""
+    error = quiet(linear, params={"place": place}, **how).estimate()
+    assert error.amplification == pytest.approx(1, abs=0.3)
+
+
+@pytest.mark.parametrize("how", [{"h": 0.005}, {"tol": 1e-9}])
+def test_a_difference_beside_a_saddle_grows_whatever_its_direction(
+    linear: ModuleType, how: dict[str, Any]
+) -> None:
+    """x'' = x: by e^10 along (1, 1), by e^-10 along (1, -1), and x itself runs away as fast."""
+    for rate in (1e-3, -1e-3):
+        params = {"place": 5.0, "k": -1.0}
+        error = quiet(linear, qd0=[rate, 0.0], params=params, **how).estimate()
+        assert error.amplification == pytest.approx(math.exp(10), rel=0.1)
+        assert "chaotic" not in error.verdict
+
+
+def test_rounding_of_a_small_motion_far_from_the_origin_is_no_chaos(linear: ModuleType) -> None:
+    """1e-9 m about 1e6 m is seven roundings of x; the verdict does not speak of growth."""
+    run = quiet(linear, q0=[1e6 + 1e-9, -1e6], h=0.005, params={"place": 1e6})
+    assert run.estimate().amplification < 100 and "chaotic" not in run.error.verdict
+
+
+def test_growth_is_that_of_the_linear_motion() -> None:
+    """Its largest factor over all directions at the start, in the norm of D and T = 1/omega."""
+    omega, D = 7.0, np.array([[3.0]])
+    t = np.linspace(0, 5, 400)[:, None]
+    c, s = np.cos(omega * t), np.sin(omega * t)
+    along, across = np.hstack([c, -omega * s]), np.hstack([s / omega, c])
+    root = growth.norm_root(D, [along, across], 5.0)
+    np.testing.assert_allclose(root, np.sqrt(3) * np.diag([omega, 1.0]), rtol=0.05)
+    ends = (np.stack([x[k] for x in (along, across)], axis=1) for k in (0, 333))
+    assert growth.growth(root, *ends) == pytest.approx(1, rel=0.05)
+    first, last = np.eye(2), np.diag([1e200, 1.0])
+    assert growth.growth(np.eye(2), first, last) == pytest.approx(1e200)
+    assert growth.growth(np.eye(2), first, np.diag([np.inf, 1.0])) == math.inf
 
 
 QUICK = (

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eomc.report.reference_solution import Reference
+from eomc.runtime.growth import growth as multiplied
+from eomc.runtime.growth import mean_mass_matrix, norm_root
 from eomc.verify.oracle import Vector
 
 Complex = NDArray[np.complex128]
@@ -27,10 +29,11 @@ EPSILON = 2.0**-53
 
 @dataclass(frozen=True)
 class Growth:
-    """By what a difference at the start has grown, amplification (n,) at t (n,).
+    """The growth of a difference of the start, amplification (n,) at t (n,).
 
-    rate: of its growth over the second half, 1/s; wild: whether that is exponential. horizon: when
-    a rounding of the start has become a tenth of the motion, inf where it does not.
+    rate: of its growth over the second half beside that of the motion itself, 1/s; wild: whether
+    that is exponential. horizon: when a rounding has become a tenth of the motion, inf where it
+    does not.
     """
 
     t: Vector
@@ -111,14 +114,13 @@ def _on_rows(module: ModuleType, x: Vector, t: float) -> Vector:
 def growth(module: ModuleType, reference: Reference, method: str, steps: int) -> Growth:
     """The norm of the product of transition matrices from row to row of the reference.
 
-    By runs of a method, of so many steps in all.
+    By runs of a method, of so many steps in all; the norm is that of `runtime.growth`.
     """
     n, scale = reference.q.shape[1], reference.scale
     stride = (len(reference.t) - 1) // SEGMENTS
     steps = max(1, min(steps, 2**16) // SEGMENTS)
-    product = np.eye(2 * n)
-    largest = [1.0]
-    duration = reference.t[-1]
+    products = [np.eye(2 * n)]
+    duration = float(reference.t[-1])
     for k in range(SEGMENTS):
         x, t0 = reference.halves[0][k * stride], float(reference.t[k * stride])
         ends = []
@@ -130,16 +132,34 @@ def growth(module: ModuleType, reference: Reference, method: str, steps: int) ->
             )  # fmt: skip
             ends.append(np.hstack([run.q[-1], run.qd[-1]]) / scale)
         with np.errstate(all="ignore"):
-            product = ((np.array(ends[1:]) - ends[0]).T / NUDGE) @ product
-            now = float(np.max(np.sum(np.abs(product), axis=1)))
-        largest.append(max(largest[-1], now if math.isfinite(now) else math.inf))
-    t, grown = reference.t[::stride], np.array(largest)
-    half = math.log(grown[-1] / grown[SEGMENTS // 2]) if math.isfinite(grown[-1]) else math.inf
-    rate, wild = half / (duration / 2), half > math.log(WILD)
-    lost = np.flatnonzero(grown * EPSILON > 0.1)
+            products.append(((np.array(ends[1:]) - ends[0]).T / NUDGE) @ products[-1])
+    x, t = reference.halves[0][::stride], reference.t[::stride]
+    D = mean_mass_matrix(module, x[:, :n], t)
+    moved = np.moveaxis(np.array(products), 2, 0) * scale  # by one scale of each at the start
+    root = norm_root(D, [*moved], duration)
+    start = np.diag(scale)
+    factors = [multiplied(root, start, (scale * P.T).T) for P in products]
+    grown = np.maximum.accumulate(np.maximum(factors, 1.0))
+    sizes = np.linalg.norm((x - x[0]) @ root.T, axis=1)  # of the motion itself
+    return _judged(t, grown, np.maximum.accumulate(sizes), np.linalg.norm(x @ root.T, axis=1))
+
+
+def _judged(t: Vector, grown: Vector, sizes: Vector, values: Vector) -> Growth:
+    """Growth, and whether it is exponential beside that of the motion, which may run away itself.
+
+    sizes: how far the motion has come until each time, values: how large the state is, in the norm.
+    """
+    half, duration = len(t) // 2, float(t[-1])
+    own = grown[-1] / max(sizes[-1] / sizes[half], 1.0) if sizes[half] > 0 else grown[-1]
+    rise = math.log(own / grown[half]) if math.isfinite(own) else math.inf
+    rate, wild = rise / (duration / 2), rise > math.log(WILD)
+    # of a rounding at any time on the way
+    carried = EPSILON * grown * np.maximum.accumulate(values / grown)
+    most = 0.1 * (sizes[-1] or values.max() or 1.0)
+    lost = np.flatnonzero(~(carried <= most))
     horizon = math.inf
     if len(lost):
         horizon = float(t[lost[0]])
     elif wild and rate > 0:
-        horizon = float(duration + math.log(0.1 / EPSILON / grown[-1]) / rate)
+        horizon = float(duration + math.log(most / carried[-1]) / rate)
     return Growth(t=t, amplification=grown, rate=rate, wild=wild, horizon=horizon)

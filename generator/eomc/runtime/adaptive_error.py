@@ -10,8 +10,9 @@ import numpy as np
 
 from .adaptive_arguments import LEAST
 from .arguments import Array
-from .estimate import Estimate, moving, scales
+from .estimate import Estimate, growth_of, moving, rounding_words, scales
 from .fitted import Fitted
+from .growth import mean_mass_matrix
 from .periods import Periods
 from .status import FULL, REMEDY
 
@@ -23,6 +24,7 @@ _LITTLE = 4.0  # roundings, by which a start is moved where more fills the scale
 _TAIL = 40  # a part of the rows, over which a difference does not vanish
 _FINER = 100.0  # the tolerance over that of the run by which an error is found
 _LEAST = 512  # steps of that, at least
+_CURVE = 24  # rows along a run, at least, at which differences are seen
 _LATER = 10  # steps, at least, in which a finer run looks for the event that ends the run
 _SHIFT = 4.0  # times that differences of states last, by which the same event may be moved
 _EDGE = 1e-9  # of a span: times so near an end are at it
@@ -54,13 +56,15 @@ def error_of(
     moves[model.nq + modes[:, 1]] = begin[modes[:, 0]] != 0  # nor is what sticks moved
     x = x[again.beside]
 
-    def grown(base: Array, size: float, tol: float) -> Array:
-        """What a start moved by one scale would become at each row, if that were little."""
-        moved = begin + moves * size * scale * signs  # where that is another motion, not to its end
-        most = _LONGER * (own.steps + own.rejected) + _LONGER**2
-        return _filled(np.abs(again(tol, moved, own._h_most, most)[0] - base)) / size
+    base = again.curve()
 
-    rows = grown(x, size, own.tol)
+    def moved(nudge: Array, tol: float = own.tol, base: Array = base) -> Array:
+        """The difference that a nudge of the start makes along the run, nan behind an end."""
+        most = _LONGER * (own.steps + own.rejected) + _LONGER**2  # of another motion, not its end
+        return again.states(tol, begin + nudge, own._h_most, most) - base
+
+    differences = [moved(moves * size * scale * signs)]
+    rows = _filled(np.abs(again.at_rows(differences[0]))) / size
     left, rounding = np.where(np.isfinite(finer), np.abs(x - finer), np.inf), eps * np.abs(x)
     events = _Events.compare(own, other, left, scale)
     if events.end is not None:
@@ -71,14 +75,21 @@ def error_of(
         # flights between jumps may be exact by any tolerance: what rounding makes of them tells
         full = np.maximum.accumulate(np.max(rows / scale, axis=1) * size > _FULL)
         if full.any():  # where so little fills the scale, rounding fills a quarter of it
-            near = grown(again(least, begin, own._h_most)[0], _LITTLE * eps, least)
+            little = moves * _LITTLE * eps * scale * signs
+            nearest = again.states(least, begin, own._h_most)
+            differences.append(moved(little, least, nearest))
+            near = _filled(np.abs(again.at_rows(differences[1]))) / (_LITTLE * eps)
             rows = np.where(full[:, None], np.maximum(rows, near), rows)
         rounding = np.maximum(rounding, eps * rows)
     exact = [*modes[:, 0], *(model.nq + modes[:, 0])]
     for some in (left, rounding):
         some[:, exact] = some[own.t == own.t0] = 0.0
     error = np.maximum(left, rounding)
-    amplification = float(np.max(rows[-1] / scale))
+    amplification = growth_of(
+        model, mean_mass_matrix(model, base[:, : model.nq], again.times, own._params),
+        [_finite(x) for x in differences], float(np.ptp(own.t)), moves,
+        (begin, own.t0, own._params), lambda nudge: _finite(moved(nudge)),
+    )  # fmt: skip
     with np.errstate(divide="ignore"):
         digits = np.clip(-np.log10(error[-1] / scale), 0.0, -np.log10(eps)) + 0.0
     names = [*model.coordinates, *(f"{c}_dot" for c in model.coordinates)]
@@ -111,23 +122,67 @@ class _Again:
         end: float | None = None,
     ) -> tuple[Array, Fitted | None]:  # fmt: skip
         """The states at the rows, nan where the run has none, and the run itself."""
-        own, nq = self.own, self.own._model.nq
+        own = self.own
         out, start = np.full_like(self.x, np.nan), start.astype(own._model.dtype)
         out[own.t == own.t0] = start
         if not len(self.kept):
             return out[self.beside], None
+        to = float(own.t[-1]) if end is None else end
+        made = self._made(tol, start, h_most, steps, to, own.t[self.kept])
+        out[self.kept[: len(made)]] = made.x
+        self._end(out, made)
+        return out[self.beside], made
+
+    def _made(
+        self, tol: float, start: Array, h_most: float, steps: float, end: float, times: Array
+    ) -> Fitted:
+        own, nq = self.own, self.own._model.nq
         made = self.run(
-            own._model, start[:nq], start[nq:], own.t0, float(own.t[-1]) if end is None else end,
-            tol, own.t[self.kept], self.u, own._params, h_most, self.progress, own._stiff, steps,
-            own._by,
+            own._model, start[:nq], start[nq:], own.t0, end, tol, times.astype(own._model.dtype),
+            self.u, own._params, h_most, self.progress, own._stiff, steps, own._by,
         )  # fmt: skip
         if made.status == "interrupted":
             raise KeyboardInterrupt
-        out[self.kept[: len(made)]] = made.x
+        return made
+
+    def _end(self, rows: Array, made: Fitted) -> None:
+        """The last row where the same event ends both runs, the other a hair sooner or later."""
+        own = self.own
         if own.stopped and made.stopped == own.stopped and own.t[-1] == self.reached:
-            found = made.events[own.stopped]  # a hair sooner or later
-            out[-1] = np.concatenate([found.q[-1], found.qd[-1]])
-        return out[self.beside], made
+            found = made.events[own.stopped]
+            rows[-1] = np.concatenate([found.q[-1], found.qd[-1]])
+
+    @property
+    def times(self) -> Array:
+        """Of `curve` and `states`: those of the rows, with others between where these are few."""
+        between = np.linspace(self.own.t0, self.own.t[-1], _CURVE + 1)[1:-1]
+        own = self.own.t[self.kept].astype(float)
+        few = between if len(own) < _CURVE else between[:0]
+        return np.unique(np.concatenate([[self.own.t0], own, few]))
+
+    def curve(self) -> Array:
+        """The run's own states at `times`."""
+        if len(self.kept) < _CURVE:
+            return np.concatenate(self.own(self.times), axis=1).astype(float)
+        return np.concatenate([np.ravel(self.own._begin)[None], self.x[self.kept]])
+
+    def states(self, tol: float, start: Array, h_most: float, steps: float = np.inf) -> Array:
+        """Those of another run at `times`, nan behind its end."""
+        own, start, times = self.own, start.astype(self.own._model.dtype), self.times
+        out = np.full((len(times), self.x.shape[1]), np.nan)
+        out[0] = start
+        if len(times) > 1:
+            made = self._made(tol, start, h_most, steps, float(own.t[-1]), times[1:])
+            out[1 : 1 + len(made)] = made.x
+            self._end(out, made)
+        return out
+
+    def at_rows(self, states: Array) -> Array:
+        """What is at `times` at the rows of the run, nan at those beside jumps."""
+        out = np.full_like(self.x, np.nan)
+        out[self.own.t == self.own.t0] = states[0]
+        out[self.kept] = states[np.searchsorted(self.times, self.own.t[self.kept].astype(float))]
+        return np.asarray(out[self.beside])
 
     def finer(self, begin: Array, least: float) -> tuple[Array, Fitted | None]:
         """The same by a finer run."""
@@ -260,6 +315,11 @@ def _finer(own: Fitted, least: float) -> tuple[float, float]:
     return tol, min((h for h in longest if h > 0), default=0.0)
 
 
+def _finite(rows: Array) -> Array:
+    """The rows as far as both runs came."""
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
+
+
 def _filled(rows: Array) -> Array:
     """Differences at rows; behind those that a run came to the last of them."""
     there = np.isfinite(rows).all(axis=1)
@@ -280,11 +340,7 @@ def _verdict(
     words += (told := events.words(own))
     lost, wrong = (np.asarray((x > _TENTH).any(axis=1)) for x in (rounding, left))
     if lost[-1]:
-        words.append(
-            f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "
-            f"rounding with it; no run in {own._model.dtype} means anything from "
-            f"t = {own.t[int(np.argmax(lost))]:.4g} s on"
-        )
+        words.append(rounding_words(own._model, amplification, float(own.t[np.argmax(lost)])))
     if wrong.any() and not (told and np.isinf(left[wrong]).all()):
         row = int(np.argmax(wrong))
         words.append(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .growth import growth, mean_mass_matrix, norm_root, other_directions
 from .package import reduced
 from .recorded import Recorded
 from .stepping import Stepping
@@ -34,8 +35,10 @@ class Estimate:
     end: of the last row, by name, velocities as theta_dot. digits: how many of each coordinate are
     right there, relative to its scale, its largest value along the run. order: the method's;
     observed: log2 of what halving h divides the differences by, nan where only rounding is seen.
-    amplification: by what a tiny difference at the start has grown at the end, positions relative
-    to the largest of them, velocities likewise; at least, where it is as large as the motion.
+    amplification: the largest factor by which the motion has multiplied a small difference of the
+    start at the end, in the norm |d|^2 = dqd' D dqd + (dq/T)' D (dq/T), with the mean mass matrix
+    D and the times T = |dq|/|dqd| of such differences (docs/python.md): 1 of an oscillator. At
+    least so large, where the difference becomes as large as the motion.
     verdict: why the motion is not resolved, in words, or "".
     events: by name the error in time of each event of the run, (n,), s; inf where a finer run does
     not detect the event. missed: by name the times of events that a finer run detects and this one
@@ -80,8 +83,8 @@ def estimate(run: Recorded, progress: Callable[[int, int], None] | None = None) 
     """The error of a run, from the same run at h/2 and h/4, and finer ones where they differ.
 
     What the finest run leaves is taken from the last difference and the observed order, and
-    nothing falls below what rounding adds up to. Costs seven to nine times the run, or forty where
-    it does not converge.
+    nothing falls below what rounding adds up to. Costs eight to twelve times the run, or forty
+    where it does not converge.
     """
     if not run.steps:
         return _nothing(run)
@@ -141,42 +144,93 @@ class _Again:
         return made
 
     def _report(self, done: int, _: int) -> None:
-        total = 9 * self.run.steps
+        total = 12 * self.run.steps
         if self.progress is not None:
             self.progress(min(self.spent + done, total), total)
 
 
 def _growth(run: Recorded, own: Array, eps: float, again: _Again) -> tuple[Array, Array, float]:
     """The scales (2 nq,), what a start moved by one scale would become at each row if that were
-    little, (n, 2 nq), and by what the largest has grown at the end."""
-    nq, every, base = run._model.nq, run.every, own
+    little, (n, 2 nq), and the growth of a small difference until the end."""
+    model, every, base, times = run._model, run.every, own, run.t
     if len(run) < _ROWS:
         every = max(1, run.steps // _ROWS)
-        base = again(1, every).x.astype(float)
-    scale = scales(base, float(np.ptp(run.t)), eps, len(run._model.still))
-    moves = moving(run._model)
+        made = again(1, every)
+        base, times = made.x.astype(float), made.t
+    scale = scales(base, float(np.ptp(run.t)), eps, len(model.still))
+    moves = moving(model)
     signs = moves * np.random.default_rng(1).choice([-1.0, 1.0], own.shape[1])
 
-    def moved(size: float) -> Array:
-        x = again(1, every, size * scale * signs).x.astype(float)
+    def moved(nudge: Array) -> Array:
+        """The difference that a nudge of the start makes at each row, itself at the first."""
+        x = again(1, every, nudge).x.astype(float)
         both = min(len(base), len(x))
-        with np.errstate(over="ignore"):
-            return _around(np.abs(x[:both] - base[:both])) / size
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(x[:both] - base[:both])
 
     walked = eps * math.sqrt(run.steps)
     size = max(20 * walked, 1e4 * eps)
-    grown = moved(size)
+    differences = [moved(size * scale * signs)]
+    grown = _around(np.abs(differences[0])) / size
     full = np.maximum.accumulate(np.max(grown / scale, axis=1) * size > _FULL)
     if full.any():
         # moved by less, though rounding shows: where that fills the scale, rounding fills a tenth
-        finer = moved(max(2 * walked, 30 * eps))
+        less = max(2 * walked, 30 * eps)
+        differences.append(moved(less * scale * signs))
+        finer = _around(np.abs(differences[1])) / less
         both = min(len(grown), len(finer))
         grown = np.where(full[:both, None], np.maximum(grown[:both], finer[:both]), grown[:both])
-    together = np.repeat(np.max((moves * scale).reshape(2, -1), axis=1), nq)
-    amplification = float(np.max(grown[-1] / together))
-    counts, times = _counts(run, run.every, len(run)), _counts(run, every, len(grown))
-    rows = np.stack([np.interp(counts, times, column) for column in grown.T], axis=1)
+    D = mean_mass_matrix(model, base[:, : model.nq], times, run._params)
+    place = base[0], float(run.t[0]), run._params
+    amplification = growth_of(model, D, differences, float(np.ptp(run.t)), moves, place, moved)
+    counts, steps = _counts(run, run.every, len(run)), _counts(run, every, len(grown))
+    rows = np.stack([np.interp(counts, steps, column) for column in grown.T], axis=1)
     return scale, rows, amplification
+
+
+def growth_of(
+    model: Stepping, D: Array, differences: list[Array], duration: float, moves: Array,
+    place: tuple[Array, float, Array], moved: Callable[[Array], Array],
+) -> float:  # fmt: skip
+    """The growth of a small difference, from what is known and from other directions.
+
+    differences: along the motion, (rows, 2 nq) each, of which the first is the least rounded;
+    place: the start (2 nq,), its time and parameters. moved: finds another difference from a nudge
+    of the start, (2 nq,).
+    """
+    n, (start, t0, p) = model.nq - len(model.still), place
+    free = [*range(n), *range(model.nq, model.nq + n)]
+
+    def allowed(nudge: Array) -> Array:
+        """The nearest nudge that obeys the constraints."""
+        if not model.constraint_names:
+            return nudge
+        try:
+            x = start + nudge
+            found = model.project(x[: model.nq], x[model.nq :], t=t0, params=p)
+        except (ArithmeticError, ValueError):
+            return nudge
+        return np.asarray(np.concatenate(found) - start, float)
+
+    with np.errstate(all="ignore"):
+        own = [x[:, free] for x in differences]
+        root = norm_root(D[:n, :n], own, duration)
+        first = [allowed(x[0])[free] for x in differences]
+        factors = [
+            growth(root, a[:, None], x[-1][:, None]) for a, x in zip(first, own, strict=True)
+        ]
+        rank = int(np.sum(moves[free]))
+        for d in other_directions(root, first[0], moves[free], rank):
+            nudge = np.zeros(2 * model.nq)
+            nudge[free] = d
+            nudge = allowed(nudge)
+            found = moved(nudge)[:, free]
+            own.append(found)
+            first.append(found[0] if not model.constraint_names else nudge[free])
+        chosen = [0, *range(len(differences), len(first))]
+        common = min(len(own[k]) for k in chosen) - 1
+        ends = [first[k] for k in chosen], [own[k][common] for k in chosen]
+        return max(*factors, growth(root, *(np.stack(x, axis=1) for x in ends)))
 
 
 def _leaps(run: Recorded, scale: Array, eps: float, again: _Again) -> bool:
@@ -295,6 +349,19 @@ def _padded(run: Recorded, rows: int, every: int) -> Array:
     return out
 
 
+def rounding_words(model: Stepping, amplification: float, lost: float) -> str:
+    """Why rounding is a tenth of the motion from the time `lost` on."""
+    if amplification * math.sqrt(float(np.finfo(model.dtype).eps)) > 1:
+        return (
+            f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "
+            f"rounding with it; no run in {model.dtype} means anything from t = {lost:.4g} s on"
+        )
+    return (
+        f"rounding of {model.dtype} is a tenth of the motion from t = {lost:.4g} s on, which is "
+        "small beside its coordinates: measure these from a nearer origin"
+    )
+
+
 def _verdict(
     run: Recorded, names: Sequence[str], relative: Array, walk: Array, observed: float, order: int,
     amplification: float, stopped: Recorded | None,
@@ -310,10 +377,7 @@ def _verdict(
         )
     if (walk[-1] > _TENTH).any():
         lost = run.t[int(np.argmax((walk > _TENTH).any(axis=1)))]
-        words.append(
-            f"chaotic: a difference at the start grows {amplification:.1g} times or more, and "
-            f"rounding with it; no run in {run._model.dtype} means anything from t = {lost:.4g} s"
-        )
+        words.append(rounding_words(run._model, amplification, float(lost)))
     wrong = relative > _TENTH
     if wrong.any():
         row = int(np.argmax(wrong.any(axis=1)))

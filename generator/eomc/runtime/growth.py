@@ -1,0 +1,82 @@
+"""The factor by which a motion multiplies a small difference of its start.
+
+The size of a difference d = [dq; dqd] is |d|^2 = dqd' D dqd + (dq/T)' D (dq/T), where D is the mean
+mass matrix along the motion, and T_i is the time in which a difference of q_i changes: the median
+of |dq_i|/|dqd_i| along the motion, at most its duration. So it depends neither on the origin of a
+coordinate, nor on units, nor on how far anything moves; of a harmonic oscillator, for which
+T = 1/omega, it is constant along the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .arguments import Array
+
+_STATES = 16  # of which D is the mean
+_DEFINITE = 1e-12  # of the largest eigenvalue of D: a smaller one counts as this
+_APART = 1e-6  # of the largest: differences at the start that are less apart are one
+_DIRECTIONS = 4  # of differences at the start, which a run each follows
+
+
+def mean_mass_matrix(model: Any, q: Array, t: Array, params: Any = None) -> Array:
+    """The mean of D (n, n) over some of the rows q (rows, n) at t (rows,)."""
+    rows = np.unique(np.linspace(0, len(q) - 1, _STATES).astype(int))
+    return np.asarray(
+        np.mean([model.D(q[k], t=float(t[k]), params=params) for k in rows], axis=0), float
+    )
+
+
+def norm_root(D: Array, differences: Sequence[Array], duration: float) -> Array:
+    """Return W (2n, 2n), the size of d being |W d|; differences: along the motion, (rows, 2n) each.
+
+    duration: the largest time T, s.
+    """
+    values, vectors = np.linalg.eigh((D + D.T) / 2)
+    values = np.maximum(values, _DEFINITE * max(float(values[-1]), np.finfo(float).tiny))
+    root = np.sqrt(values)[:, None] * vectors.T
+    n, rows = len(D), np.concatenate([*differences])
+    times = np.full(n, duration or 1.0)
+    for k in range(n):
+        dq, dqd = np.abs(rows[:, k]), np.abs(rows[:, n + k])
+        good = (dq > 0) & (dqd > 0) & (dq < np.inf) & (dqd < np.inf)
+        if good.any():
+            times[k] = min(times[k], float(np.exp(np.median(np.log(dq[good]) - np.log(dqd[good])))))
+    whole = np.zeros((2 * n, 2 * n))
+    whole[:n, :n], whole[n:, n:] = root / times, root
+    return whole
+
+
+def growth(root: Array, first: Array, last: Array) -> float:
+    """The largest factor from differences at the start (2n, k) to those at the end, (2n, k).
+
+    Of all their linear combinations; inf where one is not finite.
+    """
+    if not (np.isfinite(first).all() and np.isfinite(last).all()):
+        return float("inf")
+    most = float(np.max(np.abs(last), initial=0.0)) or 1.0  # its square may overflow
+    inverse = np.linalg.pinv(root @ first, rcond=_APART)
+    return most * float(np.linalg.norm(root @ (last / most) @ inverse, 2))
+
+
+def other_directions(root: Array, first: Array, moves: Array, rank: int) -> list[Array]:
+    """Differences (2n,) at the start, as large as the first and orthogonal to it in the norm.
+
+    moves (2n,): 1 of what may differ, else 0; rank: the dimension of the space of differences.
+    """
+    random, found = np.random.default_rng(2), [first]
+    size = float(np.linalg.norm(root @ first))
+    widths = np.linalg.norm(root, axis=0)
+    for _ in range(min(rank, _DIRECTIONS) - 1):
+        d = moves * random.standard_normal(len(first)) / widths
+        for other in found:
+            w = root @ other
+            d = d - other * float(w @ (root @ d)) / max(float(w @ w), np.finfo(float).tiny)
+        length = float(np.linalg.norm(root @ d))
+        if not 0 < length < np.inf:
+            break
+        found.append(moves * d * (size / length))
+    return found[1:]
